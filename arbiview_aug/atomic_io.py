@@ -182,8 +182,8 @@ def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") ->
         except OSError as error:
             if error.errno not in (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.EACCES):
                 raise
-    with source.open("rb") as given, whole_file(path, owner) as file:
-        shutil.copyfileobj(given, file)
+    with source.open("rb") as reading, whole_file(path, owner) as file:
+        shutil.copyfileobj(reading, file)
 
 
 def remove_parts(root: Path, owned: Callable[[str], bool]) -> None:

@@ -34,13 +34,13 @@ def installed_version(name: str) -> str | None:
 @cache
 def warn_about_cv2_wheels() -> None:
     """Warn once per process if several wheels provide ``cv2``."""
-    found = {name: version for name in _CV2_WHEELS if (version := installed_version(name)) is not None}
-    if len(found) < 2:
+    wheels = {name: version for name in _CV2_WHEELS if (version := installed_version(name)) is not None}
+    if len(wheels) < 2:
         return
-    versions = " and ".join(f"{name} {version}" for name, version in found.items())
+    versions = " and ".join(f"{name} {version}" for name, version in wheels.items())
     warn(
         f"{versions} are installed together: they overwrite each other's files, so cv2 may break or change with the "
-        f"order of installation. Keep one: pip uninstall -y {' '.join(found)} && pip install {list(found)[-1]}",
+        f"order of installation. Keep one: pip uninstall -y {' '.join(wheels)} && pip install {list(wheels)[-1]}",
         RuntimeWarning,
     )
 

@@ -39,15 +39,15 @@ _LIKENESS = 0.88
 def misnamed(entries: Mapping[Any, Any], read: Sequence[str]) -> dict[str, str]:
     """The keys of ``entries`` that are likely meant as one of the keys that are ``read`` and absent."""
     names = tuple(read)
-    found = ((key, meant_by(key, names)) for key in entries if isinstance(key, str))
-    return {k: meant for k, meant in found if meant and meant not in entries and _could_be(meant, entries[k])}
+    meanings = ((key, meant_by(key, names)) for key in entries if isinstance(key, str))
+    return {k: meant for k, meant in meanings if meant and meant not in entries and _could_be(meant, entries[k])}
 
 
 def hint(entries: Iterable[Any], wanted: Sequence[str]) -> str:
     """Suggestions for an error about missing keys; empty where there are none."""
     names = tuple(wanted)
-    found = [f"found {k!r}: did you mean {m!r}?" for k in entries if isinstance(k, str) and (m := meant_by(k, names))]
-    return "".join(f"; {words}" for words in found)
+    hints = [f"found {k!r}: did you mean {m!r}?" for k in entries if isinstance(k, str) and (m := meant_by(k, names))]
+    return "".join(f"; {words}" for words in hints)
 
 
 @lru_cache(maxsize=4096)

@@ -72,7 +72,7 @@ class RandomRig:
         if per not in ("sample", "sequence"):
             raise CalibrationError(f"RandomRig: per: expected 'sample' or 'sequence', got {per!r}")
         self.per, self.sequence_key = per, sequence_key
-        given = {
+        ranges = {
             "yaw_deg": yaw_deg,
             "pitch_deg": pitch_deg,
             "roll_deg": roll_deg,
@@ -81,7 +81,7 @@ class RandomRig:
             "lateral_m": lateral_m,
             "focal_scale": focal_scale,
         }
-        self.ranges = {name: _range(name, value) for name, value in given.items()}
+        self.ranges = {name: _range(name, value) for name, value in ranges.items()}
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -301,12 +301,12 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
 
 def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
     """Refuse numbers under another name of an absent key, which would silently be 0; text may be a note."""
-    for found in misnamed(entries, (key,)):
-        value = entries[found]
+    for wrong in misnamed(entries, (key,)):
+        value = entries[wrong]
         is_zero = not any(value) if isinstance(value, list) else not value
         if isinstance(value, Mapping | list | int | float) and not is_zero:
             raise CalibrationError(
-                f"{label}: {key!r} is absent, and {found!r} is not read: did you mean {key!r}? Rename it, or add "
+                f"{label}: {key!r} is absent, and {wrong!r} is not read: did you mean {key!r}? Rename it, or add "
                 f"{key!r} if it is something else"
             )
 

@@ -218,7 +218,7 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
     body[:3, :3] = CAMERA_AXES_IN_EGO
     metres[:, :3, 3] /= 1000
     axes = f"by {CAMERA_AXES_IN_EGO.astype(int).tolist()} from the"
-    for right, found, fix in (
+    for right, mistake, fix in (
         (metres, "positions in millimetres", "divide cam2ego[:3, 3] by 1000"),
         (np.asarray(np.linalg.inv(cam2ego), np.float64), "ego2cam, the inverse", "pass np.linalg.inv(cam2ego)"),
         (cam2ego @ body, "a body's axes (ROS: x forward, z up)", f"multiply cam2ego[:3, :3] {axes} right"),
@@ -230,7 +230,7 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
         (cam2ego @ upside_down, "OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]"),
     ):
         if (_stands(right) & is_mounted(right, ground_z_m)).mean() > 0.5:
-            return found, fix
+            return mistake, fix
     heights = ", ".join(f"{z:+.1f}" for z in cam2ego[:, 2, 3] - ground_z_m)
     if _stands(cam2ego).all():
         return f"heights over the road of {heights} m", "is ground_z_m the road's height in the ego frame?"

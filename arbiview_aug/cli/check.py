@@ -42,11 +42,11 @@ def run(arguments: argparse.Namespace) -> int:
         print(note)
     for same in lines.values():
         print(same[0] if len(chosen) == 1 else f"{same[0]} ({len(same)} of {len(chosen)} frames)")
-    found = len(notes) + len(lines)
+    count = len(notes) + len(lines)
     print(
-        f"{found or 'no'} finding{'s' * (found != 1)} in {len(chosen)} of {len(samples)} frames; pictures: {pictures}"
+        f"{count or 'no'} finding{'s' * (count != 1)} in {len(chosen)} of {len(samples)} frames; pictures: {pictures}"
     )
-    return int(found > 0)
+    return int(count > 0)
 
 
 def _draw(sample: Mapping[str, Any], folder: Path) -> str:

@@ -80,9 +80,9 @@ class _Frames(Dataset[Done]):
                 used.remove(neighbour.name)  # the frame is done again once the neighbour can be read
                 return None
 
-        found = motion_depth(frame.rig, frame.images, neighbours, boxes, load)
-        self.depths.write(token, rig, found, used)
-        return Done(token, found.density, str(found))
+        depth = motion_depth(frame.rig, frame.images, neighbours, boxes, load)
+        self.depths.write(token, rig, depth, used)
+        return Done(token, depth.density, str(depth))
 
 
 class _Loaded(NamedTuple):
@@ -123,9 +123,9 @@ class _Inputs(Dataset[_Loaded | Done]):
         motion = self.motion.read(token, sample["rig"]) if is_there else None
         used = [name for name, value in (("LiDAR", points), ("motion", motion)) if value is not None]
         origin = [*self.model, *used, *(["road"] if "road" in self.wanted else [])]
-        found = self.depths.find(token, sample["rig"], origin, "learned")
-        if found is not None:
-            return Done(token, found.density, "", existed=True)
+        there = self.depths.find(token, sample["rig"], origin, "learned")
+        if there is not None:
+            return Done(token, there.density, "", existed=True)
         return _Loaded(token, DepthInputs(frame.rig, frame.images, points, motion, scene.boxes), origin)
 
 
@@ -161,8 +161,8 @@ def _learned(
     waiting: list[_Loaded] = []
 
     def written() -> Iterator[Done]:
-        found = learned_depth(model, [one.inputs for one in waiting], arguments.batch, wanted)
-        for one, (depth, fits) in zip(waiting, found, strict=True):
+        fitted = learned_depth(model, [one.inputs for one in waiting], arguments.batch, wanted)
+        for one, (depth, fits) in zip(waiting, fitted, strict=True):
             depths.write(one.token, one.inputs.rig, depth, one.origin)
             yield Done(one.token, depth.density, "; ".join(map(str, fits)), fits=fits)
         waiting.clear()

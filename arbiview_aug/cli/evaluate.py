@@ -78,17 +78,17 @@ def open_frames(arguments: argparse.Namespace, surfaces: Sequence[GeometryName],
 def target_rigs(arguments: argparse.Namespace, chosen: Rig | None, source: Rig) -> dict[str, Rig]:
     """Rigs to render, by name; ``chosen`` is the rig of ``--target``."""
     if arguments.target_set is not None:
-        found = named_targets(arguments.target_set, source)
+        rigs = named_targets(arguments.target_set, source)
     elif arguments.yaws is None:
         rig = chosen or (load_rig(REAL_TARGET) if arguments.data else demo_target_rig(source.sizes[0]))
-        found = {rig.name or "target": rig}
+        rigs = {rig.name or "target": rig}
     else:
-        found = {f"yaw {yaw:+g}": without_masks(source.turned(yaw_deg=yaw)) for yaw in arguments.yaws}
+        rigs = {f"yaw {yaw:+g}": without_masks(source.turned(yaw_deg=yaw)) for yaw in arguments.yaws}
     if "paper" in arguments.quality:  # homographies know no lens; all methods share the targets
-        found = {name: rig.undistorted() for name, rig in found.items()}
+        rigs = {name: rig.undistorted() for name, rig in rigs.items()}
     if arguments.size is None:
-        return found
-    return {name: rig.resized(arguments.size, "crop") for name, rig in found.items()}
+        return rigs
+    return {name: rig.resized(arguments.size, "crop") for name, rig in rigs.items()}
 
 
 def scored_frames(data: Any, frames: int, hand_over_points: bool) -> Iterator[tuple[str, ScoredFrame]]:
@@ -168,9 +168,9 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
 
 def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Method], Evaluation]:
     """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
-    data, given = open_frames(arguments, ["motion", *arguments.geometry]), arguments.displaced
+    data, displaced = open_frames(arguments, ["motion", *arguments.geometry]), arguments.displaced
     with named_steps(notes) as tick:
-        next_frame = FrameFolder(given, reduce=arguments.reduce)[0] if isinstance(given, str) else None
+        next_frame = FrameFolder(displaced, reduce=arguments.reduce)[0] if isinstance(displaced, str) else None
         count_of = min(arguments.frames or len(data), len(data))
         frames = displaced_frames(data, count_of, next_frame)
         first = next(frames, None)

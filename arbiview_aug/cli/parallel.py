@@ -104,5 +104,5 @@ def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str
         num_cpus=1,
         num_gpus=min(1.0, gpus / workers),
     )
-    found: Iterator[Done] = (pickle.loads(row["done"]) for row in done.iter_rows())
-    yield from with_progress(found, len(jobs), label, note)
+    results_of_rows: Iterator[Done] = (pickle.loads(row["done"]) for row in done.iter_rows())
+    yield from with_progress(results_of_rows, len(jobs), label, note)

@@ -284,23 +284,23 @@ def loader() -> argparse.ArgumentParser:
 
 
 # --- options that exclude each other ----------------------------------------------------------------------------------
-def check_together(name: str, parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+def check_together(name: str, parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Refuse options of a command that do not fit together, as argparse refuses others."""
-    if name == "convert" and given.shard_index >= given.num_shards:
-        parser.error(f"argument --shard-index: expected less than {given.num_shards}, got {given.shard_index}")
-    if name in ("convert", "demo", "evaluate") and "paper" in given.quality:
-        surfaces = given.geometry if isinstance(given.geometry, list) else [given.geometry]
+    if name == "convert" and arguments.shard_index >= arguments.num_shards:
+        parser.error(f"argument --shard-index: expected less than {arguments.num_shards}, got {arguments.shard_index}")
+    if name in ("convert", "demo", "evaluate") and "paper" in arguments.quality:
+        surfaces = arguments.geometry if isinstance(arguments.geometry, list) else [arguments.geometry]
         if {*surfaces} - {"auto", "infinity"}:
             parser.error(f"argument --geometry: quality paper knows the far surface alone, got {', '.join(surfaces)}")
-    if name == "depth" and given.device and not given.model:
+    if name == "depth" and arguments.device and not arguments.model:
         parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
     if name == "evaluate":
-        if given.generator and not (given.paper or given.figure or "diffusion" in given.holes):
+        if arguments.generator and not (arguments.paper or arguments.figure or "diffusion" in arguments.holes):
             parser.error("argument --generator: expected it with --holes diffusion, --paper or --figure")
         for mode, fixed in _FIXED.items():
             for option in fixed:
-                if getattr(given, mode) and getattr(given, option) != parser.get_default(option):
+                if getattr(arguments, mode) and getattr(arguments, option) != parser.get_default(option):
                     flag = "downscale" if option == "reduce" else option.replace("_", "-")
                     parser.error(f"argument --{flag}: --{mode} has its own; expected none")
-        if given.displaced and given.data is None:
+        if arguments.displaced and arguments.data is None:
             parser.error("argument --displaced: expected --data FOLDER with it, found none")

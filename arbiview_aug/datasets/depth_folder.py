@@ -79,12 +79,12 @@ class DepthFolder:
             DataError: The folder holds depth of the other kind.
         """
         try:
-            depth, found = self._read(token, rig)
+            depth, origin_there = self._read(token, rig)
         except DataError:
             return None
         if type(depth) is not _KINDS[kind]:
             raise DataError(f"{self.path(token)}: expected {kind} depth, got another kind; name another --output")
-        return depth if found == list(origin) else None
+        return depth if origin_there == list(origin) else None
 
     def _read(self, token: str, rig: Rig) -> tuple[MotionDepth, list[str]]:
         path = self.path(token)
@@ -141,16 +141,16 @@ class WithDepth(Dataset[dict[str, Any]]):
         rig, token = sample.get("rig", self.source_rig), sample.get("token")
         if rig is None or token is None:
             raise SampleError("sample: expected 'rig' and 'token', to find its depth by; pass source_rig=")
-        found = dict(sample)
+        out = dict(sample)
         for folder in self.folders:
             depth = folder.read(str(token), rig)
             maps = [torch.from_numpy(one) for one in depth.depth_m]
             same = len({one.shape for one in maps}) == 1
             is_learned = isinstance(depth, LearnedDepth)
-            found[LEARNED_KEY if is_learned else MOTION_KEY] = torch.stack(maps) if same else maps
+            out[LEARNED_KEY if is_learned else MOTION_KEY] = torch.stack(maps) if same else maps
             if is_learned:
-                found[LEARNED_WORDS_KEY] = str(depth)
-        return found
+                out[LEARNED_WORDS_KEY] = str(depth)
+        return out
 
 
 WithMotionDepth = WithDepth  # deprecated: the former name
@@ -171,7 +171,7 @@ def _misfit(arrays: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> tu
         if layer.shape != (size := motion_camera(camera).size):
             return f"camera {camera.name!r} of shape {size}", f"{layer.shape}"
     for key, atol in (("K", _SAME_PX), ("cam2ego", _SAME_POSE)):
-        for camera, found, own in zip(rig, arrays[key], _calibration(rig)[key], strict=True):
-            if not np.allclose(found, own, rtol=0, atol=atol):
+        for camera, recorded, expected in zip(rig, arrays[key], _calibration(rig)[key], strict=True):
+            if not np.allclose(recorded, expected, rtol=0, atol=atol):
                 return "this calibration", f"another's: {key} of camera {camera.name!r} differs"
     return None

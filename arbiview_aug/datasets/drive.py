@@ -94,16 +94,16 @@ class Neighbours:
 
     def select(self, travelled_m: FloatArray, index: int) -> list[int]:
         """Neighbours of frame ``index`` by non-decreasing distance (F,) along a drive, nearest first per direction."""
-        found: list[int] = []
+        rows: list[int] = []
         for sign in self.signs:
             for k in range(1, self.count + 1):
                 # 1 mm of tolerance: the poses of a standing vehicle jitter.
                 target_m = travelled_m[index] + sign * (k * self.step_m - 1e-3)
                 side: Literal["left", "right"] = "left" if sign > 0 else "right"
                 at = int(np.searchsorted(travelled_m, target_m, side)) - (sign < 0)
-                if 0 <= at < len(travelled_m) and at not in found:
-                    found.append(at)
-        return found
+                if 0 <= at < len(travelled_m) and at not in rows:
+                    rows.append(at)
+        return rows
 
 
 def check_neighbours(value: Any) -> None:
@@ -130,14 +130,14 @@ class Drive:
 
 def travelled_m(positions_m: FloatArray) -> FloatArray:
     """(F,) distance along positions (F, 3), without the pose jitter of a standing vehicle."""
-    total_m, found = 0.0, []
+    total_m, distances_m = 0.0, []
     last = None
     for position in positions_m.tolist():
         step_m = 0.0 if last is None else math.dist(last, position)
         if last is None or step_m >= STILL_M:
             last, total_m = position, total_m + step_m
-        found.append(total_m)
-    return np.array(found)
+        distances_m.append(total_m)
+    return np.array(distances_m)
 
 
 def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, where: str) -> npt.NDArray[np.int64]:

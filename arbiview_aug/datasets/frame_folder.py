@@ -131,18 +131,18 @@ class FrameFolder(WritableRecording):
         """Source files of a frame: calibration, images, masks and points."""
         frame = self._frames[index]
         calib = _read_calibration(frame)
-        found = [frame.folder / CALIBRATION_FILE, *(_image_file(entry, frame) for entry in calib["cameras"])]
-        found += [mask for entry in calib["cameras"] if (mask := _mask_file(entry, frame)) is not None]
+        paths = [frame.folder / CALIBRATION_FILE, *(_image_file(entry, frame) for entry in calib["cameras"])]
+        paths += [mask for entry in calib["cameras"] if (mask := _mask_file(entry, frame)) is not None]
         points = _points_file(calib, frame) if self.load_points else None
-        return found if points is None else [*found, points]
+        return paths if points is None else [*paths, points]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         frame = self._frames[index]
         calib = _read_calibration(frame)
         rig = self._rig(calib, frame)
         for entries, read in ((calib, ("boxes_3d", "ego2world", "lidar")), *((c, ("mask",)) for c in calib["cameras"])):
-            for found, meant in misnamed(entries, read).items():
-                self._warn(found, f"{frame.where}: {found!r} is not read; did you mean {meant!r}?")
+            for wrong, meant in misnamed(entries, read).items():
+                self._warn(wrong, f"{frame.where}: {wrong!r} is not read; did you mean {meant!r}?")
         sample = camera_fields(rig, self._images(calib, frame, rig), frame.name)
         if self.load_points and (points := _read_points(calib, frame)) is not None:
             sample["points"] = points
@@ -169,14 +169,14 @@ class FrameFolder(WritableRecording):
         return camera_fields(rig, self._images(calib, frame, rig), frame.name)
 
     def _boxes_pose_time(self, calib: Mapping[str, Any], frame: _Frame) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+        values: dict[str, Any] = {}
         if calib.get("boxes_3d") is not None:
-            found["boxes_3d"] = _boxes(calib["boxes_3d"], frame.where)
+            values["boxes_3d"] = _boxes(calib["boxes_3d"], frame.where)
         if calib.get("ego2world") is not None:
-            found["ego2world"] = _pose(calib["ego2world"], frame.where)
+            values["ego2world"] = _pose(calib["ego2world"], frame.where)
         if frame.name in self._times_s:
-            found["time_s"] = self._times_s[frame.name]
-        return found
+            values["time_s"] = self._times_s[frame.name]
+        return values
 
     def _images(self, calib: Mapping[str, Any], frame: _Frame, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
         files = [_image_file(entry, frame) for entry in calib["cameras"]]
@@ -269,8 +269,8 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
     if not path.is_file():
         return {}, []
     try:
-        given = parse_json(path.read_text(encoding="utf-8"))["frames"]
-        entries = [entry if isinstance(entry, Mapping) else {"name": entry} for entry in given]
+        listed = parse_json(path.read_text(encoding="utf-8"))["frames"]
+        entries = [entry if isinstance(entry, Mapping) else {"name": entry} for entry in listed]
         names = [str(entry["name"]) for entry in entries]
         times_s = {str(entry["name"]): float(entry["time_s"]) for entry in entries if "time_s" in entry}
     except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:

@@ -72,8 +72,8 @@ def decode_images(
     labels = [f"camera {(names[k] if names else file.stem)!r}: image {file}" for k, file in enumerate(files)]
     headers = [read_header(file, label) for file, label in zip(files, labels, strict=True)]
     if sizes is not None:
-        for (_, found), label, size in zip(headers, labels, sizes, strict=True):
-            _check_size(found, size, label)
+        for (_, stored), label, size in zip(headers, labels, sizes, strict=True):
+            _check_size(stored, size, label)
     shapes = [(*reduced_size(size, reduce), 3) for _, size in headers]
     block = np.empty((len(files), *shapes[0]), np.uint8) if len(set(shapes)) == 1 else None
     images = [np.empty(shape, np.uint8) for shape in shapes] if block is None else [*block]

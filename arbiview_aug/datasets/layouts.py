@@ -16,11 +16,11 @@ def has_frames(root: Path) -> bool:
 
 def table_folders(root: Path) -> list[str]:
     """Names of a nuScenes root's folders of tables: v1.0-mini and v1.0-trainval first."""
-    found = (path.name for path in root.glob("v1.0-*") if path.is_dir())
-    return sorted(found, key=lambda name: (name not in ("v1.0-mini", "v1.0-trainval"), name))
+    names = (path.name for path in root.glob("v1.0-*") if path.is_dir())
+    return sorted(names, key=lambda name: (name not in ("v1.0-mini", "v1.0-trainval"), name))
 
 
 def log_folders(root: Path) -> list[Path]:
     """Folders of the logs below py123d's data root, its ``logs``, or one split; a log's folder is the only one."""
-    found = (sorted(path.parent for path in root.glob(pattern)) for pattern in _LOGS)
-    return next(filter(None, found), [])
+    folders = (sorted(path.parent for path in root.glob(pattern)) for pattern in _LOGS)
+    return next(filter(None, folders), [])

@@ -62,8 +62,8 @@ class _Log:
 
     def pose(self, iteration: int, column: str, *modality: Any) -> FloatArray | None:
         """(4, 4) pose in the world; None where the modality recorded nothing."""
-        found = self.scene.get_modality_column_at_iteration(iteration, column, *modality)
-        return None if found is None else _matrix(found)
+        pose = self.scene.get_modality_column_at_iteration(iteration, column, *modality)
+        return None if pose is None else _matrix(pose)
 
 
 class Py123dDataset(WritableRecording):
@@ -191,8 +191,8 @@ class Py123dDataset(WritableRecording):
         number, iteration, _ = self._frames[index]
         log = self._logs[number]
         with _reading(log.folder):
-            found = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
-            clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in found if one is not None]
+            scans = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
+            clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in scans if one is not None]
         return checked_points(np.concatenate(clouds), f"of {self.tokens[index]}") if clouds else None
 
     def _ego2world(self, index: int) -> FloatArray:
@@ -244,8 +244,8 @@ def _camera(metadata: Any, where: str) -> Camera:
     distortion: Any
     model = metadata.camera_model.serialize()
     if model == "pinhole" and metadata.intrinsics is not None:
-        given, bent = metadata.intrinsics, None if metadata.is_undistorted else metadata.distortion
-        K = np.array([[given.fx, given.skew, given.cx], [0, given.fy, given.cy], [0, 0, 1]])
+        intrinsics, bent = metadata.intrinsics, None if metadata.is_undistorted else metadata.distortion
+        K = np.array([[intrinsics.fx, intrinsics.skew, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]])
         lens, distortion = "pinhole", ()
         if bent is not None:
             lens, distortion = "radtan", (bent.k1, bent.k2, bent.p1, bent.p2, bent.k3)
@@ -283,14 +283,14 @@ def _fisheye(metadata: Any, where: str) -> tuple[FloatArray, FloatArray]:
     theta, radius = theta[:end], radius[:end]
     powers = np.stack([theta**n for n in (3, 5, 7, 9)], axis=-1)
     wanted = radius * (1 + xi) - theta  # the slope on the axis is 1 / (1 + xi)
-    found = np.linalg.lstsq(powers, wanted, rcond=None)[0]
-    error_px = float(np.abs(powers @ found - wanted).max() / (1 + xi) * max(to.gamma1, to.gamma2))
+    coefficients = np.linalg.lstsq(powers, wanted, rcond=None)[0]
+    error_px = float(np.abs(powers @ coefficients - wanted).max() / (1 + xi) * max(to.gamma1, to.gamma2))
     if not error_px <= _MEI_ERROR_PX:
         raise CalibrationError(
             f"{where}: expected a MEI lens within {_MEI_ERROR_PX} px of a fisheye lens, got {error_px:.2f} px"
         )
     K = np.array([[to.gamma1 / (1 + xi), 0, to.u0], [0, to.gamma2 / (1 + xi), to.v0], [0, 0, 1]])
-    return K, found
+    return K, coefficients
 
 
 def _boxes(detections: Any, world2ego: FloatArray) -> Any:
@@ -298,8 +298,8 @@ def _boxes(detections: Any, world2ego: FloatArray) -> Any:
     rows = np.array([one.bounding_box_se3.array for one in detections], np.float64).reshape(-1, 10)
     moved = world2ego[:3, :3] @ rotation_from_quaternion(rows[:, 3:7])
     yaw = np.arctan2(moved[:, 1, 0], moved[:, 0, 0])
-    given = [one.velocity_3d for one in detections]
-    velocity = np.array([[np.nan] * 3 if v is None else [v.x, v.y, v.z] for v in given]).reshape(-1, 3)
+    velocities = [one.velocity_3d for one in detections]
+    velocity = np.array([[np.nan] * 3 if v is None else [v.x, v.y, v.z] for v in velocities]).reshape(-1, 3)
     centre = rows[:, :3] @ world2ego[:3, :3].T + world2ego[:3, 3]
     return np.column_stack([centre, rows[:, 7:10], yaw, (velocity @ world2ego[:3, :3].T)[:, :2]]).astype(np.float32)
 

@@ -61,10 +61,10 @@ def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[Re
     for n, k in enumerate(ring):
         camera, image = source[k], to_bytes(images[k])
         left, right = gap[n - 1] / 2, gap[n] / 2
-        own = camera.width_px / camera.fov_deg[0]
+        px_per_degree = camera.width_px / camera.fov_deg[0]
         middle = float(camera.K[0, 2]) + 0.5  # counted from the image's edge
-        a = int(np.clip(round(middle - left * own), 0, camera.width_px - 1))
-        b = int(np.clip(round(middle + right * own), a + 1, camera.width_px))
+        a = int(np.clip(round(middle - left * px_per_degree), 0, camera.width_px - 1))
+        b = int(np.clip(round(middle + right * px_per_degree), a + 1, camera.width_px))
         wide = max(1, round((left + right) * per_degree))
         strips.append(cv2.resize(image[:, a:b], (wide, height), interpolation=cv2.INTER_LINEAR))
         centre_px.append(x + left * per_degree)

@@ -31,12 +31,12 @@ def displaced_frames(data: Any, count: int, next_frame: Mapping[str, Any] | None
     for index in range(len(data)):
         if count == 0:
             return
-        sample, found = data[index], None
+        sample, truth = data[index], None
         recorded = data.dataset if isinstance(data, WithDepth) else data
         if next_frame is None and isinstance(recorded, FrameFolder):
-            found = recorded.truth(index)
-        if found is not None:
-            photographs = _photographs(found["rig"], found["images"])
+            truth = recorded.truth(index)
+        if truth is not None:
+            photographs = _photographs(truth["rig"], truth["images"])
         else:
             if next_frame is not None:
                 sample = {**sample, "neighbours": [next_frame]}
@@ -86,7 +86,7 @@ COPY = Method("copy", _copy, plans=False)
 
 def surfaces_for(sample: Mapping[str, Any]) -> list[GeometryName]:
     """Surfaces that a sample has the geometry for, from the least to the most."""
-    found: list[GeometryName] = ["ground", "street"]
-    found += ["boxes"] if sample.get("boxes_3d") is not None else []
+    names: list[GeometryName] = ["ground", "street"]
+    names += ["boxes"] if sample.get("boxes_3d") is not None else []
     measured: list[GeometryName] = ["lidar"] if sample.get("points") is not None else []
-    return found + measured + ((["motion", "fused"] if measured else ["motion"]) if sample.get("neighbours") else [])
+    return names + measured + ((["motion", "fused"] if measured else ["motion"]) if sample.get("neighbours") else [])

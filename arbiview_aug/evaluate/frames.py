@@ -76,21 +76,21 @@ def make_frame(
     ``hand_over_points`` methods get the points of the sectors that do not score.
     """
     truth = None if truth is None else lru_cache(_CACHED_TRUTHS)(truth)
-    given = {key: value for key, value in sample.items() if key != "points"}
+    inputs = {key: value for key, value in sample.items() if key != "points"}
     if "points" not in sample or not exposures:
-        return ScoredFrame(dict(sample) if hand_over_points else given, truth=truth)
+        return ScoredFrame(dict(sample) if hand_over_points else inputs, truth=truth)
     rig, images = sample["rig"], as_arrays(sample["images"])
     cloud = sample["points"].numpy().astype(np.float64)
     if hand_over_points:
-        given["points"] = sample["points"][torch.from_numpy(lidar_split(cloud)[0])]
+        inputs["points"] = sample["points"][torch.from_numpy(lidar_split(cloud)[0])]
     lidar: dict[Exposure, LidarReference] = {}
     for exposure in exposures:
         exposed: list[Image] = list(equalised(rig, images, cloud)) if exposure == "even" else images
         points = coloured_points(rig, exposed, cloud)
         if hand_over_points:
             points = points.subset(lidar_split(points.points)[1])
-        lidar[exposure] = LidarReference({**given, "images": as_tensors(exposed)}, points)
-    return ScoredFrame(given, lidar, hand_over_points, truth)
+        lidar[exposure] = LidarReference({**inputs, "images": as_tensors(exposed)}, points)
+    return ScoredFrame(inputs, lidar, hand_over_points, truth)
 
 
 def scores(
@@ -115,13 +115,13 @@ def scores(
             else:
                 classes = truth.classes[k].numpy()
                 valid, parts = classes != SceneClass.VOID, regions(classes)
-            found = truth_metrics(view.image, true, coverage=view.coverage, classes=parts, valid=valid)
-            row |= {f"true_{name}": value for name, value in found.items()}
+            metrics_of_view = truth_metrics(view.image, true, coverage=view.coverage, classes=parts, valid=valid)
+            row |= {f"true_{name}": value for name, value in metrics_of_view.items()}
     for k, (exposure, reference) in enumerate(references):
         rendered = views if k == 0 else render(reference.sample, target)
         for row, camera, view in zip(rows, mounted, rendered, strict=True):
-            found = sparse_metrics(view.image, camera, reference.points, coverage=view.coverage) or {}
-            row |= {f"{exposure}_{name}": value for name, value in found.items()}
+            metrics_of_view = sparse_metrics(view.image, camera, reference.points, coverage=view.coverage) or {}
+            row |= {f"{exposure}_{name}": value for name, value in metrics_of_view.items()}
     return views, rows
 
 

@@ -87,7 +87,7 @@ def retargeting(
         """Render with the depth and the gain estimated from all cameras' overlaps."""
         if not estimates or estimates[0][0] is not sample:  # several views of a sample are rendered in a row
             estimates[:] = [(sample, *_overlap_estimates(sample, corrected, harmoniser))]
-        given, (_, depth, gains) = one_camera(sample, camera), estimates[0]
+        alone, (_, depth, gains) = one_camera(sample, camera), estimates[0]
         retarget = RigRetarget(
             target,
             quality=quality,
@@ -98,8 +98,8 @@ def retargeting(
         )
         if depth is not None and retarget.overlaps is not None:
             known = depth
-            retarget.overlaps.get((given["rig"].content_key, None), lambda: known)
-        (view,) = views_of(retarget(given))
+            retarget.overlaps.get((alone["rig"].content_key, None), lambda: known)
+        (view,) = views_of(retarget(alone))
         return view
 
     config = render_config(quality)
@@ -133,8 +133,8 @@ def _overlap_estimates(
 def one_camera(sample: Sample, camera: int) -> dict[str, Any]:
     """Reduce a sample to one camera; geometry in the ego frame stays."""
     rig: Rig = sample["rig"]
-    given = {key: value for key, value in sample.items() if key not in ("K", "cam2ego", "detections")}
-    return {**given, "images": [sample["images"][camera]], "rig": rig.with_cameras([rig[camera]])}
+    kept = {key: value for key, value in sample.items() if key not in ("K", "cam2ego", "detections")}
+    return {**kept, "images": [sample["images"][camera]], "rig": rig.with_cameras([rig[camera]])}
 
 
 def views_of(out: Sample) -> list[RenderedView]:

@@ -92,9 +92,9 @@ def measure_paper(
         tick: Called before each step with its name and the number of steps so far.
     """
     study, rows, steps = Study(), methods or study_methods(), 0
-    for name, found in _data_sets(data, frames, size, trained_on):
+    for name, data_set in _data_sets(data, frames, size, trained_on):
         collected: dict[str, dict[str, list[dict[str, float]]]] = {m.name: {kind: [] for kind in SETS} for m in rows}
-        for frame in found:
+        for frame in data_set:
             for kind in SETS:
                 # Raw exposures only where the paper has numbers.
                 exposures: tuple[Exposure, ...] = ("raw", "even") if kind == "paper" else ("even",)
@@ -211,7 +211,7 @@ def _others(study: Study) -> str:
 
 def _losses(study: Study) -> list[str]:
     """Sentence on the baselines that are above ours, with unseen pixels black."""
-    found = []
+    losses = []
     for of, methods in study.means.items():
         metric = "true_psnr_db" if _has_truth(methods) else "even_psnr_db"
         for kind, heading in _HEADINGS.items():
@@ -221,8 +221,8 @@ def _losses(study: Study) -> list[str]:
             below = [f"{name} {db[name]:.2f}" for name in OURS if name in db and db[name] < best]
             above = [f"{name} {value:.2f}" for name, value in baselines.items() if value == best]
             if below:
-                found.append(f"{of}, {heading}: {', '.join(above)} above {', '.join(below)}")
-    return [f"Where a baseline is above ours, unseen pixels black: {'; '.join(found)}."] if found else []
+                losses.append(f"{of}, {heading}: {', '.join(above)} above {', '.join(below)}")
+    return [f"Where a baseline is above ours, unseen pixels black: {'; '.join(losses)}."] if losses else []
 
 
 def _methods(study: Study) -> list[str]:

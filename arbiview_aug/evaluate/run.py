@@ -52,8 +52,8 @@ class Evaluation:
         """Summarize the pairs of sources (``overlap_...``) and of rendered views (``consistency_...``)."""
         row: dict[str, float] = {}
         for kind in ("overlap", "consistency"):
-            found = [p for p in self.pairs if p["method"] == method and p["kind"] == kind]
-            row |= summary(kind, [OverlapScore._make(map(pair.get, OverlapScore._fields)) for pair in found])
+            pairs = [p for p in self.pairs if p["method"] == method and p["kind"] == kind]
+            row |= summary(kind, [OverlapScore._make(map(pair.get, OverlapScore._fields)) for pair in pairs])
         return row
 
 

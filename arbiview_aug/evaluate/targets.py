@@ -55,12 +55,12 @@ TRUCK_UP_M = 1.0  # height of a truck's cameras over a sedan's
 def vehicle_targets(rig: Rig) -> dict[str, Rig]:
     """``VEHICLES`` by name, as pinhole rigs with the source's image width."""
     width = float(np.median([camera.width_px for camera in rig]))
-    found = {}
+    rigs = {}
     for name in VEHICLES:
         vehicle = load_rig(name).undistorted()
         scaled = [c.resize((max(1, round(c.height_px * width / c.width_px)), round(width))) for c in vehicle]
-        found[name] = without_masks(vehicle.with_cameras(scaled))
-    return found
+        rigs[name] = without_masks(vehicle.with_cameras(scaled))
+    return rigs
 
 
 def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:

@@ -64,11 +64,11 @@ def read_config(folder: Path) -> tuple[dict[str, Any], str]:
         raise GeneratorError(f"{folder}: expected a generator's folder with {CONFIG_FILE}, found none")
     try:
         config = json.loads(path.read_text())
-        found, weights = config.pop("format"), config.pop("weights")
+        version, weights = config.pop("format"), config.pop("weights")
     except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise GeneratorError(f"{path}: expected a generator's configuration ({error!r})") from None
-    if found != FORMAT:
-        raise GeneratorError(f"{path}: expected format {FORMAT}, got {shown(found)}")
+    if version != FORMAT:
+        raise GeneratorError(f"{path}: expected format {FORMAT}, got {shown(version)}")
     if not isinstance(weights, str) or not _NAME.fullmatch(weights):
         expected = "expected the name of a file beside it, as it was saved"
         raise GeneratorError(f"{path}: weights: {expected}, got {shown(weights)}")
@@ -80,11 +80,11 @@ def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder:
 
     GeneratorError for names that are missing, extra or of another shape, and for values that are no finite numbers.
     """
-    for name, own in module.state_dict().items():
-        given = tensors.get(name)
-        if given is not None and given.is_floating_point() != own.is_floating_point():
-            raise GeneratorError(f"{folder}: {name}: expected {own.dtype} or alike, got {given.dtype}")
-        if given is not None and given.is_floating_point() and not bool(torch.isfinite(given).all()):
+    for name, expected in module.state_dict().items():
+        tensor = tensors.get(name)
+        if tensor is not None and tensor.is_floating_point() != expected.is_floating_point():
+            raise GeneratorError(f"{folder}: {name}: expected {expected.dtype} or alike, got {tensor.dtype}")
+        if tensor is not None and tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise GeneratorError(f"{folder}: {name}: expected finite weights, got NaN or infinity: training diverged")
     try:
         module.load_state_dict(tensors, assign=assign)

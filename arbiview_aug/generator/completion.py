@@ -149,16 +149,16 @@ def complete_together(
         assert generator is not None and config is not None
         batch = max(1, VIEWS_AT_ONCE // count)
         for together in (numbers[start : start + batch] for start in range(0, len(numbers), batch)):
-            given = [_inputs(frames[k], drafts[k], config, seed) for k in together]
-            conditions = Conditions(*(torch.cat(part) for part in zip(*(one for one, *_ in given), strict=True)))
+            inputs = [_inputs(frames[k], drafts[k], config, seed) for k in together]
+            conditions = Conditions(*(torch.cat(part) for part in zip(*(one for one, *_ in inputs), strict=True)))
             conditions = Conditions(*(part.to(generator.device) for part in conditions))
-            geometry = batched([one for _, one, _ in given]).to(generator.device)
-            noise = torch.cat([one for *_, one in given]).to(generator.device)
+            geometry = batched([one for _, one, _ in inputs]).to(generator.device)
+            noise = torch.cat([one for *_, one in inputs]).to(generator.device)
             for k, images in zip(together, denoised(generator, config, geometry, conditions, noise), strict=True):
-                own = drafts[k]
-                for m, image in zip(own.left, images, strict=True):
-                    own.images[m] = _paste(image, own.images[m], own.holes[m])
-    return [Completed(stacked(own.images), stacked(own.holes), own.left) for own in drafts]
+                current = drafts[k]
+                for m, image in zip(current.left, images, strict=True):
+                    current.images[m] = _paste(image, current.images[m], current.holes[m])
+    return [Completed(stacked(current.images), stacked(current.holes), current.left) for current in drafts]
 
 
 def _draft(frame: FrameViews, min_confidence: float, inpaints_all: bool) -> _Draft:

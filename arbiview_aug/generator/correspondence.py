@@ -95,7 +95,7 @@ def correspond(query: Camera, rays: Rays, key: Camera, planes: FloatArray) -> tu
 def correspondences(
     queries: Sequence[Camera],
     keys: Sequence[Camera],
-    own: Sequence[int],
+    own_index: Sequence[int],
     sizes: Sequence[tuple[int, int]],
     ground_z_m: float,
     facing_m: float = FACING_M,
@@ -106,22 +106,22 @@ def correspondences(
     pair whose centres coincide has one level, infinity, which is then exact; the others have all of ``LEVELS``. J is
     the largest number of neighbours, at least 1: attention is never skipped, which would hang distributed training.
 
-    ``own`` is each query's index among the keys: no view reads itself. ``sizes`` (h, w) of the token grids, the finest
-    first. All cameras and the road lie in one ego frame.
+    ``own_index`` is each query's index among the keys: no view reads itself. ``sizes`` (h, w) of the token grids,
+    the finest first. All cameras and the road lie in one ego frame.
     """
     small = [[camera.resize(size) for size in sizes] for camera in keys]
-    found = []
-    for query, self_index in zip(queries, own, strict=True):
+    by_grid = []
+    for query, self_index in zip(queries, own_index, strict=True):
         others = {j: grids for j, grids in enumerate(small) if j != self_index}
-        found.append(_neighbours(query, others, sizes, plane_vectors(query, ground_z_m, facing_m)))
-    slots = max(1, *(len(of_query) for of_query in found))
-    levels = max((len(grids[0][0]) for of_query in found for _, grids in of_query), default=1)
+        by_grid.append(_neighbours(query, others, sizes, plane_vectors(query, ground_z_m, facing_m)))
+    slots = max(1, *(len(of_query) for of_query in by_grid))
+    levels = max((len(grids[0][0]) for of_query in by_grid for _, grids in of_query), default=1)
     of_grids = []
     for k, (h, w) in enumerate(sizes):
         shape = (1, len(queries), slots, levels, h, w)
         neighbour = torch.zeros(shape[:3], dtype=torch.int64)
         centre, valid = torch.zeros((*shape, 2)), torch.zeros(shape, dtype=torch.bool)
-        for q, of_query in enumerate(found):
+        for q, of_query in enumerate(by_grid):
             for slot, (j, grids) in enumerate(of_query):
                 centre_j, valid_j = grids[k]
                 neighbour[0, q, slot] = j
@@ -137,15 +137,15 @@ def _neighbours(
     """The views j that overlap a query, with ``correspond`` for each token grid; ``others`` are at these sizes."""
     small = [query.resize(size) for size in sizes]
     rays = [camera.unproject_cam(camera.pixel_grid()) for camera in small]
-    found = []
+    neighbours = []
     for j, grids in others.items():
         same_centre = float(np.abs(query.center_m - grids[0].center_m).max()) < SAME_CENTER_M
         used = planes[:1] if same_centre else planes
         first = correspond(query, rays[0], grids[0], used)
         if first[1].any():
             rest = [correspond(query, ray, camera, used) for ray, camera in zip(rays[1:], grids[1:], strict=True)]
-            found.append((j, [first, *rest]))
-    return found
+            neighbours.append((j, [first, *rest]))
+    return neighbours
 
 
 def stacked(frames: Sequence[Correspondence]) -> Correspondence:

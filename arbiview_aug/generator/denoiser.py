@@ -208,9 +208,9 @@ class Denoiser(nn.Module):
             if outputs is not None and attended == len(self.cross_view):  # nothing is decoded of a source
                 outputs.append(block.keys_values(_tokens(h, count)))
                 return h
-            h, own, predicted = self._checkpointed(_read_views, block, h, window, others, count, rows is not None)
+            h, tokens, predicted = self._checkpointed(_read_views, block, h, window, others, count, rows is not None)
             if outputs is not None:
-                outputs.append(own)
+                outputs.append(tokens)
             if rows is not None and predicted is not None:
                 rows.append(Rows(predicted, window.bilinear(), window.place // window.valid[0, 0, 0].numel()))
             return h
@@ -280,11 +280,11 @@ def _read_views(
 ) -> tuple[torch.Tensor, KeysValues, torch.Tensor | None]:
     """Features (B Q, width, h, w) after reading [others, these views]; these views' keys and values; L_geo's rows."""
     tokens = _tokens(h, count)
-    keys, values = own = block.keys_values(tokens)
+    keys, values = own_tokens = block.keys_values(tokens)
     if others is not None:
-        keys, values = (torch.cat(both, 1) for both in zip(others, own, strict=True))
+        keys, values = (torch.cat(both, 1) for both in zip(others, own_tokens, strict=True))
     tokens, rows = block(tokens, keys, values, window, with_rows)
-    return tokens.flatten(0, 1).transpose(1, 2).reshape(h.shape), own, rows
+    return tokens.flatten(0, 1).transpose(1, 2).reshape(h.shape), own_tokens, rows
 
 
 def _tokens(h: torch.Tensor, count: Sequence[int]) -> torch.Tensor:

@@ -128,21 +128,21 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
 
     Sides take the median of what sources see of them; tops the brighter of what they see of tops and sides.
     """
-    given = [(view.reshape(3, -1), p) for view, p in zip(views, paint, strict=True) if p is not None]
-    if not any(len(p.pixel) for _, p in given):
+    painted = [(view.reshape(3, -1), p) for view, p in zip(views, paint, strict=True) if p is not None]
+    if not any(len(p.pixel) for _, p in painted):
         return np.zeros((0, 3), np.float32)
-    colour = np.concatenate([view[:, p.sample] for view, p in given], 1).T.astype(np.float32)
-    part = np.concatenate([p.sample_part for _, p in given])
+    colour = np.concatenate([view[:, p.sample] for view, p in painted], 1).T.astype(np.float32)
+    part = np.concatenate([p.sample_part for _, p in painted])
     ends = np.bincount(part, minlength=2 * (part.max(initial=0) // 2 + 1)).cumsum()
     parts = np.split(colour[np.argsort(part, kind="stable")], ends[:-1])
-    found = np.full((len(ends), 3), -1, np.float32)
-    for k, own in enumerate(np.sort(one, 0) for one in parts):
-        if len(own):
+    colours = np.full((len(ends), 3), -1, np.float32)
+    for k, values in enumerate(np.sort(one, 0) for one in parts):
+        if len(values):
             top = k | 1
-            found[top] = np.maximum(found[top], own[int(_TOP_SHARE * len(own))])
+            colours[top] = np.maximum(colours[top], values[int(_TOP_SHARE * len(values))])
             if k < top:
-                found[k] = own[len(own) // 2]
-    return found
+                colours[k] = values[len(values) // 2]
+    return colours
 
 
 # --- one view ---------------------------------------------------------------------------------------------------------

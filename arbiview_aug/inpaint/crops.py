@@ -66,8 +66,8 @@ def windows(holes: Sequence[BoolArray], size: int) -> list[list[Window]]:
         count, labels, boxes, _ = cv2.connectedComponentsWithStats(joined)
         for label in range(1, count):
             x, y, w, h, _ = boxes[label].tolist()
-            own = (labels[y : y + h, x : x + w] == label) & hole[y : y + h, x : x + w]
-            for number, window in enumerate(_parts(Window(view, y, x, own), hole.shape, size)):
+            part = (labels[y : y + h, x : x + w] == label) & hole[y : y + h, x : x + w]
+            for number, window in enumerate(_parts(Window(view, y, x, part), hole.shape, size)):
                 if number == len(rounds):
                     rounds.append([])
                 rounds[number].append(window)
@@ -77,34 +77,34 @@ def windows(holes: Sequence[BoolArray], size: int) -> list[list[Window]]:
 def _parts(hole: Window, shape: tuple[int, ...], size: int) -> Iterator[Window]:
     """Cut a hole of a view (h, w) into parts whose windows fit, and are small together."""
     rows, columns = (np.flatnonzero(hole.fills.any(1 - axis)) for axis in (0, 1))
-    own = hole.fills[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    part = hole.fills[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     top, left = hole.top + int(rows[0]), hole.left + int(columns[0])
-    context = min(int(np.clip(min(own.shape) // 2, *_CONTEXT_PX)), size // 4)
+    context = min(int(np.clip(min(part.shape) // 2, *_CONTEXT_PX)), size // 4)
     margins = [
         (min(context, low), min(context, side - low - length))
-        for low, length, side in zip((top, left), own.shape, shape, strict=True)
+        for low, length, side in zip((top, left), part.shape, shape, strict=True)
     ]
-    axis, at = _cut(own, context)
-    sides = [length + sum(margin) for length, margin in zip(own.shape, margins, strict=True)]
+    axis, at = _cut(part, context)
+    sides = [length + sum(margin) for length, margin in zip(part.shape, margins, strict=True)]
     if max(sides) > size:
         axis = int(np.argmax(sides))
-        at = own.shape[axis] // 2
+        at = part.shape[axis] // 2
     if at:
-        first, second = np.split(own, [at], axis)
+        first, second = np.split(part, [at], axis)
         yield from _parts(Window(hole.view, top, left, first), shape, size)
         yield from _parts(Window(hole.view, top + at * (axis == 0), left + at * axis, second), shape, size)
     else:
-        yield Window(hole.view, top - margins[0][0], left - margins[1][0], np.pad(own, margins))
+        yield Window(hole.view, top - margins[0][0], left - margins[1][0], np.pad(part, margins))
 
 
-def _cut(own: BoolArray, context: int) -> tuple[int, int]:
+def _cut(part: BoolArray, context: int) -> tuple[int, int]:
     """The axis, and the row or column there, at which cutting a hole saves most pixels; 0 where it saves too few."""
-    best, found = _WORTH * (own.shape[0] + 2 * context) * (own.shape[1] + 2 * context), (0, 0)
-    for axis, lines in enumerate((own, own.T)):
+    best, cut = _WORTH * (part.shape[0] + 2 * context) * (part.shape[1] + 2 * context), (0, 0)
+    for axis, lines in enumerate((part, part.T)):
         both = _areas(lines, context)[:-1] + _areas(lines[::-1], context)[-2::-1]
         if len(both) and both.min() < best:
-            best, found = both.min(), (axis, int(both.argmin()) + 1)
-    return found
+            best, cut = both.min(), (axis, int(both.argmin()) + 1)
+    return cut
 
 
 def _areas(lines: BoolArray, context: int) -> npt.NDArray[np.int64]:
@@ -115,12 +115,12 @@ def _areas(lines: BoolArray, context: int) -> npt.NDArray[np.int64]:
     return (np.arange(1, len(lines) + 1) + 2 * context) * (last - first + 2 * context)
 
 
-def packed(found: Sequence[Window], size: int, multiple: int) -> list[Canvas]:
+def packed(parts: Sequence[Window], size: int, multiple: int) -> list[Canvas]:
     """Windows on canvases of at most ``size`` by ``size``: on the first shelf that has room, tallest windows first."""
     shelves: list[list[int]] = []  # canvas, row, height, columns taken
     rows: list[int] = []  # taken of each canvas
     placed: list[list[tuple[Window, int, int]]] = []
-    for window in sorted(found, key=lambda one: (-one.fills.shape[0], -one.fills.shape[1])):
+    for window in sorted(parts, key=lambda one: (-one.fills.shape[0], -one.fills.shape[1])):
         h, w = window.fills.shape
         shelf = next((one for one in shelves if one[2] >= h and one[3] + w <= size), None)
         if shelf is None:
@@ -151,10 +151,10 @@ def drawn(
     pixels, marks = np.zeros((3, *canvas.size), np.float32), np.zeros(canvas.size, bool)
     for window, top, left in canvas.windows:
         h, w = window.fills.shape
-        own = window.of(views[window.view])
+        window_pixels = window.of(views[window.view])
         # To the canvas's far corner; later windows, to the right and below, draw over it.
         beyond = canvas.size[0] - top - h, canvas.size[1] - left - w
-        pixels[:, top:, left:] = np.pad(own, ((0, 0), (0, beyond[0]), (0, beyond[1])), mode="edge")
+        pixels[:, top:, left:] = np.pad(window_pixels, ((0, 0), (0, beyond[0]), (0, beyond[1])), mode="edge")
         marks[top:, left:] = False
         marks[top : top + h, left : left + w] = window.of(holes[window.view])
     return pixels * ~marks, marks

@@ -156,10 +156,10 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
         at = min(max((np.float32(x) + _HALF) / np.float32(cell) - _HALF, _ZERO), np.float32(nx - 1))
         left[x], share[x] = np.int32(at), at - np.float32(np.int32(at))
     for y in range(h):
-        found = np.uint8(0)
+        any_chosen = np.uint8(0)
         for x in range(w):
-            found |= chosen[y, x]
-        if not found:
+            any_chosen |= chosen[y, x]
+        if not any_chosen:
             continue
         at = min(max((np.float32(y) + _HALF) / np.float32(cell) - _HALF, _ZERO), np.float32(ny - 1))
         j0 = int(at)
@@ -189,14 +189,14 @@ def paint(pixel: Any, part: Any, beside: Any, table: Any, seen: Any, view: Any) 
         view: (3, h w), painted.
     """
     for k in range(pixel.shape[0]):
-        at, source, own = pixel[k], beside[k], part[k]
+        at, source, number = pixel[k], beside[k], part[k]
         if seen[at]:
             continue
         for c in range(3):
             if source >= 0:
                 view[c, at] = view[c, source]
-            elif own < table.shape[0] and table[own, 0] >= _ZERO:
-                view[c, at] = table[own, c]
+            elif number < table.shape[0] and table[number, 0] >= _ZERO:
+                view[c, at] = table[number, c]
 
 
 def warm_up() -> None:

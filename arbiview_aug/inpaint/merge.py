@@ -93,9 +93,9 @@ def merged(
     # The order breaks ties.
     rank, chosen = np.full(free.shape, 256 * len(candidates), np.uint16), np.full(free.shape, -1, np.int16)
     for k, one in enumerate(candidates):
-        own = one.blur * np.uint16(len(candidates)) + np.uint16(k)
-        better = accepted[k] & (own < rank)
-        np.copyto(rank, own, where=better)
+        key = one.blur * np.uint16(len(candidates)) + np.uint16(k)
+        better = accepted[k] & (key < rank)
+        np.copyto(rank, key, where=better)
         np.copyto(chosen, np.int16(k), where=better)
         np.copyto(current, images[k], where=better)
     filled = np.clip(np.rint(current) if levels == 1 else current / np.float32(levels), 0, 255 / levels)

@@ -251,8 +251,8 @@ def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
         # Pixels per metre along the road, which is the coarser axis: proportional to sin(incidence) / distance.
         from_source = (hole.camera.center_m - source.center_m) * q[..., None] + directions
         relative = np.maximum((from_source**2).sum(axis=-1), 1e-9)
-        other, own = (np.maximum(np.abs(rays[..., 2]), 1e-9) for rays in (from_source, directions))
-        halves = np.clip(2 * np.log2(hole.camera.K[0, 0] * own * relative / (source.K[0, 0] * other)), 0, 255)
+        other, own_z = (np.maximum(np.abs(rays[..., 2]), 1e-9) for rays in (from_source, directions))
+        halves = np.clip(2 * np.log2(hole.camera.K[0, 0] * own_z * relative / (source.K[0, 0] * other)), 0, 255)
         upsample_where(halves.astype(np.float32), _CELL_PX, view.source_camera, pair.source, blur)
     if neighbour.moved is not None:
         points = hole.camera.center_m + directions / q[..., None]

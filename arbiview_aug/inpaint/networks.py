@@ -81,16 +81,16 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         # The network sees narrow holes inpainted, and they stay so.
         pixels = [telea(v, hole).float().cpu().numpy() / top for v, hole, top in zip(views, holes, tops, strict=True)]
         left = [_wide(hole.cpu().numpy()) for hole in holes]
-        for found in windows(left, self.size):
+        for window in windows(left, self.size):
             alike: dict[tuple[int, int], list[Canvas]] = defaultdict(list)
-            for canvas in packed(found, self.size, self.multiple):
+            for canvas in packed(window, self.size, self.multiple):
                 alike[canvas.size].append(canvas)
             for canvases in alike.values():
                 for start in range(0, len(canvases), self.batch):
                     self._fill(canvases[start : start + self.batch], pixels, left, seeds)
         filled = []
-        for view, hole, own, top in zip(views, holes, pixels, tops, strict=True):
-            values = torch.from_numpy(own * top).to(view.device)
+        for view, hole, own_pixels, top in zip(views, holes, pixels, tops, strict=True):
+            values = torch.from_numpy(own_pixels * top).to(view.device)
             values = values.round() if view.dtype == torch.uint8 else values
             filled.append(torch.where(hole, values.to(view.dtype), view))
         return filled
@@ -104,16 +104,16 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
     ) -> None:
         """Inpaint canvases of one size, and put their pixels where they belong; their holes are no longer left."""
         images, holes = zip(*(drawn(canvas, pixels, left) for canvas in canvases), strict=True)
-        given = torch.from_numpy(np.stack(images)).to(self.device), torch.from_numpy(np.stack(holes)).to(self.device)
-        own = [seeds[canvas.windows[0][0].view] for canvas in canvases]
-        found = self.run(*given, own)
-        if found.shape != given[0].shape:
-            raise GeneratorError(f"inpainting: expected images {tuple(given[0].shape)}, got {tuple(found.shape)}")
-        if not bool(torch.isfinite(found).all()):
+        inputs = torch.from_numpy(np.stack(images)).to(self.device), torch.from_numpy(np.stack(holes)).to(self.device)
+        canvas_seeds = [seeds[canvas.windows[0][0].view] for canvas in canvases]
+        outputs = self.run(*inputs, canvas_seeds)
+        if outputs.shape != inputs[0].shape:
+            raise GeneratorError(f"inpainting: expected images {tuple(inputs[0].shape)}, got {tuple(outputs.shape)}")
+        if not bool(torch.isfinite(outputs).all()):
             raise GeneratorError("inpainting: expected finite images, got NaN or infinity; try float32")
         self.calls += 1
-        self.pixels += given[1].numel()
-        painted = found.float().clamp(0, 1).cpu().numpy()
+        self.pixels += inputs[1].numel()
+        painted = outputs.float().clamp(0, 1).cpu().numpy()
         for canvas, image in zip(canvases, painted, strict=True):
             for window, top, at in canvas.windows:
                 h, w = window.fills.shape
@@ -187,9 +187,9 @@ class PipelineInpainter(NetworkInpainter):
             raise GeneratorError(f"{where}: expected an inpainting pipeline of diffusers: {text}") from None
         multiple = int(pipeline.vae_scale_factor)
         core = getattr(pipeline, "unet", None) or pipeline.transformer
-        own = int(getattr(core.config, "sample_size", None) or 64) * multiple
+        native_px = int(getattr(core.config, "sample_size", None) or 64) * multiple
         of_inpainter = {"steps": steps, "guidance": guidance, "min_confidence": min_confidence, "seed": seed}
-        return cls(pipeline, own if size is None else size, multiple, batch, prompt, **of_inpainter)  # type: ignore[arg-type]
+        return cls(pipeline, native_px if size is None else size, multiple, batch, prompt, **of_inpainter)  # type: ignore[arg-type]
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         h, w = images.shape[-2:]

@@ -206,13 +206,13 @@ def keep_objects_whole(
     """
     K, ny, nx = scores.shape
     n = ny * nx
-    score, error, ray, own = scores.reshape(K, n), parallax.reshape(K, n), rays.reshape(3, n), winner.reshape(n)
+    score, error, ray, chosen = scores.reshape(K, n), parallax.reshape(K, n), rays.reshape(3, n), winner.reshape(n)
     x, y, z = ray[0], ray[1], ray[2]
     first, near, inside = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
     along, vectors, count, total = np.empty(n, np.float32), np.empty((7, 3)), np.empty(K), np.empty(K)
     axes, to_box, across, away, half = vectors[:3], vectors[3], vectors[4], vectors[5], vectors[6]
     for i in range(n):
-        first[i] = own[i]
+        first[i] = chosen[i]
     for b in range(boxes.shape[0]):
         c, s = np.cos(boxes[b, 6]), np.sin(boxes[b, 6])
         for i in range(3):
@@ -268,7 +268,7 @@ def keep_objects_whole(
                 one = k
         for j in range(around if one >= 0 else 0):
             if score[one, near[j]] > _ZERO:
-                own[near[j]] = one
+                chosen[near[j]] = one
 
 
 @inlined
@@ -347,14 +347,14 @@ def _evaluate_row(
 
     ``inside`` (n,) becomes whether its image holds them, ``seen`` (n,) whether it sees them; ``place`` is scratch.
     """
-    A, o, kind, P, bounds, clean, before_m, shadow, solid, guess, given = source
+    A, o, kind, P, bounds, clean, before_m, shadow, solid, guess, positions = source
     u, v, rx, ry, rz = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
     px, py, pz, a, b = work[5, :n], work[6, :n], work[7, :n], work[8, :n], work[9, :n]
     rays_row(planes, target, y, x0, rx, ry, rz)
     turn_row(rx, ry, rz, q[y, x0 : x0 + n], A, o, px, py, pz)
     if kind < 0:
         for i in range(n):
-            u[i], v[i] = given[0, y, x0 + i], given[1, y, x0 + i]
+            u[i], v[i] = positions[0, y, x0 + i], positions[1, y, x0 + i]
     else:
         project_row(px, py, pz, kind, P, a, b, u, v)
     low_u, low_v, high_u, high_v = bounds[0], bounds[1], bounds[2], bounds[3]
@@ -615,7 +615,7 @@ def mark_objects(q: Any, face: Any, winner: Any, limit: Any, cell: int, layers: 
 
 @compiled
 def find_paint(
-    face: Any, part: Any, winner: Any, reach: int, step: int, margin: int, found: Any
+    face: Any, part: Any, winner: Any, reach: int, step: int, margin: int, table: Any
 ) -> tuple[int, int]:  # fmt: skip
     """Find the unseen pixels of objects, and a sample of seen ones; return their numbers.
 
@@ -626,7 +626,7 @@ def find_paint(
         reach: Distance up to which seen pixels of the same part are looked for; those beside a top are its border.
         step: Distance of samples.
         margin: Distance at which pixels around a sample must be of its face.
-        found: (5, h w) int32, written: the attributes of ``view_plan.Paint``.
+        table: (5, h w) int32, written: the attributes of ``view_plan.Paint``.
     """
     h, w = face.shape
     hidden, sampled = 0, 0
@@ -636,15 +636,15 @@ def find_paint(
             if number < 0:
                 continue
             if winner[y, x] < 0:
-                own, beside = part[number], -1
-                for far in range(1, 1 if own & 1 else reach + 1):
+                own_part, beside = part[number], -1
+                for far in range(1, 1 if own_part & 1 else reach + 1):
                     for way in range(4):
                         yy, xx = y + (way == 2) * far - (way == 3) * far, x + (way == 0) * far - (way == 1) * far
                         if beside < 0 and 0 <= yy < h and 0 <= xx < w and winner[yy, xx] >= 0 and face[yy, xx] >= 0:
-                            beside = yy * w + xx if part[face[yy, xx]] == own else -1
+                            beside = yy * w + xx if part[face[yy, xx]] == own_part else -1
                     if beside >= 0:
                         break
-                found[0, hidden], found[1, hidden], found[2, hidden] = y * w + x, own, beside
+                table[0, hidden], table[1, hidden], table[2, hidden] = y * w + x, own_part, beside
                 hidden += 1
             elif y % step == 0 and x % step == 0 and min(y, x, h - 1 - y, w - 1 - x) >= margin:
                 if (
@@ -653,7 +653,7 @@ def find_paint(
                     and face[y, x - margin] == number
                     and face[y, x + margin] == number
                 ):
-                    found[3, sampled], found[4, sampled] = y * w + x, part[number]
+                    table[3, sampled], table[4, sampled] = y * w + x, part[number]
                     sampled += 1
     return hidden, sampled
 
@@ -682,7 +682,7 @@ def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
         packed: (h, w) ``FixedMap.packed``.
         winner: (h, w) int8 source, -1 where none is read.
     """
-    (h, w), found = winner.shape, 0
+    (h, w), total = winner.shape, 0
     ends = np.empty((4, 128), np.int32)  # first and last row and column of each source
     for x0 in range(0, w, _AHEAD_COLUMNS):
         ends[0::2] = _MAX_SIDE_PX
@@ -699,5 +699,5 @@ def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
             if (bottom - top) * (right - left) <= _MOST_AHEAD * h * _AHEAD_COLUMNS:
                 for row in range(top, min(bottom + 2, atlas.shape[0])):
                     for at in range(left * pixel, min((right + 2) * pixel, atlas.shape[1]), 64):
-                        found ^= atlas[row, at]
-    return found  # else nothing would be read
+                        total ^= atlas[row, at]
+    return total  # else nothing would be read

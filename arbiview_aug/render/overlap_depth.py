@@ -75,9 +75,9 @@ def dense_flow(
     x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
     x, y = x + there[..., 0], y + there[..., 1]
     returned = cv2.remap(back, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(1e3, 1e3))
-    found = cv2.remap(inside, x, y, cv2.INTER_NEAREST)
+    at_flow = cv2.remap(inside, x, y, cv2.INTER_NEAREST)
     miss = np.linalg.norm(there + returned, axis=-1)
-    return there, np.where(both & (found > 0), 1 / (1 + (miss / ROUND_TRIP_PX) ** 4), 0).astype(np.float32)
+    return there, np.where(both & (at_flow > 0), 1 / (1 + (miss / ROUND_TRIP_PX) ** 4), 0).astype(np.float32)
 
 
 def _repetition(image: npt.NDArray[np.float32], inside: BoolArray) -> float:

@@ -144,13 +144,13 @@ def render_torch(
     top = 255 if dtype == torch.uint8 else 1
     atlas = _fill_atlas(plan.layout, images)
     tones: Callable[..., torch.Tensor] | None = None
-    given = [] if curves is None else [of_frame for of_frame in curves if of_frame is not None]
-    if curves is not None and given:
-        of_frames = np.stack([np.ones_like(given[0]) if of_frame is None else of_frame for of_frame in curves])
+    curved = [] if curves is None else [of_frame for of_frame in curves if of_frame is not None]
+    if curves is not None and curved:
+        of_frames = np.stack([np.ones_like(curved[0]) if of_frame is None else of_frame for of_frame in curves])
         of_views = torch.from_numpy(of_frames).float().to(device).unbind(1)
     views = []
     for number, maps in enumerate(maps_on(plan, device)):
-        if given:
+        if curved:
             tones = partial(_toned, curves=of_views[number], top=top)
         view = _sample(atlas, maps.grid, maps.interpolation)
         if maps.edge is not None:

@@ -96,9 +96,9 @@ class Paint:
         from arbiview_aug.render.kernels import find_paint
 
         step = max(1, min(face.shape) // _SAMPLES)
-        found = np.empty((5, face.size), np.int32)
-        hidden, sampled = find_paint(face, parts, winner, _BESIDE_PX, step, _INSIDE_PX, found)
-        return cls(*found[:3, :hidden].copy(), *found[3:, :sampled].copy())
+        columns = np.empty((5, face.size), np.int32)
+        hidden, sampled = find_paint(face, parts, winner, _BESIDE_PX, step, _INSIDE_PX, columns)
+        return cls(*columns[:3, :hidden].copy(), *columns[3:, :sampled].copy())
 
     @property
     def nbytes(self) -> int:

@@ -138,9 +138,9 @@ class ViewPlanner:
                 first, last = self._in_view(self.sources[k], self._projection(self.sources[k]), near, far).T
                 seen |= (first[:, None] <= cells) & (cells < last[:, None])
             self._open = seen
-        found = exact | {k: self._region(k) for k in order if k not in exact}
+        regions = exact | {k: self._region(k) for k in order if k not in exact}
         # In content order, so that ties never depend on the order of the source list.
-        self.regions = [region for k in order if (region := found[k]) is not None]
+        self.regions = [region for k in order if (region := regions[k]) is not None]
 
     # --- what a source sees -------------------------------------------------------------------------------------------
     def _choose_surface(self, index: int) -> tuple[str, str]:
@@ -269,9 +269,9 @@ class ViewPlanner:
         most = np.sort(resolution[seen][::4])
         level = halvings(most[len(most) // 5], source.size) if self.config.antialias and len(most) else 0
         kernel = self._kernel(source, level, geometry, A, o, P)
-        given = np.ascontiguousarray(kernel[-1][(slice(None), *self.at_nodes)]) if kind < 0 else kernel[-1]
+        positions = np.ascontiguousarray(kernel[-1][(slice(None), *self.at_nodes)]) if kind < 0 else kernel[-1]
         on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
-        visible = seen_image(*on_nodes, (*kernel[:-1], given))
+        visible = seen_image(*on_nodes, (*kernel[:-1], positions))
         self.counters[f"pairs_{name}"] += 1
         of_config = self.config.distance_gamma, self.config.primary_bonus
         is_primary = baseline_m < SAME_CENTER_M
@@ -298,10 +298,10 @@ class ViewPlanner:
         from arbiview_aug.cameras.kernels import LENS_CODES
 
         kind, surface = LENS_CODES.get(source.lens, -1), geometry.surface
-        given = np.zeros((2, 0, 0), np.float32)
+        positions = np.zeros((2, 0, 0), np.float32)
         if kind < 0:
             u, v, _ = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), geometry.q, source)
-            given = at_level(np.stack([u, v]), level).astype(np.float32)
+            positions = at_level(np.stack([u, v]), level).astype(np.float32)
         shadow, solid = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
         shadow_scale = 1.0
         if surface.is_layered or surface.is_dense:
@@ -324,7 +324,7 @@ class ViewPlanner:
             shadow,
             np.ascontiguousarray(solid),
             geometry.is_guess,
-            given,
+            positions,
         )
 
     # --- who wins -----------------------------------------------------------------------------------------------------
@@ -418,7 +418,7 @@ class ViewPlanner:
         for region in self.regions:
             slot = layout.slot(region.source, region.level)
             (h, w), source = slot.size, self.sources[region.source]
-            own: Any = cv2.inRange(winner, region.source, region.source)  # type: ignore[call-overload]
+            own_pixels: Any = cv2.inRange(winner, region.source, region.source)  # type: ignore[call-overload]
             low, high = (slot.x + 1, slot.y + 1), (slot.x + w - 3, slot.y + h - 3)
             inside: Any = cv2.inRange(fixed.xy, low, high)  # type: ignore[call-overload]
             clean = self.maps.clean_pixels(source, region.level)
@@ -426,7 +426,7 @@ class ViewPlanner:
                 clean = np.asarray(cv2.erode(clean, np.ones((4, 4), np.uint8), anchor=(1, 1)), np.uint8)
                 at = fixed.xy - np.array([slot.x, slot.y], np.int16)
                 inside &= cv2.remap(clean, at, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
-            cv2.bitwise_or(edge, cv2.bitwise_and(own, cv2.bitwise_not(inside)), dst=edge)
+            cv2.bitwise_or(edge, cv2.bitwise_and(own_pixels, cv2.bitwise_not(inside)), dst=edge)
         y, x = np.nonzero(edge)
         there = FixedMap(fixed.xy[y, x][None], fixed.frac[y, x][None])
         return BilinearFallback(y.astype(np.int64) * winner.shape[1] + x, there)

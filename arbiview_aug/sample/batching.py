@@ -104,10 +104,10 @@ def barred(view: torch.Tensor, size: tuple[int, int], fill: float = 0) -> torch.
     return framed(view, framing("view", (h, w), size, "pad"), fill)
 
 
-def like(value: torch.Tensor, given: Any) -> torch.Tensor:
+def like(value: torch.Tensor, original: Any) -> torch.Tensor:
     """The calibration in the dtype and on the device of the sample's own; float64 if it has none."""
-    if isinstance(given, torch.Tensor) and given.is_floating_point():
-        return value.to(dtype=given.dtype, device=given.device)
+    if isinstance(original, torch.Tensor) and original.is_floating_point():
+        return value.to(dtype=original.dtype, device=original.device)
     return value
 
 

@@ -138,7 +138,7 @@ def _cut(one: FloatArray, two: FloatArray) -> FloatArray:
 
 
 def _of_camera(camera: Camera, boxes: FloatArray) -> ImageBoxes:
-    outlines = {k: found for k, box in enumerate(boxes) if (found := outline(camera, box)) is not None}
+    outlines = {k: polygon for k, box in enumerate(boxes) if (polygon := outline(camera, box)) is not None}
     rows = np.array(list(outlines), np.int64)
     uncut, inside = np.array(list(outlines.values())).reshape(-1, 2, 4).swapaxes(0, 1)
     uncut_px, inside_px = (np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1) for rectangles in (uncut, inside))

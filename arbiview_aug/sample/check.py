@@ -104,11 +104,11 @@ def warn_of_misnamed(
     """
     lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
     geometry = () if static else (*EGO_KEYS, "depth_m")
-    for found, meant in misnamed(sample, ("neighbours", *lenses, *geometry)).items():
-        if found not in (*named, *PIXEL_BOUND_KEYS):
-            message = f"the sample's {found!r} is not read; did you mean {meant!r}?"
+    for wrong, meant in misnamed(sample, ("neighbours", *lenses, *geometry)).items():
+        if wrong not in (*named, *PIXEL_BOUND_KEYS):
+            message = f"the sample's {wrong!r} is not read; did you mean {meant!r}?"
             warn(
-                f"key {found}", f"{message} Rename it, as RigRetarget documents it, or name it in SampleKeys(keep=...)"
+                f"key {wrong}", f"{message} Rename it, as RigRetarget documents it, or name it in SampleKeys(keep=...)"
             )
 
 

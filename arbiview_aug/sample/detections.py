@@ -54,9 +54,9 @@ def _of_frame(key: str, frame: Frame) -> Any:
     return _entries(key, value, math.prod(frame.lead), "frames")[frame.number] if frame.lead else value
 
 
-def _of_cameras(given: Any, frame: Frame) -> OfCameras:
+def _of_cameras(detections: Any, frame: Frame) -> OfCameras:
     of_cameras = {}
-    for k, entry in enumerate(_entries("detections", given, len(frame.rig), "cameras")):
+    for k, entry in enumerate(_entries("detections", detections, len(frame.rig), "cameras")):
         where = f"detections[{k}]"
         if not isinstance(entry, Mapping) or not {"boxes", "labels"} <= entry.keys():
             got = ", ".join(map(str, entry)) if isinstance(entry, Mapping) else type(entry).__name__

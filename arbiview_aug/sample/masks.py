@@ -86,16 +86,16 @@ def image_circle(camera: Camera, image: torch.Tensor) -> Circle | None:
     inner[[0, -1]] = inner[:, [0, -1]] = False
     pixels = np.stack(np.meshgrid(*(np.arange(n) for n in rim.shape[::-1])), axis=-1)
     pixels = (pixels + 0.5) * (w / small.shape[1], h / small.shape[0]) - 0.5  # of the camera's image
-    found = _fitted(pixels[inner], float(camera.K[0, 0] / camera.K[1, 1]), w)
-    if found is None:
+    circle = _fitted(pixels[inner], float(camera.K[0, 0] / camera.K[1, 1]), w)
+    if circle is None:
         return None
-    radius = np.linalg.norm((pixels - found.center_px) / found.radii_px, axis=-1)
+    radius = np.linalg.norm((pixels - circle.center_px) / circle.radii_px, axis=-1)
     within, beside = (small[(radius > low) & (radius < high)] for low, high in ((0.8, 0.9), (0.96, 1.0)))
     if within.size and beside.size and np.median(beside) < _DIMMED * np.median(within):
-        found = found._replace(radii_px=_VIGNETTE * found.radii_px)
+        circle = circle._replace(radii_px=_VIGNETTE * circle.radii_px)
         radius = radius / _VIGNETTE
     # Pixels without a ray are never read.
-    return found if ((radius > 1) & camera.unproject(pixels).valid).mean() >= _LEAST_HIDDEN else None
+    return circle if ((radius > 1) & camera.unproject(pixels).valid).mean() >= _LEAST_HIDDEN else None
 
 
 def _fitted(edge: FloatArray, stretch: float, width: int) -> Circle | None:

@@ -97,41 +97,43 @@ def check(sample: Mapping[str, Any], source_rig: Rig | None = None) -> CheckRepo
     """
     frames = read_frames(sample, source_rig)
     boxes, points = (_arrays(sample, key, frames) for key in ("boxes_3d", "points"))
-    found = list(_key_findings(sample, source_rig is not None or sample.get("rig") is not None))
+    findings = list(_key_findings(sample, source_rig is not None or sample.get("rig") is not None))
     for frame, of_frame, cloud in zip(frames, boxes, points, strict=True):
         # Holes of an earlier retargeting are masks too, of any shape.
         own_masks = sample.get("coverage") is None and sample.get("ego_mask") is None
-        found += check_rig(frame.rig, masks=own_masks)
-        found += _image_findings(frame)
-        found += _label_findings(frame.rig, of_frame, cloud)
-    return CheckReport(tuple(dict.fromkeys(found)))
+        findings += check_rig(frame.rig, masks=own_masks)
+        findings += _image_findings(frame)
+        findings += _label_findings(frame.rig, of_frame, cloud)
+    return CheckReport(tuple(dict.fromkeys(findings)))
 
 
 def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
     """Mistakes in poses, intrinsics and, where ``masks``, masks alone."""
-    found = []
+    findings = []
     mistake = pose_mistake(rig.cam2ego, rig.ground_z_m)
     if mistake is not None:
         expected = "cameras upright over the road: cam2ego with axes right, down, forward, in metres"
-        found.append(Finding("cam2ego", expected, *mistake))
+        findings.append(Finding("cam2ego", expected, *mistake))
     for camera, mounted in zip(rig, is_mounted(rig.cam2ego, rig.ground_z_m), strict=True):
         if mistake is None and not mounted:
             at = ", ".join(f"{x:.1f}" for x in camera.center_m)
             fix = "compare it with the other cameras': metres, and cam2ego instead of its inverse?"
-            found.append(Finding(f"camera {camera.name!r}: cam2ego", "a place on a vehicle", f"({at}) m", fix))
-    found += _resolution_findings(rig)
+            findings.append(Finding(f"camera {camera.name!r}: cam2ego", "a place on a vehicle", f"({at}) m", fix))
+    findings += _resolution_findings(rig)
     for camera in rig:
         if camera.mask is None or not masks:
             continue
         turned = int((without_specks(camera.mask) != camera.mask).sum())
         if turned:
             fix = f"clean it: {CLEANING}"
-            found.append(Finding(f"camera {camera.name!r}: mask", "whole regions", f"specks of {turned} pixels", fix))
+            findings.append(
+                Finding(f"camera {camera.name!r}: mask", "whole regions", f"specks of {turned} pixels", fix)
+            )
         upper = camera.mask[: camera.height_px // 3].mean()
         if upper < 0.2 < camera.mask.mean():
             seen = f"{1 - upper:.0%} of the upper third hidden"
-            found.append(Finding(f"camera {camera.name!r}: mask", "True on the scene", seen, "pass ~mask"))
-    return found
+            findings.append(Finding(f"camera {camera.name!r}: mask", "True on the scene", seen, "pass ~mask"))
+    return findings
 
 
 def _arrays(sample: Mapping[str, Any], key: str, frames: Sequence[Frame]) -> list[Any]:
@@ -144,9 +146,9 @@ def _arrays(sample: Mapping[str, Any], key: str, frames: Sequence[Frame]) -> lis
 
 def _key_findings(sample: Mapping[str, Any], calibrated: bool) -> Iterator[Finding]:
     lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
-    for found, meant in misnamed(sample, ("neighbours", "depth_m", *EGO_KEYS, *lenses)).items():
-        if found not in PIXEL_BOUND_KEYS:
-            yield Finding(found, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
+    for wrong, meant in misnamed(sample, ("neighbours", "depth_m", *EGO_KEYS, *lenses)).items():
+        if wrong not in PIXEL_BOUND_KEYS:
+            yield Finding(wrong, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
 
 
 def _resolution_findings(rig: Rig) -> Iterator[Finding]:
@@ -179,7 +181,7 @@ def _image_findings(frame: Frame) -> Iterator[Finding]:
 
 # --- boxes and points -------------------------------------------------------------------------------------------------
 def _label_findings(rig: Rig, boxes: FloatArray | None, points: Points | None) -> list[Finding]:
-    found = []
+    findings = []
     road_m = None if points is None else road_height_m(points)
     if boxes is not None and (np.abs(boxes[:, 6]) > _MANY_DEG).any():
         largest = float(np.abs(boxes[:, 6]).max())
@@ -192,10 +194,10 @@ def _label_findings(rig: Rig, boxes: FloatArray | None, points: Points | None) -
             turned = _frame_finding(boxes, objects, level_m - rig.ground_z_m)
             if turned is not None:
                 return [turned]
-        found += list(_box_findings(rig, boxes, objects))
+        findings += list(_box_findings(rig, boxes, objects))
     if road_m is not None and abs(road_m - rig.ground_z_m) > ROAD_M:
-        found.append(_road_finding(rig, boxes, road_m))
-    return found
+        findings.append(_road_finding(rig, boxes, road_m))
+    return findings
 
 
 def road_height_m(points: Points) -> float | None:

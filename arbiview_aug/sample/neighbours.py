@@ -92,8 +92,8 @@ class Neighbour:
         value = self.given.get("points")
         if value is None:
             return None
-        own = checked_points(as_array("points", value))
-        points = own[~own_car(own)] @ self.ego2ego[:3, :3].T + self.ego2ego[:3, 3]
+        own_points = checked_points(as_array("points", value))
+        points = own_points[~own_car(own_points)] @ self.ego2ego[:3, :3].T + self.ego2ego[:3, 3]
         return points if self.boxes is None or self.boxes_now is None else carried(points, self.boxes, self.boxes_now)
 
     def images(self, like: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -148,7 +148,7 @@ def points_of_neighbours(rig: Rig, points: Points, neighbours: Sequence[Neighbou
 
     Points that the frame's own (Q, 3) contradict are left out, and points that cannot be read, with a warning.
     """
-    found: list[FloatArray] = []
+    parts: list[FloatArray] = []
     origin = np.mean([camera.center_m for camera in rig], axis=0)
     for neighbour in neighbours[:MAX_SWEEPS]:
         try:
@@ -157,8 +157,8 @@ def points_of_neighbours(rig: Rig, points: Points, neighbours: Sequence[Neighbou
             warn(f"points of {neighbour.name}", f"points of neighbour {neighbour.name} are left out: {error}")
             continue
         if others is not None:
-            found.append(others[~seen_through(points, others, origin)])
-    return np.concatenate(found) if found else None
+            parts.append(others[~seen_through(points, others, origin)])
+    return np.concatenate(parts) if parts else None
 
 
 def neighbour_images(neighbour: Neighbour, like: Sequence[torch.Tensor], warn: Warn) -> tuple[torch.Tensor, ...] | None:
@@ -184,9 +184,9 @@ def _neighbour(frame: Frame, current: Points | None, entry: Any, number: int, na
     _check_motion(ego2ego, travel_m, seconds)
     if travel_m < STILL_M and turned_deg < STILL_DEG:
         return None
-    own = _own_rig(frame, entry)
-    _check_same_vehicle(frame.rig, own)
-    cameras = [camera.moved(ego2ego) for camera in own]
+    own_rig = _own_rig(frame, entry)
+    _check_same_vehicle(frame.rig, own_rig)
+    cameras = [camera.moved(ego2ego) for camera in own_rig]
     rig = Rig(cameras, ground_z_m=frame.rig.ground_z_m, name=f"{frame.rig.name} {name}".strip())
     now, then = _boxes(current, entry, ego2ego, seconds)
     return Neighbour(number, name, rig, travel_m, float(ego2ego[0, 3]), seconds, then, now, ego2ego, entry)
@@ -250,8 +250,8 @@ def _check_motion(ego2ego: FloatArray, travel_m: float, seconds: float | None) -
         raise SampleError(f"time_s: expected at most {MAX_SPEED_MPS:g} m/s, got {got}; check poses and clock")
 
 
-def _check_same_vehicle(rig: Rig, own: Rig) -> None:
-    for camera, other in zip(rig, own, strict=True):
+def _check_same_vehicle(rig: Rig, neighbour_rig: Rig) -> None:
+    for camera, other in zip(rig, neighbour_rig, strict=True):
         scale = float(np.abs(other.K - camera.K).max()) / camera.width_px
         if other.lens != camera.lens or scale > 0.02:
             raise SampleError(f"camera {camera.name!r}: expected the current frame's lens and K, got another rig's")

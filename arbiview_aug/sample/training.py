@@ -32,8 +32,8 @@ def visible_boxes(sample: Mapping[str, Any], least: float = 0.1) -> BoolArray:
     if sample.get("boxes_3d") is None:
         raise SampleError("visible_boxes: expected a sample with 'boxes_3d', got none")
     visible = np.zeros(len(sample["boxes_3d"]), bool)
-    for found in project_boxes_3d(sample["boxes_3d"], sample):
-        visible[found.rows[(found.visibility >= least) & (found.visibility > 0)]] = True
+    for of_image in project_boxes_3d(sample["boxes_3d"], sample):
+        visible[of_image.rows[(of_image.visibility >= least) & (of_image.visibility > 0)]] = True
     return visible
 
 

@@ -133,7 +133,7 @@ def drop_hidden(
 
 
 @compiled
-def seen_through(q: Any, rows: Any, columns: Any, most: Any, up: int, side: int, found: Any) -> None:
+def seen_through(q: Any, rows: Any, columns: Any, most: Any, up: int, side: int, contradicted: Any) -> None:
     """Find the points of other scans that lie clearly before all of a scan's own points around them.
 
     Args:
@@ -143,13 +143,13 @@ def seen_through(q: Any, rows: Any, columns: Any, most: Any, up: int, side: int,
         most: (h, w) ``window_max`` of the scan's largest inverse distance in each cell, 0 without points.
         up: Cells of the window above and below.
         side: ... and on each side.
-        found: (n,) bool, written.
+        contradicted: (n,) bool, written.
     """
     (h, w), (height, width) = most.shape, (2 * up, 2 * side)
     for i in range(q.shape[0]):
         row, column = int(np.rint(rows[i])) - up, int(np.rint(columns[i])) - side
         known = most[row, column] if 0 <= row < h - height and 0 <= column < w - width else _ZERO
-        found[i] = known > _ZERO and _hidden_below(q[i]) > known
+        contradicted[i] = known > _ZERO and _hidden_below(q[i]) > known
 
 
 def window_max(a: Any, rows: int, columns: int) -> Any:
@@ -158,7 +158,7 @@ def window_max(a: Any, rows: int, columns: int) -> Any:
 
 
 def complete(
-    cells: Any, own: Any, residuals: Any, reach: Any, support: Any, smooth: int, work: Any, layers: Any
+    cells: Any, own_q: Any, residuals: Any, reach: Any, support: Any, smooth: int, work: Any, layers: Any
 ) -> None:
     """Give every cell the residual of the nearest point, averaged on a step's nearer and on its farther side.
 
@@ -168,13 +168,13 @@ def complete(
     _, h, w = layers.shape
     r, q = (plane[: h * w].reshape(h, w) for plane in work[:2])
     code = work[2, : (h + 4) * (w + 4)].view(np.int32).reshape(h + 4, w + 4)
-    nearest_residuals(cells, own, residuals, reach, support, code, r, q, layers)
+    nearest_residuals(cells, own_q, residuals, reach, support, code, r, q, layers)
     average_sides(r, q, *(window_max(a, 2 * smooth, 2 * smooth) for a in (r, -r)), smooth, layers)
 
 
 @compiled
 def nearest_residuals(
-    cells: Any, own: Any, residuals: Any, reach: float, support: float, code: Any, r: Any, q: Any, layers: Any
+    cells: Any, own_q: Any, residuals: Any, reach: float, support: float, code: Any, r: Any, q: Any, layers: Any
 ) -> None:
     """Give every cell of ``r`` and ``q`` (h, w) the residual and inverse distance of the nearest point.
 
@@ -188,7 +188,7 @@ def nearest_residuals(
     seeds[:] = _ZERO
     for i in range(cells.shape[0]):
         code[cells[i] // w + 2, cells[i] % w + 2] = _OWN
-        seeds[0, cells[i]], seeds[1, cells[i]] = residuals[i], own[i]
+        seeds[0, cells[i]], seeds[1, cells[i]] = residuals[i], own_q[i]
     spread(code)
     away, place, residual, nearest = np.empty(w, np.float32), np.empty(w, np.int32), seeds[0], seeds[1]
     for y in range(h):
@@ -284,9 +284,9 @@ def average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, layers: Any)
         if y < 2 * side:
             continue
         y0 = y - smooth
-        own, q0, r0, share0 = total[0], q[y0, edge : w - edge], r[y0, edge : w - edge], share[y0, edge : w - edge]
+        own_share, q0, r0, share0 = total[0], q[y0, edge : w - edge], r[y0, edge : w - edge], share[y0, edge : w - edge]
         for x in range(m):
-            share0[x] = own[x] * per
+            share0[x] = own_share[x] * per
         h0, l0 = high[y0 - smooth, side : side + m], low[y0 - smooth, side : side + m]
         for x in range(m):  # the mean where nothing steps
             flat[x] = total[1, x] * per if h0[x] + l0[x] <= _STEP * q0[x] + _STEP_PER_M else np.nan

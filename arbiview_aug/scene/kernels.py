@@ -327,19 +327,19 @@ def fit_profiles(
     """
     some = np.empty(planes.shape[1:])
     for k in range(boxes.shape[0]):
-        own = within[ends[k - 1] if k else 0 : ends[k]]
-        best, found = np.inf, fitting[k, 0]
-        if fitting[k, -1] > found and own.shape[0] >= least:
-            for number in range(found, fitting[k, -1] + 1):
+        own_points = within[ends[k - 1] if k else 0 : ends[k]]
+        best, chosen = np.inf, fitting[k, 0]
+        if fitting[k, -1] > chosen and own_points.shape[0] >= least:
+            for number in range(chosen, fitting[k, -1] + 1):
                 planes_of(boxes[k], profiles[number], some)
                 total = 0.0
-                for i in range(0, own.shape[0], 1 + own.shape[0] // 256):
-                    total += min(abs(beside(some, points[own[i]])), 1.5 * air)
+                for i in range(0, own_points.shape[0], 1 + own_points.shape[0] // 256):
+                    total += min(abs(beside(some, points[own_points[i]])), 1.5 * air)
                 if total < best - 1e-9:
-                    best, found = total, number
-        planes_of(boxes[k], profiles[found], planes[k])
+                    best, chosen = total, number
+        planes_of(boxes[k], profiles[chosen], planes[k])
         floor = boxes[k, 2] - boxes[k, 5] / 2 + air
-        for i in own:
+        for i in own_points:
             is_own[i] |= points[i, 2] > floor and beside(planes[k], points[i]) < air
 
 
@@ -366,7 +366,7 @@ def points_in(boxes: Any, points: Any, air: float) -> Any:
     for k in range(boxes.shape[0]):
         center[0, k], center[1, k] = boxes[k, 0], boxes[k, 1]
         reach[k] = np.hypot(boxes[k, 3], boxes[k, 4]) / 2 + 2 * air
-    found, n = np.empty((2, 1024), np.int64), 0
+    pairs, n = np.empty((2, 1024), np.int64), 0
     for i in range(points.shape[0]):
         px, py, hits = points[i, 0], points[i, 1], 0
         for k in range(reach.shape[0]):
@@ -379,10 +379,10 @@ def points_in(boxes: Any, points: Any, air: float) -> Any:
                 continue
             c, s = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
             if abs(c * x + s * y) <= boxes[k, 3] / 2 + air and abs(c * y - s * x) <= boxes[k, 4] / 2 + air:
-                if n == found.shape[1]:
-                    found, fewer = np.empty((2, 2 * n), np.int64), found
+                if n == pairs.shape[1]:
+                    pairs, fewer = np.empty((2, 2 * n), np.int64), pairs
                     for j in range(n):
-                        found[0, j], found[1, j] = fewer[0, j], fewer[1, j]
-                found[0, n], found[1, n] = k, i
+                        pairs[0, j], pairs[1, j] = fewer[0, j], fewer[1, j]
+                pairs[0, n], pairs[1, n] = k, i
                 n += 1
-    return found[:, :n]
+    return pairs[:, :n]

@@ -191,14 +191,14 @@ class Panorama:
         q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
         nearest_points(points, origin, window.bounds, self._place, q, number)
         most, sparse = window_max(q, 2 * cells.side, 2 * cells.side), len(points) - mapped
-        found, rays = drop_hidden(q, most, number, points, origin, cells.see_through, cells.side, sparse)
-        own = q.reshape(-1)[found]
-        residual = own - street.along(origin, rays)[0]
+        cell, rays = drop_hidden(q, most, number, points, origin, cells.see_through, cells.side, sparse)
+        own_q = q.reshape(-1)[cell]
+        residual = own_q - street.along(origin, rays)[0]
         # Windows differ by some rows from frame to frame: blocks of few sizes are found again.
         block = -(-(shape[0] + 4) * (shape[1] + 4) // _BLOCK) * _BLOCK
         self.layers = memory.empty((4 * block,), np.float32)[: 4 * q.size].reshape(4, *shape)
         work = memory.empty((3, block), np.float32)
-        complete(found, own, residual, cells.reach, cells.support, cells.smooth, work, self.layers)
+        complete(cell, own_q, residual, cells.reach, cells.support, cells.smooth, work, self.layers)
 
     @cached_property
     def hidden_below(self) -> Layer:
@@ -333,12 +333,12 @@ class PointCloudSurface(DenseSurface):
             directions.reshape(-1, 3), of, (low - of.beyond, high + of.beyond)
         )
         suitable = (p for p in held if cells in (None, p.window.cells) and p.window.holds(around(p.window.cells)))
-        found = next(suitable, None)
-        if found is None:
+        panorama = next(suitable, None)
+        if panorama is None:
             cells = cells or self._cells or FINE
-            found = Panorama(around(cells).roomy, origin, self.points, self.street, memory, self.mapped)
-            held.append(found)
-        return found
+            panorama = Panorama(around(cells).roomy, origin, self.points, self.street, memory, self.mapped)
+            held.append(panorama)
+        return panorama
 
 
 def nodes_of(rays: PixelRays, apart: int) -> Layer:
@@ -406,12 +406,12 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
     rays = (others - origin.astype(np.float32)).T.reshape(3, 1, -1).copy()
     rows, columns = np.empty((2, 1, len(others)), np.float32)
     completion.cells_of(rays, np.eye(3, dtype=np.float32), window.place, rows, columns)
-    found = np.empty(len(others), bool)
+    contradicted = np.empty(len(others), bool)
     q = 1 / np.maximum(np.linalg.norm(rays[:, 0], axis=0), np.float32(NEAREST_M))
     up, side = AROUND_CELLS
     most = completion.window_max(most, 2 * up, 2 * side)
-    completion.seen_through(q, rows[0], columns[0], most, up, side, found)
-    return found
+    completion.seen_through(q, rows[0], columns[0], most, up, side, contradicted)
+    return contradicted
 
 
 def own_car(points: Points) -> BoolArray:

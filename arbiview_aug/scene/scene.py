@@ -76,8 +76,8 @@ class Scene:
     def key(self) -> bytes:
         """Content hash."""
         digest = hashlib.sha256(repr(sorted(self.further)).encode())
-        own = self.boxes, self.points, self.motion, self.sweeps
-        for array in (*own, *(self.further[key] for key in sorted(self.further))):
+        parts = self.boxes, self.points, self.motion, self.sweeps
+        for array in (*parts, *(self.further[key] for key in sorted(self.further))):
             digest.update(b"none" if array is None else repr((array.shape, array.dtype.str)).encode())
             for rows in () if array is None else np.array_split(array, 1 + len(array) // _ROWS):
                 digest.update(rows.tobytes())

@@ -119,11 +119,11 @@ def solids_among(boxes: FloatArray, points: Points) -> tuple[FloatArray, BoolArr
     from arbiview_aug.scene.kernels import fit_profiles
 
     boxes = np.ascontiguousarray(boxes)
-    found = np.empty((len(boxes), PIECES, 6, 4)), np.zeros(len(points), bool)
+    planes_and_own = np.empty((len(boxes), PIECES, 6, 4)), np.zeros(len(points), bool)
     points = np.ascontiguousarray(points, np.float32)
     within = points_by_box(boxes, points, AIR_M)
-    fit_profiles(boxes, PROFILES, OF_KIND[kinds(boxes)], points, *within, LEAST_POINTS, AIR_M, *found)
-    return found
+    fit_profiles(boxes, PROFILES, OF_KIND[kinds(boxes)], points, *within, LEAST_POINTS, AIR_M, *planes_and_own)
+    return planes_and_own
 
 
 def points_by_box(

@@ -80,7 +80,7 @@ def match_walls(
 @called
 def _correlate(read: Any, seen: Any, windows: Any, sums: Any, costs: Any) -> None:
     """Costs of the first rows (n, w) of an image as it was read (h, w + 6); ``sums`` (8, w + 6) is scratch."""
-    own, mean, weight = windows
+    levels, mean, weight = windows
     h, wide = read.shape
     n, w = costs.shape
     values, squares, products, nothing = sums[0], sums[1], sums[2], sums[3]  # of columns
@@ -88,7 +88,7 @@ def _correlate(read: Any, seen: Any, windows: Any, sums: Any, costs: Any) -> Non
     sums[:4] = 0
     for y in range(-2 * RADIUS_PX, n):
         new, old = min(max(y + RADIUS_PX, 0), h - 1), max(y - RADIUS_PX - 1, 0)
-        a, b, c, d = read[new], own[new], read[old], own[old]
+        a, b, c, d = read[new], levels[new], read[old], levels[old]
         if y <= 0:
             c = d = nothing
         for x in range(wide):

@@ -268,9 +268,9 @@ class _Line(NamedTuple):
 
     def depth(self, values: FloatArray) -> FloatArray:
         """Metres of a network's output; inf where it is behind infinity, 0 where it is behind the camera."""
-        found = self.scale * _feature(self.form, values) + self.shift
+        depth = self.scale * _feature(self.form, values) + self.shift
         with np.errstate(divide="ignore"):
-            return np.maximum(found, 0) if self.form == "affine depth" else np.where(found > 0, 1 / found, np.inf)
+            return np.maximum(depth, 0) if self.form == "affine depth" else np.where(depth > 0, 1 / depth, np.inf)
 
 
 def _feature(form: _Form, values: FloatArray) -> FloatArray:
@@ -322,17 +322,17 @@ def _at_one_focal_length(view: View, one: Prediction) -> tuple[Layer, BoolArray]
 
 def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[_Line | None, float | None, str]:
     """Fit a network's output (P,) to depths (P,): the fit, its residual, and why it is declined, or nothing."""
-    found: list[tuple[float, float, _Line]] = []
+    fits: list[tuple[float, float, _Line]] = []
     for form in _FORMS[output]:
         x, y = _feature(form, values), depth_m if form == "affine depth" else 1 / depth_m
         limit = np.minimum(y, _RELATIVE_M) if form == "affine depth" else np.maximum(y, 1 / _RELATIVE_M)
         scale, shift = _robust_line(x, y, 1 / limit)
         if scale > 0:
             residual = float(np.median(np.abs(scale * x + shift - y) / limit))
-            found.append((residual, float(np.median(np.abs(np.median(y) - y) / limit)), _Line(form, scale, shift)))
-    if not found:
+            fits.append((residual, float(np.median(np.abs(np.median(y) - y) / limit)), _Line(form, scale, shift)))
+    if not fits:
         return None, None, "near and far are swapped: the scale is negative"
-    residual, constant, line = min(found)
+    residual, constant, line = min(fits)
     if residual > MAX_RESIDUAL:
         return line, residual, f"it errs by more than {MAX_RESIDUAL:.0%}"
     if residual > MAX_OF_CONSTANT * constant:  # a fit may turn noise into a constant

@@ -120,11 +120,11 @@ class SweptImage:
         from arbiview_aug.temporal.kernels import INVALID, match_walls
 
         h, w = self.camera.size
-        kind, given = LENS_CODES.get(other.camera.lens, -1), np.zeros((0, 2, h, w), np.float32)
+        kind, positions = LENS_CODES.get(other.camera.lens, -1), np.zeros((0, 2, h, w), np.float32)
         if kind < 0:
-            given = np.stack([self.positions(other.camera, self.inverse_distance(wall)) for wall in walls])
-            given = given.transpose(0, 3, 1, 2)
-        pose, lens = relative_pose(self.camera, other.camera), (kind, other.camera.parameters, given)
+            positions = np.stack([self.positions(other.camera, self.inverse_distance(wall)) for wall in walls])
+            positions = positions.transpose(0, 3, 1, 2)
+        pose, lens = relative_pose(self.camera, other.camera), (kind, other.camera.parameters, positions)
         costs = np.full((len(walls), h, w), INVALID, np.uint16)
         if min(other.camera.size) < 2:  # nothing lies between its pixels
             return costs

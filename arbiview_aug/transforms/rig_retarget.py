@@ -336,21 +336,21 @@ class RigRetarget(torch.nn.Module):
         self, frames: Sequence[Frame], params: Mapping[str, float] | None
     ) -> tuple[Rig, bool, dict[str, float]]:
         """Draw the target rig and whether to skip; return both, and the parameters that replay them."""
-        given = None if params is None else checked_params(params)
+        checked = None if params is None else checked_params(params)
         draws: dict[str, float] = {}
-        if self.p < 1 and given is None:
+        if self.p < 1 and checked is None:
             draws["skipped"] = float(torch.rand(()).item() >= self.p)
-        elif self.p < 1 and given is not None:
-            draws["skipped"] = given.pop("skipped", 0.0)
+        elif self.p < 1 and checked is not None:
+            draws["skipped"] = checked.pop("skipped", 0.0)
         if isinstance(self.target, RandomRig):
-            rig_params = self.target.draw_for(frames[0].sample) if given is None else given
+            rig_params = self.target.draw_for(frames[0].sample) if checked is None else checked
             target = self._sized(self.target.rig(rig_params))
             draws.update(rig_params)
         else:
             assert self._fixed_target is not None
             target = self._fixed_target
-            if given:
-                raise SampleError(f"params: expected none for a fixed target rig, got {', '.join(given)}")
+            if checked:
+                raise SampleError(f"params: expected none for a fixed target rig, got {', '.join(checked)}")
         for frame in frames if self.p < 1 else ():
             if len(frame.rig) != len(target):
                 raise SampleError(

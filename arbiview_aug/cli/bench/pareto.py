@@ -117,17 +117,17 @@ def settings(
     executions: Sequence[Execution] = ("opencv", "torch"),
 ) -> list[Setting]:
     """List all combinations that differ: ``paper`` is always far and on the CPU; ``accurate`` needs overlap depth."""
-    found = []
+    rows = []
     for quality, reduce, execution in itertools.product(qualities, reduces, executions):
         if quality == "paper":
-            found += [Setting(quality, "infinity", reduce, execution)] if execution == "opencv" else []
+            rows += [Setting(quality, "infinity", reduce, execution)] if execution == "opencv" else []
             continue
         for surface in surfaces:
             if quality != "accurate":
-                found.append(Setting(quality, surface, reduce, execution))
+                rows.append(Setting(quality, surface, reduce, execution))
             elif GEOMETRIES[surface].overlap_depth:
-                found += [Setting(quality, surface, reduce, execution, cached) for cached in (False, True)]
-    return found
+                rows += [Setting(quality, surface, reduce, execution, cached) for cached in (False, True)]
+    return rows
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -167,8 +167,8 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     for one in tqdm(wanted, desc="accuracy", unit="setting", leave=False):
         memory = peak_mib(one.call(target, frame(0, one.reduce).scored_sample))
         frames = [frame(index, one.reduce) for index in range(arguments.frames)]
-        (found,) = study([one.method(target)], frames, {"target": [target]}, repeats=0).values()
-        means, prefix = found["target"], "even" if data.truth is None else "true"
+        (scored,) = study([one.method(target)], frames, {"target": [target]}, repeats=0).values()
+        means, prefix = scored["target"], "even" if data.truth is None else "true"
         rows.append(
             {"name": one.name, **asdict(one), "peak_mib": memory, "seen": means["seen"]}
             | {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
@@ -181,9 +181,9 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     candidates = {"floor": remap_floor(noise, (h, w)), **reads, **calls}
     times = timed_rounds(candidates, arguments.repeats, "times", enough_ms=_ENOUGH_MS)
     for row in rows:
-        own, decode = times[row["name"]], quartiles(times[f"decode 1/{row['reduce']}"]).median_ms
-        row |= quartiles(own)._asdict() | {"decode_ms": decode}
-        row["floor_ratio"] = float(quartiles(own / times["floor"][: len(own)]).median_ms)
+        own_times, decode = times[row["name"]], quartiles(times[f"decode 1/{row['reduce']}"]).median_ms
+        row |= quartiles(own_times)._asdict() | {"decode_ms": decode}
+        row["floor_ratio"] = float(quartiles(own_times / times["floor"][: len(own_times)]).median_ms)
         row["decode_ratio"] = row["median_ms"] / decode
     by_name = {one.name: one for one in wanted}
 
@@ -227,8 +227,8 @@ def measure_fills(
         network = getattr(how["holes"], "generator", how["holes"])  # counts its calls, if it is one
         memory = peak_mib(calls[name])
         before = getattr(network, "calls", None)
-        (found,) = study([setting.method(target, **how)], frames, {"target": [target]}, repeats=0).values()
-        means, prefix = found["target"], "even" if frames[0].truth is None else "true"
+        (scored,) = study([setting.method(target, **how)], frames, {"target": [target]}, repeats=0).values()
+        means, prefix = scored["target"], "even" if frames[0].truth is None else "true"
         row = {"name": name, "peak_mib": memory, "whole_psnr_db": means[f"{prefix}_psnr_db"]}
         row |= {"hole_psnr_db": means["true_hole_psnr_db"]} if "true_hole_psnr_db" in means else {}
         rows.append(row | ({} if before is None else {"calls": (network.calls - before) / len(frames)}))

@@ -272,5 +272,5 @@ def _sample(data: Recorded, reduce: Reduce) -> dict[str, Any]:
     sample = data.sample(0, reduce)
     if not isinstance(sample["images"], torch.Tensor) or "points" not in sample:
         raise DataError(f"--data {data.root}: expected images of one size, and LiDAR points")
-    found = {"images": sample["images"], "rig": without_masks(sample["rig"]), "points": sample["points"]}
-    return found | dict.fromkeys((MOTION_KEY, LEARNED_KEY), torch.from_numpy(np.stack(lidar_maps(found))))
+    kept = {"images": sample["images"], "rig": without_masks(sample["rig"]), "points": sample["points"]}
+    return kept | dict.fromkeys((MOTION_KEY, LEARNED_KEY), torch.from_numpy(np.stack(lidar_maps(kept))))

@@ -113,10 +113,10 @@ def peak_mib(run: Callable[[], Any]) -> float | None:
 
 def memory_mib(file: str, fields: str, pid: int | str = "self") -> float:
     """Sum the fields (a pattern) of a process's memory file below /proc; OSError except on Linux."""
-    found = re.findall(rf"^{fields}:\s+(\d+) kB", Path(f"/proc/{pid}/{file}").read_text(), re.MULTILINE)
-    if not found:
+    sizes = re.findall(rf"^{fields}:\s+(\d+) kB", Path(f"/proc/{pid}/{file}").read_text(), re.MULTILINE)
+    if not sizes:
         raise OSError(f"no {fields}")
-    return sum(map(int, found)) / 1024
+    return sum(map(int, sizes)) / 1024
 
 
 def machine(load_before: tuple[float, float, float]) -> dict[str, Any]:
@@ -128,8 +128,8 @@ def machine(load_before: tuple[float, float, float]) -> dict[str, Any]:
 def cpu_model() -> str:
     """Processor as the kernel names it; without /proc, at least the architecture."""
     with suppress(OSError):
-        if found := re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
-            return found[1].strip()
+        if match := re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return match[1].strip()
     return platform.processor() or platform.machine()
 
 
@@ -271,10 +271,10 @@ def advice(
     if budget_ms is None and min_psnr_db is None:
         return None
     left_out = next((row["harm"] for row in rows if row["harm"] is not None), None)
-    found = {"setting": None, "left_out": left_out, "measured": None, "again": None}
+    result = {"setting": None, "left_out": left_out, "measured": None, "again": None}
     front = pareto_front([row for row in rows if row["harm"] is None])
     if not front:
-        return found | {"reason": "nothing was measured that may be recommended"}
+        return result | {"reason": "nothing was measured that may be recommended"}
     if budget_ms is not None:
         candidates = [row for row in reversed(front) if row["q3_ms"] <= budget_ms]
         reason = f"the most accurate within {budget_ms:g} ms a frame"
@@ -287,5 +287,5 @@ def advice(
         again = measure_again(row)
         if budget_ms is None or again.median_ms <= budget_ms:
             figures = {key: row[key] for key in ("psnr_db", *Quartiles._fields)}
-            return found | {"setting": row["name"], "reason": reason, "measured": figures, "again": again._asdict()}
-    return found | {"reason": missed}
+            return result | {"setting": row["name"], "reason": reason, "measured": figures, "again": again._asdict()}
+    return result | {"reason": missed}

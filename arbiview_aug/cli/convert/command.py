@@ -40,10 +40,10 @@ class Verification(Dataset[Done]):
     def __getitem__(self, number: int) -> Done:
         index = self.jobs.indices[number]
         try:
-            found = tuple(self._differences(index))
+            differences = tuple(self._differences(index))
         except Exception as error:  # of this sample alone
-            found = (f"{self.jobs.data.tokens[index]}: {described(error)}",)
-        return Done(self.jobs.data.tokens[index], "failed" if found else "kept", messages=found)
+            differences = (f"{self.jobs.data.tokens[index]}: {described(error)}",)
+        return Done(self.jobs.data.tokens[index], "failed" if differences else "kept", messages=differences)
 
     def _differences(self, index: int) -> Iterator[str]:
         manifest, token = self.jobs.manifest, self.jobs.data.tokens[index]
@@ -81,11 +81,11 @@ def differences_of_all(jobs: Jobs) -> Iterator[str]:
 
 def _difference(path: Path, recorded: str | None, fix: str) -> Iterator[str]:
     try:
-        found = checksum_once(path)
+        digest = checksum_once(path)
     except OSError as error:
-        found = error.strerror or str(error)
-    if found != recorded:
-        yield f"{path}: expected the SHA-256 {recorded or 'of a record, which has none'}, got {found}; {fix}"
+        digest = error.strerror or str(error)
+    if digest != recorded:
+        yield f"{path}: expected the SHA-256 {recorded or 'of a record, which has none'}, got {digest}; {fix}"
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -102,19 +102,19 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.verify:
         return _verify(_jobs(settings, settings.open(), arguments), arguments)
     jobs, facts = _begin(settings, settings.open(), arguments)
-    found: list[Done] = []
+    records: list[Done] = []
     started_s = working_s()
     for done in _run(jobs, arguments):
-        found.append(done)
+        records.append(done)
         if done.state == "stopped" or (done.state == "failed" and arguments.on_error == "fatal"):
             break
-    for line in dict.fromkeys(line for done in found if done.is_converted for line in done.messages):
+    for line in dict.fromkeys(line for done in records if done.is_converted for line in done.messages):
         print(f"note: {line}", file=sys.stderr)
-    print(_summary(settings.output, found, working_s() - started_s))
-    for done in found:
+    print(_summary(settings.output, records, working_s() - started_s))
+    for done in records:
         if not done.is_converted:
             print(f"  {done.token}: {done.state}: {'; '.join(done.messages)}", file=sys.stderr)
-    if any(done.state in ("stopped", "failed") for done in found):
+    if any(done.state in ("stopped", "failed") for done in records):
         return 1
     _finish(jobs, facts, arguments.report, arguments.num_shards)
     return 0
@@ -200,20 +200,20 @@ def _note(done: Done) -> str:
     return f"coverage {done.coverage:.1%}"
 
 
-def _summary(output: Path, found: Sequence[Done], wall_s: float) -> str:
+def _summary(output: Path, records: Sequence[Done], wall_s: float) -> str:
     """Counts, coverage and shares of the time."""
-    states = Counter(done.state for done in found)
+    states = Counter(done.state for done in records)
     words: dict[State, str] = {"kept": "there before", "skipped": "skipped", "failed": "failed"}
     counts = "".join(f", {states[state]} {word}" for state, word in words.items() if states[state])
-    made, coverage = states["made"], np.mean([done.coverage for done in found if done.is_converted] or [0.0])
-    text = f"{output}: {made} samples converted{counts}; {coverage:.1%} of the pixels seen"
-    if not made:
+    count, coverage = states["made"], np.mean([done.coverage for done in records if done.is_converted] or [0.0])
+    text = f"{output}: {count} samples converted{counts}; {coverage:.1%} of the pixels seen"
+    if not count:
         return text
-    seconds = np.sum([done.seconds for done in found], axis=0)
+    seconds = np.sum([done.seconds for done in records], axis=0)
     read, retarget, write = seconds / seconds.sum()
     return (
-        f"{text}\n{1e3 * seconds.sum() / made:.0f} ms a sample: read and decode {read:.0%}, retarget {retarget:.0%}, "
-        f"encode and write {write:.0%}; {made / wall_s:.2f} samples/s"
+        f"{text}\n{1e3 * seconds.sum() / count:.0f} ms a sample: read and decode {read:.0%}, retarget {retarget:.0%}, "
+        f"encode and write {write:.0%}; {count / wall_s:.2f} samples/s"
     )
 
 

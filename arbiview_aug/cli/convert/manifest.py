@@ -108,20 +108,20 @@ def _read_signed(path: Path) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(found, dict):
-            return found
-        got = type(found).__name__
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(data, dict):
+            return data
+        got = type(data).__name__
     except (OSError, ValueError, RecursionError) as error:
         got = str(error)
     raise DataError(f"{path}: expected what the conversion wrote, got {got}; remove this file")
 
 
-def _differences(found: Any, asked: Any, where: str = "") -> Iterator[str]:
+def _differences(recorded: Any, asked: Any, where: str = "") -> Iterator[str]:
     """Describe where two pieces of plain data differ."""
-    if isinstance(found, Mapping) and isinstance(asked, Mapping):
-        for key in dict.fromkeys([*found, *asked]):
-            yield from _differences(found.get(key), asked.get(key), f"{where}.{key}" if where else key)
-    elif found != asked:
-        one, two = shown(asked), shown(found)
+    if isinstance(recorded, Mapping) and isinstance(asked, Mapping):
+        for key in dict.fromkeys([*recorded, *asked]):
+            yield from _differences(recorded.get(key), asked.get(key), f"{where}.{key}" if where else key)
+    elif recorded != asked:
+        one, two = shown(asked), shown(recorded)
         yield f"another {where}" if max(len(one), len(two)) > 40 else f"{where} {one} instead of {two}"

@@ -128,7 +128,7 @@ class NuScenes(Writer):
             check_name(longest, f"rig {self.target.name!r}: camera {camera.name!r}")
         tables, there = self.tables, self.there
         references = [(table, key, of) for table, key, of in _REFERENCES if table in there and of in there]
-        own = {of: Tokens(tables, of) for _, _, of in references}
+        known_tokens = {of: Tokens(tables, of) for _, _, of in references}
         named = {(table, key): Tokens(tables, table, key) for table, key, _ in references}
         folders = {path.parent.relative_to(self.data.root).as_posix(): "maps" for path in self._maps()}
         _, kept = kept_sensors(tables)
@@ -140,8 +140,8 @@ class NuScenes(Writer):
                     tables.column(table, rows, key, kind)
                 if table == "instance":
                     tables.column(table, rows, "nbr_annotations", COUNTS, default=0)
-                if table in own:
-                    own[table].add(rows)
+                if table in known_tokens:
+                    known_tokens[table].add(rows)
                 for column in columns:
                     column.add(rows, LINKS, default="")
                 for row in rows if table == "map" or "filename" in needed else ():
@@ -150,10 +150,10 @@ class NuScenes(Writer):
                         where = self._where(table, row)
                         check_name(name, where)
                         folders.setdefault(name.rpartition("/")[0], where)
-        for tokens in own.values():
+        for tokens in known_tokens.values():
             tokens.check()
         for table, key, of in references:
-            after = named[table, key].places_in(own[of], or_empty=key not in _NEEDED.get(table, {}))
+            after = named[table, key].places_in(known_tokens[of], or_empty=key not in _NEEDED.get(table, {}))
             for k in on_circle(after)[:1] if key in ("prev", "next") else ():
                 got = f"a circle through row {tables.row(table, int(k))['token']!r}"
                 raise tables.error(table, f"{key} that lead to an end", got, f"empty one row's {key}")

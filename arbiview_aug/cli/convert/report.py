@@ -41,8 +41,10 @@ def converted(settings: Settings) -> Method:
         record = manifest.record(sample["token"])
         if rig != target or record is None:
             return anew.render(sample, rig)
-        found = written.by_token(sample["token"])
-        images = dict(zip(found["rig"].names, as_arrays(found["images"]), strict=True))  # the reader has its own order
+        stored = written.by_token(sample["token"])
+        images = dict(
+            zip(stored["rig"].names, as_arrays(stored["images"]), strict=True)
+        )  # the reader has its own order
         files = {camera["name"]: settings.output / camera["file"] for camera in record["cameras"]}
         return [RenderedView(images[name], coverage_of(files[name])) for name in rig.names]
 

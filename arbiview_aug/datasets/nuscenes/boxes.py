@@ -100,7 +100,7 @@ def read_annotations(
     table = "sample_annotation"
     unique = Tokens(tables, table)
     none = np.empty((0, 3), np.float32)
-    found: list[tuple[Any, ...]] = [
+    annotations: list[tuple[Any, ...]] = [
         (np.empty(0, np.int32), np.empty((0, 2), np.int32), np.empty(0, np.bytes_), none.astype(np.float64), none, none)
     ]
     for batch in tables.batches(table):
@@ -110,7 +110,7 @@ def read_annotations(
         for k in np.flatnonzero((sizes_m <= 0).any(axis=1))[:1]:
             raise tables.error(table, "sizes above 0", f"{sizes_m[k].tolist()} in row {rows[k].get('token')!r}")
         found_objects = tables.follow(table, rows, "instance_token", "instance", objects)
-        found.append(
+        annotations.append(
             (
                 np.array([samples[row["sample_token"]] for row in rows], np.int32),
                 np.array(found_objects, np.int32).reshape(-1, 2),
@@ -121,7 +121,7 @@ def read_annotations(
             )
         )
     unique.check()
-    columns = [np.concatenate([batch[k] for batch in found]) for k in range(len(found[0]))]
+    columns = [np.concatenate([batch[k] for batch in annotations]) for k in range(len(annotations[0]))]
     order = np.argsort(columns[0], kind="stable")
     sample, instance_and_category, tokens, centers_m, sizes, headings = (column[order] for column in columns)
     earlier, later = _in_time(instance_and_category[:, 0], scenes[sample], times_s[sample])
@@ -155,8 +155,8 @@ def _in_time(instance: IntArray, scene: npt.NDArray[np.int64], time_s: FloatArra
 
 def _velocities_mps(centers_m: FloatArray, time_s: FloatArray, earlier: IntArray, later: IntArray) -> SingleArray:
     """(B, 3) world frame, from the previous to the next annotation; NaN where none is close enough in time."""
-    own = np.arange(len(centers_m))
-    start, end = np.where(earlier < 0, own, earlier), np.where(later < 0, own, later)
+    themselves = np.arange(len(centers_m))
+    start, end = np.where(earlier < 0, themselves, earlier), np.where(later < 0, themselves, later)
     seconds = time_s[end] - time_s[start]
     longest_s = np.where((earlier >= 0) & (later >= 0), 2 * MAX_STEP_S, MAX_STEP_S)
     known = (seconds > 0) & (seconds <= longest_s)

@@ -77,10 +77,10 @@ class Recordings:
     def ego2global(self, rows: Any) -> FloatArray:
         """(..., 4, 4) ego poses of rows (...,)."""
         pose = self.poses[self.rows["pose"][rows]]
-        found = np.zeros((*pose.shape[:-1], 4, 4))
-        found[..., :3, :3], found[..., :3, 3] = rotation_from_quaternion(pose[..., 3:]), pose[..., :3]
-        found[..., 3, 3] = 1
-        return found
+        matrices = np.zeros((*pose.shape[:-1], 4, 4))
+        matrices[..., :3, :3], matrices[..., :3, 3] = rotation_from_quaternion(pose[..., 3:]), pose[..., :3]
+        matrices[..., 3, 3] = 1
+        return matrices
 
     def time_s(self, rows: Any) -> FloatArray:
         return np.asarray(1e-6 * self.rows["time_us"][rows])
@@ -96,16 +96,16 @@ class Recordings:
         """
         time_us, record = self.rows["time_us"], self.rows[row]
         keyframe_us = time_us[self.keyframes[record["sample"]]]
-        found = np.full(len(self.channels) - 1, row)
-        for channel in range(1, len(found)):
+        rows = np.full(len(self.channels) - 1, row)
+        for channel in range(1, len(rows)):
             wanted_us = record["time_us"] + keyframe_us[channel] - keyframe_us[0]
             scenes = (len(self.first) - 1) // len(self.channels)
             first, end = self.first[channel * scenes + record["scene"] :][:2]
             apart_us = np.abs(time_us[first:end] - wanted_us)
             if not len(apart_us) or apart_us.min() > 1e6 * MAX_APART_S:
                 raise DataError(f"expected an image of {self.channels[channel]} within {MAX_APART_S} s, got none")
-            found[channel] = first + apart_us.argmin()
-        return found
+            rows[channel] = first + apart_us.argmin()
+        return rows
 
     def lidar_beside(self, row: int) -> int | None:
         """Row of the LiDAR's recording nearest in time to a row of the first camera; None beyond ``MAX_APART_S``."""

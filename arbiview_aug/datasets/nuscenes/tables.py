@@ -87,10 +87,10 @@ class Tables:
             assert root is not None
             self.root, self.version = Path(root), version
             if not os.path.isdir(self.root / version):
-                found = ", ".join(sorted(p.parent.name for p in self.root.glob("*/sample.json"))) or "none"
+                versions = ", ".join(sorted(p.parent.name for p in self.root.glob("*/sample.json"))) or "none"
                 raise DataError(
                     f"nuScenes {root}: expected a folder of tables {version!r}, found none; "
-                    f"folders with tables: {found}"
+                    f"folders with tables: {versions}"
                 )
             return
         missing = [name for name in ("dataroot", "sample", "sample_data", "ego_pose") if not hasattr(nusc, name)]
@@ -142,9 +142,9 @@ class Tables:
         """A table's rows by token; DataError for invalid or duplicate tokens."""
         rows = self.rows(table)
         tokens = Tokens(self, table)
-        found = dict(zip(tokens.add(rows), rows, strict=True))
+        entries = dict(zip(tokens.add(rows), rows, strict=True))
         tokens.check()
-        return found
+        return entries
 
     def column(self, table: str, rows: Sequence[Row], key: str, kind: Kind, default: Any = None) -> list[Any]:
         """Values of one column, checked at once, and row by row to name the invalid one in a DataError.
@@ -171,10 +171,10 @@ class Tables:
 
     def follow(self, table: str, rows: Sequence[Row], key: str, target: str, entries: Mapping[str, Any]) -> list[Any]:
         """Look up a column's tokens in ``entries`` of table ``target``."""
-        found = [*map(entries.get, self.column(table, rows, key, TOKENS))]
-        if None in found:
-            raise self.dangling(table, rows[found.index(None)], key, target)
-        return found
+        targets = [*map(entries.get, self.column(table, rows, key, TOKENS))]
+        if None in targets:
+            raise self.dangling(table, rows[targets.index(None)], key, target)
+        return targets
 
     def dangling(self, table: str, row: Row, key: str, target: str) -> DataError:
         """Make the error for a row that names a missing row of another table."""
@@ -185,18 +185,18 @@ class Tables:
         """(len(rows), *shape) float64 of one column of finite numbers."""
         if not rows:
             return np.empty((0, *shape))
-        found: list[npt.NDArray[Any]] = []
+        columns: list[npt.NDArray[Any]] = []
 
         def holds(values: list[Any]) -> bool:
             try:
-                found[:] = [np.array(values)]
+                columns[:] = [np.array(values)]
             except ValueError:  # of different shapes
                 return False
-            (array,) = found
+            (array,) = columns
             return array.shape[1:] == shape and array.dtype.kind in "iuf" and bool((np.abs(array) < _LARGEST).all())
 
         self.column(table, rows, key, Kind(f"of shape {shape}, below {_LARGEST:g} and finite", holds))
-        return found[0].astype(np.float64, copy=False)
+        return columns[0].astype(np.float64, copy=False)
 
     def rotations(self, table: str, rows: Sequence[Row]) -> FloatArray:
         return rotation_from_quaternion(self.quaternions(table, rows))

@@ -136,9 +136,9 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
             for part in chosen.split(_PAIRS_PER_STEP):
                 n, p = packet[part], primitive[part]
                 before = t.index_select(0, n)
-                found = meet(local, p, rays.index_select(0, n))
-                nearer = found < before
-                t[n] = torch.where(nearer, found, before)
+                hits = meet(local, p, rays.index_select(0, n))
+                nearer = hits < before
+                t[n] = torch.where(nearer, hits, before)
                 hit[n] = torch.where(nearer, local.order[p][:, None], hit.index_select(0, n))
     return t, hit
 

@@ -179,13 +179,13 @@ class Renderer:
         origins = [pose[:3, :3] @ (camera.center_m - (0, 0, ground_z_m)) + pose[:3, 3] for camera in cameras]
         start = torch.as_tensor(np.repeat(origins, tiles, axis=0).astype(np.float32))
         scenes = [scene_from(scene, origin) for origin in origins]
-        found, first_tile = [], 0
+        casts, first_tile = [], 0
         for k, (local, packets) in enumerate(zip(scenes, directions.split(tiles), strict=True)):
             packet, primitive, rank = find_candidates(local, packets)
-            found.append((packet + first_tile, primitive + k * len(local.order), rank))
+            casts.append((packet + first_tile, primitive + k * len(local.order), rank))
             first_tile += tiles[k]
         local = LocalScene(*map(torch.cat, zip(*scenes, strict=True)))
-        candidates = Candidates(*map(torch.cat, zip(*found, strict=True)))
+        candidates = Candidates(*map(torch.cat, zip(*casts, strict=True)))
         t, hit = cast(local, start, directions, candidates)
         t, hit = torch.where(rays.valid, t, torch.inf), torch.where(rays.valid, hit, SKY_ID)
         flat = directions.transpose(1, 2).reshape(-1, 3)

@@ -77,10 +77,10 @@ def _motion(seed: np.random.SeedSequence, builder: SceneBuilder, parked: int) ->
     velocities = np.zeros((len(builder.boxes), 2))
     for row, (box, cls) in enumerate(zip(builder.boxes, builder.box_classes, strict=True)):
         yaw, walks = box[6], cls == BoxClass.PEDESTRIAN
-        own = rng.uniform(0.8, 1.7) if walks else speed_mps * rng.uniform(0.9, 1.1)
+        own_speed_mps = rng.uniform(0.8, 1.7) if walks else speed_mps * rng.uniform(0.9, 1.1)
         waits = rng.random() < _WAITING and math.cos(yaw) < 0.5
         if row >= parked and not waits:
-            velocities[row] = own * math.cos(yaw), own * math.sin(yaw)
+            velocities[row] = own_speed_mps * math.cos(yaw), own_speed_mps * math.sin(yaw)
     return speed_mps, velocities
 
 

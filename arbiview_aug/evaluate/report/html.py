@@ -46,18 +46,18 @@ def layers(camera: int, rig: Rig, done: Evaluation, shown: Mapping[str, Sequence
     source: Rig = done.first.sample["rig"]
     axis = rig[camera].cam2ego[:3, 2]
     nearest = int(np.argmax(source.cam2ego[:, :3, 2] @ axis))
-    found = {SOURCE_LAYER: shrunk(as_arrays([done.first.sample["images"][nearest]])[0], _HEIGHT_PX)}
+    pictures = {SOURCE_LAYER: shrunk(as_arrays([done.first.sample["images"][nearest]])[0], _HEIGHT_PX)}
     for method, views in shown.items():
         view = views[camera]
-        found[method] = shrunk(view.image, _HEIGHT_PX)
+        pictures[method] = shrunk(view.image, _HEIGHT_PX)
         if not view.coverage.all():
-            found[f"{method}: unseen"] = hatched_view(view, _HEIGHT_PX)
+            pictures[f"{method}: unseen"] = hatched_view(view, _HEIGHT_PX)
         if view.confidence is not None:
-            found[f"{method}: confidence"] = shrunk(overlay_confidence(view.image, view.confidence), _HEIGHT_PX)
+            pictures[f"{method}: confidence"] = shrunk(overlay_confidence(view.image, view.confidence), _HEIGHT_PX)
     if done.first.truth is not None:
         true: list[Image] = as_arrays(done.first.truth(rig).images)
-        found[TRUTH_LAYER] = shrunk(true[camera], _HEIGHT_PX)
-    return found
+        pictures[TRUTH_LAYER] = shrunk(true[camera], _HEIGHT_PX)
+    return pictures
 
 
 def _target_section(target: str, rig: Rig, done: Evaluation, shown: Mapping[str, Sequence[RenderedView]]) -> str:
@@ -65,7 +65,7 @@ def _target_section(target: str, rig: Rig, done: Evaluation, shown: Mapping[str,
     source: Rig = done.first.sample["rig"]
     by_camera = [layers(camera, rig, done, shown) for camera in range(len(rig))]
     # Every camera offers the same layers: a view without holes stands for its own holes.
-    names = list(dict.fromkeys(name for found in by_camera for name in found))
+    names = list(dict.fromkeys(name for of_camera in by_camera for name in of_camera))
     after = next(iter(shown))
     before = TRUTH_LAYER if TRUTH_LAYER in names else SOURCE_LAYER
     choices = "".join(

@@ -38,11 +38,15 @@ def rig_figure(rigs: Sequence[Rig]) -> Figure:
     rows = figure.subplots(2, len(rigs), squeeze=False, sharex="row", sharey="row", height_ratios=(7, 3))
     for column, (above, side) in enumerate(rows.T):
         for k, rig in enumerate(rigs):
-            colour, own = COLOURS[k % len(COLOURS)], k == column
+            colour, here = COLOURS[k % len(COLOURS)], k == column
             for camera in rig:
                 for axes, outline in ((above, _wedge_from_above(camera)), (side, _wedge_from_side(camera, rig))):
-                    axes.fill(*outline.T, facecolor=(colour, 0.15 if own else 0), edgecolor=(colour, 1 if own else 0.3))
-            if own:
+                    axes.fill(
+                        *outline.T,
+                        facecolor=(colour, 0.15 if here else 0),
+                        edgecolor=(colour, 1 if here else 0.3),
+                    )
+            if here:
                 _label_from_above(above, rig)
                 _label_from_side(side, rig)
                 above.set_title(f"{rig.name or 'rig'}: {len(rig)} cameras", color=colour)

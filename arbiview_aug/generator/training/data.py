@@ -155,12 +155,12 @@ def open_frames(
         return Frames(drive, size, [str(k) for k in range(scenes)], data)
     if kind not in READERS or not folder:
         raise TrainingError(f"--data {data}: expected synthetic, {' or '.join(f'{name}:PATH' for name in READERS)}")
-    found = open_data(data)
-    found.load_points = points
-    if isinstance(found, NuScenesDataset):
-        names = found.scene_tokens
-    elif not (found.root / SEQUENCE_FILE).is_file():
-        names = found.tokens
+    dataset = open_data(data)
+    dataset.load_points = points
+    if isinstance(dataset, NuScenesDataset):
+        names = dataset.scene_tokens
+    elif not (dataset.root / SEQUENCE_FILE).is_file():
+        names = dataset.tokens
     else:  # a drive is cut into blocks: frames next to each other show the same street
-        names = [f"block {_BLOCKS * k // len(found)}" for k in range(len(found))]
-    return Frames(found, size, names, f"{kind}:{Path(folder).resolve()}")
+        names = [f"block {_BLOCKS * k // len(dataset)}" for k in range(len(dataset))]
+    return Frames(dataset, size, names, f"{kind}:{Path(folder).resolve()}")

@@ -213,14 +213,14 @@ def _lidar_case(
     """
     camera = frame.rig[place]
     seed = int(torch.randint(2**31, (), generator=rng))
-    hidden, own = ~mask_bank(frame.rig, 1, seed)[0].numpy(), valid_pixels(camera).numpy()
+    hidden, valid = ~mask_bank(frame.rig, 1, seed)[0].numpy(), valid_pixels(camera).numpy()
     cameras = list(frame.rig)
-    cameras[place] = replace(camera, mask=own & ~hidden)
+    cameras[place] = replace(camera, mask=valid & ~hidden)
     sources = frame.rig.with_cameras(cameras)
     view = favs(frame.images, sources, [target])
     points = points[~own_car(points), :3].astype(np.float64)
     index, row, column = _pixels_of(camera, points)
-    is_hidden = (own & hidden)[row, column]
+    is_hidden = (valid & hidden)[row, column]
     colours = as_arrays([frame.images[place]])[0][row, column][is_hidden]
     index, row, column = _pixels_of(target, points[index[is_hidden]])
     in_hole = ~view.covered[0].numpy()[row, column]

@@ -209,21 +209,21 @@ class PseudoViews(Dataset[Batch]):
             if left_out:
                 del images[i], cameras[i]
             elif is_transferred and is_hidden:
-                own = cameras[i].mask
-                cameras[i] = replace(cameras[i], mask=mask.numpy() if own is None else own & mask.numpy())
+                own_mask = cameras[i].mask
+                cameras[i] = replace(cameras[i], mask=mask.numpy() if own_mask is None else own_mask & mask.numpy())
         rig = frame.rig.with_cameras(cameras)
         # --- the pairs, and their views at the target poses
         branches: list[Camera] = []
         shown, pseudo = [], []
         for target, mask in zip(targets, masks, strict=True):
             pair = self._pair(target, rng)
-            made = favs(images, rig, pair, config.quality)
-            masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, made.covered, strict=True)]
-            at_target = favs(list(made.images), Rig(masked, ground_z_m=rig.ground_z_m), [target], config.quality)
+            rendered = favs(images, rig, pair, config.quality)
+            masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, rendered.covered, strict=True)]
+            at_target = favs(list(rendered.images), Rig(masked, ground_z_m=rig.ground_z_m), [target], config.quality)
             if is_transferred and not is_hidden:
                 at_target = at_target._replace(covered=at_target.covered & mask.to(at_target.covered.device))
             shown.append(at_target)
-            pseudo.append(made)
+            pseudo.append(rendered)
             branches += pair
         view_at, known, confidence = (torch.cat(maps) for maps in zip(*shown, strict=True))
         view_at = view_at * known[:, None]

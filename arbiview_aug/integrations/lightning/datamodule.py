@@ -55,10 +55,10 @@ class RetargetDataModule(lightning.LightningDataModule):
 
     def on_after_batch_transfer(self, batch: dict[str, Any], dataloader_idx: int) -> dict[str, Any]:
         """The batch stage: on the device, before the training step."""
-        given = unpacked(batch)
-        images = given["images"]
+        samples = unpacked(batch)
+        images = samples["images"]
         device = (images if isinstance(images, torch.Tensor) else images[0]).device
-        return on_device(self.retarget(given) if self.trainer.training else given, device)
+        return on_device(self.retarget(samples) if self.trainer.training else samples, device)
 
     def _loader(self, dataset: Dataset[Any], *, shuffle: bool) -> DataLoader[Any]:
         return DataLoader(

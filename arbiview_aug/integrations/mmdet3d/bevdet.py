@@ -64,15 +64,15 @@ def retarget_img_inputs(
         SampleError: Another form, images that were normalised by other numbers.
         CalibrationError: A target with lenses.
     """
-    given = results["img_inputs"]
-    tensors = _checked(given)
+    inputs = results["img_inputs"]
+    tensors = _checked(inputs)
     infos = [results.get("curr"), *results.get("adjacent", ())]
     total = len(tensors[0])
     in_source = list(results.get("cam_names", [f"camera {k}" for k in range(total // len(infos))]))
     if not in_source or total % len(in_source):
         raise SampleError(f"img_inputs: expected {len(in_source)} images a frame, as 'cam_names' says, got {total}")
     count = total // len(in_source)
-    made: list[list[torch.Tensor]] = []
+    outputs: list[list[torch.Tensor]] = []
     outs: list[Mapping[str, Any]] = []
     changed = {key: value for key, value in results.items() if key not in STALE_KEYS}
     for t in range(count):
@@ -83,14 +83,14 @@ def retarget_img_inputs(
         entries, out, target, key2global = _retargeted(
             frame, retarget, in_source, boxes, names=names, ground_z_m=ground_z_m, mean_std=mean_std
         )
-        made.append(entries)
+        outputs.append(entries)
         outs.append(out)
         if isinstance(info, Mapping) and "cams" in info:
             infos[t] = {**info, "cams": _infos(target, key2global)}
-    images = torch.stack([entries[0] for entries in made], dim=1).flatten(0, 1)
-    rest = [torch.cat(of_frames) for of_frames in zip(*(entries[1:] for entries in made), strict=True)]
+    images = torch.stack([entries[0] for entries in outputs], dim=1).flatten(0, 1)
+    rest = [torch.cat(of_frames) for of_frames in zip(*(entries[1:] for entries in outputs), strict=True)]
     warn_of_dropped({key: value for key, value in results.items() if key != _PICTURES})
-    changed["img_inputs"] = type(given)([images, *rest, *given[6:]])
+    changed["img_inputs"] = type(inputs)([images, *rest, *inputs[6:]])
     if "cam_names" in results:
         changed["cam_names"] = list(target.names)
     changed |= {key: info for key, info in (("curr", infos[0]), ("adjacent", infos[1:])) if key in results}
@@ -120,7 +120,7 @@ def _retargeted(
     out = retarget({"images": torch.stack(views), "rig": source_rig(source, views, ground_z_m), **boxes})
     target = target_views(out, source, names)
     count = len(target.names)
-    made = [
+    outputs = [
         normalised(out["images"], mean_std).to(images.dtype),
         torch.from_numpy(target.cam2ego).to(sensor2egos),
         ego2globals[key].expand(count, -1, -1).clone(),
@@ -128,14 +128,14 @@ def _retargeted(
         torch.eye(3).to(post_rots).expand(count, -1, -1).clone(),
         torch.zeros(count, 3).to(post_trans),
     ]
-    return made, out, target, key2global
+    return outputs, out, target, key2global
 
 
-def _checked(given: Any) -> list[torch.Tensor]:
-    if not isinstance(given, list | tuple) or len(given) not in (6, 7):
-        got = len(given) if isinstance(given, list | tuple) else type(given).__name__
+def _checked(inputs: Any) -> list[torch.Tensor]:
+    if not isinstance(inputs, list | tuple) or len(inputs) not in (6, 7):
+        got = len(inputs) if isinstance(inputs, list | tuple) else type(inputs).__name__
         raise SampleError(f"img_inputs: expected {_FORM}, got {got} entries")
-    tensors = list(given[:6])
+    tensors = list(inputs[:6])
     count = len(tensors[0])
     shapes = [tuple(tensor.shape[1:]) for tensor in tensors]
     if shapes[1:] != [(4, 4), (4, 4), (3, 3), (3, 3), (3,)] or len(shapes[0]) != 3:

@@ -51,20 +51,20 @@ def _tensor(key: str, image: Any, norm: Norm | None) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(array)).permute(2, 0, 1)
 
 
-def like_given(given: Sequence[Any], images: torch.Tensor, norm: Norm | None = None) -> Any:
+def like_given(original: Sequence[Any], images: torch.Tensor, norm: Norm | None = None) -> Any:
     """Images (M, 3, h, w) uint8 as the given ones are: PIL, or arrays or tensors of their type, listed or stacked."""
-    first = given[0]
+    first = original[0]
     images = images if norm is None else normalised(images, norm)
     if isinstance(first, torch.Tensor):
         typed_tensors = images.to(first)
-        return typed_tensors if isinstance(given, torch.Tensor) else list(typed_tensors)
+        return typed_tensors if isinstance(original, torch.Tensor) else list(typed_tensors)
     arrays = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()) for image in images]
     if not isinstance(first, np.ndarray):
         from PIL import Image
 
         return [Image.fromarray(array) for array in arrays]
     typed = [array.astype(first.dtype, copy=False) for array in arrays]
-    return np.stack(typed) if isinstance(given, np.ndarray) else typed
+    return np.stack(typed) if isinstance(original, np.ndarray) else typed
 
 
 def norm_of(config: Any) -> Norm | None:

@@ -72,14 +72,14 @@ class Views:
         }[kind]
 
 
-def read_views(given: Mapping[str, Any], count: int, names: Sequence[str], lidar2ego: FloatArray) -> Views:
+def read_views(matrices: Mapping[str, Any], count: int, names: Sequence[str], lidar2ego: FloatArray) -> Views:
     """The cameras that a dict's matrices describe.
 
     ``cam2ego`` is not read: mmdet3d's is the mounting alone, 0.4 m beside what the image shows at 9 m/s; ``lidar2cam``
     has the motion between LiDAR and camera in it.
 
     Args:
-        given: Values of the keys of ``MATRICES``, each for all cameras.
+        matrices: Values of the keys of ``MATRICES``, each for all cameras.
         count: How many images there are.
         names: Of the cameras.
         lidar2ego: (4, 4).
@@ -89,8 +89,8 @@ def read_views(given: Mapping[str, Any], count: int, names: Sequence[str], lidar
     """
     of: dict[str, FloatArray] = {}
     for key, kind in MATRICES.items():
-        if key in given and kind not in of:
-            stack = stacked(key, given[key], count)
+        if key in matrices and kind not in of:
+            stack = stacked(key, matrices[key], count)
             of[kind] = stack.transpose(0, 2, 1) if is_transposed(stack) else stack
     if "cam2lidar" in of and "lidar2cam" not in of:
         of["lidar2cam"] = np.asarray(np.linalg.inv(of["cam2lidar"]), np.float64)
@@ -107,7 +107,7 @@ def read_views(given: Mapping[str, Any], count: int, names: Sequence[str], lidar
     else:
         raise SampleError(
             "results: expected the cameras' matrices, 'lidar2img' or 'cam2img' and 'lidar2cam' under one of "
-            f"their names ({', '.join(MATRICES)}), got {', '.join(given) or 'none'}"
+            f"their names ({', '.join(MATRICES)}), got {', '.join(matrices) or 'none'}"
         )
     if "K" not in of or "lidar2cam" not in of or np.any(of["K"][:, :3, 3]):  # P2 of KITTI: a place in its last column
         K, lidar2cam = decomposed(lidar2img)
@@ -168,20 +168,20 @@ def padded(matrices: FloatArray) -> FloatArray:
     return full
 
 
-def like_given(given: Any, matrices: FloatArray) -> Any:
+def like_given(original: Any, matrices: FloatArray) -> Any:
     """Matrices (n, 4, 4) as the given ones are: their container, their types, their shape."""
-    first = given[0]
+    first = original[0]
     rows, columns = np.shape(first)
     parts = matrices[:, :rows, :columns]
-    if isinstance(given, torch.Tensor | np.ndarray) or not isinstance(first, torch.Tensor | np.ndarray):
-        return like_array(given, parts)
-    return type(given)([like_array(first, part) for part in parts])
+    if isinstance(original, torch.Tensor | np.ndarray) or not isinstance(first, torch.Tensor | np.ndarray):
+        return like_array(original, parts)
+    return type(original)([like_array(first, part) for part in parts])
 
 
-def like_array(given: Any, values: Any) -> Any:
+def like_array(original: Any, values: Any) -> Any:
     """Numbers as the given ones are: a tensor or an array of their type, else a list or tuple."""
-    if isinstance(given, torch.Tensor):
-        return torch.tensor(np.asarray(values)).to(given)
-    if isinstance(given, np.ndarray):
-        return np.asarray(values).astype(given.dtype)
-    return type(given)(np.asarray(values).tolist())
+    if isinstance(original, torch.Tensor):
+        return torch.tensor(np.asarray(values)).to(original)
+    if isinstance(original, np.ndarray):
+        return np.asarray(values).astype(original.dtype)
+    return type(original)(np.asarray(values).tolist())

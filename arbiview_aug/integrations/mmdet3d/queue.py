@@ -73,21 +73,21 @@ def retarget_queue(results: Mapping[str, Any], retarget_frame: Callable[[Frame],
         frame = shared | {key: held[key][t] for key in sliced} | meta
         outs.append(retarget_frame(frame | (last if t == count - 1 else {})))
     warn_of_dropped(results)
-    made = {key: value for key, value in results.items() if key not in STALE_KEYS}
+    kept = {key: value for key, value in results.items() if key not in STALE_KEYS}
     for key in sliced:
         if key not in (*LABELS, "timestamp") and key in outs[0]:
-            made[key] = _put_back(results[key], _together(held[key], [out[key] for out in outs]))
+            kept[key] = _put_back(results[key], _together(held[key], [out[key] for out in outs]))
     if "img_metas" in held:
         written = [{key: out[key] for key in meta if key in out} for meta, out in zip(metas, outs, strict=True)]
-        given = held["img_metas"]
-        again = dict(zip(given, written, strict=True)) if isinstance(given, Mapping) else type(given)(written)
-        made["img_metas"] = _put_back(results["img_metas"], again)
-    return made | target_outputs(outs)
+        metas_in = held["img_metas"]
+        again = dict(zip(metas_in, written, strict=True)) if isinstance(metas_in, Mapping) else type(metas_in)(written)
+        kept["img_metas"] = _put_back(results["img_metas"], again)
+    return kept | target_outputs(outs)
 
 
-def _metas(given: Any, count: int) -> list[Frame]:
+def _metas(queued: Any, count: int) -> list[Frame]:
     """The ``img_metas`` of each frame: a list, or a dict by the frames' numbers."""
-    metas = list(given.values() if isinstance(given, Mapping) else given) or [{}] * count
+    metas = list(queued.values() if isinstance(queued, Mapping) else queued) or [{}] * count
     metas = [_content(meta) for meta in metas]
     if len(metas) != count or not all(isinstance(meta, Mapping) for meta in metas):
         raise SampleError(f"img_metas: expected a dict for each of the {count} frames of 'img', got {len(metas)}")
@@ -103,11 +103,11 @@ def _is_of_frames(key: str, value: Any, count: int) -> bool:
     return key == "img" or key in LABELS or (key in NUMBERS and (key == "timestamp" or np.ndim(value[0]) > 0))
 
 
-def _together(given: Any, values: Sequence[Any]) -> Any:
+def _together(original: Any, values: Sequence[Any]) -> Any:
     """The frames' values in the container that they came in."""
-    if isinstance(given, torch.Tensor):
+    if isinstance(original, torch.Tensor):
         return torch.stack([torch.as_tensor(value) for value in values])
-    return np.stack(values) if isinstance(given, np.ndarray) else type(given)(values)
+    return np.stack(values) if isinstance(original, np.ndarray) else type(original)(values)
 
 
 def _content(value: Any) -> Any:

@@ -96,37 +96,37 @@ def retarget_results(
         {"images": images, "rig": source_rig(source, images, ground_z_m), **geometry(results, source.lidar2ego)}
     )
     views = target_views(out, source, names)
-    made = {key: value for key, value in results.items() if key not in STALE_KEYS}
-    if isinstance(made.get("ann_info"), Mapping):
-        made["ann_info"] = {key: value for key, value in made["ann_info"].items() if key not in STALE_KEYS}
+    kept = {key: value for key, value in results.items() if key not in STALE_KEYS}
+    if isinstance(kept.get("ann_info"), Mapping):
+        kept["ann_info"] = {key: value for key, value in kept["ann_info"].items() if key not in STALE_KEYS}
     warn_of_dropped(results)
-    made["img"] = images_like(results["img"], out["images"], norm)
-    _write_matrices(made, views)
-    _write_intrinsics(made, views, out["images"])
+    kept["img"] = images_like(results["img"], out["images"], norm)
+    _write_matrices(kept, views)
+    _write_intrinsics(kept, views, out["images"])
     if isinstance(infos, Mapping):
-        made["images"] = _infos(infos, views, out["images"])
-    _write_sizes(made, out["images"])
+        kept["images"] = _infos(infos, views, out["images"])
+    _write_sizes(kept, out["images"])
     for key in FILE_KEYS:
-        if isinstance(made.get(key), list | tuple):
-            made[key] = list(views.names)
-    if np.ndim(made.get("img_timestamp", 0.0)) == 1:  # PETR's: all views are of the LiDAR's time
-        time_s = float(made.get("timestamp", np.mean(np.asarray(made["img_timestamp"]))))
-        made["img_timestamp"] = like_array(made["img_timestamp"], [time_s] * len(views.names))
-    if "num_views" in made:
-        made["num_views"] = len(views.names)
-    return made | target_outputs([out])
+        if isinstance(kept.get(key), list | tuple):
+            kept[key] = list(views.names)
+    if np.ndim(kept.get("img_timestamp", 0.0)) == 1:  # PETR's: all views are of the LiDAR's time
+        time_s = float(kept.get("timestamp", np.mean(np.asarray(kept["img_timestamp"]))))
+        kept["img_timestamp"] = like_array(kept["img_timestamp"], [time_s] * len(views.names))
+    if "num_views" in kept:
+        kept["num_views"] = len(views.names)
+    return kept | target_outputs([out])
 
 
 # --- source -----------------------------------------------------------------------------------------------------------
 def _given(results: Mapping[str, Any], count: int) -> dict[str, Any]:
     """The matrices of all cameras: at the top, else gathered from ``images``."""
-    found = {key: results[key] for key in MATRICES if results.get(key) is not None and _is_per_camera(results[key])}
+    matrices = {key: results[key] for key in MATRICES if results.get(key) is not None and _is_per_camera(results[key])}
     infos = results.get("images")
     if isinstance(infos, Mapping) and len(infos) == count:
         for key in MATRICES:
-            if key not in found and all(isinstance(info, Mapping) and key in info for info in infos.values()):
-                found[key] = [info[key] for info in infos.values()]
-    return found
+            if key not in matrices and all(isinstance(info, Mapping) and key in info for info in infos.values()):
+                matrices[key] = [info[key] for info in infos.values()]
+    return matrices
 
 
 def _is_per_camera(value: Any) -> bool:
@@ -140,7 +140,7 @@ def _names(infos: Any, count: int) -> list[str]:
     return [f"camera {k}" for k in range(count)]
 
 
-def _lidar2ego(results: Mapping[str, Any], given: Any) -> FloatArray:
+def _lidar2ego(results: Mapping[str, Any], matrix: Any) -> FloatArray:
     points = results.get("lidar_points")
     for holder in (points, results):
         if isinstance(holder, Mapping) and holder.get("lidar2ego") is not None:
@@ -150,12 +150,12 @@ def _lidar2ego(results: Mapping[str, Any], given: Any) -> FloatArray:
         lidar2ego = padded((rotation_from_quaternion(rotation) if rotation.shape == (4,) else rotation)[None])[0]
         lidar2ego[:3, 3] = results["lidar2ego_translation"]
         return lidar2ego
-    if given is None:
+    if matrix is None:
         raise SampleError(
             "lidar2ego: expected the LiDAR's pose (4, 4) in results['lidar_points'] or results['lidar2ego'], or "
             "'lidar2ego_rotation' and 'lidar2ego_translation', found none; pass lidar2ego= to the transform"
         )
-    return stacked("lidar2ego", [given], 1)[0]
+    return stacked("lidar2ego", [matrix], 1)[0]
 
 
 def _check_not_augmented(results: Mapping[str, Any]) -> None:
@@ -205,12 +205,12 @@ def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, tor
     Boxes are taken by their corners: what their numbers mean differs between mmdet3d's versions. Those of a plain array
     (Sparse4D) are gravity centre, length, width, height and yaw.
     """
-    found = {}
+    values = {}
     points = results.get("points")
     points = getattr(points, "tensor", points)
     if isinstance(points, torch.Tensor | np.ndarray) and points.ndim == 2:
         xyz = np.asarray(points[:, :3], np.float64)
-        found["points"] = torch.from_numpy(xyz @ lidar2ego[:3, :3].T + lidar2ego[:3, 3]).float()
+        values["points"] = torch.from_numpy(xyz @ lidar2ego[:3, :3].T + lidar2ego[:3, 3]).float()
     annotated = results.get("ann_info")
     boxes = results.get("gt_bboxes_3d", annotated.get("gt_bboxes_3d") if isinstance(annotated, Mapping) else None)
     corners = getattr(boxes, "corners", None)
@@ -219,15 +219,15 @@ def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, tor
         centres, yaw = boxes[:, :3] @ rotation.T + lidar2ego[:3, 3], boxes[:, 6]
         along = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1) @ rotation.T
         columns = [*centres.T, *boxes[:, 3:6].T, np.arctan2(along[:, 1], along[:, 0])]
-        found["boxes_3d"] = torch.from_numpy(np.stack(columns, axis=1)).float()
+        values["boxes_3d"] = torch.from_numpy(np.stack(columns, axis=1)).float()
     elif corners is not None:
         # Of both conventions: 1 is above 0, 3 beside it, 4 at the other end.
         x = np.asarray(corners, np.float64).reshape(-1, 8, 3) @ lidar2ego[:3, :3].T + lidar2ego[:3, 3]
         along, across, up = x[:, 4] - x[:, 0], x[:, 3] - x[:, 0], x[:, 1] - x[:, 0]
         sizes = [np.linalg.norm(side, axis=1) for side in (along, across, up)]
         columns = [*x.mean(axis=1).T, *sizes, np.arctan2(along[:, 1], along[:, 0])]
-        found["boxes_3d"] = torch.from_numpy(np.stack(columns, axis=1)).float()
-    return found
+        values["boxes_3d"] = torch.from_numpy(np.stack(columns, axis=1)).float()
+    return values
 
 
 # --- target -----------------------------------------------------------------------------------------------------------
@@ -268,38 +268,38 @@ def check_no_lenses(lenses: Sequence[str]) -> None:
 
 def target_outputs(outs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Coverage, and what else was asked for, as arrays (views, h, w); of several frames (frames, views, h, w)."""
-    found: dict[str, Any] = {}
+    outputs: dict[str, Any] = {}
     for key in TARGET_OUTPUTS:
         if key in outs[0]:
             values = [out[key].numpy() if isinstance(out[key], torch.Tensor) else out[key] for out in outs]
             is_map = len(values) > 1 and isinstance(values[0], np.ndarray)
-            found[key] = np.stack(values) if is_map else values[0]  # one draw for all frames
-    return found
+            outputs[key] = np.stack(values) if is_map else values[0]  # one draw for all frames
+    return outputs
 
 
-def _write_matrices(made: dict[str, Any], views: Views) -> None:
+def _write_matrices(out: dict[str, Any], views: Views) -> None:
     for key, kind in MATRICES.items():
-        if made.get(key) is None:
+        if out.get(key) is None:
             continue
-        if not _is_per_camera(made[key]):
-            del made[key]
+        if not _is_per_camera(out[key]):
+            del out[key]
             continue
-        made[key] = _as_written(made[key], views.matrices(kind))
+        out[key] = _as_written(out[key], views.matrices(kind))
 
 
-def _write_intrinsics(made: dict[str, Any], views: Views, images: torch.Tensor) -> None:
+def _write_intrinsics(out: dict[str, Any], views: Views, images: torch.Tensor) -> None:
     """Sparse4D's further ones: (w, h) of each image, and the geometric mean of its focal lengths."""
-    if "image_wh" in made:
-        made["image_wh"] = like_array(made["image_wh"], [images.shape[:-3:-1]] * len(images))
-    if "focal" in made:
-        made["focal"] = like_array(made["focal"], np.sqrt(np.abs(np.linalg.det(views.K[:, :2, :2]))))
+    if "image_wh" in out:
+        out["image_wh"] = like_array(out["image_wh"], [images.shape[:-3:-1]] * len(images))
+    if "focal" in out:
+        out["focal"] = like_array(out["focal"], np.sqrt(np.abs(np.linalg.det(views.K[:, :2, :2]))))
 
 
-def _as_written(given: Any, matrices: FloatArray) -> Any:
+def _as_written(original: Any, matrices: FloatArray) -> Any:
     """The matrices as the given ones are; transposed where they are."""
-    if np.shape(given[0]) == (4, 4) and is_transposed(np.stack([np.asarray(m, np.float64) for m in given])):
+    if np.shape(original[0]) == (4, 4) and is_transposed(np.stack([np.asarray(m, np.float64) for m in original])):
         matrices = matrices.transpose(0, 2, 1)
-    return like_given(given, matrices)
+    return like_given(original, matrices)
 
 
 def _infos(infos: Mapping[str, Any], views: Views, images: torch.Tensor) -> dict[str, Any]:
@@ -310,26 +310,26 @@ def _infos(infos: Mapping[str, Any], views: Views, images: torch.Tensor) -> dict
         for key, kind in MATRICES.items()
         if key in first and (kind != "cam2global" or views.ego2global is not None)
     }
-    made = {}
+    by_camera = {}
     for k, name in enumerate(views.names):
-        made[name] = {key: column[k] for key, column in columns.items()}
+        by_camera[name] = {key: column[k] for key, column in columns.items()}
         if "img_path" in first:
-            made[name]["img_path"] = name
+            by_camera[name]["img_path"] = name
         if "height" in first and "width" in first:
-            made[name] |= {"height": images.shape[-2], "width": images.shape[-1]}
-    return made
+            by_camera[name] |= {"height": images.shape[-2], "width": images.shape[-1]}
+    return by_camera
 
 
-def _write_sizes(made: dict[str, Any], images: torch.Tensor) -> None:
+def _write_sizes(out: dict[str, Any], images: torch.Tensor) -> None:
     """(h, w), (h, w, 3), (h, w, 3, views) as given; (w, h) where images are PIL's."""
     h, w = images.shape[-2:]
-    is_array = isinstance(made["img"][0], np.ndarray | torch.Tensor)
+    is_array = isinstance(out["img"][0], np.ndarray | torch.Tensor)
     full = (h, w, 3, len(images)) if is_array else (w, h)
     for key in SHAPE_KEYS:
-        if isinstance(made.get(key), tuple | list):
-            given = made[key]
-            one = given[0] if isinstance(given[0], tuple | list) else None
-            made[key] = full[: len(given)] if one is None else [full[: len(one)]] * len(images)
+        if isinstance(out.get(key), tuple | list):
+            original = out[key]
+            one = original[0] if isinstance(original[0], tuple | list) else None
+            out[key] = full[: len(original)] if one is None else [full[: len(one)]] * len(images)
 
 
 def warn_of_dropped(results: Mapping[str, Any]) -> None:
