@@ -55,6 +55,12 @@ def test_an_old_option_raises_an_error_that_gives_the_new_one(option: str) -> No
         arbiview_aug.RigRetarget("waymo", **{option: None})
 
 
+def test_other_calls_refuse_old_options_too() -> None:
+    for call in (arbiview_aug.check, arbiview_aug.datasets.WithDepth):
+        with pytest.raises(TypeError, match=r"'source_rig': since 0\.3 it is source"):
+            call([], source_rig=None, **({"folder": "."} if call is not arbiview_aug.check else {}))
+
+
 @pytest.mark.parametrize("name", renamed.NAMES)
 def test_an_old_name_raises_an_error_that_gives_the_new_one(name: str) -> None:
     module, _, old = f"arbiview_aug.{name}".rpartition(".")

@@ -14,6 +14,7 @@ from arbiview_aug.atomic_io import BROKEN_ARRAY, file_name, inside, whole_file
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.errors import DataError, SampleError
+from arbiview_aug.renamed import refuse_old_options
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY
 from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.scene.panorama import Layer
@@ -115,21 +116,22 @@ class WithDepth(Dataset[dict[str, Any]]):
     """A map-style dataset that adds the ``depth`` command's results to its samples.
 
     Depth from motion becomes ``motion_depth_m``, for ``RigRetarget(geometry="motion")``; learned depth becomes
-    ``learned_depth_m``, for ``geometry="learned"``. Samples need a ``token`` and a ``rig`` (or ``source_rig``).
+    ``learned_depth_m``, for ``geometry="learned"``. Samples need a ``token`` and a ``rig`` (or ``source``).
 
     Args:
         dataset: Map-style dataset of samples.
         folder: An output folder of the command, or the data set's root with ``motion_depth``, ``learned_depth`` or both
             in it.
-        source_rig: Rig of samples without one.
+        source: Rig of samples without one.
 
     Raises:
         DataError: On access, a file that is missing, broken or of another calibration.
         SampleError: On access, a sample without a token or rig.
     """
 
-    def __init__(self, dataset: Any, folder: str | Path, *, source_rig: Rig | None = None) -> None:
-        self.dataset, self.source_rig = dataset, source_rig
+    def __init__(self, dataset: Any, folder: str | Path, *, source: Rig | None = None, **unknown: Any) -> None:
+        refuse_old_options("WithDepth", unknown)
+        self.dataset, self.source = dataset, source
         below = [inside(Path(folder), name, "depth") for name in FOLDERS.values()]
         self.folders = [DepthFolder(one) for one in below if one.is_dir()] or [DepthFolder(folder)]
 
@@ -138,9 +140,9 @@ class WithDepth(Dataset[dict[str, Any]]):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         sample: Mapping[str, Any] = self.dataset[index]
-        rig, token = sample.get("rig", self.source_rig), sample.get("token")
+        rig, token = sample.get("rig", self.source), sample.get("token")
         if rig is None or token is None:
-            raise SampleError("sample: expected 'rig' and 'token', to find its depth by; pass source_rig=")
+            raise SampleError("sample: expected 'rig' and 'token', to find its depth by; pass source=")
         out = dict(sample)
         for folder in self.folders:
             depth = folder.read(str(token), rig)

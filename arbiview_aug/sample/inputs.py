@@ -105,12 +105,12 @@ class Frame:
         return str(value.tolist())
 
 
-def read_frames(sample: Any, source_rig: Rig | None) -> list[Frame]:
+def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
     """Read and check the frames of a sample, one for each element of its leading dimensions.
 
     Args:
         sample: The sample dict; see ``RigRetarget``.
-        source_rig: The rig of all samples, if the transform has one.
+        source: The rig of all samples, if the transform has one.
 
     Raises:
         SampleError: Missing calibration, mismatched counts or sizes, values out of range.
@@ -132,7 +132,7 @@ def read_frames(sample: Any, source_rig: Rig | None) -> list[Frame]:
     except ValueError as error:
         raise SampleError(f"images: {error}") from None
     return [
-        frame_from(checked_images(frame), sample, source_rig, lead, index)
+        frame_from(checked_images(frame), sample, source, lead, index)
         for frame, index in zip(frames, np.ndindex(*lead), strict=True)
     ]
 
@@ -222,14 +222,14 @@ def _depth_maps(key: str, frame: Frame) -> list[FloatArray]:
 def frame_from(
     images: tuple[torch.Tensor, ...],
     sample: Mapping[str, Any],
-    source_rig: Rig | None,
+    source: Rig | None,
     lead: tuple[int, ...] = (),
     index: tuple[int, ...] = (),
 ) -> Frame:
     """One frame of a sample, at an ``index`` into its leading dimensions, whose images are checked already."""
     rig = sample.get("rig")
     if rig is None:
-        rig = source_rig if source_rig is not None else _rig_from_tensors(images, sample, index)
+        rig = source if source is not None else _rig_from_tensors(images, sample, index)
     if not isinstance(rig, Rig):
         raise SampleTypeError(f"rig: expected an arbiview_aug.Rig, got {type(rig).__name__}; use load_rig(path)")
     if len(rig) > MAX_CAMERAS:

@@ -13,6 +13,7 @@ from arbiview_aug.cameras.key_names import misnamed
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_mounted, pose_mistake
+from arbiview_aug.renamed import refuse_old_options
 from arbiview_aug.sample.check import EGO_KEYS, PIXEL_BOUND_KEYS
 from arbiview_aug.sample.inputs import Frame, read_frames
 from arbiview_aug.sample.masks import CLEANING, image_circle, without_specks
@@ -82,7 +83,7 @@ class CheckReport:
         return "\n".join(map(str, self.findings)) or "no findings"
 
 
-def check(sample: Mapping[str, Any], source_rig: Rig | None = None) -> CheckReport:
+def check(sample: Mapping[str, Any], source: Rig | None = None, **unknown: Any) -> CheckReport:
     """Look for mistakes that rendering cannot notice.
 
     Points in boxes tell the reading of the boxes and the frame of the points; the road in the points tells
@@ -90,14 +91,15 @@ def check(sample: Mapping[str, Any], source_rig: Rig | None = None) -> CheckRepo
 
     Args:
         sample: A sample or batch as ``RigRetarget`` takes it.
-        source_rig: The rig of samples that carry none.
+        source: The rig of samples that carry none.
 
     Raises:
         ArbiviewError: What ``RigRetarget`` would refuse too.
     """
-    frames = read_frames(sample, source_rig)
+    refuse_old_options("check", unknown)
+    frames = read_frames(sample, source)
     boxes, points = (_arrays(sample, key, frames) for key in ("boxes_3d", "points"))
-    findings = list(_key_findings(sample, source_rig is not None or sample.get("rig") is not None))
+    findings = list(_key_findings(sample, source is not None or sample.get("rig") is not None))
     for frame, of_frame, cloud in zip(frames, boxes, points, strict=True):
         # Holes of an earlier retargeting are masks too, of any shape.
         own_masks = sample.get("coverage") is None and sample.get("ego_mask") is None

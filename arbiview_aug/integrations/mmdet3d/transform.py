@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError
+from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.cameras.random_rig import sequence_rng
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, retarget_img_inputs
 from arbiview_aug.integrations.mmdet3d.images import Norm
@@ -33,7 +33,7 @@ class RigRetargetMultiView:
             equal share one draw, in all workers of a DataLoader's epoch. By default that of a
             ``RandomRig(per="sequence")``; else each dict has a draw of its own.
         settings: Any of ``RigRetarget``'s: ``size``, ``geometry``, ``quality``, ``p``, ``match_exposure``,
-            ``holes``, ``keys``.
+            ``holes``, ``keys`` (a dict of ``SampleKeys``' values in a config file).
 
     Raises:
         CalibrationError: A target with lenses, or that cannot be loaded.
@@ -49,6 +49,8 @@ class RigRetargetMultiView:
         sequence_key: str | None = None,
         **settings: Any,
     ) -> None:
+        if isinstance(keys := settings.get("keys"), Mapping):
+            settings["keys"] = SampleKeys(**keys)
         self.retarget = RigRetarget(target, **settings)
         held = self.retarget.target
         rig = held.base if isinstance(held, RandomRig) else held

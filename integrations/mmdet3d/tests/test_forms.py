@@ -205,6 +205,10 @@ def test_skipped_frames_keep_their_cameras(given: Recording) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:retarget. drops")
+def test_keys_of_a_config_file() -> None:
+    assert RigRetargetMultiView(TARGET, keys={"labels": ["seg"]}).retarget.keys.labels == ("seg",)
+
+
 def test_messages(given: Recording) -> None:
     results = FORMS["DETR3D"](given)
     with pytest.raises(CalibrationError, match=r"pinhole cameras.*got radtan.*undistorted\(\)"):
