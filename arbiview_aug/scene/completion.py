@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 
 from arbiview_aug.cameras.kernels import angle_row
@@ -150,26 +149,6 @@ def seen_through(q: Any, rows: Any, columns: Any, most: Any, up: int, side: int,
         row, column = int(np.rint(rows[i])) - up, int(np.rint(columns[i])) - side
         known = most[row, column] if 0 <= row < h - height and 0 <= column < w - width else _ZERO
         contradicted[i] = known > _ZERO and _hidden_below(q[i]) > known
-
-
-def window_max(a: Any, rows: int, columns: int) -> Any:
-    """Largest of each cell of ``a`` (h, w) float32 and those up to so many rows and columns on."""
-    return cv2.dilate(a, np.ones((rows + 1, columns + 1), np.uint8), anchor=(0, 0))
-
-
-def complete(
-    cells: Any, own_q: Any, residuals: Any, reach: Any, support: Any, smooth: int, work: Any, layers: Any
-) -> None:
-    """Give every cell the residual of the nearest point, averaged on a step's nearer and on its farther side.
-
-    ``layers`` (4, h, w) becomes those of ``Panorama``; the points' flat cells, inverse distances, residuals are (n,).
-    ``reach``, ``support`` and ``smooth`` are those of ``Cells``, ``work`` (3, >= (h + 4) * (w + 4)) is scratch.
-    """
-    _, h, w = layers.shape
-    r, q = (plane[: h * w].reshape(h, w) for plane in work[:2])
-    code = work[2, : (h + 4) * (w + 4)].view(np.int32).reshape(h + 4, w + 4)
-    nearest_residuals(cells, own_q, residuals, reach, support, code, r, q, layers)
-    average_sides(r, q, *(window_max(a, 2 * smooth, 2 * smooth) for a in (r, -r)), smooth, layers)
 
 
 @compiled

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
@@ -184,7 +185,7 @@ class Panorama:
         memory: Memory = FRESH,
         mapped: int = 0,
     ) -> None:
-        from arbiview_aug.scene.completion import complete, drop_hidden, nearest_points, window_max
+        from arbiview_aug.scene.completion import average_sides, drop_hidden, nearest_points, nearest_residuals
 
         self.window, self._origin, self._street, self._place = window, origin, street, window.place
         shape, cells = window.shape, window.cells
@@ -197,13 +198,17 @@ class Panorama:
         # Windows differ by some rows from frame to frame: blocks of few sizes are found again.
         block = -(-(shape[0] + 4) * (shape[1] + 4) // _BLOCK) * _BLOCK
         self.layers = memory.empty((4 * block,), np.float32)[: 4 * q.size].reshape(4, *shape)
-        work = memory.empty((3, block), np.float32)
-        complete(cell, own_q, residual, cells.reach, cells.support, cells.smooth, work, self.layers)
+        r, q_near, code = memory.empty((3, block), np.float32)
+        r, q_near = (plane[: q.size].reshape(shape) for plane in (r, q_near))
+        code = code[: (shape[0] + 4) * (shape[1] + 4)].view(np.int32).reshape(shape[0] + 4, -1)
+        nearest_residuals(cell, own_q, residual, cells.reach, cells.support, code, r, q_near, self.layers)
+        high, low = (window_max(of, 2 * cells.smooth, 2 * cells.smooth) for of in (r, -r))
+        average_sides(r, q_near, high, low, cells.smooth, self.layers)
 
     @cached_property
     def hidden_below(self) -> Layer:
         """Points of a smaller inverse distance are hidden by what certainly stands there; 0 where it is silent."""
-        from arbiview_aug.scene.completion import hidden_depths, window_max
+        from arbiview_aug.scene.completion import hidden_depths
 
         rad, ends = self.window.cells.rad, (n + BASE_STEP for n in self.layers.shape[1:])
         rows, columns = (np.arange(0, end, BASE_STEP, dtype=np.float32) * np.float32(rad) for end in ends)
@@ -341,6 +346,11 @@ class PointCloudSurface(DenseSurface):
         return panorama
 
 
+def window_max(a: Layer, rows: int, columns: int) -> Layer:
+    """Largest of each cell of ``a`` (h, w) float32 and those up to so many rows and columns on."""
+    return np.asarray(cv2.dilate(a, np.ones((rows + 1, columns + 1), np.uint8), anchor=(0, 0)))
+
+
 def nodes_of(rays: PixelRays, apart: int) -> Layer:
     """Rays (3, ny + 1, nx + 1) of pixels so far apart, the last ones on the last pixels."""
     return rays.at(*(np.minimum(np.arange(0, n + apart, apart), n - 1) for n in rays.size))
@@ -409,7 +419,7 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
     contradicted = np.empty(len(others), bool)
     q = 1 / np.maximum(np.linalg.norm(rays[:, 0], axis=0), np.float32(NEAREST_M))
     up, side = AROUND_CELLS
-    most = completion.window_max(most, 2 * up, 2 * side)
+    most = window_max(most, 2 * up, 2 * side)
     completion.seen_through(q, rows[0], columns[0], most, up, side, contradicted)
     return contradicted
 
