@@ -204,11 +204,11 @@ def test_skipped_frames_keep_their_cameras(given: Recording) -> None:
     assert worst_error_px(after, SOURCE.resized(SIZE, "crop")) <= 1e-3
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_keys_of_a_config_file() -> None:
     assert RigRetargetMultiView(TARGET, keys={"labels": ["seg"]}).retarget.keys.labels == ("seg",)
 
 
+@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_messages(given: Recording) -> None:
     results = FORMS["DETR3D"](given)
     with pytest.raises(CalibrationError, match=r"pinhole cameras.*got radtan.*undistorted\(\)"):
