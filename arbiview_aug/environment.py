@@ -92,12 +92,12 @@ def compiled(function: Any) -> Any:
     Division by zero gives infinity, as in numpy. Operations keep their order, so results do not depend on the number of
     threads or processes; kinds of CPU may differ in the last bit.
     """
-    return _kernel(function, no_cfunc_wrapper=True)
+    return _kernel(function)
 
 
 def called(function: Any) -> Any:
     """Compile a function as ``compiled`` does, for other kernels alone: Python cannot call it."""
-    return _kernel(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+    return _kernel(function, no_cpython_wrapper=True)
 
 
 def inlined(function: Any) -> Any:
@@ -111,6 +111,7 @@ def _kernel(function: Any, **options: Any) -> Any:
     from numba import njit
 
     _compilation()
+    options["no_cfunc_wrapper"] = True  # C calls none
     kernel: Any = njit(error_model="numpy", nogil=True, **options)(function)
     with suppress(RuntimeError):  # no locator available: neither the package's folder nor the user's can be written
         kernel._cache = _kernel_cache()(function)

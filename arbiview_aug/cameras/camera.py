@@ -22,16 +22,14 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, Lens, LensName, intrinsics_for_fov
+from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, rotation_x, rotation_z
 from arbiview_aug.cameras.validation import (
-    CAMERA_AXES_IN_EGO,
     MAX_SIZE_PX,
     checked_array,
     checked_calibration,
     checked_numbers,
     checked_pixels,
     checked_size,
-    rotation_x,
-    rotation_z,
 )
 from arbiview_aug.errors import CalibrationError
 

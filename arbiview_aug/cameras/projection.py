@@ -1,4 +1,4 @@
-"""Projection of target rays into source images, in float64.
+"""Projection of target rays into source images, in float64; adjacent cameras and the view half-way between them.
 
 Directions lie plane by plane in memory, (3, ny, nx): three times faster.
 """

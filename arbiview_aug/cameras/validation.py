@@ -12,30 +12,8 @@ from typing import Any, cast
 import numpy as np
 
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, LensName, canonical_name
+from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, nearest_rotation
 from arbiview_aug.errors import CalibrationError, shown
-
-CAMERA_AXES_IN_EGO = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Columns: the resting camera's x (right), y (down) and z (forward) axes in the ego frame."""
-CAMERA_AXES_IN_EGO.setflags(write=False)
-
-
-def rotation_x(angle_deg: float) -> FloatArray:
-    """(3, 3) right-handed rotation about x."""
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-
-
-def rotation_z(angle_deg: float) -> FloatArray:
-    """(3, 3) right-handed rotation about z."""
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def nearest_rotation(R: FloatArray) -> FloatArray:
-    """The proper rotation closest to R in the Frobenius norm (orthogonal Procrustes)."""
-    U, _, Vt = np.linalg.svd(R)
-    return U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-
 
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R Rᵀ - I| accepted as a rotation: published calibrations carry 5 to 7 digits."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -13,8 +12,7 @@ from typing import Any, TypeVar
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
-from arbiview_aug.cli.convert.job import Done, Jobs
-from arbiview_aug.environment import one_thread, optional_package, working_s
+from arbiview_aug.environment import one_thread, working_s
 
 Result = TypeVar("Result")
 
@@ -73,36 +71,3 @@ def _end_with_parent(threads: object) -> None:
     if parent is not None:
         parent.join()
         os._exit(1)
-
-
-class Actor:
-    """Worker that holds all jobs and the transform; each call runs one job."""
-
-    def __init__(self, jobs: Jobs) -> None:
-        self.jobs = jobs
-        self._threads = one_thread()
-        self._threads.__enter__()
-        if optional_package("ray", "distributed").get_gpu_ids():
-            jobs.retarget.to("cuda")
-
-    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
-        return {"done": pickle.dumps(self.jobs[int(row["id"])])}  # Arrow's strings cannot hold every file's name
-
-
-def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str]) -> Iterator[Done]:
-    """As ``cli.parallel.results``, in any order, by actors of the cluster at ``RAY_ADDRESS``, or of this machine."""
-    ray = optional_package("ray", "distributed")
-    data = optional_package("ray.data", "distributed")
-    ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False)
-    data.DataContext.get_current().enable_progress_bars = False
-    gpus = float(ray.cluster_resources().get("GPU", 0)) if jobs.settings.holes == "diffusion" else 0.0
-    rows = data.range(len(jobs), override_num_blocks=max(1, min(len(jobs), 4 * workers)))
-    done = rows.map(
-        Actor,
-        fn_constructor_args=(jobs,),
-        compute=data.ActorPoolStrategy(size=workers),
-        num_cpus=1,
-        num_gpus=min(1.0, gpus / workers),
-    )
-    results_of_rows: Iterator[Done] = (pickle.loads(row["done"]) for row in done.iter_rows())
-    yield from with_progress(results_of_rows, len(jobs), label, note)

@@ -1,4 +1,4 @@
-"""Frame folders: one folder a frame, with calibration, images, and optional points, boxes and masks."""
+"""Frame folders, read and written: each frame with calibration, images, and optional points, boxes and masks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The protocol of all that fills pixels of rendered views that no source shows."""
+"""The protocol of all that fills pixels of rendered views that no source shows, and of loaders' batches."""
 
 from __future__ import annotations
 

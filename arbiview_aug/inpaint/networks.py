@@ -81,9 +81,9 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         # The network sees narrow holes inpainted, and they stay so.
         pixels = [telea(v, hole).float().cpu().numpy() / top for v, hole, top in zip(views, holes, tops, strict=True)]
         left = [_wide(hole.cpu().numpy()) for hole in holes]
-        for window in windows(left, self.size):
+        for together in windows(left, self.size):
             alike: dict[tuple[int, int], list[Canvas]] = defaultdict(list)
-            for canvas in packed(window, self.size, self.multiple):
+            for canvas in packed(together, self.size, self.multiple):
                 alike[canvas.size].append(canvas)
             for canvases in alike.values():
                 for start in range(0, len(canvases), self.batch):

@@ -1,4 +1,7 @@
-"""The views of one frame: every renderer returns a ``RenderedFrame``, every filler of holes takes and returns one."""
+"""The views of one frame, and their label maps.
+
+Every renderer returns a ``RenderedFrame``, every filler of holes takes and returns one.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Weights of the sources of a view, from calibration and geometry alone (paper, FAVS Stage 4)."""
+"""Weights of the sources of a view, from calibration and geometry alone (paper, FAVS Stage 4), and blended seams.
+
+A seam blends each source over its weight around the area that it wins, and over the bands that a second source adds to.
+"""
 
 from __future__ import annotations
 

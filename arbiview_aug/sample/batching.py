@@ -1,4 +1,4 @@
-"""Splitting, stacking and wrapping of per-camera tensors, with and without leading batch dimensions."""
+"""Splitting, stacking and wrapping of per-camera tensors, with and without batch dimensions; checks of images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Static surfaces: infinity, the ground with a round wall, and the street."""
+"""Static surfaces: infinity, the ground with a round wall, the street, and these corrected by overlapping cameras."""
 
 from __future__ import annotations
 
@@ -212,7 +212,11 @@ class Correction:
 
 @dataclass(frozen=True)
 class CorrectedSurface(StaticSurface):
-    """A static surface ``base`` with the corrections found over it; where several apply, their weighted mean."""
+    """A static surface ``base`` with the corrections found over it; where several apply, their weighted mean.
+
+    A correction maps the pixels of a view between two cameras to relative changes of inverse distance. The point that a
+    ray meets is projected into these views, and the change found there is applied along the ray.
+    """
 
     base: StaticSurface
     corrections: tuple[Correction, ...]

@@ -1,4 +1,4 @@
-"""Release checks of times, rates and memory against stated bounds (docs/contributing.md); fixtures are the tests'."""
+"""Studies, and release checks of times, memory and accuracy (docs/contributing.md); fixtures are the tests'."""
 
 from tests.conftest import (  # noqa: F401
     data_root,

@@ -35,7 +35,7 @@ _FORMAT = 1
 NEIGHBOURS = Neighbours()
 """One frame before and one after, 1.2 m away."""
 
-_COMPLETING = ("arbiview_aug.generator", "arbiview_aug.generator.inpainter", "arbiview_aug.inpaint.inpainter")
+_COMPLETING = ("arbiview_aug.generator", "arbiview_aug.generator.inpainter")
 _UNUSED: dict[str, tuple[str, ...]] = {
     "black": (*_COMPLETING, "arbiview_aug.inpaint.continued"),
     "fill": _COMPLETING,

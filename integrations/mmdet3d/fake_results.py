@@ -11,7 +11,7 @@ import torch
 
 from arbiview_aug import Rig
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.validation import rotation_z
+from arbiview_aug.cameras.rotations import rotation_z
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.validation import MAX_SIZE_PX, nearest_rotation
+from arbiview_aug.cameras.rotations import nearest_rotation
+from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.errors import ArbiviewError, CalibrationError
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cameras.validation import rotation_z
+from arbiview_aug.cameras.rotations import rotation_z
 from tests import helpers
 
 K = np.array([[100.0, 0, 90], [0, 120.0, 55], [0, 0, 1]])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from arbiview_aug import Camera, RenderConfig, Rig, load_rig
 from arbiview_aug.cameras.camera import UNPROJECT_TOLERANCE_PX
-from arbiview_aug.cameras.validation import rotation_x, rotation_z
+from arbiview_aug.cameras.rotations import rotation_x, rotation_z
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.plan import RenderPlan, build_plan
 from arbiview_aug.render.torch_backend import render_torch

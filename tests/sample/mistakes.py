@@ -12,7 +12,7 @@ import torch
 
 from arbiview_aug import Camera, Rig
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.validation import CAMERA_AXES_IN_EGO, rotation_z
+from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, rotation_z
 
 Sample = dict[str, Any]
 BODY = np.eye(4)

@@ -1,4 +1,8 @@
-"""The runner that the benchmarks share: scores and times of a list of ``Method``, and recommendations."""
+"""The runner that the benchmarks share: scores and times of a list of ``Method``, and recommendations.
+
+The clock is the process's CPU time over all of its threads, which leaves out waiting on a busy machine. Each round runs
+every candidate in turn, once unmeasured to warm its caches and once measured, so that other load slows all alike.
+"""
 
 from __future__ import annotations
 

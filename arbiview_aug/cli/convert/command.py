@@ -1,4 +1,7 @@
-"""``python -m arbiview_aug convert``: a data set as another vehicle's cameras would have recorded it."""
+"""``python -m arbiview_aug convert``: a data set as another vehicle's cameras would have recorded it.
+
+``--verify`` compares sources and outputs with the checksums that the conversion recorded.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +19,10 @@ from arbiview_aug.atomic_io import checksum, inside, remove_parts
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, State, checksum_once
+from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.report import write_report
 from arbiview_aug.cli.convert.settings import FOLDER, RETARGET_OPTIONS, Settings, check_output
-from arbiview_aug.cli.parallel import ray_results, results
+from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import split_kind

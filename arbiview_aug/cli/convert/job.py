@@ -1,4 +1,4 @@
-"""Conversion of one sample: read, retarget, write, record; the same for every runner."""
+"""Conversion of one sample: read, retarget, write images and masks, record; the same for every runner."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""nuScenes rows of a converted root: remaining rows of the source, and rows of the new cameras."""
+"""nuScenes rows of a converted root: remaining rows of the source, rows of the new cameras, visible shares of boxes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Objects built from primitives: vehicles, people, trees, lamp posts, signs, buildings.
+"""Objects built from primitives: vehicles, two-wheelers, people, trees, lamp posts, signs, buildings.
 
 Every labelled object touches all six sides of its 3D box.
 """

@@ -1,4 +1,4 @@
-"""Contact sheets and overlays, as (h, w, 3) uint8 RGB."""
+"""Contact sheets, also of a whole retargeted frame, and overlays, as (h, w, 3) uint8 RGB."""
 
 from __future__ import annotations
 

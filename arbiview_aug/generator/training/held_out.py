@@ -1,4 +1,4 @@
-"""Scores on held-out frames: filled target views against Telea's inpainting, inside the holes.
+"""Samples of training items; scores of filled target views on held-out frames against Telea's, inside the holes.
 
 Streets are scored by their true pixels, real frames by LiDAR points.
 """

@@ -23,11 +23,10 @@ from torch.utils.data import DataLoader
 
 from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli import parallel
-from arbiview_aug.cli.convert import job
+from arbiview_aug.cli.convert import job, ray_runner
 from arbiview_aug.cli.convert.job import Jobs
+from arbiview_aug.cli.convert.ray_runner import Actor
 from arbiview_aug.cli.convert.settings import Settings
-from arbiview_aug.cli.parallel import Actor
 from arbiview_aug.datasets import FrameFolder, NuScenesDataset, RetargetedDataset
 from arbiview_aug.errors import DataError
 from tests.cli.convert.drives import command, tree, write_frames, write_nuscenes
@@ -350,7 +349,7 @@ def test_errors_that_nobody_expects_in_ray_actors(frames: Home, monkeypatch: pyt
 
     asked = Settings(root=frames.source, target=load_rig("argoverse2"), output=frames.output, size=(24, 40))
     monkeypatch.setattr(FrameFolder, "__getitem__", broken)
-    monkeypatch.setattr(parallel, "optional_package", lambda *_: SimpleNamespace(get_gpu_ids=list))
+    monkeypatch.setattr(ray_runner, "optional_package", lambda *_: SimpleNamespace(get_gpu_ids=list))
     row = Actor(Jobs(asked, asked.open(), range(3), "skip"))({"id": 1})
     done = pickle.loads(row["done"])
     assert (done.token, done.state, done.messages) == ("0001", "skipped", ("ZeroDivisionError: of \ud800",))
