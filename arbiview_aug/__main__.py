@@ -6,10 +6,10 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from arbiview_aug.choices import FLAGS
 from arbiview_aug.cli import parsers
 from arbiview_aug.environment import imported, installed_version, warn_about_cv2_wheels
 from arbiview_aug.errors import exit_status
-from arbiview_aug.renamed import FLAGS
 
 
 class Command(NamedTuple):

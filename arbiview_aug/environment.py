@@ -17,8 +17,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+from arbiview_aug.choices import removed_name
 from arbiview_aug.errors import MissingPackageError, warn
-from arbiview_aug.renamed import removed_name
 
 _CV2_WHEELS = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
 

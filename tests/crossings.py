@@ -19,17 +19,17 @@ from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.sample.inputs import LEARNED_KEY
-from arbiview_aug.scene.depth_maps import motion_camera
+from arbiview_aug.scene.scene import motion_camera
 
 PACKAGE = str(Path(arbiview_aug.__file__).parent)
 BOUNDS = {
-    "street, plan cached": (17, 47),
-    "LiDAR + boxes": (32, 600),
-    "learned depth": (34, 600),
-    "generated": (31, 1500),
-    "neighbours, all": (43, 2500),
-    "motion": (49, 2550),
-    "paper": (19, 160),
+    "street, plan cached": (15, 47),
+    "LiDAR + boxes": (25, 600),
+    "learned depth": (26, 600),
+    "generated": (29, 1500),
+    "neighbours, all": (32, 2500),
+    "motion": (36, 2500),
+    "paper": (17, 160),
 }
 """Most files and crossings that a call may have."""
 

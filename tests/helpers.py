@@ -24,7 +24,7 @@ from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_r
 from arbiview_aug.evaluate.lidar import ColouredPoints, equalised, sparse_metrics
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.image_ops import at_level
-from arbiview_aug.render.atlas import Slot
+from arbiview_aug.render.plan import Slot
 
 
 def camera(

@@ -19,7 +19,7 @@ import arbiview_aug
 from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import shipped_rigs
-from arbiview_aug.choices import GeometryName
+from arbiview_aug.choices import GeometryName, Quality
 from arbiview_aug.cli.bench import pareto
 from arbiview_aug.datasets import registry
 from arbiview_aug.evaluate import paper_study
@@ -27,7 +27,6 @@ from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import study_methods
 from arbiview_aug.evaluate.paper_study import REAL_FRAMES, SETS, SYNTHETIC, Study, paper_report
 from arbiview_aug.generator.training import command as train_command
-from arbiview_aug.render.config import Quality
 from arbiview_aug.render.requirements import HELPFUL_DATA
 from integrations.benchmarks import generator
 from integrations.benchmarks.ablation import NOTES, ROWS, STEPS, markdown

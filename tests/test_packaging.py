@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import arbiview_aug
-from arbiview_aug import renamed
+from arbiview_aug import choices
 
 ROOT = Path(__file__).parents[1]
 PUBLIC = {
@@ -43,14 +43,14 @@ def test_one_version_everywhere() -> None:
 def test_the_changelog_lists_what_old_names_became() -> None:
     (table,) = re.findall(r"### Moving from 0.2\n(.*?)\n#", (ROOT / "CHANGELOG.md").read_text(), re.DOTALL)
     rows = dict(re.findall(r"^\| (?:the key |the setting )?`(.+?)` \| `(.+?)` \|$", table, re.MULTILINE))
-    values = {f'{option}="{old}"': f'{option}="{new}"' for (option, old), new in renamed.VALUES.items()}
-    assert rows == renamed.OPTIONS | values | renamed.KEYS | renamed.NAMES | renamed.FLAGS | renamed.SETTINGS
+    values = {f'{option}="{old}"': f'{option}="{new}"' for (option, old), new in choices.VALUES.items()}
+    assert rows == choices.OPTIONS | values | choices.KEYS | choices.NAMES | choices.FLAGS | choices.SETTINGS
 
 
-@pytest.mark.parametrize("option", renamed.OPTIONS)
+@pytest.mark.parametrize("option", choices.OPTIONS)
 def test_an_old_option_raises_an_error_that_gives_the_new_one(option: str) -> None:
     with pytest.raises(
-        TypeError, match=re.escape(f"RigRetarget: {option!r}: since 0.3 it is {renamed.OPTIONS[option]}")
+        TypeError, match=re.escape(f"RigRetarget: {option!r}: since 0.3 it is {choices.OPTIONS[option]}")
     ):
         arbiview_aug.RigRetarget("waymo", **{option: None})
 
@@ -61,10 +61,10 @@ def test_other_calls_refuse_old_options_too() -> None:
             call([], source_rig=None, **({"folder": "."} if call is not arbiview_aug.check else {}))
 
 
-@pytest.mark.parametrize("name", renamed.NAMES)
+@pytest.mark.parametrize("name", choices.NAMES)
 def test_an_old_name_raises_an_error_that_gives_the_new_one(name: str) -> None:
     module, _, old = f"arbiview_aug.{name}".rpartition(".")
-    with pytest.raises(AttributeError, match=re.escape(renamed.NAMES[name])):
+    with pytest.raises(AttributeError, match=re.escape(choices.NAMES[name])):
         getattr(import_module(module), old)
 
 

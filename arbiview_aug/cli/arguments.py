@@ -15,11 +15,9 @@ from typing import TYPE_CHECKING, Any, NoReturn, get_args
 from tqdm import tqdm
 
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import GeometryName, Holes, Reduce
+from arbiview_aug.choices import FLAGS, GeometryName, Holes, Quality, Reduce
 from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
 from arbiview_aug.errors import DataError
-from arbiview_aug.renamed import FLAGS
-from arbiview_aug.render.config import Quality
 
 if TYPE_CHECKING:
     import torch

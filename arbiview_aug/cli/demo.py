@@ -10,7 +10,7 @@ from timeit import timeit
 
 import cv2
 
-from arbiview_aug.choices import GeometryName, Holes
+from arbiview_aug.choices import GeometryName, Holes, Quality
 from arbiview_aug.cli.arguments import gathered_warnings, writable_folder
 from arbiview_aug.cli.evaluate import frames_text, measured, open_frames
 from arbiview_aug.environment import working_s
@@ -18,7 +18,6 @@ from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting, views_of
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
-from arbiview_aug.render.config import Quality
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 PICTURE_FILE = "demo.png"

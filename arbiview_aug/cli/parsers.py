@@ -10,7 +10,7 @@ from typing import get_args
 from arbiview_aug.atomic_io import Link
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, GeometryName, OnError, Reduce, Reference
+from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, GeometryName, OnError, Quality, Reduce, Reference
 from arbiview_aug.cli.arguments import (
     add_data,
     add_downscale,
@@ -28,7 +28,6 @@ from arbiview_aug.cli.arguments import (
     size,
 )
 from arbiview_aug.datasets.registry import READERS
-from arbiview_aug.render.config import Quality
 
 SIZE, FULL_SIZE = (256, 704), (900, 1600)
 """Sizes (h, w) of the views that benchmarks render."""

@@ -12,12 +12,12 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import BROKEN_ARRAY, file_name, inside, whole_file
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.errors import DataError, SampleError
-from arbiview_aug.renamed import refuse_old_options
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY
-from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.scene.scene import motion_camera
 from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import BEST_TRAVEL_M, MotionDepth
 

@@ -17,14 +17,14 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
-from arbiview_aug.cameras.projection import TILE_PX, VIEW_SIZE, adjacent_pairs, half_way_view, odd_tiles
+from arbiview_aug.cameras.rays import TILE_PX, VIEW_SIZE, adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import UnreachableError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.metrics import psnr_db
-from arbiview_aug.render.opencv_backend import render_opencv
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.rendered import render_opencv
+from arbiview_aug.render.view_planner import build_plan
 
 MIN_PIXELS = 500  # least number of pixels to fit and to test
 

@@ -15,8 +15,8 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors, to_bytes
-from arbiview_aug.render.opencv_backend import render_opencv
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.rendered import render_opencv
+from arbiview_aug.render.view_planner import build_plan
 
 Renderer = Callable[[Rig, Sequence[Image], Rig], list[RenderedView]]  # source rig, its images, target rig to views
 SPLIT_DEPTH_M = 50.0  # depth above the horizon row in ``row_split``, from UniDrive

@@ -9,15 +9,15 @@ from functools import lru_cache
 from typing import Any
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import GeometryName, Holes
+from arbiview_aug.choices import GeometryName, Holes, Quality
 from arbiview_aug.evaluate.baselines import BASELINES, Renderer
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.generator.generator import has_shipped
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
-from arbiview_aug.render.config import Quality, RenderConfig
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
+from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.transforms.plan_cache import PlanCache
@@ -127,7 +127,7 @@ def _overlap_estimates(
     scene = read_scene(read_frames(sample, None)[0], surface) or Scene()
     row = GEOMETRIES[scene.best if surface == "auto" else surface]
     boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
-    return overlap_depth(rig, images, boxes), gains  # as ``transforms.estimate_depth`` measures it
+    return overlap_depth(rig, images, boxes), gains  # as ``estimate_overlap`` measures it
 
 
 def one_camera(sample: Sample, camera: int) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from numbers import Real
 
-from arbiview_aug.render.config import check_ranges
+from arbiview_aug.render.plan import check_ranges
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,11 +11,11 @@ Needs diffusers and safetensors, imported where they are used: ``pip install arb
 
 from typing import Any
 
+from arbiview_aug.choices import removed_name
 from arbiview_aug.generator.completion import Completed
 from arbiview_aug.generator.config import GeneratorConfig, compact, inpaint, paper, small, tiny
 from arbiview_aug.generator.generator import Generator
 from arbiview_aug.generator.inpainter import Diffusion, load_inpainter
-from arbiview_aug.renamed import removed_name
 
 __all__ = [
     "Completed",

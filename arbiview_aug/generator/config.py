@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
+from arbiview_aug.choices import setting_hint
 from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
 from arbiview_aug.generator.correspondence import FACING_M
-from arbiview_aug.renamed import setting_hint
 
 _MOST_LEVELS, _MOST_LAYERS, _MOST_CHANNELS, _MOST_PIXELS = 8, 16, 8192, 8192
 

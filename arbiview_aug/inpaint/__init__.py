@@ -2,7 +2,7 @@
 
 - ``continued``: the default, the background continued behind objects, and the mean colour;
 - ``telea``: Telea's fast marching; ``networks``, ``crops``: inpainting networks that others trained;
-- ``neighbours``, ``merge``: other frames of the drive, which fill before any of these;
+- ``neighbours``: other frames of the drive, which fill before any of these;
 - ``inpainter``: the protocol, and filling after collating.
 
 The diffusion generator's inpainter is ``arbiview_aug.generator.Diffusion``.

@@ -12,8 +12,8 @@ import torch
 
 from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.inpaint.telea import GREY
+from arbiview_aug.render.plan import BACKGROUND, OBJECT, Paint
 from arbiview_aug.render.rendered import RenderedFrame
-from arbiview_aug.render.view_plan import BACKGROUND, OBJECT, Paint
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import Frame
 

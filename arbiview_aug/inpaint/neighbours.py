@@ -2,8 +2,13 @@
 
 Pixels that the current frame sees never change. By default only the near road is filled; its distances come from the
 current frame's surface. A neighbour's pixel is rejected where a labelled object hides the point from its camera, in
-either frame. Unlabelled scenes, and places beside moved objects, need the agreement of several frames
-(``arbiview_aug.inpaint.merge``).
+either frame. Unlabelled scenes, and places beside moved objects, need the agreement of several frames.
+
+The frames' views of one hole are merged: the sharpest static one is taken at each pixel, at the view's exposure. A
+candidate is accepted by the votes of the others, as far as the labels require (``ChangeRisk``). ``NONE``: half of the
+others agree. ``SHADED``: all others agree. ``BESIDE``: the same, and one confirms it. ``UNLABELLED``: the nearest
+frames before and after the current one agree with it; where all frames lie on one side, at least three agree, or none
+of at most two contradicts; and the current frame shows no newly arrived object beside the hole.
 """
 
 from __future__ import annotations
@@ -11,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 from typing import Any, Literal, NamedTuple
 
 import cv2
@@ -23,18 +29,13 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CameraMaps, PixelRays
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.image_ops import FRESH, Memory
-from arbiview_aug.inpaint.merge import Candidate, merged
-from arbiview_aug.render.config import RenderConfig
-from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
-from arbiview_aug.render.view_plan import ViewPlan
-from arbiview_aug.sample.neighbours import Neighbour, Warn, neighbour_images
-from arbiview_aug.scene.boxes import BoxSurface
+from arbiview_aug.render.view_planner import build_plan
+from arbiview_aug.sample.neighbours import BOX_MARGIN_M, ChangeRisk, Neighbour, Warn, change_risks, neighbour_images
+from arbiview_aug.scene.boxes import BoxSurface, whole
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.shapes import whole
-from arbiview_aug.scene.static import Street
-from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Surface
-from arbiview_aug.temporal.change import BOX_MARGIN_M, ChangeRisk, change_risks
+from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Street, Surface
 
 Reach = Literal["road", "all"]
 """Area that neighbours may fill: the near road, or everything that the surface covers."""
@@ -312,3 +313,220 @@ def _write(maps: Maps | None, hole: Hole, where: BoolArray, value: Any) -> None:
         place = maps[hole.target][hole.box]
         values = torch.from_numpy(np.broadcast_to(value, where.shape).copy()).to(place)
         place.copy_(torch.where(torch.from_numpy(where).to(place.device), values, place))
+
+
+_AGREEMENT_LEVELS = 16.0
+"""Largest difference of two frames that agree, in grey levels over 5 x 5 pixels."""
+
+_CONTRADICTION_LEVELS = 24.0
+"""The same between a frame and the current one, on a seam (``docs/drives.md``, Constants)."""
+
+_CONTRADICTION_REACH = 1.25
+"""A contradiction on the seam reaches to where agreement is nearer by this factor (``docs/drives.md``, Constants)."""
+
+_FEW_CANDIDATES = 2
+"""With at most this many candidates, accept one without a confirming vote."""
+
+_MIN_SEAM_PX = 20
+"""Fewest common pixels for an exposure."""
+
+_MAX_LOG_GAIN, _MAX_LOG_TINT = 1.3, 0.25
+"""Largest logarithm of the gain between two cameras (real rigs: log 3.5), and of its spread over the channels."""
+
+_SEAM_INLIERS, _OVERLAP_INLIERS = 0.5, 0.7
+"""Share of pixels that must agree after the gain: more between two neighbours, which may both show passing traffic."""
+
+_DARK_LEVELS = 4.0
+"""Offset added to colours before taking their ratio."""
+
+_MEAN_WEIGHT = 0.02
+"""Weight of the seam's mean offset beside the local one; far from the seam it stands alone."""
+
+
+Levels = npt.NDArray[np.float32]
+"""An image (3, h, w) in grey levels."""
+
+
+class Candidate(NamedTuple):
+    """The part of a hole that one neighbour shows.
+
+    Attributes:
+        shows: (h, w) bool, the free and seam pixels that it shows.
+        blur: (h, w) uint8, how much coarser it shows them, in half octaves; 0 for as sharp as the target.
+        risk: (h, w) uint8 ``ChangeRisk``.
+        later: Whether it was recorded after the current frame.
+        image: (3, h, w) of the view's type, once it is rendered.
+    """
+
+    shows: BoolArray
+    blur: npt.NDArray[np.uint8]
+    risk: npt.NDArray[np.uint8]
+    later: bool
+    image: torch.Tensor = torch.empty(0)
+
+
+def merged(
+    view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
+) -> tuple[torch.Tensor, npt.NDArray[np.int16]]:
+    """Fill the free pixels of a view by the sharpest accepted candidate, at the view's exposure.
+
+    Args:
+        view: (3, h, w) uint8, or float in [0, 1]; gradients reach the pixels that it keeps.
+        free: (h, w) bool, True where the view may be filled.
+        seam: (h, w) bool, True where view and candidates should agree.
+        candidates: The nearest first.
+        margin_px: Width of the seam.
+
+    Returns:
+        (3, h, w) filled view, and (h, w) int16 index of the candidate taken, -1 for none.
+    """
+    levels = 1.0 if view.dtype == torch.uint8 else 255.0
+    current, images = _levels(view, levels), [_levels(one.image, levels) for one in candidates]
+    _tone(current, images, free, seam, candidates, margin_px)
+    shown = np.stack([one.shows & free for one in candidates])
+    accepted = shown & _accepted(current, images, shown, seam, candidates)
+    # The order breaks ties.
+    rank, chosen = np.full(free.shape, 256 * len(candidates), np.uint16), np.full(free.shape, -1, np.int16)
+    for k, one in enumerate(candidates):
+        key = one.blur * np.uint16(len(candidates)) + np.uint16(k)
+        better = accepted[k] & (key < rank)
+        np.copyto(rank, key, where=better)
+        np.copyto(chosen, np.int16(k), where=better)
+        np.copyto(current, images[k], where=better)
+    filled = np.clip(np.rint(current) if levels == 1 else current / np.float32(levels), 0, 255 / levels)
+    where = torch.from_numpy(chosen >= 0).to(view.device)
+    return torch.where(where, torch.from_numpy(filled).to(view), view), chosen
+
+
+def _levels(image: torch.Tensor, levels: float) -> Levels:
+    grey = image.detach().cpu().to(torch.float32, memory_format=torch.contiguous_format, copy=True)
+    return np.asarray(grey.mul_(levels).numpy())
+
+
+# --- votes ------------------------------------------------------------------------------------------------------------
+def _accepted(
+    current: Levels, toned: Sequence[Levels], shown: BoolArray, seam: BoolArray, candidates: Sequence[Candidate]
+) -> BoolArray:
+    """(n, h, w) whether each candidate shows what stands there now."""
+    votes, nearest = np.zeros(shown.shape, np.uint8), np.full((2, *seam.shape), -1, np.int16)
+    for k, one in enumerate(candidates):
+        side = nearest[int(one.later)]
+        np.copyto(side, np.int16(k), where=shown[k] & (side < 0))
+    static = shown.copy()  # as far as the nearest frames before and after the current one agree
+    for pair in combinations(range(len(candidates)), 2):
+        both = shown[pair[0]] & shown[pair[1]]
+        agree = _agreeing(toned[pair[0]], toned[pair[1]], both, _AGREEMENT_LEVELS)
+        for i, j in (pair, pair[::-1]):
+            votes[i] += agree
+            static[i] &= ~both | agree | (nearest[int(candidates[j].later)] != j)
+    others = shown.sum(axis=0, dtype=np.uint8) - np.uint8(1)
+    risk, few = np.stack([one.risk for one in candidates]), len(candidates) <= _FEW_CANDIDATES
+    unanimous = votes == others
+    accepted = unanimous | ((risk < ChangeRisk.SHADED) & (2 * votes >= others))
+    accepted &= (risk < ChangeRisk.BESIDE) | (votes >= (0 if few else 1))
+    unlabelled = risk == ChangeRisk.UNLABELLED
+    if unlabelled.any():
+        on_both_sides = (nearest[0] >= 0) & (nearest[1] >= 0)
+        static = (static & on_both_sides) | (unanimous & (votes >= (0 if few else 2)) & ~on_both_sides)
+        if len(candidates) > 1:  # a single candidate may itself show the moving object
+            static &= ~_arrived(current, toned, seam, candidates)
+        accepted = (static & unlabelled) | (accepted & ~unlabelled)
+    return np.asarray(accepted)
+
+
+def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate]) -> BoolArray:
+    """(h, w) where a hole continues what the current frame alone shows on the seam."""
+    known, agree = np.zeros_like(seam), np.zeros_like(seam)
+    for image, one in zip(toned, candidates, strict=True):
+        both = seam & one.shows
+        known |= both
+        agree |= _agreeing(image, current, both, _CONTRADICTION_LEVELS)
+    contradicts = known & ~agree
+    if not contradicts.any():
+        return contradicts
+    away, near = (
+        np.asarray(cv2.distanceTransform((~places).view(np.uint8), cv2.DIST_L2, 5)) for places in (contradicts, agree)
+    )
+    return np.asarray(away / _CONTRADICTION_REACH < near)
+
+
+def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float) -> BoolArray:
+    """(h, w) where two images differ by less than a limit: means over the channels and a window's valid pixels."""
+    apart = np.asarray(cv2.absdiff(one.reshape(-1, one.shape[2]), two.reshape(-1, one.shape[2]))).reshape(one.shape)
+    valid = where.astype(np.float32)
+    total, count = (
+        np.asarray(cv2.boxFilter(part, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT))
+        for part in ((apart[0] + apart[1] + apart[2]) * valid, valid)
+    )
+    return np.asarray(where & (total < 3 * limit * count))
+
+
+# --- exposure ---------------------------------------------------------------------------------------------------------
+def _tone(
+    view: Levels,
+    images: list[Levels],
+    free: BoolArray,
+    seam: BoolArray,
+    candidates: Sequence[Candidate],
+    margin_px: int,
+) -> None:
+    """Bring the candidates to the view's exposure, in place.
+
+    Candidates with too little of the seam are matched to those with enough.
+    """
+    unmatched = []
+    for k, one in enumerate(candidates):
+        agreement = _expose(images[k], view, seam & one.shows, _SEAM_INLIERS)
+        if agreement is None:
+            unmatched.append(k)
+        else:
+            images[k] += _offset(*agreement, seam.shape, max(1, margin_px // 2))
+    if not unmatched:
+        return
+    reference, known = view.copy(), seam.copy()
+    for k in sorted(range(len(candidates)), key=unmatched.__contains__):
+        shows = free & candidates[k].shows
+        if k in unmatched and _expose(images[k], reference, shows & known, _OVERLAP_INLIERS) is None:
+            continue
+        np.copyto(reference, images[k], where=shows & ~known)
+        known |= shows
+
+
+def _expose(
+    image: Levels, reference: Levels, where: BoolArray, min_inliers: float
+) -> tuple[npt.NDArray[np.int64], Levels] | None:
+    """Give an image the gain of a reference, in place; None if it is implausible.
+
+    Returns:
+        Pixels (n,) that then agree, and what they lack (3, n).
+    """
+    pixel = np.flatnonzero(where)
+    if len(pixel) < _MIN_SEAM_PX:
+        return None
+    ours, theirs = (part.reshape(3, -1).take(pixel, 1) + np.float32(_DARK_LEVELS) for part in (reference, image))
+    middle = (len(pixel) - 1) // 2
+    gain = np.partition(ours / theirs, middle, axis=1)[:, middle, None]
+    logs = np.log(gain)
+    if abs(logs.mean()) > _MAX_LOG_GAIN or np.ptp(logs) > _MAX_LOG_TINT:
+        return None
+    error = ours - gain * theirs
+    agree = np.flatnonzero((np.abs(error) < _AGREEMENT_LEVELS).all(axis=0))
+    if len(agree) < min_inliers * len(pixel):
+        return None
+    image *= gain[:, :, None]
+    image += np.float32(_DARK_LEVELS) * (gain[:, :, None] - 1)
+    return pixel[agree], error.take(agree, 1)
+
+
+def _offset(pixel: npt.NDArray[np.int64], error: Levels, size: tuple[int, ...], cell: int) -> Levels:
+    """(3, h, w) smooth offset of a candidate: the local error near the seam, its mean farther away."""
+    h, w = (-(-n // cell) for n in size)
+    y, x = np.divmod(pixel, size[1])
+    place = y // cell * w + x // cell
+    sums = [np.bincount(place, part, h * w) for part in (*error, np.ones(len(pixel)))]
+    around: Any = np.stack(sums, axis=-1).reshape(h, w, 4) / cell**2
+    for _ in range(2):
+        around = cv2.blur(around, (5, 5), borderType=cv2.BORDER_CONSTANT)
+    coarse = (around[..., :3] + _MEAN_WEIGHT * error.mean(axis=1)) / (around[..., 3:] + _MEAN_WEIGHT)
+    fine = [cv2.resize(part, (w * cell, h * cell)) for part in np.moveaxis(coarse, -1, 0).astype(np.float32, order="C")]
+    return np.stack(fine)[:, : size[0], : size[1]]

@@ -21,13 +21,12 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.projection import adjacent_pairs, ego_rays, half_way_view, odd_tiles, project_rays
+from arbiview_aug.cameras.rays import adjacent_pairs, ego_rays, half_way_view, odd_tiles, project_rays
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.config import check_ranges
-from arbiview_aug.render.view_plan import ViewPlan
-from arbiview_aug.scene.static import Street
+from arbiview_aug.render.plan import ViewPlan, check_ranges
+from arbiview_aug.scene.surface import Street
 
 _VIEW_SIZE, _TILE_PX = (225, 400), 16  # the evaluation's views and tiles at half resolution
 _STEP_PX = 4  # every fourth pixel of each fourth row is read: medians need no more

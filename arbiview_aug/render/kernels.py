@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_row, turn_row
 from arbiview_aug.environment import called, compiled, inlined
-from arbiview_aug.render.atlas import OUTSIDE
+from arbiview_aug.render.plan import OUTSIDE
+from arbiview_aug.scene.boxes import PIECES
 from arbiview_aug.scene.kernels import upsampled_row
-from arbiview_aug.scene.shapes import PIECES
 
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
 _TINY, _MOST = np.float32(1e-30), np.float32(1e30)

@@ -23,13 +23,16 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.projection import adjacent_pairs, ego_rays, half_way_view, odd_tiles, project_rays
-from arbiview_aug.cameras.rays import edge_distance
+from arbiview_aug.cameras.rays import adjacent_pairs, edge_distance, ego_rays, half_way_view, odd_tiles, project_rays
 from arbiview_aug.cameras.rig import Rig, content_order
+from arbiview_aug.choices import GeometryName
+from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import at_level, level_size, write_halved
+from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.sample.inputs import Frame
 from arbiview_aug.scene.boxes import draw_boxes
-from arbiview_aug.scene.static import Correction, Street
-from arbiview_aug.scene.surface import StaticSurface
+from arbiview_aug.scene.scene import GEOMETRIES, Scene
+from arbiview_aug.scene.surface import Correction, StaticSurface, Street
 
 ROUND_TRIP_PX = 0.75
 """Forward-backward error at which flow has a weight of one half."""
@@ -391,3 +394,52 @@ def reduced(image: torch.Tensor, level: int) -> npt.NDArray[np.float32]:
         small = np.empty((*size, 3), np.uint8 if image.dtype == torch.uint8 else np.float32)
         write_halved(image, level, small)
     return np.multiply(small, 1 / top, dtype=np.float32)
+
+
+# --- as a stage of the transform --------------------------------------------------------------------------------------
+_OVERLAP_BYTES = 128 * 2**20
+
+
+class OverlapCache(LRUCache[tuple[bytes, str | None], OverlapDepth]):
+    """Depth from overlap by calibration and name, about 4 MB each for six cameras.
+
+    Args:
+        key: Key of the sample that names what frames share; None for nothing but the calibration.
+    """
+
+    def __init__(self, key: str | None) -> None:
+        super().__init__(_OVERLAP_BYTES, lambda depth: depth.nbytes)
+        self.key = key
+
+    def __reduce__(self) -> tuple[type[OverlapCache], tuple[str | None]]:
+        return OverlapCache, (self.key,)
+
+    @classmethod
+    def of(cls, share: bool | str, config: Any) -> OverlapCache | None:
+        """The cache of ``PlanCache.share_overlap``; ValueError unless the config asks for depth from overlap."""
+        if share is False:
+            return None
+        if not getattr(config, "overlap_depth", False):
+            raise ValueError("PlanCache.share_overlap: expected quality='accurate' (or overlap_depth=True) with it")
+        return cls(None if share is True else share)
+
+
+def estimate_overlap(
+    frame: Frame, scene: Scene, surface: GeometryName, shared: OverlapCache | None
+) -> OverlapDepth | None:
+    """Estimate depth from the overlaps of a frame's images, or take it from a cache; None if the surface has no use.
+
+    Raises:
+        SampleError: The sample lacks the key by which the cache shares depth.
+    """
+    row = GEOMETRIES[scene.best if surface == "auto" else surface]
+    if not row.overlap_depth:
+        return None
+    boxes = scene.boxes if "boxes" in row.reads else None
+    if shared is None:
+        return overlap_depth(frame.rig, frame.images, boxes)
+    key = shared.key
+    if key is not None and key not in frame.sample:
+        raise SampleError(f"PlanCache.share_overlap: expected {key!r} in the sample, to tell which frames share depth")
+    name = None if key is None else frame.name(key)
+    return shared.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images, boxes))

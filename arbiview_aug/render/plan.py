@@ -1,30 +1,347 @@
-"""The render plan: everything about a (source rig, target rig) pair that does not depend on image content.
+"""The render plan: all about a (source rig, target rig) pair that does not depend on image content; and its settings.
 
-For every target camera (``arbiview_aug.render.view_planner``): the sources that see it, the surface of each, the
-position of every pixel, its winning source, and the bands along seams that are blended. Compiled code evaluates every
-pixel (``arbiview_aug.render.kernels``), fast enough for calibrations or geometry that change with every frame.
+A plan is plain data: the place of each source image in an atlas, and for every target camera the position of every
+pixel in it, its winning source, and the bands along seams that are blended.
+
+Convention: a map holds, for every target pixel, the (x, y) of the atlas pixel to read; pixel centres are integers.
+Maps are OpenCV's fixed-point pairs: ``xy`` (h, w, 2) int16 whole pixels and ``frac`` (h, w) uint16 with 32nds of a
+pixel, (frac & 31) in x and (frac >> 5) in y. The torch path reads the very same positions, so both executions agree.
+``OUTSIDE`` marks pixels that read nothing and come out black.
+
+An atlas holds the source images that a plan reads, below and beside each other, some of them halved: one
+``cv2.remap`` then serves a target that sees several sources.
 """
 
 from __future__ import annotations
 
-import hashlib
-from collections import Counter
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, cast
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from numbers import Real
+from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import LENSES, BoolArray, LensName
-from arbiview_aug.cameras.rays import CameraMaps
-from arbiview_aug.cameras.rig import Rig, content_order
-from arbiview_aug.environment import compilation_announced
-from arbiview_aug.render.atlas import AtlasLayout
-from arbiview_aug.render.config import RenderConfig
-from arbiview_aug.render.view_plan import ViewPlan
-from arbiview_aug.render.view_planner import ViewPlanner
-from arbiview_aug.scene.point_cloud import seen_through
-from arbiview_aug.scene.scene import Scene
+from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.validation import MAX_SIZE_PX
+from arbiview_aug.errors import CalibrationError
+from arbiview_aug.image_ops import FRESH, Memory, level_size
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderConfig:
+    """Settings of planned rendering. ``docs/benchmarks.md`` (Ablation) says what each one is worth.
+
+    Attributes:
+        interpolation: Sampling of the sources. ``cubic`` applies only where a target camera magnifies what it reads at
+            its own centre (``arbiview_aug.render.view_planner.MAGNIFIED``).
+        antialias: Read from a source halved until the target no longer minifies it by two or more.
+        seam_width: Width of the blended band along a seam, as a fraction of the target's width; 0 switches blending
+            off. Wider bands show double images of near objects, narrower ones the exposure step.
+        distance_gamma: γ of w_distance = (d / d_max)^γ.
+        primary_bonus: w_primary of a source at the target's own centre: it is exact, so it wins wherever it sees.
+        far_parallax_px: Largest shift of scene points beyond 2 m at which ``auto`` takes a pair of cameras as far.
+        grid_step_px: Spacing of the nodes between which weights are interpolated. Positions are evaluated per pixel.
+        overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
+        certainty: Store the geometry's accuracy in plans, one byte a pixel; ``outputs=("confidence",)`` needs it.
+    """
+
+    interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
+    antialias: bool = True
+    seam_width: float = 0.03
+    distance_gamma: float = 1.0
+    primary_bonus: float = 1e6
+    far_parallax_px: float = 0.5
+    grid_step_px: int = 8
+    overlap_depth: bool = False
+    certainty: bool = False
+
+    def __post_init__(self) -> None:
+        check_ranges(self, _RANGES)
+        if self.grid_step_px not in (1, 4, 8, 16, 32):
+            raise ValueError(f"RenderConfig.grid_step_px: expected 1, 4, 8, 16 or 32, got {self.grid_step_px!r}")
+        if self.interpolation not in ("nearest", "linear", "cubic"):
+            raise ValueError(
+                f"RenderConfig.interpolation: expected 'nearest', 'linear' or 'cubic', got {self.interpolation!r}"
+            )
+
+
+_RANGES: dict[str, tuple[float, float]] = {
+    "seam_width": (0.0, 0.5),
+    "distance_gamma": (0.0, 16.0),
+    "primary_bonus": (1.0, 1e12),
+    "far_parallax_px": (0.0, 1e3),
+}
+
+
+def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
+    """Raise ValueError for fields of a config outside their (lowest, highest) value."""
+    for name, (low, high) in ranges.items():
+        value = getattr(config, name)
+        if not isinstance(value, Real) or not low <= float(value) <= high:
+            raise ValueError(f"{type(config).__name__}.{name}: expected {low:g} to {high:g}, got {value!r}")
+
+
+PRESETS = {
+    "draft": RenderConfig(interpolation="nearest", seam_width=0.0),
+    "fast": RenderConfig(),
+    "accurate": RenderConfig(overlap_depth=True),
+}
+"""Settings by ``quality``."""
+
+
+OUTSIDE = -16
+"""Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
+
+_MAX_ROWS = 32000  # remap needs int16 coordinates, and sizes below 32767
+
+
+@dataclass(frozen=True)
+class FixedMap:
+    """A fixed-point sampling map: ``xy`` (h, w, 2) int16 and ``frac`` (h, w) uint16 (see the module's convention)."""
+
+    xy: npt.NDArray[np.int16]
+    frac: npt.NDArray[np.uint16]
+
+    @classmethod
+    def outside(cls, size: tuple[int, int], memory: Memory = FRESH) -> FixedMap:
+        """A map (h, w) that reads nothing."""
+        return cls(memory.full((*size, 2), OUTSIDE, np.int16), memory.full(size, 0, np.uint16))
+
+    def part(self, rows: slice, columns: slice) -> FixedMap:
+        """A rectangle of it, the same memory."""
+        return FixedMap(self.xy[rows, columns], self.frac[rows, columns])
+
+    def rounded(self) -> FixedMap:
+        """The same map at the nearest whole pixels."""
+        nearest = np.stack([(self.frac & 31) >= 16, (self.frac >> 5) >= 16], -1).astype(np.int16)
+        return FixedMap(self.xy + nearest, np.zeros_like(self.frac))
+
+    def to_float(self) -> npt.NDArray[np.float32]:
+        """The (h, w, 2) positions that are read."""
+        fraction = np.stack([self.frac & 31, self.frac >> 5], -1).astype(np.float32) / np.float32(32)
+        return np.asarray(self.xy + fraction, np.float32)
+
+    @property
+    def packed(self) -> npt.NDArray[np.int32]:
+        """``xy`` as one number for each pixel, (h, w): y in the upper half, x in the lower; the same memory."""
+        return self.xy.view(np.int32)[..., 0]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held."""
+        return self.xy.nbytes + self.frac.nbytes
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Place of one source image in the atlas: halved ``level`` times, first pixel at (``x``, ``y``)."""
+
+    source: int
+    level: int
+    y: int
+    x: int
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class AtlasLayout:
+    """The places of the source images that a plan reads.
+
+    Attributes:
+        slots: One for each (source, level) in use.
+    """
+
+    slots: tuple[Slot, ...]
+
+    @cached_property
+    def size(self) -> tuple[int, int]:
+        """(h, w) of the atlas."""
+        corners = [(slot.y + slot.size[0], slot.x + slot.size[1]) for slot in self.slots]
+        return max((1, *(y for y, _ in corners))), max((1, *(x for _, x in corners)))
+
+    @cached_property
+    def is_stack(self) -> bool:
+        """Whether all are sources at full size in their order: an (N, H, W, 3) block of images *is* the atlas."""
+        return all(slot.level == slot.x == 0 and slot.y == slot.source * slot.size[0] for slot in self.slots)
+
+    @classmethod
+    def for_sources(cls, sizes: Sequence[tuple[int, int]], used: Sequence[tuple[int, int]]) -> AtlasLayout:
+        """Lay out the used (source, level) pairs: below each other, in further columns where rows run out.
+
+        Sources of one size take the rows that they have in a block of images: they may turn out to be all that is read.
+
+        Raises:
+            CalibrationError: There are no more columns: 29 images of 7680x4320 px, read at their full size.
+        """
+        used = sorted(set(used), key=lambda pair: (pair[1] > 0, pair))
+        (h, w), slots, y, x, column_width = sizes[0], list[Slot](), 0, 0, 0
+        if len(set(sizes)) == 1 and len(sizes) * h <= _MAX_ROWS and any(level == 0 for _, level in used):
+            slots = [Slot(source, 0, source * h, 0, (h, w)) for source, level in used if level == 0]
+            y, column_width = len(sizes) * h, w
+        for source, level in used[len(slots) :]:
+            h, w = level_size(sizes[source], level)
+            if y and y + h > _MAX_ROWS:
+                x, y, column_width = x + column_width, 0, 0
+            slots.append(Slot(source, level, y, x, (h, w)))
+            y, column_width = y + h, max(column_width, w)
+        layout = cls(tuple(slots))
+        if layout.size[1] > MAX_SIZE_PX:
+            raise CalibrationError(
+                f"rig: expected source images that fit {_MAX_ROWS} rows and {MAX_SIZE_PX} columns together, got "
+                f"{len(slots)} to read at once, up to {max(h for h, _ in sizes)}x{max(w for _, w in sizes)}; resize "
+                "them, and their cameras by Rig.resized"
+            )
+        return layout
+
+    def without_others(self, read: Collection[tuple[int, int]]) -> AtlasLayout:
+        """The same places for the (source, level) pairs that are read: images that win no pixel are not copied."""
+        return AtlasLayout(tuple(slot for slot in self.slots if (slot.source, slot.level) in read))
+
+    def slot(self, source: int, level: int) -> Slot:
+        """The place of one source at one level."""
+        return next(s for s in self.slots if (s.source, s.level) == (source, level))
+
+
+
+
+@dataclass(frozen=True)
+class SourceUse:
+    """How one target uses one source; ``explain`` prints it."""
+
+    source: int  # index of the source camera in the source rig
+    surface: str  # the surface its pixels are read over
+    reason: str  # why that surface
+    baseline_m: float  # distance between the two optical centres
+    parallax_px: float  # expected displacement from unknown depth: the median over the pixels that the source wins
+    share: float  # share of the target's pixels that it wins
+    level: int  # halvings of its image before it is read
+
+
+@dataclass(frozen=True)
+class BlendRegion:
+    """A rectangle in which a second source is blended into the winning one."""
+
+    y: int  # first row in the target
+    x: int  # first column
+    source: int  # index of the second source
+    at: FixedMap  # its positions in the atlas
+    weight: npt.NDArray[np.float32]  # (h, w) its share, at most 0.5
+
+
+@dataclass(frozen=True)
+class BilinearFallback:
+    """Pixels of a cubic view that are read bilinearly, because cubics would reach outside the source or its mask."""
+
+    pixel: npt.NDArray[np.int64]  # (n,) into the flattened view, ascending
+    at: FixedMap  # (1, n) positions in the atlas
+
+    def rows(self, y0: int, y1: int, width: int) -> BilinearFallback:
+        """The pixels of rows y0 to y1, numbered from y0."""
+        a, b = np.searchsorted(self.pixel, (y0 * width, y1 * width))
+        return BilinearFallback(self.pixel[a:b] - y0 * width, self.at.part(slice(None), slice(a, b)))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes."""
+        return self.pixel.nbytes + self.at.nbytes
+
+
+BACKGROUND, OCCLUDED, OBJECT = range(3)
+"""Layers of a view's pixels: background that is seen, or outside all images; background that something hides; objects,
+and what is nearer than occluded background beside it."""
+
+NEARER, NEARER_REACH = 1.5, 1 / 16
+"""Pixels so many times nearer than occluded background, within this share of the view's shorter side beside it, are not
+what continues it."""
+
+
+def nearer_cells(size: tuple[int, int], step: int) -> int:
+    """``NEARER_REACH`` of a view (h, w) in cells of ``step`` pixels, at least one."""
+    return max(1, round(NEARER_REACH * min(size) / step))
+
+
+@dataclass(frozen=True)
+class Paint:
+    """Parts of objects that no source sees, and where their colours are read in the view.
+
+    Attributes:
+        pixel: (n,) int32 unseen pixels of objects, into the flattened view.
+        part: (n,) int32 what they show: twice the object's number, 1 more on its top.
+        beside: (n,) int32 the nearest seen pixel of the same part in its row or column, -1 for none nearby.
+        sample: (m,) int32 seen pixels of objects, a sample.
+        sample_part: (m,) int32 what those show.
+    """
+
+    pixel: npt.NDArray[np.int32]
+    part: npt.NDArray[np.int32]
+    beside: npt.NDArray[np.int32]
+    sample: npt.NDArray[np.int32]
+    sample_part: npt.NDArray[np.int32]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes."""
+        return 3 * self.pixel.nbytes + 2 * self.sample.nbytes
+
+
+@dataclass(frozen=True)
+class ViewPlan:
+    """How one target view is rendered.
+
+    Attributes:
+        at: Position of each pixel in the atlas, in its winning source.
+        source_camera: (h, w) int8 index of the winning source, -1 where no source sees the pixel.
+        bands: Blended rectangles along the seams.
+        pairs: One for each source that wins any pixel.
+        interpolation: ``nearest``, ``linear`` or ``cubic``.
+        certainty: (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; on request.
+        edge: Pixels that must not be read by cubics.
+        layers: (h, w) uint8 layer of each pixel, for fillers; None if no pixel in a source's image is occluded.
+        paint: Unseen parts of objects; None without ``layers`` or objects.
+    """
+
+    at: FixedMap
+    source_camera: npt.NDArray[np.int8]
+    bands: tuple[BlendRegion, ...]
+    pairs: tuple[SourceUse, ...]
+    interpolation: str = "linear"
+    certainty: npt.NDArray[np.uint8] | None = None
+    edge: BilinearFallback | None = None
+    layers: npt.NDArray[np.uint8] | None = None
+    paint: Paint | None = None
+
+    @property
+    def coverage(self) -> BoolArray:
+        """(h, w) True where some source sees the pixel."""
+        return self.source_camera >= 0
+
+    @property
+    def sources(self) -> set[int]:
+        """Indices of the source cameras that are read."""
+        return {pair.source for pair in self.pairs} | {band.source for band in self.bands}
+
+    @cached_property
+    def seam_interpolation(self) -> str:
+        """Interpolation of its bands; never cubic: a mean of two sources is no sharper for it."""
+        return "linear" if self.interpolation == "cubic" else self.interpolation
+
+    @cached_property
+    def runs(self) -> npt.NDArray[np.int64]:
+        """(n, 3) runs of pixels of one source in the flattened view: first one, end and source."""
+        winner = self.source_camera.ravel()
+        start = np.flatnonzero(np.diff(winner, prepend=np.int8(-2)))
+        runs = np.stack([start, np.append(start[1:], winner.size), winner[start]], 1)
+        return runs[runs[:, 2] >= 0]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes."""
+        bands = sum(b.at.nbytes + b.weight.nbytes for b in self.bands)
+        further = sum(part.nbytes for part in (self.certainty, self.edge, self.layers, self.paint) if part is not None)
+        return self.at.nbytes + self.source_camera.nbytes + bands + further
 
 
 @dataclass(frozen=True)
@@ -52,81 +369,3 @@ class RenderPlan:
     def coverage(self) -> list[BoolArray]:
         """(h, w) for each target camera."""
         return [t.coverage for t in self.targets]
-
-
-def plan_key(source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene | None = None) -> bytes:
-    """Content key of a plan: calibrations, scene, surface and settings, without names."""
-    settings = tuple(getattr(config, f.name) for f in fields(config))
-    geometry = (scene or Scene()).key
-    return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings, geometry)).encode()).digest()
-
-
-def build_plan(
-    source: Rig,
-    target: Rig,
-    *,
-    geometry: str = "auto",
-    config: RenderConfig | None = None,
-    scene: Scene | None = None,
-    maps: CameraMaps | None = None,
-) -> RenderPlan:
-    """Plan how ``target`` is rendered from ``source``'s images.
-
-    Args:
-        source: The rig that recorded the images.
-        target: The rig to render, in its own ego frame: the two roads are made to coincide.
-        geometry: A name in ``GEOMETRIES``; ``auto``: for each pair of cameras ``infinity`` where their centres
-            coincide or the worst-case parallax is below
-            ``config.far_parallax_px``, else the scene's best.
-        config: Settings; the ``fast`` preset by default.
-        scene: Known geometry, in the source's ego frame.
-        maps: Rays and masks of cameras, to be reused by later plans.
-
-    Returns:
-        The plan. Targets that no source sees have zero coverage.
-    """
-    with compilation_announced():
-        return _built(source, target.in_frame_of(source), geometry, config or RenderConfig(), scene or Scene(), maps)
-
-
-def warm_up() -> None:
-    """Compile the kernels of cameras, scenes and plans, or load them from numba's cache."""
-    from arbiview_aug.render.kernels import read_ahead
-
-    views = [
-        Camera.looking(
-            name=f"{name} {side}", azimuth_deg=20 * side, position_m=(0, 0.3 * side, 1.5), width_px=32, height_px=32,
-            horizontal_fov_deg=90, lens=cast(LensName, name), distortion=(0.0,) * lens.coefficient_counts[0],
-        )
-        for name, lens in LENSES.items() for side in (-1, 0, 1)
-    ]  # fmt: skip
-    wall = np.stack(np.meshgrid(8.0, np.linspace(-2, 2, 20), np.linspace(0.3, 1.5, 10)), -1).reshape(-1, 3)
-    boxes = np.array([[8.5, 0, 1, 1, 4, 2, 0], [5, 3, 1, 1, 1, 2, 0]])
-    source = Rig(
-        [replace(camera, mask=np.eye(32, dtype=bool) < 1) for camera in views if not camera.name.endswith("0")]
-    )
-    target = Rig([camera for camera in views if camera.name.endswith("0")])
-    scene, config = Scene(boxes=boxes, points=wall), RenderConfig(certainty=True)
-    seen_through(wall, wall, target[0].center_m)
-    for surface in ("ground", "boxes", "lidar"):
-        plan = build_plan(source, target, geometry=surface, config=config, scene=scene)
-    read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
-
-
-def _built(
-    source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene, maps: CameraMaps | None
-) -> RenderPlan:
-    counters: Counter[str] = Counter()
-    order = content_order(source.cameras)
-    maps = maps or CameraMaps()
-    planners = [ViewPlanner(source, order, camera, surface, scene, config, counters, maps) for camera in target]
-    used = [(region.source, region.level) for planner in planners for region in planner.regions]
-    layout = AtlasLayout.for_sources(source.sizes, used)
-    targets = tuple(planner.finish(layout) for planner in planners)
-    read = set[tuple[int, int]]()
-    for planner, view in zip(planners, targets, strict=True):
-        sources = view.sources
-        read |= {(region.source, region.level) for region in planner.regions if region.source in sources}
-    layout = layout.without_others(read)
-    counters["bands"] = sum(len(t.bands) for t in targets)
-    return RenderPlan(source, target, layout, targets, dict(counters))

@@ -12,12 +12,12 @@ import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.projection import look_apart
+from arbiview_aug.cameras.rays import look_apart
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.render.config import RenderConfig
+from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.render.weights import distance_weight
 from arbiview_aug.scene.scene import GEOMETRIES
-from arbiview_aug.scene.static import NEAREST_SCENE_M, worst_parallax_px
+from arbiview_aug.scene.surface import NEAREST_SCENE_M, worst_parallax_px
 
 SAME_CENTER_M = 1e-6
 """Centres closer than this coincide: a homography is exact."""

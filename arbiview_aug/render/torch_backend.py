@@ -17,9 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.render.atlas import AtlasLayout
-from arbiview_aug.render.plan import RenderPlan
-from arbiview_aug.render.view_plan import ViewPlan
+from arbiview_aug.render.plan import AtlasLayout, RenderPlan, ViewPlan
 
 
 @dataclass(frozen=True)

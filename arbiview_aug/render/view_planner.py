@@ -1,37 +1,60 @@
-"""How one target view is rendered: which sources see it, over which surface, and who wins each pixel."""
+"""How a rig is rendered: which sources see each target view, over which surface, and who wins each pixel.
+
+Compiled code evaluates every pixel (``arbiview_aug.render.kernels``), fast enough for calibrations or geometry that
+change with every frame.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.projection import look_apart
-from arbiview_aug.cameras.rays import CELL_PX, CameraMaps, relative_pose, source_pixels
-from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, LensName
+from arbiview_aug.cameras.rays import (
+    CELL_PX,
+    MAX_INVERSE_DISTANCE,
+    CameraMaps,
+    look_apart,
+    relative_pose,
+    source_pixels,
+)
+from arbiview_aug.cameras.rig import Rig, content_order
+from arbiview_aug.environment import compilation_announced
 from arbiview_aug.image_ops import at_level, level_size
-from arbiview_aug.render.atlas import AtlasLayout, FixedMap
 from arbiview_aug.render.confidence import certainty
-from arbiview_aug.render.config import RenderConfig
+from arbiview_aug.render.plan import (
+    NEARER,
+    AtlasLayout,
+    BilinearFallback,
+    FixedMap,
+    Paint,
+    RenderConfig,
+    RenderPlan,
+    SourceUse,
+    ViewPlan,
+    nearer_cells,
+)
 from arbiview_aug.render.requirements import SAME_CENTER_M
-from arbiview_aug.render.view_plan import NEARER, BilinearFallback, Paint, SourceUse, ViewPlan, nearer_cells
 from arbiview_aug.render.weights import SecondBest, seam_weights, source_weight
-from arbiview_aug.scene.point_cloud import occlusion_level
+from arbiview_aug.scene.point_cloud import occlusion_level, seen_through
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
-from arbiview_aug.scene.static import is_within_wall, worst_parallax_px
-from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
+from arbiview_aug.scene.surface import is_within_wall, worst_parallax_px
 
 SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
+_SAMPLES = 64  # colours of objects are read so many times along a view's shorter side
+_INSIDE_PX = 2  # this far inside their faces: pixels at a border mix two colours
+_BESIDE_PX = 8  # cracks are narrower than twice this
 MAGNIFIED = 0.8
 """A view is read by cubics where it has this few source pixels per pixel, or fewer, and most of it is read at its own
 centre: it is sharper for it, and a cubic costs 2.6 to 4.7 times as much. On synthetic streets, dB over bilinear by
@@ -378,7 +401,7 @@ class ViewPlanner:
         side = 2 * nearer_cells(self.camera.size, self.step) + 1
         limit = cv2.erode(NEARER * farthest, np.ones((side, side), np.uint8))
         mark_objects(geometry.q, geometry.face, winner, limit, self.step, layers)
-        return Paint.of(geometry.face, winner, geometry.surface.face_parts) if geometry.face.size else None
+        return find_paint(geometry.face, winner, geometry.surface.face_parts) if geometry.face.size else None
 
     def _weights(self) -> list[npt.NDArray[np.float32]]:
         """Weights of the sources on the nodes: their scores, for one source or hard seams."""
@@ -505,3 +528,92 @@ def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:
     known = np.where(valid, values, 0).astype(np.float32)
     total, count = (cv2.blur(p, (5, 5), borderType=cv2.BORDER_REPLICATE) for p in (known, valid.astype(np.float32)))
     return np.where(valid, known, total / np.maximum(count, np.float32(1e-6)))
+
+
+def find_paint(face: npt.NDArray[np.int32], winner: npt.NDArray[np.int8], parts: npt.NDArray[np.int32]) -> Paint:
+    """Find the unseen parts of objects in a view of faces (h, w), winning sources, and the parts (n,) of faces."""
+    from arbiview_aug.render import kernels
+
+    step = max(1, min(face.shape) // _SAMPLES)
+    columns = np.empty((5, face.size), np.int32)
+    hidden, sampled = kernels.find_paint(face, parts, winner, _BESIDE_PX, step, _INSIDE_PX, columns)
+    return Paint(*columns[:3, :hidden].copy(), *columns[3:, :sampled].copy())
+
+
+# --- all views of a rig -----------------------------------------------------------------------------------------------
+def plan_key(source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene | None = None) -> bytes:
+    """Content key of a plan: calibrations, scene, surface and settings, without names."""
+    settings = tuple(getattr(config, f.name) for f in fields(config))
+    geometry = (scene or Scene()).key
+    return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings, geometry)).encode()).digest()
+
+
+def build_plan(
+    source: Rig,
+    target: Rig,
+    *,
+    geometry: str = "auto",
+    config: RenderConfig | None = None,
+    scene: Scene | None = None,
+    maps: CameraMaps | None = None,
+) -> RenderPlan:
+    """Plan how ``target`` is rendered from ``source``'s images.
+
+    Args:
+        source: The rig that recorded the images.
+        target: The rig to render, in its own ego frame: the two roads are made to coincide.
+        geometry: A name in ``GEOMETRIES``; ``auto``: for each pair of cameras ``infinity`` where their centres
+            coincide or the worst-case parallax is below
+            ``config.far_parallax_px``, else the scene's best.
+        config: Settings; the ``fast`` preset by default.
+        scene: Known geometry, in the source's ego frame.
+        maps: Rays and masks of cameras, to be reused by later plans.
+
+    Returns:
+        The plan. Targets that no source sees have zero coverage.
+    """
+    with compilation_announced():
+        return _built(source, target.in_frame_of(source), geometry, config or RenderConfig(), scene or Scene(), maps)
+
+
+def warm_up() -> None:
+    """Compile the kernels of cameras, scenes and plans, or load them from numba's cache."""
+    from arbiview_aug.render.kernels import read_ahead
+
+    views = [
+        Camera.looking(
+            name=f"{name} {side}", azimuth_deg=20 * side, position_m=(0, 0.3 * side, 1.5), width_px=32, height_px=32,
+            horizontal_fov_deg=90, lens=cast(LensName, name), distortion=(0.0,) * lens.coefficient_counts[0],
+        )
+        for name, lens in LENSES.items() for side in (-1, 0, 1)
+    ]  # fmt: skip
+    wall = np.stack(np.meshgrid(8.0, np.linspace(-2, 2, 20), np.linspace(0.3, 1.5, 10)), -1).reshape(-1, 3)
+    boxes = np.array([[8.5, 0, 1, 1, 4, 2, 0], [5, 3, 1, 1, 1, 2, 0]])
+    source = Rig(
+        [replace(camera, mask=np.eye(32, dtype=bool) < 1) for camera in views if not camera.name.endswith("0")]
+    )
+    target = Rig([camera for camera in views if camera.name.endswith("0")])
+    scene, config = Scene(boxes=boxes, points=wall), RenderConfig(certainty=True)
+    seen_through(wall, wall, target[0].center_m)
+    for surface in ("ground", "boxes", "lidar"):
+        plan = build_plan(source, target, geometry=surface, config=config, scene=scene)
+    read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
+
+
+def _built(
+    source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene, maps: CameraMaps | None
+) -> RenderPlan:
+    counters: Counter[str] = Counter()
+    order = content_order(source.cameras)
+    maps = maps or CameraMaps()
+    planners = [ViewPlanner(source, order, camera, surface, scene, config, counters, maps) for camera in target]
+    used = [(region.source, region.level) for planner in planners for region in planner.regions]
+    layout = AtlasLayout.for_sources(source.sizes, used)
+    targets = tuple(planner.finish(layout) for planner in planners)
+    read = set[tuple[int, int]]()
+    for planner, view in zip(planners, targets, strict=True):
+        sources = view.sources
+        read |= {(region.source, region.level) for region in planner.regions if region.source in sources}
+    layout = layout.without_others(read)
+    counters["bands"] = sum(len(t.bands) for t in targets)
+    return RenderPlan(source, target, layout, targets, dict(counters))

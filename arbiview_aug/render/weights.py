@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.image_ops import Memory
-from arbiview_aug.render.atlas import FixedMap
-from arbiview_aug.render.view_plan import BlendRegion
+from arbiview_aug.render.plan import BlendRegion, FixedMap
 
 
 def distance_weight(distance_px: FloatArray, d_max_px: float, gamma: float) -> FloatArray:

@@ -13,9 +13,8 @@ from arbiview_aug.cameras.key_names import misnamed
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_mounted, pose_mistake
-from arbiview_aug.renamed import refuse_old_options
-from arbiview_aug.sample.check import EGO_KEYS, PIXEL_BOUND_KEYS
-from arbiview_aug.sample.inputs import Frame, read_frames
+from arbiview_aug.choices import refuse_old_options
+from arbiview_aug.sample.inputs import EGO_KEYS, PIXEL_BOUND_KEYS, Frame, read_frames
 from arbiview_aug.sample.masks import CLEANING, image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes, points_in
 from arbiview_aug.scene.point_cloud import checked_points, own_car

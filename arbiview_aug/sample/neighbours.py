@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.lens import FloatArray
@@ -16,7 +18,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError
 from arbiview_aug.sample.batching import check_container, checked_images
 from arbiview_aug.sample.inputs import Frame, as_array, frame_from, numbers
-from arbiview_aug.scene.boxes import carried, checked_boxes, moved_boxes
+from arbiview_aug.scene.boxes import carried, checked_boxes, moved_boxes, points_in
 from arbiview_aug.scene.point_cloud import checked_points, own_car, seen_through
 from arbiview_aug.scene.surface import Points
 
@@ -284,3 +286,39 @@ def _boxes(
     then = now.copy()
     then[:, :2] += velocity_mps * seconds
     return now, then
+
+
+BOX_MARGIN_M = 0.4
+"""Margin around labelled objects: contact shadows and mirrors move with them."""
+
+_SHADOW_REACH, _CONTACT_REACH = 1.3, 0.3
+"""Length of an object's shadow (sun at 38 degrees) and of its contact shadow, as multiples of its height."""
+
+_BELOW_M = 0.5
+"""Depth below a box in which its shadow is sought: labels may float above the road."""
+
+
+class ChangeRisk(IntEnum):
+    """Why a place that another frame shows may look different now, in ascending order."""
+
+    NONE = 0  # labels say that nothing moved there
+    SHADED = 1  # the shadow of a moved object may lie there in either frame
+    BESIDE = 2  # a moved object stands or stood right beside it
+    UNLABELLED = 3  # a frame has no labels
+
+
+def change_risks(moved: FloatArray, points: FloatArray) -> npt.NDArray[np.uint8]:
+    """Compute the ``ChangeRisk`` (n,) of points (n, 3) on the road beside boxes (B, 7) that moved."""
+    risks = np.zeros(len(points), np.uint8)
+    if not len(points) or not len(moved):
+        return risks
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    radius_m = (np.hypot(moved[:, 3], moved[:, 4]) / 2 + 2 * _SHADOW_REACH * moved[:, 5])[:, None]
+    in_reach = ((moved[:, :2] > low - radius_m) & (moved[:, :2] < high + radius_m)).all(axis=1)
+    for risk, reach in ((ChangeRisk.SHADED, _SHADOW_REACH), (ChangeRisk.BESIDE, _CONTACT_REACH)):
+        grown = moved[in_reach]
+        grown[:, 3:5] += 2 * reach * grown[:, 5:6]
+        grown[:, 5] += 2 * _BELOW_M
+        for inside in points_in(grown, points):
+            risks[inside] = risk
+    return risks

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.kernels import angle_row
+from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
 from arbiview_aug.environment import called, compiled, inlined
 from arbiview_aug.scene import panorama
 from arbiview_aug.scene.kernels import upsampled_row
 from arbiview_aug.scene.panorama import NEAREST_M
-from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.kernels import rays_row
+from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
 from arbiview_aug.environment import called, compiled, inlined
-from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _TINY = np.float32(1e-30)

@@ -21,9 +21,8 @@ from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene import panorama
-from arbiview_aug.scene.boxes import BoxSurface
+from arbiview_aug.scene.boxes import BoxSurface, solids_among
 from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, SIDE_RAD, Layer
-from arbiview_aug.scene.shapes import solids_among
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))

@@ -1,27 +1,29 @@
-"""Base classes of scene surfaces, which give the inverse distance along a unit ray in 1/m.
+"""Scene surfaces, which give the inverse distance along a unit ray in 1/m: base classes, and the static ones.
 
 Infinity is 0, so the far surface, the horizon and rays that miss need no special cases. A point X = o + d / q is
-handled as the homogeneous (o q + d, q).
+handled as the homogeneous (o q + d, q). Static are infinity, the ground with a round wall, the street, and these
+corrected by overlapping cameras.
 """
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.rays import PixelRays
+from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE, PixelRays
 from arbiview_aug.image_ops import FRESH, Memory
 
 Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 """(P, 3) points in their recorded precision; surfaces use float32."""
-
-MAX_INVERSE_DISTANCE = 100.0
-"""Upper limit, 1 cm: keeps points finite when a camera touches a surface."""
 
 _TYPICAL_OBJECT_M = 20.0
 _ROWS = 64  # of pixels, evaluated at once: they stay in the cache
@@ -135,3 +137,238 @@ class StaticSurface(Surface):
             directions = np.moveaxis(np.tensordot(camera.cam2ego[:3, :3], local, 1), 0, -1)
             q[rows] = self.inverse_distance(camera.center_m, directions)
         return q
+
+
+WALL_CENTER_M = (1.0, 0.0)
+"""Centre of the far wall in the ego frame: the middle of a car's cameras if the origin is the rear axle."""
+
+
+@dataclass(frozen=True)
+class Far(StaticSurface):
+    """Everything is infinitely far away: the paper's rotation-only model (Sec. FAVS, Stage 1)."""
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """Zeros (...,)."""
+        return np.zeros(directions.shape[:-1])
+
+
+FREE_SHARE, OBJECT_DENSITY = 0.1, 1.33
+"""Free share of the way to the wall, and object density beyond. Fitted on synthetic streets, seeds 100 to 105."""
+
+
+class _RoadAndWall(StaticSurface):
+    """A street without objects."""
+
+    ground_z_m: float
+
+    @property
+    @abstractmethod
+    def semi_axes_m(self) -> tuple[float, float]:
+        """Semi-axes of the wall along the road and across it, m."""
+
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
+        """As ``inverse_distance``, compiled."""
+        q: npt.NDArray[np.float32] = memory.empty(camera.size, np.float32)
+        self._draw(camera.center_m, camera.cam2ego[:3, :3], rays.planes, rays.parameters, q)
+        return q
+
+    def along(self, origin: FloatArray, rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """As ``inverse_distance``, compiled."""
+        q = np.empty(rays.shape[1:], np.float32)
+        self._draw(origin, np.eye(3), rays, np.zeros(14, np.float32), q)
+        return q
+
+    def _draw(self, origin: FloatArray, R: FloatArray, planes: Any, parameters: Any, q: Any) -> None:
+        from arbiview_aug.scene.kernels import GROUND, STREET, static_image
+
+        height, axes = origin[2] - self.ground_z_m, self.semi_axes_m
+        ox, oy = (origin[:2] - WALL_CENTER_M) / axes
+        settings = 1 / height if height > 0 else 0.0, 1 / axes[0], 1 / axes[1], ox, oy, ox * ox + oy * oy - 1
+        kind = STREET if isinstance(self, Street) else GROUND
+        static_image(planes, parameters, R.astype(np.float32), kind, np.array(settings, np.float32), q)
+
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """Mean error (...,) in 1/m caused by unknown objects, within a quarter on most of six synthetic streets.
+
+        A ray meets objects between ``FREE_SHARE`` of the way to the wall and the surface, at ``OBJECT_DENSITY`` per
+        such way: the integral of (1/t - 1/t_surface) over t. The road nearby is certain, the wall is not.
+        """
+        wall = wall_inverse_distance(origin, directions, Street.half_length_m, Street.half_width_m)
+        t = np.clip(wall / np.maximum(inverse_distance, 1e-9), FREE_SHARE, 1.0)
+        return np.asarray(OBJECT_DENSITY * wall * (np.log(t / FREE_SHARE) - 1 + FREE_SHARE / t))
+
+
+@dataclass(frozen=True)
+class Ground(_RoadAndWall):
+    """The road plane up to a cylinder: the reference surface.
+
+    Attributes:
+        ground_z_m: Height of the road in the ego frame.
+        radius_m: Radius of the upright cylinder about ``WALL_CENTER_M``.
+    """
+
+    ground_z_m: float = 0.0
+    radius_m: float = 40.0
+
+    @property
+    def semi_axes_m(self) -> tuple[float, float]:
+        """Radii of the cylinder."""
+        return self.radius_m, self.radius_m
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """The nearer of plane and cylinder, 1/m (...,)."""
+        wall = wall_inverse_distance(origin, directions, self.radius_m, self.radius_m)
+        return np.maximum(plane_inverse_distance(origin, directions, self.ground_z_m), wall)
+
+
+@dataclass(frozen=True)
+class Street(_RoadAndWall):
+    """The road joined smoothly to an elliptical far wall, which is nearer at the sides than ahead.
+
+    The p-norm of two inverse distances, (q_road^k + q_wall^k)^(1/k), is a smooth minimum of the distances. It shortens
+    them by 16 % where road and wall cross, 1.5 % where the road is at half the wall's distance. docs/surfaces.md says
+    how the defaults were measured.
+
+    Attributes:
+        ground_z_m: Height of the road in the ego frame.
+        half_length_m: Semi-axis of the wall along the road.
+        half_width_m: Semi-axis across it.
+        sharpness: k; infinity is the hard minimum with its crease.
+    """
+
+    ground_z_m: float = 0.0
+    half_length_m: float = 40.0
+    half_width_m: float = 20.0
+    sharpness: float = 4.0
+
+    @property
+    def semi_axes_m(self) -> tuple[float, float]:
+        """Those of the wall."""
+        return self.half_length_m, self.half_width_m
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """The smooth join of plane and wall, 1/m (...,)."""
+        road = plane_inverse_distance(origin, directions, self.ground_z_m)
+        wall = wall_inverse_distance(origin, directions, self.half_length_m, self.half_width_m)
+        nearer, farther = np.maximum(road, wall), np.minimum(road, wall)
+        ratio = farther / np.maximum(nearer, 1e-300)
+        joined = nearer * (1 + ratio**self.sharpness) ** (1 / self.sharpness)
+        return np.minimum(joined, MAX_INVERSE_DISTANCE)
+
+
+def plane_inverse_distance(origin: FloatArray, directions: FloatArray, ground_z_m: float) -> FloatArray:
+    """Inverse distance to the horizontal plane z = ground_z_m; 0 for rays that miss it or start on or below it."""
+    height = origin[2] - ground_z_m
+    if height <= 0:
+        return np.zeros(directions.shape[:-1])
+    return np.clip(-directions[..., 2] / height, 0.0, MAX_INVERSE_DISTANCE)
+
+
+def wall_inverse_distance(
+    origin: FloatArray, directions: FloatArray, half_length_m: float, half_width_m: float
+) -> FloatArray:
+    """Inverse distance to the far side of an upright elliptical wall about ``WALL_CENTER_M``; 0 for rays that miss."""
+    ox, oy = (origin[0] - WALL_CENTER_M[0]) / half_length_m, (origin[1] - WALL_CENTER_M[1]) / half_width_m
+    dx, dy = directions[..., 0] / half_length_m, directions[..., 1] / half_width_m
+    # a t^2 + 2 b t + c = 0: two forms of the larger root, each without cancellation on its side of b = 0.
+    a, b, c = dx * dx + dy * dy, dx * ox + dy * oy, ox * ox + oy * oy - 1
+    root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+    towards = a / np.maximum(root - b, 1e-300)
+    if c < 0:
+        q = np.where(b > 0, (root + b) / -c, towards)
+    else:
+        q = np.where((b < 0) & (b * b >= a * c), towards, 0.0)
+    return np.clip(q, 0.0, MAX_INVERSE_DISTANCE)
+
+
+def is_within_wall(origin: FloatArray) -> bool:
+    """Whether a centre (3,) is inside the street's far wall; seen from outside, the wall has edges."""
+    ox = (origin[0] - WALL_CENTER_M[0]) / Street.half_length_m
+    oy = (origin[1] - WALL_CENTER_M[1]) / Street.half_width_m
+    return bool(ox * ox + oy * oy < 1)
+
+
+NEAREST_SCENE_M = 2.0
+"""Distance of the nearest scene point assumed for worst-case parallax."""
+
+
+def worst_parallax_px(baseline_m: Any, focal_px: float) -> Any:
+    """Largest pixel shift between two centres if the scene is anywhere from ``NEAREST_SCENE_M`` to infinity."""
+    return focal_px * baseline_m / NEAREST_SCENE_M
+
+
+_STEPS = 2  # fixed-point iterations; a third one changes two real frames by at most 0.02 dB
+_ROW = 4096  # remap's sizes must stay below 32767
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """The distance corrections of one pair of cameras; read-only.
+
+    Attributes:
+        view: The view between the two, in the ego frame.
+        change: (h, w) float32 relative change of the surface's inverse distance, > -1.
+        share: (h, w) float32 weight in [0, 1], which fades to 0 towards the borders of the view.
+    """
+
+    view: Camera
+    change: npt.NDArray[np.float32]
+    share: npt.NDArray[np.float32]
+
+    @cached_property
+    def key(self) -> bytes:
+        """Content hash."""
+        return hashlib.sha256(self.view.content_key + self.change.tobytes() + self.share.tobytes()).digest()
+
+    @cached_property
+    def planes(self) -> npt.NDArray[np.float32]:
+        """(h, w, 2): change times share, and share."""
+        return np.dstack([self.change * self.share, self.share])
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays."""
+        return 2 * (self.change.nbytes + self.share.nbytes)
+
+
+@dataclass(frozen=True)
+class CorrectedSurface(StaticSurface):
+    """A static surface ``base`` with the corrections found over it; where several apply, their weighted mean.
+
+    A correction maps the pixels of a view between two cameras to relative changes of inverse distance. The point that a
+    ray meets is projected into these views, and the change found there is applied along the ray.
+    """
+
+    base: StaticSurface
+    corrections: tuple[Correction, ...]
+
+    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
+        """Inverse distance of the base times one plus the change, 1/m (...,)."""
+        base = self.base.inverse_distance(origin, directions)
+        q = base
+        for _ in range(_STEPS):
+            q = np.minimum(base * (1 + self._change(origin, directions, q)), MAX_INVERSE_DISTANCE)
+        return q
+
+    def _change(self, origin: FloatArray, directions: FloatArray, q: FloatArray) -> FloatArray:
+        """Relative change (...,) at the points on rays."""
+        rays, inverse = np.moveaxis(directions, -1, 0).reshape(3, -1), q.reshape(-1)
+        total = np.zeros((inverse.size, 2), np.float32)
+        for correction in self.corrections:
+            view = correction.view
+            P = view.K @ view.cam2ego[:3, :3].T
+            x, y, z = P @ rays + np.outer(P @ (origin - view.center_m), inverse)  # homogeneous: views are pinholes
+            h, w = view.size
+            inside = np.flatnonzero((z > 0) & (x >= 0) & (x <= (w - 1) * z) & (y >= 0) & (y <= (h - 1) * z))
+            uv = np.stack([x[inside], y[inside]], axis=-1) / z[inside, None]
+            total[inside] += _read(correction.planes, uv)
+        return (total[:, 0] / np.maximum(total[:, 1], 1)).astype(np.float64).reshape(q.shape)
+
+
+def _read(planes: npt.NDArray[np.float32], uv: FloatArray) -> npt.NDArray[np.float32]:
+    """Bilinear samples (n, 2) of (h, w, 2) at pixels (n, 2)."""
+    padded = np.pad(uv.astype(np.float32), ((0, -len(uv) % _ROW), (0, 0))).reshape(-1, _ROW, 2)
+    if not len(padded):
+        return np.zeros((0, 2), np.float32)
+    samples = cv2.remap(planes, padded, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
+    return np.asarray(samples, np.float32).reshape(-1, 2)[: len(uv)]

@@ -18,16 +18,18 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rays import project_rays
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.environment import compilation_announced
-from arbiview_aug.sample.neighbours import Neighbour
+from arbiview_aug.errors import SampleError, WarnOnce
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, Frame
+from arbiview_aug.sample.neighbours import BOX_MARGIN_M, Neighbour, neighbour_images
 from arbiview_aug.scene.boxes import draw_boxes
-from arbiview_aug.scene.depth_maps import motion_camera, points_of_depth
 from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.scene.scene import GEOMETRIES, Scene, motion_camera, points_of_depth
 from arbiview_aug.scene.surface import Points
-from arbiview_aug.temporal.change import BOX_MARGIN_M
 from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, reduced_grey
-from arbiview_aug.temporal.pose_check import CORRECTED_PX, MAX_CORRECTIONS, MAX_ERROR_PX, PoseSamples, pose_error
 
 BEST_TRAVEL_M, TRAVEL_M = 1.2, (0.4, 3.0)
 """Best travel to a neighbour, and the range allowed: shorter baselines measure nothing, longer ones hide too much."""
@@ -106,8 +108,8 @@ def motion_depth(
 ) -> MotionDepth:
     """Estimate depth from one neighbour before the frame and one after it, or from one if there is only one.
 
-    Images are matched at half the size first. Poses are checked on the result
-    (``arbiview_aug.temporal.pose_check``); small errors are corrected and the images matched again.
+    Images are matched at half the size first. Poses are checked on the result (``pose_error``); small errors
+    are corrected and the images matched again.
 
     Args:
         rig: Rig of the current frame.
@@ -248,3 +250,166 @@ def _without_speckles(q: Layer, valid: BoolArray) -> BoolArray:
     log_q: Any = np.where(valid, np.log(np.maximum(q, 1e-3) / 1e-3) * scale + 1, 0).astype(np.int16)
     cv2.filterSpeckles(log_q, 0, _SPECKLE_PX, _SPECKLE_STEP * scale)
     return log_q > 0
+
+
+# --- as a stage of the transform --------------------------------------------------------------------------------------
+def estimates_motion(frame: Frame, surface: GeometryName) -> bool:
+    """Whether depth from motion must be estimated for a surface that needs it; False if the sample brings some.
+
+    Raises:
+        SampleError: The sample has no neighbours to estimate it from.
+    """
+    keys = [key for key in (MOTION_KEY, LEARNED_KEY) if key == MOTION_KEY or key in GEOMETRIES[surface].reads]
+    if any(frame.sample.get(key) is not None for key in keys):
+        return False
+    if frame.sample.get("neighbours") is None:
+        raise SampleError(
+            f"geometry={surface!r}: expected 'neighbours' in the sample, or {MOTION_KEY!r} from the depth command, "
+            "got neither"
+        )
+    return True
+
+
+def estimate_motion(frame: Frame, scene: Scene, neighbours: Sequence[Neighbour], warn: WarnOnce) -> MotionDepth:
+    """Estimate depth from the motion between a frame and its neighbours; warn once if it is declined."""
+
+    def images(neighbour: Neighbour) -> tuple[torch.Tensor, ...] | None:
+        return neighbour_images(neighbour, frame.images, warn)
+
+    motion = motion_depth(frame.rig, frame.images, neighbours, scene.boxes, images)
+    if not motion.density:
+        warn("motion", str(motion))
+    return motion
+
+
+# --- errors of poses --------------------------------------------------------------------------------------------------
+
+CORRECTED_PX = 0.15
+"""Mean displacement in matched images above which a pose is corrected; exact poses measure 0.02 to 0.1."""
+
+MAX_ERROR_PX = 0.4
+"""Largest displacement left after the corrections, a tenth of a degree at 400 px; above it depth is declined."""
+
+MAX_CORRECTIONS = 2
+"""One correction reduces a third of a degree to a quarter; half a degree needs two."""
+
+_ACROSS = 0.3
+"""Largest share of a gradient along the epipolar line."""
+
+_CONTRAST_LEVELS = 2.0  # per pixel; fainter gradients are noise
+
+_MIN_PIXELS = 500  # for the five parameters
+
+_TURN_DEG, _SHIFT_M = 0.1, 0.02  # steps of the derivatives
+
+_REWEIGHTINGS = 5  # of iteratively reweighted least squares, against moving objects
+
+
+class PoseSamples(NamedTuple):
+    """Correspondences of one camera's pixels in a neighbour's image.
+
+    Attributes:
+        image: The camera's image.
+        other: The neighbour's.
+        inverse_distance: (h, w) along the camera's rays, 1/m.
+        valid: (h, w) bool.
+    """
+
+    image: SweptImage
+    other: SweptImage
+    inverse_distance: Layer
+    valid: BoolArray
+
+
+@dataclass(frozen=True, eq=False)
+class PoseError:
+    """Error of a neighbour's pose.
+
+    Attributes:
+        error_px: Mean displacement of pixels.
+        turn_deg: (3,) correcting turn about the current ego frame's axes.
+        shift_m: (2,) correcting shift along its y and z; a shift along x cannot be told from scale.
+    """
+
+    error_px: float
+    turn_deg: FloatArray
+    shift_m: FloatArray
+
+    @property
+    def correction(self) -> FloatArray:
+        """(4, 4) motion of the neighbour's cameras to their estimated poses, in the current ego frame."""
+        return _pose(np.concatenate([self.turn_deg, self.shift_m]))
+
+    def __str__(self) -> str:
+        degrees, metres = float(np.linalg.norm(self.turn_deg)), float(np.linalg.norm(self.shift_m))
+        return f"{self.error_px:.2f} px ({degrees:.2f} degrees, {metres:.2f} m)"
+
+
+def pose_error(samples: Sequence[PoseSamples]) -> PoseError | None:
+    """Estimate the error of one neighbour's pose from all its cameras; None if too few pixels match."""
+    parts = [equations for sample in samples if (equations := _equations(sample)) is not None]
+    if sum(len(b) for _, b, _ in parts) < _MIN_PIXELS:
+        return None
+    A, b, J = (np.concatenate(part) for part in zip(*parts, strict=True))
+    x = np.zeros(5)
+    for _ in range(_REWEIGHTINGS):
+        residual = b - A @ x
+        scale = 1.5 * np.median(np.abs(residual)) + 1e-9
+        weighted = A * (1 / (1 + (residual / scale) ** 2))[:, None]
+        x = np.linalg.lstsq(weighted.T @ A + 1e-9 * np.eye(5), weighted.T @ b, rcond=None)[0]
+    return PoseError(float(np.linalg.norm(J @ x, axis=-1).mean()), x[:3], x[3:])
+
+
+def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Linear equations A x = b, (n, 5) and (n,), and the motion J of pixels (n, 2, 5); None without usable pixels.
+
+    x holds turns about the ego's axes in degrees and shifts along its y and z in metres. Images are compared at their
+    local mean and contrast, as in the sweep's correlation.
+    """
+    at = sample.image.positions(sample.other.camera, sample.inverse_distance)
+    warped: Any = cv2.remap(sample.other.grey, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    one, two = _normalised(sample.image.grey), _normalised(warped)
+    mean = (sample.image.grey + warped) / 2
+    # Gradients of the warped image stand for those of the neighbour's: the warp is close to the identity.
+    gx, gy = (cv2.Sobel((one + two) / 2, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))
+    contrast = np.hypot(*(cv2.Sobel(mean, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1))))
+    shift = sample.image.shift(sample.other.camera, sample.inverse_distance)
+    length = np.maximum(np.hypot(shift[..., 0], shift[..., 1]), 1e-9)
+    ex, ey = shift[..., 0] / length, shift[..., 1] / length
+    across = np.abs(gx * ex + gy * ey) <= _ACROSS * np.hypot(gx, gy)
+    use = sample.valid & (contrast > _CONTRAST_LEVELS) & across
+    if not use.any():
+        return None
+    motion = _motion(sample, use, at[use])
+    normal = np.stack([-ey[use], ex[use]], -1)
+    off_line = np.einsum("nk,nkp->np", normal, motion)  # [n, 5] px per unit
+    gradient = gx[use] * normal[:, 0] + gy[use] * normal[:, 1]
+    # Pixels read by the erroneous pose are displaced by its error: two(x) = one(x - off_line).
+    return gradient[:, None] * off_line, (one - two)[use], motion
+
+
+def _normalised(image: Layer) -> Layer:
+    mean = cv2.blur(image, (15, 15))
+    spread = np.sqrt(np.maximum(cv2.blur(image * image, (15, 15)) - mean * mean, 0) + 4)
+    return np.asarray((image - mean) / spread)
+
+
+def _motion(sample: PoseSamples, use: BoolArray, at: Layer) -> FloatArray:
+    """(n, 2, 5) motion of the corresponding pixels per unit of turn and shift of the neighbour."""
+    image, source = sample.image, sample.other.camera
+    directions, q = image.directions[use], sample.inverse_distance[use].astype(np.float64)
+    columns = []
+    for axis in range(5):
+        step = _TURN_DEG if axis < 3 else _SHIFT_M
+        moved = source.moved(_pose(step * np.eye(5)[axis]))
+        uv, _ = project_rays(moved, directions, q, image.camera.center_m - moved.center_m)
+        columns.append((uv - at) / step)
+    return np.stack(columns, -1)
+
+
+def _pose(x: FloatArray) -> FloatArray:
+    """(4, 4) of turns about x, y, z in degrees and shifts along y and z in metres."""
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(np.radians(x[:3]))[0]
+    pose[1:3, 3] = x[3:]
+    return pose

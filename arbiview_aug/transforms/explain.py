@@ -13,9 +13,8 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.inpaint.neighbours import Fills
 from arbiview_aug.render.harmonise import PhotometricReport
-from arbiview_aug.render.plan import RenderPlan
+from arbiview_aug.render.plan import RenderPlan, SourceUse
 from arbiview_aug.render.requirements import harm_remedies
-from arbiview_aug.render.view_plan import SourceUse
 from arbiview_aug.transforms.plan_cache import FramePlan
 
 if TYPE_CHECKING:

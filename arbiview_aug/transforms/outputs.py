@@ -16,8 +16,7 @@ from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, is_readable, lens_names, like, rewrapped, split, stacked
-from arbiview_aug.sample.check import PIXEL_BOUND_KEYS
-from arbiview_aug.sample.inputs import CALIBRATION_KEYS, Frame
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, PIXEL_BOUND_KEYS, Frame
 from arbiview_aug.transforms.settings import SampleKeys
 
 

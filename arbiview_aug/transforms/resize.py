@@ -17,12 +17,11 @@ import torch
 from arbiview_aug.cameras.camera import Camera, resize_matrix
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.image_ops import nearest_resized, resized
-from arbiview_aug.renamed import refuse_old_options
 from arbiview_aug.sample.batching import is_readable, like, rewrapped
-from arbiview_aug.sample.check import PIXEL_BOUND_KEYS, check_other_keys
-from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, numbers, read_frames
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, PIXEL_BOUND_KEYS, check_other_keys, numbers, read_frames
 from arbiview_aug.transforms.settings import SampleKeys
 
 _MAPS = ("coverage", "ego_mask", "source_camera", "source_frame", "confidence", "generated", "depth", "depth_m")

@@ -18,7 +18,7 @@ import torch
 from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.choices import GeometryName, Holes
+from arbiview_aug.choices import GeometryName, Holes, Quality, choice, refuse_old_options
 from arbiview_aug.environment import compilation_announced, warn_about_cv2_wheels
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.favs.renderer import PaperRendering, check_settings, render_paper
@@ -26,21 +26,27 @@ from arbiview_aug.favs.stage1_geometry import check_pinhole
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
 from arbiview_aug.inpaint.neighbours import Fills, Reach, fill_from_neighbours, plan_fills
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.renamed import choice, refuse_old_options
-from arbiview_aug.render.config import Quality, RenderConfig
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
-from arbiview_aug.render.plan import RenderPlan
+from arbiview_aug.render.overlap_depth import OverlapCache, estimate_overlap
+from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, RenderedFrame, Renderer, resize_only
-from arbiview_aug.sample.check import check_other_keys, warn_of_misnamed, warn_of_rims
 from arbiview_aug.sample.detections import read_detections
-from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, Frame, read_frames, read_scene
+from arbiview_aug.sample.inputs import (
+    LEARNED_KEY,
+    LEARNED_WORDS_KEY,
+    Frame,
+    check_other_keys,
+    read_frames,
+    read_scene,
+    warn_of_misnamed,
+    warn_of_rims,
+)
 from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
-from arbiview_aug.transforms.checks import check_reach, warn_of_harm
-from arbiview_aug.transforms.estimate_depth import OverlapCache, estimate_motion, estimate_overlap, estimates_motion
+from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
 from arbiview_aug.transforms.outputs import SampleWriter
-from arbiview_aug.transforms.plan_cache import FramePlan, PlanCache, Plans
+from arbiview_aug.transforms.plan_cache import FramePlan, PlanCache, Plans, check_reach, warn_of_harm
 from arbiview_aug.transforms.settings import (
     SampleKeys,
     checked_instance,

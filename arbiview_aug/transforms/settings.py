@@ -8,12 +8,12 @@ from numbers import Real
 from typing import Any, Literal, TypeVar
 
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
+from arbiview_aug.choices import choice
 from arbiview_aug.errors import SampleError
 from arbiview_aug.inpaint.continued import Continue, Mean
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY, Black, Inpainter
 from arbiview_aug.inpaint.telea import Telea
-from arbiview_aug.renamed import choice
-from arbiview_aug.render.config import PRESETS, RenderConfig
+from arbiview_aug.render.plan import PRESETS, RenderConfig
 
 T = TypeVar("T")
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import GeometryName, Reduce
+from arbiview_aug.choices import GeometryName, Quality, Reduce
 from arbiview_aug.cli.arguments import add_data, add_downscale, command_parser, output_file, seed
 from arbiview_aug.cli.bench.study import benchmark, machine_line, quartiles, show, study
 from arbiview_aug.datasets import open_data, reduced_rig
@@ -34,9 +34,9 @@ from arbiview_aug.evaluate.methods import Method, Sample, paper_stages, retarget
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import UP_M, named_targets, shifted_target
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.render.config import Quality, RenderConfig
+from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
-from arbiview_aug.scene.depth_maps import motion_camera
+from arbiview_aug.scene.scene import motion_camera
 from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget

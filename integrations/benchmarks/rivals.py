@@ -26,8 +26,9 @@ from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.evaluate.targets import named_targets, without_masks
 from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.image_ops import Scratch
-from arbiview_aug.render.opencv_backend import render_opencv
-from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.plan import RenderPlan
+from arbiview_aug.render.rendered import render_opencv
+from arbiview_aug.render.view_planner import build_plan
 from integrations.benchmarks.opencv_stitching import opencv_stitching
 
 YAW_DEG = 22.0

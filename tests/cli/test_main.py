@@ -21,10 +21,10 @@ import pytest
 
 from arbiview_aug import __main__, environment, load_rig
 from arbiview_aug.__main__ import BENCHMARKS, COMMANDS, Command, main
-from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, GeometryName
+from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, GeometryName, Quality
 from arbiview_aug.evaluate import paper_study
 from arbiview_aug.generator.training.config import CONFIGS
-from arbiview_aug.render.config import PRESETS, Quality
+from arbiview_aug.render.plan import PRESETS
 from arbiview_aug.scene.scene import GEOMETRIES
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.projection import adjacent_pairs, half_way_view
+from arbiview_aug.cameras.rays import adjacent_pairs, half_way_view
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.agreement import overlap_psnr, overlap_scores, source_overlap
 from arbiview_aug.evaluate.lidar import (

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.cameras.projection import half_way_view
+from arbiview_aug.cameras.rays import half_way_view
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate import methods

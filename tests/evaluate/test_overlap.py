@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.projection import adjacent_pairs, half_way_view, odd_tiles
+from arbiview_aug.cameras.rays import adjacent_pairs, half_way_view, odd_tiles
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.evaluate.agreement import MIN_PIXELS, overlap_psnr, overlap_scores
 from tests import helpers

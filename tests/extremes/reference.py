@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from arbiview_aug import Camera
-from arbiview_aug.render.atlas import Slot
-from arbiview_aug.scene.static import WALL_CENTER_M, Ground, Street
-from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE
+from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
+from arbiview_aug.render.plan import Slot
+from arbiview_aug.scene.surface import WALL_CENTER_M, Ground, Street
 
 LEAST_DEPTH = 1e-6  # of unit directions, for lenses that see less than half a turn
 

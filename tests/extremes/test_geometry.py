@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget, SampleError, SampleKeys
-from arbiview_aug.cameras.projection import ego_rays, project_rays
-from arbiview_aug.render.config import RenderConfig
-from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.cameras.rays import ego_rays, project_rays
+from arbiview_aug.render.plan import RenderConfig, RenderPlan
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.scene import Scene
 from tests import helpers
 from tests.extremes import reference

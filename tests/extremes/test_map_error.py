@@ -15,11 +15,11 @@ import pytest
 
 from arbiview_aug import Rig, load_rig
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.projection import ego_rays, project_rays
+from arbiview_aug.cameras.rays import ego_rays, project_rays
 from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.render.atlas import FixedMap
-from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.plan import FixedMap, RenderPlan
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Surface

@@ -25,10 +25,10 @@ from arbiview_aug.favs.stage2_features import (
 )
 from arbiview_aug.favs.stage4_fusion import fuse
 from arbiview_aug.render.harmonise import LEVELS, SHARES, HarmoniseConfig, estimate_gains, tone_curves
-from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.photometry_kernels import tone
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.torch_backend import render_torch
+from arbiview_aug.render.view_planner import build_plan
 from tests.extremes import reference
 from tests.extremes.conftest import Worst
 from tests.extremes.test_geometry import SOURCES, TARGETS, camera, no_numpy_warnings, ring

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug import Rig
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.scene import Scene
 from tests.extremes import reference
 from tests.extremes.test_geometry import camera

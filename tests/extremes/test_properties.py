@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from arbiview_aug import Camera, RenderConfig, Rig, load_rig
 from arbiview_aug.cameras.camera import UNPROJECT_TOLERANCE_PX
 from arbiview_aug.cameras.rotations import rotation_x, rotation_z
-from arbiview_aug.render.opencv_backend import render_opencv
-from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.plan import RenderPlan
+from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.torch_backend import render_torch
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.static import WALL_CENTER_M
+from arbiview_aug.scene.surface import WALL_CENTER_M
 from tests import helpers
 from tests.extremes import drawn, reference
 from tests.extremes.conftest import Worst

@@ -11,8 +11,8 @@ import torch
 
 from arbiview_aug import Rig, RigRetarget, SampleError
 from arbiview_aug.errors import CalibrationError
-from arbiview_aug.render.atlas import AtlasLayout
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.plan import AtlasLayout
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.scene import Scene
 from tests.extremes.conftest import Worst
 from tests.extremes.test_geometry import camera, check, no_numpy_warnings, ring

@@ -13,7 +13,7 @@ import torch
 
 from arbiview_aug import PlanCache, RigRetarget
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.transforms.estimate_depth import OverlapCache
+from arbiview_aug.render.overlap_depth import OverlapCache
 from tests.extremes import misuse
 
 

@@ -13,7 +13,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.favs.renderer import PaperRendering, paper_labels, primary_camera, render_paper
 from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.favs.stage4_fusion import fuse
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.transforms.explain import PaperExplanation
 from tests import helpers
 

@@ -15,8 +15,8 @@ from arbiview_aug import Rig, RigRetarget, SampleKeys
 from arbiview_aug.inpaint import continued as holes_module
 from arbiview_aug.inpaint.continued import fill_holes, mean_colour, object_colours
 from arbiview_aug.render.kernels import farthest_occluded, mark_objects
-from arbiview_aug.render.plan import build_plan
-from arbiview_aug.render.view_plan import BACKGROUND, OBJECT, OCCLUDED, Paint
+from arbiview_aug.render.plan import BACKGROUND, OBJECT, OCCLUDED, Paint
+from arbiview_aug.render.view_planner import build_plan, find_paint
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.transforms.resize import CropRig, ResizeRig
 from tests.helpers import camera, ring, street_sample
@@ -328,7 +328,7 @@ def painted(top_seen: bool, scale: float = 1.0) -> tuple[torch.Tensor, Paint, to
     seen = torch.ones((64, 64), dtype=torch.bool)
     seen[10:20, 36 if not top_seen else 54 : 60] = False
     view = (view * seen * scale).to(torch.uint8 if scale == 1 else torch.float32)
-    paint = Paint.of(face, np.where(seen.numpy(), 0, -1).astype(np.int8), PARTS)
+    paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), PARTS)
     return view, paint, seen
 
 
@@ -352,7 +352,7 @@ def test_cracks_in_objects_take_the_colour_beside_them() -> None:
     seen = torch.ones((64, 64), dtype=torch.bool)
     seen[:, 20] = False
     view[:, ~seen] = 0
-    paint = Paint.of(face, np.where(seen.numpy(), 0, -1).astype(np.int8), PARTS)
+    paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), PARTS)
     (out,) = fill_holes([view], [seen], [np.full((64, 64), OBJECT, np.uint8)], [paint])
     assert torch.equal(out[:, 30, 20], expected)
 

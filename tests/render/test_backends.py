@@ -13,13 +13,11 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.image_ops import Scratch
-from arbiview_aug.render.atlas import AtlasLayout, FixedMap
-from arbiview_aug.render.config import RenderConfig
 from arbiview_aug.render.kernels import read_ahead
-from arbiview_aug.render.opencv_backend import render_opencv
-from arbiview_aug.render.plan import RenderPlan, build_plan
-from arbiview_aug.render.rendered import render_labels
+from arbiview_aug.render.plan import AtlasLayout, FixedMap, RenderConfig, RenderPlan
+from arbiview_aug.render.rendered import render_labels, render_opencv
 from arbiview_aug.render.torch_backend import maps_on, render_torch
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.transforms.settings import render_config
 
 GEOMETRIES = ["infinity", "ground", "street", "auto"]

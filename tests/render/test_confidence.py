@@ -7,9 +7,8 @@ import torch
 from arbiview_aug import Rig, RigRetarget, SampleKeys
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.render.confidence import certainty, confidence
-from arbiview_aug.scene.boxes import BoxSurface
-from arbiview_aug.scene.shapes import solids
-from arbiview_aug.scene.static import Far, Street
+from arbiview_aug.scene.boxes import BoxSurface, solids
+from arbiview_aug.scene.surface import Far, Street
 from tests.helpers import street_sample
 from tests.scene.single_rays import inverse_distance
 

@@ -10,12 +10,11 @@ import pytest
 import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys, load_rig
-from arbiview_aug.cameras.projection import ego_rays
+from arbiview_aug.cameras.rays import ego_rays
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.agreement import overlap_scores
-from arbiview_aug.render.atlas import FixedMap
 from arbiview_aug.render.harmonise import (
     KNEE,
     LEVELS,
@@ -27,11 +26,11 @@ from arbiview_aug.render.harmonise import (
     pair_ratios,
     tone_curves,
 )
-from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.photometry_kernels import pair_errors, tone
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.plan import FixedMap, ViewPlan
+from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.torch_backend import render_torch
-from arbiview_aug.render.view_plan import ViewPlan
+from arbiview_aug.render.view_planner import build_plan
 
 SIZE = (180, 320)
 

@@ -12,17 +12,14 @@ import torch
 from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.projection import ego_rays, half_way_view, project_rays
+from arbiview_aug.cameras.rays import ego_rays, half_way_view, project_rays
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.render.overlap_depth import LIMITS, MIN_RISE_DB, OverlapDepth, overlap_depth
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.overlap_depth import LIMITS, MIN_RISE_DB, OverlapCache, OverlapDepth, overlap_depth
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.static import CorrectedSurface, Correction, Street
-from arbiview_aug.scene.surface import StaticSurface
-from arbiview_aug.transforms import estimate_depth
-from arbiview_aug.transforms.estimate_depth import OverlapCache
+from arbiview_aug.scene.surface import CorrectedSurface, Correction, StaticSurface, Street
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import render_config
 from tests import helpers
@@ -158,7 +155,7 @@ def test_not_where_every_pixel_is_exact(monkeypatch: pytest.MonkeyPatch) -> None
     def refuse(*_: object) -> None:
         raise AssertionError("matched without need")
 
-    monkeypatch.setattr("arbiview_aug.transforms.estimate_depth.overlap_depth", refuse)
+    monkeypatch.setattr("arbiview_aug.render.overlap_depth.overlap_depth", refuse)
     one = Rig([camera("left", 25, 0), camera("right", -25, 0)])
     sample = {"images": noise(0)}
     RigRetarget(one.turned(yaw_deg=5), source=one, quality="accurate")(sample)
@@ -278,7 +275,7 @@ def test_a_cache_computes_each_scene_once(nearer: tuple[torch.Tensor, OverlapDep
 
 def test_a_cache_forgets_the_oldest(nearer: tuple[torch.Tensor, OverlapDepth], monkeypatch: pytest.MonkeyPatch) -> None:
     _, depth = nearer
-    monkeypatch.setattr(estimate_depth, "_OVERLAP_BYTES", 2 * depth.nbytes)
+    monkeypatch.setattr("arbiview_aug.render.overlap_depth._OVERLAP_BYTES", 2 * depth.nbytes)
     cache = OverlapCache(None)
     for name in "abca":
         cache.get((b"", name), lambda: depth)

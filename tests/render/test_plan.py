@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.projection import ego_rays, project_rays
+from arbiview_aug.cameras.rays import ego_rays, project_rays
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.config import RenderConfig
-from arbiview_aug.render.plan import RenderPlan, build_plan, plan_key
+from arbiview_aug.render.plan import RenderConfig, RenderPlan
+from arbiview_aug.render.view_planner import build_plan, plan_key
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.scene import Scene
 from tests.helpers import in_atlas, in_source, sampled

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.render.config import RenderConfig
-from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.requirements import MOVED_M, baselines_m, covers_target_exactly, needs_geometry, static_harm
-from arbiview_aug.render.view_planner import ViewPlanner
+from arbiview_aug.render.view_planner import ViewPlanner, build_plan
 from arbiview_aug.transforms.settings import render_config
 
 FAST = RenderConfig()

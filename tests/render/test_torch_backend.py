@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.render.atlas import AtlasLayout, FixedMap, Slot
+from arbiview_aug.render.plan import AtlasLayout, FixedMap, Slot
 from arbiview_aug.render.torch_backend import _blend, _blended, _fill_atlas, _grid, _sample, _toned
 
 CPU = torch.device("cpu")

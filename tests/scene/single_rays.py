@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.point_cloud import COARSE, Panorama, PointCloudSurface, PointCloudWithBoxes
-from arbiview_aug.scene.surface import MAX_INVERSE_DISTANCE, StaticSurface, Surface
+from arbiview_aug.scene.surface import StaticSurface, Surface
 
 
 def inverse_distance(

@@ -14,13 +14,12 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import GeometryWarning
-from arbiview_aug.render.config import RenderConfig
-from arbiview_aug.render.opencv_backend import render_opencv
-from arbiview_aug.render.plan import build_plan
-from arbiview_aug.scene.boxes import BoxSurface, checked_boxes
+from arbiview_aug.render.plan import RenderConfig
+from arbiview_aug.render.rendered import render_opencv
+from arbiview_aug.render.view_planner import build_plan
+from arbiview_aug.scene.boxes import BoxSurface, checked_boxes, solids, whole
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.shapes import solids, whole
-from arbiview_aug.scene.static import Street
+from arbiview_aug.scene.surface import Street
 from tests.scene.single_rays import inverse_distance, occludes, solids_ahead
 
 EYE = np.array([0.0, 0.0, 1.5])

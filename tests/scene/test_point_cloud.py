@@ -15,13 +15,12 @@ from arbiview_aug import RigRetarget, SampleError, load_rig
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.render.config import RenderConfig
-from arbiview_aug.render.plan import build_plan
-from arbiview_aug.scene.depth_maps import points_of_depth
+from arbiview_aug.render.plan import RenderConfig
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.panorama import REACH_RAD
 from arbiview_aug.scene.point_cloud import Cells, PointCloudSurface, PointCloudWithBoxes, checked_points
-from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.static import Street
+from arbiview_aug.scene.scene import Scene, points_of_depth
+from arbiview_aug.scene.surface import Street
 from tests import helpers
 from tests.scene.single_rays import inverse_distance, occludes, occlusion_depth
 

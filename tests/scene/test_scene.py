@@ -13,8 +13,7 @@ from arbiview_aug import Camera, Rig, RigRetarget
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.errors import SampleError
-from arbiview_aug.scene.depth_maps import anchored
-from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
+from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene, anchored
 from arbiview_aug.scene.surface import StaticSurface
 
 

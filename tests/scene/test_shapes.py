@@ -7,13 +7,12 @@ import pytest
 from arbiview_aug import Camera, Rig
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.render.plan import build_plan
-from arbiview_aug.scene.boxes import BoxSurface, points_in
+from arbiview_aug.render.view_planner import build_plan
+from arbiview_aug.scene.boxes import KIND_M, OF_KIND, PROFILES, BoxSurface, kinds, points_in, solids, solids_among
 from arbiview_aug.scene.kernels import planes_of
 from arbiview_aug.scene.point_cloud import PointCloudWithBoxes
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.shapes import KIND_M, OF_KIND, PROFILES, kinds, solids, solids_among
-from arbiview_aug.scene.static import Street
+from arbiview_aug.scene.surface import Street
 from tests.scene.single_rays import inverse_distance, occlusion_depth, solids_ahead
 
 SIZES = {

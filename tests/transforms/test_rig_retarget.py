@@ -16,7 +16,7 @@ from torch.utils.data import default_collate
 
 from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError, SampleKeys, SampleTypeError, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.render.config import RenderConfig
+from arbiview_aug.render.plan import RenderConfig
 from tests import helpers
 from tests.helpers import same, sample_of, smooth_images
 

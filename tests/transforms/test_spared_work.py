@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from arbiview_aug.cameras.projection import adjacent_pairs
+from arbiview_aug.cameras.rays import adjacent_pairs
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.bench.data import as_of_another_frame
 from arbiview_aug.evaluate.targets import without_masks
-from arbiview_aug.render.config import RenderConfig
+from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import render_config

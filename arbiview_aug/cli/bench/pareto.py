@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from arbiview_aug import PlanCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import GeometryName, Reduce
+from arbiview_aug.choices import GeometryName, Quality, Reduce
 from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
 from arbiview_aug.cli.bench.speed import remap_floor
@@ -50,7 +50,7 @@ from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.methods import Method, Sample, views_of
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.generator import load_inpainter
-from arbiview_aug.render.config import Quality, RenderConfig
+from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.render.requirements import HELPFUL_DATA, static_harm
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget

@@ -45,8 +45,9 @@ from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.image_ops import resized
 from arbiview_aug.render.harmonise import Harmonise
-from arbiview_aug.render.plan import RenderPlan, build_plan
+from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.torch_backend import maps_on, render_torch
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.warm_up import compile_kernels

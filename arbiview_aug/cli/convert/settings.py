@@ -10,13 +10,12 @@ from typing import Any, Literal
 from arbiview_aug.atomic_io import Link, checksum, is_part
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import GeometryName, Holes, Reduce
+from arbiview_aug.choices import GeometryName, Holes, Quality, Reduce
 from arbiview_aug.datasets.drive import Neighbours, Recording
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.errors import DataError
 from arbiview_aug.generator import load_inpainter
 from arbiview_aug.inpaint.inpainter import Inpainter
-from arbiview_aug.render.config import Quality
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys
 

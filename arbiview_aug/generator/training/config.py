@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
 
+from arbiview_aug.choices import setting_hint
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import config as generators
 from arbiview_aug.generator.config import GeneratorConfig, check_fields, from_plain
-from arbiview_aug.renamed import setting_hint
 
 GeoMode = Literal["normalised", "frobenius_sum"]
 PseudoQuality = Literal["fast", "paper"]

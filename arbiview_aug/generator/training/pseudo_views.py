@@ -34,9 +34,9 @@ from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geomet
 from arbiview_aug.generator.training.config import PseudoQuality, PseudoViewConfig
 from arbiview_aug.generator.training.data import Frames
 from arbiview_aug.inpaint.telea import telea
-from arbiview_aug.render.config import RenderConfig
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.render.rendered import Renderer
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.inputs import Frame
 
 _YAW_DEG = (13.75, 35.0)  # the paper's rotations

@@ -20,17 +20,16 @@ from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import GeometryName
+from arbiview_aug.choices import GeometryName, Quality
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.agreement import overlap_scores
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.lidar import coloured_points, sparse_metrics
 from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
-from arbiview_aug.render.config import Quality
-from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.overlap_depth import overlap_depth
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.rendered import render_opencv
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Surface
 from arbiview_aug.transforms.rig_retarget import RigRetarget

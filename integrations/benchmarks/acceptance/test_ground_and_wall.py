@@ -14,11 +14,10 @@ import pytest
 import torch
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Quality
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.evaluate.metrics import psnr_db
-from arbiview_aug.render.config import Quality
-from arbiview_aug.scene.static import Ground, Street
-from arbiview_aug.scene.surface import StaticSurface
+from arbiview_aug.scene.surface import Ground, StaticSurface, Street
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 pytestmark = pytest.mark.timeout(1800)

@@ -24,9 +24,9 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
-from arbiview_aug.render.opencv_backend import render_opencv
-from arbiview_aug.render.plan import RenderPlan, build_plan
-from arbiview_aug.render.rendered import render_labels
+from arbiview_aug.render.plan import RenderPlan
+from arbiview_aug.render.rendered import render_labels, render_opencv
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.boxes import checked_boxes
 from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import Scene

@@ -24,15 +24,14 @@ import pytest
 import torch
 
 from arbiview_aug import Rig
-from arbiview_aug.cameras.projection import project_rays
+from arbiview_aug.cameras.rays import project_rays
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Scene, SceneBuilder
-from arbiview_aug.render.plan import build_plan
 from arbiview_aug.render.rendered import render_labels
-from arbiview_aug.scene.boxes import BoxSurface, checked_boxes, draw_boxes
+from arbiview_aug.render.view_planner import build_plan
+from arbiview_aug.scene.boxes import PIECES, BoxSurface, checked_boxes, draw_boxes, whole
 from arbiview_aug.scene.scene import Scene as Geometry
-from arbiview_aug.scene.shapes import PIECES, whole
-from arbiview_aug.scene.static import Street
+from arbiview_aug.scene.surface import Street
 from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(1800)

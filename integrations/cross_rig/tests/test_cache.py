@@ -99,7 +99,7 @@ def test_frames_are_made_anew_when_the_renderer_changes(tmp_path, monkeypatch):
         read.clear()
         Source(root=tmp_path, size=(24, 64), split="train", change="up70", variant=VARIANTS[name]).store()
         rendering = {
-            *("arbiview_aug.render.kernels", "arbiview_aug.scene.shapes"),
+            *("arbiview_aug.render.kernels", "arbiview_aug.scene.boxes"),
             *("arbiview_aug.transforms.rig_retarget", "arbiview_aug.inpaint.inpainter"),
         }
         assert (rendering <= read) == (name != "row_split") and "arbiview_aug.datasets.synthetic.street" in read

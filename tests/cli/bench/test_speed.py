@@ -13,7 +13,7 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.data import recorded
 from arbiview_aug.cli.bench.speed import BOUNDS, BOXES, bytes_moved, default_data, measure, table
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
-from arbiview_aug.render.plan import build_plan
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.transforms.settings import render_config
 from tests.helpers import street_sample
 

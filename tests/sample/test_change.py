@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from arbiview_aug.sample.neighbours import ChangeRisk, change_risks
 from arbiview_aug.scene.boxes import moved_boxes
-from arbiview_aug.temporal.change import ChangeRisk, change_risks
 
 CAR = np.array([10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0])
 
