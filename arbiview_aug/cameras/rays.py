@@ -119,17 +119,11 @@ CELL_PX = 8
 
 @dataclass(frozen=True)
 class PixelRays:
-    """Viewing rays of a camera's pixels, camera frame.
+    """Viewing rays of a camera's pixels, camera frame."""
 
-    Attributes:
-        size: (h, w).
-        parameters: ``Camera.parameters``.
-        planes: (3, h, w) float32 unit rays, 0 where there is none; (3, 0, 0) for a pinhole.
-    """
-
-    size: tuple[int, int]
-    parameters: Planes
-    planes: Planes
+    size: tuple[int, int]  # (h, w)
+    parameters: Planes  # ``Camera.parameters``
+    planes: Planes  # (3, h, w) float32 unit rays, 0 where there is none; (3, 0, 0) for a pinhole
 
     @cached_property
     def cones(self) -> Planes:

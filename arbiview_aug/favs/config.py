@@ -13,7 +13,7 @@ class PaperConfig:
     """Settings of ``quality="paper"``, the published stages 1 to 4 (paper, section "FAVS Algorithm").
 
     The paper names its parameters but gives no values, except for ``ratio``. Lengths named ``_px`` are target pixels at
-    a target width of 800 px and scale with the width.
+    a target width of 800 px and scale with the width. Constants of the stages' files are not the paper's.
 
     Attributes:
         use_feature_matching: Stage 2: correct H_geometric by matched features.
@@ -24,23 +24,12 @@ class PaperConfig:
         use_quality_weight: Stage 4: w_quality.
         use_primary_weight: Stage 4: w_primary.
         ratio: Lowe's ratio d1 / d2, the paper's value.
-        max_features: Number of the strongest SIFT keypoints per overlap; the most seen in real frames is 1108.
-        overlap_margin_px: Margin around the overlap's bounding box, about the reach of a SIFT descriptor.
-        min_overlap_px: Smallest width of an overlap to match: descriptors reach across narrower ones.
-        ransac_px: Largest reprojection error of an inlier of M.
         min_matches: Criterion 1, min_matches: four matches always fit a homography exactly.
-        max_area_ratio: Criterion 2: bound of ``check_homography``, relative to the cameras' focal lengths.
         consistent_px: Largest corner motion at which H_base = H_feature: half a degree at 60 degrees of view.
         inconsistent_px: Criterion 3, threshold: corner motion from which H_base = H_geometric; α is linear below it.
-        cluster_radius_px: DBSCAN's ε: a car's width, 1.8 m, at 40 m and 60 degrees of view.
-        min_samples: DBSCAN's min_samples.
-        cluster_spread_px: Spread s_j of a cluster's offsets at which confidence_j = 1 / (1 + (s_j / this)²) is 1/2.
         type_weights: type_weight_j by type. Without detections the type is geometric: ``ground`` on the road,
             ``upright`` across the horizon, ``far`` above it. The offset of near road is mostly its own parallax.
-        other_type_weight: type_weight_j of any other type of a detector.
-        ground_reach_m: Distance within which a cluster's top must meet the road for the type ``ground``.
         beta: β, the adjustment strength in [0, 1]: ΔT moves the background along with the objects.
-        max_shift_px: Longest ΔT: longer ones come from mismatches or a single near object.
         distance_gamma: γ of w_distance = (d / d_max)^γ.
         gradient_sigma: σ of w_gradient, in grey levels per pixel.
         unmatched_quality: w_quality of a source without accepted matches; it rises to 1 with the share of inliers.
@@ -56,18 +45,10 @@ class PaperConfig:
     use_primary_weight: bool = True
     # --- stage 2 ----
     ratio: float = 0.75
-    max_features: int = 2000
-    overlap_margin_px: float = 8.0
-    min_overlap_px: float = 16.0
-    ransac_px: float = 2.0
     min_matches: int = 10
-    max_area_ratio: float = 16.0
     consistent_px: float = 6.0
     inconsistent_px: float = 24.0
     # --- stage 3 ----
-    cluster_radius_px: float = 30.0
-    min_samples: int = 4
-    cluster_spread_px: float = 2.0
     type_weights: tuple[tuple[str, float], ...] = (
         ("upright", 1.0),
         ("far", 1.0),
@@ -75,10 +56,7 @@ class PaperConfig:
         ("vehicle", 1.0),
         ("pedestrian", 1.0),
     )
-    other_type_weight: float = 0.5
-    ground_reach_m: float = 40.0
     beta: float = 0.5
-    max_shift_px: float = 12.0
     # --- stage 4 ----
     distance_gamma: float = 1.0
     gradient_sigma: float = 16.0
@@ -99,26 +77,17 @@ class PaperConfig:
     def type_weight(self, kind: str) -> float:
         """Look up type_weight_j of a type, or of the first known part of a dotted name such as ``vehicle.car``."""
         weights = dict(self.type_weights)
-        return next((weights[name] for name in (kind, *kind.split(".")) if name in weights), self.other_type_weight)
+        return next((weights[name] for name in (kind, *kind.split(".")) if name in weights), _OTHER_TYPE_WEIGHT)
 
+
+_OTHER_TYPE_WEIGHT = 0.5  # type_weight_j of any other type of a detector
 
 _PAPER_RANGES: dict[str, tuple[float, float]] = {
     "ratio": (0.0, 1.0),
-    "max_features": (4, 1e6),
-    "overlap_margin_px": (0.0, 1e3),
-    "min_overlap_px": (1.0, 1e4),
-    "ransac_px": (1e-3, 100.0),
     "min_matches": (4, 1e6),
-    "max_area_ratio": (1.0, 1e6),
     "consistent_px": (0.0, 1e4),
     "inconsistent_px": (0.0, 1e4),
-    "cluster_radius_px": (1e-3, 1e4),
-    "min_samples": (1, 1e6),
-    "cluster_spread_px": (1e-3, 1e3),
-    "other_type_weight": (0.0, 1e6),
-    "ground_reach_m": (0.0, 1e4),
     "beta": (0.0, 1.0),
-    "max_shift_px": (0.0, 1e4),
     "distance_gamma": (0.0, 16.0),
     "gradient_sigma": (1e-3, 1e6),
     "unmatched_quality": (1e-6, 1.0),

@@ -170,7 +170,7 @@ def _render_view(
             features = unmatched(H, "feature matching is switched off", matches)
         if config.use_object_alignment:
             boxes = detections.get(k, ())
-            candidates = find_objects(matches, H, features.H_base, target, source.ground_z_m, config, boxes)
+            candidates = find_objects(matches, H, features.H_base, target, source.ground_z_m, boxes)
             objects = align_objects(candidates, features.H_base, size[1], config)
         else:
             objects = declined(features.H_base, "object alignment is switched off")

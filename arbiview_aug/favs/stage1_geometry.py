@@ -60,11 +60,11 @@ def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: flo
     return target.K @ (R - np.outer(t, normal) / distance_m) @ np.linalg.inv(source.K)
 
 
-def check_homography(H: FloatArray, size: tuple[int, int], max_area_ratio: float = MAX_AREA_RATIO) -> bool:
+def check_homography(H: FloatArray, size: tuple[int, int]) -> bool:
     """Check that a homography does not distort the four image corners excessively.
 
     The corners must stay in front (one sign of the third coordinate), form a convex quadrilateral of the same
-    orientation, and enclose between 1 / ``max_area_ratio`` and ``max_area_ratio`` times the image's area. H and −H are
+    orientation, and enclose between 1 / ``MAX_AREA_RATIO`` and ``MAX_AREA_RATIO`` times the image's area. H and −H are
     the same homography, so the sign is taken from the image centre. ``size`` is (h, w) of the source image.
     """
     if H.shape != (3, 3) or not np.isfinite(H).all():
@@ -82,7 +82,7 @@ def check_homography(H: FloatArray, size: tuple[int, int], max_area_ratio: float
     if turns.min() <= 0:  # y is down: corners in this order turn positively in an unmirrored image
         return False
     area = cv2.contourArea(quad.astype(np.float32)) / max((w - 1) * (h - 1), 1)
-    return bool(1 / max_area_ratio <= area <= max_area_ratio)
+    return bool(1 / MAX_AREA_RATIO <= area <= MAX_AREA_RATIO)
 
 
 def _relative_rotation(source: Camera, target: Camera) -> FloatArray:

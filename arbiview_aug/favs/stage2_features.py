@@ -30,6 +30,11 @@ GreyImage = npt.NDArray[np.uint8]
 Case = Literal["feature", "blended", "geometric"]
 
 REFERENCE_WIDTH_PX = 800  # target width at which ``PaperConfig`` states its lengths
+# Lengths named _PX are target pixels at that width.
+_MAX_FEATURES = 2000  # strongest SIFT keypoints of an overlap; the most seen in real frames is 1108
+_OVERLAP_MARGIN_PX = 8.0  # around the overlap's bounding box: about the reach of a SIFT descriptor
+_MIN_OVERLAP_PX = 16.0  # descriptors reach across narrower overlaps
+_RANSAC_PX = 2.0  # largest reprojection error of an inlier of M
 _NEIGHBOURS = 2  # the ratio test compares the nearest with the second-nearest
 _FLANN_LINEAR = 0  # exact; kd-trees depend on the state of OpenCV's random generator
 
@@ -123,15 +128,13 @@ def overlap_region(one: BoolArray, two: BoolArray, margin_px: int) -> Region | N
     )
 
 
-def match_features(
-    warped: GreyImage, reference: GreyImage, usable: BoolArray, ratio: float, max_features: int
-) -> Matches:
+def match_features(warped: GreyImage, reference: GreyImage, usable: BoolArray, ratio: float) -> Matches:
     """Match SIFT features by FLANN and Lowe's ratio test, good_matches = {m : d1 / d2 < ratio}.
 
     SIFT repeats bit for bit within ``environment.repeatable_opencv`` only. Keypoints count where ``usable`` (h, w), not
     at a warp's black border.
     """
-    sift = cv2.SIFT_create(nfeatures=max_features)  # type: ignore[attr-defined]
+    sift = cv2.SIFT_create(nfeatures=_MAX_FEATURES)  # type: ignore[attr-defined]
     inside = usable.astype(np.uint8) * 255
     points_1, descriptors_1 = sift.detectAndCompute(warped, inside)
     points_2, descriptors_2 = sift.detectAndCompute(reference, inside)
@@ -168,14 +171,14 @@ def estimate_homography(matches: Matches, ransac_px: float) -> tuple[FloatArray,
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
-def is_valid(H: FloatArray, visible: Region, scale: float, max_area_ratio: float) -> bool:
+def is_valid(H: FloatArray, visible: Region, scale: float) -> bool:
     """Apply check_homography to the visible part of a source: its other corners may lie behind the target.
 
     ``scale`` is source focal length over target focal length, so that a smaller target is no distortion.
     """
     shift = np.array([[1.0, 0.0, visible.x0], [0.0, 1.0, visible.y0], [0.0, 0.0, 1.0]])
     size = visible.y1 - visible.y0 + 1, visible.x1 - visible.x0 + 1
-    return check_homography(np.diag([scale, scale, 1.0]) @ H @ shift, size, max_area_ratio)
+    return check_homography(np.diag([scale, scale, 1.0]) @ H @ shift, size)
 
 
 def optimise_transformation(
@@ -193,17 +196,17 @@ def optimise_transformation(
     length over the target's.
     """
     scale = warped.shape[1] / REFERENCE_WIDTH_PX
-    if not is_valid(H_geometric, visible, focal_ratio, config.max_area_ratio):
+    if not is_valid(H_geometric, visible, focal_ratio):
         return unmatched(H_geometric, "H_geometric distorts this source's corners too much to match it")
-    region = overlap_region(*coverages, round(config.overlap_margin_px * scale))
+    region = overlap_region(*coverages, round(_OVERLAP_MARGIN_PX * scale))
     if region is None:
         return unmatched(H_geometric, "no overlap with the primary camera")
-    least = config.min_overlap_px * scale
+    least = _MIN_OVERLAP_PX * scale
     if min(region.x1 - region.x0, region.y1 - region.y0) < least:
         return unmatched(H_geometric, f"the overlap with the primary camera is narrower than {least:.0f} px")
     crop = slice(region.y0, region.y1 + 1), slice(region.x0, region.x1 + 1)
     usable = (coverages[0] & coverages[1])[crop]
-    cropped = match_features(warped[crop], reference[crop], usable, config.ratio, config.max_features)
+    cropped = match_features(warped[crop], reference[crop], usable, config.ratio)
     offset = np.array([region.x0, region.y0])
     matches = Matches(cropped.warped + offset, cropped.reference + offset)
     shown = overlap_region(coverages[0], coverages[0], 0)
@@ -228,14 +231,14 @@ def accept(
     count = len(matches.warped)
     if count < config.min_matches:
         return unmatched(H_geometric, f"{count} good matches, fewer than {config.min_matches}", matches)
-    estimate = estimate_homography(matches, config.ransac_px * scale)
+    estimate = estimate_homography(matches, _RANSAC_PX * scale)
     if estimate is None:
         return unmatched(H_geometric, f"{count} good matches determine no homography", matches)
     M, inlier = estimate
     H_feature = M @ H_geometric
     agreeing = Matches(matches.warped[inlier], matches.reference[inlier])
     inliers = int(inlier.sum())
-    if not is_valid(H_feature, visible, focal_ratio, config.max_area_ratio):
+    if not is_valid(H_feature, visible, focal_ratio):
         reason = f"H_feature from {inliers} of {count} matches distorts the corners too much"
         return FeatureReport(normalised(H_geometric), "geometric", 1.0, count, inliers, None, reason, agreeing)
     consistency_px = consistency(H_geometric, H_feature, shown.corners)

@@ -24,6 +24,13 @@ from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.favs.stage2_features import REFERENCE_WIDTH_PX, Matches
 from arbiview_aug.sample.detections import Detection
 
+# Lengths named _PX are target pixels at ``REFERENCE_WIDTH_PX``.
+CLUSTER_RADIUS_PX = 30.0  # DBSCAN's ε: a car's width, 1.8 m, at 40 m and 60 degrees of view
+MIN_SAMPLES = 4  # of DBSCAN
+_CLUSTER_SPREAD_PX = 2.0  # spread s_j of a cluster's offsets at which confidence_j is 1/2
+_GROUND_REACH_M = 40.0  # within which a cluster's top must meet the road for the type ``ground``
+_MAX_SHIFT_PX = 12.0  # longest ΔT: longer ones come from mismatches or a single near object
+
 
 @dataclass(frozen=True)
 class SceneObject:
@@ -121,7 +128,6 @@ def find_objects(
     H_base: FloatArray,
     target: Camera,
     ground_z_m: float,
-    config: PaperConfig,
     detections: Sequence[Detection] = (),
 ) -> list[SceneObject]:
     """Cluster one source's matches, for which it was warped by ``H_geometric``, into objects.
@@ -130,8 +136,8 @@ def find_objects(
     its type.
     """
     scale = target.width_px / REFERENCE_WIDTH_PX
-    radius_px = config.cluster_radius_px * scale
-    cluster = clusters(matches.reference, radius_px, config.min_samples)
+    radius_px = CLUSTER_RADIUS_PX * scale
+    cluster = clusters(matches.reference, radius_px, MIN_SAMPLES)
     in_source = apply(np.linalg.inv(H_geometric), matches.warped) if len(cluster) else matches.warped
     objects = []
     for k in range(cluster.max(initial=-1) + 1):
@@ -144,10 +150,10 @@ def find_objects(
                 center_source=c1,
                 center_target=p2.mean(0),
                 bbox=(x0, y0, x1, y1),
-                confidence=confidence(p2 - apply(H_base, p1), config.cluster_spread_px * scale),
+                confidence=confidence(p2 - apply(H_base, p1), _CLUSTER_SPREAD_PX * scale),
                 type=_detected_type(c1, detections)
-                or geometric_type((x0, y0, x1, y1), target, ground_z_m, config.ground_reach_m),
-                density_factor=density_factor(p2, radius_px, config.min_samples),
+                or geometric_type((x0, y0, x1, y1), target, ground_z_m, _GROUND_REACH_M),
+                density_factor=density_factor(p2, radius_px, MIN_SAMPLES),
                 points=len(p1),
             )
         )
@@ -171,7 +177,7 @@ def align_objects(
         return declined(H_base, f"{len(objects)} clusters, none with a positive type weight", objects)
     c1, c2 = (np.stack([getattr(o, name) for o in objects]) for name in ("center_source", "center_target"))
     shift = mean_offset(c1, c2, weights, H_base)
-    length, limit = float(np.linalg.norm(shift)), config.max_shift_px * width_px / REFERENCE_WIDTH_PX
+    length, limit = float(np.linalg.norm(shift)), _MAX_SHIFT_PX * width_px / REFERENCE_WIDTH_PX
     if not length <= limit:
         return declined(H_base, f"{len(objects)} objects ask for {length:.1f} px, more than {limit:.1f}", objects)
     kinds = ", ".join(sorted({o.type for o in objects}))

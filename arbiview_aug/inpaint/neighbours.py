@@ -55,27 +55,16 @@ _CELL_PX = 8
 
 @dataclass(frozen=True, eq=False)
 class Hole:
-    """Rectangle of a target view around the pixels to fill.
+    """Rectangle of a target view around the pixels to fill."""
 
-    Attributes:
-        target: Index of the target camera.
-        box: Its rows and columns in the view.
-        camera: The target camera, cropped to the rectangle.
-        rays: Of its pixels.
-        free: (h, w) bool, uncovered pixels that may be filled.
-        seam: (h, w) bool, covered pixels next to them, on the same kind of surface.
-        inverse_distance: (h, w) float32 along the rays, 1/m.
-        margin_px: Width of the seam.
-    """
-
-    target: int
-    box: tuple[slice, slice]
-    camera: Camera
-    rays: PixelRays
-    free: BoolArray
-    seam: BoolArray
-    inverse_distance: npt.NDArray[np.float32]
-    margin_px: int
+    target: int  # index of the target camera
+    box: tuple[slice, slice]  # its rows and columns in the view
+    camera: Camera  # the target camera, cropped to the rectangle
+    rays: PixelRays  # of its pixels
+    free: BoolArray  # (h, w) bool, uncovered pixels that may be filled
+    seam: BoolArray  # (h, w) bool, covered pixels next to them, on the same kind of surface
+    inverse_distance: npt.NDArray[np.float32]  # (h, w) float32 along the rays, 1/m
+    margin_px: int  # width of the seam
 
     @cached_property
     def nodes(self) -> tuple[FloatArray, FloatArray]:
@@ -86,17 +75,11 @@ class Hole:
 
 
 class Fill(NamedTuple):
-    """One neighbour's views of the holes.
-
-    Attributes:
-        neighbour: The frame.
-        plan: Render plan from its rig to the cameras of the holes.
-        shown: What it shows of each hole; no images yet.
-    """
+    """One neighbour's views of the holes."""
 
     neighbour: Neighbour
-    plan: RenderPlan
-    shown: list[Candidate]
+    plan: RenderPlan  # render plan from its rig to the cameras of the holes
+    shown: list[Candidate]  # what it shows of each hole; no images yet
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,17 +114,11 @@ class Fills:
 # --- planning ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class _HoleSurface(DenseSurface):
-    """Known distances of the holes' pixels, hidden from a neighbour by labelled objects and by what was measured.
-
-    Attributes:
-        holes: The holes.
-        full: The frame's surface.
-        objects: Labelled objects of both frames.
-    """
+    """Known distances of the holes' pixels, hidden from a neighbour by labelled objects and by what was measured."""
 
     holes: Sequence[Hole]
-    full: Surface
-    objects: BoxSurface | None
+    full: Surface  # the frame's surface
+    objects: BoxSurface | None  # labelled objects of both frames
 
     @property
     def is_dense(self) -> bool:  # type: ignore[override]
@@ -348,21 +325,14 @@ Levels = npt.NDArray[np.float32]
 
 
 class Candidate(NamedTuple):
-    """The part of a hole that one neighbour shows.
+    """The part of a hole that one neighbour shows."""
 
-    Attributes:
-        shows: (h, w) bool, the free and seam pixels that it shows.
-        blur: (h, w) uint8, how much coarser it shows them, in half octaves; 0 for as sharp as the target.
-        risk: (h, w) uint8 ``ChangeRisk``.
-        later: Whether it was recorded after the current frame.
-        image: (3, h, w) of the view's type, once it is rendered.
-    """
-
-    shows: BoolArray
+    shows: BoolArray  # (h, w) bool, the free and seam pixels that it shows
+    # (h, w) uint8, how much coarser it shows them, in half octaves; 0 for as sharp as the target
     blur: npt.NDArray[np.uint8]
-    risk: npt.NDArray[np.uint8]
-    later: bool
-    image: torch.Tensor = torch.empty(0)
+    risk: npt.NDArray[np.uint8]  # (h, w) uint8 ``ChangeRisk``
+    later: bool  # whether it was recorded after the current frame
+    image: torch.Tensor = torch.empty(0)  # (3, h, w) of the view's type, once it is rendered
 
 
 def merged(

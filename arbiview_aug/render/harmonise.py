@@ -25,7 +25,7 @@ from arbiview_aug.cameras.rays import adjacent_pairs, ego_rays, half_way_view, o
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.plan import ViewPlan, check_ranges
+from arbiview_aug.render.plan import ViewPlan
 from arbiview_aug.scene.surface import Street
 
 _VIEW_SIZE, _TILE_PX = (225, 400), 16  # the evaluation's views and tiles at half resolution
@@ -62,52 +62,26 @@ def tone_curves(gains: npt.ArrayLike, knee: float = KNEE) -> npt.NDArray[np.floa
     return np.stack([gain, np.where(gain > 1, above, below)], -1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class HarmoniseConfig:
-    """How gains are estimated, bounded and accepted."""
+MAX_GAIN = 2.5
+"""Gains are clipped to [1 / this, this]; 1.94 is the largest of a real nuScenes frame."""
 
-    max_gain: float = 2.5
-    """Gains are clipped to [1 / max_gain, max_gain]; 1.94 is the largest of a real nuScenes frame."""
+PRIOR_LOG_GAIN = 0.5
+"""Standard deviation of the prior on log-gains: weak, for overlaps that are tiny or disagree."""
 
-    prior_log_gain: float = 0.5
-    """Standard deviation of the prior on log-gains: weak, for overlaps that are tiny or disagree."""
+_PAIR_LOG_ERROR = 0.03
+"""Error floor of a pair's log-ratio (lens shading, parallax); bounds the weight of a large overlap."""
 
-    pair_log_error: float = 0.03
-    """Error floor of a pair's log-ratio (lens shading, parallax); bounds the weight of a large overlap."""
+DARK, _BRIGHT = 0.03, 0.92
+"""Shares of the scale: darker pixels are noise and black level, those with a brighter channel may be saturated."""
 
-    knee: float = KNEE
-    """Share of the scale from which a gain fades towards saturation; see ``tone_curves``."""
+_MIN_PIXELS = 200
+"""Pixels that both the fit and the gate need in a pair, in a half-way view of 225 x 400."""
 
-    dark: float = 0.03
-    """Pixels below this share of the scale are ignored: noise and black level."""
+MIN_RISE_DB = 0.1
+"""Least rise of the held-out raw overlap PSNR, mean over pairs, for gains to be accepted."""
 
-    bright: float = 0.92
-    """Pixels with a channel above this share of the scale are ignored: they may be saturated."""
-
-    min_pixels: int = 200
-    """Pixels that both the fit and the gate need in a pair, in a half-way view of 225 x 400."""
-
-    min_rise_db: float = 0.1
-    """Least rise of the held-out raw overlap PSNR, mean over pairs, for gains to be accepted."""
-
-    min_log_gain: float = 0.005
-    """If no log-gain exceeds this, the images stay as they are: half a grey level at mid-grey."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self, _RANGES)
-
-
-_RANGES: dict[str, tuple[float, float]] = {
-    "max_gain": (1.0, 16.0),
-    "prior_log_gain": (1e-3, 10.0),
-    "pair_log_error": (1e-3, 10.0),
-    "knee": (0.05, 0.99),
-    "dark": (0.0, 0.5),
-    "bright": (0.5, 1.0),
-    "min_pixels": (10, 10**6),
-    "min_rise_db": (0.0, 100.0),
-    "min_log_gain": (0.0, 1.0),
-}
+_MIN_LOG_GAIN = 0.005
+"""If no log-gain exceeds this, the images stay as they are: half a grey level at mid-grey."""
 
 
 @dataclass(frozen=True)
@@ -137,9 +111,8 @@ class Overlaps(NamedTuple):
     held_out: npt.NDArray[np.int64]  # the same of those held out
 
 
-def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
+def find_overlaps(rig: Rig) -> Overlaps:
     """Find the pixels that adjacent cameras share over the street surface, without own-car masks."""
-    config = config or HarmoniseConfig()
     order = tuple(content_order(rig.cameras))
     rig = rig.with_cameras([rig[k] for k in order])
     lattice, held_out = _lattice()
@@ -159,7 +132,7 @@ def find_overlaps(rig: Rig, config: HarmoniseConfig | None = None) -> Overlaps:
                 seen &= camera.mask[tuple(at.clip(0, last).T)]
             both, reads = both[seen], [one[seen] for one in (*reads, at)]
         kinds = ~held_out[both], held_out[both]
-        if _STEP_PX**2 * min(kind.sum() for kind in kinds) >= config.min_pixels:
+        if _STEP_PX**2 * min(kind.sum() for kind in kinds) >= _MIN_PIXELS:
             pairs.append(pair)
             shared.append([[at[kind] for kind in kinds] for at in reads])
     longest = max((len(at) for of_pair in shared for at in of_pair[0]), default=0)
@@ -188,7 +161,6 @@ def _lattice() -> tuple[FloatArray, BoolArray]:
 def estimate_gains(
     rig: Rig,
     images: Sequence[torch.Tensor],
-    config: HarmoniseConfig | None = None,
     *,
     overlaps: Overlaps | None = None,
 ) -> PhotometricReport:
@@ -197,37 +169,35 @@ def estimate_gains(
     Args:
         rig: The source rig.
         images: N images (3, H, W): uint8, or float in [0, 1]; any device. They are not changed.
-        config: Settings.
-        overlaps: ``find_overlaps(rig, config)``, if it is known: it takes longer than the rest.
+        overlaps: ``find_overlaps(rig)``, if it is known: it takes longer than the rest.
 
     Returns:
         The gains, or gains of 1 and the reason.
     """
     from arbiview_aug.render.photometry_kernels import tone
 
-    config = config or HarmoniseConfig()
-    overlaps = find_overlaps(rig, config) if overlaps is None else overlaps
+    overlaps = find_overlaps(rig) if overlaps is None else overlaps
     none = (1.0,) * len(rig)
     if not overlaps.pairs.size:
         return PhotometricReport(none, False, "no two cameras overlap enough")
     pixels = _read([images[k] for k in overlaps.order], overlaps)
-    ratios = pair_ratios(pixels, overlaps.fitted, config.dark, config.bright)
-    enough = _STEP_PX**2 * ratios[:, 0] >= config.min_pixels
+    ratios = pair_ratios(pixels, overlaps.fitted, DARK, _BRIGHT)
+    enough = _STEP_PX**2 * ratios[:, 0] >= _MIN_PIXELS
     if not enough.any():
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
-    limit, (number, ratio, spread) = np.log(config.max_gain), ratios[enough].T
+    limit, (number, ratio, spread) = np.log(MAX_GAIN), ratios[enough].T
     # Neighbouring pixels err together: a fitted tile (8 x 8) counts once.
     tiles = number * (2 * _STEP_PX / _TILE_PX) ** 2
-    variance = spread**2 / tiles + config.pair_log_error**2
-    log_gains = np.clip(_solve(len(rig), overlaps.pairs[:, enough], ratio, variance, config), -limit, limit)
-    if np.abs(log_gains).max() < config.min_log_gain:
+    variance = spread**2 / tiles + _PAIR_LOG_ERROR**2
+    log_gains = np.clip(_solve(len(rig), overlaps.pairs[:, enough], ratio, variance), -limit, limit)
+    if np.abs(log_gains).max() < _MIN_LOG_GAIN:
         return PhotometricReport(none, False, "the cameras agree already")
     gains = np.exp(log_gains)
     before = _held_out_db(pixels, overlaps)
-    tone(pixels.reshape(-1), overlaps.runs, tone_curves(gains, config.knee).astype(np.float32), *SHARES)
+    tone(pixels.reshape(-1), overlaps.runs, tone_curves(gains).astype(np.float32), *SHARES)
     after = _held_out_db(pixels, overlaps)
     reason = f"overlap {before:.1f} to {after:.1f} dB on held-out tiles"
-    if after - before < config.min_rise_db:
+    if after - before < MIN_RISE_DB:
         return PhotometricReport(none, False, f"gains would not help, {reason}", before, after)
     return PhotometricReport(tuple(gains[np.argsort(overlaps.order)].tolist()), True, reason, before, after)
 
@@ -270,7 +240,6 @@ def _solve(
     pairs: npt.NDArray[np.int64],
     ratio: npt.NDArray[np.float64],
     variance: npt.NDArray[np.float64],
-    config: HarmoniseConfig,
 ) -> npt.NDArray[np.float64]:
     """Least-squares log-gains with the prior; their median is 0 in every connected group of cameras.
 
@@ -279,7 +248,7 @@ def _solve(
     each = np.eye(count)
     rows = each[pairs[0]] - each[pairs[1]]
     weighted = rows.T / variance
-    log_gains = np.linalg.solve(each / config.prior_log_gain**2 + weighted @ rows, -(weighted @ ratio))
+    log_gains = np.linalg.solve(each / PRIOR_LOG_GAIN**2 + weighted @ rows, -(weighted @ ratio))
     group = np.arange(count)
     for a, b in pairs.T.tolist():
         group[group == group[b]] = group[a]
@@ -297,8 +266,8 @@ def _held_out_db(pixels: _Pixels, overlaps: Overlaps) -> float:
     return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-10))))
 
 
-Harmonise = bool | HarmoniseConfig | Sequence[float]
-"""A user's choice: True or a config to estimate gains for every frame, gains for each camera, or False for none."""
+Harmonise = bool | Sequence[float]
+"""A user's choice: True to estimate gains for every frame, gains for each camera, or False for none."""
 
 
 class Harmoniser:
@@ -312,8 +281,7 @@ class Harmoniser:
     """
 
     def __init__(self, choice: Harmonise = True) -> None:
-        self.config = choice if isinstance(choice, HarmoniseConfig) else HarmoniseConfig()
-        self.estimates = choice is True or isinstance(choice, HarmoniseConfig)
+        self.estimates = choice is True
         self.gains = None if self.estimates or choice is False else _checked_gains(choice)
         self.is_on = self.estimates or self.gains is not None
         self._overlaps: LRUCache[bytes, Overlaps] = LRUCache(_CACHED_RIGS)
@@ -321,7 +289,7 @@ class Harmoniser:
     def __repr__(self) -> str:
         if self.gains is not None:
             return f"({', '.join(f'{gain:g}' for gain in self.gains)})"
-        return repr(self.config) if self.estimates else "off"
+        return "on" if self.estimates else "off"
 
     def report(self, rig: Rig, images: Sequence[torch.Tensor]) -> PhotometricReport:
         """The gains of a frame, and why; SampleError if the number of given gains is not that of cameras."""
@@ -333,8 +301,8 @@ class Harmoniser:
             return PhotometricReport(self.gains, True, "given")
         if not self.estimates:
             return PhotometricReport((1.0,) * len(rig), False, "match_exposure is off")
-        overlaps = self._overlaps.get(rig.content_key, lambda: find_overlaps(rig, self.config))
-        return estimate_gains(rig, images, self.config, overlaps=overlaps)
+        overlaps = self._overlaps.get(rig.content_key, lambda: find_overlaps(rig))
+        return estimate_gains(rig, images, overlaps=overlaps)
 
     def curves(
         self, rig: Rig, images: Sequence[torch.Tensor], views: Sequence[ViewPlan]
@@ -352,7 +320,7 @@ class Harmoniser:
         if all(gain == 1 for gain in gains):
             return None
         mains = [gains[view.pairs[0].source] if view.pairs and self.estimates else 1.0 for view in views]
-        return tone_curves(np.divide.outer(gains, mains).T, self.config.knee)
+        return tone_curves(np.divide.outer(gains, mains).T)
 
 
 _MAX_GIVEN_GAIN = 1e3  # ten stops
@@ -366,7 +334,7 @@ def _checked_gains(choice: object) -> tuple[float, ...]:
         gains = ()
     if not gains or not all(1 / _MAX_GIVEN_GAIN <= gain <= _MAX_GIVEN_GAIN for gain in gains):  # NaN fails too
         raise ValueError(
-            "match_exposure: expected a bool, a HarmoniseConfig or for each camera a gain from "
+            "match_exposure: expected a bool or for each camera a gain from "
             f"{1 / _MAX_GIVEN_GAIN:g} to {_MAX_GIVEN_GAIN:g}, got {choice!r}"
         )
     return gains

@@ -148,13 +148,9 @@ class Slot:
 
 @dataclass(frozen=True)
 class AtlasLayout:
-    """The places of the source images that a plan reads.
+    """The places of the source images that a plan reads."""
 
-    Attributes:
-        slots: One for each (source, level) in use.
-    """
-
-    slots: tuple[Slot, ...]
+    slots: tuple[Slot, ...]  # one for each (source, level) in use
 
     @cached_property
     def size(self) -> tuple[int, int]:
@@ -265,21 +261,14 @@ def nearer_cells(size: tuple[int, int], step: int) -> int:
 
 @dataclass(frozen=True)
 class Paint:
-    """Parts of objects that no source sees, and where their colours are read in the view.
+    """Parts of objects that no source sees, and where their colours are read in the view."""
 
-    Attributes:
-        pixel: (n,) int32 unseen pixels of objects, into the flattened view.
-        part: (n,) int32 what they show: twice the object's number, 1 more on its top.
-        beside: (n,) int32 the nearest seen pixel of the same part in its row or column, -1 for none nearby.
-        sample: (m,) int32 seen pixels of objects, a sample.
-        sample_part: (m,) int32 what those show.
-    """
-
-    pixel: npt.NDArray[np.int32]
-    part: npt.NDArray[np.int32]
+    pixel: npt.NDArray[np.int32]  # (n,) int32 unseen pixels of objects, into the flattened view
+    part: npt.NDArray[np.int32]  # (n,) int32 what they show: twice the object's number, 1 more on its top
+    # (n,) int32 the nearest seen pixel of the same part in its row or column, -1 for none nearby
     beside: npt.NDArray[np.int32]
-    sample: npt.NDArray[np.int32]
-    sample_part: npt.NDArray[np.int32]
+    sample: npt.NDArray[np.int32]  # (m,) int32 seen pixels of objects, a sample
+    sample_part: npt.NDArray[np.int32]  # (m,) int32 what those show
 
     @property
     def nbytes(self) -> int:
@@ -289,29 +278,19 @@ class Paint:
 
 @dataclass(frozen=True)
 class ViewPlan:
-    """How one target view is rendered.
+    """How one target view is rendered."""
 
-    Attributes:
-        at: Position of each pixel in the atlas, in its winning source.
-        source_camera: (h, w) int8 index of the winning source, -1 where no source sees the pixel.
-        bands: Blended rectangles along the seams.
-        pairs: One for each source that wins any pixel.
-        interpolation: ``nearest``, ``linear`` or ``cubic``.
-        certainty: (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; on request.
-        edge: Pixels that must not be read by cubics.
-        layers: (h, w) uint8 layer of each pixel, for fillers; None if no pixel in a source's image is occluded.
-        paint: Unseen parts of objects; None without ``layers`` or objects.
-    """
-
-    at: FixedMap
-    source_camera: npt.NDArray[np.int8]
-    bands: tuple[BlendRegion, ...]
-    pairs: tuple[SourceUse, ...]
-    interpolation: str = "linear"
+    at: FixedMap  # position of each pixel in the atlas, in its winning source
+    source_camera: npt.NDArray[np.int8]  # (h, w) int8 index of the winning source, -1 where no source sees the pixel
+    bands: tuple[BlendRegion, ...]  # blended rectangles along the seams
+    pairs: tuple[SourceUse, ...]  # one for each source that wins any pixel
+    interpolation: str = "linear"  # ``nearest``, ``linear`` or ``cubic``
+    # (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; on request
     certainty: npt.NDArray[np.uint8] | None = None
-    edge: BilinearFallback | None = None
+    edge: BilinearFallback | None = None  # pixels that must not be read by cubics
+    # (h, w) uint8 layer of each pixel, for fillers; None if no pixel in a source's image is occluded
     layers: npt.NDArray[np.uint8] | None = None
-    paint: Paint | None = None
+    paint: Paint | None = None  # unseen parts of objects; None without ``layers`` or objects
 
     @property
     def coverage(self) -> BoolArray:

@@ -46,31 +46,18 @@ Warn = Callable[[str, str], None]
 
 @dataclass(frozen=True, eq=False)
 class Neighbour:
-    """Another frame of the drive, seen from the current one.
+    """Another frame of the drive, seen from the current one."""
 
-    Attributes:
-        number: Its index in the sample's list.
-        name: Its token, else its number.
-        rig: Its cameras in the current frame's ego frame, over the current frame's road.
-        travel_m: Distance between the two vehicles.
-        ahead_m: Its position along the current heading.
-        seconds: Time from the current frame to it; None if either has no time.
-        boxes: (B, 7) labelled objects at its time, in the current ego frame; None if unknown.
-        boxes_now: (B, 7) labelled objects in the current frame; None if unknown.
-        ego2ego: (4, 4) its ego frame to the current one.
-        given: The entry itself; its images are read lazily.
-    """
-
-    number: int
-    name: str
-    rig: Rig
-    travel_m: float
-    ahead_m: float
-    seconds: float | None
-    boxes: FloatArray | None
-    boxes_now: FloatArray | None
-    ego2ego: FloatArray
-    given: Mapping[str, Any]
+    number: int  # its index in the sample's list
+    name: str  # its token, else its number
+    rig: Rig  # its cameras in the current frame's ego frame, over the current frame's road
+    travel_m: float  # distance between the two vehicles
+    ahead_m: float  # its position along the current heading
+    seconds: float | None  # time from the current frame to it; None if either has no time
+    boxes: FloatArray | None  # (B, 7) labelled objects at its time, in the current ego frame; None if unknown
+    boxes_now: FloatArray | None  # (B, 7) labelled objects in the current frame; None if unknown
+    ego2ego: FloatArray  # (4, 4) its ego frame to the current one
+    given: Mapping[str, Any]  # the entry itself; its images are read lazily
 
     @property
     def is_later(self) -> bool:

@@ -53,17 +53,12 @@ Output = Literal["depth", "inverse"] | None
 
 
 class Prediction(NamedTuple):
-    """A network's output for one image.
+    """A network's output for one image."""
 
-    Attributes:
-        values: (h, w) over the whole image, of any size; not finite where unknown.
-        output: ``depth``, ``inverse`` depth, or None if only the fit tells which.
-        scale_px: Focal length of the image that the network saw, in its pixels. Networks that learned metres from one
-            focal length see things twice as near at twice the focal length. None for relative depth.
-    """
-
-    values: Layer
-    output: Output
+    values: Layer  # (h, w) over the whole image, of any size; not finite where unknown
+    output: Output  # ``depth``, ``inverse`` depth, or None if only the fit tells which
+    # Focal length of the image that the network saw, in its pixels. Networks that learned metres from one focal length
+    # see things twice as near at twice the focal length. None for relative depth.
     scale_px: float | None = None
 
 
@@ -142,21 +137,13 @@ def learned_depth(
 
 # --- images that networks know ----------------------------------------------------------------------------------------
 class View(NamedTuple):
-    """A camera's image as a pinhole camera would have taken it.
+    """A camera's image as a pinhole camera would have taken it."""
 
-    Attributes:
-        camera: The camera at the size of its depth map.
-        pinhole: The pinhole camera.
-        ground_z_m: Height of the road in their ego frame.
-        image: (3, h, w) uint8.
-        prompt: (h, w) depth of sparse measurements, made dense; None if there are none.
-    """
-
-    camera: Camera
-    pinhole: Camera
-    ground_z_m: float
-    image: torch.Tensor
-    prompt: Layer | None = None
+    camera: Camera  # the camera at the size of its depth map
+    pinhole: Camera  # the pinhole camera
+    ground_z_m: float  # height of the road in their ego frame
+    image: torch.Tensor  # (3, h, w) uint8
+    prompt: Layer | None = None  # (h, w) depth of sparse measurements, made dense; None if there are none
 
     @property
     def focal_px(self) -> float:

@@ -54,15 +54,11 @@ _AROUND = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True, eq=False)
 class MotionDepth:
-    """Depth maps of one frame.
+    """Depth maps of one frame."""
 
-    Attributes:
-        depth_m: (h, w) float32 z-depth of each camera at the size of ``motion_camera``, 0 where unknown.
-        words: How it was found, or why it was declined.
-    """
-
+    # (h, w) float32 z-depth of each camera at the size of ``motion_camera``, 0 where unknown
     depth_m: tuple[Layer, ...]
-    words: str
+    words: str  # how it was found, or why it was declined
 
     @property
     def density(self) -> float:
@@ -306,34 +302,21 @@ _REWEIGHTINGS = 5  # of iteratively reweighted least squares, against moving obj
 
 
 class PoseSamples(NamedTuple):
-    """Correspondences of one camera's pixels in a neighbour's image.
+    """Correspondences of one camera's pixels in a neighbour's image."""
 
-    Attributes:
-        image: The camera's image.
-        other: The neighbour's.
-        inverse_distance: (h, w) along the camera's rays, 1/m.
-        valid: (h, w) bool.
-    """
-
-    image: SweptImage
-    other: SweptImage
-    inverse_distance: Layer
-    valid: BoolArray
+    image: SweptImage  # the camera's image
+    other: SweptImage  # the neighbour's
+    inverse_distance: Layer  # (h, w) along the camera's rays, 1/m
+    valid: BoolArray  # (h, w) bool
 
 
 @dataclass(frozen=True, eq=False)
 class PoseError:
-    """Error of a neighbour's pose.
+    """Error of a neighbour's pose."""
 
-    Attributes:
-        error_px: Mean displacement of pixels.
-        turn_deg: (3,) correcting turn about the current ego frame's axes.
-        shift_m: (2,) correcting shift along its y and z; a shift along x cannot be told from scale.
-    """
-
-    error_px: float
-    turn_deg: FloatArray
-    shift_m: FloatArray
+    error_px: float  # mean displacement of pixels
+    turn_deg: FloatArray  # (3,) correcting turn about the current ego frame's axes
+    shift_m: FloatArray  # (2,) correcting shift along its y and z; a shift along x cannot be told from scale
 
     @property
     def correction(self) -> FloatArray:

@@ -129,27 +129,16 @@ class RigPair:
 
 @dataclass(frozen=True, eq=False)
 class FramePlan:
-    """How one frame is rendered, and from what it was planned.
+    """How one frame is rendered, and from what it was planned."""
 
-    Attributes:
-        frame: The frame.
-        pair: Its rig and the target.
-        scene: Geometry of the sample, with estimated depth.
-        surface: Name of the surface that the target is rendered over, where centres differ.
-        plan: The plan.
-        neighbours: Other frames of the drive that may fill holes, the nearest first.
-        overlap: Depth from overlap, if it was estimated.
-        motion: Depth from motion, if it was estimated.
-    """
-
-    frame: Frame
-    pair: RigPair
-    scene: Scene
-    surface: GeometryName
-    plan: RenderPlan
-    neighbours: Sequence[Neighbour] = ()
-    overlap: OverlapDepth | None = None
-    motion: MotionDepth | None = None
+    frame: Frame  # the frame
+    pair: RigPair  # its rig and the target
+    scene: Scene  # geometry of the sample, with estimated depth
+    surface: GeometryName  # name of the surface that the target is rendered over, where centres differ
+    plan: RenderPlan  # the plan
+    neighbours: Sequence[Neighbour] = ()  # other frames of the drive that may fill holes, the nearest first
+    overlap: OverlapDepth | None = None  # depth from overlap, if it was estimated
+    motion: MotionDepth | None = None  # depth from motion, if it was estimated
 
     @property
     def harm(self) -> str | None:

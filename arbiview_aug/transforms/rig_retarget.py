@@ -91,7 +91,7 @@ class RigRetarget(torch.nn.Module):
         neighbours: What other frames of the drive (``neighbours`` in the sample) may fill: ``road``, the road nearby;
             ``all``; None, nothing.
         match_exposure: Bring each view's sources to the exposure of its main one. True estimates gains where held-out
-            pixels agree better; False; a ``HarmoniseConfig``; or a gain for each camera. Never with ``paper``.
+            pixels agree better; False; or a gain for each camera. Never with ``paper``.
         size: (h, w) of every view.
         fit: How target cameras come to ``size``: ``crop`` cuts at the top and the sides, ``pad`` adds bars there,
             ``stretch`` changes the aspect.

@@ -24,7 +24,7 @@ from arbiview_aug.favs.stage2_features import (
     optimise_transformation,
 )
 from arbiview_aug.favs.stage4_fusion import fuse
-from arbiview_aug.render.harmonise import LEVELS, SHARES, HarmoniseConfig, estimate_gains, tone_curves
+from arbiview_aug.render.harmonise import LEVELS, SHARES, estimate_gains, tone_curves
 from arbiview_aug.render.photometry_kernels import tone
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.torch_backend import render_torch
@@ -106,7 +106,7 @@ def test_ill_conditioned_geometry_is_declined_in_words(exponent: int) -> None:
         H = conditioned(exponent, seed)
         with no_numpy_warnings():
             report = optimise_transformation(
-                H, texture, texture, (everywhere, everywhere), EVERYWHERE, 1.0, PaperConfig(max_features=50)
+                H, texture, texture, (everywhere, everywhere), EVERYWHERE, 1.0, PaperConfig()
             )
         assert np.isfinite(report.H_base).all() and report.reason
         assert exponent < 6 or (report.case == "geometric" and "distorts" in report.reason)
@@ -234,17 +234,20 @@ def pictures(rig: Rig) -> list[torch.Tensor]:
     ("dtype", "execution", "max_gain"),
     sampled([torch.uint8, torch.float32, torch.float16], ["opencv", "torch"], [2.5, 8.0]),
 )
-def test_gains_at_the_clamp(dtype: torch.dtype, execution: str, max_gain: float) -> None:
+def test_gains_at_the_clamp(
+    dtype: torch.dtype, execution: str, max_gain: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rig = ring(6, position_m=(0.0, 0.0, 1.5))
     images = pictures(rig)
     images[2] = images[2] / 12
     images = [(image * 255).round().to(dtype) if dtype == torch.uint8 else image.to(dtype) for image in images]
-    config = HarmoniseConfig(max_gain=max_gain, prior_log_gain=10.0, dark=0.0)
-    report = estimate_gains(rig, images, config)
+    for name, value in (("MAX_GAIN", max_gain), ("PRIOR_LOG_GAIN", 10.0), ("DARK", 0.0)):
+        monkeypatch.setattr(f"arbiview_aug.render.harmonise.{name}", value)
+    report = estimate_gains(rig, images)
     assert report.accepted and report.gains[2] == pytest.approx(max_gain, rel=1e-12), str(report)
     assert all(1 / max_gain <= gain <= max_gain for gain in report.gains)
     with no_numpy_warnings():
-        out = RigRetarget(rig.turned(yaw_deg=25), match_exposure=config, backend=execution)(
+        out = RigRetarget(rig.turned(yaw_deg=25), match_exposure=True, backend=execution)(
             {"images": images, "rig": rig}
         )
     views = out["images"].float() / (255 if dtype == torch.uint8 else 1)

@@ -98,7 +98,7 @@ def test_overlap_region() -> None:
 def test_matches_recover_a_known_homography() -> None:
     M = np.array([[1.01, 0.005, 7.0], [-0.004, 0.99, -5.0], [1e-5, 0.0, 1.0]])
     image = texture()
-    matches = match_features(image, moved(image, M), FULL, 0.75, 2000)
+    matches = match_features(image, moved(image, M), FULL, 0.75)
     assert len(matches.warped) > 100
     found = estimate_homography(matches, 2.0)
     assert found is not None and found[1].mean() > 0.9
@@ -113,7 +113,7 @@ def test_matching_is_deterministic_and_stays_inside() -> None:
     for seed in (3, 4):
         cv2.setRNGSeed(seed)
         with repeatable_opencv():
-            runs.append(match_features(image, moved(image, translation(4, 3)), usable, 0.75, 2000))
+            runs.append(match_features(image, moved(image, translation(4, 3)), usable, 0.75))
     assert np.array_equal(runs[0].warped, runs[1].warped) and np.array_equal(runs[0].reference, runs[1].reference)
     assert runs[0].warped[:, 0].min() >= 399
 
@@ -171,11 +171,11 @@ def test_criterion_3_consistency() -> None:
 
 def test_validity_forgives_size_but_not_distortion() -> None:
     small = np.diag([0.1, 0.1, 1.0])
-    assert is_valid(small, EVERYWHERE, 10.0, 16.0)  # a target of a tenth of the width
-    assert not is_valid(small, EVERYWHERE, 1.0, 16.0)
+    assert is_valid(small, EVERYWHERE, 10.0)  # a target of a tenth of the width
+    assert not is_valid(small, EVERYWHERE, 1.0)
     behind = np.array([[1.0, 0, 0], [0, 1, 0], [-0.002, 0, 1]])
-    assert not is_valid(behind, EVERYWHERE, 1.0, 16.0)
-    assert is_valid(behind, Region(0, 0, 300, 299), 1.0, 16.0)  # only what the target shows
+    assert not is_valid(behind, EVERYWHERE, 1.0)
+    assert is_valid(behind, Region(0, 0, 300, 299), 1.0)  # only what the target shows
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------

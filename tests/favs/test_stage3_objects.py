@@ -34,7 +34,7 @@ def cluster_at(x: float, y: float, count: int = 9, spacing: float = 10.0) -> np.
 
 def objects_of(reference: np.ndarray, offset, detections=()):
     matches = Matches(reference - np.asarray(offset, float), reference)
-    return find_objects(matches, EYE, EYE, CAMERA, 0.0, CONFIG, detections)
+    return find_objects(matches, EYE, EYE, CAMERA, 0.0, detections)
 
 
 def test_delta_t_is_the_weighted_mean_of_residuals() -> None:
@@ -124,7 +124,7 @@ def test_detections_give_types() -> None:
 
 def test_no_match_noise_one_cluster_and_identical_points() -> None:
     def declines(matches: Matches) -> None:
-        report = align_objects(find_objects(matches, EYE, EYE, CAMERA, 0.0, CONFIG), EYE, 800, CONFIG)
+        report = align_objects(find_objects(matches, EYE, EYE, CAMERA, 0.0), EYE, 800, CONFIG)
         assert report.reason == "no cluster of matches: nothing to align"
         assert np.array_equal(report.H_aligned, EYE) and not report.shift_px.any()
 
