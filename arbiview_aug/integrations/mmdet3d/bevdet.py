@@ -12,14 +12,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.integrations.mmdet3d.images import Norm, levels, normalised
 from arbiview_aug.integrations.mmdet3d.matrices import Views, padded, upper_triangular
-from arbiview_aug.integrations.mmdet3d.results import (
-    STALE_KEYS,
-    Retarget,
-    source_rig,
-    target_outputs,
-    target_views,
-    warn_of_dropped,
-)
+from arbiview_aug.integrations.mmdet3d.results import Retarget, source_rig, target_outputs, target_views, without_stale
 
 MEAN_STD = ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375))
 """Mean and deviation of BEVDet's ``mmlabNormalize``, in the order of the channels it leaves."""
@@ -74,7 +67,7 @@ def retarget_img_inputs(
     count = total // len(in_source)
     outputs: list[list[torch.Tensor]] = []
     outs: list[Mapping[str, Any]] = []
-    changed = {key: value for key, value in results.items() if key not in STALE_KEYS}
+    changed = without_stale(results, silently=_PICTURES)
     for t in range(count):
         rows = slice(t * len(in_source), (t + 1) * len(in_source))
         frame = [tensors[0][t::count], *(tensor[rows] for tensor in tensors[1:])]
@@ -89,7 +82,6 @@ def retarget_img_inputs(
             infos[t] = {**info, "cams": _infos(target, key2global)}
     images = torch.stack([entries[0] for entries in outputs], dim=1).flatten(0, 1)
     rest = [torch.cat(of_frames) for of_frames in zip(*(entries[1:] for entries in outputs), strict=True)]
-    warn_of_dropped({key: value for key, value in results.items() if key != _PICTURES})
     changed["img_inputs"] = type(inputs)([images, *rest, *inputs[6:]])
     if "cam_names" in results:
         changed["cam_names"] = list(target.names)
