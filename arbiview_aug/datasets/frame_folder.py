@@ -21,18 +21,9 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.plain_yaml import parse_json
 from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig, read_mask
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import (
-    Drive,
-    LazyFrame,
-    Neighbours,
-    Unreadable,
-    WritableRecording,
-    camera_fields,
-    check_neighbours,
-    parts_of_clock,
-)
-from arbiview_aug.datasets.image_io import check_reduce, decode_images, encoded_image, reduced_rig
-from arbiview_aug.datasets.layouts import CALIBRATION_FILE
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields, parts_of_clock
+from arbiview_aug.datasets.image_io import decode_images, encoded_image, reduced_rig
+from arbiview_aug.datasets.registry import CALIBRATION_FILE
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce, shown, warn
 from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
@@ -114,9 +105,7 @@ class FrameFolder(WritableRecording):
         neighbours: Neighbours | None = None,
         clean_masks: bool = False,
     ) -> None:
-        check_reduce(reduce)
-        check_neighbours(neighbours)
-        self.root, self.reduce, self.load_points, self.neighbours = Path(root), reduce, load_points, neighbours
+        super().__init__(root, reduce, load_points, neighbours)
         self.clean_masks = clean_masks
         self._frames = _find_frames(self.root)
         self.tokens = [frame.name for frame in self._frames]
@@ -147,11 +136,9 @@ class FrameFolder(WritableRecording):
         if self.load_points and (points := _read_points(calib, frame)) is not None:
             sample["points"] = points
         sample |= self._boxes_pose_time(calib, frame)
-        if self._drive is not None and self.neighbours is not None:
-            others = []
-            if frame.name in self._drive_names:
-                others = self._drive.neighbours(self._drive_names.index(frame.name), self.neighbours)
-            sample["neighbours"] = [self._neighbour(self._drive_names[k]) for k in others]
+        if self._drive is not None:
+            names, name = self._drive_names, frame.name
+            sample["neighbours"] = self._neighbours(self._drive, names.index(name)) if name in names else []
         return sample
 
     def truth(self, index: int) -> dict[str, Any] | None:
@@ -199,16 +186,14 @@ class FrameFolder(WritableRecording):
         parts = parts_of_clock(names, times_s, str(self.root / SEQUENCE_FILE))
         return Drive(np.array(list(positions_m.values())).reshape(-1, 3), parts)
 
-    def _neighbour(self, name: str) -> Mapping[str, Any]:
-        """Another frame of the drive; its images are decoded on access, where a broken one raises."""
-        frame = self._frames[self._index[name]]
-        fields: dict[str, Any] = {"token": name}
-        try:
-            calib = _read_calibration(frame)
-            rig = self._rig(calib, frame)
-            fields |= {"rig": rig, **self._boxes_pose_time(calib, frame)}
-        except ArbiviewError as error:
-            return Unreadable(fields, error)
+    def _token(self, place: int) -> str:
+        return self._drive_names[place]
+
+    def _neighbour(self, place: int) -> LazyFrame:
+        frame = self._frames[self._index[self._token(place)]]
+        calib = _read_calibration(frame)
+        rig = self._rig(calib, frame)
+        fields = {"token": frame.name, "rig": rig, **self._boxes_pose_time(calib, frame)}
         points = partial(_read_points, calib, frame) if self.load_points else None
         return LazyFrame(fields, partial(self._images, calib, frame, rig), points)
 

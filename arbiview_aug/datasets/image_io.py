@@ -10,7 +10,7 @@ import stat
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -82,6 +82,11 @@ def decode_images(
     if block is not None:
         return torch.from_numpy(block).permute(0, 3, 1, 2)
     return [torch.from_numpy(image).permute(2, 0, 1) for image in images]
+
+
+def stack_or_list(tensors: list[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
+    """Stack tensors of one shape; else return the list."""
+    return torch.stack(tensors) if len({tensor.shape for tensor in tensors}) == 1 else tensors
 
 
 def check_reduce(reduce: int) -> None:
@@ -183,13 +188,20 @@ def _decode_into(out: ByteArray, path: Path, label: str, format: str, reduce: in
         raise DataError(f"{label}: expected an image, got a {format} that cannot be decoded; copy it again")
     if _RGB_FLAG is None:
         cv2.cvtColor(image, cv2.COLOR_BGR2RGB, image)
-    if reduce > 1 and format == "PNG":
-        h, w = image.shape[:2]
-        image = cv2.copyMakeBorder(image, 0, -h % reduce, 0, -w % reduce, cv2.BORDER_REPLICATE)
-        image = cv2.resize(image, out.shape[1::-1], interpolation=cv2.INTER_AREA)
+    if format == "PNG":
+        image = area_reduced(image, reduce)
     if image.shape != out.shape:
         raise DataError(f"{label}: expected {out.shape} as its header says, decoded {image.shape}; write it again")
     out[...] = image
+
+
+def area_reduced(image: npt.NDArray[Any], reduce: int) -> npt.NDArray[Any]:
+    """(h, w, 3) reduced about the outer top-left corner, as ``reduced_camera`` says; contiguous."""
+    if reduce == 1:
+        return np.ascontiguousarray(image)
+    h, w = image.shape[:2]
+    image = cv2.copyMakeBorder(image, 0, -h % reduce, 0, -w % reduce, cv2.BORDER_REPLICATE)
+    return cv2.resize(image, reduced_size((h, w), reduce)[::-1], interpolation=cv2.INTER_AREA)
 
 
 def _decode_jpeg_in_place(out: ByteArray, path: Path, reduce: int) -> bool:

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
@@ -17,19 +16,11 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray, LensName
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import (
-    Drive,
-    LazyFrame,
-    Neighbours,
-    Unreadable,
-    WritableRecording,
-    camera_fields,
-    check_neighbours,
-)
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
 from arbiview_aug.datasets.frame_folder import checked_points
-from arbiview_aug.datasets.image_io import check_reduce, reduced_rig
-from arbiview_aug.datasets.layouts import log_folders
+from arbiview_aug.datasets.image_io import area_reduced, reduced_rig, stack_or_list
 from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion
+from arbiview_aug.datasets.registry import log_folders
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, described
 
@@ -101,9 +92,7 @@ class Py123dDataset(WritableRecording):
         neighbours: Neighbours | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
-        check_reduce(reduce)
-        check_neighbours(neighbours)
-        self.root, self.reduce, self.load_points, self.neighbours = Path(root), reduce, load_points, neighbours
+        super().__init__(root, reduce, load_points, neighbours)
         scene_of = optional_package("py123d.api.scene.arrow.arrow_scene_api", "py123d").ArrowSceneAPI
         folders = log_folders(self.root)
         if not folders:
@@ -148,8 +137,8 @@ class Py123dDataset(WritableRecording):
             sample = fields | camera_fields(fields["rig"], self._images(index, fields["rig"]), self.tokens[index])
             if self.load_points and (points := self._points(index)) is not None:
                 sample["points"] = points
-        if self._drive is not None and self.neighbours is not None:
-            sample["neighbours"] = [self._neighbour(k) for k in self._drive.neighbours(index, self.neighbours)]
+        if self._drive is not None:
+            sample["neighbours"] = self._neighbours(self._drive, index)
         return sample
 
     def _fields(self, index: int) -> dict[str, Any]:
@@ -184,8 +173,8 @@ class Py123dDataset(WritableRecording):
                     where = f"py123d log {log.folder}: iteration {iteration}: camera {camera.name!r}"
                     if image.shape != (*camera.size, 3) or image.dtype != np.uint8:
                         raise DataError(f"{where}: expected {(*camera.size, 3)} uint8, got {image.shape} {image.dtype}")
-                    images.append(torch.from_numpy(_reduced(image, self.reduce)).permute(2, 0, 1).contiguous())
-        return torch.stack(images) if len({image.shape for image in images}) == 1 else images
+                    images.append(torch.from_numpy(area_reduced(image, self.reduce)).permute(2, 0, 1).contiguous())
+        return stack_or_list(images)
 
     def _points(self, index: int) -> torch.Tensor | None:
         number, iteration, _ = self._frames[index]
@@ -212,12 +201,8 @@ class Py123dDataset(WritableRecording):
         return Drive(np.array(positions_m).reshape(-1, 3), parts)
 
     def _neighbour(self, index: int) -> LazyFrame:
-        """Another frame of the drive; its images and points are read on access, where a broken one raises."""
-        try:
-            with _reading(self._logs[self._frames[index][0]].folder):
-                fields = self._fields(index)
-        except ArbiviewError as error:
-            return Unreadable({"token": self.tokens[index]}, error)
+        with _reading(self._logs[self._frames[index][0]].folder):
+            fields = self._fields(index)
         points = partial(self._points, index) if self.load_points else None
         return LazyFrame(fields, partial(self._images, index, fields["rig"]), points)
 
@@ -310,15 +295,6 @@ def _matrix(pose: Any) -> FloatArray:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rotation_from_quaternion(numbers[3:7]), numbers[:3]
     return matrix
-
-
-def _reduced(image: Any, reduce: int) -> Any:
-    """As PNGs of other readers are reduced: about the outer top-left corner."""
-    if reduce == 1:
-        return np.ascontiguousarray(image)
-    h, w = image.shape[:2]
-    image = cv2.copyMakeBorder(image, 0, -h % reduce, 0, -w % reduce, cv2.BORDER_REPLICATE)
-    return cv2.resize(image, (-(-w // reduce), -(-h // reduce)), interpolation=cv2.INTER_AREA)
 
 
 @contextmanager

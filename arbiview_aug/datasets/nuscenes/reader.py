@@ -16,21 +16,13 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import (
-    Drive,
-    LazyFrame,
-    Neighbours,
-    Unreadable,
-    WritableRecording,
-    camera_fields,
-    check_neighbours,
-)
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
 from arbiview_aug.datasets.frame_folder import checked_points
-from arbiview_aug.datasets.image_io import check_reduce, decode_images, reduced_rig
+from arbiview_aug.datasets.image_io import decode_images, reduced_rig
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables
-from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, warn
+from arbiview_aug.errors import CalibrationError, DataError, warn
 
 CAMERA_RING = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT")
 """Order of the cameras in a sample, clockwise from above; other cameras follow by name."""
@@ -92,12 +84,9 @@ class NuScenesDataset(WritableRecording):
         reduce: Reduce = 1,
         neighbours: Neighbours | None = None,
     ) -> None:
-        check_reduce(reduce)
-        check_neighbours(neighbours)
+        super().__init__(root or "", reduce, load_points, neighbours)
         tables = Tables(root, version, nusc)
-        self.root, self.version = tables.root, tables.version
-        self.compensate_ego_motion, self.load_points = compensate_ego_motion, load_points
-        self.reduce, self.neighbours = reduce, neighbours
+        self.root, self.version, self.compensate_ego_motion = tables.root, tables.version, compensate_ego_motion
         samples = _chosen_samples(tables, split_scenes)
         self.tokens = [row["token"] for row in samples]
         self.scene_tokens: list[str] = [row["scene_token"] for row in samples]
@@ -141,9 +130,8 @@ class NuScenesDataset(WritableRecording):
             sample["box_names"] = [self._annotations.categories[k] for k in self._annotations.category[boxes]]
             sample["box_tokens"] = [token.decode() for token in self._annotations.tokens[boxes].tolist()]
         if self.neighbours is not None:
-            frame = int(np.searchsorted(self._drive_rows, cameras[0]))
-            others = self._drive.neighbours(frame, self.neighbours)
-            sample["neighbours"] = [self._neighbour(int(self._drive_rows[k])) for k in others]
+            place = int(np.searchsorted(self._drive_rows, cameras[0]))
+            sample["neighbours"] = self._neighbours(self._drive, place)
         return sample
 
     def _rig(self, cameras: IntArray, ego2global: FloatArray) -> Rig:
@@ -202,22 +190,25 @@ class NuScenesDataset(WritableRecording):
                 return rows[is_key[rows]]
         return rows
 
-    def _neighbour(self, row: int) -> LazyFrame:
-        """Another frame of the drive; its images and points are read on access, where a broken one raises."""
-        recordings, record = self._recordings, self._recordings.rows[row]
-        sample, is_keyframe = int(record["sample"]), recordings.is_keyframe(row)
+    def _token(self, place: int) -> str:
+        recordings, row = self._recordings, int(self._drive_rows[place])
+        if recordings.is_keyframe(row):
+            return self.tokens[recordings.rows["sample"][row]]
+        return str(recordings.tokens[row].decode())
+
+    def _neighbour(self, place: int) -> LazyFrame:
+        recordings, row = self._recordings, int(self._drive_rows[place])
+        record, is_keyframe = recordings.rows[row], recordings.is_keyframe(row)
+        sample = int(record["sample"])
         moment = int(recordings.keyframes[sample, -1]) if is_keyframe else row
         ego2global, time_s = recordings.ego2global(moment), float(recordings.time_s(moment))
-        fields: dict[str, Any] = {
-            "token": self.tokens[sample] if is_keyframe else recordings.tokens[row].decode(),
+        cameras = recordings.around(row)
+        fields = {
+            "token": self._token(place),
             "time_s": time_s,
             "ego2world": torch.from_numpy(ego2global),
+            "rig": self._rig(cameras, ego2global),
         }
-        try:
-            cameras = recordings.around(row)
-            fields["rig"] = self._rig(cameras, ego2global)
-        except ArbiviewError as error:
-            return Unreadable(fields, error)
         if self._annotations is not None:
             global2ego = _inverse(ego2global)
             if is_keyframe:

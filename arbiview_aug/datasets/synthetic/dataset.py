@@ -15,8 +15,9 @@ from torch.utils.data import Dataset
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import LazyFrame, Neighbours, camera_fields, check_neighbours
+from arbiview_aug.datasets.image_io import stack_or_list
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
-from arbiview_aug.datasets.synthetic.render import Renderer, stack_or_list
+from arbiview_aug.datasets.synthetic.render import Renderer
 from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
 

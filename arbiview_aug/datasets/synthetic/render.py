@@ -289,8 +289,3 @@ def _for_packets(candidates: Candidates, owner: Tensor, tiles: int) -> Candidate
     packet = torch.repeat_interleave(torch.arange(len(owner)), counts[owner])
     rank = ranks(packet, counts[owner])
     return Candidates(packet, candidates.primitive[first[owner[packet]] + rank], rank)
-
-
-def stack_or_list(tensors: list[Tensor]) -> Tensor | list[Tensor]:
-    """Stack tensors of one shape; else return the list."""
-    return torch.stack(tensors) if len({a.shape for a in tensors}) == 1 else tensors
