@@ -13,6 +13,7 @@ from torch.utils.data import Dataset
 from arbiview_aug.atomic_io import BROKEN_ARRAY, file_name, inside, whole_file
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import Neighbours
+from arbiview_aug.datasets.image_io import stack_or_list
 from arbiview_aug.errors import DataError, SampleError
 from arbiview_aug.renamed import refuse_old_options
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY
@@ -22,10 +23,8 @@ from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import BEST_TRAVEL_M, MotionDepth
 
 FOLDER, LEARNED_FOLDER = "motion_depth", "learned_depth"
-"""Default names of the folders in a data set's root."""
-
 FOLDERS = {"motion": FOLDER, LEARNED_KEY: LEARNED_FOLDER}
-"""The same, by what a surface needs (``GEOMETRIES``)."""
+"""Default names of the folders in a data set's root, by what a surface needs (``GEOMETRIES``)."""
 
 WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
 """Neighbours to open a data set with: at half the best travel and at all of it."""
@@ -90,10 +89,8 @@ class DepthFolder:
     def _read(self, token: str, rig: Rig) -> tuple[MotionDepth, list[str]]:
         path = self.path(token)
         if not path.is_file():
-            raise DataError(
-                f"{path}: expected depth of frame {token!r}, found none; make it with "
-                "python -m arbiview_aug depth --data FOLDER"
-            )
+            fix = "make it with python -m arbiview_aug depth --data FOLDER"
+            raise DataError(f"{path}: expected depth of frame {token!r}, found none; {fix}")
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays: dict[str, Any] = {name: file[name] for name in file.files}
@@ -105,10 +102,8 @@ class DepthFolder:
         except (*BROKEN_ARRAY, KeyError, TypeError, OverflowError) as error:
             raise DataError(f"{path}: expected depth of a frame, got {type(error).__name__}; delete it") from None
         if misfit is not None:
-            expected, got = misfit
-            raise DataError(
-                f"{path}: expected depth of {expected}, got {got}; delete it and run the depth command again"
-            )
+            fix = "delete it and run the depth command again"
+            raise DataError(f"{path}: expected depth of {misfit[0]}, got {misfit[1]}; {fix}")
         return kind(depth, words), origin
 
 
@@ -146,10 +141,8 @@ class WithDepth(Dataset[dict[str, Any]]):
         out = dict(sample)
         for folder in self.folders:
             depth = folder.read(str(token), rig)
-            maps = [torch.from_numpy(one) for one in depth.depth_m]
-            same = len({one.shape for one in maps}) == 1
             is_learned = isinstance(depth, LearnedDepth)
-            out[LEARNED_KEY if is_learned else MOTION_KEY] = torch.stack(maps) if same else maps
+            out[LEARNED_KEY if is_learned else MOTION_KEY] = stack_or_list([*map(torch.from_numpy, depth.depth_m)])
             if is_learned:
                 out[LEARNED_WORDS_KEY] = str(depth)
         return out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -156,14 +156,9 @@ class FrameFolder(WritableRecording):
         return camera_fields(rig, self._images(calib, frame, rig), frame.name)
 
     def _boxes_pose_time(self, calib: Mapping[str, Any], frame: _Frame) -> dict[str, Any]:
-        values: dict[str, Any] = {}
-        if calib.get("boxes_3d") is not None:
-            values["boxes_3d"] = _boxes(calib["boxes_3d"], frame.where)
-        if calib.get("ego2world") is not None:
-            values["ego2world"] = _pose(calib["ego2world"], frame.where)
-        if frame.name in self._times_s:
-            values["time_s"] = self._times_s[frame.name]
-        return values
+        checks: dict[str, Callable[[Any, str], Any]] = {"boxes_3d": _boxes, "ego2world": _pose}
+        values = {key: check(calib[key], frame.where) for key, check in checks.items() if calib.get(key) is not None}
+        return values | ({"time_s": self._times_s[frame.name]} if frame.name in self._times_s else {})
 
     def _images(self, calib: Mapping[str, Any], frame: _Frame, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
         files = [_image_file(entry, frame) for entry in calib["cameras"]]
@@ -305,20 +300,20 @@ def _calibration_of(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _image_file(entry: Mapping[str, Any], frame: _Frame) -> Path:
-    label, file = f"camera {entry.get('name')!r}: file", entry.get("file")
-    if not isinstance(file, str) or not file:
-        got = f"{file!r}{hint(entry, ('file',))}"
-        raise DataError(f"{frame.where}: {label}: expected an image's file name, got {got}")
-    return frame.file(file, label)
+    return frame.file(*_named(entry, "file", frame, DataError))
 
 
 def _mask_file(entry: Mapping[str, Any], frame: _Frame) -> Path | None:
-    label, file = f"camera {entry.get('name')!r}: mask", entry.get("mask")
-    if file is None:
-        return None
+    return None if entry.get("mask") is None else frame.mask(*_named(entry, "mask", frame, CalibrationError))
+
+
+def _named(entry: Mapping[str, Any], key: str, frame: _Frame, error: type[ArbiviewError]) -> tuple[str, str]:
+    """The file that a camera names under a key, and its description for messages."""
+    label, file = f"camera {entry.get('name')!r}: {key}", entry.get(key)
     if not isinstance(file, str) or not file:
-        raise CalibrationError(f"{frame.where}: {label}: expected an image's file name, got {file!r}")
-    return frame.mask(file, label)
+        got = f"{file!r}{hint(entry, (key,))}"
+        raise error(f"{frame.where}: {label}: expected an image's file name, got {got}")
+    return file, label
 
 
 def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) -> Camera:

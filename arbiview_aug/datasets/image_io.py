@@ -71,16 +71,18 @@ def decode_images(
     files = [Path(path) for path in paths]
     labels = [f"camera {(names[k] if names else file.stem)!r}: image {file}" for k, file in enumerate(files)]
     headers = [read_header(file, label) for file, label in zip(files, labels, strict=True)]
-    if sizes is not None:
-        for (_, stored), label, size in zip(headers, labels, sizes, strict=True):
-            _check_size(stored, size, label)
+    for (_, (h, w)), label, size in zip(headers, labels, sizes, strict=True) if sizes is not None else ():
+        if (h, w) != size:
+            fix = "use the calibration of these images, or resize its camera (Camera.resize) with them"
+            fix = "the calibration's width and height look swapped" if (w, h) == size else fix
+            raise DataError(f"{label}: expected {size[1]}x{size[0]} (w x h) as calibrated, got {w}x{h}; {fix}")
     shapes = [(*reduced_size(size, reduce), 3) for _, size in headers]
-    block = np.empty((len(files), *shapes[0]), np.uint8) if len(set(shapes)) == 1 else None
-    images = [np.empty(shape, np.uint8) for shape in shapes] if block is None else [*block]
+    is_block = len(set(shapes)) == 1
+    images: Any = np.empty((len(files), *shapes[0]), np.uint8) if is_block else [np.empty(s, np.uint8) for s in shapes]
     for file, label, (format, _), out in zip(files, labels, headers, images, strict=True):
         _decode_into(out, file, label, format, reduce)
-    if block is not None:
-        return torch.from_numpy(block).permute(0, 3, 1, 2)
+    if is_block:
+        return torch.from_numpy(images).permute(0, 3, 1, 2)
     return [torch.from_numpy(image).permute(2, 0, 1) for image in images]
 
 
@@ -167,15 +169,6 @@ def _jpeg_size(data: bytes) -> tuple[tuple[int, int], bool]:
 
 def _number(data: bytes, at: int, length: int) -> int:
     return int.from_bytes(data[at : at + length], "big")
-
-
-def _check_size(size: tuple[int, int], calibrated: tuple[int, int], label: str) -> None:
-    if size != calibrated:
-        fix = "use the calibration of these images, or resize its camera (Camera.resize) with them"
-        if size == calibrated[::-1]:
-            fix = "the calibration's width and height look swapped"
-        h, w = size
-        raise DataError(f"{label}: expected {calibrated[1]}x{calibrated[0]} (w x h) as calibrated, got {w}x{h}; {fix}")
 
 
 def _decode_into(out: ByteArray, path: Path, label: str, format: str, reduce: int) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import FloatArray, LensName
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
@@ -186,10 +186,10 @@ class Py123dDataset(WritableRecording):
 
     def _ego2world(self, index: int) -> FloatArray:
         number, iteration, _ = self._frames[index]
-        pose = self._logs[number].pose(iteration, "imu_se3", "ego_state_se3")
+        log = self._logs[number]
+        pose = log.pose(iteration, "imu_se3", "ego_state_se3")
         if pose is None:
-            folder = self._logs[number].folder
-            raise DataError(f"py123d log {folder}: iteration {iteration}: expected the ego's pose, got none")
+            raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected the ego's pose, got none")
         return pose
 
     def _find_drive(self) -> Drive:
@@ -225,32 +225,22 @@ def _open(folder: Path, scene: Any, names: Sequence[str] | None) -> _Log:
 def _camera(metadata: Any, where: str) -> Camera:
     """A camera at the ego's origin; CalibrationError for another lens."""
     where = f"{where}: camera {metadata.camera_name!r}"
-    lens: LensName
-    distortion: Any
     model = metadata.camera_model.serialize()
     if model == "pinhole" and metadata.intrinsics is not None:
         intrinsics, bent = metadata.intrinsics, None if metadata.is_undistorted else metadata.distortion
         K = np.array([[intrinsics.fx, intrinsics.skew, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]])
-        lens, distortion = "pinhole", ()
-        if bent is not None:
-            lens, distortion = "radtan", (bent.k1, bent.k2, bent.p1, bent.p2, bent.k3)
+        distortion: Any = () if bent is None else (bent.k1, bent.k2, bent.p1, bent.p2, bent.k3)
+        lens = "pinhole" if bent is None else "radtan"
     elif model == "fisheye_mei" and metadata.projection is not None and metadata.mirror_parameter is not None:
         lens, (K, distortion) = "fisheye", _fisheye(metadata, where)
     else:
         raise CalibrationError(
             f"{where}: expected a calibrated pinhole or fisheye MEI lens, got {model}; name the other cameras, cameras="
         )
-    size = {"width_px": int(metadata.width), "height_px": int(metadata.height)}
-    coefficients = tuple(map(float, distortion))
+    optics: dict[str, Any] = {"K": K, "lens": lens, "distortion": tuple(map(float, distortion))}
+    optics |= {"width_px": int(metadata.width), "height_px": int(metadata.height)}
     try:
-        return Camera(
-            name=metadata.camera_name,
-            K=K,
-            cam2ego=np.eye(4),
-            lens=lens,
-            distortion=coefficients,
-            **size,  # type: ignore[arg-type]
-        )
+        return Camera(name=metadata.camera_name, cam2ego=np.eye(4), **optics)
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from None
 

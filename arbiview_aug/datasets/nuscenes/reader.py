@@ -100,10 +100,8 @@ class NuScenesDataset(WritableRecording):
         self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
         if self._annotations is not None and self.tokens and not len(self._annotations.tokens):
             self._annotations = None  # an empty list of boxes would mean an empty street
-            warn(
-                f"nuScenes {self.root}: sample_annotation has no rows of these samples (a test split?): they come "
-                "without boxes_3d"
-            )
+            lacks = "has no rows of these samples (a test split?): they come without boxes_3d"
+            warn(f"nuScenes {self.root}: sample_annotation {lacks}")
         self._has_lidar_sweeps = False
         self._drive_rows = np.empty(0, np.int64) if neighbours is None else self._find_drive_rows()
         positions_m = self._recordings.ego2global(self._drive_rows)[:, :3, 3]
@@ -156,19 +154,14 @@ class NuScenesDataset(WritableRecording):
         return inside(self.root, self._recordings.file(row), where)
 
     def _images(self, cameras: IntArray) -> torch.Tensor | list[torch.Tensor]:
-        return decode_images(
-            [self._file(row) for row in cameras],
-            names=self.channels,
-            sizes=[self._recordings.size(row) for row in cameras],
-            reduce=self.reduce,
-        )
+        files, sizes = [*map(self._file, cameras)], [*map(self._recordings.size, cameras)]
+        return decode_images(files, names=self.channels, sizes=sizes, reduce=self.reduce)
 
     def _points(self, lidar: int, own2ego: FloatArray | None = None) -> torch.Tensor:
         """A recording's points in its own ego frame, or in the one that ``own2ego`` leads to."""
         sensor2ego = self._recordings.sensor2ego[self._recordings.rows["sensor"][lidar]]
         return _read_points(self._file(lidar), sensor2ego if own2ego is None else own2ego @ sensor2ego)
 
-    # --- other frames of the drive ------------------------------------------------------------------------------------
     def _find_drive_rows(self) -> IntArray:
         """Rows of the first camera that can be neighbours: all, or keyframes only if sweeps were not copied.
 
@@ -203,19 +196,12 @@ class NuScenesDataset(WritableRecording):
         moment = int(recordings.keyframes[sample, -1]) if is_keyframe else row
         ego2global, time_s = recordings.ego2global(moment), float(recordings.time_s(moment))
         cameras = recordings.around(row)
-        fields = {
-            "token": self._token(place),
-            "time_s": time_s,
-            "ego2world": torch.from_numpy(ego2global),
-            "rig": self._rig(cameras, ego2global),
-        }
-        if self._annotations is not None:
-            global2ego = _inverse(ego2global)
-            if is_keyframe:
-                boxes = self._annotations.at_sample(sample, global2ego)
-            else:
-                boxes = self._annotations.at_time(int(record["scene"]), time_s, global2ego)
-            fields["boxes_3d"] = torch.from_numpy(boxes)
+        fields = {"token": self._token(place), "time_s": time_s, "ego2world": torch.from_numpy(ego2global)}
+        fields["rig"] = self._rig(cameras, ego2global)
+        if (boxes := self._annotations) is not None:
+            global2ego, scene = _inverse(ego2global), int(record["scene"])
+            there = boxes.at_sample(sample, global2ego) if is_keyframe else boxes.at_time(scene, time_s, global2ego)
+            fields["boxes_3d"] = torch.from_numpy(there)
         lidar = moment if is_keyframe else recordings.lidar_beside(row) if self._has_lidar_sweeps else None
         points = None
         if self.load_points and lidar is not None:
@@ -270,16 +256,13 @@ def _read_points(path: Path, sensor2ego: FloatArray) -> torch.Tensor:
         numbers = np.fromfile(path, dtype="<f4")
         size = path.stat().st_size
     except FileNotFoundError:
-        raise DataError(
-            f"points {path}: expected the LiDAR's file, found none; check the data root, or pass load_points=False"
-        ) from None
+        fix = "check the data root, or pass load_points=False"
+        raise DataError(f"points {path}: expected the LiDAR's file, found none; {fix}") from None
     except OSError as error:
         raise DataError(f"points {path}: expected a readable file, got {error.strerror}") from None
     if size == 0 or size % (4 * _POINT_FLOATS):
-        raise DataError(
-            f"points {path}: expected whole points of {_POINT_FLOATS} float32, got {size} bytes (truncated?); "
-            "copy it again"
-        )
+        got = f"got {size} bytes (truncated?); copy it again"
+        raise DataError(f"points {path}: expected whole points of {_POINT_FLOATS} float32, {got}")
     points = numbers.reshape(-1, _POINT_FLOATS)
     checked_points(points, str(path))
     points[:, :3] = points[:, :3].astype(np.float64) @ sensor2ego[:3, :3].T + sensor2ego[:3, 3]

@@ -15,18 +15,8 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.datasets.drive import clock_message
-from arbiview_aug.datasets.nuscenes.tables import (
-    COUNTS,
-    FILES,
-    FLAGS,
-    LINKS,
-    MICROSECONDS,
-    TOKENS,
-    Row,
-    Tables,
-    Tokens,
-    rotation_from_quaternion,
-)
+from arbiview_aug.datasets.nuscenes.tables import COUNTS, FILES, FLAGS, LINKS, MICROSECONDS, TOKENS, Row, Tables, Tokens
+from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion as rotations
 from arbiview_aug.errors import DataError, warn
 
 LIDAR = "LIDAR_TOP"  # sensor whose time and ego pose are the sample's
@@ -34,21 +24,10 @@ MAX_APART_S = 0.1  # maximum time to a sweep's nearest image; cameras record eve
 
 IntArray = npt.NDArray[np.int64]
 
-_ROW = np.dtype(
-    [
-        ("channel", "i2"),
-        ("scene", "i4"),
-        ("sample", "i4"),
-        ("time_us", "i8"),
-        ("sensor", "i4"),  # row of sensor2ego and K
-        ("pose", "i4"),  # row of poses
-        ("file", "i4"),  # row of file_names
-        ("height", "i4"),
-        ("width", "i4"),
-        ("key", "?"),
-        ("token", "i4"),  # of the first channel's rows, in the table's order
-    ]
-)
+_NUMBERS = ("scene", "sample", "sensor", "pose", "file", "height", "width", "token")
+_ROW = np.dtype([("channel", "i2"), ("time_us", "i8"), ("key", "?"), *((name, "i4") for name in _NUMBERS)])
+"""Columns of a recording: ``sensor`` is a row of sensor2ego and K, ``pose`` of poses, ``file`` of file_names; ``token``
+is the number of the first channel's rows in the table's order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +57,7 @@ class Recordings:
         """(..., 4, 4) ego poses of rows (...,)."""
         pose = self.poses[self.rows["pose"][rows]]
         matrices = np.zeros((*pose.shape[:-1], 4, 4))
-        matrices[..., :3, :3], matrices[..., :3, 3] = rotation_from_quaternion(pose[..., 3:]), pose[..., :3]
+        matrices[..., :3, :3], matrices[..., :3, 3] = rotations(pose[..., 3:]), pose[..., :3]
         matrices[..., 3, 3] = 1
         return matrices
 
@@ -94,25 +73,25 @@ class Recordings:
 
         Cameras expose one after the other: the delay to the first camera's exposure is nearest to that of the keyframe.
         """
-        time_us, record = self.rows["time_us"], self.rows[row]
-        keyframe_us = time_us[self.keyframes[record["sample"]]]
+        keyframe_us = self.rows["time_us"][self.keyframes[self.rows["sample"][row]]]
         rows = np.full(len(self.channels) - 1, row)
         for channel in range(1, len(rows)):
-            wanted_us = record["time_us"] + keyframe_us[channel] - keyframe_us[0]
-            scenes = (len(self.first) - 1) // len(self.channels)
-            first, end = self.first[channel * scenes + record["scene"] :][:2]
-            apart_us = np.abs(time_us[first:end] - wanted_us)
-            if not len(apart_us) or apart_us.min() > 1e6 * MAX_APART_S:
+            nearest = self._nearest(channel, row, keyframe_us[channel] - keyframe_us[0])
+            if nearest is None:
                 raise DataError(f"expected an image of {self.channels[channel]} within {MAX_APART_S} s, got none")
-            rows[channel] = first + apart_us.argmin()
+            rows[channel] = nearest
         return rows
 
     def lidar_beside(self, row: int) -> int | None:
         """Row of the LiDAR's recording nearest in time to a row of the first camera; None beyond ``MAX_APART_S``."""
+        return self._nearest(len(self.channels) - 1, row, 0)
+
+    def _nearest(self, channel: int, row: int, later_us: int) -> int | None:
+        """A channel's row nearest in time to a moment after a row; None beyond ``MAX_APART_S``."""
         scenes = (len(self.first) - 1) // len(self.channels)
-        first, end = self.first[(len(self.channels) - 1) * scenes + self.rows["scene"][row] :][:2]
-        apart_us = np.abs(self.rows["time_us"][first:end] - self.rows["time_us"][row])
-        return int(first + apart_us.argmin()) if apart_us.min() <= 1e6 * MAX_APART_S else None
+        first, end = self.first[channel * scenes + self.rows["scene"][row] :][:2]
+        apart_us = np.abs(self.rows["time_us"][first:end] - (self.rows["time_us"][row] + later_us))
+        return int(first + apart_us.argmin()) if len(apart_us) and apart_us.min() <= 1e6 * MAX_APART_S else None
 
 
 def read_recordings(

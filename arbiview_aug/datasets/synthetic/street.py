@@ -12,6 +12,7 @@ from arbiview_aug.datasets.synthetic.scene import (
     BOX,
     BoxClass,
     Light,
+    Look,
     Material,
     Range,
     Scene,
@@ -183,7 +184,7 @@ class _World:
         for side in (-1, 1):
             y = _span(self.side_y(side, 0), side * BLOCK_DEPTH_M)
             for x in self.blocks:
-                place.box(x, y, (-0.5, self.street.kerb_m), Material.SLAB, (0.52, 0.51, 0.49))
+                place.box(x, y, (-0.5, self.street.kerb_m), Look(Material.SLAB, (0.52, 0.51, 0.49)))
 
     def add_buildings(self) -> None:
         rng, base = self.rng, self.street.kerb_m
