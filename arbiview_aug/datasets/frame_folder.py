@@ -171,8 +171,7 @@ class FrameFolder(WritableRecording):
         for name in order:
             frame = self._frames[self._index[name]]
             try:
-                pose = _read_calibration(frame).get("ego2world")
-                if pose is not None:
+                if (pose := _read_calibration(frame).get("ego2world")) is not None:
                     positions_m[name] = _pose(pose, frame.where).numpy()[:3, 3]
             except ArbiviewError as error:
                 warn(f"{error}; this frame is no neighbour")
@@ -236,10 +235,8 @@ def _find_frames(root: Path) -> list[_Frame]:
         return [_Frame(root.resolve(), root.resolve())]  # resolved, so that "." has a name
     frames = [_Frame(root, folder) for folder in sorted(root.iterdir()) if (folder / CALIBRATION_FILE).is_file()]
     if not frames:
-        raise DataError(
-            f"frame folder {root}: expected {CALIBRATION_FILE}, or folders that have one, found neither; "
-            "docs/formats.md has the format"
-        )
+        expected = f"expected {CALIBRATION_FILE}, or folders that have one, found neither"
+        raise DataError(f"frame folder {root}: {expected}; docs/formats.md has the format")
     return frames
 
 
@@ -341,14 +338,12 @@ def _points_file(calib: Mapping[str, Any], frame: _Frame) -> Path | None:
     if named is not None and not isinstance(named, str):
         raise DataError(f"{frame.where}: lidar: expected {{'file': name}}, got {entry!r}")
     path = frame.file(named or POINTS_FILE, "lidar")
-    if not path.is_file():
-        if named is None and not os.path.lexists(frame.folder / POINTS_FILE):
-            return None
-        raise DataError(
-            f"{frame.where}: lidar: expected the points {path}, found no file; copy it, remove the key 'lidar', "
-            "or pass load_points=False"
-        )
-    return path
+    if path.is_file():
+        return path
+    if named is None and not os.path.lexists(frame.folder / POINTS_FILE):
+        return None
+    fix = "copy it, remove the key 'lidar', or pass load_points=False"
+    raise DataError(f"{frame.where}: lidar: expected the points {path}, found no file; {fix}")
 
 
 def _read_points(calib: Mapping[str, Any], frame: _Frame) -> torch.Tensor | None:
@@ -369,8 +364,7 @@ def checked_points(array: Any, where: str) -> torch.Tensor:
         raise DataError(f"points {where}: expected a float array of shape (P, >=3), got {got}")
     if mistake := shape_mistake(array.shape):
         raise DataError(f"points {where}: {mistake}")
-    bad = int(np.count_nonzero(~finite_rows(array)))
-    if bad:
+    if bad := int(np.count_nonzero(~finite_rows(array))):
         fix = "drop them: points[np.isfinite(points[:, :3]).all(1)]"
         raise DataError(f"points {where}: expected finite coordinates, got {bad} points with NaN or infinity; {fix}")
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

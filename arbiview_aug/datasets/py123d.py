@@ -19,7 +19,7 @@ from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import area_reduced, reduced_rig, stack_or_list
-from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion
+from arbiview_aug.datasets.nuscenes.tables import poses_from, rotation_from_quaternion
 from arbiview_aug.datasets.registry import log_folders
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, described
@@ -54,7 +54,7 @@ class _Log:
     def pose(self, iteration: int, column: str, *modality: Any) -> FloatArray | None:
         """(4, 4) pose in the world; None where the modality recorded nothing."""
         pose = self.scene.get_modality_column_at_iteration(iteration, column, *modality)
-        return None if pose is None else _matrix(pose)
+        return None if pose is None else poses_from(np.array(pose, np.float64)[:7])
 
 
 class Py123dDataset(WritableRecording):
@@ -277,14 +277,6 @@ def _boxes(detections: Any, world2ego: FloatArray) -> Any:
     velocity = np.array([[np.nan] * 3 if v is None else [v.x, v.y, v.z] for v in velocities]).reshape(-1, 3)
     centre = rows[:, :3] @ world2ego[:3, :3].T + world2ego[:3, 3]
     return np.column_stack([centre, rows[:, 7:10], yaw, (velocity @ world2ego[:3, :3].T)[:, :2]]).astype(np.float32)
-
-
-def _matrix(pose: Any) -> FloatArray:
-    """(4, 4) of x y z and a quaternion w x y z."""
-    numbers = np.array(pose, np.float64)
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation_from_quaternion(numbers[3:7]), numbers[:3]
-    return matrix
 
 
 @contextmanager

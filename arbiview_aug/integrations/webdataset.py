@@ -69,17 +69,14 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
         described = parse_json(entry["rig.json"])
         token = described["token"]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise DataError(
-            f"{where}: rig.json: expected a rig with its token, got {type(error).__name__}: {error}"
-        ) from None
+        got = f"{type(error).__name__}: {error}"
+        raise DataError(f"{where}: rig.json: expected a rig with its token, got {got}") from None
     rig = Rig.from_dict(described, where=where)
     images, cameras = [], []
     for k, camera in enumerate(rig):
         image = _decoded(entry, f"{k:02}.jpg", where, cv2.IMREAD_COLOR)
-        if image.shape[:2] != camera.size:
-            raise DataError(
-                f"{where}: {k:02}.jpg: expected (h, w) = {camera.size}, as in rig.json, got {image.shape[:2]}"
-            )
+        if (size := image.shape[:2]) != camera.size:
+            raise DataError(f"{where}: {k:02}.jpg: expected (h, w) = {camera.size}, as in rig.json, got {size}")
         images.append(torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)).permute(2, 0, 1))
         if f"{k:02}.mask.png" in entry:
             camera = replace(camera, mask=_decoded(entry, f"{k:02}.mask.png", where, cv2.IMREAD_GRAYSCALE) > 0)

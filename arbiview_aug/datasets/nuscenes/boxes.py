@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Tables, Tokens
+from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Tables, Tokens, rotation_from_quaternion
 
 MAX_STEP_S = 1.5  # between annotations for a velocity; doubled for central differences (``NuScenes.box_velocity``)
 
@@ -117,7 +117,7 @@ def read_annotations(
                 np.array([token.encode() for token in unique.add(rows)], np.bytes_),
                 tables.numbers(table, rows, "translation", (3,)),
                 sizes_m[:, [1, 0, 2]].astype(np.float32),  # width, length, height in the table
-                tables.rotations(table, rows)[:, :, 0].astype(np.float32),
+                rotation_from_quaternion(tables.quaternions(table, rows))[:, :, 0].astype(np.float32),
             )
         )
     unique.check()

@@ -221,17 +221,10 @@ def add_traffic_light(builder: SceneBuilder, xyz: Vector, yaw: float) -> None:
 
 
 def add_building(
-    builder: SceneBuilder,
-    rng: np.random.Generator,
-    x: Range,
-    y: Range,
-    base_m: float,
-    height: float,
-    *,
-    detailed: bool = True,
+    builder: SceneBuilder, rng: np.random.Generator, x: Range, y: Range, z: Range, *, detailed: bool = True
 ) -> None:
     """A block with windows; detailed ones have a cornice, now and then bays or an awning over the ground floor."""
-    place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
+    place, (base_m, height) = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING), z
     wall = pick(rng, _WALLS)
     bay, storey = rng.uniform(2.2, 4.2), rng.uniform(2.9, 3.6)
     # bay width, storey height, share of the wall that is glass, whether the ground floor is shops
