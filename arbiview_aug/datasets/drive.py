@@ -189,9 +189,9 @@ class WritableRecording(Recording, ABC):
                 frames.append(Unreadable({"token": self._token(k)}, error))
         return frames
 
-    @abstractmethod
     def _neighbour(self, place: int) -> LazyFrame:
         """The frame at a place of the drive; its images and points are read on access."""
+        raise NotImplementedError  # not abstract: readers without neighbours need none
 
     def _token(self, place: int) -> str:
         """Token of the frame at a place of the drive."""
