@@ -14,6 +14,7 @@ from arbiview_aug.atomic_io import BROKEN_ARRAY, file_name, inside, whole_file
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.datasets.drive import Neighbours
+from arbiview_aug.datasets.image_io import stack_or_list
 from arbiview_aug.errors import DataError, SampleError
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY
 from arbiview_aug.scene.panorama import Layer
@@ -22,10 +23,8 @@ from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import BEST_TRAVEL_M, MotionDepth
 
 FOLDER, LEARNED_FOLDER = "motion_depth", "learned_depth"
-"""Default names of the folders in a data set's root."""
-
 FOLDERS = {"motion": FOLDER, LEARNED_KEY: LEARNED_FOLDER}
-"""The same, by what a surface needs (``GEOMETRIES``)."""
+"""Default names of the folders in a data set's root, by what a surface needs (``GEOMETRIES``)."""
 
 WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
 """Neighbours to open a data set with: at half the best travel and at all of it."""
@@ -52,18 +51,12 @@ class DepthFolder:
         Raises:
             OutputError: The file cannot be written.
         """
-        maps = {f"depth_{k:02}": one.astype(np.float16) for k, one in enumerate(depth.depth_m)}
+        maps: dict[str, Any] = {f"depth_{k:02}": one.astype(np.float16) for k, one in enumerate(depth.depth_m)}
         with whole_file(self.path(token)) as file:
-            np.savez_compressed(
-                file,
-                format=_FORMAT,
-                token=np.array(token),
-                kind=np.array("learned" if isinstance(depth, LearnedDepth) else "motion"),
-                words=np.array(depth.words),
-                neighbours=np.array(list(origin), dtype=np.str_),
-                **_calibration(rig),
-                **maps,  # type: ignore[arg-type]
-            )
+            kind = "learned" if isinstance(depth, LearnedDepth) else "motion"
+            facts: dict[str, Any] = {"format": _FORMAT, "token": token, "kind": kind, "words": depth.words}
+            origins = np.array(list(origin), dtype=np.str_)
+            np.savez_compressed(file, **facts, neighbours=origins, **_calibration(rig), **maps)
 
     def read(self, token: str, rig: Rig) -> MotionDepth:
         """Read a frame's depth, of either kind.
@@ -90,25 +83,21 @@ class DepthFolder:
     def _read(self, token: str, rig: Rig) -> tuple[MotionDepth, list[str]]:
         path = self.path(token)
         if not path.is_file():
-            raise DataError(
-                f"{path}: expected depth of frame {token!r}, found none; make it with "
-                "python -m arbiview_aug depth --data FOLDER"
-            )
+            fix = "make it with python -m arbiview_aug depth --data FOLDER"
+            raise DataError(f"{path}: expected depth of frame {token!r}, found none; {fix}")
         try:
             with np.load(path, allow_pickle=False) as file:
                 arrays: dict[str, Any] = {name: file[name] for name in file.files}
             depth = tuple(arrays[f"depth_{k:02}"].astype(np.float32) for k in range(len(arrays["K"])))
             words, of = str(arrays["words"]), str(arrays.get("token", token))  # older files name no token
-            misfit = None if of == token else (f"frame {token!r}", f"that of frame {of!r}")
-            misfit = misfit or _misfit(arrays, rig, depth)
+            if of != token:
+                raise _misfit(path, f"frame {token!r}", f"that of frame {of!r}")
+            _check_fits(path, arrays, rig, depth)
             kind, origin = _KINDS[str(arrays.get("kind", "motion"))], arrays["neighbours"].tolist()
+        except DataError:
+            raise
         except (*BROKEN_ARRAY, KeyError, TypeError, OverflowError) as error:
             raise DataError(f"{path}: expected depth of a frame, got {type(error).__name__}; delete it") from None
-        if misfit is not None:
-            expected, got = misfit
-            raise DataError(
-                f"{path}: expected depth of {expected}, got {got}; delete it and run the depth command again"
-            )
         return kind(depth, words), origin
 
 
@@ -146,10 +135,8 @@ class WithDepth(Dataset[dict[str, Any]]):
         out = dict(sample)
         for folder in self.folders:
             depth = folder.read(str(token), rig)
-            maps = [torch.from_numpy(one) for one in depth.depth_m]
-            same = len({one.shape for one in maps}) == 1
             is_learned = isinstance(depth, LearnedDepth)
-            out[LEARNED_KEY if is_learned else MOTION_KEY] = torch.stack(maps) if same else maps
+            out[LEARNED_KEY if is_learned else MOTION_KEY] = stack_or_list([*map(torch.from_numpy, depth.depth_m)])
             if is_learned:
                 out[LEARNED_WORDS_KEY] = str(depth)
         return out
@@ -163,17 +150,20 @@ def _calibration(rig: Rig) -> dict[str, Any]:
     return {"K": np.stack([camera.K for camera in cameras]), "cam2ego": np.stack([c.cam2ego for c in cameras])}
 
 
-def _misfit(arrays: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> tuple[str, str] | None:
-    """Expected and found, where the depth is of another format, rig, image size or calibration."""
+def _misfit(path: Path, expected: str, got: str) -> DataError:
+    return DataError(f"{path}: expected depth of {expected}, got {got}; delete it and run the depth command again")
+
+
+def _check_fits(path: Path, arrays: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> None:
+    """Raise DataError for depth of another format, rig, image size or calibration."""
     if int(arrays["format"]) != _FORMAT:
-        return f"format {_FORMAT}", f"format {int(arrays['format'])}"
+        raise _misfit(path, f"format {_FORMAT}", f"format {int(arrays['format'])}")
     if len(depth) != len(rig):
-        return f"{len(rig)} cameras", f"{len(depth)}"
+        raise _misfit(path, f"{len(rig)} cameras", f"{len(depth)}")
     for camera, layer in zip(rig, depth, strict=True):
         if layer.shape != (size := motion_camera(camera).size):
-            return f"camera {camera.name!r} of shape {size}", f"{layer.shape}"
+            raise _misfit(path, f"camera {camera.name!r} of shape {size}", f"{layer.shape}")
     for key, atol in (("K", _SAME_PX), ("cam2ego", _SAME_POSE)):
         for camera, recorded, expected in zip(rig, arrays[key], _calibration(rig)[key], strict=True):
             if not np.allclose(recorded, expected, rtol=0, atol=atol):
-                return "this calibration", f"another's: {key} of camera {camera.name!r} differs"
-    return None
+                raise _misfit(path, "this calibration", f"another's: {key} of camera {camera.name!r} differs")

@@ -18,6 +18,8 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Reduce
+from arbiview_aug.datasets.image_io import check_reduce
 from arbiview_aug.errors import ArbiviewError, DataError, warn
 from arbiview_aug.sample.neighbours import STILL_M
 
@@ -52,14 +54,6 @@ class Recording(Dataset[dict[str, Any]]):
                 f"{self.root}: expected the token of one of {len(self)} samples, got {token!r}; they are {some} …"
             )
         return self[self._index[token]]
-
-
-class WritableRecording(Recording, ABC):
-    """Base class of readers that ``convert`` has a writer for."""
-
-    @abstractmethod
-    def files(self, index: int) -> list[Path]:
-        """All files that a sample is read from."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,6 +154,48 @@ def camera_fields(rig: Rig, images: Any, token: str) -> dict[str, Any]:
     """A sample's images, rig and calibration tensors, and its token."""
     K, cam2ego = torch.from_numpy(rig.K), torch.from_numpy(rig.cam2ego)
     return {"images": images, "rig": rig, "K": K, "cam2ego": cam2ego, "token": token}
+
+
+class WritableRecording(Recording, ABC):
+    """Base class of readers that ``convert`` has a writer for, with the options that all of the package's have.
+
+    Args:
+        root: Folder of the data.
+        reduce: Decode the images at 1, 1/2 or 1/4 of their size.
+        load_points: Whether to read the LiDAR's points.
+        neighbours: Which other frames of the drive come with a sample; None for none.
+
+    Raises:
+        TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
+        ValueError: ``reduce`` is not 1, 2 or 4.
+    """
+
+    def __init__(self, root: str | Path, reduce: Reduce, load_points: bool, neighbours: Neighbours | None) -> None:
+        check_reduce(reduce)
+        check_neighbours(neighbours)
+        self.root, self.reduce, self.load_points, self.neighbours = Path(root), reduce, load_points, neighbours
+
+    @abstractmethod
+    def files(self, index: int) -> list[Path]:
+        """All files that a sample is read from."""
+
+    def _neighbours(self, drive: Drive, place: int) -> list[LazyFrame]:
+        """The frames beside the one at a place of a drive; broken ones raise on access."""
+        frames: list[LazyFrame] = []
+        for k in drive.neighbours(place, self.neighbours) if self.neighbours else ():
+            try:
+                frames.append(self._neighbour(k))
+            except ArbiviewError as error:
+                frames.append(Unreadable({"token": self._token(k)}, error))
+        return frames
+
+    def _neighbour(self, place: int) -> LazyFrame:
+        """The frame at a place of the drive; its images and points are read on access."""
+        raise NotImplementedError  # not abstract: readers without neighbours need none
+
+    def _token(self, place: int) -> str:
+        """Token of the frame at a place of the drive."""
+        return self.tokens[place]
 
 
 class LazyFrame(Mapping[str, Any]):

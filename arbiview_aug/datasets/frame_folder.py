@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -21,18 +21,9 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.plain_yaml import parse_json
 from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig, read_mask
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import (
-    Drive,
-    LazyFrame,
-    Neighbours,
-    Unreadable,
-    WritableRecording,
-    camera_fields,
-    check_neighbours,
-    parts_of_clock,
-)
-from arbiview_aug.datasets.image_io import check_reduce, decode_images, encoded_image, reduced_rig
-from arbiview_aug.datasets.layouts import CALIBRATION_FILE
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields, parts_of_clock
+from arbiview_aug.datasets.image_io import decode_images, encoded_image, reduced_rig
+from arbiview_aug.datasets.registry import CALIBRATION_FILE
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce, shown, warn
 from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
@@ -114,9 +105,7 @@ class FrameFolder(WritableRecording):
         neighbours: Neighbours | None = None,
         clean_masks: bool = False,
     ) -> None:
-        check_reduce(reduce)
-        check_neighbours(neighbours)
-        self.root, self.reduce, self.load_points, self.neighbours = Path(root), reduce, load_points, neighbours
+        super().__init__(root, reduce, load_points, neighbours)
         self.clean_masks = clean_masks
         self._frames = _find_frames(self.root)
         self.tokens = [frame.name for frame in self._frames]
@@ -147,11 +136,9 @@ class FrameFolder(WritableRecording):
         if self.load_points and (points := _read_points(calib, frame)) is not None:
             sample["points"] = points
         sample |= self._boxes_pose_time(calib, frame)
-        if self._drive is not None and self.neighbours is not None:
-            others = []
-            if frame.name in self._drive_names:
-                others = self._drive.neighbours(self._drive_names.index(frame.name), self.neighbours)
-            sample["neighbours"] = [self._neighbour(self._drive_names[k]) for k in others]
+        if self._drive is not None:
+            names, name = self._drive_names, frame.name
+            sample["neighbours"] = self._neighbours(self._drive, names.index(name)) if name in names else []
         return sample
 
     def truth(self, index: int) -> dict[str, Any] | None:
@@ -169,14 +156,9 @@ class FrameFolder(WritableRecording):
         return camera_fields(rig, self._images(calib, frame, rig), frame.name)
 
     def _boxes_pose_time(self, calib: Mapping[str, Any], frame: _Frame) -> dict[str, Any]:
-        values: dict[str, Any] = {}
-        if calib.get("boxes_3d") is not None:
-            values["boxes_3d"] = _boxes(calib["boxes_3d"], frame.where)
-        if calib.get("ego2world") is not None:
-            values["ego2world"] = _pose(calib["ego2world"], frame.where)
-        if frame.name in self._times_s:
-            values["time_s"] = self._times_s[frame.name]
-        return values
+        checks: dict[str, Callable[[Any, str], Any]] = {"boxes_3d": _boxes, "ego2world": _pose}
+        values = {key: check(calib[key], frame.where) for key, check in checks.items() if calib.get(key) is not None}
+        return values | ({"time_s": self._times_s[frame.name]} if frame.name in self._times_s else {})
 
     def _images(self, calib: Mapping[str, Any], frame: _Frame, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
         files = [_image_file(entry, frame) for entry in calib["cameras"]]
@@ -189,8 +171,7 @@ class FrameFolder(WritableRecording):
         for name in order:
             frame = self._frames[self._index[name]]
             try:
-                pose = _read_calibration(frame).get("ego2world")
-                if pose is not None:
+                if (pose := _read_calibration(frame).get("ego2world")) is not None:
                     positions_m[name] = _pose(pose, frame.where).numpy()[:3, 3]
             except ArbiviewError as error:
                 warn(f"{error}; this frame is no neighbour")
@@ -199,16 +180,14 @@ class FrameFolder(WritableRecording):
         parts = parts_of_clock(names, times_s, str(self.root / SEQUENCE_FILE))
         return Drive(np.array(list(positions_m.values())).reshape(-1, 3), parts)
 
-    def _neighbour(self, name: str) -> Mapping[str, Any]:
-        """Another frame of the drive; its images are decoded on access, where a broken one raises."""
-        frame = self._frames[self._index[name]]
-        fields: dict[str, Any] = {"token": name}
-        try:
-            calib = _read_calibration(frame)
-            rig = self._rig(calib, frame)
-            fields |= {"rig": rig, **self._boxes_pose_time(calib, frame)}
-        except ArbiviewError as error:
-            return Unreadable(fields, error)
+    def _token(self, place: int) -> str:
+        return self._drive_names[place]
+
+    def _neighbour(self, place: int) -> LazyFrame:
+        frame = self._frames[self._index[self._token(place)]]
+        calib = _read_calibration(frame)
+        rig = self._rig(calib, frame)
+        fields = {"token": frame.name, "rig": rig, **self._boxes_pose_time(calib, frame)}
         points = partial(_read_points, calib, frame) if self.load_points else None
         return LazyFrame(fields, partial(self._images, calib, frame, rig), points)
 
@@ -256,10 +235,8 @@ def _find_frames(root: Path) -> list[_Frame]:
         return [_Frame(root.resolve(), root.resolve())]  # resolved, so that "." has a name
     frames = [_Frame(root, folder) for folder in sorted(root.iterdir()) if (folder / CALIBRATION_FILE).is_file()]
     if not frames:
-        raise DataError(
-            f"frame folder {root}: expected {CALIBRATION_FILE}, or folders that have one, found neither; "
-            "docs/formats.md has the format"
-        )
+        expected = f"expected {CALIBRATION_FILE}, or folders that have one, found neither"
+        raise DataError(f"frame folder {root}: {expected}; docs/formats.md has the format")
     return frames
 
 
@@ -320,20 +297,20 @@ def _calibration_of(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _image_file(entry: Mapping[str, Any], frame: _Frame) -> Path:
-    label, file = f"camera {entry.get('name')!r}: file", entry.get("file")
-    if not isinstance(file, str) or not file:
-        got = f"{file!r}{hint(entry, ('file',))}"
-        raise DataError(f"{frame.where}: {label}: expected an image's file name, got {got}")
-    return frame.file(file, label)
+    return frame.file(*_named(entry, "file", frame, DataError))
 
 
 def _mask_file(entry: Mapping[str, Any], frame: _Frame) -> Path | None:
-    label, file = f"camera {entry.get('name')!r}: mask", entry.get("mask")
-    if file is None:
-        return None
+    return None if entry.get("mask") is None else frame.mask(*_named(entry, "mask", frame, CalibrationError))
+
+
+def _named(entry: Mapping[str, Any], key: str, frame: _Frame, error: type[ArbiviewError]) -> tuple[str, str]:
+    """The file that a camera names under a key, and its description for messages."""
+    label, file = f"camera {entry.get('name')!r}: {key}", entry.get(key)
     if not isinstance(file, str) or not file:
-        raise CalibrationError(f"{frame.where}: {label}: expected an image's file name, got {file!r}")
-    return frame.mask(file, label)
+        got = f"{file!r}{hint(entry, (key,))}"
+        raise error(f"{frame.where}: {label}: expected an image's file name, got {got}")
+    return file, label
 
 
 def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) -> Camera:
@@ -361,14 +338,12 @@ def _points_file(calib: Mapping[str, Any], frame: _Frame) -> Path | None:
     if named is not None and not isinstance(named, str):
         raise DataError(f"{frame.where}: lidar: expected {{'file': name}}, got {entry!r}")
     path = frame.file(named or POINTS_FILE, "lidar")
-    if not path.is_file():
-        if named is None and not os.path.lexists(frame.folder / POINTS_FILE):
-            return None
-        raise DataError(
-            f"{frame.where}: lidar: expected the points {path}, found no file; copy it, remove the key 'lidar', "
-            "or pass load_points=False"
-        )
-    return path
+    if path.is_file():
+        return path
+    if named is None and not os.path.lexists(frame.folder / POINTS_FILE):
+        return None
+    fix = "copy it, remove the key 'lidar', or pass load_points=False"
+    raise DataError(f"{frame.where}: lidar: expected the points {path}, found no file; {fix}")
 
 
 def _read_points(calib: Mapping[str, Any], frame: _Frame) -> torch.Tensor | None:
@@ -389,8 +364,7 @@ def checked_points(array: Any, where: str) -> torch.Tensor:
         raise DataError(f"points {where}: expected a float array of shape (P, >=3), got {got}")
     if mistake := shape_mistake(array.shape):
         raise DataError(f"points {where}: {mistake}")
-    bad = int(np.count_nonzero(~finite_rows(array)))
-    if bad:
+    if bad := int(np.count_nonzero(~finite_rows(array))):
         fix = "drop them: points[np.isfinite(points[:, :3]).all(1)]"
         raise DataError(f"points {where}: expected finite coordinates, got {bad} points with NaN or infinity; {fix}")
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

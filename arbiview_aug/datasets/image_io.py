@@ -10,7 +10,7 @@ import stat
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -71,17 +71,24 @@ def decode_images(
     files = [Path(path) for path in paths]
     labels = [f"camera {(names[k] if names else file.stem)!r}: image {file}" for k, file in enumerate(files)]
     headers = [read_header(file, label) for file, label in zip(files, labels, strict=True)]
-    if sizes is not None:
-        for (_, stored), label, size in zip(headers, labels, sizes, strict=True):
-            _check_size(stored, size, label)
+    for (_, (h, w)), label, size in zip(headers, labels, sizes, strict=True) if sizes is not None else ():
+        if (h, w) != size:
+            fix = "use the calibration of these images, or resize its camera (Camera.resize) with them"
+            fix = "the calibration's width and height look swapped" if (w, h) == size else fix
+            raise DataError(f"{label}: expected {size[1]}x{size[0]} (w x h) as calibrated, got {w}x{h}; {fix}")
     shapes = [(*reduced_size(size, reduce), 3) for _, size in headers]
-    block = np.empty((len(files), *shapes[0]), np.uint8) if len(set(shapes)) == 1 else None
-    images = [np.empty(shape, np.uint8) for shape in shapes] if block is None else [*block]
+    is_block = len(set(shapes)) == 1
+    images: Any = np.empty((len(files), *shapes[0]), np.uint8) if is_block else [np.empty(s, np.uint8) for s in shapes]
     for file, label, (format, _), out in zip(files, labels, headers, images, strict=True):
         _decode_into(out, file, label, format, reduce)
-    if block is not None:
-        return torch.from_numpy(block).permute(0, 3, 1, 2)
+    if is_block:
+        return torch.from_numpy(images).permute(0, 3, 1, 2)
     return [torch.from_numpy(image).permute(2, 0, 1) for image in images]
+
+
+def stack_or_list(tensors: list[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
+    """Stack tensors of one shape; else return the list."""
+    return torch.stack(tensors) if len({tensor.shape for tensor in tensors}) == 1 else tensors
 
 
 def check_reduce(reduce: int) -> None:
@@ -164,15 +171,6 @@ def _number(data: bytes, at: int, length: int) -> int:
     return int.from_bytes(data[at : at + length], "big")
 
 
-def _check_size(size: tuple[int, int], calibrated: tuple[int, int], label: str) -> None:
-    if size != calibrated:
-        fix = "use the calibration of these images, or resize its camera (Camera.resize) with them"
-        if size == calibrated[::-1]:
-            fix = "the calibration's width and height look swapped"
-        h, w = size
-        raise DataError(f"{label}: expected {calibrated[1]}x{calibrated[0]} (w x h) as calibrated, got {w}x{h}; {fix}")
-
-
 def _decode_into(out: ByteArray, path: Path, label: str, format: str, reduce: int) -> None:
     """Decode into ``out`` (h, w, 3), which has the shape of the (reduced) image."""
     if format == "JPEG" and _decode_jpeg_in_place(out, path, reduce):
@@ -183,13 +181,20 @@ def _decode_into(out: ByteArray, path: Path, label: str, format: str, reduce: in
         raise DataError(f"{label}: expected an image, got a {format} that cannot be decoded; copy it again")
     if _RGB_FLAG is None:
         cv2.cvtColor(image, cv2.COLOR_BGR2RGB, image)
-    if reduce > 1 and format == "PNG":
-        h, w = image.shape[:2]
-        image = cv2.copyMakeBorder(image, 0, -h % reduce, 0, -w % reduce, cv2.BORDER_REPLICATE)
-        image = cv2.resize(image, out.shape[1::-1], interpolation=cv2.INTER_AREA)
+    if format == "PNG":
+        image = area_reduced(image, reduce)
     if image.shape != out.shape:
         raise DataError(f"{label}: expected {out.shape} as its header says, decoded {image.shape}; write it again")
     out[...] = image
+
+
+def area_reduced(image: npt.NDArray[Any], reduce: int) -> npt.NDArray[Any]:
+    """(h, w, 3) reduced about the outer top-left corner, as ``reduced_camera`` says; contiguous."""
+    if reduce == 1:
+        return np.ascontiguousarray(image)
+    h, w = image.shape[:2]
+    image = cv2.copyMakeBorder(image, 0, -h % reduce, 0, -w % reduce, cv2.BORDER_REPLICATE)
+    return cv2.resize(image, reduced_size((h, w), reduce)[::-1], interpolation=cv2.INTER_AREA)
 
 
 def _decode_jpeg_in_place(out: ByteArray, path: Path, reduce: int) -> bool:

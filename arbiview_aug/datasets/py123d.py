@@ -9,27 +9,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import FloatArray, LensName
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import (
-    Drive,
-    LazyFrame,
-    Neighbours,
-    Unreadable,
-    WritableRecording,
-    camera_fields,
-    check_neighbours,
-)
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
 from arbiview_aug.datasets.frame_folder import checked_points
-from arbiview_aug.datasets.image_io import check_reduce, reduced_rig
-from arbiview_aug.datasets.layouts import log_folders
-from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion
+from arbiview_aug.datasets.image_io import area_reduced, reduced_rig, stack_or_list
+from arbiview_aug.datasets.nuscenes.tables import poses_from, rotation_from_quaternion
+from arbiview_aug.datasets.registry import log_folders
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, described
 
@@ -63,7 +54,7 @@ class _Log:
     def pose(self, iteration: int, column: str, *modality: Any) -> FloatArray | None:
         """(4, 4) pose in the world; None where the modality recorded nothing."""
         pose = self.scene.get_modality_column_at_iteration(iteration, column, *modality)
-        return None if pose is None else _matrix(pose)
+        return None if pose is None else poses_from(np.array(pose, np.float64)[:7])
 
 
 class Py123dDataset(WritableRecording):
@@ -101,9 +92,7 @@ class Py123dDataset(WritableRecording):
         neighbours: Neighbours | None = None,
         cameras: Sequence[str] | None = None,
     ) -> None:
-        check_reduce(reduce)
-        check_neighbours(neighbours)
-        self.root, self.reduce, self.load_points, self.neighbours = Path(root), reduce, load_points, neighbours
+        super().__init__(root, reduce, load_points, neighbours)
         scene_of = optional_package("py123d.api.scene.arrow.arrow_scene_api", "py123d").ArrowSceneAPI
         folders = log_folders(self.root)
         if not folders:
@@ -148,8 +137,8 @@ class Py123dDataset(WritableRecording):
             sample = fields | camera_fields(fields["rig"], self._images(index, fields["rig"]), self.tokens[index])
             if self.load_points and (points := self._points(index)) is not None:
                 sample["points"] = points
-        if self._drive is not None and self.neighbours is not None:
-            sample["neighbours"] = [self._neighbour(k) for k in self._drive.neighbours(index, self.neighbours)]
+        if self._drive is not None:
+            sample["neighbours"] = self._neighbours(self._drive, index)
         return sample
 
     def _fields(self, index: int) -> dict[str, Any]:
@@ -184,8 +173,8 @@ class Py123dDataset(WritableRecording):
                     where = f"py123d log {log.folder}: iteration {iteration}: camera {camera.name!r}"
                     if image.shape != (*camera.size, 3) or image.dtype != np.uint8:
                         raise DataError(f"{where}: expected {(*camera.size, 3)} uint8, got {image.shape} {image.dtype}")
-                    images.append(torch.from_numpy(_reduced(image, self.reduce)).permute(2, 0, 1).contiguous())
-        return torch.stack(images) if len({image.shape for image in images}) == 1 else images
+                    images.append(torch.from_numpy(area_reduced(image, self.reduce)).permute(2, 0, 1).contiguous())
+        return stack_or_list(images)
 
     def _points(self, index: int) -> torch.Tensor | None:
         number, iteration, _ = self._frames[index]
@@ -197,10 +186,10 @@ class Py123dDataset(WritableRecording):
 
     def _ego2world(self, index: int) -> FloatArray:
         number, iteration, _ = self._frames[index]
-        pose = self._logs[number].pose(iteration, "imu_se3", "ego_state_se3")
+        log = self._logs[number]
+        pose = log.pose(iteration, "imu_se3", "ego_state_se3")
         if pose is None:
-            folder = self._logs[number].folder
-            raise DataError(f"py123d log {folder}: iteration {iteration}: expected the ego's pose, got none")
+            raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected the ego's pose, got none")
         return pose
 
     def _find_drive(self) -> Drive:
@@ -212,12 +201,8 @@ class Py123dDataset(WritableRecording):
         return Drive(np.array(positions_m).reshape(-1, 3), parts)
 
     def _neighbour(self, index: int) -> LazyFrame:
-        """Another frame of the drive; its images and points are read on access, where a broken one raises."""
-        try:
-            with _reading(self._logs[self._frames[index][0]].folder):
-                fields = self._fields(index)
-        except ArbiviewError as error:
-            return Unreadable({"token": self.tokens[index]}, error)
+        with _reading(self._logs[self._frames[index][0]].folder):
+            fields = self._fields(index)
         points = partial(self._points, index) if self.load_points else None
         return LazyFrame(fields, partial(self._images, index, fields["rig"]), points)
 
@@ -240,32 +225,22 @@ def _open(folder: Path, scene: Any, names: Sequence[str] | None) -> _Log:
 def _camera(metadata: Any, where: str) -> Camera:
     """A camera at the ego's origin; CalibrationError for another lens."""
     where = f"{where}: camera {metadata.camera_name!r}"
-    lens: LensName
-    distortion: Any
     model = metadata.camera_model.serialize()
     if model == "pinhole" and metadata.intrinsics is not None:
         intrinsics, bent = metadata.intrinsics, None if metadata.is_undistorted else metadata.distortion
         K = np.array([[intrinsics.fx, intrinsics.skew, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]])
-        lens, distortion = "pinhole", ()
-        if bent is not None:
-            lens, distortion = "radtan", (bent.k1, bent.k2, bent.p1, bent.p2, bent.k3)
+        distortion: Any = () if bent is None else (bent.k1, bent.k2, bent.p1, bent.p2, bent.k3)
+        lens = "pinhole" if bent is None else "radtan"
     elif model == "fisheye_mei" and metadata.projection is not None and metadata.mirror_parameter is not None:
         lens, (K, distortion) = "fisheye", _fisheye(metadata, where)
     else:
         raise CalibrationError(
             f"{where}: expected a calibrated pinhole or fisheye MEI lens, got {model}; name the other cameras, cameras="
         )
-    size = {"width_px": int(metadata.width), "height_px": int(metadata.height)}
-    coefficients = tuple(map(float, distortion))
+    optics: dict[str, Any] = {"K": K, "lens": lens, "distortion": tuple(map(float, distortion))}
+    optics |= {"width_px": int(metadata.width), "height_px": int(metadata.height)}
     try:
-        return Camera(
-            name=metadata.camera_name,
-            K=K,
-            cam2ego=np.eye(4),
-            lens=lens,
-            distortion=coefficients,
-            **size,  # type: ignore[arg-type]
-        )
+        return Camera(name=metadata.camera_name, cam2ego=np.eye(4), **optics)
     except CalibrationError as error:
         raise CalibrationError(f"{where}: {error}") from None
 
@@ -302,23 +277,6 @@ def _boxes(detections: Any, world2ego: FloatArray) -> Any:
     velocity = np.array([[np.nan] * 3 if v is None else [v.x, v.y, v.z] for v in velocities]).reshape(-1, 3)
     centre = rows[:, :3] @ world2ego[:3, :3].T + world2ego[:3, 3]
     return np.column_stack([centre, rows[:, 7:10], yaw, (velocity @ world2ego[:3, :3].T)[:, :2]]).astype(np.float32)
-
-
-def _matrix(pose: Any) -> FloatArray:
-    """(4, 4) of x y z and a quaternion w x y z."""
-    numbers = np.array(pose, np.float64)
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation_from_quaternion(numbers[3:7]), numbers[:3]
-    return matrix
-
-
-def _reduced(image: Any, reduce: int) -> Any:
-    """As PNGs of other readers are reduced: about the outer top-left corner."""
-    if reduce == 1:
-        return np.ascontiguousarray(image)
-    h, w = image.shape[:2]
-    image = cv2.copyMakeBorder(image, 0, -h % reduce, 0, -w % reduce, cv2.BORDER_REPLICATE)
-    return cv2.resize(image, (-(-w // reduce), -(-h // reduce)), interpolation=cv2.INTER_AREA)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Table of readers, which are imported when they open a folder, and the choice of one."""
+"""Table of readers, the files they are recognised by, and the choice of one; they are imported late."""
 
 from __future__ import annotations
 
@@ -9,12 +9,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.layouts import CALIBRATION_FILE, has_frames, log_folders, table_folders
 from arbiview_aug.environment import imported
 from arbiview_aug.errors import DataError
 
 if TYPE_CHECKING:
     from arbiview_aug.datasets.drive import Neighbours, Recording
+
+CALIBRATION_FILE = "calib.json"  # of a frame folder
+
+_LOGS = ("sync.arrow", "*/sync.arrow", "*/*/sync.arrow", "logs/*/*/sync.arrow")
+
+
+def has_frames(root: Path) -> bool:
+    """Whether a folder is a frame, or has folders that are."""
+    return (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}"))
+
+
+def table_folders(root: Path) -> list[str]:
+    """Names of a nuScenes root's folders of tables: v1.0-mini and v1.0-trainval first."""
+    names = (path.name for path in root.glob("v1.0-*") if path.is_dir())
+    return sorted(names, key=lambda name: (name not in ("v1.0-mini", "v1.0-trainval"), name))
+
+
+def log_folders(root: Path) -> list[Path]:
+    """Folders of the logs below py123d's data root, its ``logs``, or one split; a log's folder is the only one."""
+    folders = (sorted(path.parent for path in root.glob(pattern)) for pattern in _LOGS)
+    return next(filter(None, folders), [])
 
 
 @dataclass(frozen=True)

@@ -73,10 +73,8 @@ class MixedDataset(Dataset[Any]):
             _checked_map_style(dataset, name, "pass two that have __getitem__") for dataset in (raw, retargeted)
         )
         if len(raw) != len(retargeted):
-            raise DataError(
-                f"{name}: expected the same samples untouched and retargeted, got {len(raw)} and {len(retargeted)}; "
-                "take those that both have with torch.utils.data.Subset"
-            )
+            got = f"got {len(raw)} and {len(retargeted)}; take those that both have with torch.utils.data.Subset"
+            raise DataError(f"{name}: expected the same samples untouched and retargeted, {got}")
         if not is_number(share) or not 0 <= share <= 1:
             raise ValueError(f"share: expected a share of retargeted items from 0 to 1, got {share!r}")
         self.share = float(share)
@@ -133,7 +131,6 @@ def _checked_retarget(retarget: Any, name: str) -> Retarget:
     if not callable(retarget):
         raise SampleTypeError(f"{name}: expected a callable such as RigRetarget, got {type(retarget).__name__}")
     if isinstance(retarget, RigRetarget):
-        compile_kernels(
-            matching=GEOMETRIES[str(retarget.geometry)].needs == "motion"
-        )  # here, once, and not in every worker
+        matching = GEOMETRIES[str(retarget.geometry)].needs == "motion"
+        compile_kernels(matching=matching)  # here, once, and not in every worker
     return retarget  # type: ignore[no-any-return]

@@ -24,7 +24,7 @@ class RigRetargetMultiViewImages:
     Args:
         target: A rig's name, file, ``Rig`` or ``RandomRig``; of pinhole cameras (``Rig.undistorted()``).
         lidar2ego: (4, 4) the LiDAR's pose; the frame of points and boxes.
-        settings: Further ones of ``RigRetargetMultiView``: ``size``, ``geometry``, ``p``, ``sequence_key``.
+        settings: Further ones of ``RigRetargetMultiView``: ``size``, ``geometry``, ``keys``, ``p``, ``sequence_key``.
 
     Raises:
         CalibrationError: A target with lenses, or that cannot be loaded.

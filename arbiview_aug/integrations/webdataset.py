@@ -17,6 +17,7 @@ import torch
 from arbiview_aug.atomic_io import BROKEN_ARRAY
 from arbiview_aug.cameras.plain_yaml import parse_json
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.drive import camera_fields
 from arbiview_aug.datasets.image_io import encoded, encoded_image
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError
@@ -68,40 +69,27 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
         described = parse_json(entry["rig.json"])
         token = described["token"]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise DataError(
-            f"{where}: rig.json: expected a rig with its token, got {type(error).__name__}: {error}"
-        ) from None
+        got = f"{type(error).__name__}: {error}"
+        raise DataError(f"{where}: rig.json: expected a rig with its token, got {got}") from None
     rig = Rig.from_dict(described, where=where)
     images, cameras = [], []
     for k, camera in enumerate(rig):
         image = _decoded(entry, f"{k:02}.jpg", where, cv2.IMREAD_COLOR)
-        if image.shape[:2] != camera.size:
-            raise DataError(
-                f"{where}: {k:02}.jpg: expected (h, w) = {camera.size}, as in rig.json, got {image.shape[:2]}"
-            )
+        if (size := image.shape[:2]) != camera.size:
+            raise DataError(f"{where}: {k:02}.jpg: expected (h, w) = {camera.size}, as in rig.json, got {size}")
         images.append(torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)).permute(2, 0, 1))
         if f"{k:02}.mask.png" in entry:
             camera = replace(camera, mask=_decoded(entry, f"{k:02}.mask.png", where, cv2.IMREAD_GRAYSCALE) > 0)
         cameras.append(camera)
     rig = rig.with_cameras(cameras)
-    sample = {
-        "images": torch.stack(images) if len(set(rig.sizes)) == 1 else images,
-        "rig": rig,
-        "K": torch.from_numpy(rig.K),
-        "cam2ego": torch.from_numpy(rig.cam2ego),
-        "token": token,
-    }
-    for name in ARRAYS:
-        if f"{name}.npy" in entry:
-            sample[name] = _array(entry[f"{name}.npy"], f"{where}: {name}.npy")
+    sample = camera_fields(rig, torch.stack(images) if len(set(rig.sizes)) == 1 else images, token)
+    for name in (name for name in ARRAYS if f"{name}.npy" in entry):
+        try:
+            sample[name] = torch.from_numpy(np.load(io.BytesIO(entry[f"{name}.npy"]), allow_pickle=False))
+        except (*BROKEN_ARRAY, TypeError) as error:  # types that torch has not
+            got = f"{type(error).__name__}: {error}"
+            raise DataError(f"{where}: {name}.npy: expected a .npy array of numbers, got {got}") from None
     return sample
-
-
-def _array(content: bytes, where: str) -> torch.Tensor:
-    try:
-        return torch.from_numpy(np.load(io.BytesIO(content), allow_pickle=False))
-    except (*BROKEN_ARRAY, TypeError) as error:  # types that torch has not
-        raise DataError(f"{where}: expected a .npy array of numbers, got {type(error).__name__}: {error}") from None
 
 
 def _decoded(entry: Mapping[str, Any], name: str, where: str, flags: int) -> np.ndarray:

@@ -15,6 +15,8 @@ import torch
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import FrameFolder, open_data
+from arbiview_aug.datasets.frame_folder import write_frame
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import CalibrationError, DataError
 from arbiview_aug.sample.masks import without_specks
 from tests.helpers import camera
@@ -129,6 +131,16 @@ def test_pickles(tmp_path: Path) -> None:
     dataset = FrameFolder(frame(tmp_path))
     rig = dataset[0]["rig"]
     assert pickle.loads(pickle.dumps(dataset))[0]["rig"] == rig
+
+
+def test_a_written_street_comes_back(tmp_path: Path) -> None:
+    sample = SyntheticDrive(demo_source_rig((48, 132)), num_frames=1)[0]
+    write_frame(tmp_path / "frame", sample)
+    again = FrameFolder(tmp_path)[0]
+    assert again["rig"] == sample["rig"] and again["token"] == "frame"
+    assert (again["images"].float() - sample["images"].float()).abs().mean() < 4  # JPEG
+    for key in ("boxes_3d", "points"):
+        assert np.array_equal(again[key].numpy(), sample[key].numpy())
 
 
 # --- real frames ------------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Tables, Tokens
+from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Tables, Tokens, poses_from
 
 MAX_STEP_S = 1.5  # between annotations for a velocity; doubled for central differences (``NuScenes.box_velocity``)
 
@@ -75,14 +75,9 @@ class Annotations:
         self, rows: npt.NDArray[np.int64], centers_m: FloatArray, headings: npt.NDArray[Any], global2ego: FloatArray
     ) -> SingleArray:
         R = global2ego[:3, :3]
-        heading = headings @ R.T
-        columns: list[npt.NDArray[Any]] = [
-            centers_m @ R.T + global2ego[:3, 3],
-            self.sizes_m[rows],
-            np.arctan2(heading[:, 1], heading[:, 0])[:, None],
-            (self.velocities_mps[rows] @ R.T)[:, :2],
-        ]
-        return np.concatenate(columns, axis=1).astype(np.float32)
+        heading, velocity = headings @ R.T, self.velocities_mps[rows] @ R.T
+        center, yaw = centers_m @ R.T + global2ego[:3, 3], np.arctan2(heading[:, 1], heading[:, 0])
+        return np.column_stack([center, self.sizes_m[rows], yaw, velocity[:, :2]]).astype(np.float32)
 
 
 def read_annotations(
@@ -109,17 +104,13 @@ def read_annotations(
         sizes_m = tables.numbers(table, rows, "size", (3,))
         for k in np.flatnonzero((sizes_m <= 0).any(axis=1))[:1]:
             raise tables.error(table, "sizes above 0", f"{sizes_m[k].tolist()} in row {rows[k].get('token')!r}")
-        found_objects = tables.follow(table, rows, "instance_token", "instance", objects)
-        annotations.append(
-            (
-                np.array([samples[row["sample_token"]] for row in rows], np.int32),
-                np.array(found_objects, np.int32).reshape(-1, 2),
-                np.array([token.encode() for token in unique.add(rows)], np.bytes_),
-                tables.numbers(table, rows, "translation", (3,)),
-                sizes_m[:, [1, 0, 2]].astype(np.float32),  # width, length, height in the table
-                tables.rotations(table, rows)[:, :, 0].astype(np.float32),
-            )
-        )
+        numbered = tables.follow(table, rows, "instance_token", "instance", objects)
+        numbers = np.array([samples[row["sample_token"]] for row in rows], np.int32)
+        tokens = np.array([token.encode() for token in unique.add(rows)], np.bytes_)
+        poses = poses_from(tables.poses(table, rows))
+        sizes, headings = sizes_m[:, [1, 0, 2]].astype(np.float32), poses[:, :3, 0].astype(np.float32)
+        pairs = np.array(numbered, np.int32).reshape(-1, 2)
+        annotations.append((numbers, pairs, tokens, poses[:, :3, 3], sizes, headings))
     unique.check()
     columns = [np.concatenate([batch[k] for batch in annotations]) for k in range(len(annotations[0]))]
     order = np.argsort(columns[0], kind="stable")

@@ -16,21 +16,13 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import (
-    Drive,
-    LazyFrame,
-    Neighbours,
-    Unreadable,
-    WritableRecording,
-    camera_fields,
-    check_neighbours,
-)
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
 from arbiview_aug.datasets.frame_folder import checked_points
-from arbiview_aug.datasets.image_io import check_reduce, decode_images, reduced_rig
+from arbiview_aug.datasets.image_io import decode_images, reduced_rig
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables
-from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, warn
+from arbiview_aug.errors import CalibrationError, DataError, warn
 
 CAMERA_RING = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT")
 """Order of the cameras in a sample, clockwise from above; other cameras follow by name."""
@@ -92,12 +84,9 @@ class NuScenesDataset(WritableRecording):
         reduce: Reduce = 1,
         neighbours: Neighbours | None = None,
     ) -> None:
-        check_reduce(reduce)
-        check_neighbours(neighbours)
+        super().__init__(root or "", reduce, load_points, neighbours)
         tables = Tables(root, version, nusc)
-        self.root, self.version = tables.root, tables.version
-        self.compensate_ego_motion, self.load_points = compensate_ego_motion, load_points
-        self.reduce, self.neighbours = reduce, neighbours
+        self.root, self.version, self.compensate_ego_motion = tables.root, tables.version, compensate_ego_motion
         samples = _chosen_samples(tables, split_scenes)
         self.tokens = [row["token"] for row in samples]
         self.scene_tokens: list[str] = [row["scene_token"] for row in samples]
@@ -111,10 +100,8 @@ class NuScenesDataset(WritableRecording):
         self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
         if self._annotations is not None and self.tokens and not len(self._annotations.tokens):
             self._annotations = None  # an empty list of boxes would mean an empty street
-            warn(
-                f"nuScenes {self.root}: sample_annotation has no rows of these samples (a test split?): they come "
-                "without boxes_3d"
-            )
+            lacks = "has no rows of these samples (a test split?): they come without boxes_3d"
+            warn(f"nuScenes {self.root}: sample_annotation {lacks}")
         self._has_lidar_sweeps = False
         self._drive_rows = np.empty(0, np.int64) if neighbours is None else self._find_drive_rows()
         positions_m = self._recordings.ego2global(self._drive_rows)[:, :3, 3]
@@ -141,9 +128,8 @@ class NuScenesDataset(WritableRecording):
             sample["box_names"] = [self._annotations.categories[k] for k in self._annotations.category[boxes]]
             sample["box_tokens"] = [token.decode() for token in self._annotations.tokens[boxes].tolist()]
         if self.neighbours is not None:
-            frame = int(np.searchsorted(self._drive_rows, cameras[0]))
-            others = self._drive.neighbours(frame, self.neighbours)
-            sample["neighbours"] = [self._neighbour(int(self._drive_rows[k])) for k in others]
+            place = int(np.searchsorted(self._drive_rows, cameras[0]))
+            sample["neighbours"] = self._neighbours(self._drive, place)
         return sample
 
     def _rig(self, cameras: IntArray, ego2global: FloatArray) -> Rig:
@@ -168,19 +154,14 @@ class NuScenesDataset(WritableRecording):
         return inside(self.root, self._recordings.file(row), where)
 
     def _images(self, cameras: IntArray) -> torch.Tensor | list[torch.Tensor]:
-        return decode_images(
-            [self._file(row) for row in cameras],
-            names=self.channels,
-            sizes=[self._recordings.size(row) for row in cameras],
-            reduce=self.reduce,
-        )
+        files, sizes = [*map(self._file, cameras)], [*map(self._recordings.size, cameras)]
+        return decode_images(files, names=self.channels, sizes=sizes, reduce=self.reduce)
 
     def _points(self, lidar: int, own2ego: FloatArray | None = None) -> torch.Tensor:
         """A recording's points in its own ego frame, or in the one that ``own2ego`` leads to."""
         sensor2ego = self._recordings.sensor2ego[self._recordings.rows["sensor"][lidar]]
         return _read_points(self._file(lidar), sensor2ego if own2ego is None else own2ego @ sensor2ego)
 
-    # --- other frames of the drive ------------------------------------------------------------------------------------
     def _find_drive_rows(self) -> IntArray:
         """Rows of the first camera that can be neighbours: all, or keyframes only if sweeps were not copied.
 
@@ -202,29 +183,25 @@ class NuScenesDataset(WritableRecording):
                 return rows[is_key[rows]]
         return rows
 
-    def _neighbour(self, row: int) -> LazyFrame:
-        """Another frame of the drive; its images and points are read on access, where a broken one raises."""
-        recordings, record = self._recordings, self._recordings.rows[row]
-        sample, is_keyframe = int(record["sample"]), recordings.is_keyframe(row)
+    def _token(self, place: int) -> str:
+        recordings, row = self._recordings, int(self._drive_rows[place])
+        if recordings.is_keyframe(row):
+            return self.tokens[recordings.rows["sample"][row]]
+        return str(recordings.tokens[row].decode())
+
+    def _neighbour(self, place: int) -> LazyFrame:
+        recordings, row = self._recordings, int(self._drive_rows[place])
+        record, is_keyframe = recordings.rows[row], recordings.is_keyframe(row)
+        sample = int(record["sample"])
         moment = int(recordings.keyframes[sample, -1]) if is_keyframe else row
         ego2global, time_s = recordings.ego2global(moment), float(recordings.time_s(moment))
-        fields: dict[str, Any] = {
-            "token": self.tokens[sample] if is_keyframe else recordings.tokens[row].decode(),
-            "time_s": time_s,
-            "ego2world": torch.from_numpy(ego2global),
-        }
-        try:
-            cameras = recordings.around(row)
-            fields["rig"] = self._rig(cameras, ego2global)
-        except ArbiviewError as error:
-            return Unreadable(fields, error)
-        if self._annotations is not None:
-            global2ego = _inverse(ego2global)
-            if is_keyframe:
-                boxes = self._annotations.at_sample(sample, global2ego)
-            else:
-                boxes = self._annotations.at_time(int(record["scene"]), time_s, global2ego)
-            fields["boxes_3d"] = torch.from_numpy(boxes)
+        cameras = recordings.around(row)
+        fields = {"token": self._token(place), "time_s": time_s, "ego2world": torch.from_numpy(ego2global)}
+        fields["rig"] = self._rig(cameras, ego2global)
+        if (boxes := self._annotations) is not None:
+            global2ego, scene = _inverse(ego2global), int(record["scene"])
+            there = boxes.at_sample(sample, global2ego) if is_keyframe else boxes.at_time(scene, time_s, global2ego)
+            fields["boxes_3d"] = torch.from_numpy(there)
         lidar = moment if is_keyframe else recordings.lidar_beside(row) if self._has_lidar_sweeps else None
         points = None
         if self.load_points and lidar is not None:
@@ -279,16 +256,13 @@ def _read_points(path: Path, sensor2ego: FloatArray) -> torch.Tensor:
         numbers = np.fromfile(path, dtype="<f4")
         size = path.stat().st_size
     except FileNotFoundError:
-        raise DataError(
-            f"points {path}: expected the LiDAR's file, found none; check the data root, or pass load_points=False"
-        ) from None
+        fix = "check the data root, or pass load_points=False"
+        raise DataError(f"points {path}: expected the LiDAR's file, found none; {fix}") from None
     except OSError as error:
         raise DataError(f"points {path}: expected a readable file, got {error.strerror}") from None
     if size == 0 or size % (4 * _POINT_FLOATS):
-        raise DataError(
-            f"points {path}: expected whole points of {_POINT_FLOATS} float32, got {size} bytes (truncated?); "
-            "copy it again"
-        )
+        got = f"got {size} bytes (truncated?); copy it again"
+        raise DataError(f"points {path}: expected whole points of {_POINT_FLOATS} float32, {got}")
     points = numbers.reshape(-1, _POINT_FLOATS)
     checked_points(points, str(path))
     points[:, :3] = points[:, :3].astype(np.float64) @ sensor2ego[:3, :3].T + sensor2ego[:3, 3]

@@ -15,18 +15,8 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.datasets.drive import clock_message
-from arbiview_aug.datasets.nuscenes.tables import (
-    COUNTS,
-    FILES,
-    FLAGS,
-    LINKS,
-    MICROSECONDS,
-    TOKENS,
-    Row,
-    Tables,
-    Tokens,
-    rotation_from_quaternion,
-)
+from arbiview_aug.datasets.nuscenes import tables as kinds
+from arbiview_aug.datasets.nuscenes.tables import TOKENS, Row, Tables, Tokens, poses_from
 from arbiview_aug.errors import DataError, warn
 
 LIDAR = "LIDAR_TOP"  # sensor whose time and ego pose are the sample's
@@ -34,21 +24,10 @@ MAX_APART_S = 0.1  # maximum time to a sweep's nearest image; cameras record eve
 
 IntArray = npt.NDArray[np.int64]
 
-_ROW = np.dtype(
-    [
-        ("channel", "i2"),
-        ("scene", "i4"),
-        ("sample", "i4"),
-        ("time_us", "i8"),
-        ("sensor", "i4"),  # row of sensor2ego and K
-        ("pose", "i4"),  # row of poses
-        ("file", "i4"),  # row of file_names
-        ("height", "i4"),
-        ("width", "i4"),
-        ("key", "?"),
-        ("token", "i4"),  # of the first channel's rows, in the table's order
-    ]
-)
+_NUMBERS = ("scene", "sample", "sensor", "pose", "file", "height", "width", "token")
+_ROW = np.dtype([("channel", "i2"), ("time_us", "i8"), ("key", "?"), *((name, "i4") for name in _NUMBERS)])
+"""Columns of a recording: ``sensor`` is a row of sensor2ego and K, ``pose`` of poses, ``file`` of file_names; ``token``
+is the number of the first channel's rows in the table's order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +55,7 @@ class Recordings:
 
     def ego2global(self, rows: Any) -> FloatArray:
         """(..., 4, 4) ego poses of rows (...,)."""
-        pose = self.poses[self.rows["pose"][rows]]
-        matrices = np.zeros((*pose.shape[:-1], 4, 4))
-        matrices[..., :3, :3], matrices[..., :3, 3] = rotation_from_quaternion(pose[..., 3:]), pose[..., :3]
-        matrices[..., 3, 3] = 1
-        return matrices
+        return poses_from(self.poses[self.rows["pose"][rows]])
 
     def time_s(self, rows: Any) -> FloatArray:
         return np.asarray(1e-6 * self.rows["time_us"][rows])
@@ -94,25 +69,25 @@ class Recordings:
 
         Cameras expose one after the other: the delay to the first camera's exposure is nearest to that of the keyframe.
         """
-        time_us, record = self.rows["time_us"], self.rows[row]
-        keyframe_us = time_us[self.keyframes[record["sample"]]]
+        keyframe_us = self.rows["time_us"][self.keyframes[self.rows["sample"][row]]]
         rows = np.full(len(self.channels) - 1, row)
         for channel in range(1, len(rows)):
-            wanted_us = record["time_us"] + keyframe_us[channel] - keyframe_us[0]
-            scenes = (len(self.first) - 1) // len(self.channels)
-            first, end = self.first[channel * scenes + record["scene"] :][:2]
-            apart_us = np.abs(time_us[first:end] - wanted_us)
-            if not len(apart_us) or apart_us.min() > 1e6 * MAX_APART_S:
+            nearest = self._nearest(channel, row, keyframe_us[channel] - keyframe_us[0])
+            if nearest is None:
                 raise DataError(f"expected an image of {self.channels[channel]} within {MAX_APART_S} s, got none")
-            rows[channel] = first + apart_us.argmin()
+            rows[channel] = nearest
         return rows
 
     def lidar_beside(self, row: int) -> int | None:
         """Row of the LiDAR's recording nearest in time to a row of the first camera; None beyond ``MAX_APART_S``."""
+        return self._nearest(len(self.channels) - 1, row, 0)
+
+    def _nearest(self, channel: int, row: int, later_us: int) -> int | None:
+        """A channel's row nearest in time to a moment after a row; None beyond ``MAX_APART_S``."""
         scenes = (len(self.first) - 1) // len(self.channels)
-        first, end = self.first[(len(self.channels) - 1) * scenes + self.rows["scene"][row] :][:2]
-        apart_us = np.abs(self.rows["time_us"][first:end] - self.rows["time_us"][row])
-        return int(first + apart_us.argmin()) if apart_us.min() <= 1e6 * MAX_APART_S else None
+        first, end = self.first[channel * scenes + self.rows["scene"][row] :][:2]
+        apart_us = np.abs(self.rows["time_us"][first:end] - (self.rows["time_us"][row] + later_us))
+        return int(first + apart_us.argmin()) if len(apart_us) and apart_us.min() <= 1e6 * MAX_APART_S else None
 
 
 def read_recordings(
@@ -133,7 +108,7 @@ def read_recordings(
     table = "sample_data"
     unique = Tokens(tables, table)
     for batch in tables.batches(table):
-        is_key = tables.column(table, batch, "is_key_frame", FLAGS)
+        is_key = tables.column(table, batch, "is_key_frame", kinds.FLAGS)
         kept = batch if sweeps else [*compress(batch, is_key)]
         of_samples = tables.column(table, kept, "sample_token", TOKENS)
         kept = [row for row, token in zip(kept, of_samples, strict=True) if token in samples]  # of the chosen scenes
@@ -148,12 +123,13 @@ def read_recordings(
         part["sample"] = [samples[row["sample_token"]] for row in kept]
         part["scene"] = [scenes[sample] for sample in part["sample"].tolist()]
         part["key"] = [row["is_key_frame"] for row in kept]
-        part["time_us"] = times_us = tables.column(table, kept, "timestamp", MICROSECONDS)
+        part["time_us"] = times_us = tables.column(table, kept, "timestamp", kinds.MICROSECONDS)
         for key in ("height", "width"):
-            part[key] = tables.column(table, kept, key, COUNTS, default=0)  # none for the LiDAR
+            part[key] = tables.column(table, kept, key, kinds.COUNTS, default=0)  # none for the LiDAR
         of_poses = tables.column(table, kept, "ego_pose_token", TOKENS)
         part["pose"] = [poses.setdefault(token, len(poses)) for token in of_poses]
-        for k, (name, time_us) in enumerate(zip(tables.column(table, kept, "filename", FILES), times_us, strict=True)):
+        names = tables.column(table, kept, "filename", kinds.FILES)
+        for k, (name, time_us) in enumerate(zip(names, times_us, strict=True)):
             head, time, tail = name.partition(str(time_us))
             part["file"][k] = files.setdefault((head, tail if time else None), len(files))
         of_tokens = unique.add(kept)
@@ -161,7 +137,7 @@ def read_recordings(
             is_first = part["channel"] == 0
             part["token"][is_first] = len(tokens) + np.arange(is_first.sum())
             tokens += compress(of_tokens, is_first)
-            previous += tables.column(table, [*compress(kept, is_first)], "prev", LINKS)
+            previous += tables.column(table, [*compress(kept, is_first)], "prev", kinds.LINKS)
         parts.append(part)
     unique.check()
     rows = np.concatenate(parts)
@@ -211,9 +187,7 @@ def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int]
             calibrated[token] = len(rows)
             rows.append(row)
             channel_of.append(wanted.index(sensor["channel"]))
-    sensor2ego = np.tile(np.eye(4), (len(rows), 1, 1))
-    sensor2ego[:, :3, 3] = tables.numbers("calibrated_sensor", rows, "translation", (3,))
-    sensor2ego[:, :3, :3] = tables.rotations("calibrated_sensor", rows)
+    sensor2ego = poses_from(tables.poses("calibrated_sensor", rows))
     K = np.tile(np.eye(3), (len(rows), 1, 1))
     cameras = [k for k, channel in enumerate(channel_of) if wanted[channel] != LIDAR]
     K[cameras] = tables.numbers("calibrated_sensor", [rows[k] for k in cameras], "camera_intrinsic", (3, 3))
@@ -229,8 +203,7 @@ def _ego_poses(tables: Tables, wanted: Mapping[str, int]) -> FloatArray:
         is_wanted = [token in wanted for token in tokens]
         rows, at = [*compress(batch, is_wanted)], [wanted[token] for token in compress(tokens, is_wanted)]
         np.add.at(counts, at, 1)
-        poses[at, :3] = tables.numbers("ego_pose", rows, "translation", (3,))
-        poses[at, 3:] = tables.quaternions("ego_pose", rows)
+        poses[at] = tables.poses("ego_pose", rows)
     for k in np.flatnonzero(counts != 1)[:1]:
         expected = f"the token {list(wanted)[k]!r} that a row of sample_data names"
         raise tables.error("ego_pose", expected, f"{counts[k]} of them" if counts[k] else "none")

@@ -82,24 +82,16 @@ class Tables:
     def __init__(self, root: str | Path | None, version: str, nusc: Any) -> None:
         if (root is None) == (nusc is None):
             raise DataError("NuScenesDataset: expected either root or nusc, got both or none")
-        self.nusc = nusc
-        if nusc is None:
-            assert root is not None
-            self.root, self.version = Path(root), version
-            if not os.path.isdir(self.root / version):
-                versions = ", ".join(sorted(p.parent.name for p in self.root.glob("*/sample.json"))) or "none"
-                raise DataError(
-                    f"nuScenes {root}: expected a folder of tables {version!r}, found none; "
-                    f"folders with tables: {versions}"
-                )
-            return
-        missing = [name for name in ("dataroot", "sample", "sample_data", "ego_pose") if not hasattr(nusc, name)]
-        if missing:
-            raise SampleTypeError(
-                f"nusc: expected a devkit NuScenes object, got {type(nusc).__name__} without {', '.join(missing)}; "
-                "pass a folder as root="
-            )
-        self.root, self.version = Path(nusc.dataroot), str(getattr(nusc, "version", version))
+        needed = ("dataroot", "sample", "sample_data", "ego_pose")
+        if nusc is not None and (missing := [name for name in needed if not hasattr(nusc, name)]):
+            got = f"{type(nusc).__name__} without {', '.join(missing)}"
+            raise SampleTypeError(f"nusc: expected a devkit NuScenes object, got {got}; pass a folder as root=")
+        self.nusc, self.root = nusc, Path(nusc.dataroot if root is None else root)
+        self.version = str(getattr(nusc, "version", version))
+        if nusc is None and not os.path.isdir(self.root / version):
+            there = ", ".join(sorted(p.parent.name for p in self.root.glob("*/sample.json"))) or "none"
+            expected = f"expected a folder of tables {version!r}, found none"
+            raise DataError(f"nuScenes {root}: {expected}; folders with tables: {there}")
 
     def path(self, table: str) -> Path:
         """Path of a table's file; DataError for a link that leaves the root."""
@@ -151,21 +143,14 @@ class Tables:
 
         ``default`` replaces missing values and null; with None they are errors.
         """
-        try:
-            if default is None:
-                values = [row[key] for row in rows]
-            else:
-                values = [default if (value := row.get(key)) is None else value for row in rows]
-            if kind.holds(values):
-                return values
-        except KeyError:
-            pass
-        for row in rows:
+        values = [default if (value := row.get(key)) is None else value for row in rows]
+        if kind.holds(values):  # no kind holds None
+            return values
+        for row, value in zip(rows, values, strict=True):
             token = _short.repr(row.get("token"))
             if key not in row and default is None:
                 raise self.error(table, f"key {key!r}", f"a row with {', '.join(map(str, row))} (token {token})")
-            value = row.get(key, default)
-            if not kind.holds([default if value is None and default is not None else value]):
+            if not kind.holds([value]):
                 raise self.error(table, f"{key} {kind.description}", f"{_short.repr(value)} in row {token}")
         raise AssertionError("an invalid column has an invalid value")
 
@@ -198,8 +183,9 @@ class Tables:
         self.column(table, rows, key, Kind(f"of shape {shape}, below {_LARGEST:g} and finite", holds))
         return columns[0].astype(np.float64, copy=False)
 
-    def rotations(self, table: str, rows: Sequence[Row]) -> FloatArray:
-        return rotation_from_quaternion(self.quaternions(table, rows))
+    def poses(self, table: str, rows: Sequence[Row]) -> FloatArray:
+        """(len(rows), 7) x y z from the column ``translation``, and w x y z from ``rotation``."""
+        return np.hstack([self.numbers(table, rows, "translation", (3,)), self.quaternions(table, rows)])
 
     def quaternions(self, table: str, rows: Sequence[Row]) -> FloatArray:
         """(len(rows), 4) w x y z from the column ``rotation``."""
@@ -285,6 +271,15 @@ def rotation_from_quaternion(wxyz: Any) -> FloatArray:
         (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def poses_from(numbers: Any) -> FloatArray:
+    """(..., 4, 4) poses of (..., 7) x y z and quaternion w x y z."""
+    numbers = np.asarray(numbers, dtype=np.float64)
+    poses = np.zeros((*numbers.shape[:-1], 4, 4))
+    poses[..., :3, :3], poses[..., :3, 3] = rotation_from_quaternion(numbers[..., 3:]), numbers[..., :3]
+    poses[..., 3, 3] = 1
+    return poses
 
 
 def quaternion_from_rotation(R: FloatArray) -> FloatArray:

@@ -15,8 +15,9 @@ from torch.utils.data import Dataset
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import LazyFrame, Neighbours, camera_fields, check_neighbours
+from arbiview_aug.datasets.image_io import stack_or_list
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
-from arbiview_aug.datasets.synthetic.render import Renderer, stack_or_list
+from arbiview_aug.datasets.synthetic.render import Renderer
 from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
 
@@ -116,35 +117,26 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         return self._scene[1]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        scene = self.scene(index)
-        sample = camera_fields(self.rig, self._images(scene), f"synthetic-{self.seed}-{self._checked_index(index)}")
+        scene, index = self.scene(index), self._checked_index(index)
+        sample = camera_fields(self.rig, self._images(scene), f"synthetic-{self.seed}-{index}")
         sample |= {"boxes_3d": self._boxes(scene), "box_classes": torch.from_numpy(scene.box_classes.copy())}
         if self.lidar:
             sample["points"] = self.points(index)
         if self.neighbours is not None:
             sample |= {"ego2world": torch.from_numpy(scene.ego2street), "time_s": 0.0}
-            moments = [
-                sign * k * self.neighbours.step_m / scene.speed_mps
-                for sign in self.neighbours.signs
-                for k in range(1, self.neighbours.count + 1)
-            ]
+            steps = [sign * k for sign in self.neighbours.signs for k in range(1, self.neighbours.count + 1)]
+            moments = [step * self.neighbours.step_m / scene.speed_mps for step in steps]
             sample["neighbours"] = [
-                self._neighbour(scene.after(s), s, sample["token"], (self.seed, self._checked_index(index), 2 + k))
+                self._neighbour(scene.after(s), s, sample["token"], (self.seed, index, 2 + k))
                 for k, s in enumerate(moments)
             ]
         return sample
 
     def _neighbour(self, scene: Scene, seconds: float, token: str, noise: tuple[int, ...]) -> LazyFrame:
-        fields = {
-            "rig": self.rig,
-            "ego2world": torch.from_numpy(scene.ego2street),
-            "time_s": seconds,
-            "boxes_3d": self._boxes(scene),
-            "token": f"{token}{seconds:+.3f}s",
-        }
-        return LazyFrame(
-            fields, partial(self._images, scene), partial(self._points, scene, noise) if self.lidar else None
-        )
+        fields = {"rig": self.rig, "boxes_3d": self._boxes(scene), "token": f"{token}{seconds:+.3f}s"}
+        fields |= {"ego2world": torch.from_numpy(scene.ego2street), "time_s": seconds}
+        points = partial(self._points, scene, noise) if self.lidar else None
+        return LazyFrame(fields, partial(self._images, scene), points)
 
     def _images(self, scene: Scene) -> Tensor | list[Tensor]:
         views = self._renderer.render(scene, self.rig.cameras, self.rig.ground_z_m)
@@ -246,15 +238,9 @@ def demo_target_rig(size: tuple[int, int] = (256, 704)) -> Rig:
 def _ring(
     layout: Sequence[tuple[str, float, float, tuple[float, float]]], height_m: float, size: tuple[int, int], name: str
 ) -> Rig:
+    looking = partial(Camera.looking, width_px=size[1], height_px=size[0])
     cameras = [
-        Camera.looking(
-            name=camera,
-            azimuth_deg=azimuth,
-            position_m=(x, y, height_m),
-            width_px=size[1],
-            height_px=size[0],
-            horizontal_fov_deg=fov,
-        )
+        looking(name=camera, azimuth_deg=azimuth, position_m=(x, y, height_m), horizontal_fov_deg=fov)
         for camera, azimuth, fov, (x, y) in layout
     ]
     return Rig(cameras, ground_z_m=0.0, name=name)

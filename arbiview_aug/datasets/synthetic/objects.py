@@ -10,7 +10,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Placed, Range, SceneBuilder, SceneClass, Vector
+from arbiview_aug.datasets.synthetic.scene import (
+    BoxClass,
+    Look,
+    Material,
+    Placed,
+    Range,
+    SceneBuilder,
+    SceneClass,
+    Vector,
+)
 
 Color = Vector
 
@@ -47,6 +56,11 @@ def pick(rng: np.random.Generator, colors: tuple[Color, ...], spread: float = 0.
     return tuple(float(c) for c in base.clip(0.05, 0.92))  # type: ignore[return-value]
 
 
+def plain(color: Color) -> Look:
+    """One colour without a pattern."""
+    return Look(Material.PLAIN, color)
+
+
 def vehicle_size(rng: np.random.Generator, cls: BoxClass) -> Vector:
     """Length, width and height in metres."""
     length, width, height = VEHICLE_SIZES[cls]
@@ -68,31 +82,31 @@ def add_vehicle(
     arch = (reach, radius, 0.0, 0.0)
     if cls is BoxClass.CAR:
         waist = rng.uniform(0.52, 0.60) * height
-        place.box((-x, x), (-y, y), (0.20, waist), Material.PAINT, paint, taper=(0.10, 0.06, 0.03, 0.03), param=arch)
+        place.box((-x, x), (-y, y), (0.20, waist), Look(Material.PAINT, paint, arch), taper=(0.10, 0.06, 0.03, 0.03))
         rear = float(rng.choice([0.06, 0.3, 0.55])) * length / 2  # estate, hatchback, saloon
         cabin = (-x + 0.08 + rear * 0.55, 0.22 * length), (-y + 0.03, y - 0.03), (waist, height)
         taper = (0.16 * length, 0.08 + rear * 0.45, 0.16, 0.16)
-        place.box(*cabin, Material.GLASSHOUSE, paint, taper=taper, param=(1.0, 0, 0, 0))
+        place.box(*cabin, Look(Material.GLASSHOUSE, paint, (1.0, 0, 0, 0)), taper=taper)
     elif cls is BoxClass.VAN:
         waist = 0.48 * height
-        place.box((-x, x), (-y, y), (0.24, waist), Material.PAINT, paint, taper=(0.08, 0, 0, 0), param=arch)
+        place.box((-x, x), (-y, y), (0.24, waist), Look(Material.PAINT, paint, arch), taper=(0.08, 0, 0, 0))
         cabin, glazed = ((-x, x - 0.75), (-y, y), (waist, height)), 0.35 if rng.random() < 0.5 else 1.0
-        place.box(*cabin, Material.GLASSHOUSE, paint, taper=(0.40, 0.03, 0.10, 0.10), param=(glazed, 0, 0, 0))
+        place.box(*cabin, Look(Material.GLASSHOUSE, paint, (glazed, 0, 0, 0)), taper=(0.40, 0.03, 0.10, 0.10))
     elif cls is BoxClass.TRUCK:
         cab = rng.uniform(1.7, 2.2)
         top = height * rng.uniform(0.72, 0.9)
         cab_color = pick(rng, PAINTS)
-        place.box((x - cab, x), (-y + 0.05, y - 0.05), (0.45, 1.35), Material.PAINT, cab_color)
+        place.box((x - cab, x), (-y + 0.05, y - 0.05), (0.45, 1.35), Look(Material.PAINT, cab_color))
         cabin = (x - cab, x), (-y + 0.05, y - 0.05), (1.35, top)
-        place.box(*cabin, Material.GLASSHOUSE, cab_color, taper=(0.22, 0, 0.04, 0.04), param=(1.0, 0, 0, 0))
-        place.box((-x, x - cab - 0.15), (-y, y), (0.95, height), Material.ROUGH, paint, param=(0.5, 0.05, 0, 0))
-        place.box((-x + 0.1, x - cab), (-0.45, 0.45), (0.5, 0.95), Material.PLAIN, DARK)
+        place.box(*cabin, Look(Material.GLASSHOUSE, cab_color, (1.0, 0, 0, 0)), taper=(0.22, 0, 0.04, 0.04))
+        place.box((-x, x - cab - 0.15), (-y, y), (0.95, height), Look(Material.ROUGH, paint, (0.5, 0.05, 0, 0)))
+        place.box((-x + 0.1, x - cab), (-0.45, 0.45), (0.5, 0.95), plain(DARK))
     else:
-        place.box((-x, x), (-y, y), (0.32, height), Material.COACH, paint, taper=(0.10, 0.02, 0.02, 0.02))
+        place.box((-x, x), (-y, y), (0.32, height), Look(Material.COACH, paint), taper=(0.10, 0.02, 0.02, 0.02))
     for side in (-1, 1):
         for end in (-1, 1):
             center = (end * reach, side * (width / 2 - 0.11), radius)
-            place.cylinder(center, (radius, radius), 0.11, Material.WHEEL, TIRE, lateral=True)
+            place.cylinder(center, (radius, radius), 0.11, Look(Material.WHEEL, TIRE), lateral=True)
 
 
 class Clothes(NamedTuple):
@@ -115,15 +129,15 @@ def add_trunk(place: Placed, hip: float, shoulder: float, width: float, wears: C
     """Torso, shoulders and neck along the z axis of ``place``."""
     middle, half = (hip + shoulder) / 2, (shoulder - hip) / 2
     radii = (0.14 * 0.9, (width / 2 - 0.08) * 0.88)
-    place.cylinder((0.0, 0.0, middle), radii, half, Material.ROUGH, wears.jacket, param=(0.1, 0.06, 0, 0))
-    place.ellipsoid((0, 0, shoulder - 0.03), (0.085, width / 2 - 0.03, 0.075), Material.PLAIN, wears.sleeve)
-    place.cylinder((0, 0, shoulder + 0.04), (0.055, 0.055), 0.09, Material.PLAIN, wears.skin)
+    place.cylinder((0.0, 0.0, middle), radii, half, Look(Material.ROUGH, wears.jacket, (0.1, 0.06, 0, 0)))
+    place.ellipsoid((0, 0, shoulder - 0.03), (0.085, width / 2 - 0.03, 0.075), plain(wears.sleeve))
+    place.cylinder((0, 0, shoulder + 0.04), (0.055, 0.055), 0.09, plain(wears.skin))
 
 
 def add_head(place: Placed, x: float, top: float, skin: Color) -> None:
     """An upright head below ``top``."""
     half = 0.115
-    place.ellipsoid((x, 0, top - half), (0.10, 0.085, half), Material.PLAIN, skin)
+    place.ellipsoid((x, 0, top - half), (0.10, 0.085, half), plain(skin))
 
 
 def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
@@ -138,13 +152,13 @@ def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector,
     stride = length / 2 - 0.075
     for side in (-1, 1):
         leg = (side * stride * 0.9, side * width * 0.17, hip / 2)
-        place.cylinder(leg, (0.075, 0.07), hip / 2, Material.PLAIN, wears.trousers)
+        place.cylinder(leg, (0.075, 0.07), hip / 2, plain(wears.trousers))
     add_trunk(place, hip, shoulder, width, wears)
     for side in (-1, 1):
         # The swinging arms carry the box's length and width.
         arm = (-side * (length / 2 - 0.055), side * (width / 2 - 0.055), (hip + shoulder) / 2)
-        place.cylinder(arm, (0.055, 0.055), (shoulder - hip) / 2 * 0.92, Material.PLAIN, wears.sleeve)
-        place.ellipsoid((arm[0], arm[1], hip - 0.03), (0.045, 0.045, 0.08), Material.PLAIN, wears.skin)
+        place.cylinder(arm, (0.055, 0.055), (shoulder - hip) / 2 * 0.92, plain(wears.sleeve))
+        place.ellipsoid((arm[0], arm[1], hip - 0.03), (0.045, 0.045, 0.08), plain(wears.skin))
     add_head(place, 0, height, wears.skin)
 
 
@@ -154,7 +168,7 @@ def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, re
     height, trunk = rng.uniform(4.5, 10), rng.uniform(0.09, 0.22)
     fork = height * rng.uniform(0.35, 0.5)
     bark = pick(rng, ((0.30, 0.25, 0.20), (0.36, 0.33, 0.29)), 0.03)
-    place.cylinder((0, 0, fork * 0.6), (trunk, trunk), fork * 0.6, Material.ROUGH, bark, param=(0.12, 0.12, 0, 0))
+    place.cylinder((0, 0, fork * 0.6), (trunk, trunk), fork * 0.6, Look(Material.ROUGH, bark, (0.12, 0.12, 0, 0)))
     # No lump reaches further than (0.8 + 0.58) spreads.
     spread = min((height - fork) * rng.uniform(0.38, 0.55), reach_m / 1.38)
     green = pick(rng, ((0.22, 0.31, 0.13), (0.17, 0.26, 0.11), (0.30, 0.33, 0.14), (0.36, 0.28, 0.12)), 0.02)
@@ -164,7 +178,7 @@ def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, re
         radius = spread * rng.uniform(0.36, 0.58) * (1.25 if k == 0 else 1.0)
         z = fork + (height - fork) * rng.uniform(0.18, 0.80)
         radii = (radius, radius, radius * rng.uniform(0.65, 0.95))
-        place.ellipsoid((out * np.cos(turn), out * np.sin(turn), z), radii, Material.LEAF, green)
+        place.ellipsoid((out * np.cos(turn), out * np.sin(turn), z), radii, Look(Material.LEAF, green))
 
 
 def add_bush(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, scale: float = 1.0) -> None:
@@ -174,7 +188,7 @@ def add_bush(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, sc
     for _ in range(4):
         x, y = rng.normal(0, 0.4 * scale, 2)
         r, height = scale * rng.uniform(0.35, 0.65), scale * rng.uniform(0.35, 0.75)
-        place.ellipsoid((float(x), float(y), height * 0.6), (r, r * 0.9, height), Material.LEAF, green)
+        place.ellipsoid((float(x), float(y), height * 0.6), (r, r * 0.9, height), Look(Material.LEAF, green))
 
 
 def add_lamp_post(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
@@ -182,65 +196,58 @@ def add_lamp_post(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, 
     place = builder.place(xyz, yaw, SceneClass.POLE)
     height, grey = rng.uniform(5.5, 8.5), rng.uniform(0.25, 0.55)
     metal: Color = (grey, grey, grey * 1.03)
-    place.cylinder((0, 0, height / 2), (0.075, 0.075), height / 2, Material.PLAIN, metal)
-    place.cylinder((0, 0, 0.5), (0.12, 0.12), 0.5, Material.PLAIN, metal)
-    place.box((0, 1.7), (-0.04, 0.04), (height - 0.1, height), Material.PLAIN, metal)
-    place.box((1.2, 1.9), (-0.12, 0.12), (height - 0.16, height - 0.02), Material.PLAIN, (0.75, 0.74, 0.68))
+    place.cylinder((0, 0, height / 2), (0.075, 0.075), height / 2, plain(metal))
+    place.cylinder((0, 0, 0.5), (0.12, 0.12), 0.5, plain(metal))
+    place.box((0, 1.7), (-0.04, 0.04), (height - 0.1, height), plain(metal))
+    place.box((1.2, 1.9), (-0.12, 0.12), (height - 0.16, height - 0.02), plain((0.75, 0.74, 0.68)))
 
 
 def add_sign(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
     """A post with one or two plates that face local -x."""
     place = builder.place(xyz, yaw, SceneClass.POLE)
     height = rng.uniform(2.3, 3.0)
-    place.cylinder((0, 0, height / 2), (0.035, 0.035), height / 2, Material.PLAIN, (0.52, 0.53, 0.54))
+    place.cylinder((0, 0, height / 2), (0.035, 0.035), height / 2, plain((0.52, 0.53, 0.54)))
     colors: tuple[Color, ...] = ((0.78, 0.12, 0.12), (0.10, 0.25, 0.62), (0.85, 0.72, 0.10), (0.90, 0.90, 0.90))
     for k in range(int(rng.integers(1, 3))):
         w, z = rng.uniform(0.25, 0.36), height - 0.35 - 0.7 * k
-        place.box((-0.06, -0.04), (-w, w), (z - 0.3, z + 0.3), Material.SIGN, pick(rng, colors, 0.02))
+        place.box((-0.06, -0.04), (-w, w), (z - 0.3, z + 0.3), Look(Material.SIGN, pick(rng, colors, 0.02)))
 
 
 def add_traffic_light(builder: SceneBuilder, xyz: Vector, yaw: float) -> None:
     """A signal head on a post, facing local -x."""
     place = builder.place(xyz, yaw, SceneClass.POLE)
-    place.cylinder((0, 0, 1.7), (0.06, 0.06), 1.7, Material.PLAIN, (0.25, 0.26, 0.26))
-    place.box((-0.28, -0.07), (-0.16, 0.16), (2.5, 3.4), Material.SIGN, DARK, param=(1.0, 0, 0, 0))
+    place.cylinder((0, 0, 1.7), (0.06, 0.06), 1.7, plain((0.25, 0.26, 0.26)))
+    place.box((-0.28, -0.07), (-0.16, 0.16), (2.5, 3.4), Look(Material.SIGN, DARK, (1.0, 0, 0, 0)))
 
 
 def add_building(
-    builder: SceneBuilder,
-    rng: np.random.Generator,
-    x: Range,
-    y: Range,
-    base_m: float,
-    height: float,
-    *,
-    detailed: bool = True,
+    builder: SceneBuilder, rng: np.random.Generator, x: Range, y: Range, z: Range, *, detailed: bool = True
 ) -> None:
     """A block with windows; detailed ones have a cornice, now and then bays or an awning over the ground floor."""
-    place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
+    place, (base_m, height) = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING), z
     wall = pick(rng, _WALLS)
     bay, storey = rng.uniform(2.2, 4.2), rng.uniform(2.9, 3.6)
     # bay width, storey height, share of the wall that is glass, whether the ground floor is shops
     param = (bay, storey, rng.uniform(0.42, 0.72), float(rng.random() < 0.55))
-    place.box(x, y, (base_m - 0.05, height), Material.FACADE, wall, param=param)
+    place.box(x, y, (base_m - 0.05, height), Look(Material.FACADE, wall, param))
     if not detailed:
         return
     trim: Color = (wall[0] * 0.8, wall[1] * 0.8, wall[2] * 0.8)
     cornice = (x[0] - 0.25, x[1] + 0.25), (y[0] - 0.25, y[1] + 0.25), (height, height + 0.4)
-    place.box(*cornice, Material.ROUGH, trim, param=(0.8, 0.08, 0, 0))
+    place.box(*cornice, Look(Material.ROUGH, trim, (0.8, 0.08, 0, 0)))
     front, outward = (y[0], -1.0) if y[0] > 0 else (y[1], 1.0)
     if param[3] and rng.random() < 0.6:
         cloth = pick(rng, _CLOTHES)
         a = rng.uniform(x[0] + 0.3, (x[0] + x[1]) / 2)
         b = min(a + rng.uniform(3, 7), x[1] - 0.2)
         ends = sorted((front, front + outward * rng.uniform(0.8, 1.3)))
-        place.box((a, b), (ends[0], ends[1]), (2.75, 3.0), Material.ROUGH, cloth, param=(0.4, 0.1, 0, 0))
+        place.box((a, b), (ends[0], ends[1]), (2.75, 3.0), Look(Material.ROUGH, cloth, (0.4, 0.1, 0, 0)))
     if height > 9 and rng.random() < 0.4:
         for _ in range(int(rng.integers(1, 3))):
             a = rng.uniform(x[0] + 0.5, max(x[0] + 0.6, x[1] - 3.5))
             ends = sorted((front, front + outward * 0.7))
             bounds = (a, min(a + 2.6, x[1])), (ends[0], ends[1]), (storey, height * 0.85)
-            place.box(*bounds, Material.FACADE, wall, param=(2.6, storey, 0.7, 0.0))
+            place.box(*bounds, Look(Material.FACADE, wall, (2.6, storey, 0.7, 0.0)))
 
 
 def add_barrier(
@@ -250,10 +257,10 @@ def add_barrier(
     height = base_m + rng.uniform(0.9, 1.4 if hedge else 2.0)
     if hedge:
         place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.VEGETATION)
-        place.box(x, y, (base_m - 0.05, height), Material.LEAF, pick(rng, ((0.19, 0.27, 0.12),), 0.02))
+        place.box(x, y, (base_m - 0.05, height), Look(Material.LEAF, pick(rng, ((0.19, 0.27, 0.12),), 0.02)))
         return
     place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
-    place.box(x, y, (base_m - 0.05, height), Material.ROUGH, pick(rng, _WALLS), param=(1.2, 0.08, 0, 0))
+    place.box(x, y, (base_m - 0.05, height), Look(Material.ROUGH, pick(rng, _WALLS), (1.2, 0.08, 0, 0)))
 
 
 # Metres: length, width at the bars, height with a rider and without one, as adults and production models have them.
@@ -297,14 +304,14 @@ def add_two_wheeler(
         _add_motorcycle(place, rng, axle, radius, bars)
         seat, grip, pedals = (-0.30 * axle, 0.78), 0.58 * axle, [(-0.05, 0.30)] * 2
         aside, helmet = 0.20, (0.14, 0.12, 0.14)
-    place.cylinder((grip, 0, bars - 0.02), (0.02, 0.02), width / 2, Material.PLAIN, DARK, lateral=True)
+    place.cylinder((grip, 0, bars - 0.02), (0.02, 0.02), width / 2, plain(DARK), lateral=True)
     if ridden:
         _add_rider(place, rng, height, seat, (grip, width / 2 - 0.07, bars), pedals, aside, helmet)
 
 
 def _add_wheels(place: Placed, axle: float, radius: float, half_width: float) -> None:
     for x in (-axle, axle):
-        place.cylinder((x, 0, radius), (radius, radius), half_width, Material.WHEEL, TIRE, lateral=True)
+        place.cylinder((x, 0, radius), (radius, radius), half_width, Look(Material.WHEEL, TIRE), lateral=True)
 
 
 def _add_bicycle(place: Placed, rng: np.random.Generator, axle: float, radius: float, bars: float) -> None:
@@ -314,24 +321,24 @@ def _add_bicycle(place: Placed, rng: np.random.Generator, axle: float, radius: f
     head, stem = (0.70 * axle, bars - 0.20), (0.66 * axle, bars - 0.02)
     low_seat = (-0.37 * axle, bars - 0.26)
     for start, end in ((rear, crank), (crank, seat), (crank, head), (low_seat, head), (rear, low_seat)):
-        place.tube((start[0], 0, start[1]), (end[0], 0, end[1]), 0.02, Material.PLAIN, paint)
-    place.tube((axle, 0, radius), (stem[0], 0, stem[1]), 0.022, Material.PLAIN, paint)
-    place.cylinder((crank[0], 0, crank[1]), (0.09, 0.09), 0.05, Material.PLAIN, _METAL, lateral=True)
-    place.box((seat[0] - 0.14, seat[0] + 0.12), (-0.07, 0.07), (seat[1] - 0.03, seat[1] + 0.03), Material.PLAIN, DARK)
+        place.tube((start[0], 0, start[1]), (end[0], 0, end[1]), 0.02, plain(paint))
+    place.tube((axle, 0, radius), (stem[0], 0, stem[1]), 0.022, plain(paint))
+    place.cylinder((crank[0], 0, crank[1]), (0.09, 0.09), 0.05, plain(_METAL), lateral=True)
+    place.box((seat[0] - 0.14, seat[0] + 0.12), (-0.07, 0.07), (seat[1] - 0.03, seat[1] + 0.03), plain(DARK))
 
 
 def _add_motorcycle(place: Placed, rng: np.random.Generator, axle: float, radius: float, bars: float) -> None:
     _add_wheels(place, axle, radius, 0.06)
     paint = pick(rng, PAINTS)
-    place.box((-0.42 * axle, 0.45 * axle), (-0.15, 0.15), (0.20, 0.62), Material.PLAIN, DARK, taper=(0.12, 0, 0, 0))
-    place.ellipsoid((0.22 * axle, 0, 0.78), (0.36 * axle, 0.16, 0.16), Material.PLAIN, paint)
-    place.box((-1.15 * axle, -0.05 * axle), (-0.14, 0.14), (0.70, 0.78), Material.PLAIN, DARK, taper=(0, 0.06, 0, 0))
-    place.box((-1.25 * axle, -0.35 * axle), (-0.11, 0.11), (0.58, 0.70), Material.PLAIN, paint)
-    place.ellipsoid((0.70 * axle, 0, 0.86), (0.11, 0.11, 0.11), Material.PLAIN, (0.80, 0.80, 0.76))
+    place.box((-0.42 * axle, 0.45 * axle), (-0.15, 0.15), (0.20, 0.62), plain(DARK), taper=(0.12, 0, 0, 0))
+    place.ellipsoid((0.22 * axle, 0, 0.78), (0.36 * axle, 0.16, 0.16), plain(paint))
+    place.box((-1.15 * axle, -0.05 * axle), (-0.14, 0.14), (0.70, 0.78), plain(DARK), taper=(0, 0.06, 0, 0))
+    place.box((-1.25 * axle, -0.35 * axle), (-0.11, 0.11), (0.58, 0.70), plain(paint))
+    place.ellipsoid((0.70 * axle, 0, 0.86), (0.11, 0.11, 0.11), plain((0.80, 0.80, 0.76)))
     for side in (-0.09, 0.09):
-        place.tube((axle, side, radius), (0.56 * axle, side, bars - 0.03), 0.03, Material.PLAIN, _METAL)
-        place.tube((-axle, side, radius), (-0.2 * axle, side, 0.40), 0.03, Material.PLAIN, _METAL)
-    place.tube((0.2 * axle, -0.17, 0.26), (-1.15 * axle, -0.19, 0.36), 0.045, Material.PLAIN, _METAL)
+        place.tube((axle, side, radius), (0.56 * axle, side, bars - 0.03), 0.03, plain(_METAL))
+        place.tube((-axle, side, radius), (-0.2 * axle, side, 0.40), 0.03, plain(_METAL))
+    place.tube((0.2 * axle, -0.17, 0.26), (-1.15 * axle, -0.19, 0.36), 0.045, plain(_METAL))
 
 
 def _add_rider(
@@ -365,14 +372,14 @@ def _add_rider(
             side * (aside + 0.03),
             (hip[1] + foot[1]) / 2 + bent * (foot[0] - hip[0]),
         )
-        place.tube((hip[0], side * 0.09, hip[1]), knee, 0.075, Material.PLAIN, wears.trousers)
-        place.tube(knee, (foot[0], side * aside, foot[1]), 0.055, Material.PLAIN, wears.trousers)
+        place.tube((hip[0], side * 0.09, hip[1]), knee, 0.075, plain(wears.trousers))
+        place.tube(knee, (foot[0], side * aside, foot[1]), 0.055, plain(wears.trousers))
         ends = sorted((side * (aside - 0.045), side * (aside + 0.045)))
-        place.box((x - 0.10, x + 0.15), (ends[0], ends[1]), (z, z + 0.08), Material.PLAIN, DARK)
+        place.box((x - 0.10, x + 0.15), (ends[0], ends[1]), (z, z + 0.08), plain(DARK))
         arm = (shoulder_x, side * (width / 2 - 0.055), shoulder_z - 0.04)
-        place.tube(arm, (grip[0], side * grip[1], grip[2]), 0.05, Material.PLAIN, wears.sleeve)
-        place.ellipsoid((grip[0], side * grip[1], grip[2]), (0.045, 0.045, 0.045), Material.PLAIN, wears.skin)
+        place.tube(arm, (grip[0], side * grip[1], grip[2]), 0.05, plain(wears.sleeve))
+        place.ellipsoid((grip[0], side * grip[1], grip[2]), (0.045, 0.045, 0.045), plain(wears.skin))
     add_head(place, shoulder_x + 0.07, top, wears.skin)
     if helmet is not None:
         center = (shoulder_x + 0.07, 0.0, top - helmet[2])
-        place.ellipsoid(center, helmet, Material.PLAIN, pick(rng, PAINTS))
+        place.ellipsoid(center, helmet, plain(pick(rng, PAINTS)))

@@ -71,14 +71,10 @@ def camera_rays(camera: Camera) -> CameraRays:
     if not valid.all():
         rays = _fill_by_tile(rays, valid)
 
-    def put(array: np.ndarray) -> Tensor:
-        dtype = bool if array.dtype == bool else np.float32
-        return _to_tiles(torch.as_tensor(np.ascontiguousarray(array, dtype=dtype)))
-
-    directions, axis = put(rays), torch.as_tensor(camera.cam2ego[:3, 2].astype(np.float32))
-    return CameraRays(
-        directions, put(right), put(down), put(pitch)[:, 0], put(valid)[:, 0], axis.expand(len(directions), 3)
-    )
+    tiles = [_to_tiles(torch.as_tensor(array.astype(np.float32))) for array in (rays, right, down, pitch)]
+    axis = torch.as_tensor(camera.cam2ego[:3, 2].astype(np.float32)).expand(len(tiles[0]), 3)
+    seen = _to_tiles(torch.as_tensor(valid))[:, 0]
+    return CameraRays(tiles[0], tiles[1], tiles[2], tiles[3][:, 0], seen, axis)
 
 
 def _differences(rays: np.ndarray, valid: np.ndarray, axis: int) -> np.ndarray:
@@ -274,11 +270,10 @@ def _hits(start: Tensor, direction: Tensor, t: Tensor, hit: Tensor, pitch: Tenso
 def _outlines(key: Tensor) -> Tensor:
     """(h, w) bool: pixels with a direct neighbour of another key."""
     out = torch.zeros_like(key, dtype=torch.bool)
-    across, down = key[:, 1:] != key[:, :-1], key[1:] != key[:-1]
-    out[:, 1:] |= across
-    out[:, :-1] |= across
-    out[1:] |= down
-    out[:-1] |= down
+    for pixels, across in ((key, out), (key.T, out.T)):
+        differs = pixels[1:] != pixels[:-1]
+        across[1:] |= differs
+        across[:-1] |= differs
     return out
 
 
@@ -289,8 +284,3 @@ def _for_packets(candidates: Candidates, owner: Tensor, tiles: int) -> Candidate
     packet = torch.repeat_interleave(torch.arange(len(owner)), counts[owner])
     rank = ranks(packet, counts[owner])
     return Candidates(packet, candidates.primitive[first[owner[packet]] + rank], rank)
-
-
-def stack_or_list(tensors: list[Tensor]) -> Tensor | list[Tensor]:
-    """Stack tensors of one shape; else return the list."""
-    return torch.stack(tensors) if len({a.shape for a in tensors}) == 1 else tensors

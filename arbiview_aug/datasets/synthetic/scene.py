@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -40,29 +40,13 @@ class SceneClass(IntEnum):
 class BoxClass(IntEnum):
     """Classes of the 3D boxes."""
 
-    CAR = 0
-    VAN = 1
-    TRUCK = 2
-    BUS = 3
-    PEDESTRIAN = 4
-    BICYCLE = 5
-    MOTORCYCLE = 6
+    CAR, VAN, TRUCK, BUS, PEDESTRIAN, BICYCLE, MOTORCYCLE = range(7)
 
 
 class Material(IntEnum):
     """Materials: one function of ``shading`` each."""
 
-    ROAD = 0
-    SLAB = 1
-    FACADE = 2
-    PAINT = 3
-    GLASSHOUSE = 4
-    COACH = 5
-    PLAIN = 6
-    WHEEL = 7
-    SIGN = 8
-    LEAF = 9
-    ROUGH = 10
+    ROAD, SLAB, FACADE, PAINT, GLASSHOUSE, COACH, PLAIN, WHEEL, SIGN, LEAF, ROUGH = range(11)
 
 
 BOX, ELLIPSOID, CYLINDER = 0, 1, 2
@@ -146,14 +130,8 @@ class Scene:
         planes, boxes = self.planes.copy(), self.boxes.copy()
         planes[..., 3] += (planes[..., :3] * move[:, None]).sum(-1)
         boxes[:, :3] += moves[:-1]
-        return replace(
-            self,
-            center=self.center + move,
-            planes=planes,
-            corners=self.corners + move[:, None],
-            boxes=boxes,
-            ego2street=ego2street,
-        )
+        center, corners = self.center + move, self.corners + move[:, None]
+        return replace(self, center=center, planes=planes, corners=corners, boxes=boxes, ego2street=ego2street)
 
 
 _ZEROS = (0.0, 0.0, 0.0, 0.0)
@@ -196,9 +174,17 @@ class SceneBuilder:
         }
 
 
+class Look(NamedTuple):
+    """The looks of a part; the meaning of ``param`` is the material's."""
+
+    material: Material
+    color: Vector
+    param: Param = _ZEROS
+
+
 @dataclass
 class Placed:
-    """Adds parts of one object in the object's own frame; the meaning of ``param`` is the material's."""
+    """Adds parts of one object in the object's own frame."""
 
     builder: SceneBuilder
     origin: FloatArray
@@ -206,17 +192,7 @@ class Placed:
     cls: SceneClass
     instance: int
 
-    def box(
-        self,
-        x: Range,
-        y: Range,
-        z: Range,
-        material: Material,
-        color: Vector,
-        *,
-        taper: Param = _ZEROS,
-        param: Param = _ZEROS,
-    ) -> None:
+    def box(self, x: Range, y: Range, z: Range, look: Look, *, taper: Param = _ZEROS) -> None:
         """Add a box from its bounds; ``taper``: how far front, rear, left and right lean inward at the top, metres."""
         lo, hi = np.array([x, y, z], np.float64).T
         hx, hy, hz = half = (hi - lo) / 2
@@ -231,26 +207,16 @@ class Placed:
         corners[:, 0] -= np.where(top, np.where(corners[:, 0] > 0, front, -rear), 0)
         corners[:, 1] -= np.where(top, np.where(corners[:, 1] > 0, left, -right), 0)
         planes = np.column_stack([normals, offsets]) / norm[:, None]
-        self._add(BOX, (hi + lo) / 2, half, material, color, param, corners=corners, planes=planes)
+        self._add(BOX, (hi + lo) / 2, half, look, corners=corners, planes=planes)
 
-    def ellipsoid(self, center: Vector, radii: Vector, material: Material, color: Vector) -> None:
+    def ellipsoid(self, center: Vector, radii: Vector, look: Look) -> None:
         """Add an ellipsoid along the object's axes."""
-        self._add(ELLIPSOID, np.array(center), np.array(radii), material, color)
+        self._add(ELLIPSOID, np.array(center), np.array(radii), look)
 
-    def cylinder(
-        self,
-        center: Vector,
-        radii: Range,
-        half_length: float,
-        material: Material,
-        color: Vector,
-        *,
-        lateral: bool = False,
-        param: Param = _ZEROS,
-    ) -> None:
+    def cylinder(self, center: Vector, radii: Range, half_length: float, look: Look, *, lateral: bool = False) -> None:
         """Add a capped elliptic cylinder, upright or (wheels) with its axis along the object's y."""
         axes = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) if lateral else _NO_TURN
-        self._add(CYLINDER, np.array(center), np.array([*radii, half_length]), material, color, param, axes=axes)
+        self._add(CYLINDER, np.array(center), np.array([*radii, half_length]), look, axes=axes)
 
     def along(self, start: Vector, end: Vector) -> tuple[Placed, float]:
         """A frame at ``start`` whose z axis points to ``end`` (not straight aside), and their distance."""
@@ -262,19 +228,17 @@ class Placed:
         origin = self.origin + self.rotation @ np.array(start)
         return replace(self, origin=origin, rotation=self.rotation @ axes), length
 
-    def tube(self, start: Vector, end: Vector, radius: float, material: Material, color: Vector) -> None:
+    def tube(self, start: Vector, end: Vector, radius: float, look: Look) -> None:
         """Add a round cylinder between two points, not straight aside of each other."""
         place, length = self.along(start, end)
-        place.cylinder((0.0, 0.0, length / 2), (radius, radius), length / 2, material, color)
+        place.cylinder((0.0, 0.0, length / 2), (radius, radius), length / 2, look)
 
     def _add(
         self,
         kind: int,
         middle: FloatArray,
         half: FloatArray,
-        material: Material,
-        color: Vector,
-        param: Param = _ZEROS,
+        look: Look,
         *,
         axes: FloatArray = _NO_TURN,
         corners: FloatArray | None = None,
@@ -282,18 +246,7 @@ class Placed:
     ) -> None:
         rotation, center = self.rotation @ axes, self.origin + self.rotation @ middle
         normals = planes[:, :3] @ rotation.T
-        self.builder.primitives.append(
-            {
-                "kind": kind,
-                "center": center,
-                "rotation": rotation,
-                "half": half,
-                "planes": np.column_stack([normals, planes[:, 3] + normals @ center]),
-                "corners": center + (_SIGNS * half if corners is None else corners) @ rotation.T,
-                "material": material,
-                "cls": self.cls,
-                "instance": self.instance,
-                "color": color,
-                "param": param,
-            }
-        )
+        row = {"kind": kind, "center": center, "rotation": rotation, "half": half, **look._asdict()}
+        row["planes"] = np.column_stack([normals, planes[:, 3] + normals @ center])
+        row["corners"] = center + (_SIGNS * half if corners is None else corners) @ rotation.T
+        self.builder.primitives.append({**row, "cls": self.cls, "instance": self.instance})

@@ -33,11 +33,10 @@ class SceneTables(NamedTuple):
 
     @classmethod
     def build(cls, scene: Scene) -> SceneTables:
-        def put(array: np.ndarray) -> Tensor:
-            return torch.as_tensor(np.ascontiguousarray(array, np.float32 if array.dtype.kind == "f" else np.int64))
-
-        names = ("kind", "material", "center", "rotation", "half", "planes", "color", "param")
-        return cls(scene=scene, light=put(light_map(scene)), **{n: put(getattr(scene, n)) for n in names})
+        columns = {name: getattr(scene, name) for name in cls._fields[1:-1]}
+        rounded = {name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in columns.items()}
+        tensors = {name: torch.as_tensor(array) for name, array in rounded.items()}
+        return cls(scene=scene, light=torch.as_tensor(light_map(scene)), **tensors)
 
 
 class Hits(NamedTuple):

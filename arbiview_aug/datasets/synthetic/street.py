@@ -7,11 +7,11 @@ import math
 import numpy as np
 
 from arbiview_aug.datasets.synthetic import objects
-from arbiview_aug.datasets.synthetic.objects import add_two_wheeler, two_wheeler_size
 from arbiview_aug.datasets.synthetic.scene import (
     BOX,
     BoxClass,
     Light,
+    Look,
     Material,
     Range,
     Scene,
@@ -183,7 +183,7 @@ class _World:
         for side in (-1, 1):
             y = _span(self.side_y(side, 0), side * BLOCK_DEPTH_M)
             for x in self.blocks:
-                place.box(x, y, (-0.5, self.street.kerb_m), Material.SLAB, (0.52, 0.51, 0.49))
+                place.box(x, y, (-0.5, self.street.kerb_m), Look(Material.SLAB, (0.52, 0.51, 0.49)))
 
     def add_buildings(self) -> None:
         rng, base = self.rng, self.street.kerb_m
@@ -199,10 +199,10 @@ class _World:
                     built = rng.random() < 0.88
                     if built:
                         y = self.band_y(side, setback, setback + depth)
-                        objects.add_building(self.builder, rng, (x, x + width), y, base, height)
+                        objects.add_building(self.builder, rng, (x, x + width), y, (base, height))
                     if rng.random() < 0.35:
                         y = self.band_y(side, setback + 22, setback + 40)
-                        objects.add_building(self.builder, rng, (x, x + width), y, base, rng.uniform(25, 60))
+                        objects.add_building(self.builder, rng, (x, x + width), y, (base, rng.uniform(25, 60)))
                     gap = float(rng.choice([0.05, 0.05, rng.uniform(2, 9)]))
                     if not built or (gap > 1 and rng.random() < 0.7):
                         y = self.band_y(side, walk + 0.3, walk + 0.8)
@@ -224,7 +224,7 @@ class _World:
                     if rng.random() < 0.7:
                         y = self.band_y(side, distance, distance + 14)
                         height = rng.uniform(7, 24)
-                        objects.add_building(self.builder, rng, (x, x + width), y, base, height, detailed=False)
+                        objects.add_building(self.builder, rng, (x, x + width), y, (base, height), detailed=False)
                     else:
                         for k in range(int(width / 6)):
                             xyz = (x + 6 * k, self.side_y(side, distance - rng.uniform(0, 6)), base)
@@ -233,7 +233,7 @@ class _World:
         for direction in (-1, 1):
             if rng.random() < 0.7:
                 xs = _span(direction * rng.uniform(185, 240), direction * 258.0)
-                objects.add_building(self.builder, rng, xs, (-60, 60), 0.0, rng.uniform(14, 45))
+                objects.add_building(self.builder, rng, xs, (-60, 60), (0.0, rng.uniform(14, 45)))
 
     def add_parked(self) -> None:
         for side in (-1, 1):
@@ -343,7 +343,7 @@ class _World:
             cls = BoxClass.BICYCLE if rng.random() < 0.6 else BoxClass.MOTORCYCLE
             ridden, side, x = rng.random() < 0.7, int(rng.choice([-1, 1])), rng.uniform(-35, 42)
             yaw = _heading(side) + math.radians(rng.normal(0, 2))
-            size = two_wheeler_size(rng, cls, ridden=ridden)
+            size = objects.two_wheeler_size(rng, cls, ridden=ridden)
             length, width, _ = size
             if ridden:
                 from_middle = rng.choice([street.lanes - 0.14, rng.integers(street.lanes) + 0.5], p=[0.6, 0.4])
@@ -355,7 +355,7 @@ class _World:
                 y, z = self.side_y(side, rng.uniform(margin, street.sidewalk_m[side > 0] - margin)), street.kerb_m
             if self.at_crossing(x, 3) or not self.is_clear(x, y, room, width, yaw):
                 continue
-            add_two_wheeler(self.builder, rng, cls, size, (x, y, z), yaw, ridden=ridden)
+            objects.add_two_wheeler(self.builder, rng, cls, size, (x, y, z), yaw, ridden=ridden)
             self.taken += _discs(x, y, length, width, yaw)
             speed = ridden * speed_mps * rng.uniform(0.9, 1.1)
             velocities.append((speed * math.cos(yaw), speed * math.sin(yaw)))

@@ -10,7 +10,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from arbiview_aug import RigRetarget
 from arbiview_aug.environment import optional_package
-from arbiview_aug.integrations.lightning.batches import on_device, packed, unpacked
+from arbiview_aug.integrations.lightning import on_device, packed, unpacked
 from arbiview_aug.sample.collate import collate
 
 optional_package("lightning")  # or one line that says how to install it

@@ -12,14 +12,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.integrations.mmdet3d.images import Norm, levels, normalised
 from arbiview_aug.integrations.mmdet3d.matrices import Views, padded, upper_triangular
-from arbiview_aug.integrations.mmdet3d.results import (
-    STALE_KEYS,
-    Retarget,
-    source_rig,
-    target_outputs,
-    target_views,
-    warn_of_dropped,
-)
+from arbiview_aug.integrations.mmdet3d.results import Retarget, source_rig, target_outputs, target_views, without_stale
 
 MEAN_STD = ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375))
 """Mean and deviation of BEVDet's ``mmlabNormalize``, in the order of the channels it leaves."""
@@ -72,24 +65,28 @@ def retarget_img_inputs(
     if not in_source or total % len(in_source):
         raise SampleError(f"img_inputs: expected {len(in_source)} images a frame, as 'cam_names' says, got {total}")
     count = total // len(in_source)
+    size = tensors[0].shape[-2], tensors[0].shape[-1]
+    key = in_source.index(_KEY_CAMERA) if _KEY_CAMERA in in_source else 0
     outputs: list[list[torch.Tensor]] = []
     outs: list[Mapping[str, Any]] = []
-    changed = {key: value for key, value in results.items() if key not in STALE_KEYS}
+    changed = without_stale(results, silently=_PICTURES)
     for t in range(count):
         rows = slice(t * len(in_source), (t + 1) * len(in_source))
-        frame = [tensors[0][t::count], *(tensor[rows] for tensor in tensors[1:])]
+        images, *frame = tensors[0][t::count], *(tensor[rows] for tensor in tensors[1:])
         info = infos[t] if t < len(infos) else None
-        boxes = _boxes(results if t == 0 else info)
-        entries, out, target, key2global = _retargeted(
-            frame, retarget, in_source, boxes, names=names, ground_z_m=ground_z_m, mean_std=mean_std
-        )
-        outputs.append(entries)
+        key2global = frame[1][key].double().numpy()
+        mirrored, source = _as_recorded(frame, in_source, key2global, size[1])
+        grey = levels("img_inputs", images, mean_std)
+        views = [image.flip(-1) if flip else image for image, flip in zip(grey, mirrored, strict=True)]
+        sample = {"images": torch.stack(views), "rig": source_rig(source, views, ground_z_m)}
+        out = retarget(sample | _boxes(results if t == 0 else info))
+        target = target_views(out, source, names)
+        outputs.append(_entries(out["images"], target, [images, *frame], mean_std))
         outs.append(out)
         if isinstance(info, Mapping) and "cams" in info:
             infos[t] = {**info, "cams": _infos(target, key2global)}
     images = torch.stack([entries[0] for entries in outputs], dim=1).flatten(0, 1)
     rest = [torch.cat(of_frames) for of_frames in zip(*(entries[1:] for entries in outputs), strict=True)]
-    warn_of_dropped({key: value for key, value in results.items() if key != _PICTURES})
     changed["img_inputs"] = type(inputs)([images, *rest, *inputs[6:]])
     if "cam_names" in results:
         changed["cam_names"] = list(target.names)
@@ -97,38 +94,18 @@ def retarget_img_inputs(
     return changed | target_outputs(outs)
 
 
-def _retargeted(
-    entries: Sequence[torch.Tensor],
-    retarget: Retarget,
-    in_source: Sequence[str],
-    boxes: dict[str, torch.Tensor],
-    *,
-    names: Sequence[str],
-    ground_z_m: float,
-    mean_std: Norm,
-) -> tuple[list[torch.Tensor], Mapping[str, Any], Views, FloatArray]:
-    """A frame's six entries, its retargeted sample, the target cameras and the pose of the key ego frame."""
-    images, sensor2egos, ego2globals, intrins, post_rots, post_trans = entries
-    size = images.shape[-2], images.shape[-1]
-    key = in_source.index(_KEY_CAMERA) if _KEY_CAMERA in in_source else 0
-    key2global = ego2globals[key].double().numpy()
-    mounted = (np.linalg.inv(key2global) @ ego2globals.double().numpy()) @ sensor2egos.double().numpy()
-    mirrored, K, cam2ego = _as_recorded(intrins, post_rots, post_trans, mounted, size)
-    grey = levels("img_inputs", images, mean_std)
-    views = [image.flip(-1) if flip else image for image, flip in zip(grey, mirrored, strict=True)]
-    source = Views(in_source, K, cam2ego, np.eye(4), key2global)
-    out = retarget({"images": torch.stack(views), "rig": source_rig(source, views, ground_z_m), **boxes})
-    target = target_views(out, source, names)
+def _entries(images: torch.Tensor, target: Views, like: Sequence[torch.Tensor], mean_std: Norm) -> list[torch.Tensor]:
+    """The six entries of a frame of target cameras, in the types of the source's; nothing is augmented."""
     count = len(target.names)
-    outputs = [
-        normalised(out["images"], mean_std).to(images.dtype),
-        torch.from_numpy(target.cam2ego).to(sensor2egos),
-        ego2globals[key].expand(count, -1, -1).clone(),
-        torch.from_numpy(target.K).to(intrins),
-        torch.eye(3).to(post_rots).expand(count, -1, -1).clone(),
-        torch.zeros(count, 3).to(post_trans),
-    ]
-    return outputs, out, target, key2global
+    values = (
+        normalised(images, mean_std),
+        torch.from_numpy(target.cam2ego),
+        torch.from_numpy(target.ego2global).expand(count, -1, -1).clone(),
+        torch.from_numpy(target.K),
+        torch.eye(3).expand(count, -1, -1).clone(),
+        torch.zeros(count, 3),
+    )
+    return [value.to(source) for value, source in zip(values, like, strict=True)]
 
 
 def _checked(inputs: Any) -> list[torch.Tensor]:
@@ -146,26 +123,21 @@ def _checked(inputs: Any) -> list[torch.Tensor]:
 
 
 def _as_recorded(
-    intrins: torch.Tensor,
-    post_rots: torch.Tensor,
-    post_trans: torch.Tensor,
-    mounted: FloatArray,
-    size: tuple[int, int],
-) -> tuple[list[bool], FloatArray, FloatArray]:
-    """Which images are mirrored; K and cam2ego of the others as they are, and of those when mirrored back."""
-    count = len(intrins)
-    moved = np.tile(np.eye(3), (count, 1, 1))
-    moved[:, :2, :2] = post_rots.double().numpy()[:, :2, :2]
-    moved[:, :2, 2] = post_trans.double().numpy()[:, :2]
+    frame: Sequence[torch.Tensor], names: Sequence[str], key2global: FloatArray, width_px: int
+) -> tuple[list[bool], Views]:
+    """Which images are mirrored; the cameras of the others as they are, and of those when mirrored back."""
+    sensor2ego, ego2global, intrinsics, post_rots, post_trans = (entry.double().numpy() for entry in frame)
+    moved = np.tile(np.eye(3), (len(names), 1, 1))
+    moved[:, :2, :2], moved[:, :2, 2] = post_rots[:, :2, :2], post_trans[:, :2]
     # They move pixels as PIL does, whose outer edges are 0 and w; those of ``Camera`` are -0.5 and w - 0.5.
     half = np.eye(3)
     half[:2, 2] = 0.5
     moved = np.linalg.inv(half) @ moved @ half
     mirrored = np.linalg.det(moved[:, :2, :2]) < 0
-    back = np.array([[-1.0, 0, size[1] - 1], [0, 1, 0], [0, 0, 1]])
-    moved[mirrored] = back @ moved[mirrored]
-    K, turned = upper_triangular(moved @ intrins.double().numpy())
-    return mirrored.tolist(), K / K[:, 2:, 2:], mounted @ np.linalg.inv(padded(turned))
+    moved[mirrored] = np.array([[-1.0, 0, width_px - 1], [0, 1, 0], [0, 0, 1]]) @ moved[mirrored]
+    K, turned = upper_triangular(moved @ intrinsics)
+    cam2ego = (np.linalg.inv(key2global) @ ego2global) @ sensor2ego @ np.linalg.inv(padded(turned))
+    return mirrored.tolist(), Views(names, K / K[:, 2:, 2:], cam2ego, np.eye(4), key2global)
 
 
 def _boxes(info: Any) -> dict[str, torch.Tensor]:
@@ -185,12 +157,8 @@ def _infos(target: Views, key2global: FloatArray) -> dict[str, dict[str, Any]]:
         quaternion = rotation_matrix_to_quaternion(torch.from_numpy(matrix[:3, :3].copy()))
         return {f"{prefix}_rotation": quaternion.tolist(), f"{prefix}_translation": matrix[:3, 3].tolist()}
 
+    of_key = pose("ego2global", key2global)
     return {
-        name: {
-            "data_path": name,
-            "cam_intrinsic": K,
-            **pose("sensor2ego", cam2ego),
-            **pose("ego2global", key2global),
-        }
+        name: {"data_path": name, "cam_intrinsic": K, **pose("sensor2ego", cam2ego), **of_key}
         for name, K, cam2ego in zip(target.names, target.K, target.cam2ego, strict=True)
     }

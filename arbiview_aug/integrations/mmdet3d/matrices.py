@@ -13,22 +13,11 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError
 
 MATRICES = {
-    "cam2img": "K",
-    "cam_intrinsic": "K",
-    "intrinsics": "K",
-    "camera_intrinsics": "K",
-    "ori_cam2img": "K",
-    "lidar2cam": "lidar2cam",
-    "lidar2camera": "lidar2cam",
-    "extrinsics": "lidar2cam",
-    "cam2lidar": "cam2lidar",
-    "camera2lidar": "cam2lidar",
-    "cam2ego": "cam2ego",
-    "camera2ego": "cam2ego",
-    "lidar2img": "lidar2img",
-    "lidar2image": "lidar2img",
-    "ori_lidar2img": "lidar2img",
-    "projection_mat": "lidar2img",
+    **dict.fromkeys(("cam2img", "cam_intrinsic", "intrinsics", "camera_intrinsics", "ori_cam2img"), "K"),
+    **dict.fromkeys(("lidar2cam", "lidar2camera", "extrinsics"), "lidar2cam"),
+    **dict.fromkeys(("cam2lidar", "camera2lidar"), "cam2lidar"),
+    **dict.fromkeys(("cam2ego", "camera2ego"), "cam2ego"),
+    **dict.fromkeys(("lidar2img", "lidar2image", "ori_lidar2img", "projection_mat"), "lidar2img"),
     "cam2global": "cam2global",
 }
 """Matrix of each key, for each camera."""

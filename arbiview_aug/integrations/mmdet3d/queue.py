@@ -10,7 +10,7 @@ import torch
 
 from arbiview_aug.errors import SampleError
 from arbiview_aug.integrations.mmdet3d.matrices import MATRICES
-from arbiview_aug.integrations.mmdet3d.results import STALE_KEYS, target_outputs, warn_of_dropped
+from arbiview_aug.integrations.mmdet3d.results import STALE_KEYS, target_outputs, without_stale
 
 NUMBERS = ("image_wh", "focal", "img_timestamp", "timestamp")
 """Numbers of each frame, or of each of its cameras, where their first axis is as long as the queue."""
@@ -72,8 +72,7 @@ def retarget_queue(results: Mapping[str, Any], retarget_frame: Callable[[Frame],
     for t, meta in enumerate(metas):
         frame = shared | {key: held[key][t] for key in sliced} | meta
         outs.append(retarget_frame(frame | (last if t == count - 1 else {})))
-    warn_of_dropped(results)
-    kept = {key: value for key, value in results.items() if key not in STALE_KEYS}
+    kept = without_stale(results)
     for key in sliced:
         if key not in (*LABELS, "timestamp") and key in outs[0]:
             kept[key] = _put_back(results[key], _together(held[key], [out[key] for out in outs]))

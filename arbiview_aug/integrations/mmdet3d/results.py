@@ -29,19 +29,8 @@ from arbiview_aug.integrations.mmdet3d.matrices import (
 Retarget = Callable[[dict[str, Any]], dict[str, Any]]
 
 STALE_KEYS = (
-    "cam_instances",
-    "gt_bboxes",
-    "gt_bboxes_labels",
-    "bboxes",
-    "bboxes_ignore",
-    "bboxes2d",
-    "labels2d",
-    "centers_2d",
-    "centers2d",
-    "depths",
-    "depth_map",
-    "gt_depth",
-    "canvas",
+    *("cam_instances", "gt_bboxes", "gt_bboxes_labels", "bboxes", "bboxes_ignore", "bboxes2d", "labels2d"),
+    *("centers_2d", "centers2d", "depths", "depth_map", "gt_depth", "canvas"),
 )
 """Keys, also in ``ann_info``, that speak of the source's pixels: dropped (``project_boxes_3d`` makes 2D boxes anew)."""
 
@@ -86,26 +75,22 @@ def retarget_results(
     norm = norm_of(results.get("img_norm_cfg"))
     images = to_tensors(_recorded(results), norm)
     _check_not_augmented(results)
-    infos = results.get("images")
-    source = read_views(
-        _given(results, len(images)), len(images), _names(infos, len(images)), _lidar2ego(results, lidar2ego)
-    )
-    if isinstance(infos, Mapping) and len(infos) == len(images):
-        images = [_without_padding(image, info) for image, info in zip(images, infos.values(), strict=True)]
+    count, infos = len(images), results.get("images")
+    by_name: Mapping[str, Any] = infos if isinstance(infos, Mapping) and len(infos) == count else {}
+    camera_names = [*map(str, by_name)] or [f"camera {k}" for k in range(count)]
+    source = read_views(_given(results, by_name), count, camera_names, _lidar2ego(results, lidar2ego))
+    for k, info in enumerate(by_name.values()):  # mmdet3d pads images of several sizes to the largest
+        if isinstance(info, Mapping) and "height" in info and "width" in info:
+            images[k] = images[k][:, : int(info["height"]), : int(info["width"])]
     out = retarget(
         {"images": images, "rig": source_rig(source, images, ground_z_m), **geometry(results, source.lidar2ego)}
     )
     views = target_views(out, source, names)
-    kept = {key: value for key, value in results.items() if key not in STALE_KEYS}
-    if isinstance(kept.get("ann_info"), Mapping):
-        kept["ann_info"] = {key: value for key, value in kept["ann_info"].items() if key not in STALE_KEYS}
-    warn_of_dropped(results)
+    kept = without_stale(results)
     kept["img"] = images_like(results["img"], out["images"], norm)
-    _write_matrices(kept, views)
-    _write_intrinsics(kept, views, out["images"])
+    _write_numbers(kept, views, out["images"])
     if isinstance(infos, Mapping):
         kept["images"] = _infos(infos, views, out["images"])
-    _write_sizes(kept, out["images"])
     for key in FILE_KEYS:
         if isinstance(kept.get(key), list | tuple):
             kept[key] = list(views.names)
@@ -118,15 +103,16 @@ def retarget_results(
 
 
 # --- source -----------------------------------------------------------------------------------------------------------
-def _given(results: Mapping[str, Any], count: int) -> dict[str, Any]:
+def _given(results: Mapping[str, Any], by_name: Mapping[str, Any]) -> dict[str, Any]:
     """The matrices of all cameras: at the top, else gathered from ``images``."""
-    matrices = {key: results[key] for key in MATRICES if results.get(key) is not None and _is_per_camera(results[key])}
-    infos = results.get("images")
-    if isinstance(infos, Mapping) and len(infos) == count:
-        for key in MATRICES:
-            if key not in matrices and all(isinstance(info, Mapping) and key in info for info in infos.values()):
-                matrices[key] = [info[key] for info in infos.values()]
-    return matrices
+    infos = [*by_name.values()]
+    gathered = {
+        key: [info[key] for info in infos]
+        for key in MATRICES
+        if infos and all(isinstance(info, Mapping) and key in info for info in infos)
+    }
+    at_top = {key: results[key] for key in MATRICES if results.get(key) is not None}
+    return gathered | {key: value for key, value in at_top.items() if _is_per_camera(value)}
 
 
 def _is_per_camera(value: Any) -> bool:
@@ -134,15 +120,8 @@ def _is_per_camera(value: Any) -> bool:
     return len(value) > 0 and np.ndim(value[0]) == 2
 
 
-def _names(infos: Any, count: int) -> list[str]:
-    if isinstance(infos, Mapping) and len(infos) == count:
-        return [str(name) for name in infos]
-    return [f"camera {k}" for k in range(count)]
-
-
 def _lidar2ego(results: Mapping[str, Any], matrix: Any) -> FloatArray:
-    points = results.get("lidar_points")
-    for holder in (points, results):
+    for holder in (results.get("lidar_points"), results):
         if isinstance(holder, Mapping) and holder.get("lidar2ego") is not None:
             return stacked("lidar2ego", [holder["lidar2ego"]], 1)[0]
     if "lidar2ego_rotation" in results and "lidar2ego_translation" in results:  # BEVFormer, Sparse4D
@@ -163,13 +142,6 @@ def _check_not_augmented(results: Mapping[str, Any]) -> None:
         value = results.get(key)
         if value is not None and np.abs(np.asarray(value, np.float64) - np.eye(4)).max() > 1e-6:
             raise SampleError(f"{key}: expected none yet, got one; retarget right after loading, before augmentations")
-
-
-def _without_padding(image: torch.Tensor, info: Any) -> torch.Tensor:
-    """An image as recorded: mmdet3d pads those of several sizes to the largest."""
-    if not isinstance(info, Mapping) or "height" not in info or "width" not in info:
-        return image
-    return image[:, : int(info["height"]), : int(info["width"])]
 
 
 def _recorded(results: Mapping[str, Any]) -> Any:
@@ -213,21 +185,20 @@ def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, tor
         values["points"] = torch.from_numpy(xyz @ lidar2ego[:3, :3].T + lidar2ego[:3, 3]).float()
     annotated = results.get("ann_info")
     boxes = results.get("gt_bboxes_3d", annotated.get("gt_bboxes_3d") if isinstance(annotated, Mapping) else None)
-    corners = getattr(boxes, "corners", None)
+    corners, rotation = getattr(boxes, "corners", None), lidar2ego[:3, :3]
     if isinstance(boxes, np.ndarray) and boxes.ndim == 2 and boxes.shape[1] >= 7:
-        rotation = lidar2ego[:3, :3]
-        centres, yaw = boxes[:, :3] @ rotation.T + lidar2ego[:3, 3], boxes[:, 6]
-        along = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1) @ rotation.T
-        columns = [*centres.T, *boxes[:, 3:6].T, np.arctan2(along[:, 1], along[:, 0])]
-        values["boxes_3d"] = torch.from_numpy(np.stack(columns, axis=1)).float()
+        centres, sizes, yaw = boxes[:, :3], boxes[:, 3:6].T, boxes[:, 6]
+        along = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
     elif corners is not None:
-        # Of both conventions: 1 is above 0, 3 beside it, 4 at the other end.
-        x = np.asarray(corners, np.float64).reshape(-1, 8, 3) @ lidar2ego[:3, :3].T + lidar2ego[:3, 3]
-        along, across, up = x[:, 4] - x[:, 0], x[:, 3] - x[:, 0], x[:, 1] - x[:, 0]
-        sizes = [np.linalg.norm(side, axis=1) for side in (along, across, up)]
-        columns = [*x.mean(axis=1).T, *sizes, np.arctan2(along[:, 1], along[:, 0])]
-        values["boxes_3d"] = torch.from_numpy(np.stack(columns, axis=1)).float()
-    return values
+        # In both conventions corner 1 is above 0, 3 beside it, 4 at the other end.
+        x = np.asarray(corners, np.float64).reshape(-1, 8, 3)
+        centres, along = x.mean(axis=1), x[:, 4] - x[:, 0]
+        sizes = np.linalg.norm([along, x[:, 3] - x[:, 0], x[:, 1] - x[:, 0]], axis=-1)
+    else:
+        return values
+    along = along @ rotation.T
+    columns = [*(centres @ rotation.T + lidar2ego[:3, 3]).T, *sizes, np.arctan2(along[:, 1], along[:, 0])]
+    return values | {"boxes_3d": torch.from_numpy(np.stack(columns, axis=1)).float()}
 
 
 # --- target -----------------------------------------------------------------------------------------------------------
@@ -277,22 +248,24 @@ def target_outputs(outs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return outputs
 
 
-def _write_matrices(out: dict[str, Any], views: Views) -> None:
+def _write_numbers(out: dict[str, Any], views: Views, images: torch.Tensor) -> None:
+    """Matrices and sizes; Sparse4D's (w, h) of each image, and geometric mean of its focal lengths."""
     for key, kind in MATRICES.items():
-        if out.get(key) is None:
-            continue
-        if not _is_per_camera(out[key]):
-            del out[key]
-            continue
-        out[key] = _as_written(out[key], views.matrices(kind))
-
-
-def _write_intrinsics(out: dict[str, Any], views: Views, images: torch.Tensor) -> None:
-    """Sparse4D's further ones: (w, h) of each image, and the geometric mean of its focal lengths."""
+        if out.get(key) is not None:
+            matrices = out.pop(key)
+            if _is_per_camera(matrices):
+                out[key] = _as_written(matrices, views.matrices(kind))
+    h, w = images.shape[-2:]
     if "image_wh" in out:
-        out["image_wh"] = like_array(out["image_wh"], [images.shape[:-3:-1]] * len(images))
+        out["image_wh"] = like_array(out["image_wh"], [(w, h)] * len(images))
     if "focal" in out:
         out["focal"] = like_array(out["focal"], np.sqrt(np.abs(np.linalg.det(views.K[:, :2, :2]))))
+    # (h, w), (h, w, 3), (h, w, 3, views) as given; (w, h) where images are PIL's.
+    full = (h, w, 3, len(images)) if isinstance(out["img"][0], np.ndarray | torch.Tensor) else (w, h)
+    for key in SHAPE_KEYS:
+        if isinstance(shape := out.get(key), tuple | list):
+            is_list = isinstance(shape[0], tuple | list)
+            out[key] = [full[: len(shape[0])]] * len(images) if is_list else full[: len(shape)]
 
 
 def _as_written(original: Any, matrices: FloatArray) -> Any:
@@ -320,22 +293,13 @@ def _infos(infos: Mapping[str, Any], views: Views, images: torch.Tensor) -> dict
     return by_camera
 
 
-def _write_sizes(out: dict[str, Any], images: torch.Tensor) -> None:
-    """(h, w), (h, w, 3), (h, w, 3, views) as given; (w, h) where images are PIL's."""
-    h, w = images.shape[-2:]
-    is_array = isinstance(out["img"][0], np.ndarray | torch.Tensor)
-    full = (h, w, 3, len(images)) if is_array else (w, h)
-    for key in SHAPE_KEYS:
-        if isinstance(out.get(key), tuple | list):
-            original = out[key]
-            one = original[0] if isinstance(original[0], tuple | list) else None
-            out[key] = full[: len(original)] if one is None else [full[: len(one)]] * len(images)
-
-
-def warn_of_dropped(results: Mapping[str, Any]) -> None:
-    """Warn of labels that are dropped."""
-    annotated = results.get("ann_info")
-    held = [*results, *(annotated if isinstance(annotated, Mapping) else ())]
-    dropped = sorted({key for key in held if key in STALE_KEYS})
+def without_stale(results: Mapping[str, Any], *, silently: str = "") -> dict[str, Any]:
+    """Drop ``STALE_KEYS``, also in ``ann_info``, with a warning but for the one that goes ``silently``."""
+    kept = {key: value for key, value in results.items() if key not in STALE_KEYS}
+    dropped = {*results} - {*kept, silently}
+    if isinstance(annotated := kept.get("ann_info"), Mapping):
+        kept["ann_info"] = {key: value for key, value in annotated.items() if key not in STALE_KEYS}
+        dropped |= {*annotated} - {*kept["ann_info"]}
     if dropped:
-        warn(f"retarget: drops {', '.join(dropped)}: they speak of the source's pixels")
+        warn(f"retarget: drops {', '.join(sorted(dropped))}: they speak of the source's pixels")
+    return kept

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from arbiview_aug import SampleError, load_rig
+from arbiview_aug import SampleError, SampleKeys, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.integrations.autoware_ml import RigRetargetMultiViewImages
 from integrations.mmdet3d.fake_results import FORMS, LIDAR2EGO, Recording, recording, source_rig
@@ -91,3 +91,5 @@ def test_config_of_the_readme(given: Recording, tmp_path: Path, monkeypatch: pyt
     module, name = node.pop("_target_").rsplit(".", 1)
     transform = getattr(import_module(module), name)(**node, geometry="street")
     assert transform(loaded(given))["img"].shape == (5, 3, 256, 704)
+    more = RigRetargetMultiViewImages(**node, keys={"extra": ["confidence"]})
+    assert more.step.retarget.keys == SampleKeys(extra=("confidence",))

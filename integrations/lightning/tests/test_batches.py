@@ -10,7 +10,7 @@ from torchvision import tv_tensors
 
 from arbiview_aug import RigRetarget, SampleError, SampleKeys
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.integrations.lightning.batches import ON_HOST, on_device, packed, unpacked
+from arbiview_aug.integrations.lightning import ON_HOST, on_device, packed, unpacked
 from arbiview_aug.sample.collate import collate
 
 RIG = demo_source_rig((48, 128))
