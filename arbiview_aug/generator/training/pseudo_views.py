@@ -29,8 +29,8 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.renderer import render_paper
 from arbiview_aug.generator.completion import Conditions, nearest_sources, seeded, valid_pixels
+from arbiview_aug.generator.conditioning import FrameGeometry, batched, frame_geometry
 from arbiview_aug.generator.config import GeneratorConfig
-from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geometry
 from arbiview_aug.generator.training.config import PseudoQuality, PseudoViewConfig
 from arbiview_aug.generator.training.data import Frames
 from arbiview_aug.inpaint.telea import telea
