@@ -16,7 +16,7 @@ from torch.nn import functional
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import GeneratorError, SampleError
-from arbiview_aug.generator.conditioning import FrameGeometry, Views, batched, by_axis, frame_geometry
+from arbiview_aug.generator.conditioning import FrameGeometry, Views, batched, frame_geometry
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.correspondence import TokenWindow
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, GeneratorNetworks
@@ -244,8 +244,9 @@ def shown_condition(config: GeneratorConfig, prefilled: torch.Tensor, known: tor
 
 
 def nearest_sources(target: Camera, sources: Rig) -> list[int]:
-    """Indices of the sources whose optical axes are nearest to a target's."""
-    return by_axis(target, list(sources))[:SOURCES_PER_TARGET]
+    """Indices of the sources whose optical axes are nearest to a target's; ties are broken by content."""
+    likeness = [(float(-s.cam2ego[:3, 2] @ target.cam2ego[:3, 2]), s.content_key, k) for k, s in enumerate(sources)]
+    return [k for _, _, k in sorted(likeness)[:SOURCES_PER_TARGET]]
 
 
 # --- pixels -----------------------------------------------------------------------------------------------------------

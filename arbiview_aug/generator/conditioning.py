@@ -69,10 +69,9 @@ def input_channels(latent_channels: int) -> int:
 
 
 # --- geometry ---------------------------------------------------------------------------------------------------------
-def by_axis(camera: Camera, others: Sequence[Camera]) -> list[int]:
-    """Indices of cameras, those whose optical axes are nearest to a camera's first; ties are broken by content."""
-    unlikeness = [(float(-other.cam2ego[:3, 2] @ camera.cam2ego[:3, 2]), other.content_key) for other in others]
-    return sorted(range(len(others)), key=unlikeness.__getitem__)
+def reference_camera(target: Camera, sources: Sequence[Camera]) -> Camera:
+    """The source whose optical axis is nearest to the target's; ties are broken by content."""
+    return max(sources, key=lambda source: (float(source.cam2ego[:3, 2] @ target.cam2ego[:3, 2]), source.content_key))
 
 
 def relative_pose(camera: Camera, reference: Camera) -> tuple[FloatArray, FloatArray]:
@@ -173,7 +172,7 @@ def frame_geometry(
 ) -> FrameGeometry:
     """The geometry of one frame (B = 1), whose N targets, S sources and road lie in one ego frame."""
     size = config.latent_size
-    viewed = [(target, sources[by_axis(target, sources)[0]]) for target in targets], [(one, one) for one in sources]
+    viewed = [(target, reference_camera(target, sources)) for target in targets], [(one, one) for one in sources]
     rays = [torch.stack([plucker_rays(*pair, size) for pair in pairs])[None] for pairs in viewed]
     poses = [torch.stack([pose_vector(*pair) for pair in pairs])[None] for pairs in viewed]
     keys, count = [*sources, *targets], len(sources)

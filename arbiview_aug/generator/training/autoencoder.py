@@ -20,9 +20,7 @@ from arbiview_aug.generator.training.data import Frames, item_workers
 from arbiview_aug.generator.training.losses import Perceptual
 from arbiview_aug.generator.training.pseudo_views import one_of
 
-FOLDER = "autoencoder"
 _SCALE_IMAGES = 64  # number of images that set the latents' scale, to within 0.1 %
-
 _MESSAGE_EVERY = 250
 
 
@@ -43,31 +41,39 @@ def train_autoencoder(
     settings of this stage; the other arguments are those of ``Trainer``. TrainingError if the saved one has another
     architecture, or a loss is not finite.
     """
-    stage, vae, folder = config.autoencoder, generator.autoencoder.vae, output / FOLDER
+    stage, vae, folder = config.autoencoder, generator.autoencoder.vae, output / "autoencoder"
     if stage is None or vae is None:
         return
     if (folder / CONFIG_FILE).is_file():
-        _load(generator, folder)
+        try:
+            data, tensors = read_checkpoint(folder)
+            load_weights(vae, tensors, folder)
+        except GeneratorError as error:
+            raise TrainingError(f"{error}; delete {folder} to train another autoencoder") from None
+        generator.autoencoder.scale = float(data["scale"])
         return
     if perceptual is not None:
         perceptual.to(generator.device)
     optimiser = torch.optim.AdamW(vae.parameters(), lr=stage.lr)
     vae.train()
     batches = _Batches(frames, frames.split(config.seed).training, stage.batch, config.seed)
-    loader: DataLoader[torch.Tensor] = DataLoader(
-        batches, batch_size=None, sampler=range(stage.steps), **item_workers(config.workers)
+    workers: Any = item_workers(config.workers)
+    bar = tqdm(
+        DataLoader(batches, batch_size=None, sampler=range(stage.steps), **workers),
+        desc="autoencoder",
+        unit="step",
+        disable=not show,
     )
-    bar = tqdm(loader, desc="autoencoder", unit="step", disable=not show)
     for step, on_cpu in enumerate(bar):
         rng = torch.Generator().manual_seed((2 * config.seed + 1) * 2**32 + step)
         images = on_cpu.to(generator.device).float() / 255
         terms = _terms(vae, images, stage, perceptual, rng, bf16=config.precision == "bf16")
-        numbers = torch.stack(list(terms.values())).detach().tolist()
-        values = dict(zip(terms, numbers, strict=True))
+        losses = torch.stack(list(terms.values()))
+        values = dict(zip(terms, losses.tolist(), strict=True))
         for name, value in values.items():
             if not math.isfinite(value):
                 raise TrainingError(f"autoencoder, step {step}: loss term {name} is {value}; lower its lr")
-        torch.stack(list(terms.values())).sum().backward()
+        losses.sum().backward()
         torch.nn.utils.clip_grad_norm_(vae.parameters(), 1.0)
         optimiser.step()
         optimiser.zero_grad(set_to_none=True)
@@ -101,17 +107,6 @@ def _terms(
     if perceptual is not None:
         terms["perceptual"] = stage.perceptual * perceptual(decoded, images).mean()
     return terms
-
-
-def _load(generator: Generator, folder: Path) -> None:
-    vae = generator.autoencoder.vae
-    assert vae is not None
-    try:
-        data, tensors = read_checkpoint(folder)
-        load_weights(vae, tensors, folder)
-    except GeneratorError as error:
-        raise TrainingError(f"{error}; delete {folder} to train another autoencoder") from None
-    generator.autoencoder.scale = float(data["scale"])
 
 
 class _Batches(Dataset[torch.Tensor]):

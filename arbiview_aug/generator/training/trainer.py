@@ -66,7 +66,7 @@ class Trainer:
         self.config, self.frames, self.output = config, frames, Path(output)
         self.accelerator = accelerate.Accelerator(mixed_precision=config.precision, cpu=not torch.cuda.is_available())
         self.is_main: bool = self.accelerator.is_main_process
-        self.show, self.say = show and self.is_main, say if self.is_main else _silent
+        self.show, self.say = show and self.is_main, say if self.is_main else silent
         self.device = self.accelerator.device
         scaled = replace(config.generator.autoencoder, scale=generator.config.autoencoder.scale)
         if generator.config != replace(config.generator, autoencoder=scaled, one_step=generator.config.one_step):
@@ -239,7 +239,7 @@ class Trainer:
         return mean_hole_psnr(methods, batch), picture(batch, samples)
 
 
-def _silent(message: str) -> None:
+def silent(message: str) -> None:
     """Say nothing: the main process alone prints."""
 
 
