@@ -24,7 +24,9 @@ from arbiview_aug.generator.sampler import guided, noise_schedule, sample
 from arbiview_aug.image_ops import resized
 from arbiview_aug.inpaint.inpainter import check_device, known_and_holes, seeded
 from arbiview_aug.inpaint.telea import telea
+from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.batching import stacked
+from arbiview_aug.sample.inputs import Frame
 
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
 SOURCES_PER_TARGET = 2  # source branches of a target camera, as in training (Algorithm 1: left and right)
@@ -59,32 +61,13 @@ class Conditions(NamedTuple):
         return targets, geometry.source_views(sources, self.seen, self.seen)
 
 
-class FrameViews(NamedTuple):
-    """A frame to complete.
-
-    Attributes:
-        views: (M, 3, h, w), or M tensors (3, h, w): FAVS at the target cameras, uint8 or float in [0, 1].
-        coverage: (M, h, w) bool, or M tensors: pixels that some source saw.
-        targets: The M target cameras; pixels of their own car (masks) are not generated.
-        source_images: N images (3, H, W).
-        sources: The N cameras that recorded them.
-        confidence: (M, h, w) in [0, 1], or M tensors; 1 by default.
-        frame: Name of the frame, for the noise.
-    """
-
-    views: Maps
-    coverage: Maps
-    targets: Rig
-    source_images: Maps
-    sources: Rig
-    confidence: Maps | None = None
-    frame: str | int = 0
-
-
 class _Draft(NamedTuple):
     """A frame with its almost complete views inpainted; the others are left to the generator."""
 
-    frame: FrameViews
+    rig: Rig  # the target cameras
+    trust: Maps
+    source: Frame
+    name: str
     images: list[torch.Tensor]
     known: list[torch.Tensor]
     holes: list[torch.Tensor]
@@ -104,27 +87,42 @@ def complete(
     frame: str | int = 0,
     **settings: Any,
 ) -> Completed:
-    """Complete the target views of one frame: ``FrameViews``, and the settings of ``complete_together``."""
-    one = FrameViews(views, coverage, targets, source_images, sources, confidence, frame)
-    return complete_together(generator, [one], **settings)[0]
+    """Complete the target views of one frame.
+
+    Args:
+        views: (M, 3, h, w), or M tensors (3, h, w): FAVS at the target cameras, uint8 or float in [0, 1].
+        coverage: (M, h, w) bool, or M tensors: pixels that some source saw.
+        targets: The M target cameras; pixels of their own car (masks) are not generated.
+        source_images: N images (3, H, W).
+        sources: The N cameras that recorded them.
+        confidence: (M, h, w) in [0, 1], or M tensors; 1 by default.
+        frame: Name of the frame, for the noise.
+        settings: Those of ``complete_together``.
+    """
+    trust = None if confidence is None else list(confidence)
+    rendered = RenderedFrame(list(views), targets, list(coverage), confidence=trust)
+    return complete_together(generator, [rendered], [Frame(tuple(source_images), sources)], [str(frame)], **settings)[0]
 
 
 @torch.no_grad()
 def complete_together(
     generator: GeneratorNetworks,
-    frames: Sequence[FrameViews],
+    rendered: Sequence[RenderedFrame],
+    sources: Sequence[Frame],
+    names: Sequence[str],
     *,
     min_confidence: float = 0.0,
     steps: int | None = None,
     guidance: float | None = None,
     seed: int = 0,
 ) -> list[Completed]:
-    """Complete the target views of frames; those with as many views to denoise share the denoiser's calls.
+    """Complete rendered frames of ``sources``; those with as many views to denoise share the denoiser's calls.
 
     The result depends on the seed, the frame and the cameras' names, not on the order of the cameras or on earlier
     calls. It is computed on the generator's device and returned on the views'.
 
     Args:
+        names: Names of the frames, for the noise.
         min_confidence: Covered pixels below this confidence are generated too.
         steps: Denoising steps; 1 is the one-step regression. Default: the generator's.
         guidance: Classifier-free guidance; 1 is none. Default: the generator's.
@@ -144,7 +142,7 @@ def complete_together(
             "trained (loss.regression=0)"
         )
     check_device(generator)
-    drafts = [_draft(frame, min_confidence) for frame in frames]
+    drafts = [_draft(*frame, min_confidence) for frame in zip(rendered, sources, names, strict=True)]
     alike: dict[tuple[int, int], list[_Draft]] = {}
     for draft in drafts:
         if draft.left:
@@ -162,37 +160,35 @@ def complete_together(
     return [Completed(stacked(draft.images), stacked(draft.holes), draft.left) for draft in drafts]
 
 
-def _draft(frame: FrameViews, min_confidence: float) -> _Draft:
+def _draft(rendered: RenderedFrame, source: Frame, name: str, min_confidence: float) -> _Draft:
     """Inpaint the views of a frame that are almost complete."""
-    targets, sources = frame.targets.in_frame_of(frame.sources), frame.sources
-    if len(frame.source_images) != len(sources):
-        raise SampleError(f"complete: expected {len(sources)} source images, got {len(frame.source_images)}")
-    _check_sizes(frame.views, frame.coverage, targets)
-    trust = frame.coverage if frame.confidence is None else frame.confidence
-    images, left = list(frame.views), []
-    known, holes = known_and_holes(targets, frame.coverage, trust, min_confidence)
+    rig, images, left = rendered.rig.in_frame_of(source.rig), list(rendered.images), []
+    if len(source.images) != len(source.rig):
+        raise SampleError(f"complete: expected {len(source.rig)} source images, got {len(source.images)}")
+    _check_sizes(images, rendered.coverage, rig)
+    trust = rendered.coverage if rendered.confidence is None else rendered.confidence
+    known, holes = known_and_holes(rig, rendered.coverage, trust, min_confidence)
     for m, hole in enumerate(holes):
         if float(hole.float().mean()) > 1 - ALMOST_COMPLETE:
             left.append(m)
         elif bool(hole.any()):
             images[m] = torch.where(hole, telea(images[m], ~known[m]), images[m])
-    branches = sorted({k for m in left for k in nearest_sources(targets[m], sources)})
-    return _Draft(frame._replace(targets=targets, confidence=trust), images, known, holes, left, branches)
+    branches = sorted({k for m in left for k in nearest_sources(rig[m], source.rig)})
+    return _Draft(rig, trust, source, name, images, known, holes, left, branches)
 
 
 def _inputs(draft: _Draft, config: GeneratorConfig, seed: int) -> tuple[Conditions, FrameGeometry, torch.Tensor]:
     """Conditions, cameras and noise of a frame's views that are left, on the CPU."""
-    frame, size = draft.frame, config.image_size
-    sources, targets = [frame.sources[k] for k in draft.branches], [frame.targets[m] for m in draft.left]
-    assert frame.confidence is not None
-    views = [_prefilled(draft.images[m], draft.known[m], frame.confidence[m], size) for m in draft.left]
-    images = [unit(resized(frame.source_images[k], size)) for k in draft.branches]
+    source, size = draft.source, config.image_size
+    sources, targets = [source.rig[k] for k in draft.branches], [draft.rig[m] for m in draft.left]
+    views = [_prefilled(draft.images[m], draft.known[m], draft.trust[m], size) for m in draft.left]
+    images = [unit(resized(source.images[k], size)) for k in draft.branches]
     seen = [valid_pixels(camera.resize(size)).float() for camera in sources]
     conditions = Conditions(*(torch.stack(list(part))[None] for part in (*zip(*views, strict=True), images, seen)))
     # Noise of a (frame, camera) is drawn on the CPU: the same on every device.
     shape = config.autoencoder.latent_channels, *config.latent_size
-    noise = [torch.randn(shape, generator=seeded(seed, str(frame.frame), one.name)) for one in targets]
-    return conditions, frame_geometry(targets, sources, frame.sources.ground_z_m, config), torch.stack(noise)[None]
+    noise = [torch.randn(shape, generator=seeded(seed, draft.name, one.name)) for one in targets]
+    return conditions, frame_geometry(targets, sources, source.rig.ground_z_m, config), torch.stack(noise)[None]
 
 
 def denoised(

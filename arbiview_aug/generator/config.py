@@ -157,9 +157,7 @@ class GeneratorConfig:
     prefilled: bool = True  # inpaint the condition's holes by Telea's method; else mid-grey, as in Algorithm 1
     one_step: bool = True  # whether the one-step regression was trained
     frozen_unet: bool = False  # train only attention, pose, LoRA, the one-step head and the widened conv_in
-    inpainting: bool = (
-        False  # the U-Net reads [noisy, hole, masked latent] first, as Stable Diffusion's inpainting does
-    )
+    inpainting: bool = False  # the U-Net's input begins as Stable Diffusion's inpainting: noisy, hole, masked latent
     lora_rank: int = 0  # rank of the changes to the U-Net's own attention (Hu et al. 2022); 0 for none
     prompt_tokens: int = 0  # tokens of the empty prompt's embedding
     facing_m: float = FACING_M  # distance of the depth level that faces the camera
@@ -255,13 +253,7 @@ def compact() -> GeneratorConfig:
     return GeneratorConfig(
         name="compact",
         image_size=(64, 112),
-        unet=UNetConfig(
-            widths=(64, 96, 128),
-            transformers=(False, True, True),
-            cross_view=(False, True, True),
-            layers=1,
-            context_width=64,
-        ),
+        unet=_light_unet((64, 96, 128), norm_groups=32),
         autoencoder=AutoencoderConfig(patch=4, latent_channels=48),
         steps=1,  # after an hour of training, samples of more steps are speckled
     )
@@ -272,13 +264,13 @@ def tiny() -> GeneratorConfig:
     return GeneratorConfig(
         name="tiny",
         image_size=(32, 56),
-        unet=UNetConfig(
-            widths=(32, 64, 64),
-            transformers=(False, True, True),
-            cross_view=(False, True, True),
-            layers=1,
-            context_width=64,
-            norm_groups=8,
-        ),
+        unet=_light_unet((32, 64, 64), norm_groups=8),
         autoencoder=AutoencoderConfig(patch=2, latent_channels=12),
+    )
+
+
+def _light_unet(widths: tuple[int, int, int], norm_groups: int) -> UNetConfig:
+    coarse = (False, True, True)
+    return UNetConfig(
+        widths=widths, transformers=coarse, cross_view=coarse, layers=1, context_width=64, norm_groups=norm_groups
     )
