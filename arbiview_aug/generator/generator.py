@@ -63,11 +63,9 @@ class Generator(GeneratorNetworks):
         latent = config.autoencoder.latent_channels
         unet = unet_class(**config.unet.arguments(input_channels(latent), latent))
         vae = vae_class(**config.autoencoder.arguments()) if config.autoencoder.widths else None
-        signal = None
-        if config.residual:
-            with torch.device("cpu"):  # also where the weights are on meta
-                schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr)
-            signal = schedule.alphas_cumprod.double().sqrt().float()
+        with torch.device("cpu"):  # also where the weights are on meta
+            schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr)
+        signal = schedule.alphas_cumprod.double().sqrt().float() if config.residual else None
         return cls(config, unet, vae, signal)
 
     @classmethod

@@ -208,15 +208,13 @@ class Step(nn.Module):
         if perceptual and vgg is not None and bool(early.any()):
             image = autoencoder.decode(self.diffusion.x0(noisy, predicted, t)[early]).float()
             truth, known = batch.truth[early], batch.valid[early][:, :, None]
-            y, x = (slice(start, start + loss.perceptual_crop) for start in self._corner(truth, draws.rng))
-            image, truth, known = (value[..., y, x].flatten(0, 1) for value in (image, truth, known))
+            side = loss.perceptual_crop  # a random square, or the whole image
+            spans = (n - min(side, n) + 1 for n in config.generator.image_size)
+            y, x = (int(torch.randint(span, (), generator=draws.rng)) for span in spans)
+            views = (image, truth, known)
+            image, truth, known = (value[..., y : y + side, x : x + side].flatten(0, 1) for value in views)
             terms["perceptual"] = vgg(torch.where(known, image, truth), truth).sum() / len(t)
         return terms
-
-    def _corner(self, images: torch.Tensor, rng: torch.Generator) -> list[int]:
-        """First row and column of the square of images (..., h, w) that L_perceptual compares."""
-        side = self.config.loss.perceptual_crop
-        return [int(torch.randint(n - min(side, n) + 1, (), generator=rng)) for n in images.shape[-2:]]
 
     def _latents(self, batch: Batch) -> torch.Tensor:
         """x0 (B, N, C, h, w) of the truth; a VAE encodes each real view once, and alone: the same bits in any batch."""
