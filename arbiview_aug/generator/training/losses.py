@@ -211,8 +211,8 @@ class Step(nn.Module):
             side = loss.perceptual_crop  # a random square, or the whole image
             spans = (n - min(side, n) + 1 for n in config.generator.image_size)
             y, x = (int(torch.randint(span, (), generator=draws.rng)) for span in spans)
-            views = (image, truth, known)
-            image, truth, known = (value[..., y : y + side, x : x + side].flatten(0, 1) for value in views)
+            compared = (image, truth, known)
+            image, truth, known = (value[..., y : y + side, x : x + side].flatten(0, 1) for value in compared)
             terms["perceptual"] = vgg(torch.where(known, image, truth), truth).sum() / len(t)
         return terms
 
