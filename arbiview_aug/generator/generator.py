@@ -144,8 +144,7 @@ class Generator(GeneratorNetworks):
         Raises:
             OutputError: The disk is full, or the folder cannot be written.
         """
-        scaled = replace(self.config.autoencoder, scale=self.autoencoder.scale)
-        config = {"generator": asdict(replace(self.config, autoencoder=scaled))}
+        config = {"generator": asdict(self.config)}
         if self.trained_on is not None:
             config["trained_on"] = asdict(self.trained_on)
         write_checkpoint(Path(folder), config, self.state_dict())

@@ -15,7 +15,6 @@ from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.training.autoencoder import train_autoencoder
 from arbiview_aug.generator.training.checkpointing import saved_config
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.data import open_frames
@@ -25,7 +24,7 @@ from arbiview_aug.generator.training.trainer import Trainer, silent
 
 COMMANDS = ("train", "evaluate")
 
-_TIMEOUT = timedelta(hours=3)  # timeout of the other processes, while one trains the autoencoder or scores
+_TIMEOUT = timedelta(hours=3)  # timeout of the other processes, while one renders or scores
 
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
@@ -41,8 +40,6 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
     if arguments.command == "evaluate":
         _evaluate(arguments, config, output, processes.device, **options)
         return 0
-    if arguments.stage == "autoencoder" and config.autoencoder is None:
-        raise TrainingError(f"--stage autoencoder: --config {arguments.config} has none of its own")
     check_weights(config, arguments.weights)
     options["perceptual"] = load_perceptual(arguments.vgg_weights) if config.loss.perceptual else None
     data, device = arguments.data or "synthetic", processes.device
@@ -55,13 +52,7 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
         # Each process takes a second to start, a street half a second to render.
         readers = min(8, os.cpu_count() or 1) if device.type == "cpu" and len(used) >= 16 else 0
         frames.prepare(used, workers=readers, show=options["show"])
-    generator = fresh(config, arguments.weights).to(device)
-    with processes.main_process_first():  # the others load the autoencoder that it saved
-        train_autoencoder(config, frames, generator, output, **options)
-    if arguments.stage == "autoencoder":
-        say(f"the autoencoder is in {output / 'autoencoder'}")
-    else:
-        Trainer(config, frames, generator, output, **options).train()
+    Trainer(config, frames, fresh(config, arguments.weights).to(device), output, **options).train()
     return 0
 
 

@@ -71,22 +71,10 @@ class LossConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AutoencoderTraining:
-    """The first stage, for configurations with an autoencoder of their own."""
-
-    steps: int = 3000
-    batch: int = 32
-    lr: float = 3e-4
-    kl: float = 1e-6  # weight of the KL term: Stable Diffusion's (Rombach et al. 2022)
-    perceptual: float = 0.1  # weight of the VGG term
-
-
-@dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     generator: GeneratorConfig
     pseudo_views: PseudoViewConfig = field(default_factory=PseudoViewConfig)
     loss: LossConfig = field(default_factory=LossConfig)
-    autoencoder: AutoencoderTraining | None = None  # None if latents are pixels, or the autoencoder is pretrained
     steps: int
     batch: int  # items per process and step
     lr: float
@@ -194,7 +182,6 @@ def small() -> TrainConfig:
     """Minutes on a GPU."""
     return TrainConfig(
         generator=generators.small(),
-        autoencoder=AutoencoderTraining(),
         steps=20_000,
         batch=16,
         lr=3e-4,
