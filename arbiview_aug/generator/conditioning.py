@@ -27,6 +27,7 @@ from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.correspondence import (
     Correspondence,
     TokenWindow,
+    between,
     correspondences,
     stacked,
     token_sizes,
@@ -76,10 +77,9 @@ def reference_camera(target: Camera, sources: Sequence[Camera]) -> Camera:
 
 def relative_pose(camera: Camera, reference: Camera) -> tuple[FloatArray, FloatArray]:
     """R (3, 3) and t (3,) from the camera's frame to the reference's, t compressed to less than 1: t / (1 + |t|)."""
-    to_reference = reference.cam2ego[:3, :3].T
     with np.errstate(over="ignore"):  # of poses beyond 1e154 m
-        t = to_reference @ (camera.center_m - reference.center_m)
-        return to_reference @ camera.cam2ego[:3, :3], t / (1 + np.linalg.norm(t))
+        R, t = between(camera, reference)
+        return R, t / (1 + np.linalg.norm(t))
 
 
 def plucker_rays(camera: Camera, reference: Camera, size: tuple[int, int]) -> torch.Tensor:

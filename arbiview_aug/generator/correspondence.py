@@ -59,11 +59,15 @@ def plane_vectors(camera: Camera, ground_z_m: float, facing_m: float = FACING_M)
     return np.stack([np.zeros(3), road, np.array([0.0, 0.0, 1 / facing_m])])
 
 
+def between(query: Camera, key: Camera) -> tuple[FloatArray, FloatArray]:
+    """R (3, 3) and t (3,), metres, from the frame of ``query`` to that of ``key``: X_j = R X_i + t."""
+    to_key = key.cam2ego[:3, :3].T
+    return to_key @ query.cam2ego[:3, :3], to_key @ (query.center_m - key.center_m)
+
+
 def ray_map(query: Camera, key: Camera, plane: FloatArray) -> FloatArray:
     """(3, 3) R + t nᵀ/d: rays of ``query`` to rays of ``key`` over a plane (3,) n/d of ``query``'s frame."""
-    to_key = key.cam2ego[:3, :3].T
-    R = to_key @ query.cam2ego[:3, :3]
-    t = to_key @ (query.center_m - key.center_m)
+    R, t = between(query, key)
     return R + np.outer(t, plane)
 
 

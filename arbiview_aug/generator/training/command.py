@@ -24,7 +24,7 @@ from arbiview_aug.generator.training.trainer import Trainer, silent
 
 COMMANDS = ("train", "evaluate")
 
-_TIMEOUT = timedelta(hours=3)  # timeout of the other processes, while one renders or scores
+_TIMEOUT = timedelta(hours=3)  # of a process that waits for the others: they prepare frames, validate and save
 
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
