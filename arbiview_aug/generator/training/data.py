@@ -70,13 +70,8 @@ class Frames:
 
     def prepare(self, indices: Sequence[int], *, workers: int = 0, show: bool = True) -> None:
         """Cache frames, read by ``workers`` processes, before the workers that make items fork and share the memory."""
-        read: DataLoader[TrainingFrame] = DataLoader(
-            self,  # type: ignore[arg-type]
-            batch_size=None,
-            sampler=indices,
-            collate_fn=_unchanged,
-            **forked(workers),
-        )
+        settings: Any = {"batch_size": None, "sampler": indices, "collate_fn": _unchanged, **item_workers(workers)}
+        read: DataLoader[TrainingFrame] = DataLoader(self, **settings)  # type: ignore[arg-type]
         for index, frame in zip(indices, tqdm(read, desc="frames", unit="frame", disable=not show), strict=True):
             if workers:  # copied, since each tensor in shared memory keeps a file open
                 frame = frame._replace(images=[image.clone() for image in frame.images])
@@ -108,17 +103,13 @@ def _bytes_of(frame: TrainingFrame) -> int:
     return sum(image.nbytes for image in frame.images)
 
 
-def forked(count: int) -> dict[str, Any]:
-    """Arguments of a ``DataLoader`` with workers; 0 makes its items in this process.
+def item_workers(count: int) -> dict[str, Any]:
+    """Arguments of a ``DataLoader`` with workers of one thread each; 0 makes its items in this process.
 
     Workers fork, to share this process's frames (not the default from Python 3.14).
     """
-    return {"num_workers": count, "multiprocessing_context": "fork" if count else None}
-
-
-def item_workers(count: int) -> dict[str, Any]:
-    """As ``forked``, with one thread for each worker."""
-    return {**forked(count), "worker_init_fn": one_thread_worker if count else None}
+    started = ("fork", one_thread_worker) if count else (None, None)
+    return {"num_workers": count, "multiprocessing_context": started[0], "worker_init_fn": started[1]}
 
 
 def one_thread_worker(worker: int) -> None:

@@ -212,9 +212,16 @@ class Trainer:
             self.say(f"step {self.done}: not saved, going on with the last good state: {error}")
 
     def _validate(self, writer: Any) -> None:
-        """Log samples of fixed items by the averaged weights."""
+        """Log samples of fixed items by the averaged weights, and their mean PSNR inside the holes, in dB by method."""
+        config, steps = self.config, max(2, self.config.generator.steps)
         if self.is_main:
-            scores, image = self.validated()
+            batch = collate([self.validation[k] for k in range(config.validation_items)]).to(self.device)
+            methods = {"condition": batch.condition}
+            with averaged(self.average, self.trained.values()):
+                if config.loss.regression:
+                    methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
+                methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)
+            scores, image = mean_hole_psnr(methods, batch), picture(batch, samples)
             for name, value in scores.items():
                 writer.add_scalar(f"hole_psnr/{name}", value, self.done)
             writer.add_image("validation", image, self.done, dataformats="HWC")
@@ -225,18 +232,6 @@ class Trainer:
             numbers = ", ".join(f"{name} {value:.2f}" for name, value in scores.items())
             self.say(f"step {self.done}: PSNR inside the holes, dB: {numbers}")
         self.accelerator.wait_for_everyone()
-
-    def validated(self) -> tuple[dict[str, float], Any]:
-        """Mean PSNR inside the holes of the validation items, in dB by method, and their picture (h, w, 3) uint8."""
-        config = self.config
-        batch = collate([self.validation[k] for k in range(config.validation_items)]).to(self.device)
-        steps = max(2, config.generator.steps)
-        methods = {"condition": batch.condition}
-        with averaged(self.average, self.trained.values()):
-            if config.loss.regression:
-                methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
-            methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)
-        return mean_hole_psnr(methods, batch), picture(batch, samples)
 
 
 def silent(message: str) -> None:
