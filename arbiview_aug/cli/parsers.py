@@ -207,7 +207,6 @@ def train() -> argparse.ArgumentParser:
     add("--data", metavar="DATA", help=data)
     add_output(parser, "folder of the run")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
-    add("--stage", choices=("all", "autoencoder"), default="all", help="autoencoder: that alone, if the config has one")
     weights = "config paper or inpaint: Stable Diffusion 1.5, or its inpainting model: a folder or hub id"
     add("--weights", metavar="DIR", help=weights)
     add("--vgg-weights", metavar="FILE", help="torchvision's vgg16 weights (default: cache or download)")

@@ -2,11 +2,9 @@
 
 Needs diffusers and safetensors, imported where they are used: ``pip install arbiview_aug[generator]``.
 
-- ``correspondence``, ``attention``: geometry-guided cross-view attention;
-- ``conditioning``, ``geometry``: conditions and cameras as tensors;
-- ``denoiser``, ``autoencoder``, ``networks``: the networks; ``sampler``: the reverse process;
-- ``completion``: inference on a frame; ``inpainter``: on rendered views, as ``Diffusion``;
-- ``generator``: ``Generator``, which loads and saves them.
+- ``correspondence``, ``attention``: geometry-guided cross-view attention; ``conditioning``: conditions and cameras;
+- ``denoiser``: the networks; ``sampler``: the reverse process; ``completion``: inference on frames;
+- ``generator``: ``Generator``, which loads and saves them; ``inpainter``: ``Diffusion``, which fills views by one.
 """
 
 from typing import Any

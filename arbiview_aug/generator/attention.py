@@ -80,9 +80,7 @@ class CrossViewAttention(nn.Module):
             raise ValueError(f"CrossViewAttention: expected a width that is a multiple of {HEAD_WIDTH}, got {width}")
         self.heads = width // HEAD_WIDTH
         self.norm = nn.LayerNorm(width)
-        self.to_q = nn.Linear(width, width, bias=False)
-        self.to_k = nn.Linear(width, width, bias=False)
-        self.to_v = nn.Linear(width, width, bias=False)
+        self.to_q, self.to_k, self.to_v = (nn.Linear(width, width, bias=False) for _ in range(3))
         self.to_out = nn.Linear(width, width)
         self.positions = PositionalEncoding()
         self.level_logits = nn.Parameter(torch.tensor([_INFINITY_LOGIT] + [0.0] * (levels - 1)))

@@ -70,8 +70,7 @@ def read_config(folder: Path) -> tuple[dict[str, Any], str]:
     if version != FORMAT:
         raise GeneratorError(f"{path}: expected format {FORMAT}, got {shown(version)}")
     if not isinstance(weights, str) or not _NAME.fullmatch(weights):
-        expected = "expected the name of a file beside it, as it was saved"
-        raise GeneratorError(f"{path}: weights: {expected}, got {shown(weights)}")
+        raise GeneratorError(f"{path}: weights: expected the name of a file beside it, got {shown(weights)}")
     return config, weights
 
 
@@ -81,10 +80,10 @@ def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder:
     GeneratorError for names that are missing, extra or of another shape, and for values that are no finite numbers.
     """
     for name, expected in module.state_dict().items():
-        tensor = tensors.get(name)
-        if tensor is not None and tensor.is_floating_point() != expected.is_floating_point():
+        tensor = tensors.get(name, expected.new_zeros(0, device="cpu"))  # missing names are torch's to report
+        if tensor.is_floating_point() != expected.is_floating_point():
             raise GeneratorError(f"{folder}: {name}: expected {expected.dtype} or alike, got {tensor.dtype}")
-        if tensor is not None and tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise GeneratorError(f"{folder}: {name}: expected finite weights, got NaN or infinity: training diverged")
     try:
         module.load_state_dict(tensors, assign=assign)

@@ -16,17 +16,17 @@ from torch.nn import functional
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import GeneratorError, SampleError
-from arbiview_aug.generator.autoencoder import Autoencoder
-from arbiview_aug.generator.conditioning import Views
+from arbiview_aug.generator.conditioning import FrameGeometry, Views, batched, frame_geometry
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.correspondence import TokenWindow
-from arbiview_aug.generator.denoiser import REGRESSION, GeneratorNetworks
-from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geometry
+from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, GeneratorNetworks
 from arbiview_aug.generator.sampler import guided, noise_schedule, sample
 from arbiview_aug.image_ops import resized
 from arbiview_aug.inpaint.inpainter import check_device, known_and_holes, seeded
 from arbiview_aug.inpaint.telea import telea
+from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.batching import stacked
+from arbiview_aug.sample.inputs import Frame
 
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
 SOURCES_PER_TARGET = 2  # source branches of a target camera, as in training (Algorithm 1: left and right)
@@ -61,31 +61,13 @@ class Conditions(NamedTuple):
         return targets, geometry.source_views(sources, self.seen, self.seen)
 
 
-class FrameViews(NamedTuple):
-    """A frame to complete.
-
-    Attributes:
-        views: (M, 3, h, w), or M tensors (3, h, w): FAVS at the target cameras, uint8 or float in [0, 1].
-        coverage: (M, h, w) bool, or M tensors: pixels that some source saw.
-        targets: The M target cameras; pixels of their own car (masks) are not generated.
-        source_images: N images (3, H, W).
-        sources: The N cameras that recorded them.
-        confidence: (M, h, w) in [0, 1], or M tensors; 1 by default.
-        frame: Name of the frame, for the noise.
-    """
-
-    views: Maps
-    coverage: Maps
-    targets: Rig
-    source_images: Maps
-    sources: Rig
-    confidence: Maps | None = None
-    frame: str | int = 0
-
-
 class _Draft(NamedTuple):
     """A frame with its almost complete views inpainted; the others are left to the generator."""
 
+    rig: Rig  # the target cameras
+    trust: Maps
+    source: Frame
+    name: str
     images: list[torch.Tensor]
     known: list[torch.Tensor]
     holes: list[torch.Tensor]
@@ -94,7 +76,7 @@ class _Draft(NamedTuple):
 
 
 def complete(
-    generator: GeneratorNetworks | None,
+    generator: GeneratorNetworks,
     views: Maps,
     coverage: Maps,
     targets: Rig,
@@ -105,29 +87,42 @@ def complete(
     frame: str | int = 0,
     **settings: Any,
 ) -> Completed:
-    """Complete the target views of one frame: ``FrameViews``, and the settings of ``complete_together``."""
-    one = FrameViews(views, coverage, targets, source_images, sources, confidence, frame)
-    return complete_together(generator, [one], **settings)[0]
+    """Complete the target views of one frame.
+
+    Args:
+        views: (M, 3, h, w), or M tensors (3, h, w): FAVS at the target cameras, uint8 or float in [0, 1].
+        coverage: (M, h, w) bool, or M tensors: pixels that some source saw.
+        targets: The M target cameras; pixels of their own car (masks) are not generated.
+        source_images: N images (3, H, W).
+        sources: The N cameras that recorded them.
+        confidence: (M, h, w) in [0, 1], or M tensors; 1 by default.
+        frame: Name of the frame, for the noise.
+        settings: Those of ``complete_together``.
+    """
+    trust = None if confidence is None else list(confidence)
+    rendered = RenderedFrame(list(views), targets, list(coverage), confidence=trust)
+    return complete_together(generator, [rendered], [Frame(tuple(source_images), sources)], [str(frame)], **settings)[0]
 
 
 @torch.no_grad()
 def complete_together(
-    generator: GeneratorNetworks | None,
-    frames: Sequence[FrameViews],
+    generator: GeneratorNetworks,
+    rendered: Sequence[RenderedFrame],
+    sources: Sequence[Frame],
+    names: Sequence[str],
     *,
     min_confidence: float = 0.0,
     steps: int | None = None,
     guidance: float | None = None,
     seed: int = 0,
 ) -> list[Completed]:
-    """Complete the target views of frames; those with as many views to denoise share the denoiser's calls.
+    """Complete rendered frames of ``sources``; those with as many views to denoise share the denoiser's calls.
 
     The result depends on the seed, the frame and the cameras' names, not on the order of the cameras or on earlier
     calls. It is computed on the generator's device and returned on the views'.
 
     Args:
-        generator: The model; None inpaints all holes by Telea's method.
-        frames: The frames.
+        names: Names of the frames, for the noise.
         min_confidence: Covered pixels below this confidence are generated too.
         steps: Denoising steps; 1 is the one-step regression. Default: the generator's.
         guidance: Classifier-free guidance; 1 is none. Default: the generator's.
@@ -138,76 +133,62 @@ def complete_together(
         GeneratorError: Impossible settings, one step of a generator that was not trained for it, or a generator on a
             GPU in a DataLoader worker.
     """
-    config = None if generator is None else _settings(generator, steps, guidance)
-    frames = [frame._replace(targets=frame.targets.in_frame_of(frame.sources)) for frame in frames]
-    drafts = [_draft(frame, min_confidence, inpaints_all=generator is None) for frame in frames]
-    alike: dict[tuple[int, int], list[int]] = {}
-    for k, draft in enumerate(drafts):
-        if draft.left:
-            alike.setdefault((len(draft.left), len(draft.branches)), []).append(k)
-    for (count, _), numbers in alike.items():
-        assert generator is not None and config is not None
-        batch = max(1, VIEWS_AT_ONCE // count)
-        for together in (numbers[start : start + batch] for start in range(0, len(numbers), batch)):
-            inputs = [_inputs(frames[k], drafts[k], config, seed) for k in together]
-            conditions = Conditions(*(torch.cat(part) for part in zip(*(one for one, *_ in inputs), strict=True)))
-            conditions = Conditions(*(part.to(generator.device) for part in conditions))
-            geometry = batched([one for _, one, _ in inputs]).to(generator.device)
-            noise = torch.cat([one for *_, one in inputs]).to(generator.device)
-            for k, images in zip(together, denoised(generator, config, geometry, conditions, noise), strict=True):
-                current = drafts[k]
-                for m, image in zip(current.left, images, strict=True):
-                    current.images[m] = _paste(image, current.images[m], current.holes[m])
-    return [Completed(stacked(current.images), stacked(current.holes), current.left) for current in drafts]
-
-
-def _draft(frame: FrameViews, min_confidence: float, inpaints_all: bool) -> _Draft:
-    """Inpaint the views of a frame that are almost complete, or all."""
-    targets, sources = frame.targets, frame.sources
-    if len(frame.source_images) != len(sources):
-        raise SampleError(f"complete: expected {len(sources)} source images, got {len(frame.source_images)}")
-    _check_sizes(frame.views, frame.coverage, targets)
-    images, trust = list(frame.views), frame.coverage if frame.confidence is None else frame.confidence
-    known, holes = known_and_holes(targets, frame.coverage, trust, min_confidence)
-    left = []
-    for m, hole in enumerate(holes):
-        if not inpaints_all and float(hole.float().mean()) > 1 - ALMOST_COMPLETE:
-            left.append(m)
-        elif bool(hole.any()):
-            images[m] = torch.where(hole, telea(images[m], ~known[m]), images[m])
-    branches = sorted({k for m in left for k in nearest_sources(targets[m], sources)})
-    return _Draft(images, known, holes, left, branches)
-
-
-def _inputs(
-    frame: FrameViews, draft: _Draft, config: GeneratorConfig, seed: int
-) -> tuple[Conditions, FrameGeometry, torch.Tensor]:
-    """Conditions, cameras and noise of a frame's views that are left, on the CPU."""
-    size, sources = config.image_size, [frame.sources[k] for k in draft.branches]
-    targets = [frame.targets[m] for m in draft.left]
-    trust = frame.coverage if frame.confidence is None else frame.confidence
-    views = zip(*(_prefilled(draft.images[m], draft.known[m], trust[m], size) for m in draft.left), strict=True)
-    seen = [valid_pixels(camera.resize(size)).float() for camera in sources]
-    parts = [*views, [_at_size(frame.source_images[k], size) for k in draft.branches], seen]
-    conditions = Conditions(*(torch.stack(list(part))[None] for part in parts))
-    geometry = frame_geometry(targets, sources, frame.sources.ground_z_m, config)
-    return conditions, geometry, torch.stack([_noise(config, seed, frame.frame, one.name) for one in targets])[None]
-
-
-def _settings(generator: GeneratorNetworks, steps: int | None, guidance: float | None) -> GeneratorConfig:
     config = generator.config
-    config = replace(
-        config,
-        steps=config.steps if steps is None else steps,
-        guidance=config.guidance if guidance is None else guidance,
-    )
+    steps, guidance = config.steps if steps is None else steps, config.guidance if guidance is None else guidance
+    config = replace(config, steps=steps, guidance=guidance)
     if config.steps == 1 and not config.one_step:
         raise GeneratorError(
             f"complete: expected steps >= 2, got 1: the one-step regression of generator {config.name!r} was not "
             "trained (loss.regression=0)"
         )
     check_device(generator)
-    return config
+    drafts = [_draft(*frame, min_confidence) for frame in zip(rendered, sources, names, strict=True)]
+    alike: dict[tuple[int, int], list[_Draft]] = {}
+    for draft in drafts:
+        if draft.left:
+            alike.setdefault((len(draft.left), len(draft.branches)), []).append(draft)
+    for (count, _), group in alike.items():
+        size = max(1, VIEWS_AT_ONCE // count)
+        for together in (group[start : start + size] for start in range(0, len(group), size)):
+            inputs, geometries, noise = zip(*(_inputs(draft, config, seed) for draft in together), strict=True)
+            conditions = Conditions(*(torch.cat(part).to(generator.device) for part in zip(*inputs, strict=True)))
+            geometry = batched(geometries).to(generator.device)
+            done = denoised(generator, config, geometry, conditions, torch.cat(noise).to(generator.device))
+            for draft, images in zip(together, done, strict=True):
+                for m, image in zip(draft.left, images, strict=True):
+                    draft.images[m] = _paste(image, draft.images[m], draft.holes[m])
+    return [Completed(stacked(draft.images), stacked(draft.holes), draft.left) for draft in drafts]
+
+
+def _draft(rendered: RenderedFrame, source: Frame, name: str, min_confidence: float) -> _Draft:
+    """Inpaint the views of a frame that are almost complete."""
+    rig, images, left = rendered.rig.in_frame_of(source.rig), list(rendered.images), []
+    if len(source.images) != len(source.rig):
+        raise SampleError(f"complete: expected {len(source.rig)} source images, got {len(source.images)}")
+    _check_sizes(images, rendered.coverage, rig)
+    trust = rendered.coverage if rendered.confidence is None else rendered.confidence
+    known, holes = known_and_holes(rig, rendered.coverage, trust, min_confidence)
+    for m, hole in enumerate(holes):
+        if float(hole.float().mean()) > 1 - ALMOST_COMPLETE:
+            left.append(m)
+        elif bool(hole.any()):
+            images[m] = torch.where(hole, telea(images[m], ~known[m]), images[m])
+    branches = sorted({k for m in left for k in nearest_sources(rig[m], source.rig)})
+    return _Draft(rig, trust, source, name, images, known, holes, left, branches)
+
+
+def _inputs(draft: _Draft, config: GeneratorConfig, seed: int) -> tuple[Conditions, FrameGeometry, torch.Tensor]:
+    """Conditions, cameras and noise of a frame's views that are left, on the CPU."""
+    source, size = draft.source, config.image_size
+    sources, targets = [source.rig[k] for k in draft.branches], [draft.rig[m] for m in draft.left]
+    views = [_prefilled(draft.images[m], draft.known[m], draft.trust[m], size) for m in draft.left]
+    images = [unit(resized(source.images[k], size)) for k in draft.branches]
+    seen = [valid_pixels(camera.resize(size)).float() for camera in sources]
+    conditions = Conditions(*(torch.stack(list(part))[None] for part in (*zip(*views, strict=True), images, seen)))
+    # Noise of a (frame, camera) is drawn on the CPU: the same on every device.
+    shape = config.autoencoder.latent_channels, *config.latent_size
+    noise = [torch.randn(shape, generator=seeded(seed, draft.name, one.name)) for one in targets]
+    return conditions, frame_geometry(targets, sources, source.rig.ground_z_m, config), torch.stack(noise)[None]
 
 
 def denoised(
@@ -272,9 +253,8 @@ def _prefilled(
 
     Colours are averaged over known pixels alone.
     """
-    unit = image.float() / 255 if image.dtype == torch.uint8 else image.float()
     weight = known.float()[None]
-    planes = torch.cat([unit * weight, weight, (trust.float() * known)[None]])[None]
+    planes = torch.cat([unit(image) * weight, weight, (trust.float() * known)[None]])[None]
     if tuple(image.shape[-2:]) != size:
         planes = functional.interpolate(planes, size, mode="bilinear", antialias=True)
     colour, share, confidence = planes[0].split([3, 1, 1])
@@ -293,20 +273,14 @@ def _paste(generated: torch.Tensor, image: torch.Tensor, hole: torch.Tensor) -> 
     return torch.where(hole, generated.to(image.dtype), image)
 
 
-def _at_size(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
-    small = resized(image, size)
-    return small.float() / 255 if small.dtype == torch.uint8 else small.float()
+def unit(image: torch.Tensor) -> torch.Tensor:
+    """An image, uint8 or in [0, 1], as float32 in [0, 1]."""
+    return image.float() / 255 if image.dtype == torch.uint8 else image.float()
 
 
 def valid_pixels(camera: Camera) -> torch.Tensor:
     """(H, W) bool: True on the scene, False on the camera's own car."""
     return torch.ones(camera.size, dtype=torch.bool) if camera.mask is None else torch.tensor(camera.mask)
-
-
-def _noise(config: GeneratorConfig, seed: int, frame: str | int, camera: str) -> torch.Tensor:
-    """(C, h, w) standard normal of a (frame, camera), drawn on the CPU: the same on every device."""
-    rng = seeded(seed, str(frame), camera)
-    return torch.randn(config.autoencoder.latent_channels, *config.latent_size, generator=rng)
 
 
 def _check_sizes(views: Maps, coverage: Maps, targets: Rig) -> None:
@@ -315,9 +289,7 @@ def _check_sizes(views: Maps, coverage: Maps, targets: Rig) -> None:
         raise SampleError(f"complete: expected as many of each, got {counts}")
     for camera, view, seen in zip(targets, views, coverage, strict=True):
         if tuple(view.shape) != (3, *camera.size) or tuple(seen.shape) != camera.size:
-            got = f"{tuple(view.shape)} and {tuple(seen.shape)}"
-            raise SampleError(
-                f"camera {camera.name!r}: expected a view (3, h, w) and coverage of {camera.size}, got {got}"
-            )
+            expected, got = f"a view (3, h, w) and coverage of {camera.size}", (tuple(view.shape), tuple(seen.shape))
+            raise SampleError(f"camera {camera.name!r}: expected {expected}, got {got[0]} and {got[1]}")
         if seen.dtype != torch.bool:
             raise SampleError(f"camera {camera.name!r}: coverage: expected bool, got {seen.dtype}; pass coverage > 0")

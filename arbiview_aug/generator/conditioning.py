@@ -1,4 +1,4 @@
-"""Conditions of the denoiser: condition latent, mask, confidence, viewing rays, and f_pose of L_main.
+"""Conditions of the denoiser: condition latent, mask, confidence, viewing rays, f_pose of L_main; cameras as tensors.
 
 The paper does not define its pose condition encoding f_pose. Here each view has
 
@@ -13,7 +13,7 @@ invariant to rotations of the whole rig and to the order of its cameras.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,16 @@ from torch.nn import functional
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.generator.config import GeneratorConfig
+from arbiview_aug.generator.correspondence import (
+    Correspondence,
+    TokenWindow,
+    between,
+    correspondences,
+    stacked,
+    token_sizes,
+    window,
+)
 
 RAY_CHANNELS = 6
 POSE_WIDTH = 16  # numbers of a pose: R (9), t (3), K (4)
@@ -62,19 +72,14 @@ def input_channels(latent_channels: int) -> int:
 # --- geometry ---------------------------------------------------------------------------------------------------------
 def reference_camera(target: Camera, sources: Sequence[Camera]) -> Camera:
     """The source whose optical axis is nearest to the target's; ties are broken by content."""
-
-    def likeness(camera: Camera) -> tuple[float, bytes]:
-        return float(camera.cam2ego[:3, 2] @ target.cam2ego[:3, 2]), camera.content_key
-
-    return max(sources, key=likeness)
+    return max(sources, key=lambda source: (float(source.cam2ego[:3, 2] @ target.cam2ego[:3, 2]), source.content_key))
 
 
 def relative_pose(camera: Camera, reference: Camera) -> tuple[FloatArray, FloatArray]:
     """R (3, 3) and t (3,) from the camera's frame to the reference's, t compressed to less than 1: t / (1 + |t|)."""
-    to_reference = reference.cam2ego[:3, :3].T
     with np.errstate(over="ignore"):  # of poses beyond 1e154 m
-        t = to_reference @ (camera.center_m - reference.center_m)
-        return to_reference @ camera.cam2ego[:3, :3], t / (1 + np.linalg.norm(t))
+        R, t = between(camera, reference)
+        return R, t / (1 + np.linalg.norm(t))
 
 
 def plucker_rays(camera: Camera, reference: Camera, size: tuple[int, int]) -> torch.Tensor:
@@ -93,15 +98,6 @@ def pose_vector(camera: Camera, reference: Camera) -> torch.Tensor:
     K = camera.K
     intrinsics = [math.log2(K[0, 0] / w), math.log2(K[1, 1] / h), (K[0, 2] + 0.5) / w - 0.5, (K[1, 2] + 0.5) / h - 0.5]
     return torch.from_numpy(np.concatenate([R.ravel(), t, intrinsics]).astype(np.float32))
-
-
-def camera_conditions(
-    cameras: Sequence[Camera], references: Sequence[Camera], size: tuple[int, int]
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rays (N, 6, h, w) and poses (N, 16) of the views of one frame."""
-    pairs = list(zip(cameras, references, strict=True))
-    rays = torch.stack([plucker_rays(camera, reference, size) for camera, reference in pairs])
-    return rays, torch.stack([pose_vector(camera, reference) for camera, reference in pairs])
 
 
 def pooled(maps: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
@@ -132,3 +128,74 @@ class PoseContext(nn.Module):
         token = self.mlp(features.to(dtype)) * is_given
         prompt = self.empty_prompt.expand(len(pose), -1, -1)
         return torch.cat([prompt, token[:, None]], 1)
+
+
+# --- the cameras of a frame -------------------------------------------------------------------------------------------
+class FrameGeometry(NamedTuple):
+    """The N target and S source cameras of B frames. If both are read, sources are numbered before targets."""
+
+    target_rays: torch.Tensor  # (B, N, 6, h, w), see ``plucker_rays``
+    target_pose: torch.Tensor  # (B, N, 16), see ``pose_vector``
+    source_rays: torch.Tensor  # (B, S, 6, h, w)
+    source_pose: torch.Tensor  # (B, S, 16)
+    target_reads: list[Correspondence]  # of the targets in sources and targets, one per token grid, the finest first
+    source_reads: list[Correspondence]  # of the sources in the other sources
+
+    def to(self, device: torch.device | str) -> FrameGeometry:
+        tensors = (value.to(device, non_blocking=True) for value in self[:4])
+        return FrameGeometry._make([*tensors, *self[4:]]).with_reads(lambda reads: reads.to(device))
+
+    def with_reads(self, change: Callable[[Correspondence], Correspondence]) -> FrameGeometry:
+        """Replace each correspondence by ``change`` of it."""
+        return FrameGeometry._make([*self[:4], *([change(grid) for grid in reads] for reads in self[4:])])
+
+    def target_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
+        """The targets' conditions: latents (B, N, C, h, w), coverage and confidence (B, N, H, W) at any resolution."""
+        return _views(latent, mask, confidence, self.target_rays, self.target_pose)
+
+    def source_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
+        """The sources' conditions; the latents are those of their images."""
+        return _views(latent, mask, confidence, self.source_rays, self.source_pose)
+
+    def target_windows(self, dropped: torch.Tensor | None = None) -> list[TokenWindow]:
+        """Windows of the targets, without sources in the frames ``dropped`` (B,) bool (classifier-free guidance)."""
+        sources, targets = self.source_pose.shape[1], self.target_pose.shape[1]
+        reads = self.target_reads if dropped is None else [c.without(sources, dropped) for c in self.target_reads]
+        return [window(c, sources + targets) for c in reads]
+
+    def source_windows(self) -> list[TokenWindow]:
+        return [window(c, self.source_pose.shape[1]) for c in self.source_reads]
+
+
+def frame_geometry(
+    targets: Sequence[Camera], sources: Sequence[Camera], ground_z_m: float, config: GeneratorConfig
+) -> FrameGeometry:
+    """The geometry of one frame (B = 1), whose N targets, S sources and road lie in one ego frame."""
+    size = config.latent_size
+    viewed = [(target, reference_camera(target, sources)) for target in targets], [(one, one) for one in sources]
+    rays = [torch.stack([plucker_rays(*pair, size) for pair in pairs])[None] for pairs in viewed]
+    poses = [torch.stack([pose_vector(*pair) for pair in pairs])[None] for pairs in viewed]
+    keys, count = [*sources, *targets], len(sources)
+    settings = token_sizes(size, len(config.unet.widths)), ground_z_m, config.facing_m
+    return FrameGeometry(
+        rays[0],
+        poses[0],
+        rays[1],
+        poses[1],
+        correspondences(targets, keys, range(count, len(keys)), *settings),
+        correspondences(sources, sources, range(count), *settings),
+    )
+
+
+def batched(frames: Sequence[FrameGeometry]) -> FrameGeometry:
+    """One geometry of frames with equal numbers of targets and of sources."""
+    *tensors, target_reads, source_reads = zip(*frames, strict=True)
+    reads = ([stacked(grid) for grid in zip(*grids, strict=True)] for grids in (target_reads, source_reads))
+    return FrameGeometry._make([*map(torch.cat, tensors), *reads])
+
+
+def _views(
+    latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor, rays: torch.Tensor, pose: torch.Tensor
+) -> Views:
+    size = (latent.shape[-2], latent.shape[-1])
+    return Views(latent, pooled(mask, size)[:, :, None], pooled(confidence, size)[:, :, None], rays, pose)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_type_hints
+from typing import Any, Literal, TypeVar, get_type_hints
 
 from arbiview_aug.choices import setting_hint
 from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
@@ -59,9 +59,8 @@ def from_plain(kind: type[_Config], data: Any, where: str, error: type[ArbiviewE
         )
     values: dict[str, Any] = {}
     for key, value in data.items():
-        nested = next((part for part in (hints[key], *get_args(hints[key])) if is_dataclass(part)), None)
-        if nested is not None and value is not None:
-            value = from_plain(nested, value, f"{where}: {key}", error)  # type: ignore[arg-type]
+        if is_dataclass(hints[key]):
+            value = from_plain(hints[key], value, f"{where}: {key}", error)
         values[key] = tuple(value) if isinstance(value, list) else value
     try:
         return kind(**values)
@@ -115,7 +114,7 @@ class AutoencoderConfig:
     layers: int = 2
     latent_channels: int = 3  # channels of a latent; 3 patch² for squares of pixels
     norm_groups: int = 16
-    scale: float = 1.0  # factor that gives latents unit variance; set from the data after training
+    scale: float = 1.0  # factor that gives latents unit variance
 
     def __post_init__(self) -> None:
         check_sizes(self, _MOST_CHANNELS, "widths", "patch", "latent_channels", "norm_groups")
@@ -157,9 +156,7 @@ class GeneratorConfig:
     prefilled: bool = True  # inpaint the condition's holes by Telea's method; else mid-grey, as in Algorithm 1
     one_step: bool = True  # whether the one-step regression was trained
     frozen_unet: bool = False  # train only attention, pose, LoRA, the one-step head and the widened conv_in
-    inpainting: bool = (
-        False  # the U-Net reads [noisy, hole, masked latent] first, as Stable Diffusion's inpainting does
-    )
+    inpainting: bool = False  # the U-Net's input begins as Stable Diffusion's inpainting: noisy, hole, masked latent
     lora_rank: int = 0  # rank of the changes to the U-Net's own attention (Hu et al. 2022); 0 for none
     prompt_tokens: int = 0  # tokens of the empty prompt's embedding
     facing_m: float = FACING_M  # distance of the depth level that faces the camera
@@ -241,12 +238,12 @@ def inpaint() -> GeneratorConfig:
 
 
 def small() -> GeneratorConfig:
-    """Minutes on a GPU: a U-Net of 63 M and 10 M of cross-view attention on the latents of its own autoencoder."""
+    """Minutes on a GPU: a U-Net of 63 M and 10 M of cross-view attention; 4 x 4 pixels of 128 x 224 images."""
     return GeneratorConfig(
         name="small",
         image_size=(128, 224),
         unet=UNetConfig(widths=(128, 256, 384), transformers=(False, True, True)),
-        autoencoder=AutoencoderConfig(widths=(64, 128, 128), latent_channels=4),
+        autoencoder=AutoencoderConfig(patch=4, latent_channels=48),
     )
 
 
@@ -255,13 +252,7 @@ def compact() -> GeneratorConfig:
     return GeneratorConfig(
         name="compact",
         image_size=(64, 112),
-        unet=UNetConfig(
-            widths=(64, 96, 128),
-            transformers=(False, True, True),
-            cross_view=(False, True, True),
-            layers=1,
-            context_width=64,
-        ),
+        unet=_light_unet((64, 96, 128), norm_groups=32),
         autoencoder=AutoencoderConfig(patch=4, latent_channels=48),
         steps=1,  # after an hour of training, samples of more steps are speckled
     )
@@ -272,13 +263,13 @@ def tiny() -> GeneratorConfig:
     return GeneratorConfig(
         name="tiny",
         image_size=(32, 56),
-        unet=UNetConfig(
-            widths=(32, 64, 64),
-            transformers=(False, True, True),
-            cross_view=(False, True, True),
-            layers=1,
-            context_width=64,
-            norm_groups=8,
-        ),
+        unet=_light_unet((32, 64, 64), norm_groups=8),
         autoencoder=AutoencoderConfig(patch=2, latent_channels=12),
+    )
+
+
+def _light_unet(widths: tuple[int, int, int], norm_groups: int) -> UNetConfig:
+    coarse = (False, True, True)
+    return UNetConfig(
+        widths=widths, transformers=coarse, cross_view=coarse, layers=1, context_width=64, norm_groups=norm_groups
     )

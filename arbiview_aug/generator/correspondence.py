@@ -59,11 +59,15 @@ def plane_vectors(camera: Camera, ground_z_m: float, facing_m: float = FACING_M)
     return np.stack([np.zeros(3), road, np.array([0.0, 0.0, 1 / facing_m])])
 
 
+def between(query: Camera, key: Camera) -> tuple[FloatArray, FloatArray]:
+    """R (3, 3) and t (3,), metres, from the frame of ``query`` to that of ``key``: X_j = R X_i + t."""
+    to_key = key.cam2ego[:3, :3].T
+    return to_key @ query.cam2ego[:3, :3], to_key @ (query.center_m - key.center_m)
+
+
 def ray_map(query: Camera, key: Camera, plane: FloatArray) -> FloatArray:
     """(3, 3) R + t nᵀ/d: rays of ``query`` to rays of ``key`` over a plane (3,) n/d of ``query``'s frame."""
-    to_key = key.cam2ego[:3, :3].T
-    R = to_key @ query.cam2ego[:3, :3]
-    t = to_key @ (query.center_m - key.center_m)
+    R, t = between(query, key)
     return R + np.outer(t, plane)
 
 
@@ -110,33 +114,31 @@ def correspondences(
     the finest first. All cameras and the road lie in one ego frame.
     """
     small = [[camera.resize(size) for size in sizes] for camera in keys]
-    by_grid = []
+    by_query = []
     for query, self_index in zip(queries, own_index, strict=True):
         others = {j: grids for j, grids in enumerate(small) if j != self_index}
-        by_grid.append(_neighbours(query, others, sizes, plane_vectors(query, ground_z_m, facing_m)))
-    slots = max(1, *(len(of_query) for of_query in by_grid))
-    levels = max((len(grids[0][0]) for of_query in by_grid for _, grids in of_query), default=1)
-    of_grids = []
-    for k, (h, w) in enumerate(sizes):
-        shape = (1, len(queries), slots, levels, h, w)
-        neighbour = torch.zeros(shape[:3], dtype=torch.int64)
-        centre, valid = torch.zeros((*shape, 2)), torch.zeros(shape, dtype=torch.bool)
-        for q, of_query in enumerate(by_grid):
-            for slot, (j, grids) in enumerate(of_query):
-                centre_j, valid_j = grids[k]
-                neighbour[0, q, slot] = j
-                centre[0, q, slot, : len(centre_j)] = torch.from_numpy(centre_j.astype(np.float32))
-                valid[0, q, slot, : len(valid_j)] = torch.from_numpy(valid_j)
-        of_grids.append(Correspondence(neighbour, centre, valid))
-    return of_grids
+        by_query.append(_neighbours(query, others, sizes, plane_vectors(query, ground_z_m, facing_m)))
+    slots = max(1, *(len(of_query) for of_query in by_query))
+    levels = max((len(grids[0][0]) for of_query in by_query for _, grids in of_query), default=1)
+    shapes = [(1, len(queries), slots, levels, h, w) for h, w in sizes]
+    neighbour = torch.zeros(shapes[0][:3], dtype=torch.int64)
+    reads = [
+        Correspondence(neighbour, torch.zeros((*shape, 2)), torch.zeros(shape, dtype=torch.bool)) for shape in shapes
+    ]
+    for q, of_query in enumerate(by_query):
+        for slot, (j, grids) in enumerate(of_query):
+            neighbour[0, q, slot] = j
+            for of_grid, (centre, valid) in zip(reads, grids, strict=True):
+                of_grid.centre[0, q, slot, : len(centre)] = torch.from_numpy(centre.astype(np.float32))
+                of_grid.valid[0, q, slot, : len(valid)] = torch.from_numpy(valid)
+    return reads
 
 
 def _neighbours(
     query: Camera, others: Mapping[int, Sequence[Camera]], sizes: Sequence[tuple[int, int]], planes: FloatArray
 ) -> list[tuple[int, list[tuple[FloatArray, BoolArray]]]]:
     """The views j that overlap a query, with ``correspond`` for each token grid; ``others`` are at these sizes."""
-    small = [query.resize(size) for size in sizes]
-    rays = [camera.unproject_cam(camera.pixel_grid()) for camera in small]
+    rays = [camera.unproject_cam(camera.pixel_grid()) for camera in map(query.resize, sizes)]
     neighbours = []
     for j, grids in others.items():
         same_centre = float(np.abs(query.center_m - grids[0].center_m).max()) < SAME_CENTER_M
@@ -150,18 +152,12 @@ def _neighbours(
 
 def stacked(frames: Sequence[Correspondence]) -> Correspondence:
     """One batch of frames with equal numbers of query views; slots and levels are padded with invalid ones."""
-    slots = max(frame.valid.shape[2] for frame in frames)
-    levels = max(frame.valid.shape[3] for frame in frames)
+    slots, levels = (max(frame.valid.shape[axis] for frame in frames) for axis in (2, 3))
     padded = []
     for neighbour, centre, valid in frames:
-        more, deeper = slots - valid.shape[2], levels - valid.shape[3]
-        padded.append(
-            Correspondence(
-                pad(neighbour, (0, more)),
-                pad(centre, (0, 0, 0, 0, 0, 0, 0, deeper, 0, more)),
-                pad(valid, (0, 0, 0, 0, 0, deeper, 0, more)),
-            )
-        )
+        more = 0, slots - valid.shape[2]
+        grid = 0, 0, 0, 0, 0, levels - valid.shape[3], *more
+        padded.append((pad(neighbour, more), pad(centre, (0, 0, *grid)), pad(valid, grid)))
     return Correspondence(*(torch.cat(values) for values in zip(*padded, strict=True)))
 
 

@@ -1,4 +1,4 @@
-"""The multi-branch denoising U-Net (appendix: The Multi-Branch U-Net; Sec. Network Architecture).
+"""The networks: the multi-branch denoising U-Net and the autoencoder (Sec. Network Architecture; appendix).
 
 Every view is a branch of one set of weights. Source branches (existing images: clean, t = 0) read each other; target
 branches (noisy, t) read sources and targets. The sources' keys and values do not depend on the step, so they are
@@ -16,21 +16,21 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import nn
+from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator.attention import CrossViewAttention
-from arbiview_aug.generator.autoencoder import Autoencoder
 from arbiview_aug.generator.conditioning import PoseContext, Views, input_channels
 from arbiview_aug.generator.config import GeneratorConfig, TrainedOn
 from arbiview_aug.generator.correspondence import LEVELS, TokenWindow
 
 TIMESTEPS = 1000  # diffusion steps in training (Sec. Training Parameters)
-_LORA_LAYERS = ("to_q", "to_k", "to_v", "to_out.0")  # of the U-Net's self- and cross-attention
 REGRESSION = TIMESTEPS  # predicts x0 in one step, from the pre-filled latent instead of a noisy one
+_LORA_LAYERS = ("to_q", "to_k", "to_v", "to_out.0")  # of the U-Net's self- and cross-attention
 
 KeysValues = tuple[torch.Tensor, torch.Tensor]
-
 Sources = list[KeysValues]  # (B, S, T, width) of S source branches, for each cross-view block in the order they run
 
 
@@ -90,10 +90,6 @@ class Denoiser(nn.Module):
             nn.init.zeros_(unet.conv_out.weight)
             nn.init.zeros_(unet.conv_out.bias)
 
-    @property
-    def dtype(self) -> torch.dtype:
-        return self.unet.conv_in.weight.dtype
-
     def own_parameters(self) -> list[nn.Parameter]:
         """Parameters trained beside a frozen U-Net: attention, pose, one-step head, widened ``conv_in``, LoRA."""
         parts = (self.cross_view, self.context, self.regression, self.unet.conv_in)
@@ -133,7 +129,9 @@ class Denoiser(nn.Module):
         is_regression = (t == REGRESSION).view(-1, 1, 1, 1, 1)
         x = noisy
         if self.signal is not None:
-            z, linear, scale = self._preconditioned(noisy, t, targets)
+            a, s, deviation, root = self._deviations(t, targets)
+            condition = targets.latent.float()
+            z = (noisy.float() - a * condition) / root
             x = z.masked_fill(is_regression, 0)
         h = self._run(x, t, targets, windows, sources, None, rows)
         unet = self.unet
@@ -141,22 +139,9 @@ class Denoiser(nn.Module):
             h = unet.conv_act(unet.conv_norm_out(h))
         predicted, change = (head(h).unflatten(0, noisy.shape[:2]) for head in (unet.conv_out, self.regression))
         if self.signal is not None:
-            predicted = linear - scale * predicted.float()
+            linear = -s * condition + a * s * (1 - deviation**2) / root * z
+            predicted = linear - deviation / root * predicted.float()
         return torch.where(is_regression, noisy.to(change.dtype) + change, predicted)
-
-    def _preconditioned(
-        self, noisy: torch.Tensor, t: torch.Tensor, targets: Views
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """z, the v of the best linear estimate, and σ / √D (Karras et al. 2022, around the condition c instead of 0).
-
-        With x_t = a x0 + s ε and x0 = c + r, r of variance σ², z = (x_t − a c) / √D with D = a² σ² + s² has unit
-        variance, and the best linear estimate is x0 = c + a σ² / √D z. The network sees z, and σ s / √D times its
-        output n is added. Then v = (a x_t − x0) / s = −s c + a s (1 − σ²) / √D z − σ / √D n, finite for all t.
-        """
-        a, s, deviation, root = self._deviations(t, targets)
-        condition = targets.latent.float()
-        z = (noisy.float() - a * condition) / root
-        return z, -s * condition + a * s * (1 - deviation**2) / root * z, deviation / root
 
     def output_scale(self, t: torch.Tensor, targets: Views) -> torch.Tensor:
         """(B, N, 1, h, w) factor of the network's output in ``forward``'s at t (B,).
@@ -168,10 +153,13 @@ class Denoiser(nn.Module):
         _, _, deviation, root = self._deviations(t, targets)
         return torch.where((t == REGRESSION).view(-1, 1, 1, 1, 1), deviation, deviation / root)
 
-    def _deviations(
-        self, t: torch.Tensor, targets: Views
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """a, s, σ and √D of ``_preconditioned``."""
+    def _deviations(self, t: torch.Tensor, targets: Views) -> tuple[torch.Tensor, ...]:
+        """a, s, σ and √D for preconditioning around the condition c (Karras et al. 2022, there around 0).
+
+        With x_t = a x0 + s ε and x0 = c + r, r of variance σ², z = (x_t − a c) / √D with D = a² σ² + s² has unit
+        variance, and the best linear estimate is x0 = c + a σ² / √D z. The network sees z, and σ s / √D times its
+        output n is added. Then v = (a x_t − x0) / s = −s c + a s (1 − σ²) / √D z − σ / √D n, finite for all t.
+        """
         assert self.signal is not None
         a = self.signal.to(t.device)[t.clamp(max=TIMESTEPS - 1)].view(-1, 1, 1, 1, 1)
         s = (1 - a**2).sqrt()
@@ -191,8 +179,8 @@ class Denoiser(nn.Module):
     ) -> torch.Tensor:
         """Run all blocks of the U-Net; a source run appends its keys and values to ``outputs``."""
         unet, count = self.unet, noisy.shape[:2]
-        x = views.channels(noisy, self.inpainting).flatten(0, 1).to(self.dtype)
-        emb = unet.time_embedding(unet.time_proj(t.repeat_interleave(count[1])).to(self.dtype))
+        x = views.channels(noisy, self.inpainting).flatten(0, 1).to(unet.dtype)
+        emb = unet.time_embedding(unet.time_proj(t.repeat_interleave(count[1])).to(unet.dtype))
         context = self.context(views.pose.flatten(0, 1))
         blocks, attended = 0, 0  # blocks of the U-Net so far, and cross-view blocks
 
@@ -218,18 +206,17 @@ class Denoiser(nn.Module):
         h = unet.conv_in(x)
         skips = [h]
         for block, window in zip(unet.down_blocks, windows, strict=True):
-            h, inner = self._checkpointed(_encode, block, h, emb, context)
+            *inner, h = self._checkpointed(_layers, block, h, emb, context)
             h = attend(h, window)
-            skips += [*inner[:-1], h]  # the last skip has read the other views
+            skips += [*inner, h]  # the last skip has read the other views
             if block.downsamplers is not None:
                 h = block.downsamplers[0](h)
                 skips.append(h)
         h = self._checkpointed(unet.mid_block, h, emb, context)
         h = attend(h, windows[-1])
         for block, window in zip(unet.up_blocks, reversed(windows), strict=True):
-            inner = skips[-len(block.resnets) :]
-            del skips[-len(block.resnets) :]
-            h = self._checkpointed(_decode, block, h, inner, emb, context)
+            skips, inner = skips[: -len(block.resnets)], skips[-len(block.resnets) :]
+            h = self._checkpointed(_layers, block, h, emb, context, inner)[-1]
             h = attend(h, window)
             if outputs is not None and attended == len(self.cross_view):
                 break
@@ -243,31 +230,17 @@ class Denoiser(nn.Module):
         return function(*arguments)
 
 
-# --- the U-Net's blocks, up to their resamplers -----------------------------------------------------------------------
-def _encode(
-    block: Any, h: torch.Tensor, emb: torch.Tensor, context: torch.Tensor
-) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """An encoder block's output and its skips, the last of which is the output."""
-    skips = []
-    for k in range(len(block.resnets)):
-        h = _layer(block, k, h, emb, context)
-        skips.append(h)
-    return h, skips
-
-
-def _decode(
-    block: Any, h: torch.Tensor, skips: Sequence[torch.Tensor], emb: torch.Tensor, context: torch.Tensor
-) -> torch.Tensor:
-    for k, skip in enumerate(reversed(skips)):
-        h = _layer(block, k, torch.cat([h, skip], 1), emb, context)
-    return h
-
-
-def _layer(block: Any, k: int, h: torch.Tensor, emb: torch.Tensor, context: torch.Tensor) -> torch.Tensor:
-    h = block.resnets[k](h, emb)
-    if getattr(block, "has_cross_attention", False):
-        h = block.attentions[k](h, encoder_hidden_states=context, return_dict=False)[0]
-    return h
+def _layers(
+    block: Any, h: torch.Tensor, emb: torch.Tensor, context: torch.Tensor, skips: Sequence[torch.Tensor] = ()
+) -> list[torch.Tensor]:
+    """Outputs of the layers of a U-Net's block, up to its resampler; a decoder's layers read skips, the last first."""
+    outputs = []
+    for k, resnet in enumerate(block.resnets):
+        h = resnet(torch.cat([h, skips[-1 - k]], 1) if skips else h, emb)
+        if getattr(block, "has_cross_attention", False):
+            h = block.attentions[k](h, encoder_hidden_states=context, return_dict=False)[0]
+        outputs.append(h)
+    return outputs
 
 
 def _read_views(
@@ -305,16 +278,67 @@ def widen(unet: Any, channels: int) -> None:
     unet.register_to_config(in_channels=channels)
 
 
-class GeneratorNetworks(nn.Module):
-    """Denoiser and autoencoder of one configuration (Sec. CVC-SSL); ``calls`` counts those of the denoiser."""
+class Autoencoder(nn.Module):
+    """diffusers' ``AutoencoderKL`` with images in [0, 1] and latents of unit variance, or squares of pixels.
 
-    def __init__(self, config: GeneratorConfig, denoiser: Denoiser, autoencoder: Autoencoder) -> None:
+    ``vae`` is None for pixels in [-1, 1], with ``patch`` pixels along a latent pixel's side.
+    """
+
+    def __init__(self, vae: Any | None, scale: float = 1.0, patch: int = 1) -> None:
         super().__init__()
-        self.config, self.denoiser, self.autoencoder = config, denoiser, autoencoder
+        self.vae, self.patch = vae, patch
+        self.scale = float(scale)  # of the latents; no buffer, since half precision would round it
+
+    def encode(self, images: torch.Tensor) -> torch.Tensor:
+        """Encode images (..., 3, H, W) in [0, 1] to latents (..., C, H / f, W / f), without sampling.
+
+        GeneratorError with weights in float16, as in ``decode``.
+        """
+        images = images * 2 - 1
+        if self.vae is None:
+            return functional.pixel_unshuffle(images, self.patch)
+        self._refuse_float16()
+        flat = images.reshape(-1, *images.shape[-3:]).to(self.vae.dtype)
+        latents = self.vae.encode(flat).latent_dist.mode() * self.scale
+        return latents.reshape(*images.shape[:-3], *latents.shape[-3:])
+
+    def decode(self, latents: torch.Tensor) -> torch.Tensor:
+        """Decode latents (..., C, h, w) to images (..., 3, H, W), in [0, 1] up to over- and undershoot."""
+        if self.vae is None:
+            images = functional.pixel_shuffle(latents, self.patch)
+        else:
+            self._refuse_float16()
+            flat = latents.reshape(-1, *latents.shape[-3:]).to(self.vae.dtype)
+            images = self.vae.decode(flat / self.scale).sample
+            images = images.reshape(*latents.shape[:-3], *images.shape[-3:])
+        return images / 2 + 0.5
+
+    def _refuse_float16(self) -> None:
+        assert self.vae is not None
+        device = self.vae.device.type
+        autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
+        if autocast or self.vae.dtype == torch.float16:
+            raise GeneratorError(
+                "autoencoder: expected float32 or bfloat16, got float16, in which Stable Diffusion's overflows; use "
+                "generator.to(torch.bfloat16)"
+            )
+
+
+class GeneratorNetworks(nn.Module):
+    """Denoiser and autoencoder of one configuration (Sec. CVC-SSL); ``calls`` counts those of the denoiser.
+
+    Made of diffusers' networks, ``vae`` None without one; ``signal`` as for ``Denoiser``.
+    """
+
+    def __init__(self, config: GeneratorConfig, unet: Any, vae: Any | None, signal: torch.Tensor | None = None) -> None:
+        super().__init__()
+        self.config = config
+        cross_view, lora_rank = config.unet.cross_view, config.lora_rank
+        self.denoiser = Denoiser(unet, config.prompt_tokens, cross_view, signal, config.inpainting, lora_rank)
+        self.autoencoder = Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch)
         if config.frozen_unet:
-            autoencoder.requires_grad_(False)
-            denoiser.requires_grad_(False)
-            for parameter in denoiser.own_parameters():
+            self.requires_grad_(False)
+            for parameter in self.denoiser.own_parameters():
                 parameter.requires_grad_(True)
         self.calls = 0
         self.trained_on: TrainedOn | None = None  # set by the training, and read from a folder

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -10,17 +12,24 @@ import torch
 
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator.autoencoder import Autoencoder
 from arbiview_aug.generator.checkpoint import CONFIG_FILE, load_weights, read_checkpoint, read_config, write_checkpoint
 from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
 from arbiview_aug.generator.config import GeneratorConfig, TrainedOn, from_plain, paper
-from arbiview_aug.generator.denoiser import Denoiser, GeneratorNetworks
+from arbiview_aug.generator.denoiser import GeneratorNetworks
 from arbiview_aug.generator.sampler import noise_schedule
-from arbiview_aug.generator.stable_diffusion import PLAIN_UNET, load_part
-from arbiview_aug.generator.stable_diffusion import empty_prompt as embedded_empty_prompt
 
 _SHIPPED = Path(__file__).with_name("weights")
+_EMPTY_PROMPT = [49406, *[49407] * 76]  # CLIP's tokens of "": start of text, then end of text up to 77
+_PLAIN_UNET = {  # entries of Stable Diffusion 1.5's configuration on which ``Denoiser`` relies
+    "mid_block_type": "UNetMidBlock2DCrossAttn",
+    "class_embed_type": None,
+    "addition_embed_type": None,
+    "encoder_hid_dim": None,
+    "time_cond_proj_dim": None,
+    "time_embedding_act_fn": None,
+    "center_input_sample": False,
+}
 
 
 def has_shipped() -> bool:
@@ -42,8 +51,8 @@ def _networks() -> tuple[Any, Any]:
 class Generator(GeneratorNetworks):
     """Generator of the pixels that no camera saw (Sec. CVC-SSL).
 
-    ``from_pretrained`` loads one, ``from_config`` creates an untrained one, ``from_stable_diffusion`` one with Stable
-    Diffusion's weights. ``to`` moves it to a GPU or to bfloat16.
+    ``from_pretrained`` loads one, ``from_config`` and ``from_stable_diffusion`` create untrained ones. ``to`` moves it
+    to a GPU or to bfloat16.
     """
 
     # --- creation -----------------------------------------------------------------------------------------------------
@@ -54,15 +63,10 @@ class Generator(GeneratorNetworks):
         latent = config.autoencoder.latent_channels
         unet = unet_class(**config.unet.arguments(input_channels(latent), latent))
         vae = vae_class(**config.autoencoder.arguments()) if config.autoencoder.widths else None
-        signal = None
-        if config.residual:
-            with torch.device("cpu"):  # also where the weights are on meta
-                schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr)
-            signal = schedule.alphas_cumprod.double().sqrt().float()
-        denoiser = Denoiser(
-            unet, config.prompt_tokens, config.unet.cross_view, signal, config.inpainting, config.lora_rank
-        )
-        return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch))
+        with torch.device("cpu"):  # also where the weights are on meta
+            schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr)
+        signal = schedule.alphas_cumprod.double().sqrt().float() if config.residual else None
+        return cls(config, unet, vae, signal)
 
     @classmethod
     def from_stable_diffusion(
@@ -87,7 +91,7 @@ class Generator(GeneratorNetworks):
         latent = config.autoencoder.latent_channels
         if not config.autoencoder.widths:
             raise GeneratorError("from_stable_diffusion: expected a config with an autoencoder, got one on pixels")
-        expected_unet = config.unet.arguments(config.unet_channels, latent) | PLAIN_UNET
+        expected_unet = config.unet.arguments(config.unet_channels, latent) | _PLAIN_UNET
         unet = load_part("UNet2DConditionModel", where, "unet", expected_unet)
         shape = config.autoencoder.arguments()
         del shape["scaling_factor"]  # the file's own is used
@@ -95,14 +99,14 @@ class Generator(GeneratorNetworks):
         config = replace(config, autoencoder=replace(config.autoencoder, scale=float(vae.config.scaling_factor)))
         if empty_prompt is None and config.prompt_tokens:
             empty_prompt = embedded_empty_prompt(where)
-        lora = config.lora_rank
-        denoiser = Denoiser(unet, config.prompt_tokens, config.unet.cross_view, None, config.inpainting, lora)
+        generator = cls(config, unet, vae).eval()
         if empty_prompt is not None:
-            expected = tuple(denoiser.context.empty_prompt.shape)
-            if tuple(empty_prompt.shape) != expected:
-                raise GeneratorError(f"empty_prompt: expected shape {expected}, got {tuple(empty_prompt.shape)}")
-            denoiser.context.empty_prompt.copy_(empty_prompt)
-        return cls(config, denoiser, Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch)).eval()
+            prompt = generator.denoiser.context.empty_prompt
+            if empty_prompt.shape != prompt.shape:
+                expected, got = tuple(prompt.shape), tuple(empty_prompt.shape)
+                raise GeneratorError(f"empty_prompt: expected shape {expected}, got {got}")
+            prompt.copy_(empty_prompt)
+        return generator
 
     # --- folders ------------------------------------------------------------------------------------------------------
     @classmethod
@@ -140,11 +144,64 @@ class Generator(GeneratorNetworks):
         Raises:
             OutputError: The disk is full, or the folder cannot be written.
         """
-        scaled = replace(self.config.autoencoder, scale=self.autoencoder.scale)
-        config = {"generator": asdict(replace(self.config, autoencoder=scaled))}
+        config = {"generator": asdict(self.config)}
         if self.trained_on is not None:
             config["trained_on"] = asdict(self.trained_on)
         write_checkpoint(Path(folder), config, self.state_dict())
 
     # --- use ----------------------------------------------------------------------------------------------------------
     complete_views = complete
+
+
+# --- Stable Diffusion's weights ---------------------------------------------------------------------------------------
+def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[str, Any]) -> Any:
+    """Load a diffusers model (class ``kind``) whose configuration must have the ``expected`` entries.
+
+    ``where`` is a folder or hub id in diffusers' layout; from a hub id, safetensors are downloaded. GeneratorError if
+    anything does not fit.
+    """
+    cls = getattr(optional_package("diffusers", "generator"), kind)
+    label = f"{where}/{subfolder}"
+    try:
+        config = cls.load_config(where, subfolder=subfolder)
+    except (OSError, ValueError) as error:
+        raise GeneratorError(f"{label}: expected a diffusers folder or hub id with a {kind}: {error}") from None
+    defaults = inspect.signature(cls.__init__).parameters
+    for name, value in expected.items():
+        wanted, got = _plain(value), _plain(config.get(name, defaults[name].default))
+        if got != wanted:
+            raise GeneratorError(f"{label}: expected {name} {wanted}, got {got}")
+    return _complete_model(cls, where, subfolder, low_cpu_mem_usage=False)
+
+
+def _complete_model(cls: Any, where: str | Path, subfolder: str, **options: Any) -> Any:
+    """Load a model and refuse what the libraries only warn of: missing or extra weights."""
+    label = f"{where}/{subfolder}: expected"
+    try:
+        model, report = cls.from_pretrained(
+            where, subfolder=subfolder, use_safetensors=True, output_loading_info=True, **options
+        )
+    except (OSError, ValueError, RuntimeError) as error:  # no safetensors; shapes that do not fit
+        raise GeneratorError(f"{label} the weights of this {cls.__name__} as safetensors: {error}") from None
+    kinds = ("missing", report["missing_keys"]), ("that do not belong", report["unexpected_keys"])
+    wrong = [f"{len(keys)} {what}: {', '.join(sorted(map(str, keys))[:4])}" for what, keys in kinds if keys]
+    if wrong:
+        raise GeneratorError(f"{label} exactly the weights of this {cls.__name__}; {'; '.join(wrong)}")
+    return model
+
+
+def embedded_empty_prompt(where: str | Path) -> torch.Tensor:
+    """(77, width) CLIP's embedding of the empty prompt, by transformers; a generator's own folder contains it.
+
+    GeneratorError for weights that are missing, extra or of another shape.
+    """
+    encoder = _complete_model(optional_package("transformers", "generator").CLIPTextModel, where, "text_encoder")
+    with torch.no_grad():
+        return encoder(torch.tensor([_EMPTY_PROMPT])).last_hidden_state[0]
+
+
+def _plain(value: Any) -> Any:
+    """Lists as tuples, and tuples of one repeated value as that value: diffusers takes all of them."""
+    if isinstance(value, list | tuple):
+        return value[0] if len(set(value)) == 1 else tuple(value)
+    return value

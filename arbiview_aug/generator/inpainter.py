@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from arbiview_aug.errors import GeneratorError, WarnOnce
-from arbiview_aug.generator.completion import FrameViews, complete_together
+from arbiview_aug.generator.completion import complete_together
 from arbiview_aug.generator.denoiser import GeneratorNetworks
 from arbiview_aug.generator.generator import Generator
 from arbiview_aug.inpaint.inpainter import Inpainter, checked_settings, frame_names, put
@@ -59,11 +59,8 @@ class Diffusion(Inpainter, torch.nn.Module):
         self.steps, self.guidance = steps, guidance
         config = self.generator.config
         if config.steps == 1 < (steps or 1):
-            _warn(
-                config.name,
-                f"steps={steps}: generator {config.name!r} was trained for one step; more add noise (the package's "
-                "own loses 0.3 to 0.8 dB in the holes of synthetic streets). Pass steps=1, or a model made for more",
-            )
+            made_for = f"steps={steps}: generator {config.name!r} was trained for one step; more add noise"
+            _warn(config.name, f"{made_for}. Pass steps=1, or a model made for more")
 
     @property
     def needs_confidence(self) -> bool:
@@ -76,13 +73,18 @@ class Diffusion(Inpainter, torch.nn.Module):
 
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
         """Fill rendered frames, which share the network's calls; ``frames`` hold their source images."""
-        jobs = []
-        for one, frame, name in zip(rendered, frames, frame_names(frames), strict=True):
-            # Noise by camera number: cameras have no names in a batch.
-            rig = one.rig.with_cameras([replace(camera, name=str(k)) for k, camera in enumerate(one.rig)])
-            jobs.append(FrameViews(one.images, one.coverage, rig, frame.images, frame.rig, one.confidence, name))
-        settings = {"steps": self.steps, "guidance": self.guidance, "seed": self.seed}
-        done = complete_together(self.generator, jobs, min_confidence=self.min_confidence, **settings)  # type: ignore[arg-type]
+        # Noise by camera number: cameras have no names in a batch.
+        rigs = [one.rig.with_cameras([replace(c, name=str(k)) for k, c in enumerate(one.rig)]) for one in rendered]
+        done = complete_together(
+            self.generator,
+            [replace(one, rig=rig) for one, rig in zip(rendered, rigs, strict=True)],
+            frames,
+            frame_names(frames),
+            min_confidence=self.min_confidence,
+            steps=self.steps,
+            guidance=self.guidance,
+            seed=self.seed,
+        )
         return [put(one, list(views.images), list(views.generated)) for one, views in zip(rendered, done, strict=True)]
 
 

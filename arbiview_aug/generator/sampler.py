@@ -52,12 +52,10 @@ def sample(
     temperature: float = 1.0,
     warm_start: bool = False,
 ) -> torch.Tensor:
-    """Sample x0 (B, N, C, h, w) float32.
+    """Sample x0 (B, N, C, h, w) float32 from pre-filled latents and standard normal noise of that shape.
 
     Args:
         predict: The denoiser with its conditions; called once per step.
-        prefilled: (B, N, C, h, w) latents to start from.
-        noise: Likewise, standard normal.
         schedule: From ``noise_schedule``; its state changes.
         steps: 1 is the one-step regression, without noise.
         strength: Share of the diffusion by which the pre-filled latent is noised, in (0, 1].
@@ -84,6 +82,6 @@ def guided(conditional: torch.Tensor, unconditional: torch.Tensor, guidance: flo
     Lin et al. 2023, Sec. 3.4: φ = 0.7 keeps strong guidance from overexposing.
     """
     mixed = unconditional + guidance * (conditional - unconditional)
-    each = (2, 3, 4)
-    scaled = mixed * (conditional.std(each, keepdim=True) / mixed.std(each, keepdim=True).clamp(min=1e-6))
+    deviation, mixed_deviation = (x.std((2, 3, 4), keepdim=True) for x in (conditional, mixed))
+    scaled = mixed * (deviation / mixed_deviation.clamp(min=1e-6))
     return rescale * scaled + (1 - rescale) * mixed

@@ -18,8 +18,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.conditioning import FrameGeometry
 from arbiview_aug.generator.denoiser import Rows
-from arbiview_aug.generator.geometry import FrameGeometry
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.data import open_frames
 from arbiview_aug.generator.training.pseudo_views import PseudoViews, collate

@@ -16,15 +16,15 @@ import torch
 from arbiview_aug.cli.parsers import train
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.conditioning import FrameGeometry
 from arbiview_aug.generator.correspondence import Correspondence
 from arbiview_aug.generator.denoiser import REGRESSION, Rows
-from arbiview_aug.generator.geometry import FrameGeometry
 from arbiview_aug.generator.training.command import fresh
 from arbiview_aug.generator.training.config import CONFIGS, PseudoViewConfig, TrainConfig, overridden
 from arbiview_aug.generator.training.data import Frames, open_frames
 from arbiview_aug.generator.training.held_out import gains, held_out_scores, mean_hole_psnr, sampled
+from arbiview_aug.generator.training.losses import without_attention
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
-from arbiview_aug.generator.training.step import without_attention
 from arbiview_aug.generator.training.trainer import Trainer
 
 _AS_WRITTEN = (

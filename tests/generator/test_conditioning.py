@@ -12,13 +12,14 @@ from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.generator.conditioning import (
     PoseContext,
     Views,
+    batched,
+    frame_geometry,
     input_channels,
     plucker_rays,
     pooled,
     pose_vector,
     reference_camera,
 )
-from arbiview_aug.generator.geometry import batched, frame_geometry
 from tests.generator.small import ring, small_config
 
 ONE = Camera.looking(

@@ -9,12 +9,10 @@ import torch
 from diffusers import UNet2DConditionModel
 
 from arbiview_aug.generator import Generator, compact, paper, small, tiny
-from arbiview_aug.generator.autoencoder import Autoencoder
-from arbiview_aug.generator.conditioning import Views
+from arbiview_aug.generator.conditioning import FrameGeometry, Views, frame_geometry
 from arbiview_aug.generator.config import UNetConfig
 from arbiview_aug.generator.correspondence import token_sizes
-from arbiview_aug.generator.denoiser import REGRESSION, Denoiser, Rows
-from arbiview_aug.generator.geometry import FrameGeometry, frame_geometry
+from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, Denoiser, Rows
 from tests.generator.small import ring, small_config, stirred
 
 

@@ -14,10 +14,10 @@ from diffusers import AutoencoderKL, UNet2DConditionModel
 
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Generator, GeneratorConfig, paper
+from arbiview_aug.generator.conditioning import frame_geometry
 from arbiview_aug.generator.config import AutoencoderConfig, UNetConfig
 from arbiview_aug.generator.denoiser import Denoiser
-from arbiview_aug.generator.geometry import frame_geometry
-from arbiview_aug.generator.stable_diffusion import empty_prompt
+from arbiview_aug.generator.generator import embedded_empty_prompt
 from tests.generator.small import ring, small_config
 
 UNET_15 = {
@@ -219,21 +219,21 @@ def test_the_text_encoder_is_loaded_completely_or_not_at_all(folder: Path, monke
     tokens = torch.tensor([[49406, *[49407] * 76]])
     with torch.no_grad():
         expected = encoder.eval()(tokens).last_hidden_state[0]
-        assert torch.allclose(empty_prompt(folder), expected, atol=1e-5)
+        assert torch.allclose(embedded_empty_prompt(folder), expected, atol=1e-5)
     layer = {name: value for name, value in good.items() if "layers.1." in name}
     save({name: value for name, value in good.items() if name not in layer})
     expected = r"text_encoder: expected exactly the weights of this CLIPTextModel; "
     with pytest.raises(GeneratorError, match=rf"{expected}{len(layer)} missing: encoder.layers.1"):
-        empty_prompt(folder)
+        embedded_empty_prompt(folder)
     save({**good, "lora.up": torch.zeros(2)})
     with pytest.raises(GeneratorError, match=f"{expected}1 that do not belong: lora.up"):
-        empty_prompt(folder)
+        embedded_empty_prompt(folder)
     save({**good, next(iter(layer)): torch.zeros(7)})
-    with pytest.raises(GeneratorError, match="text_encoder: expected the weights of a CLIPTextModel as safetensors"):
-        empty_prompt(folder)
+    with pytest.raises(GeneratorError, match="text_encoder: expected the weights of this CLIPTextModel as safetensors"):
+        embedded_empty_prompt(folder)
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ImportError, match=r"^transformers is not installed: pip install 'arbiview_aug\[generator\]'$"):
-        empty_prompt(folder)
+        embedded_empty_prompt(folder)
 
 
 def test_half_precision_is_refused_by_the_autoencoder(folder: Path) -> None:

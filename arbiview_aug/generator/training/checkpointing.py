@@ -22,6 +22,7 @@ from arbiview_aug.generator.config import from_plain
 from arbiview_aug.generator.training.config import TrainConfig
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
+_MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")  # in a resumed run
 
 
 @contextmanager
@@ -55,16 +56,17 @@ def save_state(
     write_checkpoint(folder, {"step": step, "training": asdict(config)}, tensors)
 
 
+def has_state(folder: Path) -> bool:
+    """Whether a folder holds a state to resume from."""
+    return (folder / CONFIG_FILE).is_file()
+
+
 def saved_config(folder: Path, otherwise: TrainConfig) -> TrainConfig:
     """The settings of the run whose state a folder holds, TrainingError if broken; ``otherwise`` without a state."""
-    return _training_config(folder, read_config(folder)[0]) if has_state(folder) else otherwise
-
-
-def _training_config(folder: Path, data: Mapping[str, Any]) -> TrainConfig:
-    try:
-        return from_plain(TrainConfig, data["training"], "config", TrainingError)
-    except (GeneratorError, KeyError) as error:
-        raise TrainingError(f"{folder}: expected the state of a training run: {error}") from None
+    if not has_state(folder):
+        return otherwise
+    with _broken(folder):
+        return from_plain(TrainConfig, read_config(folder)[0]["training"], "config", TrainingError)
 
 
 def load_state(
@@ -75,24 +77,20 @@ def load_state(
     optimiser: torch.optim.Optimizer,
 ) -> int:
     """Load a saved state into a run; returns its steps. TrainingError for other settings, or a broken state."""
-    try:
-        data, tensors = read_checkpoint(folder)
-        step = int(data["step"])
-    except (GeneratorError, KeyError) as error:
-        raise TrainingError(f"{folder}: expected the state of a training run: {error}") from None
-    before, now = asdict(_training_config(folder, data)), asdict(config)
+    before, now = asdict(saved_config(folder, config)), asdict(config)
     changed = [key for key in now if key not in _MAY_DIFFER and before[key] != now[key]]
     if changed:
         raise TrainingError(
             f"{folder}: a run with other settings of {', '.join(changed)}; resume with the same ones, or give another "
             "--output"
         )
-    missing = [f"{part}.{n}" for part in ("weights", "average") for n in parameters if f"{part}.{n}" not in tensors]
-    if missing:
-        raise TrainingError(f"{folder}: expected {missing[0]} and others, {len(missing)} are missing")
-    for (name, parameter), value in zip(parameters.items(), average.shadow_params, strict=True):
-        parameter.data.copy_(tensors[f"weights.{name}"])
-        value.copy_(tensors[f"average.{name}"])
+    with _broken(folder):
+        data, tensors = read_checkpoint(folder)
+        step = int(data["step"])
+        saved = [(tensors[f"weights.{name}"], tensors[f"average.{name}"]) for name in parameters]
+    for parameter, shadow, (weight, mean) in zip(parameters.values(), average.shadow_params, saved, strict=True):
+        parameter.data.copy_(weight)
+        shadow.copy_(mean)
     average.optimization_step = step
     state: dict[int, dict[str, torch.Tensor]] = {}
     for name, value in tensors.items():
@@ -103,12 +101,12 @@ def load_state(
     return step
 
 
-_MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")  # in a resumed run
-
-
-def has_state(folder: Path) -> bool:
-    """Whether a folder holds a state to resume from."""
-    return (folder / CONFIG_FILE).is_file()
+@contextmanager
+def _broken(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except (GeneratorError, KeyError) as error:
+        raise TrainingError(f"{folder}: expected the state of a training run: {error}") from None
 
 
 @contextmanager

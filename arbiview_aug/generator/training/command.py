@@ -15,17 +15,16 @@ from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.training.autoencoder import train_autoencoder
 from arbiview_aug.generator.training.checkpointing import saved_config
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.data import open_frames
 from arbiview_aug.generator.training.held_out import held_out_scores, report
 from arbiview_aug.generator.training.losses import load_perceptual
-from arbiview_aug.generator.training.trainer import Trainer
+from arbiview_aug.generator.training.trainer import Trainer, silent
 
 COMMANDS = ("train", "evaluate")
 
-_TIMEOUT = timedelta(hours=3)  # timeout of the other processes, while one trains the autoencoder or scores
+_TIMEOUT = timedelta(hours=3)  # of a process that waits for the others: they prepare frames, validate and save
 
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
@@ -35,59 +34,54 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
         config = saved_config(output / "state", config)
     accelerate = optional_package("accelerate", "generator")
     processes = accelerate.PartialState(cpu=not torch.cuda.is_available(), timeout=_TIMEOUT)
-    show, device = processes.is_main_process and not arguments.quiet, processes.device
     if not processes.is_main_process:
-        say = _discard
-    size, seed = config.generator.image_size, config.seed
+        say = silent
+    options: dict[str, Any] = {"show": processes.is_main_process and not arguments.quiet, "say": say}
     if arguments.command == "evaluate":
-        generator = Generator.from_pretrained(output / "generator").to(device)
-        data = arguments.data or (generator.trained_on.data if generator.trained_on else "synthetic")
-        frames = open_frames(data, size, scenes=config.scenes, seed=seed, points=True, device=device)
-        indices, seeds = frames.split(seed).held_out[: arguments.views], range(arguments.seeds)
-        if not indices:
-            raise TrainingError(f"evaluate: {data}: expected at least two scenes, one to train on and one held out")
-        scores = held_out_scores(generator, frames, indices, seeds=seeds, steps=arguments.steps, show=show)
-        say(f"{data}, {arguments.steps or generator.config.steps} steps, guidance {generator.config.guidance:g}")
-        report(scores, len(seeds), say)
+        _evaluate(arguments, config, output, processes.device, **options)
         return 0
-    data = arguments.data or "synthetic"
-    frames = open_frames(data, size, scenes=config.scenes, seed=seed, device=device)
-    split = frames.split(seed)
-    if arguments.stage == "autoencoder" and config.autoencoder is None:
-        raise TrainingError(f"--stage autoencoder: --config {arguments.config} has none of its own")
     check_weights(config, arguments.weights)
-    perceptual = load_perceptual(arguments.vgg_weights) if config.loss.perceptual else None
+    options["perceptual"] = load_perceptual(arguments.vgg_weights) if config.loss.perceptual else None
+    data, device = arguments.data or "synthetic", processes.device
+    frames = open_frames(data, config.generator.image_size, scenes=config.scenes, seed=config.seed, device=device)
     if data == "synthetic":
+        split = frames.split(config.seed)
         used = [*split.training, *split.validation]
         if device.type != "cpu" and config.workers:
             frames.check_fits(used)
         # Each process takes a second to start, a street half a second to render.
         readers = min(8, os.cpu_count() or 1) if device.type == "cpu" and len(used) >= 16 else 0
-        frames.prepare(used, workers=readers, show=show)
-    options: dict[str, Any] = {"perceptual": perceptual, "show": show, "say": say}
-    generator = fresh(config, arguments.weights).to(device)
-    with processes.main_process_first():  # the others load the autoencoder that it saved
-        train_autoencoder(config, frames, generator, output, **options)
-    if arguments.stage == "autoencoder":
-        say(f"the autoencoder is in {output / 'autoencoder'}")
-    else:
-        Trainer(config, frames, generator, output, **options).train()
+        frames.prepare(used, workers=readers, show=options["show"])
+    Trainer(config, frames, fresh(config, arguments.weights).to(device), output, **options).train()
     return 0
 
 
-def _discard(message: str) -> None:
-    """Discard a message: only the first process prints."""
+def _evaluate(
+    arguments: argparse.Namespace,
+    config: TrainConfig,
+    output: Path,
+    device: torch.device,
+    show: bool,
+    say: Callable[[str], None],
+) -> None:
+    generator = Generator.from_pretrained(output / "generator").to(device)
+    data = arguments.data or (generator.trained_on.data if generator.trained_on else "synthetic")
+    size, seed, seeds = config.generator.image_size, config.seed, range(arguments.seeds)
+    frames = open_frames(data, size, scenes=config.scenes, seed=seed, points=True, device=device)
+    indices = frames.split(seed).held_out[: arguments.views]
+    if not indices:
+        raise TrainingError(f"evaluate: {data}: expected at least two scenes, one to train on and one held out")
+    scores = held_out_scores(generator, frames, indices, seeds=seeds, steps=arguments.steps, show=show)
+    say(f"{data}, {arguments.steps or generator.config.steps} steps, guidance {generator.config.guidance:g}")
+    report(scores, len(seeds), say)
 
 
 def check_weights(config: TrainConfig, weights: str | None) -> None:
     """Check, before any work, that weights are given exactly if ``fresh`` needs them; TrainingError otherwise."""
     name = config.generator.name
     if config.generator.frozen_unet and weights is None:
-        model = f"Stable Diffusion 1.5{' inpainting' if config.generator.inpainting else ''}"
-        raise TrainingError(
-            f"--config {name}: expected --weights, a folder or hub id of {model} in diffusers' layout, for its frozen "
-            "U-Net"
-        )
+        model = f"Stable Diffusion 1.5{' inpainting' if config.generator.inpainting else ''} in diffusers' layout"
+        raise TrainingError(f"--config {name}: expected --weights, a folder or hub id of {model}, for its frozen U-Net")
     if not config.generator.frozen_unet and weights is not None:
         raise TrainingError(f"--weights: expected none for --config {name}, which is trained from scratch")
 
@@ -95,6 +89,5 @@ def check_weights(config: TrainConfig, weights: str | None) -> None:
 def fresh(config: TrainConfig, weights: str | None) -> Generator:
     """The untrained generator of a run, the same for the same seed."""
     torch.manual_seed(config.seed)
-    if weights is not None:
-        return Generator.from_stable_diffusion(weights, config.generator)
-    return Generator.from_config(config.generator)
+    settings = config.generator
+    return Generator.from_config(settings) if weights is None else Generator.from_stable_diffusion(weights, settings)

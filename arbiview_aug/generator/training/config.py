@@ -25,7 +25,6 @@ class PseudoViewConfig:
 
     quality: PseudoQuality = "fast"  # how FAVS renders them: as this package does, or by the published stages 1 to 4
     targets: int = 1  # real views to reconstruct together, of neighbouring cameras: each reads the others
-    pairs: int = 1  # K of Algorithm 1: pairs of pseudo poses per draw of a real view; each is an item of its own
     yaw_deg: tuple[float, float] = (5.0, 35.0)  # range of a pseudo pose's turn to its side
     pitch_deg: float = 8.0  # half-widths of the other turns and moves
     lateral_m: float = 1.0
@@ -43,7 +42,7 @@ class PseudoViewConfig:
         shares = ("p_translate", "p_mask_transfer", "hidden", "leave_one_out", "virtual", "real_sources")
         _check(self, "a probability", lambda p: 0 <= p <= 1, *shares)
         _check(self, "fast or paper", lambda q: q in ("fast", "paper"), "quality")
-        _check(self, "at least 1", lambda n: n >= 1, "targets", "pairs", "mask_bank")
+        _check(self, "at least 1", lambda n: n >= 1, "targets", "mask_bank")
         _check(self, "0 <= low <= high <= 90", lambda yaw: 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
         _check(self, "0 < low <= high", lambda factor: 0 < factor[0] <= factor[1], "focal")
 
@@ -72,22 +71,10 @@ class LossConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AutoencoderTraining:
-    """The first stage, for configurations with an autoencoder of their own."""
-
-    steps: int = 3000
-    batch: int = 32
-    lr: float = 3e-4
-    kl: float = 1e-6  # weight of the KL term: Stable Diffusion's (Rombach et al. 2022)
-    perceptual: float = 0.1  # weight of the VGG term
-
-
-@dataclass(frozen=True, kw_only=True)
 class TrainConfig:
     generator: GeneratorConfig
     pseudo_views: PseudoViewConfig = field(default_factory=PseudoViewConfig)
     loss: LossConfig = field(default_factory=LossConfig)
-    autoencoder: AutoencoderTraining | None = None  # None if latents are pixels, or the autoencoder is pretrained
     steps: int
     batch: int  # items per process and step
     lr: float
@@ -195,7 +182,6 @@ def small() -> TrainConfig:
     """Minutes on a GPU."""
     return TrainConfig(
         generator=generators.small(),
-        autoencoder=AutoencoderTraining(),
         steps=20_000,
         batch=16,
         lr=3e-4,

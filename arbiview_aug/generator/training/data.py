@@ -70,14 +70,8 @@ class Frames:
 
     def prepare(self, indices: Sequence[int], *, workers: int = 0, show: bool = True) -> None:
         """Cache frames, read by ``workers`` processes, before the workers that make items fork and share the memory."""
-        read: DataLoader[TrainingFrame] = DataLoader(
-            self,  # type: ignore[arg-type]
-            batch_size=None,
-            sampler=indices,
-            num_workers=workers,
-            multiprocessing_context=forked(workers),
-            collate_fn=_unchanged,
-        )
+        settings: Any = {"batch_size": None, "sampler": indices, "collate_fn": _unchanged, **item_workers(workers)}
+        read: DataLoader[TrainingFrame] = DataLoader(self, **settings)  # type: ignore[arg-type]
         for index, frame in zip(indices, tqdm(read, desc="frames", unit="frame", disable=not show), strict=True):
             if workers:  # copied, since each tensor in shared memory keeps a file open
                 frame = frame._replace(images=[image.clone() for image in frame.images])
@@ -101,26 +95,21 @@ class Frames:
         order = torch.randperm(len(names), generator=torch.Generator().manual_seed(seed)).tolist()
         first = max(1, round(SHARES[0] * len(names)))
         second = max(first, min(first + round(SHARES[1] * len(names)), len(names) - 1))
-        part = {names[k]: (place >= first) + (place >= second) for place, k in enumerate(order)}
-        parts: tuple[list[int], list[int], list[int]] = ([], [], [])
-        for index, scene in enumerate(self.scenes):
-            parts[part[scene]].append(index)
-        return Split(*parts)
+        parts = ({names[k] for k in part} for part in (order[:first], order[first:second], order[second:]))
+        return Split(*([index for index, scene in enumerate(self.scenes) if scene in part] for part in parts))
 
 
 def _bytes_of(frame: TrainingFrame) -> int:
     return sum(image.nbytes for image in frame.images)
 
 
-def forked(workers: int) -> str | None:
-    """Start method of workers: fork, to share this process's frames (not the default from Python 3.14)."""
-    return "fork" if workers else None
-
-
 def item_workers(count: int) -> dict[str, Any]:
-    """Arguments of a ``DataLoader`` whose workers make items, each with one thread; 0 makes them in this process."""
-    started = one_thread_worker if count else None
-    return {"num_workers": count, "multiprocessing_context": forked(count), "worker_init_fn": started}
+    """Arguments of a ``DataLoader`` with workers of one thread each; 0 makes its items in this process.
+
+    Workers fork, to share this process's frames (not the default from Python 3.14).
+    """
+    started = ("fork", one_thread_worker) if count else (None, None)
+    return {"num_workers": count, "multiprocessing_context": started[0], "worker_init_fn": started[1]}
 
 
 def one_thread_worker(worker: int) -> None:

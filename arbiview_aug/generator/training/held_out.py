@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -24,6 +23,7 @@ from arbiview_aug.errors import TrainingError
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.lidar import visible_points
 from arbiview_aug.evaluate.metrics import errors, spectrum_distance_db
+from arbiview_aug.evaluate.report.pictures import contact_sheet
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import denoised, valid_pixels
 from arbiview_aug.generator.training.data import Frames, TrainingFrame
@@ -72,29 +72,21 @@ def bootstrap(values: Sequence[float], seed: int = 0, draws: int = 2000) -> Inte
     return Interval(float(array.mean()), float(low), float(high))
 
 
-# --- pictures ---------------------------------------------------------------------------------------------------------
 COLUMNS = ("source", "source", "FAVS", "mask", "filled", "sample", "truth")
-_MIN_WIDTH_PX = 112  # smaller views are enlarged
-_GAP_PX = 2
+_COLUMN_PX = 120  # smaller views are enlarged
 
 
 def picture(batch: Batch, samples: torch.Tensor) -> np.ndarray:
     """(height, width, 3) uint8: a row for each item of a batch with samples (B, N, 3, H, W), a column for each view."""
-    scale = max(1, -(-_MIN_WIDTH_PX // samples.shape[-1]))
     mask = batch.known[:, :1, None].float().expand_as(batch.favs[:, :1])
-    others = (batch.condition, samples, batch.truth)
-    columns = [batch.sources[:, :2], batch.favs[:, :1], mask, *(views[:, :1] for views in others)]
-    views = torch.nn.functional.pad(
-        torch.cat(columns, 1).repeat_interleave(scale, -1).repeat_interleave(scale, -2), (0, _GAP_PX, 0, _GAP_PX)
-    )  # [B, columns, 3, h, w]
-    pixels = (views.cpu().clamp(0, 1) * 255).round().byte().permute(0, 3, 1, 4, 2).flatten(2, 3).flatten(0, 1).numpy()
-    width = pixels.shape[1]
-    head = np.zeros((16, width, 3), np.uint8)
-    for k, name in enumerate(COLUMNS):
-        cv2.putText(head, name, (k * width // len(COLUMNS) + 3, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1)
-    return np.concatenate([head, pixels])
+    firsts = (batch.favs, mask, batch.condition, samples, batch.truth)
+    views = torch.cat([batch.sources[:, :2], *(views[:, :1] for views in firsts)], 1).cpu().clamp(0, 1) * 255
+    rows = views.permute(0, 1, 3, 4, 2).numpy()  # [B, columns, h, w, 3]
+    width = len(COLUMNS) * max(_COLUMN_PX, rows.shape[3])
+    return contact_sheet([list(row) for row in rows], [COLUMNS] * len(rows), batch.tokens, width_px=width)
 
 
+# --- scores -----------------------------------------------------------------------------------------------------------
 MIN_HOLES = 0.05  # smallest share of holes in a drawn target
 
 _TRIES = 60
@@ -124,12 +116,11 @@ def held_out_scores(
 ) -> dict[str, list[float]]:
     """Score each filling method by PSNR (dB) inside the holes, one value for each (seed, scene).
 
-    Each target is drawn from the retarget distribution; FAVS renders it from all cameras and the generator completes
-    it, as at inference. A perfect sampler is 3 dB below the posterior's mean, so a single sample, the mean of several
+    Targets are drawn from the retarget distribution; FAVS renders them from all cameras, and the generator completes
+    them, as at inference. A perfect sampler is 3 dB below the posterior's mean: a single sample, the mean of several
     and the one-step regression are scored separately.
 
     Args:
-        generator: The model, with its own guidance.
         frames: Synthetic streets, whose true pixels are known, or samples with LiDAR points; see ``case_of``.
         indices: Held-out ones.
         seeds: Seeds of targets and noise.
@@ -174,16 +165,16 @@ def held_out_scores(
 def case_of(frames: Frames, index: int, rng: torch.Generator) -> Case:
     """Draw targets until one has holes, and true pixels or points in them; TrainingError if none of many has."""
     frame, drive = frames[index], frames.dataset
-    points = None if isinstance(drive, SyntheticDrive) else drive[index].get("points")
-    if points is None and not isinstance(drive, SyntheticDrive):
+    street = drive if isinstance(drive, SyntheticDrive) else None
+    points: Any = drive[index].get("points") if street is None else None
+    if street is None and points is None:
         raise TrainingError(f"frame {frame.token}: expected LiDAR points, which score real frames, found none")
     for _ in range(_TRIES):
         place = one_of(rng, len(frame.rig))
         target = replace(retarget(frame.rig[place], rng), mask=None)
-        if isinstance(drive, SyntheticDrive):
-            case = _street_case(drive, index, frame, target)
+        if street is not None:
+            case = _street_case(street, index, frame, target)
         else:
-            assert points is not None
             case = _lidar_case(frame, place, target, points.numpy(), rng)
         if case is not None and float((~case.view.covered).float().mean()) >= MIN_HOLES:
             return case
@@ -211,10 +202,9 @@ def _lidar_case(
     Points in the holes of a real target have no colour, since no camera saw them. So a drawn mask hides a part of the
     camera at this place from FAVS and from the generator, and colours the points there.
     """
-    camera = frame.rig[place]
+    camera, cameras = frame.rig[place], list(frame.rig)
     seed = int(torch.randint(2**31, (), generator=rng))
     hidden, valid = ~mask_bank(frame.rig, 1, seed)[0].numpy(), valid_pixels(camera).numpy()
-    cameras = list(frame.rig)
     cameras[place] = replace(camera, mask=valid & ~hidden)
     sources = frame.rig.with_cameras(cameras)
     view = favs(frame.images, sources, [target])

@@ -1,21 +1,26 @@
-"""Terms of L_total = L_main + α L_geo + β L_perceptual (Sec. Loss Function Design)."""
+"""The loss terms of a training step of CVC-SSL: L_total = L_main + α L_geo + β L_perceptual (Algorithm 1)."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from torch import nn
 
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
+from arbiview_aug.generator.conditioning import FrameGeometry, pooled
 from arbiview_aug.generator.config import Prediction
-from arbiview_aug.generator.denoiser import Rows
-from arbiview_aug.generator.training.config import GeoMode
+from arbiview_aug.generator.denoiser import REGRESSION, TIMESTEPS, Autoencoder, Denoiser, Rows
+from arbiview_aug.generator.sampler import noise_schedule
+from arbiview_aug.generator.training.config import GeoMode, TrainConfig
+from arbiview_aug.generator.training.pseudo_views import Batch
 
 VGG_LAYERS = (3, 8, 15, 22)  # relu1_2, 2_2, 3_3, 4_3 of torchvision's vgg16 (Johnson et al. 2016); λ_l = 1/4
+LATENT_BYTES = 4 * 2**30  # memory for latents of real views: 190,000 of 224 x 400 pixels
 
 
 class Diffusion:
@@ -25,25 +30,25 @@ class Diffusion:
         self.signal, self.noise = alphas_cumprod.double().sqrt().float(), (1 - alphas_cumprod.double()).sqrt().float()
         self.prediction = prediction
 
-    def _at(self, values: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
-        return values.to(t.device)[t].view(-1, 1, 1, 1, 1)
+    def _at(self, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """a and s at t (B,), (B, 1, 1, 1, 1)."""
+        a, s = (values.to(t.device)[t].view(-1, 1, 1, 1, 1) for values in (self.signal, self.noise))
+        return a, s
 
     def noisy(self, x0: torch.Tensor, eps: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
         """x_t (B, N, C, h, w) of x0 and ε at t (B,)."""
-        return self._at(self.signal, t) * x0 + self._at(self.noise, t) * eps
+        a, s = self._at(t)
+        return a * x0 + s * eps
 
     def target(self, x0: torch.Tensor, eps: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
         """The prediction target: ε, or v = a ε − s x0 (Salimans & Ho 2022)."""
-        if self.prediction == "epsilon":
-            return eps
-        return self._at(self.signal, t) * eps - self._at(self.noise, t) * x0
+        a, s = self._at(t)
+        return eps if self.prediction == "epsilon" else a * eps - s * x0
 
     def x0(self, x: torch.Tensor, predicted: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
         """Estimate x0 from the prediction at x_t; inaccurate at late t with ε."""
-        a, s = self._at(self.signal, t), self._at(self.noise, t)
-        if self.prediction == "epsilon":
-            return (x - s * predicted) / a.clamp(min=1e-4)
-        return a * x - s * predicted
+        a, s = self._at(t)
+        return (x - s * predicted) / a.clamp(min=1e-4) if self.prediction == "epsilon" else a * x - s * predicted
 
     def weight(self, t: torch.Tensor, limit: float, floor: float) -> torch.Tensor:
         """(B,) Min-SNR-γ weights, at least ``floor``; 1 where the limit is 0."""
@@ -68,18 +73,15 @@ def geometric_loss(rows: Sequence[Rows], mode: GeoMode) -> torch.Tensor:
     ``frobenius_sum`` is the paper's Σ_ij ‖M_pred − M_target‖_F, summed over blocks. ``normalised`` is the mean over
     rows of ‖m_pred − m_target‖, averaged over blocks: it does not grow with resolution, cameras and depth.
     """
+    if mode == "normalised":
+        norms = [torch.linalg.vector_norm(predicted - target, dim=1) for predicted, target, _ in rows]
+        return torch.stack([norm.sum() / max(len(norm), 1) for norm in norms]).sum() / len(norms)
     losses = []
     for predicted, target, pair in rows:
-        difference = predicted - target
-        if mode == "frobenius_sum":
-            count = int(pair.max()) + 1 if len(pair) else 1
-            squares = difference.new_zeros(count).index_add(0, pair, difference.square().sum(1))
-            # sqrt has no gradient at 0; pairs without rows are left out
-            losses.append((squares[squares > 0]).sqrt().sum())
-        else:
-            losses.append(torch.linalg.vector_norm(difference, dim=1).sum() / max(len(difference), 1))
-    total = torch.stack(losses).sum()
-    return total if mode == "frobenius_sum" else total / len(losses)
+        count = int(pair.max()) + 1 if len(pair) else 1
+        squares = predicted.new_zeros(count).index_add(0, pair, (predicted - target).square().sum(1))
+        losses.append(squares[squares > 0].sqrt().sum())  # sqrt has no gradient at 0; pairs without rows are left out
+    return torch.stack(losses).sum()
 
 
 class Perceptual(nn.Module):
@@ -134,10 +136,103 @@ def load_perceptual(weights: str | Path | None) -> Perceptual:
     return Perceptual(vgg.features)
 
 
-def crop(images: torch.Tensor, side: int, rng: torch.Generator) -> tuple[Any, ...]:
-    """Index of one random square of images (..., h, w), as large as they allow."""
-    spans = []
-    for n in images.shape[-2:]:
-        start = int(torch.randint(n - min(side, n) + 1, (), generator=rng))
-        spans.append(slice(start, start + side))
-    return (..., *spans)
+# --- the step ---------------------------------------------------------------------------------------------------------
+class Draws(NamedTuple):
+    """Random draws of a step, on the batch's device."""
+
+    t: torch.Tensor  # (B,) int64 times; ``REGRESSION`` for the items that train the one-step head
+    eps: torch.Tensor  # (B, N, C, h, w) standard normal
+    drop: torch.Tensor  # (B,) bool, items without conditions
+    rng: torch.Generator  # for the crop of the perceptual loss
+
+
+def without_attention(geometry: FrameGeometry) -> FrameGeometry:
+    """The geometry with all correspondences masked: no view reads another one."""
+    return geometry.with_reads(lambda reads: reads._replace(valid=torch.zeros_like(reads.valid)))
+
+
+def draw(config: TrainConfig, batch: Batch, rng: torch.Generator) -> Draws:
+    """Draw times, noise and dropped conditions for a batch, on the CPU: the same on every device."""
+    latent, count, device = config.generator, len(batch.tokens), batch.truth.device
+    t = torch.randint(TIMESTEPS, (count,), generator=rng)
+    is_regression = torch.rand(count, generator=rng) < config.loss.regression
+    drop = (torch.rand(count, generator=rng) < config.cond_drop_prob) & ~is_regression
+    eps = torch.randn((*batch.truth.shape[:2], latent.autoencoder.latent_channels, *latent.latent_size), generator=rng)
+    return Draws(torch.where(is_regression, REGRESSION, t).to(device), eps.to(device), drop.to(device), rng)
+
+
+class Step(nn.Module):
+    """The loss terms of a batch, as one module that distributed training can wrap; no VGG switches L_perceptual off."""
+
+    def __init__(
+        self, config: TrainConfig, denoiser: Denoiser, autoencoder: Autoencoder, perceptual: Perceptual | None
+    ) -> None:
+        super().__init__()
+        self.config, self.denoiser = config, denoiser
+        self._frozen = (autoencoder, perceptual)  # a tuple: not among this module's parameters
+        self._cache: dict[tuple[int, int] | None, torch.Tensor] = {}  # x0 of real views, by frame and camera
+        schedule = noise_schedule(prediction=config.generator.prediction, zero_snr=config.generator.zero_snr)
+        self.diffusion = Diffusion(schedule.alphas_cumprod, config.generator.prediction)
+
+    def forward(self, batch: Batch, draws: Draws, perceptual: bool = False) -> dict[str, torch.Tensor]:
+        """Compute ``main``, ``regression``, ``geo`` and, if asked for, ``perceptual``: without their weights."""
+        config, loss = self.config, self.config.loss
+        autoencoder, vgg = self._frozen
+        geometry = batch.geometry if config.attention else without_attention(batch.geometry)
+        with torch.no_grad():
+            x0 = self._latents(batch)
+            views, source_views = batch.conditions.encoded(config.generator, autoencoder, geometry)
+        size = (x0.shape[-2], x0.shape[-1])
+        valid = (pooled(batch.valid, size) > 0.99).float()[:, :, None]
+        pixel_weight = valid * (1 - (1 - loss.known_weight) * pooled(batch.known, size)[:, :, None])
+        is_regression = draws.t == REGRESSION
+        t, regressed = draws.t.clamp(max=TIMESTEPS - 1), is_regression.view(-1, 1, 1, 1, 1)
+        noisy = self.diffusion.noisy(x0, draws.eps, t)
+        start = torch.where(regressed, views.latent, noisy)
+        target = torch.where(regressed, x0, self.diffusion.target(x0, draws.eps, t))
+        views, windows = views.dropped(draws.drop), geometry.target_windows(draws.drop)
+        rows: list[Rows] | None = [] if loss.geo else None
+        sources = self.denoiser.read_sources(source_views, geometry.source_windows())
+        predicted = self.denoiser(start, draws.t, views, windows, sources, rows).float()
+        unit = self.denoiser.output_scale(draws.t, views)
+        error = masked_mse(predicted / unit, target / unit, pixel_weight)
+        weight = torch.ones_like(error)
+        if not config.generator.residual:  # its unit makes all times alike
+            weight = self.diffusion.weight(t, loss.snr_limit, loss.snr_floor)
+        terms = {"main": (error * weight)[~is_regression].sum() / len(t)}
+        if loss.regression:
+            terms["regression"] = error[is_regression].sum() / len(t)
+        if rows is not None:
+            terms["geo"] = geometric_loss(rows, loss.geo_mode)
+        early = ~is_regression & (t < loss.perceptual_below_t)
+        if perceptual and vgg is not None and bool(early.any()):
+            image = autoencoder.decode(self.diffusion.x0(noisy, predicted, t)[early]).float()
+            truth, known = batch.truth[early], batch.valid[early][:, :, None]
+            side = loss.perceptual_crop  # a random square, or the whole image
+            spans = (n - min(side, n) + 1 for n in config.generator.image_size)
+            y, x = (int(torch.randint(span, (), generator=draws.rng)) for span in spans)
+            compared = (image, truth, known)
+            image, truth, known = (value[..., y : y + side, x : x + side].flatten(0, 1) for value in compared)
+            terms["perceptual"] = vgg(torch.where(known, image, truth), truth).sum() / len(t)
+        return terms
+
+    def _latents(self, batch: Batch) -> torch.Tensor:
+        """x0 (B, N, C, h, w) of the truth; a VAE encodes each real view once, and alone: the same bits in any batch."""
+        autoencoder, _ = self._frozen
+        if autoencoder.vae is None:
+            return autoencoder.encode(batch.truth).float()
+        latents = []
+        for image, view in zip(batch.truth.flatten(0, 1), itertools.chain(*batch.views), strict=True):
+            latent = self._cache.get(view)
+            if latent is None:
+                latent = autoencoder.encode(image[None])[0].float().cpu()
+                if view is not None and len(self._cache) * latent.nbytes < LATENT_BYTES:
+                    self._cache[view] = latent
+            latents.append(latent)
+        return torch.stack(latents).unflatten(0, batch.truth.shape[:2]).to(batch.truth.device)
+
+    def total(self, terms: dict[str, torch.Tensor]) -> torch.Tensor:
+        """L_total = L_main + α L_geo + β L_perceptual; the one-step head's loss counts as L_main."""
+        loss = self.config.loss
+        weights = {"main": 1.0, "regression": 1.0, "geo": loss.geo, "perceptual": loss.perceptual}
+        return torch.stack([weights[name] * term for name, term in terms.items()]).sum()

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,9 +28,9 @@ from torch.utils.data import Dataset
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.renderer import render_paper
-from arbiview_aug.generator.completion import Conditions, nearest_sources, seeded, valid_pixels
+from arbiview_aug.generator.completion import Conditions, nearest_sources, seeded, unit, valid_pixels
+from arbiview_aug.generator.conditioning import FrameGeometry, batched, frame_geometry
 from arbiview_aug.generator.config import GeneratorConfig
-from arbiview_aug.generator.geometry import FrameGeometry, batched, frame_geometry
 from arbiview_aug.generator.training.config import PseudoQuality, PseudoViewConfig
 from arbiview_aug.generator.training.data import Frames
 from arbiview_aug.inpaint.telea import telea
@@ -44,6 +44,8 @@ _PITCH_DEG = (5.0, 12.0)
 _FOCAL = (0.4, 0.85)  # of a 65° lens: 74 to 115°
 _MIN_HOLES, _MAX_HOLES = 0.02, 0.75
 _TRIES = 8
+_VIRTUAL_YAW_DEG, _VIRTUAL_PITCH_DEG = 20.0, 8.0
+_FAVS = RenderConfig(certainty=True)
 
 
 def uniform(rng: torch.Generator, low: float, high: float) -> float:
@@ -93,10 +95,6 @@ def mask_bank(rig: Rig, count: int, seed: int) -> torch.Tensor:
             covered[:, : max(1, round(covered.shape[1] * uniform(rng, 0.1, 0.5)))] = False
         masks.append(covered)
     return torch.from_numpy(np.stack(masks))
-
-
-_VIRTUAL_YAW_DEG, _VIRTUAL_PITCH_DEG = 20.0, 8.0
-_FAVS = RenderConfig(certainty=True)
 
 
 class Batch(NamedTuple):
@@ -153,53 +151,38 @@ def favs(
     if quality == "paper":
         published = render_paper(rig, target, [image.cpu() for image in images])
         covered = torch.from_numpy(np.stack(published.coverage)).to(images[0].device)
-        return Rendered(_unit([view.image for view in published.targets]).to(covered.device), covered, covered.float())
+        views = unit(torch.stack([view.image for view in published.targets])).clamp(0, 1)
+        return Rendered(views.to(covered.device), covered, covered.float())
     is_moved = any(abs(c.center_m - rig[k].center_m).max() > 1e-6 for c in targets for k in nearest_sources(c, rig)[:1])
     plan = build_plan(rig, target, geometry="street" if is_moved else "infinity", config=_FAVS)
     (rendered,) = Renderer().render([plan], [Frame(tuple(images), rig)], [None], ("confidence",))
     assert isinstance(rendered.coverage, torch.Tensor) and isinstance(rendered.confidence, torch.Tensor)  # one size
-    return Rendered(_unit(rendered.images), rendered.coverage, rendered.confidence)
+    return Rendered(unit(torch.stack(rendered.images)).clamp(0, 1), rendered.coverage, rendered.confidence)
 
 
-def _unit(images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """(M, 3, h, w) float32 in [0, 1] of images in uint8 or in [0, 1]."""
-    return (torch.stack(list(images)).float() / (255 if images[0].dtype == torch.uint8 else 1)).clamp(0, 1)
-
-
-def neighbours(rig: Rig, camera: int) -> list[int]:
-    """Indices of a rig's cameras, this one first, the others by the angle between the optical axes."""
-    axes = [c.cam2ego[:3, 2] for c in rig]
-    return sorted(range(len(rig)), key=lambda k: (k != camera, -float(axes[k] @ axes[camera])))
-
-
+@dataclass(eq=False)
 class PseudoViews(Dataset[Batch]):
     """Items 0, 1, 2, …, without end, drawn from the frames ``indices``.
 
     Masks (n, h, w) bool are transferred. FAVS renders on ``device``, which is the CPU in workers.
     """
 
-    def __init__(
-        self,
-        frames: Frames,
-        indices: Sequence[int],
-        config: PseudoViewConfig,
-        generator: GeneratorConfig,
-        masks: torch.Tensor,
-        seed: int,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        self.device = device
-        self.frames, self.indices, self.config = frames, list(indices), config
-        self.generator, self.masks, self.seed = generator, masks, seed
+    frames: Frames
+    indices: Sequence[int]
+    config: PseudoViewConfig
+    generator: GeneratorConfig
+    masks: torch.Tensor
+    seed: int
+    device: torch.device | str = "cpu"
 
     def __getitem__(self, k: int) -> Batch:
-        config, view = self.config, k // self.config.pairs
-        rng = seeded(self.seed, "view", view)
+        config, rng = self.config, seeded(self.seed, "view", k)
         index = self.indices[one_of(rng, len(self.indices))]
         frame = self.frames[index]
         frame = frame._replace(images=[image.to(self.device) for image in frame.images])
         first = one_of(rng, len(frame.rig))
-        places = neighbours(frame.rig, first)[: config.targets]
+        axes = [camera.cam2ego[:3, 2] for camera in frame.rig]
+        places = sorted(range(len(axes)), key=lambda i: (i != first, -float(axes[i] @ axes[first])))[: config.targets]
         drawn = [self._target(frame.images[i], frame.rig[i], rng) for i in places]
         targets, truths, valids = zip(*drawn, strict=True)
         rng = seeded(self.seed, "pair", k)
@@ -221,14 +204,13 @@ class PseudoViews(Dataset[Batch]):
         shown, pseudo = [], []
         for target, mask in zip(targets, masks, strict=True):
             pair = self._pair(target, rng)
-            rendered = favs(images, rig, pair, config.quality)
-            masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, rendered.covered, strict=True)]
-            at_target = favs(list(rendered.images), Rig(masked, ground_z_m=rig.ground_z_m), [target], config.quality)
+            branches += pair
+            pseudo.append(favs(images, rig, pair, config.quality))
+            masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, pseudo[-1].covered, strict=True)]
+            at_target = favs(list(pseudo[-1].images), Rig(masked, ground_z_m=rig.ground_z_m), [target], config.quality)
             if is_transferred and not is_hidden:
                 at_target = at_target._replace(covered=at_target.covered & mask.to(at_target.covered.device))
             shown.append(at_target)
-            pseudo.append(rendered)
-            branches += pair
         view_at, known, confidence = (torch.cat(maps) for maps in zip(*shown, strict=True))
         view_at = view_at * known[:, None]
         # --- the source branches

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,8 @@ from arbiview_aug.generator.training.checkpointing import averaged, has_state, l
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
 from arbiview_aug.generator.training.held_out import mean_hole_psnr, picture, sampled
-from arbiview_aug.generator.training.losses import Perceptual
+from arbiview_aug.generator.training.losses import Perceptual, Step, draw
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate, mask_bank
-from arbiview_aug.generator.training.step import Step, draw
 
 _LOG_EVERY = 10
 _DEVIATION_ITEMS = 32
@@ -67,7 +66,7 @@ class Trainer:
         self.config, self.frames, self.output = config, frames, Path(output)
         self.accelerator = accelerate.Accelerator(mixed_precision=config.precision, cpu=not torch.cuda.is_available())
         self.is_main: bool = self.accelerator.is_main_process
-        self.show, self._say = show and self.is_main, say
+        self.show, self.say = show and self.is_main, say if self.is_main else silent
         self.device = self.accelerator.device
         scaled = replace(config.generator.autoencoder, scale=generator.config.autoencoder.scale)
         if generator.config != replace(config.generator, autoencoder=scaled, one_step=generator.config.one_step):
@@ -81,51 +80,40 @@ class Trainer:
         self.split = frames.split(config.seed)
         generator.trained_on = TrainedOn(data=frames.name, seed=config.seed, held_out=tuple(self.split.held_out))
         self.perceptual = perceptual.to(self.device) if config.loss.perceptual and perceptual is not None else None
-        step = Step(config, generator.denoiser, generator.autoencoder, self.perceptual)
-        self.optimiser = torch.optim.AdamW(
-            [p for p in step.parameters() if p.requires_grad], lr=config.lr, weight_decay=config.weight_decay
-        )
+        self.step = Step(config, generator.denoiser, generator.autoencoder, self.perceptual)
         self.trained = {n: p for n, p in generator.denoiser.named_parameters() if p.requires_grad}
+        self.optimiser = torch.optim.AdamW(self.trained.values(), lr=config.lr, weight_decay=config.weight_decay)
         ema = optional_package("diffusers.training_utils", "generator").EMAModel
         self.average = ema(self.trained.values(), decay=config.ema, foreach=True)
-        self.done, self.state_folder = 0, self.output / "state"
-        if has_state(self.state_folder):
-            self.done = load_state(self.state_folder, config, self.trained, self.average, self.optimiser)
-            self.say(f"going on after step {self.done} of {self.state_folder}")
+        self.done, state = 0, self.output / "state"
+        if has_state(state):
+            self.done = load_state(state, config, self.trained, self.average, self.optimiser)
+            self.say(f"going on after step {self.done} of {state}")
         # The optimiser is not placed: AdamW's step counters on a GPU would synchronise one by one.
-        self.model, self._optimiser = self.accelerator.prepare(step, self.optimiser, device_placement=[True, False])
-        self.step = step
-        masks = mask_bank(
-            frames[self.split.training[0]].rig, config.pseudo_views.mask_bank, config.seed + _SEEDS["masks"]
+        self.model, self._optimiser = self.accelerator.prepare(
+            self.step, self.optimiser, device_placement=[True, False]
         )
-        self.items = self._items(self.split.training, masks, "items")
+        rig, seeds = frames[self.split.training[0]].rig, {name: 10 * config.seed + k for name, k in _SEEDS.items()}
+        masks = mask_bank(rig, config.pseudo_views.mask_bank, config.seed + _SEEDS["masks"])
+        shared = config.pseudo_views, config.generator, masks
+        maker = "cpu" if config.workers else self.device
+        self.items = PseudoViews(frames, self.split.training, *shared, seeds["items"], maker)
+        validation = self.split.validation or self.split.training
+        self.validation = PseudoViews(frames, validation, *shared, seeds["validation"], maker)
         if config.generator.residual:
             self._measure_deviation()
-        self.validation = self._items(self.split.validation or self.split.training, masks, "validation")
         if not self.split.validation:
             self.say("too few scenes for a validation part: validating on training scenes, with other draws")
-
-    def say(self, message: str) -> None:
-        """Print a message from the main process alone."""
-        if self.is_main:
-            self._say(message)
-
-    def _items(self, indices: list[int], masks: torch.Tensor, what: str) -> PseudoViews:
-        config = self.config
-        device = "cpu" if config.workers else self.device
-        seed = 10 * config.seed + _SEEDS[what]
-        return PseudoViews(self.frames, indices, config.pseudo_views, config.generator, masks, seed, device)
 
     @torch.no_grad()
     def _measure_deviation(self) -> None:
         """Measure the standard deviation of the residual inside and outside holes, on the first items."""
-        encode = self.generator.autoencoder.encode
+        encode, size = self.generator.autoencoder.encode, self.config.generator.latent_size
         sums = torch.zeros(2, 2, dtype=torch.float64)
         for k in range(_DEVIATION_ITEMS):
             batch = self.items[k].to(self.device)
             shown = shown_condition(self.config.generator, batch.condition, batch.known)
             squared = (encode(batch.truth) - encode(shown)).float().square().mean(2)
-            size = (squared.shape[-2], squared.shape[-1])
             known, valid = (pooled(maps, size) > 0.99 for maps in (batch.known, batch.valid))
             for row, pixels in enumerate((valid & ~known, valid & known)):
                 sums[row] += torch.stack([squared[pixels].sum(), pixels.sum()]).cpu()
@@ -152,7 +140,10 @@ class Trainer:
                     bar.update()
                     last = self.done == config.steps
                     if writer is not None and (self.done % _LOG_EVERY == 0 or last):
-                        self._log(writer, bar, terms)
+                        for name, value in terms.items():
+                            writer.add_scalar(f"loss/{name}", value, self.done)
+                        writer.add_scalar("lr", learning_rate(config, self.done - 1), self.done)
+                        bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()})
                     if self.done % config.validate_every == 0 or last:
                         self._validate(writer)
                     stops = torch.tensor(float(len(asked)), device=self.device)
@@ -199,22 +190,16 @@ class Trainer:
     def _batches(self) -> Iterator[Batch]:
         config, world = self.config, self.accelerator.num_processes
         first = range(self.done * world + self.accelerator.process_index, config.steps * world, world)
-        numbers = [range(n * config.batch, (n + 1) * config.batch) for n in first]
-        return iter(
-            DataLoader(
-                self.items,
-                batch_sampler=numbers,  # type: ignore[arg-type]
-                collate_fn=collate,
-                **item_workers(config.workers),
-            )
-        )
+        numbers: Any = [range(n * config.batch, (n + 1) * config.batch) for n in first]
+        workers = item_workers(config.workers)
+        return iter(DataLoader(self.items, batch_sampler=numbers, collate_fn=collate, **workers))
 
     # --- saving -------------------------------------------------------------------------------------------------------
     def save(self) -> None:
         """Write the state, and the generator with averaged weights; after an OutputError the last is unchanged."""
         try:
             if self.is_main:
-                save_state(self.state_folder, self.config, self.done, self.trained, self.average, self.optimiser)
+                save_state(self.output / "state", self.config, self.done, self.trained, self.average, self.optimiser)
                 with averaged(self.average, self.trained.values()):
                     self.generator.save_pretrained(self.output / "generator")
         finally:  # the other processes wait in any case
@@ -226,17 +211,17 @@ class Trainer:
         except OutputError as error:
             self.say(f"step {self.done}: not saved, going on with the last good state: {error}")
 
-    # --- logs ---------------------------------------------------------------------------------------------------------
-    def _log(self, writer: Any, bar: Any, terms: Mapping[str, float]) -> None:
-        for name, value in terms.items():
-            writer.add_scalar(f"loss/{name}", value, self.done)
-        writer.add_scalar("lr", learning_rate(self.config, self.done - 1), self.done)
-        bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()})
-
     def _validate(self, writer: Any) -> None:
-        """Log samples of fixed items by the averaged weights."""
+        """Log samples of fixed items by the averaged weights, and their mean PSNR inside the holes, in dB by method."""
+        config, steps = self.config, max(2, self.config.generator.steps)
         if self.is_main:
-            scores, image = self.validated()
+            batch = collate([self.validation[k] for k in range(config.validation_items)]).to(self.device)
+            methods = {"condition": batch.condition}
+            with averaged(self.average, self.trained.values()):
+                if config.loss.regression:
+                    methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
+                methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)
+            scores, image = mean_hole_psnr(methods, batch), picture(batch, samples)
             for name, value in scores.items():
                 writer.add_scalar(f"hole_psnr/{name}", value, self.done)
             writer.add_image("validation", image, self.done, dataformats="HWC")
@@ -248,17 +233,9 @@ class Trainer:
             self.say(f"step {self.done}: PSNR inside the holes, dB: {numbers}")
         self.accelerator.wait_for_everyone()
 
-    def validated(self) -> tuple[dict[str, float], Any]:
-        """Mean PSNR inside the holes of the validation items, in dB by method, and their picture (h, w, 3) uint8."""
-        config = self.config
-        batch = collate([self.validation[k] for k in range(config.validation_items)]).to(self.device)
-        steps = max(2, config.generator.steps)
-        methods = {"condition": batch.condition}
-        with averaged(self.average, self.trained.values()):
-            if config.loss.regression:
-                methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
-            methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)
-        return mean_hole_psnr(methods, batch), picture(batch, samples)
+
+def silent(message: str) -> None:
+    """Say nothing: the main process alone prints."""
 
 
 def learning_rate(config: TrainConfig, step: int) -> float:

@@ -67,28 +67,6 @@ def test_train_and_evaluate_on_streets(tmp_path: Path, capsys: pytest.CaptureFix
     assert "wrong rig" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_an_autoencoder_comes_first(drawn_frames: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    smaller = [
-        *SMALLER,
-        "--set=generator.autoencoder.widths=[16, 16]",
-        "--set=generator.unet.context_width=32",
-        "--set=autoencoder.steps=2",
-        "--set=autoencoder.batch=2",
-        "--set=loss.perceptual=0",
-        "--set=precision=no",
-        "--set=workers=0",
-    ]
-    common = ["--config", "small", "--output", str(tmp_path), "--quiet", *smaller]
-    assert main([*common, "--stage", "autoencoder"]) == 0
-    first = (tmp_path / "autoencoder" / "config.json").read_text()
-    assert not (tmp_path / "generator").exists()
-    assert main(common) == 0
-    assert (tmp_path / "autoencoder" / "config.json").read_text() == first
-    made = Generator.from_pretrained(tmp_path / "generator")
-    assert made.config.autoencoder.scale == pytest.approx(made.autoencoder.scale) and made.autoencoder.scale != 1.0
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -97,7 +75,6 @@ def test_an_autoencoder_comes_first(drawn_frames: None, tmp_path: Path, capsys: 
         (["--config", "paper"], "expected --weights"),
         (["--weights", "somewhere"], "expected none for --config tiny"),
         (["evaluate"], "expected a generator's folder"),
-        (["--stage", "autoencoder"], "--config tiny has none of its own"),
     ],
 )
 def test_what_cannot_be_used_is_said_in_one_line(

@@ -25,8 +25,8 @@ from arbiview_aug.generator.training.held_out import (
     picture,
     sampled,
 )
+from arbiview_aug.generator.training.losses import without_attention
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
-from arbiview_aug.generator.training.step import without_attention
 from integrations.benchmarks import training
 from integrations.benchmarks.training import correct_correspondences, seen_scores, text_of, wrong_rig
 from tests.generator.small import ring, stirred

@@ -90,14 +90,6 @@ def test_the_condition_is_made_of_the_pair_alone() -> None:
     assert bool(batch.known.flatten(1).any(1).all())
 
 
-def test_k_pairs_share_their_real_view() -> None:
-    made = items(pairs=2)
-    a, b, c = made[0], made[1], made[2]
-    assert torch.equal(a.truth, b.truth) and not torch.equal(a.sources, b.sources)
-    assert a.tokens[0].rsplit("/", 1)[0] == b.tokens[0].rsplit("/", 1)[0]
-    assert not torch.equal(a.truth, c.truth)
-
-
 def answer_is_shown(k: int, **changes: Any) -> tuple[bool, bool]:
     """Whether another content of the holes of the real views changes the condition, and the source branches."""
     made = items(**changes)

@@ -13,9 +13,8 @@ from arbiview_aug.generator.config import AutoencoderConfig
 from arbiview_aug.generator.denoiser import REGRESSION
 from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.training.config import LossConfig, TrainConfig
-from arbiview_aug.generator.training.losses import Perceptual
+from arbiview_aug.generator.training.losses import Draws, Perceptual, Step, draw
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
-from arbiview_aug.generator.training.step import Draws, Step, draw
 from tests.generator.training.small import config, frames
 from tests.generator.training.test_losses import features
 from tests.generator.training.test_pseudo_views import HOLE

@@ -139,7 +139,7 @@ def test_a_state_that_is_no_state_is_refused(tmp_path: Path) -> None:
     made = run(tmp_path, steps=2)
     (tmp_path / "state").mkdir()
     (tmp_path / "state" / "config.json").write_text("{}")
-    assert checkpointing.has_state(made.state_folder)
+    assert checkpointing.has_state(made.output / "state")
     with pytest.raises(TrainingError, match="expected the state of a training run"):
         run(tmp_path, steps=2)
 
