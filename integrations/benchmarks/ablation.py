@@ -21,7 +21,7 @@ import torch
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Reduce
 from arbiview_aug.cli.arguments import add_data, add_downscale, command_parser, output_file, seed
-from arbiview_aug.cli.bench.study import benchmark, machine_line, quartiles, show, study
+from arbiview_aug.cli.bench.timing import benchmark, machine_line, quartiles, show
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.depth_folder import WANTED
 from arbiview_aug.datasets.registry import data_name
@@ -40,6 +40,7 @@ from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from integrations.benchmarks.study import study
 
 PROGRAM = "python -m integrations.benchmarks.ablation"
 SYNTHETIC = "synthetic street"

@@ -15,7 +15,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
 from arbiview_aug.cli.bench.data import Recorded
-from arbiview_aug.cli.bench.study import quartiles, timed_rounds
+from arbiview_aug.cli.bench.timing import quartiles, timed_rounds
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.baselines import Renderer, row_split
 from arbiview_aug.evaluate.frames import scores

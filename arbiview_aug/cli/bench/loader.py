@@ -20,7 +20,7 @@ from tqdm import tqdm
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import output_file
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, lifted, recorded
-from arbiview_aug.cli.bench.study import benchmark, machine_line, memory_mib, quartiles, show
+from arbiview_aug.cli.bench.timing import benchmark, machine_line, memory_mib, quartiles, show
 from arbiview_aug.datasets import RetargetedDataset, WithDepth, open_data
 from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.registry import split_kind

@@ -38,7 +38,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Reduce
 from arbiview_aug.cli.arguments import device_named, output_file
 from arbiview_aug.cli.bench.data import Recorded, lidar_maps, lifted, recorded
-from arbiview_aug.cli.bench.study import benchmark, clock_of, machine_line, quartiles, show, timed_rounds
+from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, show, timed_rounds
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
