@@ -57,6 +57,8 @@ FLAGS = {
     "--motion-depth": "--depth",
     "--reduce": "--downscale",
     "--yaws SET": "--target-set SET",
+    "--paper": "python -m integrations.benchmarks.paper, from a clone",
+    "--figure": "python -m integrations.benchmarks.paper --figure, from a clone",
     "bench neighbours": "bench speed --only neighbour",
     "bench trade": "bench pareto",
 }

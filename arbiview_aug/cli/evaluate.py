@@ -2,7 +2,6 @@
 
 Real frames are scored by sparse LiDAR metrics, overlap and consistency; synthetic streets by the true views.
 ``--displaced`` scores real frames by photographs that another camera took, or the next frame's cameras.
-``--paper`` measures the paper's tables, ``--figure`` draws its figures.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any
 from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.arguments import REAL_TARGET, gathered_warnings, named_steps, writable_folder
+from arbiview_aug.cli.arguments import REAL_TARGET, named_steps, writable_folder
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
 from arbiview_aug.datasets.registry import split_kind
@@ -28,33 +27,23 @@ from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.methods import Method, retargeting, study_methods
-from arbiview_aug.evaluate.paper_study import draw_figures, measure_paper, paper_report, unseen_frames
+from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
 from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.evaluate.targets import named_targets, without_masks
-from arbiview_aug.generator import Diffusion, load_inpainter
-from arbiview_aug.generator.config import TrainedOn
-from arbiview_aug.inpaint.inpainter import Inpainter
+from arbiview_aug.generator import load_inpainter
 from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.settings import SampleKeys
-
-_MODES = ("paper", "figure", "displaced")  # their options are no settings of an evaluation
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Measure, print the tables, write JSON, pictures and the report."""
     folder = writable_folder(Path(arguments.output), arguments.output)
     notes: list[str] = []
-    if arguments.paper:
-        text = _paper(arguments, folder)
-    elif arguments.figure:
-        text = _figure(arguments, folder)
-    else:
-        text = _evaluate(arguments, folder, notes)
+    text = _evaluate(arguments, folder, notes)
     for note in notes:
         print(f"note: {note}\n")
     print(text)
@@ -134,7 +123,7 @@ def measured(
         return evaluate(frames, targets, methods, lambda name, steps: tick(name, steps * count_of), agreement=agreement)
 
 
-# --- the three modes --------------------------------------------------------------------------------------------------
+# --- the two modes ----------------------------------------------------------------------------------------------------
 def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> str:
     if arguments.displaced:
         methods, done = _displaced(arguments, notes)
@@ -150,7 +139,7 @@ def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> 
     count_of = len({view["frame"] for view in done.views})
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
     title = f"{source}: {count_of} frame{'s' * (count_of > 1)}"
-    settings = {key: value for key, value in vars(arguments).items() if key not in _MODES}
+    settings = {key: value for key, value in vars(arguments).items() if key != "displaced"}
     report: dict[str, Any] = {"arguments": settings, "scored_on_other_points": done.first.held_out}
     report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in tables), strict=False))
     report |= {"views": done.views, "pairs": done.pairs}
@@ -188,36 +177,3 @@ def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Me
             agreement=False,
         )
     return methods, done
-
-
-def _paper(arguments: argparse.Namespace, folder: Path) -> str:
-    with named_steps([]) as tick:  # warnings of targets half outside the view are expected
-        generator, trained_on = _generator(arguments)
-        study = measure_paper(
-            arguments.data,
-            frames=arguments.frames,
-            size=arguments.size,
-            methods=study_methods(generator),
-            trained_on=trained_on,
-            tick=tick,
-        )
-    study.generator = arguments.generator
-    (folder / "paper.json").write_text(json.dumps(study.as_dict(), indent=1) + "\n")
-    return f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}"
-
-
-def _generator(arguments: argparse.Namespace) -> tuple[Inpainter | None, TrainedOn | None]:
-    """The generator of ``--generator``, if any, and the data that it was trained on, if known."""
-    inpainter = None if arguments.generator is None else load_inpainter(arguments.generator)
-    return inpainter, inpainter.generator.trained_on if isinstance(inpainter, Diffusion) else None
-
-
-def _figure(arguments: argparse.Namespace, folder: Path) -> str:
-    generator, trained_on = _generator(arguments)
-    (index,) = unseen_frames(trained_on, arguments.data, 1)
-    if trained_on is not None and arguments.data is None and trained_on.unseen(None):
-        arguments.frames, arguments.seed = index + 1, trained_on.seed
-    frame = make_frame(open_frames(arguments, arguments.geometry)[index], exposures=())
-    with gathered_warnings([]):
-        files = draw_figures(frame.sample, folder, generator)
-    return "\n".join(f"picture: {file}" for file in files)

@@ -30,7 +30,7 @@ from arbiview_aug.errors import DataError, exit_status
 from arbiview_aug.evaluate.agreement import source_overlap, summary
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import RenderedView
-from arbiview_aug.evaluate.methods import Method, Sample, paper_stages, retargeting
+from arbiview_aug.evaluate.methods import Method, Sample, retargeting
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import UP_M, named_targets, shifted_target
 from arbiview_aug.favs.config import PaperConfig
@@ -40,6 +40,7 @@ from arbiview_aug.scene.depth_maps import motion_camera
 from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from integrations.benchmarks.paper import paper_stages
 from integrations.benchmarks.study import study
 
 PROGRAM = "python -m integrations.benchmarks.ablation"

@@ -123,24 +123,11 @@ def test_lenses_that_a_method_cannot_take(
     assert "pinhole" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_figures(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "--figure", "--size", "40x110", "--output", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.count("picture: ") == 5
-    heights = {k: cv2.imread(str(tmp_path / f"figure{k}.png")).shape[0] for k in range(2, 7)}
-    # Figure 2 has two configurations of four rows each below the recorded row, the others one.
-    assert heights[3] == heights[4] == heights[5] == heights[6]
-    assert heights[2] / heights[3] == pytest.approx(9 / 5, rel=0.02)
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
         ["--yaws", "left"],
         ["--target", "waymo", "--target-set", "paper"],
-        ["--paper", "--figure"],
-        ["--paper", "--target-set", "yaw"],
-        ["--figure", "--geometry", "infinity"],
         ["--displaced"],
         ["--displaced", "--target", "waymo", "--data", "."],
     ],
