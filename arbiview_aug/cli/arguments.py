@@ -149,15 +149,6 @@ def positive(text: str) -> float:
     return value
 
 
-def degrees(text: str) -> list[float]:
-    """Angles from ``-11,11``."""
-    try:
-        return [float(value) for value in text.split(",")]
-    except ValueError:
-        expected = "degrees such as -11,11 (names of sets are for --target-set)"
-        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}") from None
-
-
 def _integer(text: str, least: int, expected: str) -> int:
     value = int(text)
     if value < least:

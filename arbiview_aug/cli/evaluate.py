@@ -25,14 +25,13 @@ from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
-from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
+from arbiview_aug.evaluate.frames import Evaluation, ScoredFrame, evaluate, make_frame
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
-from arbiview_aug.evaluate.run import Evaluation, evaluate
-from arbiview_aug.evaluate.targets import named_targets, without_masks
+from arbiview_aug.evaluate.targets import named_targets
 from arbiview_aug.generator import load_inpainter
 from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import GEOMETRIES
@@ -68,11 +67,9 @@ def target_rigs(arguments: argparse.Namespace, chosen: Rig | None, source: Rig) 
     """Rigs to render, by name; ``chosen`` is the rig of ``--target``."""
     if arguments.target_set is not None:
         rigs = named_targets(arguments.target_set, source)
-    elif arguments.yaws is None:
+    else:
         rig = chosen or (load_rig(REAL_TARGET) if arguments.data else demo_target_rig(source.sizes[0]))
         rigs = {rig.name or "target": rig}
-    else:
-        rigs = {f"yaw {yaw:+g}": without_masks(source.turned(yaw_deg=yaw)) for yaw in arguments.yaws}
     if "paper" in arguments.quality:  # homographies know no lens; all methods share the targets
         rigs = {name: rig.undistorted() for name, rig in rigs.items()}
     if arguments.size is None:

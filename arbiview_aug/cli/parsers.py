@@ -21,7 +21,6 @@ from arbiview_aug.cli.arguments import (
     add_target,
     command_parser,
     count,
-    degrees,
     kinds_text,
     positive,
     seed,
@@ -38,7 +37,7 @@ EXECUTIONS = ("opencv", "torch", "cuda")
 
 _GENERATOR = "folder of a generator or of diffusers, TorchScript file, or OWNER/NAME on the Hugging Face Hub"
 
-_FIXED = ("target", "target_set", "yaws", "seed", "size")  # by ``evaluate --displaced``
+_FIXED = ("target", "target_set", "seed", "size")  # by ``evaluate --displaced``
 
 
 def check() -> argparse.ArgumentParser:
@@ -111,7 +110,7 @@ def demo() -> argparse.ArgumentParser:
     add_rendering(parser)
     add_frames(parser, 1)
     parser.add_argument("--width", type=count, default=1800, metavar="PX", help="width of the contact sheet")
-    parser.set_defaults(target_set=None, yaws=None, reduce=1, clean_masks=False)
+    parser.set_defaults(target_set=None, reduce=1, clean_masks=False)
     return parser
 
 
@@ -149,8 +148,6 @@ def evaluate() -> argparse.ArgumentParser:
     add_target(target)
     sets = "instead of --target: paper (its six configurations), yaw (5 turns), vehicles, or truck (1 m higher)"
     target.add_argument("--target-set", choices=TARGET_SETS, help=sets)
-    yaws = "instead of --target: the source rig turned, as in --yaws=-11,11"
-    target.add_argument("--yaws", metavar="DEG,...", type=degrees, help=yaws)
     add_rendering(parser, "black", several=True)
     add = parser.add_argument
     add("--generator", metavar="PATH", help=f"of --holes diffusion: {_GENERATOR}")

@@ -216,10 +216,7 @@ def test_names_in_options_are_those_of_the_tables() -> None:
     [
         ("convert --data d --target waymo --output o --reduce 2", "--reduce is now --downscale"),
         ("convert --data d --target waymo --output o --motion-depth=d", "--motion-depth is now --depth"),
-        (
-            "evaluate --yaws vehicles",
-            "names of sets are for --target-set",
-        ),
+        ("evaluate --yaws vehicles", "--yaws is now --target-set SET"),
         ("evaluate --paper", "--paper is now python -m integrations.benchmarks.paper"),
         ("bench trade", "it is now bench pareto"),
         ("bench neighbours", "it is now bench speed --only neighbour"),
@@ -307,7 +304,6 @@ HELP = {
         "--output DIR",
         "--quality",
         "--target-set",
-        "--yaws",
         "--displaced",
     ),
     "inspect": ("RIG", "--output FILE"),

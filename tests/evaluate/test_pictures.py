@@ -11,8 +11,15 @@ import pytest
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.report.pictures import HOLE, contact_sheet, outline_coverage, put_text, save_picture
-from arbiview_aug.evaluate.report.rig_picture import draw_rigs, rig_figure
+from arbiview_aug.evaluate.report.pictures import (
+    HOLE,
+    contact_sheet,
+    draw_rigs,
+    outline_coverage,
+    put_text,
+    rig_figure,
+    save_picture,
+)
 
 
 def plain(h: int, w: int, colour: tuple[int, int, int]) -> np.ndarray:

@@ -13,13 +13,12 @@ import pytest
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.evaluate.frames import make_frame
+from arbiview_aug.evaluate.frames import Evaluation, evaluate, make_frame
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report, layers
 from arbiview_aug.evaluate.report.pictures import overlay_confidence
 from arbiview_aug.evaluate.report.tables import TRUTH_COLUMNS
-from arbiview_aug.evaluate.run import Evaluation, evaluate
 
 SIZE = (48, 132)
 NAMES = ["fast, street", "own & only"]

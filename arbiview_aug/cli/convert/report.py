@@ -15,12 +15,11 @@ from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import kinds_of, open_data
-from arbiview_aug.evaluate.frames import make_frame
+from arbiview_aug.evaluate.frames import Evaluation, evaluate, make_frame
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.tables import evaluation_tables
-from arbiview_aug.evaluate.run import Evaluation, evaluate
 from arbiview_aug.scene.scene import GEOMETRIES
 
 CONVERTED = "converted"  # name of the written views in tables

@@ -10,11 +10,17 @@ import cv2
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.evaluate.frames import Evaluation
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
-from arbiview_aug.evaluate.report.pictures import Picture, hatched_view, left_to_right, overlay_confidence, shrunk
-from arbiview_aug.evaluate.report.rig_picture import draw_rigs
+from arbiview_aug.evaluate.report.pictures import (
+    Picture,
+    draw_rigs,
+    hatched_view,
+    left_to_right,
+    overlay_confidence,
+    shrunk,
+)
 from arbiview_aug.evaluate.report.tables import Columns, Table, cell
-from arbiview_aug.evaluate.run import Evaluation
 
 SOURCE_LAYER = "nearest source camera"
 TRUTH_LAYER = "truth"
