@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
@@ -25,7 +25,7 @@ from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
-from arbiview_aug.evaluate.frames import Evaluation, ScoredFrame, evaluate, make_frame
+from arbiview_aug.evaluate.frames import EXPOSURES, Evaluation, ScoredFrame, evaluate, make_frame
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report
@@ -42,10 +42,52 @@ def run(arguments: argparse.Namespace) -> None:
     """Measure, print the tables, write JSON, pictures and the report."""
     folder = writable_folder(Path(arguments.output), arguments.output)
     notes: list[str] = []
-    text = _evaluate(arguments, folder, notes)
+    if arguments.displaced:
+        methods, done = _displaced(arguments, notes)
+    else:
+        methods = _methods(arguments)
+        done = measured(arguments, open_frames(arguments, arguments.geometry), methods, notes)
+    if not done.views:
+        raise DataError("; ".join(done.declined.values()))
+    assert done.first is not None
+    notes.extend(f"{name}: {why}" for name, why in done.declined.items())
+    names = [method.name for method in methods]
+    tables = evaluation_tables(done, names)
+    source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
+    title = f"{source}: {frames_text(len({view['frame'] for view in done.views}))}"
+    settings = {key: value for key, value in vars(arguments).items() if key != "displaced"}
+    report: dict[str, Any] = {"arguments": settings, "scored_on_other_points": done.first.held_out}
+    report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in tables), strict=False))
+    report |= {"views": done.views, "pairs": done.pairs}
+    (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
+    sample = done.first.sample
+    for (target, method), views in done.pictures.items():
+        rig = done.targets[target]
+        file = re.sub(r"[^\w+-]+", "-", f"{target}-{method}") + ".png"
+        sheet = frame_sheet(sample["rig"], as_arrays(sample["images"]), rig, views, done.first.true_images(rig))
+        save_picture(folder / file, sheet)
+    (folder / "report.html").write_text(html_report(title, done, names, tables, notes), encoding="utf-8")
     for note in notes:
         print(f"note: {note}\n")
-    print(text)
+    print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
+    print(f"report: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}")
+
+
+def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Method], Evaluation]:
+    """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
+    data, displaced = open_frames(arguments, ["motion", *arguments.geometry]), arguments.displaced
+    count_of = min(arguments.frames or len(data), len(data))
+    with named_steps(notes, count_of) as tick:
+        next_frame = FrameFolder(displaced, reduce=arguments.reduce)[0] if isinstance(displaced, str) else None
+        frames = displaced_frames(data, count_of, next_frame)
+        first = next(frames, None)
+        if first is None:
+            expected = "a 'truth' camera in calib.json, or a later frame of the drive (sequence.json and ego2world)"
+            raise DataError(f"--displaced: {arguments.data}: expected {expected}, found none; see docs/formats.md")
+        if arguments.geometry == ["auto"]:
+            arguments.geometry = surfaces_for(first[1].sample)
+        methods = [COPY, *_methods(arguments, neighbours=None)]
+        return methods, evaluate(chain([first], frames), lambda _: {}, methods, tick, agreement=False)
 
 
 # --- frames and targets -----------------------------------------------------------------------------------------------
@@ -80,13 +122,11 @@ def target_rigs(arguments: argparse.Namespace, chosen: Rig | None, source: Rig) 
 def scored_frames(data: Any, frames: int, hand_over_points: bool) -> Iterator[tuple[str, ScoredFrame]]:
     """Name and frame of the first samples; synthetic ones are scored by the true views, not by points."""
     for index in range(frames):
-        sample = data[index]
-        name = str(sample.get("token", index))
-        if isinstance(data, SyntheticDrive):
-            truth: Callable[..., Any] = partial(data.render, index)
-            yield name, make_frame(sample, truth=truth, exposures=(), hand_over_points=hand_over_points)
-        else:
-            yield name, make_frame(sample, hand_over_points=hand_over_points)
+        sample, is_synthetic = data[index], isinstance(data, SyntheticDrive)
+        truth = partial(data.render, index) if is_synthetic else None
+        exposures = () if is_synthetic else EXPOSURES
+        frame = make_frame(sample, truth=truth, exposures=exposures, hand_over_points=hand_over_points)
+        yield str(sample.get("token", index)), frame
 
 
 def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
@@ -102,9 +142,8 @@ def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
     return methods
 
 
-def frames_text(arguments: argparse.Namespace, data: Any) -> str:
+def frames_text(count_of: int) -> str:
     """Number of evaluated frames, for titles."""
-    count_of = min(arguments.frames or 1, len(data))
     return f"{count_of} frame{'s' * (count_of > 1)}"
 
 
@@ -115,62 +154,5 @@ def measured(
     chosen = None if arguments.target is None else load_rig(arguments.target)
     count_of = min(arguments.frames or 1, len(data))
     frames = scored_frames(data, count_of, any(method.reads_points for method in methods))
-    targets = partial(target_rigs, arguments, chosen)
-    with named_steps(notes) as tick:
-        return evaluate(frames, targets, methods, lambda name, steps: tick(name, steps * count_of), agreement=agreement)
-
-
-# --- the two modes ----------------------------------------------------------------------------------------------------
-def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> str:
-    if arguments.displaced:
-        methods, done = _displaced(arguments, notes)
-    else:
-        methods = _methods(arguments)
-        done = measured(arguments, open_frames(arguments, arguments.geometry), methods, notes)
-    if not done.views:
-        raise DataError("; ".join(done.declined.values()))
-    assert done.first is not None
-    notes.extend(f"{name}: {why}" for name, why in done.declined.items())
-    names = [method.name for method in methods]
-    tables = evaluation_tables(done, names)
-    count_of = len({view["frame"] for view in done.views})
-    source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
-    title = f"{source}: {count_of} frame{'s' * (count_of > 1)}"
-    settings = {key: value for key, value in vars(arguments).items() if key != "displaced"}
-    report: dict[str, Any] = {"arguments": settings, "scored_on_other_points": done.first.held_out}
-    report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in tables), strict=False))
-    report |= {"views": done.views, "pairs": done.pairs}
-    (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
-    sample = done.first.sample
-    for (target, method), views in done.pictures.items():
-        rig = done.targets[target]
-        truth = None if done.first.truth is None else as_arrays(done.first.truth(rig).images)
-        file = re.sub(r"[^\w+-]+", "-", f"{target}-{method}") + ".png"
-        save_picture(folder / file, frame_sheet(sample["rig"], as_arrays(sample["images"]), rig, views, truth))
-    (folder / "report.html").write_text(html_report(title, done, names, tables, notes), encoding="utf-8")
-    printed = "\n\n".join(text_table(*table) for table in tables)
-    return f"{title}\n\n{printed}\n\nreport: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}"
-
-
-def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Method], Evaluation]:
-    """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
-    data, displaced = open_frames(arguments, ["motion", *arguments.geometry]), arguments.displaced
-    with named_steps(notes) as tick:
-        next_frame = FrameFolder(displaced, reduce=arguments.reduce)[0] if isinstance(displaced, str) else None
-        count_of = min(arguments.frames or len(data), len(data))
-        frames = displaced_frames(data, count_of, next_frame)
-        first = next(frames, None)
-        if first is None:
-            expected = "a 'truth' camera in calib.json, or a later frame of the drive (sequence.json and ego2world)"
-            raise DataError(f"--displaced: {arguments.data}: expected {expected}, found none; see docs/formats.md")
-        if arguments.geometry == ["auto"]:
-            arguments.geometry = surfaces_for(first[1].sample)
-        methods = [COPY, *_methods(arguments, neighbours=None)]
-        done = evaluate(
-            chain([first], frames),
-            lambda _: {},
-            methods,
-            lambda name, steps: tick(name, steps * count_of),
-            agreement=False,
-        )
-    return methods, done
+    with named_steps(notes, count_of) as tick:
+        return evaluate(frames, partial(target_rigs, arguments, chosen), methods, tick, agreement=agreement)

@@ -65,6 +65,10 @@ class ScoredFrame:
         """Sample that methods get for scoring, with even exposures if points score at those."""
         return self.lidar["even"].sample if "even" in self.lidar else self.sample
 
+    def true_images(self, target: Rig) -> list[Image] | None:
+        """The true views (h, w, 3) of a rig, if the truth is known."""
+        return None if self.truth is None else as_arrays(self.truth(target).images)
+
 
 def make_frame(
     sample: Mapping[str, Any],
