@@ -280,8 +280,9 @@ def draw_figures(sample: Mapping[str, Any], folder: Path, generator: Inpainter |
     order, spacing = left_to_right(rig), spacing_deg(rig)
     files = []
     for number, shares in FIGURES.items():
-        rows: list[list[Image]] = [[images[k] for k in order]]
-        titles, labels = ["Recorded"], [[rig.names[k] for k in order]]
+        rows: list[tuple[str, list[Image], list[str]]] = [
+            ("Recorded", [images[k] for k in order], [rig.names[k] for k in order])
+        ]
         for share in shares:
             target = paper_target(rig, share)
             for name, method in figure_methods(generator).items():
@@ -289,10 +290,9 @@ def draw_figures(sample: Mapping[str, Any], folder: Path, generator: Inpainter |
                     views = method.render(sample, target)
                 except (CalibrationError, SampleError):
                     continue
-                rows.append([views[k].image for k in order])
-                titles.append(name)
-                labels.append([f"{rig.names[k]} {share * spacing[k]:+.4g} deg" for k in order])
-        files.append(save_picture(folder / f"figure{number}.png", contact_sheet(rows, labels, titles)))
+                captions = [f"{rig.names[k]} {share * spacing[k]:+.4g} deg" for k in order]
+                rows.append((name, [views[k].image for k in order], captions))
+        files.append(save_picture(folder / f"figure{number}.png", contact_sheet(rows)))
     return files
 
 

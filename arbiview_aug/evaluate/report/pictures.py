@@ -42,15 +42,13 @@ def put_text(picture: Picture, text: str, xy: tuple[int, int], scale: float) -> 
     cv2.putText(picture, text, xy, _FONT, scale, INK, 1, cv2.LINE_AA)
 
 
-def contact_sheet(
-    rows: Sequence[Sequence[Image]], labels: Sequence[Sequence[str]], titles: Sequence[str], *, width_px: int = 1800
-) -> Picture:
-    """Lay out titled rows of images (h, w, 3), scale 0-255, with captions; a row's images share a height.
+def contact_sheet(rows: Sequence[tuple[str, Sequence[Image], Sequence[str]]], *, width_px: int = 1800) -> Picture:
+    """Lay out rows (title, images (h, w, 3), scale 0-255, and their captions); a row's images share a height.
 
     Rows fill the width; captions that are too long are cut.
     """
     strips = []
-    for images, captions, title in zip(rows, labels, titles, strict=True):
+    for title, images, captions in rows:
         strips.append(_paper(_TITLE_PX, width_px))
         put_text(strips[-1], title, (_GAP_PX, _TITLE_PX - 8), 0.6)
         strips.append(_row(images, captions, width_px))
@@ -163,28 +161,26 @@ def frame_sheet(
     width_px: int = 1800,
 ) -> Picture:
     """Lay out source images, target views, holes and (if given) the truth, cameras from left to right."""
-    ring, order = left_to_right(source), left_to_right(target)
     names, vehicle = target.names, target.name or "the target"
     unseen = [1 - float(view.coverage.mean()) for view in views]
     rendered: list[Image] = [view.image for view in views]
-    rows: list[tuple[str, Sequence[Image], Sequence[str], list[int]]] = [
-        (f"What {source.name or 'the source'} recorded: {len(source)} cameras", images, source.names, ring),
-        (f"The same moment, retargeted to {vehicle}: {len(names)} cameras", rendered, names, order),
+    rows: list[tuple[str, Rig, Sequence[Image], Sequence[str]]] = [
+        (f"What {source.name or 'the source'} recorded: {len(source)} cameras", source, images, source.names),
+        (f"The same moment, retargeted to {vehicle}: {len(names)} cameras", target, rendered, names),
     ]
     if any(unseen):
         # At the size of the sheet, since finer hatching would blur.
         height = round(width_px / sum(image.shape[1] / image.shape[0] for image in rendered))
         hatched = [hatched_view(view, height) for view in views]
         captions = [f"{name}: {share:.1%} unseen" for name, share in zip(names, unseen, strict=True)]
-        rows.append((f"Hatched: what no source camera saw, {np.mean(unseen):.1%}", hatched, captions, order))
+        rows.append((f"Hatched: what no source camera saw, {np.mean(unseen):.1%}", target, hatched, captions))
     if truth is not None:
-        rows.append((f"The truth: what {vehicle} would have seen", truth, names, order))
-    return contact_sheet(
-        [[pictures[k] for k in places] for _, pictures, _, places in rows],
-        [[captions[k] for k in places] for _, _, captions, places in rows],
-        [title for title, *_ in rows],
-        width_px=width_px,
-    )
+        rows.append((f"The truth: what {vehicle} would have seen", target, truth, names))
+    ordered = [
+        (title, [pictures[k] for k in left_to_right(rig)], [captions[k] for k in left_to_right(rig)])
+        for title, rig, pictures, captions in rows
+    ]
+    return contact_sheet(ordered, width_px=width_px)
 
 
 def hatched_view(view: RenderedView, height_px: int) -> Picture:
