@@ -86,7 +86,9 @@ FLAGS = {
     "--path": "--holes",
     "--motion-depth": "--depth",
     "--reduce": "--downscale",
-    "--yaws SET": "--target-set SET",
+    "--yaws": "--target-set SET, or --target FILE of Rig.turned(yaw_deg=...).save(FILE)",
+    "--paper": "python -m integrations.benchmarks.paper, from a clone",
+    "--figure": "python -m integrations.benchmarks.paper --figure, from a clone",
     "bench neighbours": "bench speed --only neighbour",
     "bench trade": "bench pareto",
 }

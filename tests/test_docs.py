@@ -22,14 +22,12 @@ from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.choices import GeometryName, Quality
 from arbiview_aug.cli.bench import pareto
 from arbiview_aug.datasets import registry
-from arbiview_aug.evaluate import paper_study
 from arbiview_aug.evaluate.frames import ScoredFrame
-from arbiview_aug.evaluate.methods import study_methods
-from arbiview_aug.evaluate.paper_study import REAL_FRAMES, SETS, SYNTHETIC, Study, paper_report
 from arbiview_aug.generator.training import command as train_command
 from arbiview_aug.render.requirements import HELPFUL_DATA
 from integrations.benchmarks import generator
 from integrations.benchmarks.ablation import NOTES, ROWS, STEPS, markdown
+from integrations.benchmarks.paper import REAL_FRAMES, SETS, SYNTHETIC, Study, paper_report, study_methods
 from tests.generator.training.small import frames as drawn_frames
 from tests.generator.training.test_command import SMALLER
 from tests.helpers import saved_depth_model
@@ -52,8 +50,6 @@ TINY = {
     "evaluate --data FOLDER --target-set paper": ["--downscale", "4", "--size", "40x72"],
     "evaluate --data FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
     "evaluate --displaced --data FOLDER": ["--geometry", "street", "--downscale", "4", "--frames", "1"],
-    "evaluate --paper": ["--size", "16x44", "--frames", "1"],
-    "evaluate --figure --data FOLDER": ["--downscale", "4"],
     "check FOLDER": ["--downscale", "4"],
     "check FOLDER --frames 5 --output output": ["--downscale", "4"],
     "inspect nuscenes waymo": [],
@@ -82,8 +78,6 @@ TINY = {
 SLOW = (
     "bench",
     "depth --model",
-    "evaluate --paper",
-    "evaluate --figure",
     "evaluate --data FOLDER --target waymo --geometry learned",
     "evaluate --data FOLDER --target-set",
 )
@@ -211,9 +205,6 @@ def test_the_commands_run(
         arguments[arguments.index("FOLDER")] = str(root)
     if "ID_OR_PATH" in arguments:
         arguments[arguments.index("ID_OR_PATH")] = str(saved_depth_model(tmp_path / "model"))
-    if "--paper" in arguments:  # whole, it takes long
-        monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
-        monkeypatch.setattr(paper_study, "SETS", ("truck",))
     monkeypatch.setattr(train_command, "open_frames", lambda *_, **__: drawn_frames())  # streets take seconds
     monkeypatch.chdir(tmp_path)
     if "truck.yaml" in arguments:
@@ -262,7 +253,7 @@ def test_the_generators_table_is_the_commands() -> None:
 
 
 def test_the_papers_tables_are_the_commands() -> None:
-    """``evaluate --paper``: headings, methods, the paper's own numbers and the words between."""
+    """``integrations.benchmarks.paper``: headings, methods, the paper's own numbers and the words between."""
     metrics = ("raw_psnr_db", "raw_ssim", "raw_mae", "raw_rmse")
     real = dict.fromkeys((*metrics, "even_psnr_db"), 1.0)
     true = dict.fromkeys((*metrics, "true_psnr_db", "true_covered_psnr_db"), 1.0)

@@ -33,7 +33,8 @@ class _HelpFormatter(argparse.HelpFormatter):
         has_none = default is None or isinstance(default, bool) or default in ("", [], argparse.SUPPRESS)
         if has_none or "default" in text or not action.option_strings:
             return text
-        shown = [f"{one[0]}x{one[1]}" if isinstance(one, tuple) else str(one) for one in _several(default)]
+        several = default if isinstance(default, list) else [default]
+        shown = ["x".join(map(str, one)) if isinstance(one, tuple) else str(one) for one in several]
         return f"{text} (default: {' '.join(shown)})"
 
 
@@ -45,10 +46,6 @@ class _Parser(argparse.ArgumentParser):
             if re.search(rf"(?<![\w-]){old}(?![\w-])", message):
                 message += f"; {old} is now {new}"
         super().error(message)
-
-
-def _several(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
 
 
 def command_parser(
@@ -147,15 +144,6 @@ def positive(text: str) -> float:
     return value
 
 
-def degrees(text: str) -> list[float]:
-    """Angles from ``-11,11``."""
-    try:
-        return [float(value) for value in text.split(",")]
-    except ValueError:
-        expected = "degrees such as -11,11 (names of sets are for --target-set)"
-        raise argparse.ArgumentTypeError(f"expected {expected}, got {text!r}") from None
-
-
 def _integer(text: str, least: int, expected: str) -> int:
     value = int(text)
     if value < least:
@@ -215,16 +203,16 @@ def gathered_warnings(lines: list[str]) -> Iterator[None]:
 
 
 @contextmanager
-def named_steps(notes: list[str]) -> Iterator[Callable[[str, int], None]]:
+def named_steps(notes: list[str], frames: int = 1) -> Iterator[Callable[[str, int], None]]:
     """Show a progress bar and collect warnings in ``notes``.
 
     Yields:
-        A function to call before each step, with its name and the number of steps.
+        A function to call before each step, with its name and the number of steps of each of the ``frames``.
     """
     with gathered_warnings(notes), tqdm(unit="step", leave=False) as bar:
 
         def tick(name: str, steps: int) -> None:
-            bar.total = steps
+            bar.total = steps * frames
             bar.set_description(name)
             bar.update()
 

@@ -48,7 +48,8 @@ def run(arguments: argparse.Namespace) -> None:
     source = sample["rig"]
     print(f"{source!r}\n\n{target!r}\n\n{explained}\n")
     table, _ = evaluation_tables(done, [method.name for method in methods])
-    print(text_table(f"{table[0]} ({len(target)} cameras, {frames_text(arguments, data)})", *table[1:]))
+    count_of = frames_text(min(arguments.frames, len(data)))
+    print(text_table(f"{table[0]} ({len(target)} cameras, {count_of})", *table[1:]))
     frame_ms = statistics.median(times_ms[1:])
     planned = f"a new plan, for another calibration or other boxes, takes {max(times_ms[0] - frame_ms, 0):.0f} ms more."
     if arguments.quality == "paper":
@@ -58,7 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
         f"{target[0].width_px}x{target[0].height_px}, quality {arguments.quality}, {cv2.getNumThreads()} threads; "
         f"{planned}"
     )
-    truth = None if done.first is None or done.first.truth is None else as_arrays(done.first.truth(target).images)
+    truth = None if done.first is None else done.first.true_images(target)
     sheet = frame_sheet(source, as_arrays(sample["images"]), target, views, truth, width_px=arguments.width)
     print(f"picture: {save_picture(path, sheet)}")
 

@@ -8,7 +8,8 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from statistics import median
@@ -45,46 +46,6 @@ class Done(NamedTuple):
     fits: Sequence[CameraFit] = ()  # of a network's depth
 
 
-class _Frames(Dataset[Done]):
-    """Frames whose depth is computed and written on access, in a DataLoader's workers."""
-
-    def __init__(self, data: Any, tokens: Sequence[str], depths: DepthFolder) -> None:
-        self.data, self.tokens, self.depths = data, tokens, depths
-
-    def __len__(self) -> int:
-        return len(self.data)
-
-    def __getitem__(self, index: int) -> Done:
-        token = self.tokens[index]
-        try:
-            return self._done(token, self.data[index])
-        except Exception as error:  # the other frames go on
-            return Done(token, 0.0, described(error), failed=True)
-
-    def _done(self, token: str, sample: dict[str, Any]) -> Done:
-        rig = sample["rig"]
-        (frame,) = read_frames(sample, None)
-        warn = WarnOnce()
-        neighbours = read_neighbours(frame, warn)
-        used = [neighbour.name for neighbour in neighbours]
-        known = self.depths.find(token, rig, used)
-        if known is not None:
-            return Done(token, known.density, "", existed=True)
-        boxes = None if sample.get("boxes_3d") is None else sample["boxes_3d"].numpy().astype(float)
-
-        def load(neighbour: Neighbour) -> Sequence[torch.Tensor] | None:
-            try:
-                return neighbour.images(frame.images)
-            except (ArbiviewError, OSError) as error:
-                warn_lost(warn, neighbour.name, error)
-                used.remove(neighbour.name)  # the frame is done again once the neighbour can be read
-                return None
-
-        depth = motion_depth(frame.rig, frame.images, neighbours, boxes, load)
-        self.depths.write(token, rig, depth, used)
-        return Done(token, depth.density, str(depth))
-
-
 class _Loaded(NamedTuple):
     """A frame for a network, and what its file will say of its origin."""
 
@@ -93,40 +54,71 @@ class _Loaded(NamedTuple):
     origin: Sequence[str]
 
 
-class _Inputs(Dataset[_Loaded | Done]):
-    """Frames for a network, read on access in a DataLoader's workers; those that have their depth are done.
+class _Frames(Dataset[Any]):
+    """Frames, with each of which ``work`` is done on access, in a DataLoader's workers."""
 
-    ``model`` is what a file says of the network; ``motion`` is the folder of depth from motion.
-    """
-
-    def __init__(
-        self, data: Any, depths: DepthFolder, motion: DepthFolder, model: Sequence[str], wanted: Sequence[Reference]
-    ) -> None:
-        self.data, self.depths, self.motion, self.model, self.wanted = data, depths, motion, model, wanted
+    def __init__(self, data: Any, work: Callable[[str, dict[str, Any]], Done | _Loaded]) -> None:
+        self.data, self.work = data, work
 
     def __len__(self) -> int:
         return len(self.data)
 
-    def __getitem__(self, index: int) -> _Loaded | Done:
+    def __getitem__(self, index: int) -> Done | _Loaded:
         token = self.data.tokens[index]
         try:
-            return self._loaded(token, self.data[index])
+            return self.work(token, self.data[index])
         except Exception as error:  # the other frames go on
             return Done(token, 0.0, described(error), failed=True)
 
-    def _loaded(self, token: str, sample: dict[str, Any]) -> _Loaded | Done:
-        (frame,) = read_frames(sample, None)
-        scene = read_scene(frame, "auto") or Scene()
-        measured = [one for one in (scene.points, scene.further.get("depth_m")) if one is not None]
-        points = np.concatenate(measured).astype(float) if measured and "LiDAR" in self.wanted else None
-        is_there = "motion" in self.wanted and self.motion.path(token).is_file()
-        motion = self.motion.read(token, sample["rig"]) if is_there else None
-        used = [name for name, value in (("LiDAR", points), ("motion", motion)) if value is not None]
-        origin = [*self.model, *used, *(["road"] if "road" in self.wanted else [])]
-        there = self.depths.find(token, sample["rig"], origin, "learned")
-        if there is not None:
-            return Done(token, there.density, "", existed=True)
-        return _Loaded(token, DepthInputs(frame.rig, frame.images, points, motion, scene.boxes), origin)
+
+def _from_motion(depths: DepthFolder, token: str, sample: dict[str, Any]) -> Done:
+    """Compute and write a frame's depth from motion, unless it is there."""
+    (frame,) = read_frames(sample, None)
+    warn = WarnOnce()
+    neighbours = read_neighbours(frame, warn)
+    used = [neighbour.name for neighbour in neighbours]
+    known = depths.find(token, sample["rig"], used)
+    if known is not None:
+        return Done(token, known.density, "", existed=True)
+    boxes = None if sample.get("boxes_3d") is None else sample["boxes_3d"].numpy().astype(float)
+
+    def load(neighbour: Neighbour) -> Sequence[torch.Tensor] | None:
+        try:
+            return neighbour.images(frame.images)
+        except (ArbiviewError, OSError) as error:
+            warn_lost(warn, neighbour.name, error)
+            used.remove(neighbour.name)  # the frame is done again once the neighbour can be read
+            return None
+
+    depth = motion_depth(frame.rig, frame.images, neighbours, boxes, load)
+    depths.write(token, sample["rig"], depth, used)
+    return Done(token, depth.density, str(depth))
+
+
+def _for_network(
+    depths: DepthFolder,
+    motion: DepthFolder,
+    model: Sequence[str],
+    wanted: Sequence[Reference],
+    token: str,
+    sample: dict[str, Any],
+) -> _Loaded | Done:
+    """Load what a network needs of a frame, unless its depth is there.
+
+    ``model`` is what a file says of the network; ``motion`` is the folder of depth from motion.
+    """
+    (frame,) = read_frames(sample, None)
+    scene = read_scene(frame, "auto") or Scene()
+    measured = [one for one in (scene.points, scene.further.get("depth_m")) if one is not None]
+    points = np.concatenate(measured).astype(float) if measured and "LiDAR" in wanted else None
+    is_there = "motion" in wanted and motion.path(token).is_file()
+    from_motion = motion.read(token, sample["rig"]) if is_there else None
+    used = [name for name, value in (("LiDAR", points), ("motion", from_motion)) if value is not None]
+    origin = [*model, *used, *(["road"] if "road" in wanted else [])]
+    there = depths.find(token, sample["rig"], origin, "learned")
+    if there is not None:
+        return Done(token, there.density, "", existed=True)
+    return _Loaded(token, DepthInputs(frame.rig, frame.images, points, from_motion, scene.boxes), origin)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -145,7 +137,7 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             with compilation_announced():
                 warm_up()  # here, once, and not in every worker
-            frames = _Frames(data, data.tokens, depths)
+            frames = _Frames(data, partial(_from_motion, depths))
             done = list(results(frames, arguments.workers, "depth from motion"))
     for line in warned:
         print(line, file=sys.stderr)
@@ -167,7 +159,8 @@ def _learned(
             yield Done(one.token, depth.density, "; ".join(map(str, fits)), fits=fits)
         waiting.clear()
 
-    for one in results(_Inputs(data, depths, motion, facts, wanted), arguments.workers, "learned depth"):
+    frames = _Frames(data, partial(_for_network, depths, motion, facts, wanted))
+    for one in results(frames, arguments.workers, "learned depth"):
         if isinstance(one, Done):
             yield one
             continue

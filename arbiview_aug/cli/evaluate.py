@@ -2,7 +2,6 @@
 
 Real frames are scored by sparse LiDAR metrics, overlap and consistency; synthetic streets by the true views.
 ``--displaced`` scores real frames by photographs that another camera took, or the next frame's cameras.
-``--paper`` measures the paper's tables, ``--figure`` draws its figures.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
@@ -19,45 +18,76 @@ from typing import Any
 from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.arguments import REAL_TARGET, gathered_warnings, named_steps, writable_folder
+from arbiview_aug.cli.arguments import REAL_TARGET, named_steps, writable_folder
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
 from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
-from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
+from arbiview_aug.evaluate.frames import EXPOSURES, Evaluation, ScoredFrame, evaluate, make_frame
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.methods import Method, retargeting, study_methods
-from arbiview_aug.evaluate.paper_study import draw_figures, measure_paper, paper_report, unseen_frames
+from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
-from arbiview_aug.evaluate.run import Evaluation, evaluate
-from arbiview_aug.evaluate.targets import named_targets, without_masks
-from arbiview_aug.generator import Diffusion, load_inpainter
-from arbiview_aug.generator.config import TrainedOn
-from arbiview_aug.inpaint.inpainter import Inpainter
+from arbiview_aug.evaluate.targets import named_targets
+from arbiview_aug.generator import load_inpainter
 from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.settings import SampleKeys
-
-_MODES = ("paper", "figure", "displaced")  # their options are no settings of an evaluation
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Measure, print the tables, write JSON, pictures and the report."""
     folder = writable_folder(Path(arguments.output), arguments.output)
     notes: list[str] = []
-    if arguments.paper:
-        text = _paper(arguments, folder)
-    elif arguments.figure:
-        text = _figure(arguments, folder)
+    if arguments.displaced:
+        methods, done = _displaced(arguments, notes)
     else:
-        text = _evaluate(arguments, folder, notes)
+        methods = _methods(arguments)
+        done = measured(arguments, open_frames(arguments, arguments.geometry), methods, notes)
+    if not done.views:
+        raise DataError("; ".join(done.declined.values()))
+    assert done.first is not None
+    notes.extend(f"{name}: {why}" for name, why in done.declined.items())
+    names = [method.name for method in methods]
+    tables = evaluation_tables(done, names)
+    source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
+    title = f"{source}: {frames_text(len({view['frame'] for view in done.views}))}"
+    settings = {key: value for key, value in vars(arguments).items() if key != "displaced"}
+    report: dict[str, Any] = {"arguments": settings, "scored_on_other_points": done.first.held_out}
+    report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in tables), strict=False))
+    report |= {"views": done.views, "pairs": done.pairs}
+    (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
+    sample = done.first.sample
+    for (target, method), views in done.pictures.items():
+        rig = done.targets[target]
+        file = re.sub(r"[^\w+-]+", "-", f"{target}-{method}") + ".png"
+        sheet = frame_sheet(sample["rig"], as_arrays(sample["images"]), rig, views, done.first.true_images(rig))
+        save_picture(folder / file, sheet)
+    (folder / "report.html").write_text(html_report(title, done, names, tables, notes), encoding="utf-8")
     for note in notes:
         print(f"note: {note}\n")
-    print(text)
+    print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
+    print(f"report: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}")
+
+
+def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Method], Evaluation]:
+    """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
+    data, displaced = open_frames(arguments, ["motion", *arguments.geometry]), arguments.displaced
+    count_of = min(arguments.frames or len(data), len(data))
+    with named_steps(notes, count_of) as tick:
+        next_frame = FrameFolder(displaced, reduce=arguments.reduce)[0] if isinstance(displaced, str) else None
+        frames = displaced_frames(data, count_of, next_frame)
+        first = next(frames, None)
+        if first is None:
+            expected = "a 'truth' camera in calib.json, or a later frame of the drive (sequence.json and ego2world)"
+            raise DataError(f"--displaced: {arguments.data}: expected {expected}, found none; see docs/formats.md")
+        if arguments.geometry == ["auto"]:
+            arguments.geometry = surfaces_for(first[1].sample)
+        methods = [COPY, *_methods(arguments, neighbours=None)]
+        return methods, evaluate(chain([first], frames), lambda _: {}, methods, tick, agreement=False)
 
 
 # --- frames and targets -----------------------------------------------------------------------------------------------
@@ -79,11 +109,9 @@ def target_rigs(arguments: argparse.Namespace, chosen: Rig | None, source: Rig) 
     """Rigs to render, by name; ``chosen`` is the rig of ``--target``."""
     if arguments.target_set is not None:
         rigs = named_targets(arguments.target_set, source)
-    elif arguments.yaws is None:
+    else:
         rig = chosen or (load_rig(REAL_TARGET) if arguments.data else demo_target_rig(source.sizes[0]))
         rigs = {rig.name or "target": rig}
-    else:
-        rigs = {f"yaw {yaw:+g}": without_masks(source.turned(yaw_deg=yaw)) for yaw in arguments.yaws}
     if "paper" in arguments.quality:  # homographies know no lens; all methods share the targets
         rigs = {name: rig.undistorted() for name, rig in rigs.items()}
     if arguments.size is None:
@@ -94,13 +122,11 @@ def target_rigs(arguments: argparse.Namespace, chosen: Rig | None, source: Rig) 
 def scored_frames(data: Any, frames: int, hand_over_points: bool) -> Iterator[tuple[str, ScoredFrame]]:
     """Name and frame of the first samples; synthetic ones are scored by the true views, not by points."""
     for index in range(frames):
-        sample = data[index]
-        name = str(sample.get("token", index))
-        if isinstance(data, SyntheticDrive):
-            truth: Callable[..., Any] = partial(data.render, index)
-            yield name, make_frame(sample, truth=truth, exposures=(), hand_over_points=hand_over_points)
-        else:
-            yield name, make_frame(sample, hand_over_points=hand_over_points)
+        sample, is_synthetic = data[index], isinstance(data, SyntheticDrive)
+        truth = partial(data.render, index) if is_synthetic else None
+        exposures = () if is_synthetic else EXPOSURES
+        frame = make_frame(sample, truth=truth, exposures=exposures, hand_over_points=hand_over_points)
+        yield str(sample.get("token", index)), frame
 
 
 def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
@@ -116,9 +142,8 @@ def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
     return methods
 
 
-def frames_text(arguments: argparse.Namespace, data: Any) -> str:
+def frames_text(count_of: int) -> str:
     """Number of evaluated frames, for titles."""
-    count_of = min(arguments.frames or 1, len(data))
     return f"{count_of} frame{'s' * (count_of > 1)}"
 
 
@@ -129,95 +154,5 @@ def measured(
     chosen = None if arguments.target is None else load_rig(arguments.target)
     count_of = min(arguments.frames or 1, len(data))
     frames = scored_frames(data, count_of, any(method.reads_points for method in methods))
-    targets = partial(target_rigs, arguments, chosen)
-    with named_steps(notes) as tick:
-        return evaluate(frames, targets, methods, lambda name, steps: tick(name, steps * count_of), agreement=agreement)
-
-
-# --- the three modes --------------------------------------------------------------------------------------------------
-def _evaluate(arguments: argparse.Namespace, folder: Path, notes: list[str]) -> str:
-    if arguments.displaced:
-        methods, done = _displaced(arguments, notes)
-    else:
-        methods = _methods(arguments)
-        done = measured(arguments, open_frames(arguments, arguments.geometry), methods, notes)
-    if not done.views:
-        raise DataError("; ".join(done.declined.values()))
-    assert done.first is not None
-    notes.extend(f"{name}: {why}" for name, why in done.declined.items())
-    names = [method.name for method in methods]
-    tables = evaluation_tables(done, names)
-    count_of = len({view["frame"] for view in done.views})
-    source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
-    title = f"{source}: {count_of} frame{'s' * (count_of > 1)}"
-    settings = {key: value for key, value in vars(arguments).items() if key not in _MODES}
-    report: dict[str, Any] = {"arguments": settings, "scored_on_other_points": done.first.held_out}
-    report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in tables), strict=False))
-    report |= {"views": done.views, "pairs": done.pairs}
-    (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
-    sample = done.first.sample
-    for (target, method), views in done.pictures.items():
-        rig = done.targets[target]
-        truth = None if done.first.truth is None else as_arrays(done.first.truth(rig).images)
-        file = re.sub(r"[^\w+-]+", "-", f"{target}-{method}") + ".png"
-        save_picture(folder / file, frame_sheet(sample["rig"], as_arrays(sample["images"]), rig, views, truth))
-    (folder / "report.html").write_text(html_report(title, done, names, tables, notes), encoding="utf-8")
-    printed = "\n\n".join(text_table(*table) for table in tables)
-    return f"{title}\n\n{printed}\n\nreport: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}"
-
-
-def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Method], Evaluation]:
-    """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
-    data, displaced = open_frames(arguments, ["motion", *arguments.geometry]), arguments.displaced
-    with named_steps(notes) as tick:
-        next_frame = FrameFolder(displaced, reduce=arguments.reduce)[0] if isinstance(displaced, str) else None
-        count_of = min(arguments.frames or len(data), len(data))
-        frames = displaced_frames(data, count_of, next_frame)
-        first = next(frames, None)
-        if first is None:
-            expected = "a 'truth' camera in calib.json, or a later frame of the drive (sequence.json and ego2world)"
-            raise DataError(f"--displaced: {arguments.data}: expected {expected}, found none; see docs/formats.md")
-        if arguments.geometry == ["auto"]:
-            arguments.geometry = surfaces_for(first[1].sample)
-        methods = [COPY, *_methods(arguments, neighbours=None)]
-        done = evaluate(
-            chain([first], frames),
-            lambda _: {},
-            methods,
-            lambda name, steps: tick(name, steps * count_of),
-            agreement=False,
-        )
-    return methods, done
-
-
-def _paper(arguments: argparse.Namespace, folder: Path) -> str:
-    with named_steps([]) as tick:  # warnings of targets half outside the view are expected
-        generator, trained_on = _generator(arguments)
-        study = measure_paper(
-            arguments.data,
-            frames=arguments.frames,
-            size=arguments.size,
-            methods=study_methods(generator),
-            trained_on=trained_on,
-            tick=tick,
-        )
-    study.generator = arguments.generator
-    (folder / "paper.json").write_text(json.dumps(study.as_dict(), indent=1) + "\n")
-    return f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}"
-
-
-def _generator(arguments: argparse.Namespace) -> tuple[Inpainter | None, TrainedOn | None]:
-    """The generator of ``--generator``, if any, and the data that it was trained on, if known."""
-    inpainter = None if arguments.generator is None else load_inpainter(arguments.generator)
-    return inpainter, inpainter.generator.trained_on if isinstance(inpainter, Diffusion) else None
-
-
-def _figure(arguments: argparse.Namespace, folder: Path) -> str:
-    generator, trained_on = _generator(arguments)
-    (index,) = unseen_frames(trained_on, arguments.data, 1)
-    if trained_on is not None and arguments.data is None and trained_on.unseen(None):
-        arguments.frames, arguments.seed = index + 1, trained_on.seed
-    frame = make_frame(open_frames(arguments, arguments.geometry)[index], exposures=())
-    with gathered_warnings([]):
-        files = draw_figures(frame.sample, folder, generator)
-    return "\n".join(f"picture: {file}" for file in files)
+    with named_steps(notes, count_of) as tick:
+        return evaluate(frames, partial(target_rigs, arguments, chosen), methods, tick, agreement=agreement)

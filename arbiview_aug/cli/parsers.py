@@ -21,7 +21,6 @@ from arbiview_aug.cli.arguments import (
     add_target,
     command_parser,
     count,
-    degrees,
     kinds_text,
     positive,
     seed,
@@ -37,12 +36,7 @@ EXECUTIONS = ("opencv", "torch", "cuda")
 
 _GENERATOR = "folder of a generator or of diffusers, TorchScript file, or OWNER/NAME on the Hugging Face Hub"
 
-_FIXED = {
-    "paper": ("target", "target_set", "yaws", "quality", "geometry", "holes", "steps", "seed", "reduce", "clean_masks"),
-    "figure": ("target", "target_set", "yaws", "quality", "geometry", "holes", "steps", "frames"),
-    "displaced": ("target", "target_set", "yaws", "seed", "size"),
-}
-"""Options that the modes of ``evaluate`` fix."""
+_FIXED = ("target", "target_set", "seed", "size")  # by ``evaluate --displaced``
 
 
 def check() -> argparse.ArgumentParser:
@@ -115,7 +109,7 @@ def demo() -> argparse.ArgumentParser:
     add_rendering(parser)
     add_frames(parser, 1)
     parser.add_argument("--width", type=count, default=1800, metavar="PX", help="width of the contact sheet")
-    parser.set_defaults(target_set=None, yaws=None, reduce=1, clean_masks=False)
+    parser.set_defaults(target_set=None, reduce=1, clean_masks=False)
     return parser
 
 
@@ -153,29 +147,18 @@ def evaluate() -> argparse.ArgumentParser:
     add_target(target)
     sets = "instead of --target: paper (its six configurations), yaw (5 turns), vehicles, or truck (1 m higher)"
     target.add_argument("--target-set", choices=TARGET_SETS, help=sets)
-    yaws = "instead of --target: the source rig turned, as in --yaws=-11,11"
-    target.add_argument("--yaws", metavar="DEG,...", type=degrees, help=yaws)
     add_rendering(parser, "black", several=True)
     add = parser.add_argument
-    generator = f"of --holes diffusion, --paper and --figure, which score held-out frames of its training: {_GENERATOR}"
-    add("--generator", metavar="PATH", help=generator)
+    add("--generator", metavar="PATH", help=f"of --holes diffusion: {_GENERATOR}")
     add("--steps", nargs="+", type=count, default=[None], metavar="N", help="steps of the generator (default: its own)")
-    add_frames(parser, None, "number of frames (default: 1; --paper: 3 synthetic ones; --displaced: all)")
+    add_frames(parser, None, "number of frames (default: 1; --displaced: all)")
     add_reading(parser)
     add_output(parser)
-    mode = parser.add_mutually_exclusive_group()
     displaced = (
         "photographs as truth: of the frames' `truth` camera (docs/formats.md), else of the next frame of the drive; "
         "with NEXT of this frame folder's first frame. Surfaces: a copy, and all that the data offers"
     )
-    mode.add_argument("--displaced", nargs="?", const=True, metavar="NEXT", help=displaced)
-    paper = (
-        "the paper's Tables 1 and 2: baselines, the published stages and ours; without --data on nuscenes-one and "
-        "ddad-one below ARBIVIEW_DATA and on synthetic streets; quarter of an hour"
-    )
-    mode.add_argument("--paper", action="store_true", help=paper)
-    figure = "the paper's Figures 2 to 6 from the first frame, as PNG files"
-    mode.add_argument("--figure", action="store_true", help=figure)
+    add("--displaced", nargs="?", const=True, metavar="NEXT", help=displaced)
     return parser
 
 
@@ -293,12 +276,10 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
     if name == "depth" and arguments.device and not arguments.model:
         parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
     if name == "evaluate":
-        if arguments.generator and not (arguments.paper or arguments.figure or "diffusion" in arguments.holes):
-            parser.error("argument --generator: expected it with --holes diffusion, --paper or --figure")
-        for mode, fixed in _FIXED.items():
-            for option in fixed:
-                if getattr(arguments, mode) and getattr(arguments, option) != parser.get_default(option):
-                    flag = "downscale" if option == "reduce" else option.replace("_", "-")
-                    parser.error(f"argument --{flag}: --{mode} has its own; expected none")
+        if arguments.generator and "diffusion" not in arguments.holes:
+            parser.error("argument --generator: expected it with --holes diffusion")
+        for option in _FIXED if arguments.displaced else ():
+            if getattr(arguments, option) != parser.get_default(option):
+                parser.error(f"argument --{option.replace('_', '-')}: --displaced has its own; expected none")
         if arguments.displaced and arguments.data is None:
             parser.error("argument --displaced: expected --data FOLDER with it, found none")

@@ -11,8 +11,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import data
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
-from arbiview_aug.evaluate.report.pictures import save_picture
-from arbiview_aug.evaluate.report.rig_picture import draw_rigs
+from arbiview_aug.evaluate.report.pictures import draw_rigs, save_picture
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.evaluate.rig_gap import rig_gap
 

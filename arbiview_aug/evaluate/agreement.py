@@ -118,8 +118,7 @@ def summary(prefix: str, pairs: Sequence[OverlapScore]) -> dict[str, float]:
     """Mean and worst of the pairs with a score, as ``<prefix>_...``; empty if there are none."""
     row: dict[str, float] = {}
     for kind in ("raw", "fitted"):
-        values = [value for pair in pairs if (value := getattr(pair, f"{kind}_psnr_db")) is not None]
-        if values:
+        if values := [value for pair in pairs if (value := getattr(pair, f"{kind}_psnr_db")) is not None]:
             row[f"{prefix}_{kind}_psnr_db"] = float(np.mean(values))
             row[f"{prefix}_worst_{kind}_psnr_db"] = min(values)
     return row

@@ -8,12 +8,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.baselines import own_index
 from arbiview_aug.evaluate.frames import Photographs, ScoredFrame
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.methods import Method
@@ -78,6 +78,12 @@ def _copy(sample: Mapping[str, Any], target: Rig) -> list[RenderedView]:
         image: Any = cv2.resize(images[own_index(rig, camera)], camera.size[::-1], interpolation=cv2.INTER_AREA)
         views.append(RenderedView(image, np.ones(camera.size, bool)))
     return views
+
+
+def own_index(source: Rig, camera: Camera) -> int:
+    """Index of the source camera of the same name, or else of the nearest direction."""
+    nearest = int(np.argmax(source.cam2ego[:, :3, 2] @ camera.cam2ego[:3, 2]))
+    return source.names.index(camera.name) if camera.name in source.names else nearest
 
 
 COPY = Method("copy", _copy, plans=False)

@@ -120,21 +120,19 @@ def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray) -> F
     at least 20 shared points that are neither dark nor saturated, with weak priors g = 0 and sum g = 0.
     """
     _check_images(rig, images)
-    light: list[dict[int, float]] = []
-    for camera, image in zip(rig, images, strict=True):
+    count = len(rig)
+    light = np.full((count, len(points)), np.nan)  # log brightness
+    for k, (camera, image) in enumerate(zip(rig, images, strict=True)):
         index, uv, _ = _unmasked(camera, visible_points(camera, points))
         brightness = colours_at(image, uv).mean(-1)
         usable = (brightness > _DARK) & (brightness < _SATURATED)
-        light.append(dict(zip(index[usable].tolist(), np.log(brightness[usable]).tolist(), strict=True)))
-    count = len(rig)
+        light[k, index[usable]] = np.log(brightness[usable])
     rows, targets = [], []
     for a, b in combinations(range(count), 2):
-        shared = light[a].keys() & light[b].keys()
-        if len(shared) >= _MIN_SHARED_POINTS:
-            row = np.zeros(count)
-            row[a], row[b] = 1, -1
-            rows.append(row)
-            targets.append(-np.median([light[a][k] - light[b][k] for k in shared]))
+        brighter = (light[a] - light[b])[np.isfinite(light[a] - light[b])]
+        if len(brighter) >= _MIN_SHARED_POINTS:
+            rows.append(np.eye(count)[a] - np.eye(count)[b])
+            targets.append(-np.median(brighter))
     A = np.vstack([*rows, _GAIN_PRIOR * np.eye(count), np.ones((1, count))])
     rhs = np.concatenate([targets, np.zeros(count + 1)])
     return np.asarray(np.exp(np.linalg.lstsq(A, rhs, rcond=None)[0]))

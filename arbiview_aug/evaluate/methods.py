@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Holes, Quality
-from arbiview_aug.evaluate.baselines import BASELINES, Renderer
-from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
+from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.generator.generator import has_shipped
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
@@ -25,11 +22,6 @@ from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import inpainter_of, render_config
 
 Sample = Mapping[str, Any]
-
-OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")  # presets other than the published method
-
-INPAINTED, GENERATED = "fast, inpainted", "generator"
-"""Rows of ``fast`` with holes filled by Telea's inpainting, and by the shipped weights."""
 
 _CACHED_TRANSFORMS = 8  # the targets of a set; full-size plans take 50 MB each
 
@@ -142,63 +134,3 @@ def views_of(out: Sample) -> list[RenderedView]:
     confidence = [c.float().cpu().numpy() for c in out["confidence"]] if "confidence" in out else [None] * len(images)
     generated = [g.cpu().numpy() for g in out["generated"]] if "generated" in out else [None] * len(images)
     return [RenderedView(*parts) for parts in zip(images, coverage, confidence, generated, strict=True)]
-
-
-def baseline(name: str) -> Method:
-    """Wrap one of ``baselines.BASELINES`` as a method."""
-    renderer: Renderer = BASELINES[name]
-
-    def render(sample: Sample, target: Rig) -> list[RenderedView]:
-        rig: Rig = sample["rig"]
-        images: list[Image] = as_arrays(sample["images"])
-        return renderer(rig, images, target.in_frame_of(rig))
-
-    return Method(name, render)
-
-
-def paper_stages() -> dict[str, PaperConfig]:
-    """``paper``, and with each stage switched off.
-
-    Without stage 4 the fused image is the plain mean of all sources that see a pixel.
-    """
-    full = PaperConfig()
-    return {
-        "paper": full,
-        "paper without stage 2, matching": replace(full, use_feature_matching=False),
-        "paper without stage 3, objects": replace(full, use_object_alignment=False),
-        "paper without stages 2 and 3": replace(full, use_feature_matching=False, use_object_alignment=False),
-        "paper without stage 4, weights": replace(
-            full,
-            use_distance_weight=False,
-            use_gradient_weight=False,
-            use_quality_weight=False,
-            use_primary_weight=False,
-        ),
-    }
-
-
-def study_methods(generator: Inpainter | None = None) -> list[Method]:
-    """Rows of the paper's tables and ours, from images and poses alone.
-
-    The generator's row is of the shipped weights if none is given, and only with diffusers.
-    """
-    published = [retargeting(config, "auto", name) for name, config in paper_stages().items()]
-    return [
-        *map(baseline, BASELINES),
-        *published,
-        *(retargeting(quality, "street", quality) for quality in OURS),
-        retargeting("fast", "street", INPAINTED, holes="telea"),
-        *generating(GENERATED, generator),
-    ]
-
-
-def generating(name: str, generator: Inpainter | None) -> list[Method]:
-    """``fast`` with holes by a generator, or by the shipped weights; nothing where these are not installed."""
-    if generator is None and not has_generator():
-        return []
-    return [retargeting("fast", "street", name, holes=generator or "diffusion")]
-
-
-def has_generator() -> bool:
-    """Whether the shipped weights and diffusers are installed."""
-    return importlib.util.find_spec("diffusers") is not None and has_shipped()

@@ -21,7 +21,7 @@ import torch
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Quality, Reduce
 from arbiview_aug.cli.arguments import add_data, add_downscale, command_parser, output_file, seed
-from arbiview_aug.cli.bench.study import benchmark, machine_line, quartiles, show, study
+from arbiview_aug.cli.bench.timing import benchmark, machine_line, quartiles, show
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.depth_folder import WANTED
 from arbiview_aug.datasets.registry import data_name
@@ -30,7 +30,7 @@ from arbiview_aug.errors import DataError, exit_status
 from arbiview_aug.evaluate.agreement import source_overlap, summary
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import RenderedView
-from arbiview_aug.evaluate.methods import Method, Sample, paper_stages, retargeting
+from arbiview_aug.evaluate.methods import Method, Sample, retargeting
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import UP_M, named_targets, shifted_target
 from arbiview_aug.favs.config import PaperConfig
@@ -40,6 +40,8 @@ from arbiview_aug.scene.scene import motion_camera
 from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from integrations.benchmarks.paper import paper_stages
+from integrations.benchmarks.study import study
 
 PROGRAM = "python -m integrations.benchmarks.ablation"
 SYNTHETIC = "synthetic street"

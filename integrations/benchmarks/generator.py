@@ -15,12 +15,13 @@ import numpy as np
 from arbiview_aug import SampleKeys
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_output, command_parser, count, device_named, size, writable_folder
-from arbiview_aug.cli.bench.study import benchmark, clock_of, machine_line, quartiles, show, study
+from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.generator import Diffusion, Generator
+from integrations.benchmarks.study import study
 
 SIZE = (256, 448)
 STEPS = (1, 4)

@@ -24,7 +24,7 @@ from tqdm import tqdm
 from arbiview_aug import RigRetarget
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_output, command_parser, count, size, writable_folder
-from arbiview_aug.cli.bench.study import benchmark, machine_line, show
+from arbiview_aug.cli.bench.timing import benchmark, machine_line, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.datasets.synthetic.dataset import RenderedViews
 from arbiview_aug.sample.boxes_2d import project_boxes_3d

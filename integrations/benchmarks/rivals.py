@@ -15,9 +15,8 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
 from arbiview_aug.cli.bench.data import Recorded
-from arbiview_aug.cli.bench.study import quartiles, timed_rounds
+from arbiview_aug.cli.bench.timing import quartiles, timed_rounds
 from arbiview_aug.errors import SampleError
-from arbiview_aug.evaluate.baselines import Renderer, row_split
 from arbiview_aug.evaluate.frames import scores
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting
@@ -29,6 +28,7 @@ from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.view_planner import build_plan
+from integrations.benchmarks.baselines import Renderer, row_split
 from integrations.benchmarks.opencv_stitching import opencv_stitching
 
 YAW_DEG = 22.0

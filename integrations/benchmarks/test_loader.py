@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader, Dataset
 from arbiview_aug import RetargetedDataset, RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.loader import loader_rates
-from arbiview_aug.cli.bench.study import memory_mib
+from arbiview_aug.cli.bench.timing import memory_mib
 from arbiview_aug.datasets.synthetic import demo_target_rig
 from integrations.benchmarks.machine import counting
 from tests.helpers import street_sample

@@ -18,7 +18,7 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench import pareto
 from arbiview_aug.cli.bench.data import recorded
 from arbiview_aug.cli.bench.speed import BOUNDS, default_data, measure, table
-from arbiview_aug.cli.bench.study import timed_rounds
+from arbiview_aug.cli.bench.timing import timed_rounds
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread

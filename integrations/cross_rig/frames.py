@@ -100,11 +100,12 @@ class Source:
             spec["two_wheelers"] = True
         if self.variant is not None:
             variant = self.variant
-            renderer = "transforms.rig_retarget" if variant.kind == "retarget" else "evaluate.baselines"
+            retargets = variant.kind == "retarget"
+            renderer = "arbiview_aug.transforms.rig_retarget" if retargets else "integrations.benchmarks.baselines"
             spec |= {
                 "source": source_rig(self.size).content_key.hex(),
                 "arm": variant.views_spec(),  # the key that names existing frame stores
-                "renderer": code_hash(f"arbiview_aug.{renderer}", without=_UNUSED[variant.holes]),
+                "renderer": code_hash(renderer, without=_UNUSED[variant.holes]),
                 # What a variant says of its views is in ``variant``; another variant's needs may change without it.
                 "noise": code_hash("integrations.cross_rig.noise") if variant.noise else None,
                 "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.variant",)),

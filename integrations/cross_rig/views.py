@@ -10,12 +10,12 @@ import numpy as np
 import torch
 
 from arbiview_aug import Camera, RandomRig, Rig, RigRetarget, visible_boxes
-from arbiview_aug.evaluate.baselines import row_split
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.temporal.motion_depth import motion_depth
+from integrations.benchmarks.baselines import row_split
 from integrations.cross_rig.cache import Arrays
 from integrations.cross_rig.variant import RANDOM, Variant
 

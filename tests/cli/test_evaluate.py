@@ -14,6 +14,7 @@ import pytest
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.evaluate.images import as_arrays, as_tensors
+from arbiview_aug.evaluate.targets import YAWS_DEG
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 AGREEMENT_DB = 0.01
@@ -49,7 +50,8 @@ def test_numbers_agree_with_the_protocol(
 ) -> None:
     """The command's sparse figures, against the protocol's metrics of the same renderings."""
     common = ["--data", str(nuscenes_root), "--downscale", "2", "--geometry", "street"]
-    found = run([*common, "--yaws", "22"], tmp_path)
+    FrameFolder(nuscenes_root, reduce=2)[0]["rig"].turned(yaw_deg=22).save(tmp_path / "turned.yaml")
+    found = run([*common, "--target", str(tmp_path / "turned.yaml")], tmp_path)
     assert "every other degree" not in capsys.readouterr().out
     sample = FrameFolder(nuscenes_root, reduce=2)[0]
     rig, points = sample["rig"], sample["points"].numpy()[:, :3].astype(float)
@@ -92,22 +94,11 @@ def test_points_that_methods_may_read_do_not_score(
 
 
 @pytest.mark.slow
-def test_degrees_of_yaw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = [
-        "evaluate",
-        "--size",
-        "24x66",
-        "--yaws=-11,11",
-        "--geometry",
-        "infinity",
-        "--output",
-        str(tmp_path),
-    ]
-    assert main(arguments) == 0
-    printed = json.loads((tmp_path / "evaluate.json").read_text())
-    assert list(printed["means"]) == ["fast, infinity: yaw -11", "fast, infinity: yaw +11", "fast, infinity: all"]
-    first, second, both = (row["true_psnr_db"] for row in printed["means"].values())
-    assert both == pytest.approx((first + second) / 2)
+def test_a_set_of_targets(tmp_path: Path) -> None:
+    means = run(["--size", "24x66", "--target-set", "yaw", "--geometry", "infinity"], tmp_path)["means"]
+    assert list(means) == [f"fast, infinity: {of}" for of in (*(f"yaw {yaw:+g}" for yaw in YAWS_DEG), "all")]
+    *each, of_all = (row["true_psnr_db"] for row in means.values())
+    assert of_all == pytest.approx(np.mean(each))
 
 
 @pytest.mark.slow
@@ -123,24 +114,11 @@ def test_lenses_that_a_method_cannot_take(
     assert "pinhole" in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_figures(nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "--figure", "--size", "40x110", "--output", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.count("picture: ") == 5
-    heights = {k: cv2.imread(str(tmp_path / f"figure{k}.png")).shape[0] for k in range(2, 7)}
-    # Figure 2 has two configurations of four rows each below the recorded row, the others one.
-    assert heights[3] == heights[4] == heights[5] == heights[6]
-    assert heights[2] / heights[3] == pytest.approx(9 / 5, rel=0.02)
-
-
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["--yaws", "left"],
+        ["--target-set", "left"],
         ["--target", "waymo", "--target-set", "paper"],
-        ["--paper", "--figure"],
-        ["--paper", "--target-set", "yaw"],
-        ["--figure", "--geometry", "infinity"],
         ["--displaced"],
         ["--displaced", "--target", "waymo", "--data", "."],
     ],

@@ -21,8 +21,7 @@ import pytest
 
 from arbiview_aug import __main__, environment, load_rig
 from arbiview_aug.__main__ import BENCHMARKS, COMMANDS, Command, main
-from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, GeometryName, Quality
-from arbiview_aug.evaluate import paper_study
+from arbiview_aug.choices import TRAINING_PRESETS, GeometryName, Quality
 from arbiview_aug.generator.training.config import CONFIGS
 from arbiview_aug.render.plan import PRESETS
 from arbiview_aug.scene.scene import GEOMETRIES
@@ -143,7 +142,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("bench pareto --generator /nope", "generator /nope: expected a folder of a generator or .*, found none"),
         ("evaluate --holes diffusion --generator /nope", "generator /nope: expected a folder of a generator"),
         ("evaluate --quality paper fast --geometry street", "quality paper knows the far surface alone, got street"),
-        ("evaluate --generator /nope", "argument --generator: expected it with --holes diffusion, --paper or --figure"),
+        ("evaluate --generator /nope", "argument --generator: expected it with --holes diffusion"),
         ("depth --data frame --device nope", "argument --device: expected it with --model alone"),
         ("depth --data frame --model m --device nope", "expected cpu, cuda, cuda:1, ..., got 'nope'"),
     ],
@@ -209,7 +208,7 @@ assert "torch" not in sys.modules
 
 def test_names_in_options_are_those_of_the_tables() -> None:
     assert [*get_args(Quality)] == [*PRESETS, "paper"] and {*get_args(GeometryName)} == {*GEOMETRIES}
-    assert {*TRAINING_PRESETS} == {*CONFIGS} and paper_study.SETS == TARGET_SETS
+    assert {*TRAINING_PRESETS} == {*CONFIGS}
 
 
 @pytest.mark.parametrize(
@@ -217,10 +216,8 @@ def test_names_in_options_are_those_of_the_tables() -> None:
     [
         ("convert --data d --target waymo --output o --reduce 2", "--reduce is now --downscale"),
         ("convert --data d --target waymo --output o --motion-depth=d", "--motion-depth is now --depth"),
-        (
-            "evaluate --yaws vehicles",
-            "names of sets are for --target-set",
-        ),
+        ("evaluate --yaws vehicles", "--yaws is now --target-set SET"),
+        ("evaluate --paper", "--paper is now python -m integrations.benchmarks.paper"),
         ("bench trade", "it is now bench pareto"),
         ("bench neighbours", "it is now bench speed --only neighbour"),
     ],
@@ -307,8 +304,7 @@ HELP = {
         "--output DIR",
         "--quality",
         "--target-set",
-        "--yaws",
-        "--paper",
+        "--displaced",
     ),
     "inspect": ("RIG", "--output FILE"),
     "train": ("--data", "--output DIR", "--config", "--set KEY=VALUE"),

@@ -64,7 +64,7 @@ def test_what_is_no_table(tmp_path: Path, text: str, message: str) -> None:
 GROWTH = """
 import json, sys, time
 from pathlib import Path
-from arbiview_aug.cli.bench.study import peak_mib
+from arbiview_aug.cli.bench.timing import peak_mib
 from arbiview_aug.datasets import Neighbours, NuScenesDataset
 
 def as_objects():

@@ -10,9 +10,8 @@ from arbiview_aug.cameras.rays import half_way_view
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate import methods
-from arbiview_aug.evaluate.baselines import BASELINES, row_split
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.methods import baseline, one_camera, paper_stages, retargeting, study_methods, views_of
+from arbiview_aug.evaluate.methods import one_camera, retargeting, views_of
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -39,32 +38,6 @@ def test_names_and_points() -> None:
     assert retargeting(PaperConfig(), name="mine").name == "mine"
     assert retargeting("fast", "auto").reads_points and not retargeting("fast", "street").reads_points
     assert not retargeting("paper", "auto").reads_points, "the published stages know rotations only"
-    assert not any(method.reads_points for method in study_methods())
-
-
-def test_rows_of_the_study() -> None:
-    names = [method.name for method in study_methods()]
-    assert names[:3] == list(BASELINES) and {"paper", "draft", "fast", "accurate"} <= set(names)
-    assert len(set(names)) == len(names)
-
-
-def test_stages_are_off_one_at_a_time() -> None:
-    whole = PaperConfig()
-    stages = paper_stages()
-    assert stages["paper"] == whole
-    off = {name: [k for k, v in vars(config).items() if v != getattr(whole, k)] for name, config in stages.items()}
-    assert off["paper without stage 2, matching"] == ["use_feature_matching"]
-    assert off["paper without stage 3, objects"] == ["use_object_alignment"]
-    weights = off["paper without stage 4, weights"]
-    assert len(weights) == 4 and all("weight" in key for key in weights)
-
-
-def test_baselines_take_targets_in_their_own_frame(sample: dict) -> None:
-    rig: Rig = sample["rig"]
-    target = Rig([c.shifted(z_m=0.3) for c in rig], ground_z_m=rig.ground_z_m + 0.3)  # the same place over the road
-    views = baseline("row split").render(sample, target)
-    for view, want in zip(views, row_split(rig, as_arrays(sample["images"]), rig), strict=True):
-        np.testing.assert_array_equal(view.image, want.image)
 
 
 def test_one_camera_keeps_what_the_ego_frame_holds(sample: dict) -> None:

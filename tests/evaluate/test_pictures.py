@@ -11,8 +11,15 @@ import pytest
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.report.pictures import HOLE, contact_sheet, outline_coverage, put_text, save_picture
-from arbiview_aug.evaluate.report.rig_picture import draw_rigs, rig_figure
+from arbiview_aug.evaluate.report.pictures import (
+    HOLE,
+    contact_sheet,
+    draw_rigs,
+    outline_coverage,
+    put_text,
+    rig_figure,
+    save_picture,
+)
 
 
 def plain(h: int, w: int, colour: tuple[int, int, int]) -> np.ndarray:
@@ -21,12 +28,9 @@ def plain(h: int, w: int, colour: tuple[int, int, int]) -> np.ndarray:
 
 def test_contact_sheet_places_images_row_by_row() -> None:
     red, green, blue = (250, 0, 0), (0, 250, 0), (0, 0, 250)
-    sheet = contact_sheet(
-        [[plain(90, 160, red), plain(90, 160, green)], [plain(200, 100, blue)]],
-        [["left", "right, with a caption that is far too long to fit under it" * 3], ["portrait"]],
-        ["first", "second"],
-        width_px=600,
-    )
+    captions = ["left", "right, with a caption that is far too long to fit under it" * 3]
+    two = ("first", [plain(90, 160, red), plain(90, 160, green)], captions)
+    sheet = contact_sheet([two, ("second", [plain(200, 100, blue)], ["portrait"])], width_px=600)
     assert sheet.dtype == np.uint8 and sheet.shape[1:] == (600, 3)
     places = {}
     for name, colour in (("red", red), ("green", green), ("blue", blue)):
@@ -42,7 +46,7 @@ def test_contact_sheet_places_images_row_by_row() -> None:
 
 
 def test_contact_sheet_takes_floats() -> None:
-    sheet = contact_sheet([[np.full((20, 40, 3), 99.6)]], [[""]], [""], width_px=100)
+    sheet = contact_sheet([("", [np.full((20, 40, 3), 99.6)], [""])], width_px=100)
     assert (sheet == 100).all(-1).any()
 
 

@@ -13,13 +13,12 @@ import pytest
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.evaluate.frames import make_frame
+from arbiview_aug.evaluate.frames import Evaluation, evaluate, make_frame
 from arbiview_aug.evaluate.images import RenderedView
-from arbiview_aug.evaluate.methods import Method, baseline, retargeting
+from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report, layers
 from arbiview_aug.evaluate.report.pictures import overlay_confidence
 from arbiview_aug.evaluate.report.tables import TRUTH_COLUMNS
-from arbiview_aug.evaluate.run import Evaluation, evaluate
 
 SIZE = (48, 132)
 NAMES = ["fast, street", "own & only"]
@@ -27,7 +26,7 @@ NAMES = ["fast, street", "own & only"]
 
 def halfway_sure(sample: dict, target: Rig) -> list[RenderedView]:
     """A renderer that tells a confidence."""
-    views = baseline("own camera").render(sample, target)
+    views = retargeting("draft", "infinity").render(sample, target)
     return [RenderedView(v.image, v.coverage, np.full(v.coverage.shape, 0.5, np.float32)) for v in views]
 
 

@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 from arbiview_aug import RetargetedDataset, RigRetarget, SampleKeys, collate
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.bench.study import peak_mib
+from arbiview_aug.cli.bench.timing import peak_mib
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig

@@ -16,9 +16,9 @@ import torch
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import Reduce
 from arbiview_aug.cli.arguments import REAL_TARGET
-from arbiview_aug.datasets import Neighbours, open_data
+from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.depth_folder import FOLDERS, DepthFolder
-from arbiview_aug.datasets.frame_folder import write_drive, write_frame
+from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
@@ -41,8 +41,8 @@ class Recorded:
 
     def sample(self, index: int, reduce: Reduce = 1) -> dict[str, Any]:
         """Read a frame with images at 1 / ``reduce``."""
-        data = open_data(self.root, reduce=reduce)
-        return data[index]
+        sample: dict[str, Any] = open_data(self.root, reduce=reduce)[index]
+        return sample
 
     def reader(self, reduce: Reduce) -> Callable[[], Any]:
         """Function that reads the first frame from disk, without its points."""
@@ -75,35 +75,23 @@ class Recorded:
 
 
 @contextmanager
-def recorded(
-    data: str | Path | None,
-    *,
-    frames: int = 1,
-    size: tuple[int, int] = (512, 1408),
-    neighbours: Neighbours | None = None,
-) -> Iterator[Recorded]:
+def recorded(data: str | Path | None, *, frames: int = 1, size: tuple[int, int] = (512, 1408)) -> Iterator[Recorded]:
     """Open a user's frames, or write synthetic ones of ``size`` (h, w) as JPEGs to a temporary folder.
 
-    With ``neighbours`` it writes one frame with these neighbours, as a drive; else frames with depth maps of LiDAR in
-    place of the ``depth`` command's.
+    Those have depth maps of LiDAR in place of the ``depth`` command's.
     """
     if data is not None:
         yield Recorded(data_name(data), Path(data))
         return
-    drive = SyntheticDrive(demo_source_rig(size), num_frames=frames, lidar=neighbours is None, neighbours=neighbours)
+    drive = SyntheticDrive(demo_source_rig(size), num_frames=frames)
     with tempfile.TemporaryDirectory() as folder:
-        if neighbours is not None:
-            sample = drive[0]
-            write_drive(Path(folder), [sample, *sample["neighbours"]])
-        else:
-            for k in range(frames):
-                sample = drive[k]
-                write_frame(Path(folder) / f"{k:04}", sample)
-                for name, kind in zip(FOLDERS.values(), (MotionDepth, LearnedDepth), strict=True):
-                    depth = kind(tuple(lidar_maps(sample)), "from LiDAR")
-                    DepthFolder(Path(folder) / name).write(f"{k:04}", sample["rig"], depth)
-        name = "synthetic streets" if neighbours is None else "synthetic drive"
-        yield Recorded(name, Path(folder), drive.render)
+        for k in range(frames):
+            sample = drive[k]
+            write_frame(Path(folder) / f"{k:04}", sample)
+            for name, kind in zip(FOLDERS.values(), (MotionDepth, LearnedDepth), strict=True):
+                depth = kind(tuple(lidar_maps(sample)), "from LiDAR")
+                DepthFolder(Path(folder) / name).write(f"{k:04}", sample["rig"], depth)
+        yield Recorded("synthetic streets", Path(folder), drive.render)
 
 
 def lidar_maps(sample: Mapping[str, Any]) -> list[Layer]:

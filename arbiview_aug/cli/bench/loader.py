@@ -20,7 +20,7 @@ from tqdm import tqdm
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import output_file
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, lifted, recorded
-from arbiview_aug.cli.bench.study import benchmark, machine_line, memory_mib, quartiles, show
+from arbiview_aug.cli.bench.timing import benchmark, machine_line, memory_mib, quartiles, show
 from arbiview_aug.datasets import RetargetedDataset, WithDepth, open_data
 from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.registry import split_kind
@@ -63,13 +63,11 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     opened = open_data(data.root, reduce=arguments.reduce)
     plain: Dataset[Any] = Repeated(opened, arguments.frames)
     datasets: dict[str, Dataset[Any]] = {PLAIN: plain}
-    rig: Rig = data.sample(0, arguments.reduce)["rig"]
+    rig: Rig = opened[0]["rig"]
     for surface in arguments.geometry:
         retarget, source = RigRetarget(target, geometry=surface), plain
-        if surface != "auto" and FOLDERS.keys() & GEOMETRIES[surface].reads:
-            source = Repeated(
-                WithDepth(opened, split_kind(data.root)[1]), arguments.frames
-            )  # what the depth command wrote
+        if surface != "auto" and FOLDERS.keys() & GEOMETRIES[surface].reads:  # what the depth command wrote
+            source = Repeated(WithDepth(opened, split_kind(data.root)[1]), arguments.frames)
         if GEOMETRIES[surface].needs is None:
             retarget.prepare(rig)  # workers share static plans
         datasets[f"retargeted, {surface}"] = RetargetedDataset(source, retarget)
@@ -128,7 +126,15 @@ def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], e
                 start_s = _cpu_s(pids[key])
                 times[key].append(_epoch_s(loader))
                 used_s[key] += _cpu_s(pids[key]) - start_s
-        return [_rate(key, len(loaders[key]), times, used_s[key], pids[key]) for key in loaders]
+        rows = []
+        for (name, n), loader in loaders.items():
+            frames, epochs_s = len(loader), np.array(times[name, n])
+            ms = quartiles(1e3 * epochs_s / frames)
+            row = {"name": name, "workers": n, "frames_per_s": 1e3 / ms.median_ms, "best_per_s": frames / min(epochs_s)}
+            row["of_reading"] = float(np.median(times.get((PLAIN, n), epochs_s) / epochs_s))
+            row |= {"ms": ms._asdict(), "cpu_ms": 1e3 * used_s[name, n] / frames / epochs or None}
+            rows.append(row | {"unique_mib": _unique_mib(pids[name, n]) if n else None})
+        return rows
 
 
 def _epoch_s(loader: DataLoader[Any]) -> float:
@@ -138,22 +144,12 @@ def _epoch_s(loader: DataLoader[Any]) -> float:
     return time.perf_counter() - start
 
 
-def _rate(
-    key: tuple[str, int], frames: int, times: Mapping[Any, list[float]], used_s: float, pids: list[int]
-) -> dict[str, Any]:
-    (name, workers), epochs_s = key, np.array(times[key])
-    ms, plain_s = quartiles(1e3 * epochs_s / frames), times.get((PLAIN, workers), times[key])
-    row = {"name": name, "workers": workers, "frames_per_s": 1e3 / ms.median_ms, "best_per_s": frames / min(epochs_s)}
+def _unique_mib(pids: Sequence[int]) -> float | None:
+    """Mean private memory of processes; None except on Linux."""
     try:
-        unique = [memory_mib("smaps_rollup", "Private_(?:Clean|Dirty)", pid) for pid in pids] if workers else []
+        return float(np.mean([memory_mib("smaps_rollup", "Private_(?:Clean|Dirty)", pid) for pid in pids]))
     except OSError:
-        unique = []
-    return row | {
-        "of_reading": float(np.median(plain_s / epochs_s)),
-        "ms": ms._asdict(),
-        "cpu_ms": 1e3 * used_s / frames / len(epochs_s) if used_s else None,
-        "unique_mib": float(np.mean(unique)) if unique else None,
-    }
+        return None
 
 
 def _children() -> set[int]:

@@ -15,8 +15,8 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -25,39 +25,38 @@ from tqdm import tqdm
 
 from arbiview_aug import PlanCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import GeometryName, Quality, Reduce
+from arbiview_aug.choices import GeometryName, Holes, Quality, Reduce
 from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
 from arbiview_aug.cli.bench.speed import remap_floor
-from arbiview_aug.cli.bench.study import (
-    LEAST_GAIN_DB,
+from arbiview_aug.cli.bench.timing import (
     Quartiles,
-    Row,
-    advice,
     benchmark,
-    distinct_steps,
     machine_line,
-    pareto_front,
     peak_mib,
     quartiles,
     show,
-    study,
     timed_rounds,
 )
 from arbiview_aug.cli.parsers import EXECUTIONS
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.frames import ScoredFrame
-from arbiview_aug.evaluate.methods import Method, Sample, views_of
+from arbiview_aug.evaluate.frames import ScoredFrame, scores
+from arbiview_aug.evaluate.images import RenderedView
+from arbiview_aug.evaluate.methods import Sample, views_of
+from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.generator import load_inpainter
+from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.render.requirements import HELPFUL_DATA, static_harm
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 Execution = Literal["opencv", "torch", "cuda"]
+Row = Mapping[str, Any]
 
 REFERENCE: Reduce = 2  # decoding factor of the images whose colours score
+LEAST_GAIN_DB = 0.2  # smaller differences are noise on single frames
 _ENOUGH_MS = 1000.0  # keeps a sweep of 63 settings at three minutes
 
 
@@ -68,41 +67,36 @@ class Setting:
     reduce: Reduce  # images are decoded at 1 / this
     execution: Execution  # ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU
     cached: bool = False  # whether depth from overlap is cached
+    holes: Holes | Inpainter = "black"
 
     @property
     def name(self) -> str:
         depth = ["depth held"] if self.cached else []
         return ", ".join([self.quality, self.surface, *depth, f"1/{self.reduce}", self.execution])
 
-    def transform(self, target: Rig, **filling: Any) -> RigRetarget:
-        """Create the setting's transform, which caches the last plan alone; holes stay black unless ``filling``."""
-        return RigRetarget(
+    def call(self, target: Rig) -> Callable[[Sample], dict[str, Any]]:
+        """Create a transform that caches the last plan alone, and moves images to the GPU if it renders there."""
+        retarget = RigRetarget(
             target,
             quality=self.quality,
             geometry=self.surface,
-            backend="torch" if self.execution == "cuda" else self.execution,
+            holes=self.holes,
+            backend="opencv" if self.execution == "opencv" else "torch",
             cache=PlanCache(share_overlap=self.cached, max_bytes=0),
-            **filling or {"holes": "black"},
         )
-
-    def method(self, target: Rig, **filling: Any) -> Method:
-        """Create a row of a study of one target."""
-        retarget = self.transform(target, **filling)
-        return Method(self.name, lambda sample, _: views_of(retarget(self.on_device(sample))))
-
-    def on_device(self, sample: Sample) -> dict[str, Any]:
-        """Move the images to the GPU if this setting renders there."""
         if self.execution != "cuda":
-            return dict(sample)
-        return {**sample, "images": [image.to("cuda") for image in sample["images"]]}
+            return retarget
+        return lambda sample: retarget({**sample, "images": [image.to("cuda") for image in sample["images"]]})
 
-    def call(self, target: Rig, sample: Sample, **filling: Any) -> Callable[[], Any]:
+    def alternating(self, target: Rig, sample: Sample) -> Callable[[], Any]:
         """Create a transform and alternate it between two frames of one calibration."""
-        sample, retarget = self.on_device(sample), self.transform(target, **filling)
-        samples = itertools.cycle([sample, as_of_another_frame(sample)])
+        retarget, samples = self.call(target), [sample, as_of_another_frame(sample)]
+        if self.execution == "cuda":
+            samples = [{**one, "images": [image.to("cuda") for image in one["images"]]} for one in samples]
+        frames = itertools.cycle(samples)
 
         def run() -> None:
-            retarget(next(samples))
+            retarget(next(frames))
             if self.execution == "cuda":
                 torch.cuda.synchronize()
 
@@ -147,7 +141,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 @benchmark
 def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Score and time all settings."""
+    """Score and time all settings, and what fills the holes of the recommended one."""
     source: Rig = data.sample(0, REFERENCE)["rig"]
     target = data.target(arguments.target, arguments.size)
     if "paper" in arguments.quality:  # homographies know no lens; all settings share the target
@@ -157,47 +151,64 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     def frame(index: int, reduce: Reduce) -> ScoredFrame:
         return data.frame(index, reduce, REFERENCE)
 
-    wanted = settings(
-        [s for s in _surfaces(frame(0, REFERENCE).scored_sample) if not arguments.geometry or s in arguments.geometry],
-        qualities=arguments.quality,
-        reduces=arguments.reduce,
-        executions=arguments.execution,
-    )
-    rows: list[dict[str, Any]] = []
-    for one in tqdm(wanted, desc="accuracy", unit="setting", leave=False):
-        memory = peak_mib(one.call(target, frame(0, one.reduce).scored_sample))
-        frames = [frame(index, one.reduce) for index in range(arguments.frames)]
-        (scored,) = study([one.method(target)], frames, {"target": [target]}, repeats=0).values()
-        means, prefix = scored["target"], "even" if data.truth is None else "true"
-        rows.append(
-            {"name": one.name, **asdict(one), "peak_mib": memory, "seen": means["seen"]}
-            | {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
-            | {"harm": static_harm(source, target, one.surface, RenderConfig())}
-        )
-    calls = {one.name: one.call(target, frame(0, one.reduce).scored_sample) for one in wanted}
+    def alternating(one: Setting) -> Callable[[], Any]:
+        return one.alternating(target, frame(0, one.reduce).scored_sample)
+
     h, w = target.sizes[0]
     noise = torch.randint(0, 256, (len(target), 3, h, w), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    reads = {f"decode 1/{reduce}": data.reader(reduce) for reduce in {one.reduce for one in wanted}}
-    candidates = {"floor": remap_floor(noise, (h, w)), **reads, **calls}
-    times = timed_rounds(candidates, arguments.repeats, "times", enough_ms=_ENOUGH_MS)
-    for row in rows:
-        own_times, decode = times[row["name"]], quartiles(times[f"decode 1/{row['reduce']}"]).median_ms
-        row |= quartiles(own_times)._asdict() | {"decode_ms": decode}
-        row["floor_ratio"] = float(quartiles(own_times / times["floor"][: len(own_times)]).median_ms)
-        row["decode_ratio"] = row["median_ms"] / decode
-    by_name = {one.name: one for one in wanted}
+    floor = remap_floor(noise, (h, w))
+
+    def measured(candidates: Mapping[str, Setting]) -> list[dict[str, Any]]:
+        rows = []
+        for name, one in tqdm(candidates.items(), desc="accuracy", unit="setting", leave=False):
+            memory = peak_mib(alternating(one))
+            network: Any = getattr(one.holes, "generator", one.holes)  # counts its calls, if it is one
+            before = getattr(network, "calls", None)
+            frames = [frame(index, one.reduce) for index in range(arguments.frames)]
+            render = partial(_render, one.call(target))
+            means = mean_of(row for each in frames for row in scores(each, render, target, ("even",))[1])
+            prefix = "even" if data.truth is None else "true"
+            row: dict[str, Any] = {"name": name, "peak_mib": memory, "seen": means["seen"]}
+            row |= {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
+            row["hole_psnr_db"] = means.get("true_hole_psnr_db")
+            row["calls"] = None if before is None else (network.calls - before) / len(frames)
+            rows.append(row)
+        timed = {"floor": floor}
+        timed |= {f"decode 1/{reduce}": data.reader(reduce) for reduce in {one.reduce for one in candidates.values()}}
+        timed |= {name: alternating(one) for name, one in candidates.items()}
+        times = timed_rounds(timed, arguments.repeats, "times", enough_ms=_ENOUGH_MS)
+        for row, one in zip(rows, candidates.values(), strict=True):
+            own_times, decode = times[row["name"]], quartiles(times[f"decode 1/{one.reduce}"]).median_ms
+            row |= quartiles(own_times)._asdict() | {"decode_ms": decode}
+            row["floor_ratio"] = quartiles(own_times / times["floor"][: len(own_times)]).median_ms
+            row["decode_ratio"] = row["median_ms"] / decode
+        return rows
+
+    known = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3d", "lidar": "points"}
+    offered: list[Any] = [name for name, key in known.items() if key in frame(0, REFERENCE).scored_sample]
+    by_name = {
+        one.name: one
+        for one in settings(
+            [name for name in offered if not arguments.geometry or name in arguments.geometry],
+            qualities=arguments.quality,
+            reduces=arguments.reduce,
+            executions=arguments.execution,
+        )
+    }
+    rows = measured(by_name)
+    for row, one in zip(rows, by_name.values(), strict=True):
+        row |= {"quality": one.quality, "surface": one.surface, "reduce": one.reduce, "execution": one.execution}
+        row["harm"] = static_harm(source, target, one.surface, RenderConfig())
 
     def again(row: Row) -> Quartiles:
-        one = by_name[row["name"]]
-        call = one.call(target, frame(0, one.reduce).scored_sample)
-        return quartiles(timed_rounds({one.name: call}, arguments.repeats, "again")[one.name])
+        name = row["name"]
+        return quartiles(timed_rounds({name: alternating(by_name[name])}, arguments.repeats, "again")[name])
 
     recommended = advice(rows, again, budget_ms=arguments.budget_ms, min_psnr_db=arguments.min_psnr)
     front = {row["name"] for row in pareto_front(rows)}
     steps = [row["name"] for row in distinct_steps(rows)]
     filled = by_name[recommended["setting"] if recommended and recommended["setting"] else steps[-1]]
-    frames = [frame(index, filled.reduce) for index in range(arguments.frames)]
-    fills = measure_fills(filled, target, frames, arguments)
+    fillings = {how: how for how in ("black", "continue", "telea")} | arguments.generator
     return {
         "clock": "CPU time of the process, milliseconds, one thread",
         "data": data.name,
@@ -209,41 +220,80 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         "steps": steps,
         "advice": recommended,
         "filled": filled.name,
-        "fills": fills,
+        "fills": [
+            {**row, "kept": None if arguments.budget_ms is None else row["q3_ms"] <= arguments.budget_ms}
+            for row in measured({name: replace(filled, holes=how) for name, how in fillings.items()})
+        ],
     }
 
 
-def measure_fills(
-    setting: Setting, target: Rig, frames: Sequence[ScoredFrame], arguments: argparse.Namespace
-) -> list[dict[str, Any]]:
-    """Score and time what fills the holes of one setting's views."""
-    fillings: dict[str, dict[str, Any]] = {how: {"holes": how} for how in ("black", "continue")}
-    fillings["telea"] = {"holes": "telea"}
-    fillings |= {path: {"holes": inpainter} for path, inpainter in arguments.generator.items()}
-    sample = frames[0].scored_sample
-    calls = {name: setting.call(target, sample, **how) for name, how in fillings.items()}
-    rows = []
-    for name, how in fillings.items():
-        network = getattr(how["holes"], "generator", how["holes"])  # counts its calls, if it is one
-        memory = peak_mib(calls[name])
-        before = getattr(network, "calls", None)
-        (scored,) = study([setting.method(target, **how)], frames, {"target": [target]}, repeats=0).values()
-        means, prefix = scored["target"], "even" if frames[0].truth is None else "true"
-        row = {"name": name, "peak_mib": memory, "whole_psnr_db": means[f"{prefix}_psnr_db"]}
-        row |= {"hole_psnr_db": means["true_hole_psnr_db"]} if "true_hole_psnr_db" in means else {}
-        rows.append(row | ({} if before is None else {"calls": (network.calls - before) / len(frames)}))
-    times = timed_rounds(calls, arguments.repeats, "fills", enough_ms=_ENOUGH_MS)
-    for row in rows:
-        row |= quartiles(times[row["name"]])._asdict()
-        row["kept"] = None if arguments.budget_ms is None else row["q3_ms"] <= arguments.budget_ms
-    return rows
+def _render(call: Callable[[Sample], dict[str, Any]], sample: Sample, _: Rig) -> list[RenderedView]:
+    return views_of(call(sample))
 
 
-def _surfaces(sample: Sample) -> list[GeometryName]:
-    """Surfaces that a sample has the geometry for."""
-    needs: dict[GeometryName, str] = {"infinity": "rig", "ground": "rig", "street": "rig"}
-    needs |= {"boxes": "boxes_3d", "lidar": "points"}
-    return [surface for surface, key in needs.items() if key in sample]
+# --- recommendations --------------------------------------------------------------------------------------------------
+def pareto_front(rows: Sequence[Row]) -> list[Row]:
+    """Rows that no other beats in both ``median_ms`` and ``psnr_db``, fastest first."""
+    front: list[Row] = []
+    for row in sorted(rows, key=lambda row: (row["median_ms"], -row["psnr_db"])):
+        if not front or row["psnr_db"] > front[-1]["psnr_db"]:
+            front.append(row)
+    return front
+
+
+def distinct_steps(rows: Sequence[Row]) -> list[Row]:
+    """Rows of the front that differ by more than noise.
+
+    Each gains at least ``LEAST_GAIN_DB`` over the one before, and its first quartile of time exceeds the other's third.
+    """
+    steps: list[Row] = []
+    for row in pareto_front(rows):
+        if not steps:
+            steps = [row]
+        elif row["q1_ms"] <= steps[-1]["q3_ms"]:  # as fast, and better
+            if len(steps) == 1 or row["q1_ms"] > steps[-2]["q3_ms"]:
+                steps[-1] = row
+        elif row["psnr_db"] >= steps[-1]["psnr_db"] + LEAST_GAIN_DB:
+            steps.append(row)
+    return steps
+
+
+def advice(
+    rows: Sequence[Row],
+    measure_again: Callable[[Row], Quartiles],
+    *,
+    budget_ms: float | None = None,
+    min_psnr_db: float | None = None,
+) -> dict[str, Any] | None:
+    """Recommend the most accurate row within a budget, or the fastest of an accuracy; None if neither is given.
+
+    Rows with ``harm``, a reason against them, are never recommended. A budget must hold when measured again.
+
+    Returns:
+        ``setting`` (a name, None if nothing qualifies), its ``measured`` figures and those ``again``, the ``reason``,
+        and the harm of rows that were ``left_out``.
+    """
+    if budget_ms is None and min_psnr_db is None:
+        return None
+    left_out = next((row["harm"] for row in rows if row["harm"] is not None), None)
+    result = {"setting": None, "left_out": left_out, "measured": None, "again": None}
+    front = pareto_front([row for row in rows if row["harm"] is None])
+    if not front:
+        return result | {"reason": "nothing was measured that may be recommended"}
+    if budget_ms is not None:
+        candidates = [row for row in reversed(front) if row["q3_ms"] <= budget_ms]
+        reason = f"the most accurate within {budget_ms:g} ms a frame"
+        missed = f"nothing keeps to {budget_ms:g} ms: the fastest takes {front[0]['median_ms']:.1f} ms"
+    else:
+        candidates, best = [row for row in front if row["psnr_db"] >= min_psnr_db], front[-1]  # type: ignore[operator]
+        reason = f"the fastest of at least {min_psnr_db:g} dB"
+        missed = f"nothing reaches {min_psnr_db:g} dB: the best has {best['psnr_db']:.2f} dB ({best['name']})"
+    for row in candidates:
+        again = measure_again(row)
+        if budget_ms is None or again.median_ms <= budget_ms:
+            figures = {key: row[key] for key in ("psnr_db", *Quartiles._fields)}
+            return result | {"setting": row["name"], "reason": reason, "measured": figures, "again": again._asdict()}
+    return result | {"reason": missed}
 
 
 # --- the tables -------------------------------------------------------------------------------------------------------
@@ -257,14 +307,7 @@ COLUMNS = (
     ("seen", "{seen:.1%}"),
     ("whole dB", "{whole_psnr_db:.2f}"),
 )
-FILL_COLUMNS = (
-    ("ms", "{median_ms:.1f}"),
-    ("quartiles", "{q1_ms:.1f} to {q3_ms:.1f}"),
-    ("MiB", "{peak_mib:.0f}"),
-    ("calls", "{calls:.1f}"),
-    ("holes dB", "{hole_psnr_db:.2f}"),
-    ("whole dB", "{whole_psnr_db:.2f}"),
-)
+FILL_COLUMNS = (*COLUMNS, ("holes dB", "{hole_psnr_db:.2f}"), ("calls", "{calls:.1f}"))
 NOTES = (
     "CPU ms a frame on one thread, with the plan where every frame needs its own; x floor: bare cv2.remap of the same "
     "views; x decode: reading the images that the setting reads (1/2: at half size); MiB: growth over the first call; "

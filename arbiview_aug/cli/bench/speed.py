@@ -38,7 +38,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Reduce
 from arbiview_aug.cli.arguments import device_named, output_file
 from arbiview_aug.cli.bench.data import Recorded, lidar_maps, lifted, recorded
-from arbiview_aug.cli.bench.study import benchmark, clock_of, machine_line, quartiles, show, timed_rounds
+from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, show, timed_rounds
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
@@ -73,7 +73,7 @@ YAW_DEG = 22.0
 _STEP_M, _STEPS = 1e-4, 200
 
 Sample = Mapping[str, Any]
-Calls = dict[str, Callable[[], Any]]
+Calls = dict[str, Callable[[], Any]]  # the first is the floor
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -110,17 +110,16 @@ def measure(
     ready_s = time.process_time() - start
     rows = []
     for h, w in sizes:
-        for target, (floor, runs) in (
-            _calls_of(full, half, (h, w)) if device is None else _batches(full, (h, w), device)
-        ):
-            chosen = {name: call for name, call in runs.items() if only in name}
-            if not chosen:
+        targets = _calls_of(full, half, (h, w)) if device is None else _batches(full, (h, w), device)
+        for target, calls in targets:
+            floor, *others = calls
+            chosen = {name: calls[name] for name in (floor, *(name for name in others if only in name))}
+            if len(chosen) == 1:
                 continue
-            times = timed_rounds(
-                {**floor, **chosen}, repeats, f"{w}x{h} {target}", enough_ms=_ENOUGH_MS, clock=clock_of(device)
-            )
+            label = f"{w}x{h} {target}"
+            times = timed_rounds(chosen, repeats, label, enough_ms=_ENOUGH_MS, clock=clock_of(device))
             for name, taken in times.items():
-                ratio = statistics.median(a / b for a, b in zip(taken, times[next(iter(floor))], strict=False))
+                ratio = statistics.median(a / b for a, b in zip(taken, times[floor], strict=False))
                 row = {"size": [h, w], "target": target, "name": name, **quartiles(taken)._asdict(), "ratio": ratio}
                 rows.append(row | {"bound": BOUNDS.get((h, w), {}).get(name)})
     if not rows:
@@ -128,20 +127,20 @@ def measure(
     return {"data": data.name, "rounds": repeats, "ready_s": ready_s, "measures": rows}
 
 
-def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tuple[str, tuple[Calls, Calls]]]:
+def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tuple[str, Calls]]:
     """Yield targets at (h, w), each with its floor and its calls."""
     waymo, fisheye = (without_masks(load_rig(name)).resized(size) for name in ("waymo", "fisheye_surround"))
     is_small = all(2 * side <= of_camera for side, of_camera in zip(size, full["rig"].sizes[0], strict=True))
     sample = half if is_small else full
     for name, rig in {"pinhole": waymo.undistorted(), "radtan": waymo, "fisheye": fisheye}.items():
-        calls = _calls(sample, rig)
+        calls = {_FLOOR: remap_floor(sample["images"][: len(rig)], size)} | _calls(sample, rig)
         if is_small and name == "radtan":
             cropped = without_masks(load_rig("waymo")).resized(size, "crop")
             calls |= _both_layouts("street, held, squashed from full size", full, waymo)
             calls |= _both_layouts("street, held, cropped from full size", full, cropped)
-        yield name, ({_FLOOR: remap_floor(sample["images"][: len(rig)], size)}, calls)
+        yield name, calls
     if is_small:
-        yield "own", ({_FLOOR: remap_floor(sample["images"], size)}, _own(sample, size))
+        yield "own", {_FLOOR: remap_floor(sample["images"], size)} | _own(sample, size)
 
 
 def table(report: Mapping[str, Any]) -> str:
@@ -201,7 +200,7 @@ def lowered(rig: Rig, size: tuple[int, int]) -> Rig:
     return Rig(cameras, ground_z_m=rig.ground_z_m, name="lowered")
 
 
-def _batches(sample: Sample, size: tuple[int, int], device: torch.device) -> Iterator[tuple[str, tuple[Calls, Calls]]]:
+def _batches(sample: Sample, size: tuple[int, int], device: torch.device) -> Iterator[tuple[str, Calls]]:
     """Yield batches of images on a device by type, for turned cameras at (h, w); the floor copies as many bytes there.
 
     The bytes are the least that must move: each source image and each map position read once, each view written once.
@@ -215,7 +214,7 @@ def _batches(sample: Sample, size: tuple[int, int], device: torch.device) -> Ite
         # Each copy reads and writes its own buffers: smaller ones could fit a cache.
         one, two = (torch.zeros(bytes_moved(plan, batches) // 2, dtype=torch.uint8, device=device) for _ in range(2))
         render = torch.no_grad()(partial(render_torch, plan, batches))
-        yield f"{name} on {device}", ({"copy": partial(one.copy_, two)}, {f"batch of {batch} by torch": render})
+        yield f"{name} on {device}", {"copy": partial(one.copy_, two), f"batch of {batch} by torch": render}
 
 
 def bytes_moved(plan: RenderPlan, images: Sequence[torch.Tensor]) -> int:

@@ -9,31 +9,39 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch.utils.data import Dataset
 
-from arbiview_aug.atomic_io import checksum, inside, remove_parts
-from arbiview_aug.cameras.rig import load_rig
+from arbiview_aug.atomic_io import checksum, inside, remove_parts, write_whole
+from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import writable_folder
-from arbiview_aug.cli.convert.job import Done, Jobs, State, checksum_once
+from arbiview_aug.cli.convert.job import Done, Jobs, State, checksum_once, coverage_of
+from arbiview_aug.cli.convert.manifest import Manifest
 from arbiview_aug.cli.convert.ray_runner import ray_results
-from arbiview_aug.cli.convert.report import write_report
 from arbiview_aug.cli.convert.settings import FOLDER, RETARGET_OPTIONS, Settings, check_output
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.drive import Recording
-from arbiview_aug.datasets.registry import split_kind
+from arbiview_aug.datasets.registry import kinds_of, open_data, split_kind
 from arbiview_aug.environment import one_thread, versions, working_s
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError, described
+from arbiview_aug.evaluate.frames import Evaluation, evaluate, make_frame
+from arbiview_aug.evaluate.images import RenderedView, as_arrays
+from arbiview_aug.evaluate.methods import Method, retargeting
+from arbiview_aug.evaluate.report.html import html_report
+from arbiview_aug.evaluate.report.tables import evaluation_tables
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.warm_up import compile_kernels
 
+CONVERTED = "converted"  # name of the written views in tables
 
-class Verification(Dataset[Done]):
-    """Samples of a shard, each verified on access: ``failed`` with a message for each file that differs."""
+
+class Verification(Dataset[list[str]]):
+    """Samples of a shard, each verified on access: a message for each file that differs."""
 
     def __init__(self, jobs: Jobs) -> None:
         self.jobs = jobs
@@ -41,20 +49,19 @@ class Verification(Dataset[Done]):
     def __len__(self) -> int:
         return len(self.jobs)
 
-    def __getitem__(self, number: int) -> Done:
+    def __getitem__(self, number: int) -> list[str]:
         index = self.jobs.indices[number]
         try:
-            differences = tuple(self._differences(index))
+            return list(self._differences(index))
         except Exception as error:  # of this sample alone
-            differences = (f"{self.jobs.data.tokens[index]}: {described(error)}",)
-        return Done(self.jobs.data.tokens[index], "failed" if differences else "kept", messages=differences)
+            return [f"{self.jobs.data.tokens[index]}: {described(error)}"]
 
     def _differences(self, index: int) -> Iterator[str]:
         manifest, token = self.jobs.manifest, self.jobs.data.tokens[index]
         record, path = manifest.record(token), manifest.path(token)
+        if record is None:
+            yield f"{path}: expected the record of a conversion, found none; run it without --verify"
         if record is None or "skipped" in record:
-            if record is None:
-                yield f"{path}: expected the record of a conversion, found none; run it without --verify"
             return
         again = f"remove {path} and run convert again"
         sources = self.jobs.source_files(index)
@@ -181,12 +188,11 @@ def _jobs(settings: Settings, data: Recording, arguments: argparse.Namespace) ->
 
 def _verify(jobs: Jobs, arguments: argparse.Namespace) -> int:
     """Print what differs from the recorded checksums, and return the exit status; the first shard checks tables."""
-    done = list(results(Verification(jobs), min(arguments.workers, len(jobs)), "verify"))
-    differ = [line for one in done for line in one.messages]
+    differ = [*chain.from_iterable(results(Verification(jobs), min(arguments.workers, len(jobs)), "verify"))]
     differ += differences_of_all(jobs) if arguments.shard_index == 0 else ()
     for line in differ:
         print(line, file=sys.stderr)
-    print(f"{jobs.settings.output}: {len(done)} samples verified, {len(differ)} differences")
+    print(f"{jobs.settings.output}: {len(jobs)} samples verified, {len(differ)} differences")
     return int(bool(differ))
 
 
@@ -247,3 +253,46 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: in
     if report_frames:
         write_report(settings, jobs.data, converted, report_frames)
         print(f"report: {settings.output / FOLDER / 'report.html'}")
+
+
+# --- report.html: the written views, scored as ``evaluate`` scores ----------------------------------------------------
+def converted(settings: Settings) -> Method:
+    """Wrap the written views as a method; for other rigs than the target it renders anew."""
+    # Scored frames hold their points back, and depth on disk is not read again.
+    anew = retargeting(
+        settings.quality, "auto" if GEOMETRIES[settings.geometry].needs in ("points", *FOLDERS) else settings.geometry
+    )
+    manifest, target = Manifest(settings.output), settings.sized_target
+    kind = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
+    written = open_data(settings.output, kind=kind, version=settings.version)
+    written.load_points = False  # they may be links that leave the output
+
+    def render(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:
+        record = manifest.record(sample["token"])
+        if rig != target or record is None:
+            return anew.render(sample, rig)
+        stored = written.by_token(sample["token"])
+        images = dict(zip(stored["rig"].names, as_arrays(stored["images"]), strict=True))  # the reader's own order
+        files = {camera["name"]: settings.output / camera["file"] for camera in record["cameras"]}
+        return [RenderedView(images[name], coverage_of(files[name])) for name in rig.names]
+
+    return Method(CONVERTED, render, anew.reads_points, anew.render_alone)
+
+
+def write_report(settings: Settings, data: Recording, tokens: Sequence[str], count: int) -> Evaluation:
+    """Score ``count`` converted frames, spread evenly over ``tokens``, and write the page."""
+    picked = [tokens[int(k)] for k in np.unique(np.linspace(0, len(tokens) - 1, min(count, len(tokens))).round())]
+    target = settings.sized_target
+    # The views were rendered at the recorded exposures.
+    frames = ((token, make_frame(data.by_token(token), exposures=("raw",))) for token in picked)
+    done = evaluate(frames, lambda _: {target.name or "target": target}, [converted(settings)])
+    title = f"{data.root.resolve().name} as {target.name or 'the target'} would have seen it"
+    notes = [f"{len(picked)} of {len(tokens)} frames, as they were written to {settings.output}."]
+    if settings.holes != "black":
+        notes.append("Pixels that no camera saw are scored as filled; covered figures leave them out.")
+    if "points" in GEOMETRIES[settings.geometry].reads:
+        notes.append("LiDAR points score views that were made with them: evaluate holds half of them out.")
+    notes += [f"Not everything could be scored: {words}." for words in done.declined.values()]
+    page = html_report(title, done, [CONVERTED], evaluation_tables(done, [CONVERTED]), notes)
+    write_whole({settings.output / FOLDER / "report.html": page.encode()})
+    return done

@@ -10,11 +10,17 @@ import cv2
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
-from arbiview_aug.evaluate.report.pictures import Picture, hatched_view, left_to_right, overlay_confidence, shrunk
-from arbiview_aug.evaluate.report.rig_picture import draw_rigs
+from arbiview_aug.evaluate.frames import Evaluation
+from arbiview_aug.evaluate.images import RenderedView, as_arrays
+from arbiview_aug.evaluate.report.pictures import (
+    Picture,
+    draw_rigs,
+    hatched_view,
+    left_to_right,
+    overlay_confidence,
+    shrunk,
+)
 from arbiview_aug.evaluate.report.tables import Columns, Table, cell
-from arbiview_aug.evaluate.run import Evaluation
 
 SOURCE_LAYER = "nearest source camera"
 TRUTH_LAYER = "truth"
@@ -54,8 +60,8 @@ def layers(camera: int, rig: Rig, done: Evaluation, shown: Mapping[str, Sequence
             pictures[f"{method}: unseen"] = hatched_view(view, _HEIGHT_PX)
         if view.confidence is not None:
             pictures[f"{method}: confidence"] = shrunk(overlay_confidence(view.image, view.confidence), _HEIGHT_PX)
-    if done.first.truth is not None:
-        true: list[Image] = as_arrays(done.first.truth(rig).images)
+    true = done.first.true_images(rig)
+    if true is not None:
         pictures[TRUTH_LAYER] = shrunk(true[camera], _HEIGHT_PX)
     return pictures
 

@@ -1,10 +1,10 @@
-"""Contact sheets, also of a whole retargeted frame, and overlays, as (h, w, 3) uint8 RGB."""
+"""Contact sheets, also of a whole retargeted frame, overlays, and drawings of rigs, as (h, w, 3) uint8 RGB."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -18,11 +18,16 @@ from arbiview_aug.evaluate.images import Image, RenderedView, to_bytes
 from arbiview_aug.evaluate.lidar import visible_points
 from arbiview_aug.sample.boxes_2d import edge_points
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 Picture = npt.NDArray[np.uint8]
 INK, PAPER = (40, 40, 40), (255, 255, 255)
 HOLE = (255, 0, 160)  # colour of uncovered regions; rare on streets
 _BOX = (0, 230, 255)
 _FARTHEST_M = 80.0  # points there, and beyond, are blue
+
+RIG_COLOURS = ("#1f64c8", "#d65414", "#1e8c3c", "#8c3caa", "#966e14")  # of rigs, in their order
 
 _GAP_PX = 6
 _CAPTION_PX, _CAPTION_SCALE = 20, 0.42
@@ -37,15 +42,13 @@ def put_text(picture: Picture, text: str, xy: tuple[int, int], scale: float) -> 
     cv2.putText(picture, text, xy, _FONT, scale, INK, 1, cv2.LINE_AA)
 
 
-def contact_sheet(
-    rows: Sequence[Sequence[Image]], labels: Sequence[Sequence[str]], titles: Sequence[str], *, width_px: int = 1800
-) -> Picture:
-    """Lay out titled rows of images (h, w, 3), scale 0-255, with captions; a row's images share a height.
+def contact_sheet(rows: Sequence[tuple[str, Sequence[Image], Sequence[str]]], *, width_px: int = 1800) -> Picture:
+    """Lay out rows (title, images (h, w, 3), scale 0-255, and their captions); a row's images share a height.
 
     Rows fill the width; captions that are too long are cut.
     """
     strips = []
-    for images, captions, title in zip(rows, labels, titles, strict=True):
+    for title, images, captions in rows:
         strips.append(_paper(_TITLE_PX, width_px))
         put_text(strips[-1], title, (_GAP_PX, _TITLE_PX - 8), 0.6)
         strips.append(_row(images, captions, width_px))
@@ -158,28 +161,26 @@ def frame_sheet(
     width_px: int = 1800,
 ) -> Picture:
     """Lay out source images, target views, holes and (if given) the truth, cameras from left to right."""
-    ring, order = left_to_right(source), left_to_right(target)
     names, vehicle = target.names, target.name or "the target"
     unseen = [1 - float(view.coverage.mean()) for view in views]
     rendered: list[Image] = [view.image for view in views]
-    rows: list[tuple[str, Sequence[Image], Sequence[str], list[int]]] = [
-        (f"What {source.name or 'the source'} recorded: {len(source)} cameras", images, source.names, ring),
-        (f"The same moment, retargeted to {vehicle}: {len(names)} cameras", rendered, names, order),
+    rows: list[tuple[str, Rig, Sequence[Image], Sequence[str]]] = [
+        (f"What {source.name or 'the source'} recorded: {len(source)} cameras", source, images, source.names),
+        (f"The same moment, retargeted to {vehicle}: {len(names)} cameras", target, rendered, names),
     ]
     if any(unseen):
         # At the size of the sheet, since finer hatching would blur.
         height = round(width_px / sum(image.shape[1] / image.shape[0] for image in rendered))
         hatched = [hatched_view(view, height) for view in views]
         captions = [f"{name}: {share:.1%} unseen" for name, share in zip(names, unseen, strict=True)]
-        rows.append((f"Hatched: what no source camera saw, {np.mean(unseen):.1%}", hatched, captions, order))
+        rows.append((f"Hatched: what no source camera saw, {np.mean(unseen):.1%}", target, hatched, captions))
     if truth is not None:
-        rows.append((f"The truth: what {vehicle} would have seen", truth, names, order))
-    return contact_sheet(
-        [[pictures[k] for k in places] for _, pictures, _, places in rows],
-        [[captions[k] for k in places] for _, _, captions, places in rows],
-        [title for title, *_ in rows],
-        width_px=width_px,
-    )
+        rows.append((f"The truth: what {vehicle} would have seen", target, truth, names))
+    ordered = [
+        (title, [pictures[k] for k in left_to_right(rig)], [captions[k] for k in left_to_right(rig)])
+        for title, rig, pictures, captions in rows
+    ]
+    return contact_sheet(ordered, width_px=width_px)
 
 
 def hatched_view(view: RenderedView, height_px: int) -> Picture:
@@ -200,3 +201,91 @@ def shrunk(image: Image, height_px: int) -> Picture:
 def left_to_right(rig: Rig) -> list[int]:
     """Indices of the cameras in the order of a panorama."""
     return sorted(range(len(rig)), key=lambda k: -((rig[k].azimuth_deg + _RING_START_DEG) % 360))
+
+
+# --- rigs: fields of view from above, heights over the road from the side ---------------------------------------------
+def draw_rigs(rigs: Sequence[Rig]) -> Picture:
+    # Without pyplot: no global state and no display.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(rig_figure(rigs))
+    canvas.draw()
+    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
+
+
+def rig_figure(rigs: Sequence[Rig]) -> Figure:
+    """Draw one column per rig: from above (forward is up) and from the side (forward is to the right).
+
+    Wedges show horizontal fields of view above and vertical ones below. A telephoto camera's wedge is longer. All
+    columns share one scale, with the other rigs' outlines behind. Heights are over each rig's own road.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8 * len(rigs), 10.5), dpi=100, layout="constrained")
+    rows = figure.subplots(2, len(rigs), squeeze=False, sharex="row", sharey="row", height_ratios=(7, 3))
+    for column, (above, side) in enumerate(rows.T):
+        for k, rig in enumerate(rigs):
+            colour, here = RIG_COLOURS[k % len(RIG_COLOURS)], k == column
+            for camera in rig:
+                for axes, outline in ((above, _wedge_from_above(camera)), (side, _wedge_from_side(camera, rig))):
+                    axes.fill(
+                        *outline.T,
+                        facecolor=(colour, 0.15 if here else 0),
+                        edgecolor=(colour, 1 if here else 0.3),
+                    )
+            if here:
+                _label_from_above(above, rig)
+                _label_from_side(side, rig)
+                above.set_title(f"{rig.name or 'rig'}: {len(rig)} cameras", color=colour)
+        above.set(xlabel="left (m)", ylabel="forward (m)", aspect="equal")
+        side.set(xlabel="forward (m)", ylabel="height over the road (m)", aspect="equal")
+        side.axhline(0, color="grey", linewidth=3)
+        above.grid(alpha=0.3)
+        side.grid(alpha=0.3)
+        above.margins(0.15)
+        side.margins(0.7, 0.05)
+    above.invert_xaxis()
+    return figure
+
+
+def _label_from_above(axes: Any, rig: Rig) -> None:
+    """Write each camera's name and field of view at the end of its wedge."""
+    for camera in rig:
+        forward, left = np.cos(np.radians(camera.azimuth_deg)), np.sin(np.radians(camera.azimuth_deg))
+        axes.text(
+            camera.center_m[1] + (_radius_m(camera) + 0.2) * left,
+            camera.center_m[0] + (_radius_m(camera) + 0.2) * forward,
+            f"{camera.name}\n{camera.fov_deg[0]:.0f}° x {camera.fov_deg[1]:.0f}°",
+            fontsize=8,
+            ha="right" if left > 0.3 else "left" if left < -0.3 else "center",
+            va="bottom" if forward > 0 else "top",
+        )
+
+
+def _label_from_side(axes: Any, rig: Rig) -> None:
+    """List names and heights beside the drawing: rear cameras left, front ones right."""
+    order = sorted(rig, key=lambda camera: (camera.center_m[0], camera.azimuth_deg))
+    for side, cameras in (("left", order[: len(order) // 2]), ("right", order[len(order) // 2 :])):
+        lines = [f"{camera.name} {camera.center_m[2] - rig.ground_z_m:.2f} m" for camera in cameras]
+        x = 0.01 if side == "left" else 0.99
+        axes.text(x, 0.96, "\n".join(lines), transform=axes.transAxes, ha=side, va="top", fontsize=8)
+
+
+def _wedge_from_above(camera: Camera) -> np.ndarray:
+    """(n, 2) outline in ego y, x: the horizontal field of view about the optical axis."""
+    fov = min(camera.fov_deg[0], 359.0)
+    angle = np.radians(camera.azimuth_deg + np.linspace(-fov / 2, fov / 2, max(2, int(fov / 3))))
+    arc = camera.center_m[1::-1] + _radius_m(camera) * np.stack([np.sin(angle), np.cos(angle)], -1)
+    return np.concatenate([camera.center_m[None, 1::-1], arc])
+
+
+def _wedge_from_side(camera: Camera, rig: Rig) -> np.ndarray:
+    """(n, 2) outline in ego x and height over the road: the vertical field of view."""
+    row = np.linspace(-0.5, camera.height_px - 0.5, 25)
+    rays = camera.unproject(np.stack([np.full_like(row, camera.K[0, 2]), row], -1)).directions
+    centre = camera.center_m - (0, 0, rig.ground_z_m)
+    return np.concatenate([centre[None], centre + 1.1 * rays])[:, [0, 2]]
+
+
+def _radius_m(camera: Camera) -> float:
+    return float(np.clip(5.0 * np.sqrt(60.0 / max(camera.fov_deg[0], 1.0)), 2.6, 6.5))

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from arbiview_aug.evaluate.run import Evaluation
+    from arbiview_aug.evaluate.frames import Evaluation
 
 Columns = Sequence[tuple[str, str]]  # headings, and the format of the cells below them: fields of a row
 Table = tuple[str, Mapping[str, Mapping[str, float]], Columns, str]  # title, metrics by row, columns and notes

@@ -11,7 +11,7 @@ import pytest
 
 from arbiview_aug import Rig, RigRetarget, load_rig
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.convert.report import converted
+from arbiview_aug.cli.convert.command import converted
 from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.evaluate.frames import make_frame, scores
 from arbiview_aug.evaluate.images import RenderedView

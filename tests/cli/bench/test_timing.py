@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from arbiview_aug.cli.bench.study import peak_mib, quartiles, show, timed_rounds
+from arbiview_aug.cli.bench.timing import peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.errors import DataError
 
 

@@ -12,8 +12,6 @@ from typing import Any
 import pytest
 import torch
 
-from arbiview_aug.__main__ import main as package_main
-from arbiview_aug.evaluate import paper_study
 from arbiview_aug.generator import Diffusion, load_inpainter
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.config import GeneratorConfig, TrainedOn
@@ -23,6 +21,7 @@ from arbiview_aug.generator.training.data import Frames
 from arbiview_aug.generator.training.trainer import Trainer
 from arbiview_aug.train import main
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from integrations.benchmarks import paper
 from tests.generator.test_stable_diffusion import saved
 from tests.generator.training.small import OneColour
 
@@ -110,10 +109,10 @@ def test_from_pretrained_weights_to_filled_holes(
     assert float(filled["images"][~known].float().std()) > 0
     # --- scored in the paper's tables
     if name == "paper":
-        monkeypatch.setattr(paper_study, "SETS", ("truck",))
+        monkeypatch.setattr(paper, "SETS", ("truck",))
         monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
-        paper = ["evaluate", "--paper", "--generator", str(tmp_path / "whole" / "generator")]
-        assert package_main([*paper, "--size", "24x66", "--frames", "1", "--output", str(tmp_path / "paper")]) == 0
+        scored = ["--generator", str(tmp_path / "whole" / "generator")]
+        assert paper.main([*scored, "--size", "24x66", "--frames", "1", "--output", str(tmp_path / "paper")]) == 0
         printed = capsys.readouterr().out
         assert "| generator " in printed and "Frames of the data that it was trained on are held-out ones" in printed
         assert "generator" in json.loads((tmp_path / "paper" / "paper.json").read_text())["means"]["synthetic"]

@@ -1,36 +1,60 @@
-"""The paper's Tables 1 and 2 with this package's evaluator: baselines, the published stages and ours.
+"""``python -m integrations.benchmarks.paper``: the paper's Tables 1 and 2, and its figures, by this package's metrics.
 
-Targets are the paper's six configurations, all cameras turned, four other vehicles, and the cameras 1 m higher (a
-truck). Every method gets images and poses alone.
+The rows are baselines, the published stages and ours. Targets are the paper's six configurations, all cameras turned,
+four other vehicles, and the cameras 1 m higher (a truck). Every method gets images and poses alone.
 """
 
 from __future__ import annotations
 
+import argparse
+import importlib.util
+import json
 import math
 import os
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import Reduce
+from arbiview_aug.choices import TARGET_SETS, Quality, Reduce
+from arbiview_aug.cli.arguments import (
+    add_data,
+    add_output,
+    command_parser,
+    count,
+    gathered_warnings,
+    named_steps,
+    size,
+    writable_folder,
+)
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.errors import CalibrationError, DataError, SampleError
-from arbiview_aug.evaluate.baselines import BASELINES
+from arbiview_aug.errors import CalibrationError, DataError, SampleError, exit_status
 from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scores
-from arbiview_aug.evaluate.images import Image, as_arrays
-from arbiview_aug.evaluate.methods import GENERATED, OURS, Method, baseline, generating, retargeting, study_methods
+from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
+from arbiview_aug.evaluate.methods import Method, Sample, retargeting
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.pictures import contact_sheet, left_to_right, save_picture
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets, paper_target, spacing_deg
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.generator import Diffusion, load_inpainter
 from arbiview_aug.generator.config import TrainedOn
+from arbiview_aug.generator.generator import has_shipped
 from arbiview_aug.inpaint.inpainter import Inpainter
+from integrations.benchmarks.baselines import BASELINES, Renderer
+
+PROGRAM = "python -m integrations.benchmarks.paper"
+
+OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")  # presets other than the published method
+
+INPAINTED, GENERATED = "fast, inpainted", "generator"
+"""Rows of ``fast`` with holes filled by Telea's inpainting, and by the shipped weights."""
 
 REAL_FRAMES = ("nuscenes-one", "ddad-one")
 SYNTHETIC = "synthetic"
@@ -38,7 +62,7 @@ SYNTHETIC_FRAMES, SYNTHETIC_SEED, SYNTHETIC_SIZE = 3, 0, (256, 704)
 
 REDUCE: Reduce = 2  # decoding factor of real images
 
-SETS = ("paper", "yaw", "vehicles", "truck")
+SETS = TARGET_SETS
 
 PROTOCOL = (
     "Not the same protocol: the paper averages over a fifth of nuScenes' scenes, without saying at which turns and "
@@ -255,8 +279,9 @@ def draw_figures(sample: Mapping[str, Any], folder: Path, generator: Inpainter |
     order, spacing = left_to_right(rig), spacing_deg(rig)
     files = []
     for number, shares in FIGURES.items():
-        rows: list[list[Image]] = [[images[k] for k in order]]
-        titles, labels = ["Recorded"], [[rig.names[k] for k in order]]
+        rows: list[tuple[str, list[Image], list[str]]] = [
+            ("Recorded", [images[k] for k in order], [rig.names[k] for k in order])
+        ]
         for share in shares:
             target = paper_target(rig, share)
             for name, method in figure_methods(generator).items():
@@ -264,8 +289,126 @@ def draw_figures(sample: Mapping[str, Any], folder: Path, generator: Inpainter |
                     views = method.render(sample, target)
                 except (CalibrationError, SampleError):
                     continue
-                rows.append([views[k].image for k in order])
-                titles.append(name)
-                labels.append([f"{rig.names[k]} {share * spacing[k]:+.4g} deg" for k in order])
-        files.append(save_picture(folder / f"figure{number}.png", contact_sheet(rows, labels, titles)))
+                captions = [f"{rig.names[k]} {share * spacing[k]:+.4g} deg" for k in order]
+                rows.append((name, [views[k].image for k in order], captions))
+        files.append(save_picture(folder / f"figure{number}.png", contact_sheet(rows)))
     return files
+
+
+# --- methods ----------------------------------------------------------------------------------------------------------
+def baseline(name: str) -> Method:
+    """Wrap one of ``baselines.BASELINES`` as a method."""
+    renderer: Renderer = BASELINES[name]
+
+    def render(sample: Sample, target: Rig) -> list[RenderedView]:
+        rig: Rig = sample["rig"]
+        images: list[Image] = as_arrays(sample["images"])
+        return renderer(rig, images, target.in_frame_of(rig))
+
+    return Method(name, render)
+
+
+def paper_stages() -> dict[str, PaperConfig]:
+    """``paper``, and with each stage switched off.
+
+    Without stage 4 the fused image is the plain mean of all sources that see a pixel.
+    """
+    full = PaperConfig()
+    return {
+        "paper": full,
+        "paper without stage 2, matching": replace(full, use_feature_matching=False),
+        "paper without stage 3, objects": replace(full, use_object_alignment=False),
+        "paper without stages 2 and 3": replace(full, use_feature_matching=False, use_object_alignment=False),
+        "paper without stage 4, weights": replace(
+            full,
+            use_distance_weight=False,
+            use_gradient_weight=False,
+            use_quality_weight=False,
+            use_primary_weight=False,
+        ),
+    }
+
+
+def study_methods(generator: Inpainter | None = None) -> list[Method]:
+    """Rows of the paper's tables and ours, from images and poses alone.
+
+    The generator's row is of the shipped weights if none is given, and only with diffusers.
+    """
+    published = [retargeting(config, "auto", name) for name, config in paper_stages().items()]
+    return [
+        *map(baseline, BASELINES),
+        *published,
+        *(retargeting(quality, "street", quality) for quality in OURS),
+        retargeting("fast", "street", INPAINTED, holes="telea"),
+        *generating(GENERATED, generator),
+    ]
+
+
+def generating(name: str, generator: Inpainter | None) -> list[Method]:
+    """``fast`` with holes by a generator, or by the shipped weights; nothing where these are not installed."""
+    if generator is None and not has_generator():
+        return []
+    return [retargeting("fast", "street", name, holes=generator or "diffusion")]
+
+
+def has_generator() -> bool:
+    """Whether the shipped weights and diffusers are installed."""
+    return importlib.util.find_spec("diffusers") is not None and has_shipped()
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure and print the tables, or draw the figures; the exit status."""
+    parser = command_parser(
+        "",
+        "The paper's Tables 1 and 2: baselines, the published stages and ours; quarter of an hour. --figure: its "
+        "Figures 2 to 6 from the first frame, as PNG files.",
+        "--data FOLDER",
+        program=PROGRAM,
+    )
+    add_data(parser, "nuscenes-one and ddad-one below ARBIVIEW_DATA, and synthetic streets")
+    parser.add_argument("--figure", action="store_true", help="draw the figures instead")
+    parser.add_argument("--generator", metavar="PATH", help="of the row *generator*; frames are held-out ones")
+    parser.add_argument("--frames", type=count, metavar="N", help="frames of tables (default: 1; 3 synthetic ones)")
+    parser.add_argument("--size", type=size, metavar="HxW", help="of synthetic images (default: 256x704)")
+    add_output(parser)
+    arguments = parser.parse_args(argv)
+    return exit_status(PROGRAM, lambda: print(_run(arguments)))
+
+
+def _run(arguments: argparse.Namespace) -> str:
+    folder = writable_folder(Path(arguments.output), arguments.output)
+    generator = None if arguments.generator is None else load_inpainter(arguments.generator)
+    trained_on = generator.generator.trained_on if isinstance(generator, Diffusion) else None
+    if arguments.figure:
+        with gathered_warnings([]):
+            files = draw_figures(_figures_sample(arguments, trained_on), folder, generator)
+        return "\n".join(f"picture: {file}" for file in files)
+    with named_steps([]) as tick:  # warnings of targets half outside the view are expected
+        study = measure_paper(
+            arguments.data,
+            frames=arguments.frames,
+            size=arguments.size,
+            methods=study_methods(generator),
+            trained_on=trained_on,
+            tick=tick,
+        )
+    study.generator = arguments.generator
+    (folder / "paper.json").write_text(json.dumps(study.as_dict(), indent=1) + "\n")
+    return f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}"
+
+
+def _figures_sample(arguments: argparse.Namespace, trained_on: TrainedOn | None) -> Sample:
+    """The first frame that the generator was not trained on, without its points."""
+    (index,) = unseen_frames(trained_on, arguments.data, 1)
+    if arguments.data is not None:
+        data = open_data(arguments.data)
+    else:
+        seed = SYNTHETIC_SEED if trained_on is None or trained_on.unseen(None) is None else trained_on.seed
+        source = demo_source_rig(arguments.size or SYNTHETIC_SIZE)
+        data = SyntheticDrive(source, num_frames=index + 1, seed=seed, lidar=False)
+    return make_frame(data[index], exposures=()).sample
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -6,21 +6,31 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
-from arbiview_aug.__main__ import main
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate import paper_study
-from arbiview_aug.evaluate.methods import Method, baseline, retargeting
-from arbiview_aug.evaluate.paper_study import (
+from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.evaluate.methods import Method, retargeting
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.generator.config import TrainedOn
+from integrations.benchmarks import paper
+from integrations.benchmarks.baselines import BASELINES, row_split
+from integrations.benchmarks.paper import (
     PROTOCOL,
     PUBLISHED,
     Study,
+    baseline,
+    main,
     measure_paper,
     paper_report,
+    paper_stages,
+    study_methods,
     unseen_frames,
 )
-from arbiview_aug.generator.config import TrainedOn
+from tests.helpers import street_sample
 
 
 def methods() -> list[Method]:
@@ -44,7 +54,7 @@ def test_published_numbers() -> None:
 @pytest.mark.filterwarnings("ignore:the target rig")
 @pytest.mark.slow
 def test_synthetic_streets(no_real_frames: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paper_study, "SETS", ("paper", "truck"))
+    monkeypatch.setattr(paper, "SETS", ("paper", "truck"))
     told = []
     study = measure_paper(
         None, frames=1, size=(32, 88), methods=methods(), tick=lambda what, of: told.append((what, of))
@@ -95,8 +105,8 @@ def test_real_sets_stand_in_the_papers_measure() -> None:
 
 @pytest.mark.slow
 def test_real_frames(nuscenes_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paper_study, "SETS", ("paper", "truck"))
-    monkeypatch.setattr(paper_study, "REDUCE", 4)
+    monkeypatch.setattr(paper, "SETS", ("paper", "truck"))
+    monkeypatch.setattr(paper, "REDUCE", 4)
     study = measure_paper(nuscenes_root, methods=methods())
     assert list(study.means) == ["nuscenes-one"]
     own, fast = (study.means["nuscenes-one"][name] for name in ("own camera", "fast"))
@@ -107,8 +117,8 @@ def test_real_frames(nuscenes_root: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_lenses_are_told(fisheye_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paper_study, "SETS", ("truck",))
-    monkeypatch.setattr(paper_study, "REDUCE", 4)
+    monkeypatch.setattr(paper, "SETS", ("truck",))
+    monkeypatch.setattr(paper, "REDUCE", 4)
     study = measure_paper(fisheye_root, methods=[baseline("row split"), retargeting("draft", "infinity", "draft")])
     assert list(study.means["surround-fisheye"]) == ["draft"]
     assert "expected pinhole cameras" in study.declined["surround-fisheye, row split"]
@@ -117,7 +127,7 @@ def test_lenses_are_told(fisheye_root: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_missing_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ARBIVIEW_DATA", str(tmp_path))
-    monkeypatch.setattr(paper_study, "SETS", ("truck",))
+    monkeypatch.setattr(paper, "SETS", ("truck",))
     assert list(measure_paper(frames=1, size=(16, 44), methods=methods()[:1]).means) == ["synthetic"]
 
 
@@ -125,8 +135,8 @@ def test_missing_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_the_command(
     no_real_frames: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(paper_study, "SETS", ("truck",))
-    assert main(["evaluate", "--paper", "--size", "24x66", "--frames", "1", "--output", str(tmp_path)]) == 0
+    monkeypatch.setattr(paper, "SETS", ("truck",))
+    assert main(["--size", "24x66", "--frames", "1", "--output", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     assert "| paper without stage 3, objects " in printed and PROTOCOL in printed
     assert set(json.loads((tmp_path / "paper.json").read_text())) == {"means", "published", "protocol", "declined"}
@@ -139,13 +149,13 @@ def test_an_empty_study() -> None:
 @pytest.mark.slow
 def test_a_generator_is_measured_on_frames_that_it_never_saw(no_real_frames: None, tmp_path: Path) -> None:
     trained_on = TrainedOn(data="synthetic", seed=3, held_out=(2, 5))
-    ((name, streets),) = paper_study._data_sets(None, 4, (16, 44), trained_on)
+    ((name, streets),) = paper._data_sets(None, 4, (16, 44), trained_on)
     assert name == "synthetic" and [frame.sample["token"] for frame in streets] == ["synthetic-3-2", "synthetic-3-5"]
     on_frames = TrainedOn(data=f"frames:{tmp_path.resolve()}", seed=3, held_out=(2, 5))
     assert list(unseen_frames(on_frames, tmp_path, 1)) == [2]
     assert list(unseen_frames(on_frames, f"frames:{tmp_path}", 3)) == [2, 5]
     assert list(unseen_frames(on_frames, tmp_path / "other", 3)) == [0, 1, 2]
-    ((_, streets),) = paper_study._data_sets(None, 1, (16, 44), on_frames)
+    ((_, streets),) = paper._data_sets(None, 1, (16, 44), on_frames)
     assert [frame.sample["token"] for frame in streets] == ["synthetic-0-0"]
     with pytest.raises(DataError, match="the generator was trained on all of its scenes"):
         unseen_frames(replace(on_frames, held_out=()), tmp_path, 1)
@@ -153,3 +163,40 @@ def test_a_generator_is_measured_on_frames_that_it_never_saw(no_real_frames: Non
     assert "its holes by output/tiny. Frames of the data that it was trained on are held-out ones" in paper_report(
         study
     )
+
+
+def test_rows_of_the_study() -> None:
+    names = [method.name for method in study_methods()]
+    assert names[:3] == list(BASELINES) and {"paper", "draft", "fast", "accurate"} <= set(names)
+    assert len(set(names)) == len(names)
+    assert not any(method.reads_points for method in study_methods())
+
+
+def test_stages_are_off_one_at_a_time() -> None:
+    whole = PaperConfig()
+    stages = paper_stages()
+    assert stages["paper"] == whole
+    off = {name: [k for k, v in vars(config).items() if v != getattr(whole, k)] for name, config in stages.items()}
+    assert off["paper without stage 2, matching"] == ["use_feature_matching"]
+    assert off["paper without stage 3, objects"] == ["use_object_alignment"]
+    weights = off["paper without stage 4, weights"]
+    assert len(weights) == 4 and all("weight" in key for key in weights)
+
+
+def test_baselines_take_targets_in_their_own_frame() -> None:
+    sample = street_sample((48, 132))
+    rig: Rig = sample["rig"]
+    target = Rig([c.shifted(z_m=0.3) for c in rig], ground_z_m=rig.ground_z_m + 0.3)  # the same place over the road
+    views = baseline("row split").render(sample, target)
+    for view, want in zip(views, row_split(rig, as_arrays(sample["images"]), rig), strict=True):
+        np.testing.assert_array_equal(view.image, want.image)
+
+
+@pytest.mark.slow
+def test_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--figure", "--size", "40x110", "--output", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.count("picture: ") == 5
+    heights = {k: cv2.imread(str(tmp_path / f"figure{k}.png")).shape[0] for k in range(2, 7)}
+    # Figure 2 has two configurations of four rows each below the recorded row, the others one.
+    assert heights[3] == heights[4] == heights[5] == heights[6]
+    assert heights[2] / heights[3] == pytest.approx(9 / 5, rel=0.02)

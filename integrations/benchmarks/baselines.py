@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
+from arbiview_aug.evaluate.displaced import own_index
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors, to_bytes
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.view_planner import build_plan
@@ -35,12 +35,6 @@ def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[Render
         (view,) = as_arrays(render_opencv(plan, as_tensors([images[index]])))
         views.append(RenderedView(view, plan.coverage[0]))
     return views
-
-
-def own_index(source: Rig, camera: Camera) -> int:
-    """Index of the source camera of the same name, or else of the nearest direction."""
-    nearest = int(np.argmax(source.cam2ego[:, :3, 2] @ camera.cam2ego[:3, 2]))
-    return source.names.index(camera.name) if camera.name in source.names else nearest
 
 
 def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:

@@ -10,7 +10,7 @@ import pytest
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.evaluate.baselines import BASELINES, SPLIT_DEPTH_M, crop_and_slide, own_camera, row_split
+from integrations.benchmarks.baselines import BASELINES, SPLIT_DEPTH_M, crop_and_slide, own_camera, row_split
 from tests import helpers
 from tests.helpers import ring
 
