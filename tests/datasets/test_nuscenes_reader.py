@@ -42,11 +42,7 @@ def tables() -> Tables:
         ],
         "category": [{"token": "c0", "name": "vehicle.car"}],
         "instance": [{"token": "i0", "category_token": "c0"}],
-        "calibrated_sensor": [],
-        "sample": [],
-        "sample_data": [],
-        "ego_pose": [],
-        "sample_annotation": [],
+        **{name: [] for name in ("calibrated_sensor", "sample", "sample_data", "ego_pose", "sample_annotation")},
     }
     K = [[40.0, 0, 31.5], [0, 40.0, 23.5], [0, 0, 1]]
     for sensor, x, rotation in (
@@ -55,15 +51,8 @@ def tables() -> Tables:
         ("lidar", 1.0, UNTURNED),
         ("radar", 3.0, UNTURNED),
     ):
-        data["calibrated_sensor"].append(
-            {
-                "token": f"cs-{sensor}",
-                "sensor_token": sensor,
-                "translation": [x, 0, 1.6],
-                "rotation": rotation,
-                "camera_intrinsic": K if sensor in ("front", "rear") else [],
-            }
-        )
+        row = {"token": f"cs-{sensor}", "sensor_token": sensor, "translation": [x, 0, 1.6], "rotation": rotation}
+        data["calibrated_sensor"].append(row | {"camera_intrinsic": K if sensor in ("front", "rear") else []})
     for k in range(2):
         data["sample"].append({"token": f"t{k}", "scene_token": f"s{k}", "timestamp": k})
         for sensor in ("front", "rear", "lidar", "radar"):
@@ -78,16 +67,8 @@ def tables() -> Tables:
         sweep = dict(data["sample_data"][-1], token=f"sweep-{k}", is_key_frame=False, ego_pose_token="dropped")
         data["sample_data"].append(sweep)
         # 10 m ahead and 2 m to the right of the ego, turned left by 90 degrees in the world: heading as the ego.
-        data["sample_annotation"].append(
-            {
-                "token": f"a{k}",
-                "sample_token": f"t{k}",
-                "instance_token": "i0",
-                "translation": [102, 60, 0.8],
-                "size": [1.9, 4.5, 1.6],
-                "rotation": LEFT_90,
-            }
-        )
+        row = {"token": f"a{k}", "sample_token": f"t{k}", "instance_token": "i0", "translation": [102, 60, 0.8]}
+        data["sample_annotation"].append(row | {"size": [1.9, 4.5, 1.6], "rotation": LEFT_90})
     return data
 
 

@@ -22,6 +22,7 @@ from arbiview_aug.datasets.synthetic.materials import MATERIALS, Surface, band, 
 from arbiview_aug.datasets.synthetic.raycast import cast
 from arbiview_aug.datasets.synthetic.render import Renderer, camera_rays
 from arbiview_aug.datasets.synthetic.shading import Hits, SceneTables, sky_color
+from tests.helpers import same
 
 SIZE = (64, 176)
 
@@ -77,17 +78,13 @@ def test_scenes_do_not_depend_on_the_rig():
     torch.testing.assert_close(one.render(1, other.rig).images, sample["images"], rtol=0, atol=0)
 
 
-def equal(a: dict, b: dict) -> bool:
-    return all(torch.equal(a[k], b[k]) for k in ("images", "points", "boxes_3d", "box_classes"))
-
-
 @pytest.mark.slow
 def test_same_arguments_give_the_same_bits(drive):
     first = drive[3]
     drive[1]
-    assert equal(first, drive[3])
-    assert equal(first, SyntheticDrive(demo_source_rig(SIZE), num_frames=5)[3])
-    assert equal(first, drive[-2])
+    assert same(first, drive[3])
+    assert same(first, SyntheticDrive(demo_source_rig(SIZE), num_frames=5)[3])
+    assert same(first, drive[-2])
     assert not torch.equal(first["images"], drive[4]["images"])
     assert not torch.equal(first["images"], SyntheticDrive(drive.rig, num_frames=5, seed=1)[3]["images"])
 
@@ -100,7 +97,7 @@ def test_threads_and_global_seeds_change_nothing(drive):
             torch.manual_seed(7)
             np.random.seed(7)  # noqa: NPY002 - the global state that must not matter
             state = torch.get_rng_state()
-            assert equal(before, drive[0])
+            assert same(before, drive[0])
             assert torch.equal(state, torch.get_rng_state())
             assert torch.get_num_threads() == threads
     finally:
@@ -133,7 +130,7 @@ def test_one_torch_thread_while_a_street_is_cast(drive, monkeypatch):
 def test_workers_return_the_same_bits(drive):
     loader = DataLoader(drive, batch_size=None, num_workers=1, sampler=[0, 3])
     for expected, got in zip((drive[0], drive[3]), loader, strict=True):
-        assert equal(expected, got)
+        assert same(expected, got)
 
 
 @pytest.mark.slow
@@ -141,7 +138,7 @@ def test_pickles_small(drive):
     drive[0]
     data = pickle.dumps(drive)
     assert len(data) < 20_000  # the caches stay behind
-    assert equal(pickle.loads(data)[0], drive[0])
+    assert same(pickle.loads(data)[0], drive[0])
 
 
 @pytest.mark.parametrize(
