@@ -46,13 +46,13 @@ LIMIT_S = 0.4
 
 def modules() -> dict[str, Path]:
     """Dotted names below the package; a package's ``__init__`` goes by the package's name."""
-    found = {}
+    paths = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__init__")
         if name:
-            found[name] = path
-    return found
+            paths[name] = path
+    return paths
 
 
 def room(name: str) -> str:
@@ -62,7 +62,7 @@ def room(name: str) -> str:
 
 def imports(path: Path, known: dict[str, Path]) -> set[str]:
     """The package's modules that a file imports, wherever in the file."""
-    found = set()
+    imported = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -74,8 +74,8 @@ def imports(path: Path, known: dict[str, Path]) -> set[str]:
         for name in names:
             below = name.removeprefix("arbiview_aug.")
             if name.startswith("arbiview_aug.") and below in known:
-                found.add(below)
-    return found
+                imported.add(below)
+    return imported
 
 
 def test_rooms_import_from_those_before_them() -> None:

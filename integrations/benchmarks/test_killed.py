@@ -26,7 +26,7 @@ def started(commands: Sequence[Sequence[str]]) -> list[multiprocessing.process.B
     """Each in a process of its own."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["arbiview_aug.cli.convert.command"])
-    processes: list[multiprocessing.process.BaseProcess] = [context.Process(target=main, args=(one,)) for one in commands]
+    processes: list[Any] = [context.Process(target=main, args=(one,)) for one in commands]
     for process in processes:
         process.start()
     return processes

@@ -279,15 +279,15 @@ def test_scene_is_plain_data():
 
 
 def test_tensors_are_made_on_the_device():
-    """On the device "meta", which refuses operations with tensors of another one."""
+    """On the device "meta", which refuses operations with outs of another one."""
     scene, camera, n = make_scene(0, 0), demo_source_rig(SIZE)[0], 7
     with Renderer(device="meta").run():
         rays, local = camera_rays(camera), raycast.scene_from(scene, np.array([1.0, 0.0, 1.5]))
         tables, number, vector, row = SceneTables.build(scene), torch.zeros(n), torch.zeros(n, 3), torch.arange(n)
-        made = [*rays, *local, *tables[1:], raycast.pyramids(rays.directions)]
-        made += [ground.road_color(scene.street, 1, *[number] * 4), *ground.sample_light(tables.light, number, number)]
-        made += [ground.slab_color(scene.street, 1, vector, number > 0, number, number, vector)]
-        made += [sky_color(scene, Hits(vector, vector, number, number, row))]
+        outs = [*rays, *local, *tables[1:], raycast.pyramids(rays.directions)]
+        outs += [ground.road_color(scene.street, 1, *[number] * 4), *ground.sample_light(tables.light, number, number)]
+        outs += [ground.slab_color(scene.street, 1, vector, number > 0, number, number, vector)]
+        outs += [sky_color(scene, Hits(vector, vector, number, number, row))]
         surface = [scene, vector, vector, vector, row, vector, vector, number, number, vector, torch.zeros(n, 4), row]
-        made += [material(Surface(*surface)) for material in MATERIALS.values()]
-    assert all(tensor.device.type == "meta" for tensor in made)
+        outs += [material(Surface(*surface)) for material in MATERIALS.values()]
+    assert all(tensor.device.type == "meta" for tensor in outs)

@@ -191,7 +191,7 @@ def test_isolated_vehicles_outlines_agree_with_their_boxes():
 
 @pytest.mark.parametrize("cls", list(BoxClass))
 def test_every_object_touches_the_six_sides_of_its_box(cls):
-    found = 0
+    checked = 0
     for index in range(12):
         scene = make_scene(9, index, two_wheelers=True)
         for row in np.flatnonzero(scene.box_classes == cls)[:6]:
@@ -213,8 +213,8 @@ def test_every_object_touches_the_six_sides_of_its_box(cls):
                 reach = np.stack([np.minimum(reach[:, 0], low), np.maximum(reach[:, 1], high)], 1)
             np.testing.assert_allclose(reach[:, 1], box[3:6] / 2, atol=0.012)
             np.testing.assert_allclose(reach[:, 0], -box[3:6] / 2, atol=0.012)
-            found += 1
-    assert found > 2
+            checked += 1
+    assert checked > 2
 
 
 def test_two_wheelers_join_the_same_street():

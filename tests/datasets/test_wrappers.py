@@ -126,8 +126,8 @@ def test_mixed_in_a_data_loader(workers: int, batch: dict[str, Any]) -> None:
     def epochs() -> list[list[dict[str, Any]]]:
         torch.manual_seed(3)
         loader = DataLoader(dataset, shuffle=True, num_workers=workers, **batch)
-        found = [list(loader) for _ in range(2)]
-        return found if "collate_fn" not in batch else [[s for part in epoch for s in part] for epoch in found]
+        batches = [list(loader) for _ in range(2)]
+        return batches if "collate_fn" not in batch else [[s for part in epoch for s in part] for epoch in batches]
 
     one, again = epochs(), epochs()
     forms = []

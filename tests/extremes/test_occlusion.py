@@ -29,19 +29,19 @@ def test_boxes_hide_boxes_and_the_street(rows: int, side: float) -> None:
     source, target = views(rows, side)
     boxes = np.array([NEAR, FAR])
     coverage = build_plan(source, target, geometry="boxes", scene=Scene(boxes=boxes)).targets[0].coverage
-    found = reference.seen(source[0], target[0], "boxes", 0.0, boxes)
+    seen = reference.seen(source[0], target[0], "boxes", 0.0, boxes)
     directions, _ = reference.rays(target[0])
     near, far = (reference.box_distance(box, target[0].center_m, directions) for box in boxes)
-    inside = found.valid & source[0].contains(found.uv)
+    inside = seen.valid & source[0].contains(seen.uv)
     hidden = np.zeros_like(inside)
-    hidden[inside] = reference.hidden(source[0], found.point_m[inside], boxes, MARGIN_M / 2)
+    hidden[inside] = reference.hidden(source[0], seen.point_m[inside], boxes, MARGIN_M / 2)
     on_far = inside & np.isfinite(far) & ~np.isfinite(near)
     street = inside & ~np.isfinite(far) & ~np.isfinite(near)
     for what, pixels in (("the box behind", on_far & hidden), ("the street", street & hidden)):
         assert pixels.sum() > rows / 4, what
         assert not coverage[pixels].any(), f"{what} is read through the box before it"
     clear = street.copy()
-    clear[street] = ~reference.hidden(source[0], found.point_m[street], boxes, -MARGIN_M)
+    clear[street] = ~reference.hidden(source[0], seen.point_m[street], boxes, -MARGIN_M)
     assert coverage[clear].mean() > 0.98, "and nothing else is hidden"
 
 

@@ -114,8 +114,8 @@ def test_memory_layouts_and_dtypes_give_the_same_views() -> None:
         expected = render_opencv(plan, images)
         block = torch.stack(images).contiguous(memory_format=torch.channels_last)  # one block: used without a copy
         planar = [image.contiguous() for image in images]
-        for given in (block, planar, list(block)):
-            assert differences(expected, render_opencv(plan, list(given), scratch)).max() == 0
+        for layout in (block, planar, list(block)):
+            assert differences(expected, render_opencv(plan, list(layout), scratch)).max() == 0
         floats = render_opencv(plan, [image.float() / 255 for image in planar])
         assert differences(expected, [(v * 255).round() for v in floats]).max() <= 1
         half = render_opencv(plan, [(image.float() / 255).half() for image in planar])
@@ -328,8 +328,8 @@ def test_cubics_do_not_reach_beyond_a_source_or_onto_its_mask(execution: str) ->
         assert target.interpolation == "cubic" and target.edge is not None and len(target.edge.pixel) > 50
         assert len(target.sources) > 1 and not target.coverage.all()
         for source in target.sources:
-            own = view[:, torch.from_numpy(target.source_camera == source)]
-            assert (own == colours[source]).all()
+            won = view[:, torch.from_numpy(target.source_camera == source)]
+            assert (won == colours[source]).all()
 
 
 def test_executions_agree_on_cubics() -> None:

@@ -192,9 +192,9 @@ def test_pairs_are_compared_by_their_usable_pixels() -> None:
     for p, count in enumerate((80, 33, 2)):
         reads[:, p, :count] = rng.integers(0, 200, (2, count))
     pixels[reads[:, 2, :2]] = 0.001  # dark
-    found, errors = pair_ratios(pixels, reads, 0.2, 0.9), np.empty(3)
+    ratios, errors = pair_ratios(pixels, reads, 0.2, 0.9), np.empty(3)
     pair_errors(pixels, reads, errors)
-    for (number, middle, spread), error, (one, two) in zip(found, errors, reads.swapaxes(0, 1), strict=True):
+    for (number, middle, spread), error, (one, two) in zip(ratios, errors, reads.swapaxes(0, 1), strict=True):
         one, two = (pixels[side[side < 200]].astype(np.float64) for side in (one, two))
         assert error == pytest.approx(np.mean((one - two) ** 2), rel=1e-5)
         use = np.all([(side.mean(1) > 0.2) & (side.max(1) < 0.9) for side in (one, two)], 0)

@@ -111,8 +111,8 @@ def test_auto_decides_for_each_pair_not_for_the_rig() -> None:
 def test_auto_takes_far_where_parallax_cannot_be_seen() -> None:
     source = half_size("nuscenes")
     plan = build_plan(source, source.shifted(x_m=1e-3))
-    own = [next(p for p in view.pairs if p.source == k) for k, view in enumerate(plan.targets)]
-    assert {p.surface for p in own} == {"infinity"} and all("parallax" in p.reason for p in own)
+    nearest = [next(p for p in view.pairs if p.source == k) for k, view in enumerate(plan.targets)]
+    assert {p.surface for p in nearest} == {"infinity"} and all("parallax" in p.reason for p in nearest)
 
 
 def test_only_what_the_scene_requires_is_evaluated() -> None:

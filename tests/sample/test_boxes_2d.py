@@ -94,5 +94,5 @@ def test_what_goes_on_where_a_lens_folds_back(beside_m: float) -> None:
     both = [int(k) for k in bent.rows if int(k) in plain.rows.tolist()]
     assert len(both) >= 2
     for k in both:
-        one, two = (found.truncation[found.rows.tolist().index(k)] for found in (bent, plain))
+        one, two = (view.truncation[view.rows.tolist().index(k)] for view in (bent, plain))
         assert abs(float(one - two)) < 0.12

@@ -105,8 +105,8 @@ def test_depth_maps_show_gaps_as_they_are() -> None:
 
 def test_maps_among_boxes_are_counted_without_those_of_objects() -> None:
     box = np.array([[13.0, 0.0, 1.0, 2.0, 3.0, 2.0, 0.0]])  # its back is x = 12, y within 1.5
-    own = wall(12.0, (-1.4, 1.4), (0.4, 1.8))
-    surface = PointCloudWithBoxes.among(Street(), np.concatenate([FAR, own, NEAR + 5]), box, len(own) + len(NEAR))
+    of_box = wall(12.0, (-1.4, 1.4), (0.4, 1.8))
+    surface = PointCloudWithBoxes.among(Street(), np.concatenate([FAR, of_box, NEAR + 5]), box, len(of_box) + len(NEAR))
     assert len(surface.street.points) == len(FAR) + len(NEAR) and surface.street.mapped == len(NEAR)
 
 
@@ -147,9 +147,9 @@ def test_the_own_car_is_no_obstacle() -> None:
 def test_a_box_decides_within_its_silhouette_and_its_points_not_beyond() -> None:
     box = np.array([[13.0, 0.0, 1.0, 2.0, 3.0, 2.0, 0.0]])  # its back is x = 12, y within 1.5, the top at 2
     mirror = wall(12.1, (1.5, 1.65), (1.0, 1.2))
-    own = wall(12.0, (-1.5, 1.5), (0.0, 2.0))
-    own = own[:: len(own) // 30]  # too few to show a shape
-    surface = PointCloudWithBoxes.among(Street(), np.concatenate([own, mirror, FAR]), box)
+    of_box = wall(12.0, (-1.5, 1.5), (0.0, 2.0))
+    of_box = of_box[:: len(of_box) // 30]  # too few to show a shape
+    surface = PointCloudWithBoxes.among(Street(), np.concatenate([of_box, mirror, FAR]), box)
     assert len(surface.boxes) == 1
     inside, q = towards(np.array([[12.0, y, z] for y in (-1.49, 1.49) for z in (0.3, 1.99)]))
     assert np.allclose(inverse_distance(surface, EYE, inside), q, rtol=1e-6)

@@ -90,11 +90,11 @@ def sight(source: Rig, views: tuple[np.ndarray, np.ndarray], target: Rig, depth_
             offset_m = camera.center_m - recorded.center_m
             uv, valid = project_rays(recorded, rays, q, offset_m)
             inside = valid & recorded.contains(uv)
-            own = q / np.maximum((rays + q[..., None] * offset_m) @ recorded.cam2ego[:3, 2], 1e-12)
+            ahead_m = q / np.maximum((rays + q[..., None] * offset_m) @ recorded.cam2ego[:3, 2], 1e-12)
             u, v = np.round(np.where(inside[..., None], uv, 0)).astype(int).transpose(2, 0, 1)
             # 2 % and 1/1000 m: the depth of one surface varies between its pixels.
-            seen |= inside & (own >= 0.98 * nearest[k][v, u] - 1e-3)
-            maybe = inside & (own >= 0.98 * farthest[k][v, u] - 1e-3)
+            seen |= inside & (ahead_m >= 0.98 * nearest[k][v, u] - 1e-3)
+            maybe = inside & (ahead_m >= 0.98 * farthest[k][v, u] - 1e-3)
             possible |= maybe
             behind |= inside & ~maybe & (views[1][k][v, u] >= 0)
         all_seen.append(seen)

@@ -60,11 +60,11 @@ class Frame(ProtocolFrame):
             )
             return as_arrays(retarget({"images": images})["images"])
 
-        found = {}
+        psnr = {}
         for name, targets in self.sets.items():
             rigs = [Rig([as_camera(*view) for view in views], ground_z_m=self.ground_z_m) for views in targets]
-            found[name] = score_targets(render, self.points, rigs)["psnr_db"]
-        return found
+            psnr[name] = score_targets(render, self.points, rigs)["psnr_db"]
+        return psnr
 
     def reference(self) -> dict[str, float]:
         """PSNR of each set: the protocol's ``ground`` renderer and metrics."""
@@ -79,23 +79,23 @@ def scores(request: pytest.FixtureRequest, referee: ModuleType, data_root: Path)
     folder = data_root / request.param
     if not folder.is_dir():
         pytest.skip(f"no frame {request.param} in {data_root}")
-    found: Scores = {}
+    psnr: Scores = {}
     start = time.perf_counter()
     with one_thread(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of targets that are half outside: the paper's are
         for raw in (False, True):
             frame = Frame(referee, folder, raw)
             if not raw:  # what takes the time
-                found[REFERENCE, raw] = frame.reference()
+                psnr[REFERENCE, raw] = frame.reference()
             for surface in GEOMETRIES[:1] if raw else GEOMETRIES:
-                found[surface, raw] = frame.ours(surface)
-    print(f"\n{table(request.param, found)}\n({time.perf_counter() - start:.0f} s)")
-    return found
+                psnr[surface, raw] = frame.ours(surface)
+    print(f"\n{table(request.param, psnr)}\n({time.perf_counter() - start:.0f} s)")
+    return psnr
 
 
-def table(title: str, found: Scores) -> str:
+def table(title: str, psnr: Scores) -> str:
     lines = [f"{title + ', PSNR in dB':<32}" + "".join(f"{name:>8}" for name in LARGEST_LOSS_DB)]
-    for (method, raw), row in sorted(found.items(), key=lambda item: item[0][1]):
+    for (method, raw), row in sorted(psnr.items(), key=lambda item: item[0][1]):
         label = f"{method}, raw exposures" if raw else method
         lines.append(f"  {label:<30}" + "".join(f"{row[name]:>8.2f}" for name in LARGEST_LOSS_DB))
     return "\n".join(lines)

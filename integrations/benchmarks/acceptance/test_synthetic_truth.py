@@ -69,21 +69,21 @@ def scores(request: pytest.FixtureRequest) -> Scores:
                 covered = out["coverage"].numpy()
                 ground = covered & np.isin(truth[move].classes.numpy(), [int(c) for c in GROUND_CLASSES])
                 rows[move, surface].append(tuple(psnr_db(float(squares[part].mean())) for part in (ground, covered)))
-    found = {key: Psnr(*np.array(values).T) for key, values in rows.items()}
+    psnr = {key: Psnr(*np.array(values).T) for key, values in rows.items()}
     for name in Psnr._fields:
-        print(f"\n{table(name, found)}")
+        print(f"\n{table(name, psnr)}")
     print(f"({time.perf_counter() - start:.0f} s)")
-    return found
+    return psnr
 
 
-def table(field: str, found: Scores) -> str:
+def table(field: str, psnr: Scores) -> str:
     """Means over the streets; in brackets, by how much the worst street is below the best single surface."""
-    title = f"PSNR in dB, {field} pixels (worst of {len(found[MOVES[0], SINGLE[0]].ground)} streets)"
+    title = f"PSNR in dB, {field} pixels (worst of {len(psnr[MOVES[0], SINGLE[0]].ground)} streets)"
     lines = [f"{title:<52}" + "".join(f"{move:>18}" for move in MOVES)]
     for surface in GEOMETRIES:
         cells = []
         for move in MOVES:
-            values = {s: getattr(found[move, s], field) for s in GEOMETRIES}
+            values = {s: getattr(psnr[move, s], field) for s in GEOMETRIES}
             best = np.max([values[s] for s in SINGLE], axis=0)
             cells.append(f"{values[surface].mean():.2f} ({(values[surface] - best).min():+.2f})")
         lines.append(f"  {surface:<50}" + "".join(f"{cell:>18}" for cell in cells))

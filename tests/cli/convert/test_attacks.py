@@ -142,8 +142,8 @@ def test_names_of_kept_files(table: str, name: str, tables: Home) -> None:
         (tables.source / name).touch()
     token = tables.rename(table, name)
     assert tables.convert() == 2 and not tables.output.exists()
-    outside = (f"table {table}: ", repr(token), "filename")
-    assert all(words in tables.said for words in ([f"got one in {Path(name).parent}"] if name in OWN_FILES else outside))
+    said = [f"got one in {Path(name).parent}"] if name in OWN_FILES else [f"table {table}: ", repr(token), "filename"]
+    assert all(words in tables.said for words in said)
 
 
 @pytest.mark.parametrize("channel", ["CAM_FRONT__", "LIDAR_TOP"])

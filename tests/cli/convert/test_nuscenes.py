@@ -172,10 +172,10 @@ def test_a_mended_sample_comes_back(source: Path, output: Path, tmp_path: Path) 
     assert main(command(tmp_path / "source", tmp_path / "new", "--images", "png", "--on-error", "skip")) == 0
     broken.write_bytes(sound)
     assert main(command(tmp_path / "source", tmp_path / "new", "--images", "png")) == 0
-    expected, found = tree(output), tree(tmp_path / "new")
-    assert set(found) == set(expected)
+    expected, mended = tree(output), tree(tmp_path / "new")
+    assert set(mended) == set(expected)
     named = {"conversion/settings.json", "conversion/provenance.json"}  # the roots have other names
-    assert {name for name in found if found[name] != expected[name]} == named
+    assert {name for name in mended if mended[name] != expected[name]} == named
 
 
 def test_lidar_files_that_are_missing(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
