@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 
 from arbiview_aug import Camera, Rig
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.lidar import ColouredPoints, equalised, sparse_metrics
+from arbiview_aug.evaluate.lidar import ColouredPoints, sparse_metrics
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.image_ops import at_level
 from arbiview_aug.render.atlas import Slot
@@ -238,33 +237,6 @@ def in_source(slot: Slot, at: Any) -> Any:
 def as_camera(name: str, K: Any, cam2ego: Any, size: tuple[int, int], mask: Any = None) -> Camera:
     """A camera in the protocol's words; its size is (h, w)."""
     return Camera(name=name, width_px=size[1], height_px=size[0], K=K, cam2ego=cam2ego, mask=mask)
-
-
-class ProtocolFrame:
-    """A frame at half resolution as the protocol reads it, and as this package does.
-
-    Attributes:
-        cameras: The protocol's cameras; exposures made even unless ``raw``.
-        lidar: (P, 3+) points in the ego frame.
-        rig: The cameras as ours.
-        images: (h, w, 3) uint8 for each camera; exposures made even unless ``raw``.
-    """
-
-    def __init__(self, referee: ModuleType, folder: Path, raw: bool = False) -> None:
-        self.cameras, self.lidar, self.calibration = referee.load_frame(str(folder), 0.5)
-        self.ground_z_m = float(self.calibration["ground_z_m"])
-        self.rig = Rig(
-            [
-                as_camera(name, c["K"], c["cam2ego"], c["image"].shape[:2], c["mask"] > 0)
-                for name, c in self.cameras.items()
-            ],
-            ground_z_m=self.ground_z_m,
-            name=folder.name,
-        )
-        self.images = [c["image"] for c in self.cameras.values()]
-        if not raw:
-            self.images = list(equalised(self.rig, self.images, self.lidar))
-            self.cameras = referee.equalised(self.cameras, self.lidar)
 
 
 def score_targets(

@@ -286,16 +286,16 @@ def test_the_detectors_numbers_are_the_reports() -> None:
 
     def changes(name: str) -> dict[str, Any]:
         report = json.loads((ROOT / "integrations" / "cross_rig" / "results" / f"{name}.json").read_text())
-        return {change: changed["variants"] for change, changed in report["changes"].items()}
+        return {change: of_change["variants"] for change, of_change in report["changes"].items()}
 
     def percent(row: dict[str, Any]) -> int:
         return round(100 * row["share"]["value"])
 
     pilot = changes("pilot")
-    (table,) = (changed for changed in tables(BENCHMARKS) if changed[0][1] == "closed gap")
-    for row, changed in zip(table[2:], (pilot[change] for change in ("fov50", "up70", "waymo")), strict=True):
-        ious = [f"{100 * changed[name]['iou']['value']:.1f}" for name in ("raw", "auto", "oracle")]
-        assert row[1:] == [f"{percent(changed['auto'])} %", *ious]
+    (table,) = (table for table in tables(BENCHMARKS) if table[0][1] == "closed gap")
+    for row, variants in zip(table[2:], (pilot[change] for change in ("fov50", "up70", "waymo")), strict=True):
+        ious = [f"{100 * variants[name]['iou']['value']:.1f}" for name in ("raw", "auto", "oracle")]
+        assert row[1:] == [f"{percent(variants['auto'])} %", *ious]
     readme = text_of(ROOT / "README.md")
     assert f"| {percent(pilot['fov50']['auto'])} % |" in readme
     families = changes("families")
@@ -304,8 +304,8 @@ def test_the_detectors_numbers_are_the_reports() -> None:
     shares += [
         [percent(pilot[change][name]) for change in ("up70", "waymo")] for name in ("objects_mixed", "scale_crop")
     ]
-    for changed in shares:
-        assert f"| {min(changed)} to {max(changed)} % |" in readme
+    for of_row in shares:
+        assert f"| {min(of_row)} to {max(of_row)} % |" in readme
     first, *others = (percent(families[f"up70{family}"]["recipe"]) for family in ("", "-depths", "-queries"))
     assert f"| {round(100 * changes('seeds')['up70']['recipe']['share_t']['value'])} % | `python -m" in readme
     filled = percent(changes("recipe_families")["up70-depths"]["auto_fill"])

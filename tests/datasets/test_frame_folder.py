@@ -249,11 +249,11 @@ def test_folders_that_are_none(tmp_path: Path) -> None:
 # --- masks that are cleaned -------------------------------------------------------------------------------------------
 def test_specks_in_masks_are_cleaned_on_demand(ddad_root: Path) -> None:
     for reduce in (1, 4):
-        before, cleaned = (FrameFolder(ddad_root, reduce=reduce, clean_masks=clean)[0]["rig"] for clean in (False, True))
-        for one, two in zip(before, cleaned, strict=True):
+        raw, cleaned = (FrameFolder(ddad_root, reduce=reduce, clean_masks=clean)[0]["rig"] for clean in (False, True))
+        for one, two in zip(raw, cleaned, strict=True):
             assert two.mask is not None and (without_specks(two.mask) == two.mask).all()
             assert (one.mask != two.mask).mean() < 3e-3
-    assert any((one.mask != two.mask).any() for one, two in zip(before, cleaned, strict=True))
+    assert any((one.mask != two.mask).any() for one, two in zip(raw, cleaned, strict=True))
 
 
 @pytest.mark.slow

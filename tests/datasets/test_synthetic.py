@@ -279,7 +279,7 @@ def test_scene_is_plain_data():
 
 
 def test_tensors_are_made_on_the_device():
-    """On the device "meta", which refuses operations with outs of another one."""
+    """On the device "meta", which refuses operations with tensors of another one."""
     scene, camera, n = make_scene(0, 0), demo_source_rig(SIZE)[0], 7
     with Renderer(device="meta").run():
         rays, local = camera_rays(camera), raycast.scene_from(scene, np.array([1.0, 0.0, 1.5]))

@@ -124,6 +124,7 @@ def test_unproject_is_the_inverse_of_project(worst: Worst, camera: Camera, seed:
     rng = np.random.default_rng(seed)
     grid = camera.pixel_grid()
     rays = camera.unproject(grid)
+    assert rays.valid[camera.height_px // 2, camera.width_px // 2]
     again = camera.project(camera.center_m + rays.directions * rng.uniform(0.1, 1e4, (*camera.size, 1)))
     assert again.valid[rays.valid].all()
     error_px = np.abs(again.uv - grid)[rays.valid].max(initial=0)

@@ -252,11 +252,6 @@ def test_marks_follow_resizing_and_cropping(street: dict[str, Any]) -> None:
     assert not (small["generated"] & small["coverage"]).any()
 
 
-def test_unknown_names_are_refused() -> None:
-    with pytest.raises(ValueError, match="holes: expected one of continue, telea, mean, black, diffusion, got 'grey'"):
-        RigRetarget(ring(), holes="grey")  # type: ignore[arg-type]
-
-
 # --- the functions ----------------------------------------------------------------------------------------------------
 def test_the_mean_colour_is_that_of_what_is_seen_in_all_views() -> None:
     views = [torch.zeros((3, 8, 8), dtype=torch.uint8), torch.full((3, 8, 8), 90, dtype=torch.uint8)]

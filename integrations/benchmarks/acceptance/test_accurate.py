@@ -26,7 +26,6 @@ from arbiview_aug.evaluate.agreement import overlap_scores
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.lidar import coloured_points, sparse_metrics
 from arbiview_aug.evaluate.metrics import psnr_db
-from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
 from arbiview_aug.render.config import Quality
 from arbiview_aug.render.opencv_backend import render_opencv
 from arbiview_aug.render.overlap_depth import overlap_depth
@@ -34,16 +33,15 @@ from arbiview_aug.render.plan import build_plan
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Surface
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from tests.helpers import ProtocolFrame, as_camera, few_or_all
+from integrations.benchmarks.acceptance.protocol import FRAMES, MOVES, ProtocolFrame, frame_folder, moved, psnr_of
+from tests.helpers import as_camera, few_or_all
 
 pytestmark = pytest.mark.timeout(1800)
 
-FRAMES = [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("ddad-one", marks=pytest.mark.release)]
 QUALITIES: tuple[Quality, ...] = ("fast", "accurate")
 SETS = ("yaw", "up")
 
 
-MOVES = ("0.6 m higher", "0.5 m forward", "turned by 20°")
 SEEDS = few_or_all(3, 20)
 SIZE = (128, 352)
 NEAR_M = 20.0
@@ -84,20 +82,15 @@ class Real(NamedTuple):
 @pytest.fixture(scope="module", params=FRAMES)
 def real(request: pytest.FixtureRequest, referee: ModuleType, data_root: Path) -> Real:
     """All numbers of one frame, printed."""
-    if not (data_root / request.param).is_dir():
-        pytest.skip(f"no frame {request.param} in {data_root}")
-    frame = Frame(referee, data_root / request.param)
-    sets = {
-        "yaw": [referee.rotated_targets(frame.cameras, yaw) for yaw in YAWS_DEG],
-        "up": [referee.rotated_targets(frame.cameras, 0.0, (0.0, 0.0, UP_M))],
-    }
+    frame = Frame(referee, frame_folder(data_root, request.param))
+    sets = frame.targets()
     reference = referee.reference_renderer(frame.cameras, "ground", ground_z=frame.ground_z_m)
     points = coloured_points(frame.rig, frame.images, frame.lidar)
     psnr: dict[tuple[str, str], np.ndarray] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for name, targets in sets.items():
-            rigs = [Rig([as_camera(*view) for view in views], ground_z_m=frame.ground_z_m) for views in targets]
+            rigs = frame.rigs(targets)
             views = {"ground": [list(reference(t)) for t in targets]}
             views |= {q: [frame.render(rig, q)[0] for rig in rigs] for q in QUALITIES}
             for method, images in views.items():
@@ -184,10 +177,6 @@ METHODS: tuple[tuple[GeometryName, Quality], ...] = (
 )
 
 
-def moved(rig: Rig) -> dict[str, Rig]:
-    return dict(zip(MOVES, (rig.shifted(z_m=0.6), rig.shifted(x_m=0.5), rig.turned(yaw_deg=20)), strict=True))
-
-
 @pytest.fixture(scope="module", params=SEEDS)
 def streets(request: pytest.FixtureRequest) -> Truth:
     """20 streets, three moves; of each street two cameras next to each other in the rig's order."""
@@ -219,10 +208,7 @@ def streets(request: pytest.FixtureRequest) -> Truth:
                 for surface, quality in METHODS:
                     # Boxes have a say in what is measured, so surfaces share nothing.
                     out = retargets[seed % 3, move, surface, quality]({**sample, "seed": (seed, surface)})
-                    squares = (out["images"].float() - truth.images).square().mean(1).numpy()
-                    covered = out["coverage"].numpy()
-                    parts = (covered, covered & near, covered & labelled)
-                    scores = [psnr_db(float(squares[part].mean())) if part.any() else np.nan for part in parts]
+                    scores = psnr_of(out, truth, (np.ones_like(near), near, labelled))
                     rows.setdefault((move, surface, quality), []).append(scores)
     truths = {key: np.array(values) for key, values in rows.items()}
     print(

@@ -20,13 +20,12 @@ from arbiview_aug.choices import GeometryName
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.lidar import coloured_points
-from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from tests.helpers import ProtocolFrame, as_camera, score_targets
+from integrations.benchmarks.acceptance.protocol import FRAMES, ProtocolFrame, frame_folder
+from tests.helpers import score_targets
 
 pytestmark = pytest.mark.timeout(1800)
 
-FRAMES = [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("ddad-one", marks=pytest.mark.release)]
 GEOMETRIES: tuple[GeometryName, ...] = ("auto", "ground", "infinity")
 REFERENCE = "reference ground"
 LARGEST_LOSS_DB = {"yaw": 0.1, "up": 0.25, "paper": 0.1}
@@ -41,14 +40,10 @@ class Frame(ProtocolFrame):
 
     def __init__(self, referee: ModuleType, folder: Path, raw: bool) -> None:
         super().__init__(referee, folder, raw)
-        self.referee = referee
         self.points = coloured_points(self.rig, self.images, self.lidar)
         # The protocol's own targets: on every rig it takes the paper's degrees, which are of nuScenes' spacing.
-        self.sets = {
-            "yaw": [referee.rotated_targets(self.cameras, yaw) for yaw in YAWS_DEG],
-            "up": [referee.rotated_targets(self.cameras, 0.0, (0.0, 0.0, UP_M))],
-            "paper": [referee.paper_targets(self.cameras, share) for share in referee.PAPER_SHARES],
-        }
+        paper = [referee.paper_targets(self.cameras, share) for share in referee.PAPER_SHARES]
+        self.sets = {**self.targets(), "paper": paper}
 
     def ours(self, surface: GeometryName) -> dict[str, float]:
         """PSNR of each set: this package's renderer and metrics."""
@@ -62,8 +57,7 @@ class Frame(ProtocolFrame):
 
         psnr = {}
         for name, targets in self.sets.items():
-            rigs = [Rig([as_camera(*view) for view in views], ground_z_m=self.ground_z_m) for views in targets]
-            psnr[name] = score_targets(render, self.points, rigs)["psnr_db"]
+            psnr[name] = score_targets(render, self.points, self.rigs(targets))["psnr_db"]
         return psnr
 
     def reference(self) -> dict[str, float]:
@@ -76,9 +70,7 @@ class Frame(ProtocolFrame):
 @pytest.fixture(scope="module", params=FRAMES)
 def scores(request: pytest.FixtureRequest, referee: ModuleType, data_root: Path) -> Scores:
     """All numbers of one frame, printed as a table."""
-    folder = data_root / request.param
-    if not folder.is_dir():
-        pytest.skip(f"no frame {request.param} in {data_root}")
+    folder = frame_folder(data_root, request.param)
     psnr: Scores = {}
     start = time.perf_counter()
     with one_thread(), warnings.catch_warnings():
