@@ -94,14 +94,7 @@ def test_points_that_methods_may_read_do_not_score(
 @pytest.mark.slow
 def test_degrees_of_yaw(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [
-        "evaluate",
-        "--size",
-        "24x66",
-        "--yaws=-11,11",
-        "--geometry",
-        "infinity",
-        "--output",
-        str(tmp_path),
+        "evaluate", "--size", "24x66", "--yaws=-11,11", "--geometry", "infinity", "--output", str(tmp_path),
     ]
     assert main(arguments) == 0
     printed = json.loads((tmp_path / "evaluate.json").read_text())

@@ -150,17 +150,13 @@ def test_blank_images(street, fill: int, reason: str) -> None:
     assert not report.accepted and reason in report.reason
 
 
-def test_night_and_noise_and_stripes(street) -> None:
+def test_stripes(street) -> None:
     rig, images = street
-    generator = torch.Generator().manual_seed(0)
-    night = [torch.randint(0, 20, image.shape, generator=generator, dtype=torch.uint8) for image in images]
-    noise = [torch.randint(0, 256, image.shape, generator=generator, dtype=torch.uint8) for image in images]
     stripes = [torch.zeros_like(image) for image in images]
     for image in stripes:
         image[..., ::8] = 200
-    for odd in (night, noise, stripes):
-        report = estimate_gains(rig, odd)
-        assert all(0.9 < gain < 1.1 for gain in report.gains) and report.reason
+    report = estimate_gains(rig, stripes)
+    assert all(0.9 < gain < 1.1 for gain in report.gains) and report.reason
 
 
 def test_order_of_cameras_and_repetition_change_nothing(street) -> None:

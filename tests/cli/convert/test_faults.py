@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.convert import command as converting
 from tests.cli.convert.drives import command, tree, write_frames, write_nuscenes
 from tests.helpers import sampled
 
@@ -122,15 +121,6 @@ def test_nothing_that_can_be_converted(conversion: Conversion, sources: dict[str
     (frame / "00.jpg").write_bytes(b"")
     assert conversion.run("frames", "--on-error", "skip", source=frame) == 2
     assert "expected at least one sample that can be converted" in conversion.said
-
-
-def test_an_interrupt_says_how_to_go_on(conversion: Conversion, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(converting, "_run", interrupted)
-    assert conversion.run("frames") == 130
-    assert "run it again to go on" in conversion.said
 
 
 @pytest.mark.parametrize("kind", ["frames", "nuscenes"])
