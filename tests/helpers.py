@@ -76,6 +76,12 @@ def smooth_images(rig: Rig, dtype: torch.dtype = torch.uint8, seed: int = 0) -> 
     return torch.stack(images) if len(set(rig.sizes)) == 1 else images
 
 
+def noise(rig: Rig, seed: int = 0) -> list[torch.Tensor]:
+    """Random pictures (3, h, w) in [0, 1]."""
+    generator = torch.Generator().manual_seed(seed)
+    return [torch.rand(3, *one.size, generator=generator) for one in rig]
+
+
 def sample_of(rig: Rig, dtype: torch.dtype = torch.uint8, seed: int = 0, **more: Any) -> dict[str, Any]:
     """A sample of smooth images with its calibration in tensors."""
     calibration = {"K": torch.from_numpy(rig.K), "cam2ego": torch.from_numpy(rig.cam2ego)}

@@ -238,22 +238,21 @@ def test_broken_tables(tmp_path: Path, change: Change, message: str) -> None:
         NuScenesDataset(tmp_path)
 
 
-def test_wrong_arguments(tmp_path: Path) -> None:
-    write(tmp_path)
-    with pytest.raises(DataError, match=r"expected a folder of tables 'v1\.0-trainval', found none.*: v1\.0-mini"):
-        NuScenesDataset(tmp_path, "v1.0-trainval")
-    with pytest.raises(DataError, match="expected either root or nusc, got both or none"):
-        NuScenesDataset()
-    with pytest.raises(SampleTypeError, match="nusc: expected a devkit NuScenes object, got int without dataroot"):
-        NuScenesDataset(nusc=3)
-    with pytest.raises(DataError, match="channels: expected some of CAM_BACK, CAM_FRONT, got 'CAM_TOP'"):
-        NuScenesDataset(tmp_path, channels=["CAM_FRONT", "CAM_TOP"])
-    with pytest.raises(DataError, match="table scene: expected the scenes scene-9, got 2 others"):
-        NuScenesDataset(tmp_path, split_scenes=["scene-1", "scene-9"])
-    with pytest.raises(DataError, match="split_scenes: expected a collection of scene names"):
-        NuScenesDataset(tmp_path, split_scenes="scene-1")
-    with pytest.raises(ValueError, match="reduce: expected 1, 2 or 4"):
-        NuScenesDataset(tmp_path, reduce=3)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"version": "v1.0-x"}, DataError, r"expected a folder of tables 'v1\.0-x', found none.*: v1\.0-mini"),
+        ({"root": None}, DataError, "expected either root or nusc, got both or none"),
+        ({"root": None, "nusc": 3}, SampleTypeError, "nusc: expected a devkit NuScenes object, got int without dataro"),
+        ({"channels": ["CAM_FRONT", "CAM_TOP"]}, DataError, "channels: expected some of CAM_BACK, CAM_FRONT, got 'CAM_TOP'"),
+        ({"split_scenes": ["scene-1", "scene-9"]}, DataError, "table scene: expected the scenes scene-9, got 2 others"),
+        ({"split_scenes": "scene-1"}, DataError, "split_scenes: expected a collection of scene names"),
+        ({"reduce": 3}, ValueError, "reduce: expected 1, 2 or 4"),
+    ],
+)
+def test_wrong_arguments(tmp_path: Path, arguments: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        NuScenesDataset(**{"root": write(tmp_path)} | arguments)
 
 
 def test_a_token_that_is_not_there(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from arbiview_aug.scene.static import WALL_CENTER_M
 from tests import helpers
 from tests.extremes import drawn, reference
 from tests.extremes.conftest import Worst
-from tests.helpers import examples, in_source
+from tests.helpers import examples, in_source, noise
 
 # No vehicle is so short: their shape is the box.
 BOXES = np.array([[12.03, 1.0, 0.807, 2.5, 1.9, 1.613, 0.3], [-8.0, -3.0, 1.01, 2.9, 2.0, 2.02, 1.5]])
@@ -33,11 +33,6 @@ UNBLENDED = RenderConfig(seam_width=0.0, interpolation="linear")
 
 def scene_of(surface: str, boxes: np.ndarray = BOXES) -> Scene:
     return Scene(boxes=boxes) if surface == "boxes" else Scene()
-
-
-def noise(rig: Rig) -> list[torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    return [torch.rand(3, *camera.size, generator=generator) for camera in rig]
 
 
 def rendered(plan: RenderPlan, images: list[torch.Tensor], execution: str) -> list[np.ndarray]:
