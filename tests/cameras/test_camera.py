@@ -168,6 +168,7 @@ WORDS = {
     "turn in words": (lambda: looking().turned(yaw_deg="3"), r"yaw, pitch, roll: expected finite angles in degrees"),
     "endless turn": (lambda: looking().turned(yaw_deg=np.inf), r"yaw, pitch, roll: expected finite angles"),
     "shift in words": (lambda: looking().shifted(z_m="1"), r"shift: expected finite \(x, y, z\) in metres"),
+    "no fit": (lambda: looking().resize((4, 4), None), "fit: expected one of crop, pad, stretch, got None"),
     "one side": (lambda: looking().resize(5), r"size: expected \(h, w\) in pixels, got 5"),
     "size in words": (lambda: looking().resize(("4", "5")), r"height_px: expected a whole number of pixels .* got '4'"),
     "half a pixel": (lambda: looking().crop(0.5, 0, (4, 4)), r"top: expected a whole number of pixels .* got 0.5"),

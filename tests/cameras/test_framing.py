@@ -204,8 +204,3 @@ def test_what_would_be_cut_from_too_large_an_image_is_refused_by_name() -> None:
     with pytest.raises(ArbiviewError, match=r"camera 'c0': size=\(20000, 2\), fit='crop'"):
         RigRetarget(rig(), size=(20000, 2))
     assert rig()[0].resize((20000, 2), "pad").size == (20000, 2)
-
-
-def test_an_unknown_fit_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="camera 'c0': fit: expected one of crop, pad, stretch, got None"):
-        rig().resized(OWN, None)  # type: ignore[arg-type]
