@@ -81,10 +81,10 @@ def traced_calls() -> dict[str, Tracer]:
     tracers = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for name, (retarget, given) in calls.items():
-            retarget(given)
+        for name, (retarget, entries) in calls.items():
+            retarget(entries)
             with Tracer() as tracers[name]:
-                retarget(_anew(given))
+                retarget(_anew(entries))
     return tracers
 
 

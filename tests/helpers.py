@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 
 from arbiview_aug import Camera, Rig
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.lidar import ColouredPoints, equalised, sparse_metrics
+from arbiview_aug.evaluate.lidar import ColouredPoints, sparse_metrics
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.image_ops import at_level
 from arbiview_aug.render.plan import Slot
@@ -75,6 +74,12 @@ def smooth_images(rig: Rig, dtype: torch.dtype = torch.uint8, seed: int = 0) -> 
         image = image.clamp(0, 1)
         images.append((image * 255).round().to(torch.uint8) if dtype == torch.uint8 else image.to(dtype))
     return torch.stack(images) if len(set(rig.sizes)) == 1 else images
+
+
+def noise(rig: Rig, seed: int = 0) -> list[torch.Tensor]:
+    """Random pictures (3, h, w) in [0, 1]."""
+    generator = torch.Generator().manual_seed(seed)
+    return [torch.rand(3, *one.size, generator=generator) for one in rig]
 
 
 def sample_of(rig: Rig, dtype: torch.dtype = torch.uint8, seed: int = 0, **more: Any) -> dict[str, Any]:
@@ -238,33 +243,6 @@ def in_source(slot: Slot, at: Any) -> Any:
 def as_camera(name: str, K: Any, cam2ego: Any, size: tuple[int, int], mask: Any = None) -> Camera:
     """A camera in the protocol's words; its size is (h, w)."""
     return Camera(name=name, width_px=size[1], height_px=size[0], K=K, cam2ego=cam2ego, mask=mask)
-
-
-class ProtocolFrame:
-    """A frame at half resolution as the protocol reads it, and as this package does.
-
-    Attributes:
-        cameras: The protocol's cameras; exposures made even unless ``raw``.
-        lidar: (P, 3+) points in the ego frame.
-        rig: The cameras as ours.
-        images: (h, w, 3) uint8 for each camera; exposures made even unless ``raw``.
-    """
-
-    def __init__(self, referee: ModuleType, folder: Path, raw: bool = False) -> None:
-        self.cameras, self.lidar, self.calibration = referee.load_frame(str(folder), 0.5)
-        self.ground_z_m = float(self.calibration["ground_z_m"])
-        self.rig = Rig(
-            [
-                as_camera(name, c["K"], c["cam2ego"], c["image"].shape[:2], c["mask"] > 0)
-                for name, c in self.cameras.items()
-            ],
-            ground_z_m=self.ground_z_m,
-            name=folder.name,
-        )
-        self.images = [c["image"] for c in self.cameras.values()]
-        if not raw:
-            self.images = list(equalised(self.rig, self.images, self.lidar))
-            self.cameras = referee.equalised(self.cameras, self.lidar)
 
 
 def score_targets(

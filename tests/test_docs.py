@@ -113,14 +113,14 @@ def prose(page: Path) -> str:
 
 def measured(mark: str) -> str:
     """The text between two marks."""
-    (found,) = re.findall(rf"<!-- {mark}\b.*?-->\n(.*?)<!-- /{mark} -->", BENCHMARKS, re.DOTALL)
-    return found
+    (text,) = re.findall(rf"<!-- {mark}\b.*?-->\n(.*?)<!-- /{mark} -->", BENCHMARKS, re.DOTALL)
+    return text
 
 
 def tables(markdown: str) -> list[list[list[str]]]:
     """The cells of each table, row by row."""
-    found = re.findall(r"(?:^\|.*\n?)+", markdown, re.MULTILINE)
-    return [[[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()] for table in found]
+    parts = re.findall(r"(?:^\|.*\n?)+", markdown, re.MULTILINE)
+    return [[[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()] for table in parts]
 
 
 def words(markdown: str) -> list[str]:
@@ -171,10 +171,7 @@ def check_completed(names: dict[str, Any]) -> None:
 
 
 CHECKS: dict[str, Callable[[dict[str, Any]], None]] = {
-    "rigs.md": check_truck,
-    "drives.md": check_filled,
-    "holes.md": check_completed,
-    "contributing.md": check_read,
+    "rigs.md": check_truck, "drives.md": check_filled, "holes.md": check_completed, "contributing.md": check_read,
 }
 """Values that a page's code must leave in its names."""
 
@@ -276,16 +273,16 @@ def test_the_detectors_numbers_are_the_reports() -> None:
 
     def changes(name: str) -> dict[str, Any]:
         report = json.loads((ROOT / "integrations" / "cross_rig" / "results" / f"{name}.json").read_text())
-        return {change: found["variants"] for change, found in report["changes"].items()}
+        return {change: of_change["variants"] for change, of_change in report["changes"].items()}
 
     def percent(row: dict[str, Any]) -> int:
         return round(100 * row["share"]["value"])
 
     pilot = changes("pilot")
-    (table,) = (found for found in tables(BENCHMARKS) if found[0][1] == "closed gap")
-    for row, found in zip(table[2:], (pilot[change] for change in ("fov50", "up70", "waymo")), strict=True):
-        ious = [f"{100 * found[name]['iou']['value']:.1f}" for name in ("raw", "auto", "oracle")]
-        assert row[1:] == [f"{percent(found['auto'])} %", *ious]
+    (table,) = (table for table in tables(BENCHMARKS) if table[0][1] == "closed gap")
+    for row, variants in zip(table[2:], (pilot[change] for change in ("fov50", "up70", "waymo")), strict=True):
+        ious = [f"{100 * variants[name]['iou']['value']:.1f}" for name in ("raw", "auto", "oracle")]
+        assert row[1:] == [f"{percent(variants['auto'])} %", *ious]
     readme = text_of(ROOT / "README.md")
     assert f"| {percent(pilot['fov50']['auto'])} % |" in readme
     families = changes("families")
@@ -294,8 +291,8 @@ def test_the_detectors_numbers_are_the_reports() -> None:
     shares += [
         [percent(pilot[change][name]) for change in ("up70", "waymo")] for name in ("objects_mixed", "scale_crop")
     ]
-    for found in shares:
-        assert f"| {min(found)} to {max(found)} % |" in readme
+    for of_row in shares:
+        assert f"| {min(of_row)} to {max(of_row)} % |" in readme
     first, *others = (percent(families[f"up70{family}"]["recipe"]) for family in ("", "-depths", "-queries"))
     assert f"| {round(100 * changes('seeds')['up70']['recipe']['share_t']['value'])} % | `python -m" in readme
     filled = percent(changes("recipe_families")["up70-depths"]["auto_fill"])
@@ -361,8 +358,7 @@ def test_the_reference_lists_what_is_public() -> None:
 
 def test_names_are_complete() -> None:
     for page, names in (
-        ("rigs.md", shipped_rigs()),
-        ("surfaces.md", [*get_args(GeometryName), *get_args(Quality)]),
+        ("rigs.md", shipped_rigs()), ("surfaces.md", [*get_args(GeometryName), *get_args(Quality)]),
     ):
         for name in names:
             assert f"`{name}`" in text_of(ROOT / "docs" / page)

@@ -18,8 +18,8 @@ def blocks(language: str) -> list[str]:
 
 
 def section(title: str) -> str:
-    (found,) = re.findall(rf"^## {title}\n(.*?)(?=^## |\Z)", README, re.DOTALL | re.MULTILINE)
-    return found
+    (text,) = re.findall(rf"^## {title}\n(.*?)(?=^## |\Z)", README, re.DOTALL | re.MULTILINE)
+    return text
 
 
 def table_rows(markdown: str) -> list[str]:

@@ -39,11 +39,11 @@ def digests(sample: Mapping[str, Any], repeats: int = 1) -> list[str]:
     floats = {**sample, "images": sample["images"].float() / 255}
     for name, settings in SETTINGS.items():
         for kind, images in (("uint8", sample), ("float", floats)):
-            found = set()
+            results = set()
             for _ in range(repeats):
                 held.append(np.empty(int(rng.integers(1, 300_000)), np.uint8))  # buffers lie elsewhere the next time
-                found.add(digest(RigRetarget(target, **settings)(images)))
-            lines.append(f"{name} {kind} {' '.join(sorted(found))}")
+                results.add(digest(RigRetarget(target, **settings)(images)))
+            lines.append(f"{name} {kind} {' '.join(sorted(results))}")
     return lines
 
 

@@ -1,4 +1,4 @@
-"""Studies, and release checks of times, memory and accuracy (docs/contributing.md); fixtures are the tests'."""
+"""Studies, and checks of times, memory, accuracy and killed conversions; fixtures are those of the tests."""
 
 from tests.conftest import (  # noqa: F401
     data_root,

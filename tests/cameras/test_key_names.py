@@ -28,13 +28,13 @@ def sample(**more: Any) -> dict[str, Any]:
     return {"images": torch.zeros(1, 3, 12, 16), "K": torch.tensor(RIG.K), "cam2ego": torch.tensor(RIG.cam2ego), **more}
 
 
-def warned(given: dict[str, Any], calls: int = 2, **settings: Any) -> list[str]:
+def warned(entries: dict[str, Any], calls: int = 2, **settings: Any) -> list[str]:
     """Warnings about keys in so many calls."""
     retarget = RigRetarget(RIG.turned(yaw_deg=3), **settings)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for _ in range(calls):
-            retarget(given)
+            retarget(entries)
     return [str(w.message) for w in caught if "did you mean" in str(w.message)]
 
 
@@ -97,8 +97,8 @@ def test_our_own_samples_are_understood() -> None:
     drive = SyntheticDrive(demo_source_rig((16, 44)), num_frames=1)
     first = drive[0]
     out = RigRetarget(first["rig"].turned(yaw_deg=3), keys=SampleKeys(extra=("confidence", "source_camera")))(first)
-    for given in (first, out):
-        assert not misnamed(given, (*USUAL_NAMES,))
+    for one in (first, out):
+        assert not misnamed(one, (*USUAL_NAMES,))
 
 
 @pytest.mark.parametrize(
@@ -114,9 +114,9 @@ def test_our_own_samples_are_understood() -> None:
     ],
 )
 def test_errors_name_what_was_found_instead(change: dict[str, str], words: str) -> None:
-    given = {change.get(key, key): value for key, value in sample().items()}
+    renamed = {change.get(key, key): value for key, value in sample().items()}
     with pytest.raises(SampleError) as caught:
-        RigRetarget(RIG)(given)
+        RigRetarget(RIG)(renamed)
     assert words in str(caught.value)
 
 
@@ -217,18 +217,12 @@ def test_opencvs_lenses_by_their_other_names(alias: Any, lens: str, tmp_path: Pa
     folder = write_frame(tmp_path / "a", {}, {"distortion": data["cameras"][0]["distortion"]})
     assert FrameFolder(folder)[0]["rig"] == expected
     camera = Camera.looking(
-        name="front",
-        azimuth_deg=0,
-        width_px=16,
-        height_px=12,
-        K=RIG.K[0],
-        lens=alias,
-        distortion=coefficients,
+        name="front", azimuth_deg=0, width_px=16, height_px=12, K=RIG.K[0], lens=alias, distortion=coefficients,
     )
     assert camera == expected[0]
     padded = torch.tensor([[*coefficients, 0, 0, 0, 0]])
-    given = sample(lens=[alias], distortion=padded, ground_z_m=-0.2)
+    lensed = sample(lens=[alias], distortion=padded, ground_z_m=-0.2)
     target = RIG.turned(yaw_deg=3)
     assert RigRetarget(target).plan(expected, target).source == expected
-    named, alike = (RigRetarget(target)({**given, "lens": [name]}) for name in (alias, lens))
+    named, alike = (RigRetarget(target)({**lensed, "lens": [name]}) for name in (alias, lens))
     assert torch.equal(named["coverage"], alike["coverage"]) and named["coverage"].any()

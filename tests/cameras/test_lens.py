@@ -94,12 +94,6 @@ def test_points_behind_are_invalid_and_finite() -> None:
             assert not got.valid.any()
 
 
-def test_beside_the_camera_only_a_fisheye_sees() -> None:
-    beside = np.array([0.0, 5.0, 1.5])  # 90 degrees to the left
-    assert make("fisheye", azimuth_deg=0.0, elevation_deg=0.0).project(beside).valid
-    assert not make("pinhole", azimuth_deg=0.0, elevation_deg=0.0).project(beside).valid
-
-
 @pytest.mark.parametrize(
     ("lens", "distortion", "limit"),
     [

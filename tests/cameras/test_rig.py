@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, content_order, load_rig, shipped_rigs
 from arbiview_aug.errors import CalibrationError
 from tests import helpers
@@ -128,14 +128,11 @@ def test_missing_file_names_the_shipped_rigs() -> None:
         load_rig(3)  # type: ignore[arg-type]
 
 
-def test_broken_json_and_bytes(tmp_path: Path) -> None:
-    path = tmp_path / "rig.json"
-    path.write_bytes(b"\xff\xfe\x00")
+@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b'{"cameras": ['])
+def test_broken_json_and_bytes(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "rig.json").write_bytes(content)
     with pytest.raises(CalibrationError, match="expected plain YAML or JSON"):
-        load_rig(path)
-    path.write_text('{"cameras": [')
-    with pytest.raises(CalibrationError, match="expected plain YAML or JSON"):
-        load_rig(path)
+        load_rig(tmp_path / "rig.json")
 
 
 # --- shipped rigs -----------------------------------------------------------------------------------------------------
@@ -212,18 +209,13 @@ def test_changed_copies() -> None:
 
 def test_content_key_and_order_depend_on_calibration_alone() -> None:
     rig = rig_with_everything()
-    renamed = Rig([Camera(**{**vars_of(c), "name": c.name * 2}) for c in rig], ground_z_m=rig.ground_z_m)
+    renamed = Rig([replace(c, name=c.name * 2) for c in rig], ground_z_m=rig.ground_z_m)
     assert renamed.content_key == rig.content_key and renamed != rig
     assert Rig(rig.cameras, ground_z_m=0.0).content_key != rig.content_key
     cameras = list(rig)
     order = [cameras[k].name for k in content_order(cameras)]
     for shuffled in (cameras[::-1], cameras[1:] + cameras[:1]):
         assert [shuffled[k].name for k in content_order(shuffled)] == order
-
-
-def vars_of(camera: Camera) -> dict:
-    fields = ("name", "width_px", "height_px", "K", "cam2ego", "lens", "distortion", "mask")
-    return {field: getattr(camera, field) for field in fields}
 
 
 def test_repr_is_a_table() -> None:

@@ -37,7 +37,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def made(recorded: Path) -> Path:
+def depth_root(recorded: Path) -> Path:
     assert main(["depth", "--data", str(recorded)]) == 0
     return recorded / FOLDER
 
@@ -46,8 +46,8 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-def test_every_frame_gets_a_file_and_a_line_if_it_has_no_depth(made: Path, recorded: Path, capsys) -> None:
-    assert set(contents(made)) == {"000.npz", "001.npz", "002.npz", "other.npz"}
+def test_every_frame_gets_a_file_and_a_line_if_it_has_no_depth(depth_root: Path, recorded: Path, capsys) -> None:
+    assert set(contents(depth_root)) == {"000.npz", "001.npz", "002.npz", "other.npz"}
     assert main(["depth", "--data", str(recorded), "--output", str(recorded / "again")]) == 0
     out = capsys.readouterr().out
     assert "3 of 4 frames have depth" in out and "0 were there before" in out
@@ -55,9 +55,9 @@ def test_every_frame_gets_a_file_and_a_line_if_it_has_no_depth(made: Path, recor
 
 
 @pytest.mark.slow
-def test_it_goes_on_where_it_was(made: Path, recorded: Path, tmp_path: Path, capsys) -> None:
+def test_it_goes_on_where_it_was(depth_root: Path, recorded: Path, tmp_path: Path, capsys) -> None:
     """Also after a file was cut short; by more than one process to the same bytes."""
-    output, whole = tmp_path / "depth", contents(made)
+    output, whole = tmp_path / "depth", contents(depth_root)
     output.mkdir()
     (output / "000.npz").write_bytes(whole["000.npz"])
     (output / "001.npz").write_bytes(whole["001.npz"][:100])
@@ -66,7 +66,7 @@ def test_it_goes_on_where_it_was(made: Path, recorded: Path, tmp_path: Path, cap
     again = contents(output)
     assert set(again) == set(whole)
     for name in whole:
-        with np.load(made / name) as one, np.load(output / name) as two:
+        with np.load(depth_root / name) as one, np.load(output / name) as two:
             assert all(np.array_equal(one[key], two[key]) for key in one.files)
 
 
@@ -81,8 +81,8 @@ def test_what_cannot_be_read_is_named(recorded: Path, tmp_path: Path, capsys) ->
     assert main(["depth", "--data", str(tmp_path / "nowhere")]) == 2
 
 
-def test_samples_carry_it(made: Path, recorded: Path) -> None:
-    data = WithDepth(FrameFolder(recorded), made)
+def test_samples_carry_it(depth_root: Path, recorded: Path) -> None:
+    data = WithDepth(FrameFolder(recorded), depth_root)
     assert WithMotionDepth is WithDepth  # its former name
     sample = data[1]
     assert len(data) == 4 and sample["motion_depth_m"].shape == (2, 64, 176)
@@ -97,8 +97,8 @@ def test_samples_carry_it(made: Path, recorded: Path) -> None:
     assert difference.mean() < 0.5  # half precision; the road is filled from other frames besides
 
 
-def test_files_that_do_not_fit_are_named(made: Path, recorded: Path, tmp_path: Path) -> None:
-    depths, rig = DepthFolder(made), FrameFolder(recorded)[0]["rig"]
+def test_files_that_do_not_fit_are_named(depth_root: Path, recorded: Path, tmp_path: Path) -> None:
+    depths, rig = DepthFolder(depth_root), FrameFolder(recorded)[0]["rig"]
     with pytest.raises(DataError, match=r"missing\.npz: expected depth of frame 'missing', found none"):
         depths.read("missing", rig)
     with pytest.raises(DataError, match=r"000\.npz: expected depth of this calibration"):
@@ -117,7 +117,7 @@ def test_files_that_do_not_fit_are_named(made: Path, recorded: Path, tmp_path: P
         DepthFolder(tmp_path).read("x", rig)
     assert DepthFolder(tmp_path).path("a/b").parent == tmp_path
     with pytest.raises(SampleError, match="expected 'rig' and 'token'"):
-        WithDepth([{"images": 0}], made)[0]
+        WithDepth([{"images": 0}], depth_root)[0]
 
 
 def test_what_was_found_from_less_is_found_again(recorded: Path, tmp_path: Path, capsys) -> None:
@@ -154,9 +154,9 @@ def test_a_broken_frame_is_no_neighbour(recorded: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("broken", [{"format": [1, 2]}, {"words": None}, {"format": None}, {"K": [1]}, {"depth_00": 3}])
-def test_files_of_nonsense_are_named(made: Path, recorded: Path, tmp_path: Path, broken: dict) -> None:
+def test_files_of_nonsense_are_named(depth_root: Path, recorded: Path, tmp_path: Path, broken: dict) -> None:
     """Arrays that are missing or of other shapes."""
-    with np.load(made / "000.npz") as file:
+    with np.load(depth_root / "000.npz") as file:
         held = {name: file[name] for name in file.files} | {name: np.array(value) for name, value in broken.items()}
     np.savez(tmp_path / "000.npz", **{name: value for name, value in held.items() if broken.get(name, 0) is not None})
     with pytest.raises(DataError, match=r"000\.npz: expected depth"):

@@ -26,17 +26,17 @@ def run(arguments: list[str], folder: Path) -> dict:
 
 
 def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = run(["--size", "48x132", "--quality", "fast", "draft", "--geometry", "street", "infinity"], tmp_path)
+    report = run(["--size", "48x132", "--quality", "fast", "draft", "--geometry", "street", "infinity"], tmp_path)
     printed = capsys.readouterr().out
     assert "Against the true views" in printed and "Agreement of neighbours" in printed
     rows = ["fast, street", "fast, infinity", "draft, street", "draft, infinity"]
-    assert list(found["means"]) == list(found["agreement"]) == rows
-    street, far = found["means"]["fast, street"], found["means"]["fast, infinity"]
+    assert list(report["means"]) == list(report["agreement"]) == rows
+    street, far = report["means"]["fast, street"], report["means"]["fast, infinity"]
     assert street["true_covered_ground_psnr_db"] > far["true_covered_ground_psnr_db"] + 3
     assert {"true_hole_object_share", "true_covered_sky_psnr_db", "seen"} <= set(street)
     assert "raw_psnr_db" not in street, "where the truth is known, LiDAR need not score"
-    assert len(found["views"]) == 4 * 5 and {row["camera"] for row in found["views"]} >= {"front", "side_left"}
-    kinds = {pair["kind"] for pair in found["pairs"]}
+    assert len(report["views"]) == 4 * 5 and {row["camera"] for row in report["views"]} >= {"front", "side_left"}
+    kinds = {pair["kind"] for pair in report["pairs"]}
     assert kinds == {"overlap", "consistency"}
     assert f"{street['true_covered_psnr_db']:.2f}" in printed
     picture = cv2.imread(str(tmp_path / "van-fast-street.png"))
@@ -51,7 +51,7 @@ def test_numbers_agree_with_the_protocol(
     """The command's sparse figures, against the protocol's metrics of the same renderings."""
     common = ["--data", str(nuscenes_root), "--downscale", "2", "--geometry", "street"]
     FrameFolder(nuscenes_root, reduce=2)[0]["rig"].turned(yaw_deg=22).save(tmp_path / "turned.yaml")
-    found = run([*common, "--target", str(tmp_path / "turned.yaml")], tmp_path)
+    report = run([*common, "--target", str(tmp_path / "turned.yaml")], tmp_path)
     assert "every other degree" not in capsys.readouterr().out
     sample = FrameFolder(nuscenes_root, reduce=2)[0]
     rig, points = sample["rig"], sample["points"].numpy()[:, :3].astype(float)
@@ -59,7 +59,7 @@ def test_numbers_agree_with_the_protocol(
         c.name: {"K": c.K, "cam2ego": c.cam2ego, "image": image, "mask": np.ones(c.size, np.uint8)}
         for c, image in zip(rig, as_arrays(sample["images"]), strict=True)
     }
-    mean = found["means"]["fast, street"]
+    mean = report["means"]["fast, street"]
     for exposure, protocol in (("raw", cameras), ("even", referee.equalised(cameras, points))):
 
         def render(targets: list, protocol: dict = protocol) -> list[np.ndarray]:
@@ -106,9 +106,9 @@ def test_lenses_that_a_method_cannot_take(
     fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["--data", str(fisheye_root), "--target", "ddad", "--size", "60x100", "--geometry", "infinity"]
-    found = run([*arguments, "--quality", "fast", "paper"], tmp_path)
+    report = run([*arguments, "--quality", "fast", "paper"], tmp_path)
     printed = capsys.readouterr().out
-    assert list(found["means"]) == ["fast, infinity"] and "note: paper, infinity: " in printed and "pinhole" in printed
+    assert list(report["means"]) == ["fast, infinity"] and "note: paper, infinity: " in printed and "pinhole" in printed
     assert "no truth and no LiDAR points" in printed
     assert main(["evaluate", *arguments, "--quality", "paper", "--output", str(tmp_path)]) == 2
     assert "pinhole" in capsys.readouterr().err

@@ -299,12 +299,7 @@ HELP = {
     "demo": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--geometry", "--seed N seed of"),
     "depth": ("--data [KIND:]PATH", "--output", "--workers"),
     "evaluate": (
-        "--data [KIND:]PATH",
-        "--target RIG",
-        "--output DIR",
-        "--quality",
-        "--target-set",
-        "--displaced",
+        "--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--target-set", "--displaced",
     ),
     "inspect": ("RIG", "--output FILE"),
     "train": ("--data", "--output DIR", "--config", "--set KEY=VALUE"),

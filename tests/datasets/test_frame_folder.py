@@ -160,6 +160,11 @@ def test_real_masks_lens_and_ground(ddad_root: Path, fisheye_root: Path) -> None
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
+def swapped(calib: dict[str, Any]) -> None:
+    for entry in calib["cameras"]:
+        entry.update(width=48, height=64, mask=None)
+
+
 def edit(key: str, value: Any, camera: int | None = None) -> Change:
     return lambda calib: (calib if camera is None else calib["cameras"][camera]).update({key: value})
 
@@ -174,6 +179,7 @@ def edit(key: str, value: Any, camera: int | None = None) -> Change:
         (edit("distortion", {"model": "fisheye", "coeffs": [1]}, 1), CalibrationError, "4 coefficients for a fisheye"),
         (edit("name", "front", 1), CalibrationError, "front more than once"),
         (edit("width", 1600, 0), DataError, r"'front': image .*expected 1600x48 \(w x h\) as calibrated, got 64x48"),
+        (swapped, DataError, "expected 48x64 .*got 64x48; the calibration's width and height look swapped"),
         (edit("cameras", []), CalibrationError, "at least one camera"),
         (edit("cameras", None), DataError, "expected an object with a list 'cameras'"),
         (edit("cameras", ["front"]), CalibrationError, "camera 0: expected a mapping, got str"),
@@ -195,15 +201,6 @@ def test_bad_calibrations(tmp_path: Path, change: Change, error: type[Exception]
     with pytest.raises(error, match=message) as raised:
         dataset[0]
     assert "broken" in str(raised.value)  # the frame is named, whatever went wrong
-
-
-def test_swapped_width_and_height(tmp_path: Path) -> None:
-    def swap(calib: dict[str, Any]) -> None:
-        for entry in calib["cameras"]:
-            entry.update(width=48, height=64, mask=None)
-
-    with pytest.raises(DataError, match=r"expected 48x64 .*got 64x48; the calibration's width and height look swapped"):
-        FrameFolder(frame(tmp_path, swap))[0]
 
 
 def test_mask_of_another_size(tmp_path: Path) -> None:
@@ -261,11 +258,11 @@ def test_folders_that_are_none(tmp_path: Path) -> None:
 # --- masks that are cleaned -------------------------------------------------------------------------------------------
 def test_specks_in_masks_are_cleaned_on_demand(ddad_root: Path) -> None:
     for reduce in (1, 4):
-        given, cleaned = (FrameFolder(ddad_root, reduce=reduce, clean_masks=clean)[0]["rig"] for clean in (False, True))
-        for one, two in zip(given, cleaned, strict=True):
+        raw, cleaned = (FrameFolder(ddad_root, reduce=reduce, clean_masks=clean)[0]["rig"] for clean in (False, True))
+        for one, two in zip(raw, cleaned, strict=True):
             assert two.mask is not None and (without_specks(two.mask) == two.mask).all()
             assert (one.mask != two.mask).mean() < 3e-3
-    assert any((one.mask != two.mask).any() for one, two in zip(given, cleaned, strict=True))
+    assert any((one.mask != two.mask).any() for one, two in zip(raw, cleaned, strict=True))
 
 
 @pytest.mark.slow

@@ -1,7 +1,10 @@
 """Decoding: layout, half pixels of the reduced decode, and files that must not pass as pictures."""
 
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -68,9 +71,7 @@ def test_without_the_rgb_flag_of_newer_opencv(jpeg: Path, tmp_path: Path, monkey
     monkeypatch.setattr(images_module, "_RGB_FLAG", None)
     monkeypatch.setattr(images_module, "_FLAGS", cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_COLOR)
     monkeypatch.setattr(
-        images_module,
-        "_REDUCED_FLAGS",
-        {1: 0, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4},
+        images_module, "_REDUCED_FLAGS", {1: 0, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4},
     )
     images = decode_images(files)
     assert isinstance(images, torch.Tensor) and isinstance(expected, torch.Tensor)
@@ -141,27 +142,44 @@ def test_reduce_is_checked(jpeg: Path) -> None:
 
 
 # --- bad files --------------------------------------------------------------------------------------------------------
-def test_missing_image(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"camera 'left': image .*gone\.jpg: expected an image file, found none"):
-        decode_images([tmp_path / "gone.jpg"], names=["left"])
+def half(data: bytes) -> bytes:
+    return data[: len(data) // 2]
 
 
-def test_a_folder_is_no_image(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="expected an image file, got a folder"):
-        decode_images([tmp_path])
+def one_byte_off(data: bytes) -> bytes:
+    return half(data) + bytes([data[len(data) // 2] ^ 255]) + data[len(data) // 2 + 1 :]
 
 
+def without_tables(data: bytes) -> bytes:
+    """OpenCV hands such a JPEG's given array back untouched, as if it had worked."""
+    table = data.find(b"\xff\xc4")
+    return data[: table + 5] + b"\xff" * 16 + data[table + 21 :]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "damage", "message"),
+    [
+        (".jpg", None, "expected an image file, found none"),
+        (".jpg", Path.mkdir, "expected an image file, got a folder"),
+        (".jpg", os.mkfifo, "got a folder, pipe, socket or device"),
+        (".jpg", lambda data: b"", "got an empty file"),
+        (".jpg", lambda data: b"<html>404</html>", "expected a JPEG or PNG, got a file that begins with b'<html>40'"),
+        (".jpg", lambda data: half(data) + bytes(len(data) - len(half(data))), "truncated file"),
+        (".jpg", without_tables, "got a JPEG that cannot be decoded"),
+        (".png", one_byte_off, "got a PNG that cannot be decoded"),
+    ],
+    ids=["missing", "folder", "pipe", "empty", "HTML", "zeros", "no tables", "one byte"],
+)
 @pytest.mark.timeout(20)
-def test_a_pipe_is_no_image_and_is_not_waited_for(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "front.jpg")
-    with pytest.raises(DataError, match=r"camera 'front': .* got a folder, pipe, socket or device"):
-        decode_images([tmp_path / "front.jpg"])
-
-
-def test_empty_file(tmp_path: Path) -> None:
-    (tmp_path / "a.jpg").touch()
-    with pytest.raises(DataError, match="got an empty file"):
-        decode_images([tmp_path / "a.jpg"])
+def test_bad_files(tmp_path: Path, suffix: str, damage: Callable[[Any], Any] | None, message: str) -> None:
+    """A pipe is not waited for."""
+    file = tmp_path / f"left{suffix}"
+    if damage in (Path.mkdir, os.mkfifo):
+        damage(file)
+    elif damage is not None:
+        file.write_bytes(damage(write(file, ramp(90, 160)).read_bytes()))
+    with pytest.raises(DataError, match=rf"camera 'left': image .*left\{suffix}: .*{re.escape(message)}"):
+        decode_images([file], names=["left"])
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
@@ -183,13 +201,6 @@ def test_truncated_real_jpeg_which_opencv_would_fill_with_grey(nuscenes_root: Pa
         decode_images([file])
 
 
-def test_a_file_whose_rest_is_zeros_is_truncated(jpeg: Path) -> None:
-    data = jpeg.read_bytes()
-    jpeg.write_bytes(data[: len(data) // 2] + bytes(len(data) - len(data) // 2))
-    with pytest.raises(DataError, match="truncated file"):
-        decode_images([jpeg])
-
-
 def test_bytes_after_the_end_and_fill_bytes_are_no_fault(jpeg: Path) -> None:
     expected = decode_images([jpeg])
     data = jpeg.read_bytes()
@@ -208,28 +219,6 @@ def test_a_thumbnail_in_the_header_does_not_hide_a_truncation(jpeg: Path) -> Non
     jpeg.write_bytes(whole[:-20])
     with pytest.raises(DataError, match="truncated file"):
         decode_images([jpeg])
-
-
-def test_undecodable_files_with_sound_ends(jpeg: Path, tmp_path: Path) -> None:
-    """OpenCV hands such a JPEG's given array back untouched, as if it had worked."""
-    data = bytearray(jpeg.read_bytes())
-    table = data.find(b"\xff\xc4")
-    data[table + 5 : table + 21] = b"\xff" * 16
-    jpeg.write_bytes(data)
-    with pytest.raises(DataError, match="got a JPEG that cannot be decoded"):
-        decode_images([jpeg])
-    png = write(tmp_path / "a.png", ramp(90, 160))
-    data = bytearray(png.read_bytes())
-    data[len(data) // 2] ^= 255
-    png.write_bytes(data)
-    with pytest.raises(DataError, match="got a PNG that cannot be decoded"):
-        decode_images([png])
-
-
-def test_another_format(tmp_path: Path) -> None:
-    (tmp_path / "a.jpg").write_text("<html>404</html>")
-    with pytest.raises(DataError, match="expected a JPEG or PNG, got a file that begins with b'<html>40'"):
-        decode_images([tmp_path / "a.jpg"])
 
 
 def test_size_that_is_not_the_calibrations(jpeg: Path) -> None:

@@ -42,11 +42,7 @@ def tables() -> Tables:
         ],
         "category": [{"token": "c0", "name": "vehicle.car"}],
         "instance": [{"token": "i0", "category_token": "c0"}],
-        "calibrated_sensor": [],
-        "sample": [],
-        "sample_data": [],
-        "ego_pose": [],
-        "sample_annotation": [],
+        **{name: [] for name in ("calibrated_sensor", "sample", "sample_data", "ego_pose", "sample_annotation")},
     }
     K = [[40.0, 0, 31.5], [0, 40.0, 23.5], [0, 0, 1]]
     for sensor, x, rotation in (
@@ -55,15 +51,8 @@ def tables() -> Tables:
         ("lidar", 1.0, UNTURNED),
         ("radar", 3.0, UNTURNED),
     ):
-        data["calibrated_sensor"].append(
-            {
-                "token": f"cs-{sensor}",
-                "sensor_token": sensor,
-                "translation": [x, 0, 1.6],
-                "rotation": rotation,
-                "camera_intrinsic": K if sensor in ("front", "rear") else [],
-            }
-        )
+        row = {"token": f"cs-{sensor}", "sensor_token": sensor, "translation": [x, 0, 1.6], "rotation": rotation}
+        data["calibrated_sensor"].append(row | {"camera_intrinsic": K if sensor in ("front", "rear") else []})
     for k in range(2):
         data["sample"].append({"token": f"t{k}", "scene_token": f"s{k}", "timestamp": k})
         for sensor in ("front", "rear", "lidar", "radar"):
@@ -78,16 +67,8 @@ def tables() -> Tables:
         sweep = dict(data["sample_data"][-1], token=f"sweep-{k}", is_key_frame=False, ego_pose_token="dropped")
         data["sample_data"].append(sweep)
         # 10 m ahead and 2 m to the right of the ego, turned left by 90 degrees in the world: heading as the ego.
-        data["sample_annotation"].append(
-            {
-                "token": f"a{k}",
-                "sample_token": f"t{k}",
-                "instance_token": "i0",
-                "translation": [102, 60, 0.8],
-                "size": [1.9, 4.5, 1.6],
-                "rotation": LEFT_90,
-            }
-        )
+        row = {"token": f"a{k}", "sample_token": f"t{k}", "instance_token": "i0", "translation": [102, 60, 0.8]}
+        data["sample_annotation"].append(row | {"size": [1.9, 4.5, 1.6], "rotation": LEFT_90})
     return data
 
 
@@ -257,22 +238,21 @@ def test_broken_tables(tmp_path: Path, change: Change, message: str) -> None:
         NuScenesDataset(tmp_path)
 
 
-def test_wrong_arguments(tmp_path: Path) -> None:
-    write(tmp_path)
-    with pytest.raises(DataError, match=r"expected a folder of tables 'v1\.0-trainval', found none.*: v1\.0-mini"):
-        NuScenesDataset(tmp_path, "v1.0-trainval")
-    with pytest.raises(DataError, match="expected either root or nusc, got both or none"):
-        NuScenesDataset()
-    with pytest.raises(SampleTypeError, match="nusc: expected a devkit NuScenes object, got int without dataroot"):
-        NuScenesDataset(nusc=3)
-    with pytest.raises(DataError, match="channels: expected some of CAM_BACK, CAM_FRONT, got 'CAM_TOP'"):
-        NuScenesDataset(tmp_path, channels=["CAM_FRONT", "CAM_TOP"])
-    with pytest.raises(DataError, match="table scene: expected the scenes scene-9, got 2 others"):
-        NuScenesDataset(tmp_path, split_scenes=["scene-1", "scene-9"])
-    with pytest.raises(DataError, match="split_scenes: expected a collection of scene names"):
-        NuScenesDataset(tmp_path, split_scenes="scene-1")
-    with pytest.raises(ValueError, match="reduce: expected 1, 2 or 4"):
-        NuScenesDataset(tmp_path, reduce=3)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"version": "v1.0-x"}, DataError, r"expected a folder of tables 'v1\.0-x', found none.*: v1\.0-mini"),
+        ({"root": None}, DataError, "expected either root or nusc, got both or none"),
+        ({"root": None, "nusc": 3}, SampleTypeError, "nusc: expected a devkit NuScenes object, got int without dataro"),
+        ({"channels": ["CAM_FRONT", "CAM_TOP"]}, DataError, "expected some of CAM_BACK, CAM_FRONT, got 'CAM_TOP'"),
+        ({"split_scenes": ["scene-1", "scene-9"]}, DataError, "table scene: expected the scenes scene-9, got 2 others"),
+        ({"split_scenes": "scene-1"}, DataError, "split_scenes: expected a collection of scene names"),
+        ({"reduce": 3}, ValueError, "reduce: expected 1, 2 or 4"),
+    ],
+)
+def test_wrong_arguments(tmp_path: Path, arguments: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        NuScenesDataset(**{"root": write(tmp_path)} | arguments)
 
 
 def test_a_token_that_is_not_there(tmp_path: Path) -> None:

@@ -132,6 +132,12 @@ def test_a_rig_on_another_ground_height_sees_the_same_pixels():
     torch.testing.assert_close(low["points"][:, 2] + 0.7, high["points"][:, 2])
 
 
+def in_box(box: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points (n, 3) along a box's own axes, from its centre."""
+    c, s = np.cos(box[6]), np.sin(box[6])
+    return (points - box[:3]) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
 @pytest.mark.slow
 def test_instances_fill_their_boxes():
     """Surface points of every well visible object lie in its box and reach the sides that face the camera."""
@@ -146,12 +152,7 @@ def test_instances_fill_their_boxes():
             for row in np.unique(instances[instances >= 0]):
                 at = instances.numpy() == row
                 points = camera.center_m + rays[at] * scale[at][:, None]
-                c, s = np.cos(boxes[row, 6]), np.sin(boxes[row, 6])
-                offset = points - boxes[row, :3]
-                local = np.stack(
-                    [c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]], 1
-                )
-                assert (np.abs(local) <= boxes[row, 3:6] / 2 + 0.01).all()
+                assert (np.abs(in_box(boxes[row], points)) <= boxes[row, 3:6] / 2 + 0.01).all()
                 checked += 1
     assert checked > 40
 
@@ -191,7 +192,7 @@ def test_isolated_vehicles_outlines_agree_with_their_boxes():
 
 @pytest.mark.parametrize("cls", list(BoxClass))
 def test_every_object_touches_the_six_sides_of_its_box(cls):
-    found = 0
+    checked = 0
     for index in range(12):
         scene = make_scene(9, index, two_wheelers=True)
         for row in np.flatnonzero(scene.box_classes == cls)[:6]:
@@ -213,8 +214,8 @@ def test_every_object_touches_the_six_sides_of_its_box(cls):
                 reach = np.stack([np.minimum(reach[:, 0], low), np.maximum(reach[:, 1], high)], 1)
             np.testing.assert_allclose(reach[:, 1], box[3:6] / 2, atol=0.012)
             np.testing.assert_allclose(reach[:, 0], -box[3:6] / 2, atol=0.012)
-            found += 1
-    assert found > 2
+            checked += 1
+    assert checked > 2
 
 
 def test_two_wheelers_join_the_same_street():
@@ -285,10 +286,7 @@ def test_boxes_are_where_the_lidar_sees_objects():
     sample = drive[0]
     points, inside = sample["points"][:, :3].numpy(), 0
     for box in sample["boxes_3d"].numpy():
-        c, s = np.cos(box[6]), np.sin(box[6])
-        offset = points - box[:3]
-        local = np.stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0], offset[:, 2]], 1)
-        inside += (np.abs(local) < box[3:6] / 2 + 0.08).all(1).sum() > 5
+        inside += (np.abs(in_box(box, points)) < box[3:6] / 2 + 0.08).all(1).sum() > 5
     assert inside >= 5
 
 

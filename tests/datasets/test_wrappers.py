@@ -71,19 +71,23 @@ def test_iterable_in_a_data_loader(workers: int) -> None:
         assert sorted(int(sample["images"]) for sample in loader) == [10, 11, 12, 13, 14, 15]
 
 
-def test_wrong_types() -> None:
-    with pytest.raises(SampleTypeError, match="expected a map-style dataset, got Stream; use RetargetedIterable"):
-        RetargetedDataset(Stream(), add_ten)
-    with pytest.raises(SampleTypeError, match="expected a map-style dataset, got function; pass the dataset first"):
-        RetargetedDataset(add_ten, Numbers())  # type: ignore[arg-type]
-    with pytest.raises(SampleTypeError, match="expected an iterable dataset, got Numbers; use RetargetedDataset"):
-        RetargetedIterable(Numbers(), add_ten)
-    with pytest.raises(SampleTypeError, match="iterated again, got list_iterator, which ends after one epoch"):
-        RetargetedIterable(iter([1]), add_ten)
-    with pytest.raises(SampleTypeError, match="expected a callable such as RigRetarget, got str"):
-        RetargetedDataset(Numbers(), "waymo")  # type: ignore[arg-type]
-    with pytest.raises(SampleTypeError, match="with __len__, got Unsized"):
-        RetargetedDataset(type("Unsized", (), {"__getitem__": lambda self, k: k})(), add_ten)
+UNSIZED = type("Unsized", (), {"__getitem__": lambda self, k: k})()
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "dataset", "transform", "message"),
+    [
+        (RetargetedDataset, Stream(), add_ten, "expected a map-style dataset, got Stream; use RetargetedIterable"),
+        (RetargetedDataset, add_ten, Numbers(), "expected a map-style dataset, got function; pass the dataset first"),
+        (RetargetedDataset, Numbers(), "waymo", "expected a callable such as RigRetarget, got str"),
+        (RetargetedDataset, UNSIZED, add_ten, "with __len__, got Unsized"),
+        (RetargetedIterable, Numbers(), add_ten, "expected an iterable dataset, got Numbers; use RetargetedDataset"),
+        (RetargetedIterable, iter([1]), add_ten, "iterated again, got list_iterator, which ends after one epoch"),
+    ],
+)
+def test_wrong_types(wrapper: Any, dataset: Any, transform: Any, message: str) -> None:
+    with pytest.raises(SampleTypeError, match=message):
+        wrapper(dataset, transform)
 
 
 # --- mixing -----------------------------------------------------------------------------------------------------------
@@ -126,8 +130,8 @@ def test_mixed_in_a_data_loader(workers: int, batch: dict[str, Any]) -> None:
     def epochs() -> list[list[dict[str, Any]]]:
         torch.manual_seed(3)
         loader = DataLoader(dataset, shuffle=True, num_workers=workers, **batch)
-        found = [list(loader) for _ in range(2)]
-        return found if "collate_fn" not in batch else [[s for part in epoch for s in part] for epoch in found]
+        batches = [list(loader) for _ in range(2)]
+        return batches if "collate_fn" not in batch else [[s for part in epoch for s in part] for epoch in batches]
 
     one, again = epochs(), epochs()
     forms = []

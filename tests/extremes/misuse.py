@@ -72,7 +72,7 @@ def rig(names: tuple[str, ...] = ("left", "right"), spread_deg: float = 40.0) ->
     return Rig(cameras, name="fuzz")
 
 
-def made(makers: tuple[Callable[[], Any], ...]) -> st.SearchStrategy[Any]:
+def fresh(makers: tuple[Callable[[], Any], ...]) -> st.SearchStrategy[Any]:
     """One of the values, made anew."""
     return st.sampled_from(makers).map(lambda make: make())
 
@@ -81,7 +81,7 @@ def made(makers: tuple[Callable[[], Any], ...]) -> st.SearchStrategy[Any]:
 def changes(draw: st.DrawFn, part: Any) -> Any:
     """A tensor of another shape, type or kind, or with a number that is wrong; junk in place of anything else."""
     if not isinstance(part, torch.Tensor) or part.device.type != "cpu" or part.layout != torch.strided:
-        return draw(made(JUNK))
+        return draw(fresh(JUNK))
     if "float8" in str(part.dtype) or not part.numel() or draw(st.integers(0, 2)):
         return draw(st.sampled_from(TENSOR_CHANGES))(part)
     changed = part.clone().double()
@@ -127,7 +127,7 @@ def wrong_samples(draw: st.DrawFn) -> dict[str, Any]:
     """A sample with one or two things wrong."""
     sample: dict[str, Any] = draw(samples())
     for _ in range(draw(st.sampled_from([1, 1, 2]))):
-        sample = draw(mutated(sample, made(JUNK), changes))
+        sample = draw(mutated(sample, fresh(JUNK), changes))
     return sample
 
 
@@ -185,7 +185,7 @@ SETTING_JUNK: tuple[Callable[[], Any], ...] = (
 
 def wrong_settings(keys: Container[str]) -> st.SearchStrategy[dict[str, Any]]:
     """Settings of a ``RigRetarget`` with one of them wrong."""
-    wrong = st.tuples(st.sampled_from(SETTING_NAMES), made((*JUNK, *SETTING_JUNK)))
+    wrong = st.tuples(st.sampled_from(SETTING_NAMES), fresh((*JUNK, *SETTING_JUNK)))
     return st.tuples(settings(keys), wrong).map(lambda drawn: {**drawn[0], drawn[1][0]: drawn[1][1]})
 
 

@@ -24,7 +24,7 @@ def images(kind: str) -> torch.Tensor:
     rng = np.random.default_rng(0)
     shape = (len(RIG), 3, 90, 160)
     tile = rng.integers(0, 256, (1, 3, 10, 10))
-    made = {
+    pixels = {
         "blank": np.zeros(shape),
         "grey": np.full(shape, 128),
         "saturated": np.full(shape, 255),
@@ -35,7 +35,7 @@ def images(kind: str) -> torch.Tensor:
         "coarse checkerboard": np.broadcast_to(64 + 128 * (np.indices((90, 160)) // 10).sum(0) % 2, shape),
         "gradient": np.broadcast_to(np.linspace(40, 200, 160), shape),
     }[kind]
-    return torch.from_numpy(made.astype(np.uint8))
+    return torch.from_numpy(pixels.astype(np.uint8))
 
 
 def sample(kind: str) -> dict[str, torch.Tensor | Rig]:
@@ -126,12 +126,12 @@ def test_a_constant_gradient_says_where_it_was_read(move: str, quality: Any, exe
     retarget = RigRetarget(Rig([target]), quality=quality, geometry=surface, backend=execution)
     out = retarget({"images": coordinates(source)[None], "rig": Rig([source])})
     pixel = 160 // target.width_px if quality != "paper" else 1
-    found = reference.seen(source, target, "street" if move == "moved" else "infinity", 0.0)
+    truth = reference.seen(source, target, "street" if move == "moved" else "infinity", 0.0)
     (h, w), half = source.size, (pixel - 1) / 2
-    inner = out["coverage"][0].numpy() & ((found.uv >= half) & (found.uv <= np.array([w - 1, h - 1]) - half)).all(-1)
+    inner = out["coverage"][0].numpy() & ((truth.uv >= half) & (truth.uv <= np.array([w - 1, h - 1]) - half)).all(-1)
     assert inner.mean() > 0.4
     read = out["images"][0, :2].numpy().transpose(1, 2, 0) / RAMP
-    error_px = np.abs(read - found.uv)[inner].max() / pixel
+    error_px = np.abs(read - truth.uv)[inner].max() / pixel
     nearest = quality == "draft"
     worst(f"px, a constant gradient {'at the nearest pixel' if nearest else 'interpolated'}", error_px)
     assert error_px <= (0.5 if nearest else 0) + 1 / 32 + 1e-3

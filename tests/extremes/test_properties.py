@@ -22,7 +22,7 @@ from arbiview_aug.scene.surface import WALL_CENTER_M
 from tests import helpers
 from tests.extremes import drawn, reference
 from tests.extremes.conftest import Worst
-from tests.helpers import examples, in_source
+from tests.helpers import examples, in_source, noise
 
 # No vehicle is so short: their shape is the box.
 BOXES = np.array([[12.03, 1.0, 0.807, 2.5, 1.9, 1.613, 0.3], [-8.0, -3.0, 1.01, 2.9, 2.0, 2.02, 1.5]])
@@ -36,11 +36,6 @@ def scene_of(surface: str, boxes: np.ndarray = BOXES) -> Scene:
     return Scene(boxes=boxes) if surface == "boxes" else Scene()
 
 
-def noise(rig: Rig) -> list[torch.Tensor]:
-    generator = torch.Generator().manual_seed(0)
-    return [torch.rand(3, *camera.size, generator=generator) for camera in rig]
-
-
 def rendered(plan: RenderPlan, images: list[torch.Tensor], execution: str) -> list[np.ndarray]:
     if execution == "opencv":
         return [view.numpy() for view in render_opencv(plan, images)]
@@ -48,26 +43,26 @@ def rendered(plan: RenderPlan, images: list[torch.Tensor], execution: str) -> li
 
 
 # --- what a source truly sees -----------------------------------------------------------------------------------------
-def may_see(source: Camera, found: reference.Seen, boxes: np.ndarray | None, level: int) -> np.ndarray:
+def may_see(source: Camera, seen: reference.Seen, boxes: np.ndarray | None, level: int) -> np.ndarray:
     """Whether a source sees a target's pixels (h, w), doubtful borders included: coverage may not exceed it."""
     tolerance = (MAP_TOLERANCE_PX + ROUNDING_PX) * 2**level
-    u, v = np.moveaxis(np.where(found.valid[..., None], found.uv, -9.0), -1, 0)
+    u, v = np.moveaxis(np.where(seen.valid[..., None], seen.uv, -9.0), -1, 0)
     h, w = source.size
-    inside = found.valid & (np.minimum(u, v) >= -tolerance) & (u <= w - 1 + tolerance) & (v <= h - 1 + tolerance)
+    inside = seen.valid & (np.minimum(u, v) >= -tolerance) & (u <= w - 1 + tolerance) & (v <= h - 1 + tolerance)
     if source.mask is not None:
         x, y = np.floor(u + 0.5).astype(int).clip(0, w - 1), np.floor(v + 0.5).astype(int).clip(0, h - 1)
         inside &= source.mask[y, x]  # the tap of the largest weight
     if boxes is not None:
         at = np.nonzero(inside)
-        pixel_m = 2**level * np.linalg.norm(found.point_m[at] - source.center_m, axis=-1) / source.K[0, 0]
-        inside[at] &= ~reference.hidden(source, found.point_m[at], boxes, 0.5 * float(pixel_m.max(initial=0)))
-    return inside | found.unsure
+        pixel_m = 2**level * np.linalg.norm(seen.point_m[at] - source.center_m, axis=-1) / source.K[0, 0]
+        inside[at] &= ~reference.hidden(source, seen.point_m[at], boxes, 0.5 * float(pixel_m.max(initial=0)))
+    return inside | seen.unsure
 
 
-def must_see(source: Camera, found: reference.Seen, level: int) -> np.ndarray:
+def must_see(source: Camera, seen: reference.Seen, level: int) -> np.ndarray:
     """Whether a source sees them beyond doubt, over a surface without boxes: coverage may not fall short of it."""
     margin = 2**level  # halving leaves out the last row or column of an odd size
-    u, v = np.moveaxis(np.where(found.valid[..., None], found.uv, -9.0), -1, 0)
+    u, v = np.moveaxis(np.where(seen.valid[..., None], seen.uv, -9.0), -1, 0)
     return (np.minimum(u, v) >= margin) & (u <= source.width_px - 1 - margin) & (v <= source.height_px - 1 - margin)
 
 
@@ -98,18 +93,18 @@ def test_only_what_a_source_truly_sees(
         for k, recorded in enumerate(source):
             name = "infinity" if np.linalg.norm(camera.center_m - recorded.center_m) < 1e-6 else surface
             boxes = BOXES if name == "boxes" else None
-            found = reference.seen(recorded, camera, name, source.ground_z_m, boxes)
-            sees = may_see(recorded, found, boxes, levels.get(k, 0))
+            seen = reference.seen(recorded, camera, name, source.ground_z_m, boxes)
+            sees = may_see(recorded, seen, boxes, levels.get(k, 0))
             low = np.where(sees, np.minimum(low, shades[k]), low)
             high = np.where(sees, np.maximum(high, shades[k]), high)
             if recorded.mask is None and name != "boxes":
-                assert view.coverage[must_see(recorded, found, levels.get(k, 3))].all(), f"{recorded.name} sees more"
+                assert view.coverage[must_see(recorded, seen, levels.get(k, 3))].all(), f"{recorded.name} sees more"
             won = view.source_camera == k
             if not won.any():
                 continue
             assert sees[won].all(), f"{recorded.name} is read where it does not see"
-            sure = won & ~found.unsure
-            at = reference.atlas_position(plan.layout.slot(k, levels[k]), found.uv[sure])
+            sure = won & ~seen.unsure
+            at = reference.atlas_position(plan.layout.slot(k, levels[k]), seen.uv[sure])
             error_px = np.abs(view.at.to_float()[sure] - at).max(initial=0)
             worst("px, a position against float64, any rigs", error_px)
             assert error_px <= MAP_TOLERANCE_PX + ROUNDING_PX
@@ -125,6 +120,7 @@ def test_unproject_is_the_inverse_of_project(worst: Worst, camera: Camera, seed:
     rng = np.random.default_rng(seed)
     grid = camera.pixel_grid()
     rays = camera.unproject(grid)
+    assert rays.valid[camera.height_px // 2, camera.width_px // 2]
     again = camera.project(camera.center_m + rays.directions * rng.uniform(0.1, 1e4, (*camera.size, 1)))
     assert again.valid[rays.valid].all()
     error_px = np.abs(again.uv - grid)[rays.valid].max(initial=0)

@@ -16,7 +16,7 @@ from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.scene import Scene
 from tests.extremes.conftest import Worst
 from tests.extremes.test_geometry import camera, check, no_numpy_warnings, ring
-from tests.helpers import sampled
+from tests.helpers import noise, sampled
 
 
 def shades(count: int) -> list[int]:
@@ -93,8 +93,7 @@ def test_images_of_a_row_or_a_pixel(which: str, size: tuple[int, int], how: tupl
     (h, w), (quality, execution) = size, how
     tiny, usual = ring(2, height_px=h, width_px=w), ring(2)
     source, target = (tiny, usual) if which == "source" else (usual, tiny)
-    generator = torch.Generator().manual_seed(0)
-    images = [0.25 + 0.5 * torch.rand(3, *c.size, generator=generator) for c in source]
+    images = [0.25 + 0.5 * image for image in noise(source)]
     surface = "auto" if quality == "paper" else "street"
     for rig in (target, source):
         retarget = RigRetarget(rig, quality=quality, geometry=surface, backend=execution)

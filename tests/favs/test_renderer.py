@@ -158,22 +158,6 @@ def test_deterministic_and_independent_of_the_source_order(pair_images) -> None:
     assert np.array_equal(np.where(one.coverage, 1 - one.source_camera, -1), turned.source_camera)
 
 
-@pytest.mark.parametrize("kind", ["blank", "saturated", "tiles", "night"])
-def test_degenerate_images_keep_the_geometry_with_a_reason(kind: str) -> None:
-    rng = np.random.default_rng(0)
-    image = {
-        "blank": np.zeros((3, 240, 400)),
-        "saturated": np.full((3, 240, 400), 255),
-        "tiles": np.tile(rng.integers(0, 255, (3, 20, 20)), (1, 12, 20)),
-        "night": rng.poisson(1.0, (3, 240, 400)),
-    }[kind]
-    images = [torch.from_numpy(image.astype(np.uint8))] * 2
-    view = render_paper(PAIR, MIDDLE, images).targets[0]
-    assert all(r.features.reason and r.objects.reason for r in view.reports)
-    if kind != "tiles":
-        assert all(r.features.case == "geometric" for r in view.reports)
-
-
 def test_float_images_and_sources_that_see_nothing(pair_images) -> None:
     whole = render_paper(PAIR, MIDDLE, pair_images).targets[0].image
     for dtype in (torch.float32, torch.float16, torch.float64):

@@ -100,9 +100,9 @@ def test_matches_recover_a_known_homography() -> None:
     image = texture()
     matches = match_features(image, moved(image, M), FULL, 0.75)
     assert len(matches.warped) > 100
-    found = estimate_homography(matches, 2.0)
-    assert found is not None and found[1].mean() > 0.9
-    assert consistency(M, found[0], EVERYWHERE.corners) < 0.5
+    estimate = estimate_homography(matches, 2.0)
+    assert estimate is not None and estimate[1].mean() > 0.9
+    assert consistency(M, estimate[0], EVERYWHERE.corners) < 0.5
 
 
 def test_matching_is_deterministic_and_stays_inside() -> None:

@@ -90,15 +90,15 @@ def test_geometric_types() -> None:
 def test_clusters_are_objects() -> None:
     near, far = cluster_at(200, 300), cluster_at(600, 100, count=16)
     noise = np.array([[400.0, 10.0], [30.0, 30.0]])
-    found = objects_of(np.concatenate([near, noise, far]), (5, -2))
-    assert [o.points for o in found] == [9, 16]
-    assert [o.type for o in found] == ["ground", "far"]
-    assert np.allclose(found[0].center_target, (200, 300)) and np.allclose(found[0].center_source, (195, 302))
-    assert found[0].bbox == (190, 290, 210, 310)
-    assert found[0].confidence == 1.0
+    objects = objects_of(np.concatenate([near, noise, far]), (5, -2))
+    assert [o.points for o in objects] == [9, 16]
+    assert [o.type for o in objects] == ["ground", "far"]
+    assert np.allclose(objects[0].center_target, (200, 300)) and np.allclose(objects[0].center_source, (195, 302))
+    assert objects[0].bbox == (190, 290, 210, 310)
+    assert objects[0].confidence == 1.0
     # 9 points in a 20 px square count as in one of 30: ρ = 9, 9 / 13; w = 1 · 0.25 · 9 / 13.
-    assert found[0].weight(CONFIG) == pytest.approx(0.25 * 9 / 13)
-    report = align_objects(found, EYE, 800, CONFIG)
+    assert objects[0].weight(CONFIG) == pytest.approx(0.25 * 9 / 13)
+    report = align_objects(objects, EYE, 800, CONFIG)
     assert np.allclose(report.shift_px, (5, -2))
     assert np.allclose(report.H_aligned[:2, 2], (2.5, -1))
     assert report.reason == "2 objects (far, ground) shift it by 0.5 x (+5.0, -2.0) px"
@@ -116,8 +116,8 @@ def test_weights_decide_between_objects() -> None:
 def test_detections_give_types() -> None:
     reference = cluster_at(200, 300)
     boxes = [Detection((0, 0, 800, 400), "scene"), Detection((180, 280, 220, 320), "vehicle")]
-    (found,) = objects_of(reference, (0, 0), boxes)
-    assert found.type == "vehicle" and found.weight(CONFIG) == pytest.approx(9 / 13)
+    (vehicle,) = objects_of(reference, (0, 0), boxes)
+    assert vehicle.type == "vehicle" and vehicle.weight(CONFIG) == pytest.approx(9 / 13)
     (unknown,) = objects_of(reference, (0, 0), boxes[:1])
     assert unknown.weight(CONFIG) == pytest.approx(0.5 * 9 / 13)
 
@@ -141,9 +141,9 @@ def test_no_match_noise_one_cluster_and_identical_points() -> None:
 
 
 def test_long_shifts_and_worthless_types_decline() -> None:
-    found = objects_of(cluster_at(600, 100), (9, 9))
-    report = align_objects(found, EYE, 800, CONFIG)
+    objects = objects_of(cluster_at(600, 100), (9, 9))
+    report = align_objects(objects, EYE, 800, CONFIG)
     assert report.reason == "1 objects ask for 12.7 px, more than 12.0" and np.array_equal(report.H_aligned, EYE)
-    assert align_objects(found, EYE, 1600, CONFIG).shift_px.any()  # lengths scale with the target's width
+    assert align_objects(objects, EYE, 1600, CONFIG).shift_px.any()  # lengths scale with the target's width
     worthless = PaperConfig(type_weights=(("far", 0.0),))
-    assert align_objects(found, EYE, 800, worthless).reason == "1 clusters, none with a positive type weight"
+    assert align_objects(objects, EYE, 800, worthless).reason == "1 clusters, none with a positive type weight"

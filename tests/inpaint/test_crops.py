@@ -29,8 +29,8 @@ def holes(seed: int, shape: tuple[int, int], kind: str) -> np.ndarray:
 def test_every_hole_is_filled_once(size: int, shape: tuple[int, int]) -> None:
     views = [holes(k, shape, kind) for k, kind in enumerate(("specks", "none", "wedge", "boxes", "all"))]
     filled = [np.zeros(shape, int) for _ in views]
-    for found in windows(views, size):
-        for window in found:
+    for of_round in windows(views, size):
+        for window in of_round:
             h, w = window.fills.shape
             assert h <= size and w <= size and window.top >= 0 and window.left >= 0
             assert window.top + h <= shape[0] and window.left + w <= shape[1]
@@ -42,18 +42,18 @@ def test_every_hole_is_filled_once(size: int, shape: tuple[int, int]) -> None:
 def test_a_hole_has_context_and_a_whole_view_no_window() -> None:
     hole = np.zeros((100, 300), bool)
     hole[40:60, 100:140] = True
-    (found,) = windows([np.zeros_like(hole), hole], 256)
-    (window,) = found
+    (of_round,) = windows([np.zeros_like(hole), hole], 256)
+    (window,) = of_round
     assert window.view == 1 and window.top <= 40 - 12 and window.left <= 100 - 12
     assert window.fills.shape[0] >= 20 + 2 * 12 and window.fills.shape[1] >= 40 + 2 * 12
 
 
 def test_parts_of_one_hole_come_one_after_the_other() -> None:
     rounds = windows([np.ones((64, 300), bool), np.ones((64, 64), bool)], 64)
-    assert len(rounds) > 4 and [len(found) for found in rounds] == [2, *[1] * (len(rounds) - 1)]
+    assert len(rounds) > 4 and [len(of_round) for of_round in rounds] == [2, *[1] * (len(rounds) - 1)]
     filled = np.zeros((64, 300), bool)
-    for found in rounds:
-        window = next(one for one in found if one.view == 0)
+    for of_round in rounds:
+        window = next(one for one in of_round if one.view == 0)
         seen = window.of(filled)
         assert seen.any() or window is rounds[0][0], "each part sees the part before it"
         seen |= window.fills
@@ -62,8 +62,8 @@ def test_parts_of_one_hole_come_one_after_the_other() -> None:
 def test_a_bent_hole_is_cut_where_that_saves_pixels() -> None:
     frame = np.zeros((256, 704), bool)
     frame[:20], frame[:, :20] = True, True
-    found = [window for of_round in windows([frame], 704) for window in of_round]
-    assert len(found) == 2 and sum(window.fills.size for window in found) < 0.25 * frame.size
+    cut = [window for of_round in windows([frame], 704) for window in of_round]
+    assert len(cut) == 2 and sum(window.fills.size for window in cut) < 0.25 * frame.size
     whole = np.zeros((256, 704), bool)
     whole[100:200, 100:500] = True
     assert [len(of_round) for of_round in windows([whole], 704)] == [1]
@@ -72,9 +72,9 @@ def test_a_bent_hole_is_cut_where_that_saves_pixels() -> None:
 def test_small_windows_share_a_canvas_and_do_not_overlap() -> None:
     view = np.zeros((256, 704), bool)
     view[30:200:60, 30:600:120] = True
-    (found,) = windows([view], 256)
-    canvases = packed(found, 256, 8)
-    assert len(canvases) < len(found) / 4
+    (small,) = windows([view], 256)
+    canvases = packed(small, 256, 8)
+    assert len(canvases) < len(small) / 4
     for canvas in canvases:
         taken = np.zeros(canvas.size, int)
         assert not any(side % 8 or side > 256 for side in canvas.size)
@@ -94,9 +94,9 @@ def test_windows_of_all_sizes_are_drawn_whole() -> None:
     """Also where a narrow one is placed on the upper shelf after a wide one below."""
     view = np.random.default_rng(0).random((3, 256, 704), np.float32)
     hole = holes(0, (256, 704), "specks")
-    found = [Window(0, 0, 0, hole[:100, :200]), Window(0, 100, 0, hole[100:190, :250])]
-    found += [Window(0, 0, 300, hole[:80, 300:350]), Window(0, 150, 400, hole[150:200, 400:420])]
-    (canvas,) = packed(found, 256, 8)
+    cut = [Window(0, 0, 0, hole[:100, :200]), Window(0, 100, 0, hole[100:190, :250])]
+    cut += [Window(0, 0, 300, hole[:80, 300:350]), Window(0, 150, 400, hole[150:200, 400:420])]
+    (canvas,) = packed(cut, 256, 8)
     pixels, marks = drawn(canvas, [view], [hole])
     for window, top, left in canvas.windows:
         h, w = window.fills.shape

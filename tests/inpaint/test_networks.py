@@ -143,11 +143,11 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
         RigRetarget(target, holes="black", keys=SampleKeys(extra=("sources", "confidence")))(frame) for frame in frames
     ]
     filler = PipelineInpainter.from_pretrained(pipeline, size=128, steps=1)
-    given: list[tuple[int, ...]] = []
+    shapes: list[tuple[int, ...]] = []
     run = filler.run
 
     def watched(images: torch.Tensor, *others: Any) -> torch.Tensor:
-        given.append(tuple(images.shape))
+        shapes.append(tuple(images.shape))
         return run(images, *others)
 
     filler.run = watched  # type: ignore[method-assign]
@@ -167,14 +167,13 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
     (batch,) = CompletedLoader(loader, filler)
     for k, one in enumerate(seen):
         assert_completed({key: batch[key][k] for key in ("images", "coverage", "generated")}, one)
-    assert all(count <= filler.batch and max(h, w) <= filler.size for count, _, h, w in given)
+    assert all(count <= filler.batch and max(h, w) <= filler.size for count, _, h, w in shapes)
 
     write_frame(tmp_path / "data" / "frame", frames[0])
     target.save(tmp_path / "target.yaml")
     common = ["--data", str(tmp_path / "data"), "--target", str(tmp_path / "target.yaml"), "--images", "png"]
     ways = {
-        "seen": ["--holes", "black"],
-        "done": ["--holes", "diffusion", "--generator", str(pipeline), "--steps", "1"],
+        "seen": ["--holes", "black"], "done": ["--holes", "diffusion", "--generator", str(pipeline), "--steps", "1"],
     }
     for name, way in ways.items():
         assert (

@@ -107,9 +107,9 @@ def test_identity_is_certain(sample: dict, surface: str) -> None:
 def test_range_and_holes(sample: dict) -> None:
     for target in (sample["rig"].shifted(z_m=0.7), sample["rig"].turned(yaw_deg=20, pitch_deg=-10)):
         out = retargeted(sample, target)
-        seen, found = out["coverage"], out["confidence"]
-        assert not seen.all() and (found[~seen] == 0).all()
-        assert (found[seen] > 0).all() and (found <= 1).all()
+        seen, sure = out["coverage"], out["confidence"]
+        assert not seen.all() and (sure[~seen] == 0).all()
+        assert (sure[seen] > 0).all() and (sure <= 1).all()
 
 
 def test_more_change_is_less_confidence(sample: dict) -> None:
@@ -122,9 +122,9 @@ def test_more_change_is_less_confidence(sample: dict) -> None:
 
 def test_exact_sources_are_surer_than_displaced_ones(sample: dict) -> None:
     out = retargeted(sample, sample["rig"].turned(yaw_deg=20), keys=SampleKeys(extra=("confidence", "source_camera")))
-    own = out["source_camera"] == torch.arange(6)[:, None, None].to(torch.int8)
-    other = out["coverage"] & ~own
-    assert out["confidence"][own].mean() > 0.9 > 0.7 > out["confidence"][other].mean()
+    same_place = out["source_camera"] == torch.arange(6)[:, None, None].to(torch.int8)
+    other = out["coverage"] & ~same_place
+    assert out["confidence"][same_place].mean() > 0.9 > 0.7 > out["confidence"][other].mean()
 
 
 def test_both_executions_agree(sample: dict) -> None:
@@ -164,9 +164,9 @@ def test_lens_targets_and_sizes_of_their_own(sample: dict) -> None:
     small = Camera.looking(
         name="small", azimuth_deg=0, position_m=(1.7, 0.0, 1.5), width_px=40, height_px=24, horizontal_fov_deg=50
     )
-    found, seen = (retargeted(sample, Rig([fisheye, small]))[key] for key in ("confidence", "coverage"))
-    assert [tuple(part.shape) for part in found] == [(140, 180), (24, 40)]
-    for part, covered in zip(found, seen, strict=True):
+    parts, seen = (retargeted(sample, Rig([fisheye, small]))[key] for key in ("confidence", "coverage"))
+    assert [tuple(part.shape) for part in parts] == [(140, 180), (24, 40)]
+    for part, covered in zip(parts, seen, strict=True):
         assert torch.isfinite(part).all() and (part[~covered] == 0).all() and (part[covered] > 0).all()
 
 

@@ -87,38 +87,6 @@ def test_an_exposure_that_differs_is_recovered(street, camera: int, gain: float)
     assert back - lost >= 0.8 * (clean - lost)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("gain", "least", "mean"), [(0.7, 0.95, 0.98), (1.3, 0.6, 0.85)])
-def test_an_exposure_is_recovered_by_truth(gain: float, least: float, mean: float) -> None:
-    """Share of the lost PSNR that comes back, against true views turned by 20 degrees; each camera of three streets.
-
-    Over-exposed, the gains are as exact, and without the fade towards saturation at least 0.91 would come back; with
-    it 0.65 where the sky is bright but not white: what was clipped cannot be told from what was white.
-    """
-    rig = load_rig("nuscenes").undistorted().resized(SIZE)
-    target = rig.turned(yaw_deg=20)
-    plan = build_plan(rig, target, geometry="street")
-    covered = torch.from_numpy(np.stack(plan.coverage))[:, None].expand(-1, 3, -1, -1)
-    shares, errors = [], []
-    for seed in range(3):
-        drive = SyntheticDrive(rig, num_frames=1, seed=seed, lidar=False)
-        images, truth = list(drive[0]["images"]), drive.render(0, target).images.float()
-
-        def db(sources: list[torch.Tensor], gains: tuple[float, ...], truth: torch.Tensor = truth) -> float:
-            views = torch.stack(render_opencv(plan, sources, None, tone_curves([gains] * len(target))))
-            return float(-10 * torch.log10((views - truth)[covered].square().mean()))
-
-        none = (1.0,) * len(rig)
-        clean = db(images, none)
-        for camera in range(len(rig)):
-            spoiled = exposed(images, camera, gain)
-            gains, lost = estimate_gains(rig, spoiled).gains, db(spoiled, none)
-            shares.append((db(spoiled, gains) - lost) / (clean - lost))
-            errors.append(abs(gains[camera] * gain - 1))
-    print(f"x {gain}: {np.mean(shares):.3f} of the loss comes back, at least {min(shares):.3f}")
-    assert max(errors) < 0.04 and min(shares) >= least and np.mean(shares) >= mean
-
-
 def test_cameras_that_agree_stay_as_they_are(street) -> None:
     rig = load_rig("nuscenes").resized(SIZE)
     rig = rig.with_cameras([c.shifted(*(-c.center_m + (0, 0, 1.6))) for c in rig])  # one centre: no parallax
@@ -182,17 +150,13 @@ def test_blank_images(street, fill: int, reason: str) -> None:
     assert not report.accepted and reason in report.reason
 
 
-def test_night_and_noise_and_stripes(street) -> None:
+def test_stripes(street) -> None:
     rig, images = street
-    generator = torch.Generator().manual_seed(0)
-    night = [torch.randint(0, 20, image.shape, generator=generator, dtype=torch.uint8) for image in images]
-    noise = [torch.randint(0, 256, image.shape, generator=generator, dtype=torch.uint8) for image in images]
     stripes = [torch.zeros_like(image) for image in images]
     for image in stripes:
         image[..., ::8] = 200
-    for odd in (night, noise, stripes):
-        report = estimate_gains(rig, odd)
-        assert all(0.9 < gain < 1.1 for gain in report.gains) and report.reason
+    report = estimate_gains(rig, stripes)
+    assert all(0.9 < gain < 1.1 for gain in report.gains) and report.reason
 
 
 def test_order_of_cameras_and_repetition_change_nothing(street) -> None:
@@ -224,9 +188,9 @@ def test_pairs_are_compared_by_their_usable_pixels() -> None:
     for p, count in enumerate((80, 33, 2)):
         reads[:, p, :count] = rng.integers(0, 200, (2, count))
     pixels[reads[:, 2, :2]] = 0.001  # dark
-    found, errors = pair_ratios(pixels, reads, 0.2, 0.9), np.empty(3)
+    ratios, errors = pair_ratios(pixels, reads, 0.2, 0.9), np.empty(3)
     pair_errors(pixels, reads, errors)
-    for (number, middle, spread), error, (one, two) in zip(found, errors, reads.swapaxes(0, 1), strict=True):
+    for (number, middle, spread), error, (one, two) in zip(ratios, errors, reads.swapaxes(0, 1), strict=True):
         one, two = (pixels[side[side < 200]].astype(np.float64) for side in (one, two))
         assert error == pytest.approx(np.mean((one - two) ** 2), rel=1e-5)
         use = np.all([(side.mean(1) > 0.2) & (side.max(1) < 0.9) for side in (one, two)], 0)

@@ -96,7 +96,7 @@ def test_a_right_street_is_left_alone() -> None:
     assert "would not help" in str(depth)
 
 
-def noise(seed: int, low: int = 0, high: int = 255) -> torch.Tensor:
+def random_images(seed: int, low: int = 0, high: int = 255) -> torch.Tensor:
     return torch.randint(low, high + 1, (2, 3, *SIZE), dtype=torch.uint8, generator=torch.Generator().manual_seed(seed))
 
 
@@ -111,8 +111,8 @@ USELESS = {
     "blank": torch.full((2, 3, *SIZE), 90, dtype=torch.uint8),
     "black": torch.zeros((2, 3, *SIZE), dtype=torch.uint8),
     "saturated": torch.full((2, 3, *SIZE), 255, dtype=torch.uint8),
-    "night": noise(1, 0, 6),
-    "noise": noise(2),
+    "night": random_images(1, 0, 6),
+    "noise": random_images(2),
     "stripes": grating(20, 6),
     "narrow stripes": grating(9, 3),
     "shuffled": photographs(NEARER).flip(0),
@@ -157,7 +157,7 @@ def test_not_where_every_pixel_is_exact(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr("arbiview_aug.render.overlap_depth.overlap_depth", refuse)
     one = Rig([camera("left", 25, 0), camera("right", -25, 0)])
-    sample = {"images": noise(0)}
+    sample = {"images": random_images(0)}
     RigRetarget(one.turned(yaw_deg=5), source=one, quality="accurate")(sample)
     for surface in ("infinity", "ground"):
         RigRetarget(TARGET, source=RIG, quality="accurate", geometry=surface)(sample)  # type: ignore[arg-type]

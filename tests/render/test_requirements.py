@@ -20,7 +20,7 @@ from arbiview_aug.transforms.settings import render_config
 FAST = RenderConfig()
 
 
-def ring(size: tuple[int, int] = (90, 160)) -> Rig:
+def nuscenes(size: tuple[int, int] = (90, 160)) -> Rig:
     return load_rig("nuscenes").resized(size)
 
 
@@ -55,7 +55,7 @@ def same(one: RenderPlan, two: RenderPlan) -> bool:
 def test_no_pixel_changes_where_one_source_serves_alone(
     view: Callable[[Camera], Camera], config: RenderConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig = ring()
+    rig = nuscenes()
     target = rig.with_cameras([view(camera) for camera in rig])
     plan, whole = build_plan(rig, target, config=config), built_without(rig, target, config, monkeypatch)
     assert plan.counters["pairs_infinity"] == len(rig)
@@ -99,7 +99,7 @@ def test_a_source_that_serves_alone_covers_every_pixel(
     masked: bool,
     exact: bool,
 ) -> None:
-    source = ring(source_size)[0]
+    source = nuscenes(source_size)[0]
     if masked:
         mask = np.ones(source.size, bool)
         mask[-source.height_px // 8 :, source.width_px // 3 : -source.width_px // 3] = False
@@ -115,7 +115,7 @@ def test_a_source_that_serves_alone_covers_every_pixel(
 
 
 def test_what_does_not_serve_alone() -> None:
-    source = ring()[0]
+    source = nuscenes()[0]
     fish = load_rig("fisheye_surround")[0]
     hidden = np.ones(source.size, bool)
     hidden[40:50, 70:90] = False
@@ -129,15 +129,15 @@ def test_what_does_not_serve_alone() -> None:
         (source, source, RenderConfig(primary_bonus=1.0)),  # exactness counts for nothing
         (source, source, RenderConfig(distance_gamma=8.0)),  # at the border others weigh more
         (fish, fish, FAST),  # past its fold a lens sees nothing
-        (ring((91, 161))[0], ring((91, 161))[0].resize((45, 80)), FAST),  # halving drops the last row and column
+        (nuscenes((91, 161))[0], nuscenes((91, 161))[0].resize((45, 80)), FAST),  # halving drops a row and a column
     ):
         assert not covers_target_exactly(one, target, config)
-    assert covers_target_exactly(ring((92, 160))[0], ring((92, 160))[0].resize((46, 80)), FAST)
+    assert covers_target_exactly(nuscenes((92, 160))[0], nuscenes((92, 160))[0].resize((46, 80)), FAST)
 
 
 def test_two_sources_at_one_centre_share_the_view() -> None:
     """A telephoto camera beside a wide one that sees everything keeps the middle: it has the resolution."""
-    wide = ring()[0]
+    wide = nuscenes()[0]
     rig = Rig([wide, replace(zoomed(wide, 3.0), name="tele"), replace(wide.shifted(y_m=0.5), name="beside")])
     target = Rig([zoomed(wide, 1.5)])
     plan = build_plan(rig, target)
@@ -146,7 +146,7 @@ def test_two_sources_at_one_centre_share_the_view() -> None:
 
 
 def test_geometry_is_needed_where_a_pixel_can_move() -> None:
-    rig = ring()
+    rig = nuscenes()
     cut = rig.with_cameras([zoomed(camera, 1.3) for camera in rig])
     front_and_back = rig.with_cameras([rig[0], rig[3]])
     one_centre = rig.with_cameras([c.moved(moved_to_origin(c)) for c in rig])
@@ -176,13 +176,13 @@ def moved_to_origin(camera: Camera) -> np.ndarray:
 
 
 def test_baselines_align_the_roads() -> None:
-    rig = ring()
+    rig = nuscenes()
     lifted = Rig([c.shifted(z_m=-0.4) for c in rig], ground_z_m=-0.4)
     assert np.allclose(np.diag(baselines_m(rig, lifted)), 0, atol=1e-9)
 
 
 def test_a_static_surface_harms_where_cameras_move_and_pixels_depend_on_the_street() -> None:
-    rig = ring()
+    rig = nuscenes()
     for surface in ("infinity", "ground", "street"):
         assert "stand up to 0.60 m" in str(static_harm(rig, rig.shifted(z_m=0.6), surface, FAST))
         assert static_harm(rig, rig.shifted(z_m=0.9 * MOVED_M), surface, FAST) is None

@@ -37,12 +37,12 @@ def columns(order: list[int]) -> Callable[[Sample], Sample]:
 
 
 def yaws(change: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Sample], Sample]:
-    def made(sample: Sample) -> Sample:
+    def mistaken(sample: Sample) -> Sample:
         boxes = sample["boxes_3d"].clone()
         boxes[:, 6] = change(boxes[:, 6])
         return {**sample, "boxes_3d": boxes}
 
-    return made
+    return mistaken
 
 
 def at_the_bottom(sample: Sample) -> Sample:
@@ -58,13 +58,13 @@ def without(*keys: str) -> Callable[[Sample], Sample]:
 def lidar_frame(yaw_deg: float, forward_m: float = 0.94, up_m: float = 1.84) -> Callable[[Sample], Sample]:
     """Points in the frame of a LiDAR on the roof; its x axis looks to ``-yaw_deg``."""
 
-    def made(sample: Sample) -> Sample:
+    def mistaken(sample: Sample) -> Sample:
         points = sample["points"].clone()
         points[:, :3] -= torch.tensor([forward_m, 0, up_m])
         points[:, :3] = points[:, :3] @ torch.from_numpy(rotation_z(yaw_deg).T).to(points.dtype)
         return {**sample, "points": points}
 
-    return made
+    return mistaken
 
 
 def ground(shift_m: float) -> Callable[[Sample], Sample]:

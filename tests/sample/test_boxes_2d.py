@@ -12,15 +12,10 @@ from arbiview_aug import Camera, Rig, RigRetarget, SampleError, load_rig, projec
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.scene.boxes import draw_boxes
 from tests.helpers import camera
+from tests.sample.test_detections import FRONT, box
 
-# 90 degrees over 801 px: focal length 400.5 px, principal point (400, 200), looking along the ego's x axis.
-FRONT = camera(size=(401, 801), position_m=(0, 0, 1.0), horizontal_fov_deg=90)
 LENS = {"lens": "fisheye", "distortion": (-0.01, -0.005, 0.001, 0.0), "horizontal_fov_deg": 185}
 FISHEYE = camera("fisheye", 10, size=(400, 500), elevation_deg=-20, position_m=(0, 0, 1.0), **LENS)
-
-
-def box(x: float, y: float = 0.0, z: float = 1.0, yaw: float = 0.0, size=(2.0, 2.0, 2.0)) -> list[float]:
-    return [x, y, z, *size, yaw]
 
 
 def test_a_cube_by_hand() -> None:
@@ -99,5 +94,5 @@ def test_what_goes_on_where_a_lens_folds_back(beside_m: float) -> None:
     both = [int(k) for k in bent.rows if int(k) in plain.rows.tolist()]
     assert len(both) >= 2
     for k in both:
-        one, two = (found.truncation[found.rows.tolist().index(k)] for found in (bent, plain))
+        one, two = (view.truncation[view.rows.tolist().index(k)] for view in (bent, plain))
         assert abs(float(one - two)) < 0.12

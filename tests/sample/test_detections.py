@@ -21,7 +21,7 @@ RIG = Rig([FRONT, replace(FRONT.turned(yaw_deg=180), name="back")])
 IMAGES = torch.zeros(2, 3, 401, 801, dtype=torch.uint8)
 
 
-def found(sample: dict, lead: tuple[int, ...] = ()) -> list:
+def detected(sample: dict, lead: tuple[int, ...] = ()) -> list:
     frames: list[Frame] = read_frames({"images": IMAGES.expand(*lead, -1, -1, -1, -1), "rig": RIG}, None)
     return [read_detections(replace(frame, sample=sample)) for frame in frames]
 
@@ -33,32 +33,32 @@ def box(x: float, y: float = 0.0, z: float = 1.0, yaw: float = 0.0, size=(2.0, 2
 def test_boxes_are_projected_by_hand() -> None:
     """A cube of 2 m whose near face is 10 m ahead: half a side is f / 10 = 40.05 px around the middle."""
     f = FRONT.K[0, 0]
-    (frame,) = found({"boxes_3d": torch.tensor([box(11.0)]), "box_names": ["vehicle.car"]})
+    (frame,) = detected({"boxes_3d": torch.tensor([box(11.0)]), "box_names": ["vehicle.car"]})
     (seen,) = frame[0]
     assert seen.type == "vehicle.car" and frame[1] == []
     assert np.allclose(seen.box, (400 - f / 10, 200 - f / 10, 400 + f / 10, 200 + f / 10))
     # Turned by 45 degrees its corner points at the camera: half a diagonal to both sides at 11 m.
-    (turned,) = found({"boxes_3d": torch.tensor([box(11.0, yaw=np.pi / 4)])})[0][0]
+    (turned,) = detected({"boxes_3d": torch.tensor([box(11.0, yaw=np.pi / 4)])})[0][0]
     half = f * np.sqrt(2) / 11
     assert turned.type == UNNAMED_TYPE
     assert np.allclose((turned.box[0], turned.box[2]), (400 - half, 400 + half))
     # Beside the vehicle, reaching behind it: both cameras see its part, cut at their borders.
-    (frame,) = found({"boxes_3d": torch.tensor([box(0.0, y=3.0, size=(20.0, 2.0, 2.0))])})
+    (frame,) = detected({"boxes_3d": torch.tensor([box(0.0, y=3.0, size=(20.0, 2.0, 2.0))])})
     assert frame[0][0].box[0] == 0 and frame[1][0].box[2] == 800
-    assert found({"boxes_3d": torch.tensor([box(11.0, y=60.0)])})[0] == {0: [], 1: []}
-    assert found({"boxes_3d": torch.zeros(0, 7)})[0] == {0: [], 1: []} and found({}) == [{}]
+    assert detected({"boxes_3d": torch.tensor([box(11.0, y=60.0)])})[0] == {0: [], 1: []}
+    assert detected({"boxes_3d": torch.zeros(0, 7)})[0] == {0: [], 1: []} and detected({}) == [{}]
 
 
 def test_detections_win_over_boxes_and_batches_have_an_entry_a_frame() -> None:
     detections = [{"boxes": torch.tensor([[1.0, 2, 30, 40]]), "labels": ["pedestrian"]}, {"boxes": [], "labels": []}]
     sample = {"detections": detections, "boxes_3d": torch.tensor([box(11.0)])}
-    (frame,) = found(sample)
+    (frame,) = detected(sample)
     assert frame[0][0].box == (1, 2, 30, 40) and frame[0][0].type == "pedestrian" and frame[1] == []
-    assert found({"detections": [detections, detections]}, (2,)) == [frame, frame]
+    assert detected({"detections": [detections, detections]}, (2,)) == [frame, frame]
     boxes = {"boxes_3d": torch.tensor([[box(11.0)], [box(21.0)]]), "box_names": [["bus"], ["tram"]]}
-    assert [f[0][0].type for f in found(boxes, (2,))] == ["bus", "tram"]
+    assert [f[0][0].type for f in detected(boxes, (2,))] == ["bus", "tram"]
     del boxes["box_names"]
-    assert [f[0][0].type for f in found(boxes, (2,))] == [UNNAMED_TYPE] * 2
+    assert [f[0][0].type for f in detected(boxes, (2,))] == [UNNAMED_TYPE] * 2
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_detections_win_over_boxes_and_batches_have_an_entry_a_frame() -> None:
 )
 def test_messages(sample: dict, message: str) -> None:
     with pytest.raises((SampleError, TypeError), match=message):
-        found(sample)
+        detected(sample)
 
 
 def test_names_in_parts_have_the_weight_of_a_part() -> None:
@@ -88,8 +88,7 @@ def test_names_in_parts_have_the_weight_of_a_part() -> None:
 @pytest.mark.slow
 def test_labels_of_a_real_frame_reach_stage_3(nuscenes_root) -> None:
     labelled, small = (
-        NuScenesDataset(nuscenes_root, "v1.0-mini", load_points=False)[0],
-        FrameFolder(nuscenes_root, reduce=2)[0],
+        NuScenesDataset(nuscenes_root, "v1.0-mini", load_points=False)[0], FrameFolder(nuscenes_root, reduce=2)[0],
     )
     sample = {key: small[key] for key in ("images", "rig")} | {k: labelled[k] for k in ("boxes_3d", "box_names")}
     rendering = RigRetarget(sample["rig"].turned(yaw_deg=-22), quality="paper").explain(sample).rendering

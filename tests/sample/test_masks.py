@@ -42,11 +42,11 @@ def test_specks_are_turned_over_and_regions_stay() -> None:
 def test_the_image_circle_is_found(dtype: torch.dtype) -> None:
     fish = fisheye()
     image = vignetted(fish)
-    found = image_circle(fish, image if dtype == torch.uint8 else (image / 255).to(dtype))
-    assert found is not None
-    assert np.abs(found.center_px - (122, 78)).max() < 2
-    assert np.abs(found.radii_px / (110, 110 * 84 / 80) - 0.93).max() < 0.05
-    hidden = ~found.holds(fish)
+    circle = image_circle(fish, image if dtype == torch.uint8 else (image / 255).to(dtype))
+    assert circle is not None
+    assert np.abs(circle.center_px - (122, 78)).max() < 2
+    assert np.abs(circle.radii_px / (110, 110 * 84 / 80) - 0.93).max() < 0.05
+    hidden = ~circle.holds(fish)
     assert image[0].numpy()[hidden].mean() < 40 and 0.2 < hidden.mean() < 0.3
 
 

@@ -1,9 +1,10 @@
-"""``check`` finds every silent mistake, and nothing in right samples."""
+"""``check`` finds every silent mistake, and nothing in right samples; errors and warnings name the others."""
 
 from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import CheckReport, Finding, Rig, RigRetarget, SampleError, check, load_rig, shipped_rigs
+from arbiview_aug import (
+    ArbiviewError,
+    CheckReport,
+    Finding,
+    Rig,
+    RigRetarget,
+    SampleError,
+    check,
+    load_rig,
+    shipped_rigs,
+)
 from arbiview_aug.datasets import FrameFolder, cleaned_rig, open_data
 from arbiview_aug.sample.mistakes import check_rig, road_height_m
 from tests.helpers import street_sample
@@ -41,6 +52,7 @@ def test_a_silent_mistake_is_found(frame: str, mistake: str, request: pytest.Fix
     make, message = MISTAKES[mistake]
     report = check(make(request.getfixturevalue(frame)))
     assert not report.ok and any(re.search(message, str(finding)) for finding in report.findings), report
+    assert all(finding.fix for finding in report.findings)
 
 
 @pytest.mark.parametrize(
@@ -78,6 +90,13 @@ def test_right_labels_have_no_findings(yaw_deg: float) -> None:
         }
         for changes in ({"boxes_3d": boxes + torch.from_numpy(jitter).to(boxes.dtype)}, few, {"points": None}):
             assert check({**sample, **changes}).ok, check({**sample, **changes})
+
+
+def test_the_right_sample_is_silent(street: Sample) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        RigRetarget(street["rig"].turned(yaw_deg=10))(street)
+    assert check(street).ok
 
 
 def test_sides_and_yaw_that_are_both_swapped_are_the_same_boxes(street: Sample) -> None:
@@ -174,3 +193,49 @@ def test_points_of_a_lidar_that_looks_ahead_alone(street: Sample) -> None:
     assert road_height_m(ahead.numpy()) is None
     assert check({**street, "points": ahead}).ok
     assert "pass -yaw" in str(check(yaws(lambda yaw: -yaw)({**street, "points": ahead})))
+
+
+# --- mistakes that errors and warnings name ---------------------------------------------------------------------------
+def tensors(sample: Sample, **changes: Any) -> Sample:
+    """The sample calibrated by K and cam2ego."""
+    K, cam2ego = torch.from_numpy(sample["rig"].K), torch.from_numpy(sample["rig"].cam2ego)
+    return {**without("rig")(sample), "K": K, "cam2ego": cam2ego, **changes}
+
+
+def hwc(sample: Sample) -> Sample:
+    return {**sample, "images": [image.permute(1, 2, 0).numpy() for image in sample["images"]]}
+
+
+ERRORS: dict[str, tuple[Callable[[Sample], Sample], str]] = {
+    "images as numpy arrays (h, w, 3)": (hwc, "permute"),
+    "float images from 0 to 255": (lambda s: {**s, "images": s["images"].float()}, r"\[0, 1\]"),
+    "K of images of twice the size": (lambda s: tensors(s, K=torch.from_numpy(s["rig"].K) * 2), "K"),
+    "coefficients without a lens": (lambda s: tensors(s, distortion=torch.ones(6, 4) * 0.01), "lens"),
+    "ROS axes": (MISTAKES["ROS axes"][0], "ROS.*multiply cam2ego"),
+    "positions in millimetres": (MISTAKES["millimetres"][0], "millimetres: divide"),
+    "a mask of 0 and 255": (
+        lambda s: {**s, "ego_mask": torch.zeros(6, 64, 176, dtype=torch.uint8)}, "ego_mask: .*bool",
+    ),
+    "images under another key": (lambda s: {**without("images")(s), "imgs": s["images"]}, "did you mean 'images'"),
+}
+WARNINGS: dict[str, tuple[Callable[[Sample], Sample], str]] = {
+    "an inverted cam2ego": (MISTAKES["inverted cam2ego"][0], r"ego2cam, the inverse: pass np\.linalg\.inv"),
+    "boxes as gt_boxes": (MISTAKES["gt_boxes"][0], "gt_boxes.*did you mean 'boxes_3d'"),
+}
+
+
+@pytest.mark.parametrize("mistake", ERRORS)
+def test_an_error_names_the_fix(mistake: str, street: Sample) -> None:
+    make, message = ERRORS[mistake]
+    with warnings.catch_warnings(), pytest.raises(ArbiviewError, match=message):
+        warnings.simplefilter("ignore")
+        RigRetarget("waymo", size=(32, 64), geometry="street")(make(street))
+
+
+@pytest.mark.parametrize("mistake", WARNINGS)
+def test_a_warning_names_the_fix(mistake: str, street: Sample) -> None:
+    make, message = WARNINGS[mistake]
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        RigRetarget("waymo", size=(32, 64))(make(street))
+    assert any(re.search(message, str(warning.message)) for warning in told), list(map(str, told))

@@ -85,8 +85,8 @@ def test_a_network_overrules_motion_where_they_contradict_each_other() -> None:
     sample = {"images": torch.rand(1, 3, 64, 96), "rig": Rig([camera])}
     sample |= {"learned_depth_m": network[None], "motion_depth_m": motion[None]}
 
-    def depth_m(given: dict[str, object], row: int, column: int) -> float:
-        (plan,) = RigRetarget(Rig([camera.shifted(z_m=0.5)]), geometry="fused").explain(given).plan.targets
+    def depth_m(inputs: dict[str, object], row: int, column: int) -> float:
+        (plan,) = RigRetarget(Rig([camera.shifted(z_m=0.5)]), geometry="fused").explain(inputs).plan.targets
         return float(0.5 * camera.K[1, 1] / (row - plan.at.to_float()[row, column, 1]))
 
     assert depth_m(sample, 36, 45) == pytest.approx(5.0, rel=0.03)

@@ -52,8 +52,8 @@ def surface_points(planes: np.ndarray, box: np.ndarray, count: int = 400) -> np.
     away[:, 2] = np.abs(away[:, 2])
     start = box[:3] + 20 * away / np.linalg.norm(away, axis=1, keepdims=True)
     rays = (box[:3] - start) / 20
-    found = [solids_ahead(box[None], planes[None], a, ray[None])[0][0] for a, ray in zip(start, rays, strict=True)]
-    return np.array([a + ray / q for a, ray, q in zip(start, rays, found, strict=True) if q > 0])
+    hits = [solids_ahead(box[None], planes[None], a, ray[None])[0][0] for a, ray in zip(start, rays, strict=True)]
+    return np.array([a + ray / q for a, ray, q in zip(start, rays, hits, strict=True) if q > 0])
 
 
 def test_kinds_by_size() -> None:
@@ -65,8 +65,8 @@ def test_objects_lie_within_their_boxes() -> None:
     for row, planes in enumerate(solids(boxes)):
         points = boxes[row, :3] + rng.uniform(-1, 1, (20000, 3)) * np.linalg.norm(boxes[row, 3:6]) / 2
         (inside,) = points_in(boxes[row : row + 1], points)
-        own = np.flatnonzero(beside(planes, points) <= 0)
-        assert np.isin(own, inside).all() and len(own) > 0.1 * len(inside)
+        within = np.flatnonzero(beside(planes, points) <= 0)
+        assert np.isin(within, inside).all() and len(within) > 0.1 * len(inside)
 
 
 def test_kinds_of_thin_objects_stay_apart() -> None:
@@ -167,12 +167,12 @@ def true_holes(rig: Rig, depth: np.ndarray, target: Rig, far: np.ndarray) -> np.
         along = rays @ camera.cam2ego[:3, 2]
         points = camera.center_m + rays * (np.where(np.isfinite(z), z, 1e5) / along)[..., None]
         seen = np.zeros(camera.size, bool)
-        for source, own in zip(rig, depth, strict=True):
+        for source, z_m in zip(rig, depth, strict=True):
             pixels, ahead, valid = source.project(points.reshape(-1, 3))
             h, w = source.size
             u, v = np.rint(np.where(np.isfinite(pixels), pixels, -9)).astype(int).T
             inside = valid & (u >= 0) & (u < w) & (v >= 0) & (v < h)
-            farthest = cv2.dilate(np.where(np.isfinite(own), own, 1e6).astype(np.float32), np.ones((3, 3), np.uint8))
+            farthest = cv2.dilate(np.where(np.isfinite(z_m), z_m, 1e6).astype(np.float32), np.ones((3, 3), np.uint8))
             limit = farthest[v.clip(0, h - 1), u.clip(0, w - 1)] * 1.02 + 0.1
             seen |= (inside & (ahead <= limit)).reshape(camera.size)
         holes.append(~seen)

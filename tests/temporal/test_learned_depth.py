@@ -38,12 +38,12 @@ class Oracle:
 
     def predict(self, views: Sequence[View]) -> list[Prediction]:
         self.batches = [*getattr(self, "batches", []), len(views)]
-        found = []
+        predictions = []
         for view in views:
             seen = self.truth[view.image.numpy().tobytes()] * (self.assumed_px or view.focal_px) / view.focal_px
             scale_px = view.focal_px if self.assumed_px is not None else None
-            found.append(Prediction(self.form(seen).astype(np.float32), self.output, scale_px))
-        return found
+            predictions.append(Prediction(self.form(seen).astype(np.float32), self.output, scale_px))
+        return predictions
 
 
 @cache
@@ -66,17 +66,17 @@ def inputs(**changes: Any) -> DepthInputs:
     return DepthInputs(RIG, list(sample["images"]), **({"points": points, "boxes": boxes} | changes))
 
 
-def found(model: Oracle, given: DepthInputs, **settings: Any) -> tuple[MotionDepth, list[CameraFit]]:
-    (one,) = learned_depth(model, [given], **({"batch": 2} | settings))
+def depth_of(model: Oracle, frame: DepthInputs, **settings: Any) -> tuple[MotionDepth, list[CameraFit]]:
+    (one,) = learned_depth(model, [frame], **({"batch": 2} | settings))
     return one
 
 
 def errors(depth: MotionDepth) -> np.ndarray:
     """Relative errors of the pixels nearer than 75 m, nine tenths of which have a depth; the sky is far away."""
-    true, found = street()[1].depth_m.numpy(), np.stack(depth.depth_m)
+    true, depth_of = street()[1].depth_m.numpy(), np.stack(depth.depth_m)
     near = true < 75
-    assert (found[near] > 0).mean() > 0.9 and found[true > 1000].min() > 100
-    return np.abs(found[near & (found > 0)] / true[near & (found > 0)] - 1)
+    assert (depth_of[near] > 0).mean() > 0.9 and depth_of[true > 1000].min() > 100
+    return np.abs(depth_of[near & (depth_of > 0)] / true[near & (depth_of > 0)] - 1)
 
 
 FORMS = {
@@ -96,7 +96,7 @@ def test_an_affine_change_and_another_focal_length_come_back(form: str, referenc
     """Within 2 % of the truth; the road is all that a fit needs."""
     true = street()[1].depth_m.numpy()
     motion = MotionDepth(tuple(np.where(true < 60, true, 0).astype(np.float32)), "")
-    depth, fits = found(oracle(*FORMS[form]), inputs(motion=motion), wanted=[reference])
+    depth, fits = depth_of(oracle(*FORMS[form]), inputs(motion=motion), wanted=[reference])
     assert [fit.reference for fit in fits] == [reference] * 2 and not any(fit.declined for fit in fits)
     assert np.quantile(errors(depth), 0.99) < 0.02
     assert "oracle, revision 1, licence mit" in str(depth) and f"of {reference}, residual 0." in str(depth)
@@ -104,11 +104,11 @@ def test_an_affine_change_and_another_focal_length_come_back(form: str, referenc
 
 def test_the_best_reference_is_taken() -> None:
     model = oracle(*FORMS["relative inverse depth"])
-    assert {fit.reference for fit in found(model, inputs())[1]} == {"LiDAR"}
+    assert {fit.reference for fit in depth_of(model, inputs())[1]} == {"LiDAR"}
     assert model.batches == [2]
-    assert {fit.reference for fit in found(model, inputs(points=None))[1]} == {"road"}
+    assert {fit.reference for fit in depth_of(model, inputs(points=None))[1]} == {"road"}
     few = inputs().points[:0]
-    assert {fit.reference for fit in found(model, inputs(points=few))[1]} == {"road"}
+    assert {fit.reference for fit in depth_of(model, inputs(points=few))[1]} == {"road"}
 
 
 WRONG = "it errs by more than 15%|it is hardly better than one depth|near and far are swapped"
@@ -126,7 +126,7 @@ WRONG = "it errs by more than 15%|it is hardly better than one depth|near and fa
 )
 @pytest.mark.parametrize("reference", ["LiDAR", "road"])
 def test_wrong_networks_are_declined(form: Callable[[np.ndarray], np.ndarray], reason: str, reference: Any) -> None:
-    depth, fits = found(oracle(form, "inverse"), inputs(), wanted=[reference])
+    depth, fits = depth_of(oracle(form, "inverse"), inputs(), wanted=[reference])
     assert depth.density == 0 and all(fit.declined for fit in fits)
     assert all(re.search(reason, fit.declined) for fit in fits), fits
     assert "front: declined, " in str(depth)
@@ -161,13 +161,13 @@ def test_one_picture_with_two_focal_lengths() -> None:
             return [Prediction(np.float32(0.7 * true), "depth", view.focal_px) for view in views]
 
     model = OfOnePicture({image.numpy().tobytes(): true}, lambda z: z)
-    depth, fits = found(model, DepthInputs(Rig([wide, tele]), [image, image]))
+    depth, fits = depth_of(model, DepthInputs(Rig([wide, tele]), [image, image]))
     assert fits[0].reference == "road" and str(fits[1]) == "tele: scale of the other cameras, at its own focal length"
     one, two = depth.depth_m
     both = (one > 0) & (two > 0)
     assert both.mean() > 0.5 and np.allclose(two[both], 2 * one[both], rtol=0.02)
     relative = Oracle(model.truth, lambda z: 9 / z + 1, "inverse")
-    _, fits = found(relative, DepthInputs(Rig([wide, tele]), [image, image]))
+    _, fits = depth_of(relative, DepthInputs(Rig([wide, tele]), [image, image]))
     assert fits[1].declined == "fewer than 50 points of LiDAR, motion, road"
 
 
@@ -186,7 +186,7 @@ def test_fisheye_images_are_shown_as_pinhole_ones() -> None:
             return [Prediction(inverse.astype(np.float32), "inverse") for _ in views]
 
     image = torch.rand(3, 96, 128)
-    depth, (fit,) = found(Road({}, lambda z: z), DepthInputs(Rig([lens]), [image]))
+    depth, (fit,) = depth_of(Road({}, lambda z: z), DepthInputs(Rig([lens]), [image]))
     rays, _ = lens.unproject(lens.pixel_grid())
     true = np.where(rays[..., 2] < -0.1, -1.5 / np.minimum(rays[..., 2], -1e-3) * rays[..., 0], np.inf)
     known = (depth.depth_m[0] > 0) & np.isfinite(true)

@@ -27,15 +27,15 @@ def drive() -> SyntheticDrive:
 
 @pytest.fixture(scope="module")
 def sample(drive: SyntheticDrive) -> dict[str, Any]:
-    found = drive[1]
-    del found["boxes_3d"]
-    found["neighbours"] = [
-        {k: torch.as_tensor(n[k]) if k == "images" else n[k] for k in n if k != "boxes_3d"} for n in found["neighbours"]
+    frame = drive[1]
+    del frame["boxes_3d"]
+    frame["neighbours"] = [
+        {k: torch.as_tensor(n[k]) if k == "images" else n[k] for k in n if k != "boxes_3d"} for n in frame["neighbours"]
     ]
-    return found
+    return frame
 
 
-def found(sample: dict[str, Any], **changes: Any) -> MotionDepth:
+def depth_of(sample: dict[str, Any], **changes: Any) -> MotionDepth:
     (frame,) = read_frames(sample, None)
     near = read_neighbours(frame, lambda topic, message: pytest.fail(message))
     settings: dict[str, Any] = {"neighbours": near, "boxes": None, "load": lambda n: n.images(frame.images)}
@@ -67,7 +67,7 @@ def right(drive: SyntheticDrive, depth: MotionDepth) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def exact(sample: dict[str, Any]) -> MotionDepth:
-    return found(sample)
+    return depth_of(sample)
 
 
 def test_most_pixels_have_the_right_depth(drive: SyntheticDrive, exact: MotionDepth) -> None:
@@ -80,24 +80,24 @@ def test_most_pixels_have_the_right_depth(drive: SyntheticDrive, exact: MotionDe
 def test_wrong_poses_are_corrected_or_declined(
     drive: SyntheticDrive, sample: dict[str, Any], exact: MotionDepth
 ) -> None:
-    corrected = found(turned(sample, 0.3))
+    corrected = depth_of(turned(sample, 0.3))
     assert "poses corrected by" in corrected.words
     density, share = right(drive, corrected)
     assert density > right(drive, exact)[0] - 0.05 and share > 0.9
-    lost = found(turned(sample, 4.0))
+    lost = depth_of(turned(sample, 4.0))
     assert lost.density == 0 and "the static street stands" in str(lost)
     assert "the pose of frame" in lost.words or "too little of frame" in lost.words
 
 
 @pytest.mark.slow
 def test_one_side_alone(drive: SyntheticDrive, sample: dict[str, Any]) -> None:
-    density, share = right(drive, found({**sample, "neighbours": sample["neighbours"][:1]}))
+    density, share = right(drive, depth_of({**sample, "neighbours": sample["neighbours"][:1]}))
     assert density > 0.4 and share > 0.85
 
 
 def test_without_frames_nearby_it_declines(sample: dict[str, Any]) -> None:
-    assert "no frame 0.4 to 3 m before or after" in found({**sample, "neighbours": []}).words
-    assert found(sample, load=lambda neighbour: None).density == 0
+    assert "no frame 0.4 to 3 m before or after" in depth_of({**sample, "neighbours": []}).words
+    assert depth_of(sample, load=lambda neighbour: None).density == 0
 
 
 def test_a_lost_frame_leaves_the_other_side(sample: dict[str, Any]) -> None:
@@ -106,13 +106,13 @@ def test_a_lost_frame_leaves_the_other_side(sample: dict[str, Any]) -> None:
     def load(neighbour: Neighbour) -> Any:
         return None if "-0." in neighbour.name else neighbour.images(frame.images)
 
-    one = found(sample, load=load)
+    one = depth_of(sample, load=load)
     assert one.density > 0.2 and "-0." not in one.words and " and " not in one.words.partition(";")[0]
 
 
 def test_labelled_objects_are_left_out(sample: dict[str, Any], exact: MotionDepth) -> None:
     box = np.array([[8.0, 6.0, 1.0, 4.0, 2.0, 2.0, 0.0]])
-    less = found(sample, boxes=box)
+    less = depth_of(sample, boxes=box)
     u, v = np.rint(SIDE[1].project(box[:, :3]).uv[0]).astype(int)
     assert not less.depth_m[1][v - 5 : v + 5, u - 5 : u + 5].any()
     assert less.density < exact.density
@@ -144,7 +144,7 @@ def test_the_street_replaces_declined_depth_with_a_warning(sample: dict[str, Any
 
 @pytest.mark.parametrize("size", [(1, 8), (8, 1)])
 def test_images_of_one_pixel_are_declined(size: tuple[int, int]) -> None:
-    tiny = found(Standing(SIDE.resized(size), num_frames=3, lidar=False, neighbours=Neighbours())[1])
+    tiny = depth_of(Standing(SIDE.resized(size), num_frames=3, lidar=False, neighbours=Neighbours())[1])
     assert "images one pixel wide or high" in str(tiny) and not tiny.density
 
 

@@ -78,8 +78,8 @@ def correlation(image: SweptImage, other: SweptImage, wall: float) -> Any:
 
     one, two = image.grey.astype(np.float64), read
     variances = [mean(x * x) - mean(x) ** 2 + NOISE_LEVELS**2 for x in (one, two)]
-    found = (mean(one * two) - mean(one) * mean(two)) / np.sqrt(variances[0] * variances[1])
-    return np.where(seen, found, np.nan)
+    correlations = (mean(one * two) - mean(one) * mean(two)) / np.sqrt(variances[0] * variances[1])
+    return np.where(seen, correlations, np.nan)
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "radtan", "fisheye"])

@@ -31,10 +31,10 @@ def test_entries_are_plain_data_and_add_up() -> None:
         assert sum(source["share"] for source in entry["sources"]) == pytest.approx(entry["coverage"], abs=1e-9)
         shares = [source["share"] for source in entry["sources"]]
         assert shares == sorted(shares, reverse=True)
-        own = next(source for source in entry["sources"] if source["camera"] == nuscenes().names[k])
-        assert own["surface"] == "infinity" and own["reason"] == "centres coincide: exact"
-        assert own["baseline_m"] < 1e-6 and own["parallax_px"] < 1e-3
-        others = [source for source in entry["sources"] if source is not own]
+        exact = next(source for source in entry["sources"] if source["camera"] == nuscenes().names[k])
+        assert exact["surface"] == "infinity" and exact["reason"] == "centres coincide: exact"
+        assert exact["baseline_m"] < 1e-6 and exact["parallax_px"] < 1e-3
+        others = [source for source in entry["sources"] if source is not exact]
         assert others and {other["surface"] for other in others} == {"street"}
         assert all(other["baseline_m"] > 0.3 and other["parallax_px"] > 0 for other in others)
 

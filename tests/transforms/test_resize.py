@@ -18,7 +18,7 @@ RIG = Rig([camera("a", size=SIZE), camera("b", 70, size=SIZE, mask=MASK, **LENS)
 TRANSFORMS = [ResizeRig((30, 50)), ResizeRig((90, 110)), CropRig(10, 20, (40, 70))]
 
 
-def sample_of(rig: Rig = RIG, **entries: object) -> dict:
+def blobs(rig: Rig = RIG, **entries: object) -> dict:
     """A bright blob 9 px wide in every image, at the pixel of one point of the scene."""
     v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in SIZE), indexing="ij")
     images = [torch.exp(-((u - x) ** 2 + (v - y) ** 2) / 18).expand(3, *SIZE) for x, y in _pixels(rig)]
@@ -36,7 +36,7 @@ def _pixels(rig: Rig) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("transform", TRANSFORMS, ids=str)
 def test_the_point_is_where_the_calibration_says(transform: torch.nn.Module) -> None:
-    out = transform(sample_of())
+    out = transform(blobs())
     h, w = transform.size
     assert out["images"].shape == (2, 3, h, w) and out["rig"].sizes == [(h, w)] * 2
     assert np.allclose(out["K"].numpy(), out["rig"].K, atol=1e-12)
@@ -50,7 +50,7 @@ def test_the_point_is_where_the_calibration_says(transform: torch.nn.Module) -> 
 def test_maps_and_masks_follow(transform: torch.nn.Module) -> None:
     """Each row of a map holds its own number: after, the row of the image that the camera's mask of it comes from."""
     rows = torch.arange(60)[:, None].expand(2, 60, 100)
-    sample = sample_of(coverage=rows < 50, labels=rows.to(torch.uint8), token="x")
+    sample = blobs(coverage=rows < 50, labels=rows.to(torch.uint8), token="x")
     transform.keys = SampleKeys(labels=("labels",))
     out = transform(sample)
     transform.label_keys = ()
@@ -62,8 +62,8 @@ def test_maps_and_masks_follow(transform: torch.nn.Module) -> None:
 
 def test_resizing_before_or_after_is_the_same_calibration() -> None:
     target = RIG.turned(yaw_deg=12).undistorted()
-    before = RigRetarget(target.resized((30, 50)), geometry="infinity", holes="black")(sample_of())
-    after = ResizeRig((30, 50))(RigRetarget(target, geometry="infinity", holes="black")(sample_of()))
+    before = RigRetarget(target.resized((30, 50)), geometry="infinity", holes="black")(blobs())
+    after = ResizeRig((30, 50))(RigRetarget(target, geometry="infinity", holes="black")(blobs()))
     assert torch.allclose(before["K"], after["K"]) and after["coverage"].shape == (2, 30, 50)
     both = before["coverage"] & after["coverage"]
     assert (before["images"] - after["images"]).abs().mean(1)[both].mean() < 0.005
@@ -74,7 +74,7 @@ def test_resizing_before_or_after_is_the_same_calibration() -> None:
 
 
 def test_batches_lists_and_other_types() -> None:
-    sample = sample_of()
+    sample = blobs()
     batch = {"images": sample["images"].expand(3, -1, -1, -1, -1), "rig": RIG, "coverage": torch.ones(3, 2, *SIZE) > 0}
     out = CropRig(1, 2, (20, 30))(batch)
     assert out["images"].shape == (3, 2, 3, 20, 30) and out["coverage"].shape == (3, 2, 20, 30)
@@ -89,13 +89,13 @@ def test_batches_lists_and_other_types() -> None:
 
 def test_what_cannot_follow_is_dropped_and_misuse_is_named() -> None:
     with pytest.warns(UserWarning, match="ResizeRig drops boxes_2d: it speaks of pixels that have moved"):
-        assert "boxes_2d" not in ResizeRig((30, 50))(sample_of(boxes_2d=torch.zeros(1, 4)))
+        assert "boxes_2d" not in ResizeRig((30, 50))(blobs(boxes_2d=torch.zeros(1, 4)))
     with pytest.warns(UserWarning, match="ResizeRig drops neighbours"):  # which are of the old size
-        assert "neighbours" not in ResizeRig((30, 50))(sample_of(neighbours=[{}]))
+        assert "neighbours" not in ResizeRig((30, 50))(blobs(neighbours=[{}]))
     with pytest.raises(SampleError, match=r"within the image of \(h, w\) = \(60, 100\), got rows 30 to 70"):
-        CropRig(30, 0, (40, 10))(sample_of())
+        CropRig(30, 0, (40, 10))(blobs())
     with pytest.raises(SampleError, match="looks like a map"):
-        ResizeRig((30, 50))(sample_of(classes=torch.zeros(2, *SIZE)))
+        ResizeRig((30, 50))(blobs(classes=torch.zeros(2, *SIZE)))
     with pytest.raises(SampleError, match="missing K, cam2ego"):
         ResizeRig((30, 50))({"images": torch.zeros(1, 3, 4, 4)})
     for size in ((0, 5), (2.5, 5), 7, "ab"):

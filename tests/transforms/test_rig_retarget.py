@@ -540,9 +540,9 @@ def test_the_roads_height_survives_a_second_retargeting() -> None:
 def test_points_in_lists_and_arrays_move_too(container: str) -> None:
     source, retarget = ring(), RigRetarget(ring(ground_z_m=-0.5), keys=SampleKeys(frame="target"))
     points = torch.rand(6, 3)
-    given: Any = [points, points[:2]] if container == "list" else points.numpy()
+    moving: Any = [points, points[:2]] if container == "list" else points.numpy()
     sample = default_collate([sample_of(source)] * 2) if container == "list" else sample_of(source)
-    out = retarget({**sample, "points": given})["points"]
+    out = retarget({**sample, "points": moving})["points"]
     moved = points - torch.tensor([0, 0, 0.5])
     if container == "list":
         assert len(out) == 2 and torch.equal(out[0], moved) and torch.equal(out[1], moved[:2])
@@ -632,13 +632,22 @@ def test_frames_without_objects_move_too() -> None:
         ({"holes": "magic"}, "holes: expected one of continue, telea, mean, black, diffusion, got 'magic'"),
         ({"quality": "best"}, "quality: expected one of draft, fast"),
         ({"geometry": "sphere"}, "geometry: expected one of .*infinity.* got 'sphere'"),
+        ({"geometry": ["infinity"]}, "geometry: expected"),
+        ({"quality": ["fast"]}, "quality: expected"),
+        ({"holes": 3}, "holes: expected a name or an"),
+        ({"fit": "cover"}, "fit: expected one of crop, pad, stretch, got 'cover'"),
+        ({"match_exposure": torch.zeros(0)}, "match_exposure"),
         ({"keys": {"frame": "source"}}, "keys: expected a SampleKeys, got dict"),
+        ({"keys": "confidence"}, "keys: expected a SampleKeys"),
         ({"cache": 7}, "cache: expected a PlanCache, got int"),
+        ({"cache": {"max_bytes": 3}}, "cache: expected a PlanCache"),
         ({"backend": "jax"}, "backend: expected one of auto, opencv, torch, got 'jax'"),
         ({"p": 1.5}, "p: expected a probability from 0 to 1, got 1.5"),
         ({"p": float("nan")}, "p: expected a probability"),
+        ({"p": "x"}, "p: expected"),
+        ({"p": [0.5]}, "p: expected"),
         ({"size": 256}, r"size: expected \(h, w\) in pixels, got 256"),
-        ({"size": (0, 704)}, r"size: expected \(h, w\) in pixels"),
+        *(({"size": size}, r"size: expected \(h, w\) in pixels") for size in ((0, 704), (10.5, 20), (40_000, 20))),
     ],
 )
 def test_impossible_settings(settings: dict[str, Any], message: str) -> None:
@@ -757,11 +766,11 @@ def test_outputs_own_their_memory(execution: str, dtype: torch.dtype) -> None:
     kept = copy.deepcopy(first)
     second = retarget(samples[1])
     assert same(first, kept) and not torch.equal(first["images"], second["images"])
-    given = samples[0]["images"].clone()
+    untouched = samples[0]["images"].clone()
     for value in first.values():
         if isinstance(value, torch.Tensor):
             value.zero_()
-    assert torch.equal(samples[0]["images"], given)
+    assert torch.equal(samples[0]["images"], untouched)
     assert same(retarget(samples[0]), kept)  # neither the cached plan nor the rigs were touched
 
 
@@ -787,19 +796,19 @@ def test_another_default_device_changes_nothing(how: str) -> None:
     try:
         if how == "default":
             torch.set_default_device("meta")
-            found = RigRetarget("waymo", size=(36, 64))(sample)
+            rendered = RigRetarget("waymo", size=(36, 64))(sample)
         else:
             with torch.device("meta"):
-                found = RigRetarget("waymo", size=(36, 64))(sample)
+                rendered = RigRetarget("waymo", size=(36, 64))(sample)
     finally:
         torch.set_default_device(None)
     for key in ("images", "coverage", "K", "cam2ego", "points", "boxes_3d"):
-        assert torch.equal(found[key], expected[key]), key
+        assert torch.equal(rendered[key], expected[key]), key
 
 
 @pytest.mark.slow
 def test_a_compiled_transform_runs_as_it_is() -> None:
     sample = SyntheticDrive(demo_source_rig((36, 64)), num_frames=1)[0]
     retarget = RigRetarget("waymo", size=(36, 64))
-    expected, found = retarget(sample), torch.compile(retarget)(sample)
-    assert torch.equal(found["images"], expected["images"]) and found.keys() == expected.keys()
+    expected, compiled = retarget(sample), torch.compile(retarget)(sample)
+    assert torch.equal(compiled["images"], expected["images"]) and compiled.keys() == expected.keys()

@@ -83,7 +83,8 @@ def picture(batch: Batch, samples: torch.Tensor) -> np.ndarray:
     views = torch.cat([batch.sources[:, :2], *(views[:, :1] for views in firsts)], 1).cpu().clamp(0, 1) * 255
     rows = views.permute(0, 1, 3, 4, 2).numpy()  # [B, columns, h, w, 3]
     width = len(COLUMNS) * max(_COLUMN_PX, rows.shape[3])
-    return contact_sheet([list(row) for row in rows], [COLUMNS] * len(rows), batch.tokens, width_px=width)
+    titled = [(token, list(row), COLUMNS) for token, row in zip(batch.tokens, rows, strict=True)]
+    return contact_sheet(titled, width_px=width)
 
 
 # --- scores -----------------------------------------------------------------------------------------------------------

@@ -82,9 +82,9 @@ def calibration(pixels: Pixels) -> Calibration:
     )
 
 
-def row(name: str, found: Calibration) -> str:
-    bins = " ".join(f"{error:5.1f}" for error in found.errors)
-    return f"  {name:<16}{bins}   rho {found.spearman:+.3f}   error / that of the best half {found.halving:.2f}"
+def row(name: str, bins_of: Calibration) -> str:
+    bins = " ".join(f"{error:5.1f}" for error in bins_of.errors)
+    return f"  {name:<16}{bins}   rho {bins_of.spearman:+.3f}   error / that of the best half {bins_of.halving:.2f}"
 
 
 @pytest.fixture(scope="module", params=SEEDS)

@@ -43,14 +43,14 @@ def test_it_scores_as_on_the_fly(name: Any, target: Rig, nuscenes_root: Path, tm
         return views_of(retarget(sample))
 
     frame = make_frame(sample, exposures=("raw",))
-    found = {}
+    means = {}
     for label, render in (("on the fly", on_the_fly), ("converted", converted(settings).render)):
         _, rows = scores(frame, render, settings.target)
         keys = ("raw_psnr_db", "raw_covered_psnr_db", "seen")
-        found[label] = {key: float(np.mean([row[key] for row in rows if key in row])) for key in keys}
-        print(f"{name} as {target.name}, {label}: {found[label]}")
-    assert found["converted"]["seen"] == pytest.approx(found["on the fly"]["seen"], abs=1e-6)
+        means[label] = {key: float(np.mean([row[key] for row in rows if key in row])) for key in keys}
+        print(f"{name} as {target.name}, {label}: {means[label]}")
+    assert means["converted"]["seen"] == pytest.approx(means["on the fly"]["seen"], abs=1e-6)
     for key in ("raw_psnr_db", "raw_covered_psnr_db"):
-        assert abs(found["converted"][key] - found["on the fly"][key]) <= MOST_DB
+        assert abs(means["converted"][key] - means["on the fly"][key]) <= MOST_DB
     page = (output / "conversion" / "report.html").read_text()
     assert page.count('<div class="slider"') == len(target)

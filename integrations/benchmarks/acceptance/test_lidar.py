@@ -112,7 +112,7 @@ def vehicle_shifts(plan: RenderPlan, source: RenderedViews, truth: RenderedViews
 def shifts(request: pytest.FixtureRequest) -> dict[tuple[str, str], np.ndarray]:
     """Displacements of vehicles' outlines, by (move, surface)."""
     rig = demo_source_rig((256, 704))
-    found: dict[tuple[str, str], list[float]] = {}
+    shifts: dict[tuple[str, str], list[float]] = {}
     for seed in range(request.param):
         drive = SyntheticDrive(rig, num_frames=1, seed=seed)
         sample, source = drive[0], drive.render(0)
@@ -121,13 +121,13 @@ def shifts(request: pytest.FixtureRequest) -> dict[tuple[str, str], np.ndarray]:
             truth = drive.render(0, rig.shifted(**by))
             for surface in ("lidar", "street"):
                 plan = build_plan(rig, rig.shifted(**by), geometry=surface, scene=scene)
-                found.setdefault((move, surface), []).extend(vehicle_shifts(plan, source, truth))
-    for (move, surface), values in found.items():
+                shifts.setdefault((move, surface), []).extend(vehicle_shifts(plan, source, truth))
+    for (move, surface), values in shifts.items():
         half, more, most = np.percentile(values, [50, 75, 90])
         print(
             f"\n{surface:<8}{move:<14}{len(values):>6} edges, 50/75/90 %: {half:.1f}/{more:.1f}/{most:.1f} px", end=""
         )
-    return {key: np.array(values) for key, values in found.items()}
+    return {key: np.array(values) for key, values in shifts.items()}
 
 
 @pytest.mark.parametrize("move", STREET_MOVES)
@@ -163,8 +163,8 @@ def test_other_frames_show_what_is_between_scan_lines(count: int) -> None:
         for move, by in moves.items():
             target = rig.shifted(**by)
             truth = drive.render(index, target)
-            for name, given in (("alone", bare), ("swept", near)):
-                plan = RigRetarget(target).explain(sample | {"neighbours": given}).plan
+            for name, neighbours in (("alone", bare), ("swept", near)):
+                plan = RigRetarget(target).explain(sample | {"neighbours": neighbours}).plan
                 shifts.setdefault((move, name), []).extend(vehicle_shifts(plan, source, truth))
                 views = render_opencv(plan, list(sample["images"]))
                 for view, true, z, covered, camera in zip(

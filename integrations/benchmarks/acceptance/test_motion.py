@@ -101,16 +101,16 @@ def test_depth_is_right_and_renders_better_than_the_street(
         sample = sample_of(index, standing, labels, turned_deg)
         depth = depth_of(sample)
         counts += right(index, depth)
-        for move, found in gains.items():
-            found.append(gain_db(index, move, sample, depth))
-    mean = {move: float(np.mean(found)) for move, found in gains.items()}
+        for move, rows in gains.items():
+            rows.append(gain_db(index, move, sample, depth))
+    mean = {move: float(np.mean(rows)) for move, rows in gains.items()}
     words = ", ".join(
         f"{move} {db:+.1f} dB ({min(gains[move]):+.1f} to {max(gains[move]):+.1f})" for move, db in mean.items()
     )
     print(f"\ndensity {counts[1] / counts[0]:.1%}, right {counts[2] / counts[1]:.1%}; over the street: {words}")
     assert counts[1] >= density * counts[0] and counts[2] >= share * counts[1]
     assert min(mean.values()) >= least_db
-    assert min(min(found) for found in gains.values()) >= -0.1
+    assert min(min(rows) for rows in gains.values()) >= -0.1
 
 
 @pytest.mark.slow
@@ -131,7 +131,7 @@ def test_the_next_frame_as_truth(ddad_root: Path) -> None:
         cv2.resize(image.numpy().transpose(1, 2, 0), camera.size[::-1], interpolation=cv2.INTER_AREA).astype(float)
         for camera, image in zip(target, ahead["images"], strict=True)
     ]
-    found, cover = {}, {surface: float(out["coverage"].float().mean()) for surface, out in outs.items()}
+    psnr, cover = {}, {surface: float(out["coverage"].float().mean()) for surface, out in outs.items()}
     for surface, out in outs.items():
         rows = []
         for k, (camera, true) in enumerate(zip(target, then, strict=True)):
@@ -139,7 +139,7 @@ def test_the_next_frame_as_truth(ddad_root: Path) -> None:
             use = seen if camera.mask is None else seen & camera.mask
             error = out["images"][k].numpy().transpose(1, 2, 0)[use] - true[use]
             rows.append(10 * np.log10(255**2 / np.mean(error**2)))
-        found[surface] = float(np.mean(rows))
-    print(f"\nthe next frame as truth, dB: {found}; covered: {cover}")
-    assert found["motion"] >= found["street"] + 3.0
-    assert found["fused"] >= max(19.5, found["lidar"] + 1.0) and cover["fused"] >= 0.97 * cover["street"]
+        psnr[surface] = float(np.mean(rows))
+    print(f"\nthe next frame as truth, dB: {psnr}; covered: {cover}")
+    assert psnr["motion"] >= psnr["street"] + 3.0
+    assert psnr["fused"] >= max(19.5, psnr["lidar"] + 1.0) and cover["fused"] >= 0.97 * cover["street"]

@@ -80,8 +80,8 @@ def test_the_filled_road_is_as_right_as_the_current_one(ddad_root: Path) -> None
             index, uv, _ = visible_points(camera, road)
             near = np.linalg.norm(road[index, :2] - camera.center_m[:2], axis=1) < 15
             index, uv = index[near], uv[near]
-            own = cv2.erode((source == number).astype(np.uint8), np.ones((3, 3), np.uint8))
-            use = colours_at(own, uv) > 0.99  # nothing of the other frame is read
+            unmixed = cv2.erode((source == number).astype(np.uint8), np.ones((3, 3), np.uint8))
+            use = colours_at(unmixed, uv) > 0.99  # nothing of the other frame is read
             squares.append(((colours_at(image, uv[use]) - colours[index[use]]) ** 2).mean(1))
         squares_of_all = np.concatenate(squares)
         assert len(squares_of_all) > 100

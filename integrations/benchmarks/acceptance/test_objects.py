@@ -47,7 +47,7 @@ LEAST_PX = 100
 ROAD_AND_OBJECTS = (SceneClass.GROUND, SceneClass.SIDEWALK, SceneClass.VEHICLE, SceneClass.PEDESTRIAN)
 
 
-class Found:
+class Sums:
     """Sums over the streets, for one world, move and surface."""
 
     def __init__(self) -> None:
@@ -89,11 +89,11 @@ def sight(source: Rig, views: tuple[np.ndarray, np.ndarray], target: Rig, depth_
             offset_m = camera.center_m - recorded.center_m
             uv, valid = project_rays(recorded, rays, q, offset_m)
             inside = valid & recorded.contains(uv)
-            own = q / np.maximum((rays + q[..., None] * offset_m) @ recorded.cam2ego[:3, 2], 1e-12)
+            ahead_m = q / np.maximum((rays + q[..., None] * offset_m) @ recorded.cam2ego[:3, 2], 1e-12)
             u, v = np.round(np.where(inside[..., None], uv, 0)).astype(int).transpose(2, 0, 1)
             # 2 % and 1/1000 m: the depth of one surface varies between its pixels.
-            seen |= inside & (own >= 0.98 * nearest[k][v, u] - 1e-3)
-            maybe = inside & (own >= 0.98 * farthest[k][v, u] - 1e-3)
+            seen |= inside & (ahead_m >= 0.98 * nearest[k][v, u] - 1e-3)
+            maybe = inside & (ahead_m >= 0.98 * farthest[k][v, u] - 1e-3)
             possible |= maybe
             behind |= inside & ~maybe & (views[1][k][v, u] >= 0)
         all_seen.append(seen)
@@ -111,7 +111,7 @@ def edges(mask: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     return mask.any(0), {"top": mask.argmax(0), "bottom": len(mask) - 1 - mask[::-1].argmax(0)}
 
 
-def measure(seed: int, found: dict[tuple[str, str, str], Found]) -> None:
+def measure(seed: int, sums: dict[tuple[str, str, str], Sums]) -> None:
     rig = demo_source_rig(SIZE)
     source = rig.with_cameras([rig[name] for name in SOURCES])
     drive = SyntheticDrive(source, num_frames=1, seed=seed, lidar=False, supersampling=1)
@@ -133,7 +133,7 @@ def measure(seed: int, found: dict[tuple[str, str, str], Found]) -> None:
             seen, hidden = sight(source, (depth_m, instances), target, truth.depth_m.numpy())
             plans = {surface: build_plan(source, target, geometry=surface, scene=geometry) for surface in GEOMETRIES}
             for surface, plan in plans.items():
-                into = found[world, move, surface]
+                into = sums[world, move, surface]
                 labels = render_labels(plan, list(recorded.instances.long()), -2)
                 for m, camera in enumerate(target):
                     true, label = truth.instances[m].numpy(), labels[m].numpy()
@@ -156,7 +156,7 @@ def measure(seed: int, found: dict[tuple[str, str, str], Found]) -> None:
                         into.count["hidden" + name] += int((hidden[m] & where).sum())
 
 
-def displaced(true: np.ndarray, shown: np.ndarray, seen: np.ndarray, into: Found) -> None:
+def displaced(true: np.ndarray, shown: np.ndarray, seen: np.ndarray, into: Sums) -> None:
     """Median displacement of one object's edges over the columns where a source sees the true edge."""
     if true.sum() < LEAST_PX:
         return
@@ -172,10 +172,10 @@ def displaced(true: np.ndarray, shown: np.ndarray, seen: np.ndarray, into: Found
 
 
 @pytest.fixture(scope="module", params=SEEDS)
-def found(request: pytest.FixtureRequest) -> dict[tuple[str, str, str], Found]:
+def sums(request: pytest.FixtureRequest) -> dict[tuple[str, str, str], Sums]:
     """All numbers, printed as a table."""
     torch.set_num_threads(1)
-    out: dict[tuple[str, str, str], Found] = defaultdict(Found)
+    out: dict[tuple[str, str, str], Sums] = defaultdict(Sums)
     for seed in range(request.param):
         measure(seed, out)
     print(
@@ -200,29 +200,29 @@ def found(request: pytest.FixtureRequest) -> dict[tuple[str, str, str], Found]:
 
 @pytest.mark.parametrize("move", MOVES)
 @pytest.mark.parametrize("world", WORLDS)
-def test_objects_keep_their_place_and_height(found: dict, world: str, move: str) -> None:
-    here = found[world, move, "boxes"]
+def test_objects_keep_their_place_and_height(sums: dict, world: str, move: str) -> None:
+    here = sums[world, move, "boxes"]
     assert here.median("top") <= 1.5 and here.median("bottom") <= 1.5
     assert here.share("top columns shown", "top columns") > 0.9  # holes have no displacement
 
 
 @pytest.mark.parametrize("move", MOVES)
 @pytest.mark.parametrize("world", WORLDS)
-def test_no_colour_of_an_object_leaves_its_box(found: dict, world: str, move: str) -> None:
-    assert found[world, move, "boxes"].share("outside box", "vehicle") < 0.001
+def test_no_colour_of_an_object_leaves_its_box(sums: dict, world: str, move: str) -> None:
+    assert sums[world, move, "boxes"].share("outside box", "vehicle") < 0.001
 
 
 @pytest.mark.parametrize("move", MOVES)
-def test_what_blocks_hid_and_nothing_else_is_a_hole(found: dict, move: str) -> None:
+def test_what_blocks_hid_and_nothing_else_is_a_hole(sums: dict, move: str) -> None:
     """Profiles are not the vehicles themselves: for ``shapes`` the printed table says how much is missed."""
-    here = found["blocks", move, "boxes"]
+    here = sums["blocks", move, "boxes"]
     assert here.share("right", "marked") >= 0.95
     assert here.share("within 2 px", "hidden") >= 0.95
 
 
 @pytest.mark.parametrize("move", MOVES)
-def test_holes_of_vehicles_are_not_their_boxes(found: dict, move: str) -> None:
+def test_holes_of_vehicles_are_not_their_boxes(sums: dict, move: str) -> None:
     """Six streets: precision and recall 0.85, 0.88 from above, 0.82, 0.79 from the left; of boxes 0.53 to 0.58."""
-    here = found["shapes", move, "boxes"]
+    here = sums["shapes", move, "boxes"]
     assert here.share("right", "marked") >= 0.78
     assert here.share("within 2 px", "hidden") >= 0.75

@@ -20,13 +20,12 @@ from arbiview_aug.choices import GeometryName
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.lidar import coloured_points
-from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from tests.helpers import ProtocolFrame, as_camera, score_targets
+from integrations.benchmarks.acceptance.protocol import FRAMES, ProtocolFrame, frame_folder
+from tests.helpers import score_targets
 
 pytestmark = pytest.mark.timeout(1800)
 
-FRAMES = [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("ddad-one", marks=pytest.mark.release)]
 GEOMETRIES: tuple[GeometryName, ...] = ("auto", "ground", "infinity")
 REFERENCE = "reference ground"
 LARGEST_LOSS_DB = {"yaw": 0.1, "up": 0.25, "paper": 0.1}
@@ -41,14 +40,10 @@ class Frame(ProtocolFrame):
 
     def __init__(self, referee: ModuleType, folder: Path, raw: bool) -> None:
         super().__init__(referee, folder, raw)
-        self.referee = referee
         self.points = coloured_points(self.rig, self.images, self.lidar)
         # The protocol's own targets: on every rig it takes the paper's degrees, which are of nuScenes' spacing.
-        self.sets = {
-            "yaw": [referee.rotated_targets(self.cameras, yaw) for yaw in YAWS_DEG],
-            "up": [referee.rotated_targets(self.cameras, 0.0, (0.0, 0.0, UP_M))],
-            "paper": [referee.paper_targets(self.cameras, share) for share in referee.PAPER_SHARES],
-        }
+        paper = [referee.paper_targets(self.cameras, share) for share in referee.PAPER_SHARES]
+        self.sets = {**self.targets(), "paper": paper}
 
     def ours(self, surface: GeometryName) -> dict[str, float]:
         """PSNR of each set: this package's renderer and metrics."""
@@ -60,11 +55,10 @@ class Frame(ProtocolFrame):
             )
             return as_arrays(retarget({"images": images})["images"])
 
-        found = {}
+        psnr = {}
         for name, targets in self.sets.items():
-            rigs = [Rig([as_camera(*view) for view in views], ground_z_m=self.ground_z_m) for views in targets]
-            found[name] = score_targets(render, self.points, rigs)["psnr_db"]
-        return found
+            psnr[name] = score_targets(render, self.points, self.rigs(targets))["psnr_db"]
+        return psnr
 
     def reference(self) -> dict[str, float]:
         """PSNR of each set: the protocol's ``ground`` renderer and metrics."""
@@ -76,26 +70,24 @@ class Frame(ProtocolFrame):
 @pytest.fixture(scope="module", params=FRAMES)
 def scores(request: pytest.FixtureRequest, referee: ModuleType, data_root: Path) -> Scores:
     """All numbers of one frame, printed as a table."""
-    folder = data_root / request.param
-    if not folder.is_dir():
-        pytest.skip(f"no frame {request.param} in {data_root}")
-    found: Scores = {}
+    folder = frame_folder(data_root, request.param)
+    psnr: Scores = {}
     start = time.perf_counter()
     with one_thread(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of targets that are half outside: the paper's are
         for raw in (False, True):
             frame = Frame(referee, folder, raw)
             if not raw:  # what takes the time
-                found[REFERENCE, raw] = frame.reference()
+                psnr[REFERENCE, raw] = frame.reference()
             for surface in GEOMETRIES[:1] if raw else GEOMETRIES:
-                found[surface, raw] = frame.ours(surface)
-    print(f"\n{table(request.param, found)}\n({time.perf_counter() - start:.0f} s)")
-    return found
+                psnr[surface, raw] = frame.ours(surface)
+    print(f"\n{table(request.param, psnr)}\n({time.perf_counter() - start:.0f} s)")
+    return psnr
 
 
-def table(title: str, found: Scores) -> str:
+def table(title: str, psnr: Scores) -> str:
     lines = [f"{title + ', PSNR in dB':<32}" + "".join(f"{name:>8}" for name in LARGEST_LOSS_DB)]
-    for (method, raw), row in sorted(found.items(), key=lambda item: item[0][1]):
+    for (method, raw), row in sorted(psnr.items(), key=lambda item: item[0][1]):
         label = f"{method}, raw exposures" if raw else method
         lines.append(f"  {label:<30}" + "".join(f"{row[name]:>8.2f}" for name in LARGEST_LOSS_DB))
     return "\n".join(lines)

@@ -13,11 +13,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from integrations.benchmarks.acceptance.protocol import MOVES, moved, psnr_of
 from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(1800)
@@ -26,7 +25,6 @@ SEEDS = few_or_all(2, 20)
 SIZE = (256, 704)
 SINGLE: tuple[GeometryName, ...] = ("street", "ground", "infinity")
 GEOMETRIES: tuple[GeometryName, ...] = ("auto", *SINGLE)
-MOVES = ("0.6 m higher", "0.5 m forward", "turned by 20°")
 GAIN_OVER_FAR_DB = 3.0
 LARGEST_LOSS_DB = 0.1
 """Largest loss of ``auto`` to the best single surface on covered pixels."""
@@ -43,47 +41,38 @@ Scores = dict[tuple[str, str], Psnr]
 """By (move, surface)."""
 
 
-def moved(rig: Rig, move: str) -> Rig:
-    if move == "0.6 m higher":
-        return rig.shifted(z_m=0.6)
-    return rig.shifted(x_m=0.5) if move == "0.5 m forward" else rig.turned(yaw_deg=20)
-
-
 @pytest.fixture(scope="module", params=SEEDS)
 def scores(request: pytest.FixtureRequest) -> Scores:
     """All numbers, printed as tables."""
     start, source = time.perf_counter(), demo_source_rig(SIZE)
-    targets = {move: moved(source, move) for move in MOVES}
+    targets = moved(source)
     retargets = {
         (m, s): RigRetarget(target, geometry=s, holes="black") for m, target in targets.items() for s in GEOMETRIES
     }
-    rows: dict[tuple[str, str], list[tuple[float, float]]] = {key: [] for key in retargets}
+    rows: dict[tuple[str, str], list[list[float]]] = {key: [] for key in retargets}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for seed in range(request.param):
             drive = SyntheticDrive(source, num_frames=1, seed=seed, lidar=False)
             sample, truth = drive[0], {move: drive.render(0, target) for move, target in targets.items()}
             for (move, surface), retarget in retargets.items():
-                out = retarget(sample)
-                squares = (out["images"].float() - truth[move].images).square().mean(1).numpy()
-                covered = out["coverage"].numpy()
-                ground = covered & np.isin(truth[move].classes.numpy(), [int(c) for c in GROUND_CLASSES])
-                rows[move, surface].append(tuple(psnr_db(float(squares[part].mean())) for part in (ground, covered)))
-    found = {key: Psnr(*np.array(values).T) for key, values in rows.items()}
+                ground = np.isin(truth[move].classes.numpy(), [int(c) for c in GROUND_CLASSES])
+                rows[move, surface].append(psnr_of(retarget(sample), truth[move], (ground, np.ones_like(ground))))
+    psnr = {key: Psnr(*np.array(values).T) for key, values in rows.items()}
     for name in Psnr._fields:
-        print(f"\n{table(name, found)}")
+        print(f"\n{table(name, psnr)}")
     print(f"({time.perf_counter() - start:.0f} s)")
-    return found
+    return psnr
 
 
-def table(field: str, found: Scores) -> str:
+def table(field: str, psnr: Scores) -> str:
     """Means over the streets; in brackets, by how much the worst street is below the best single surface."""
-    title = f"PSNR in dB, {field} pixels (worst of {len(found[MOVES[0], SINGLE[0]].ground)} streets)"
+    title = f"PSNR in dB, {field} pixels (worst of {len(psnr[MOVES[0], SINGLE[0]].ground)} streets)"
     lines = [f"{title:<52}" + "".join(f"{move:>18}" for move in MOVES)]
     for surface in GEOMETRIES:
         cells = []
         for move in MOVES:
-            values = {s: getattr(found[move, s], field) for s in GEOMETRIES}
+            values = {s: getattr(psnr[move, s], field) for s in GEOMETRIES}
             best = np.max([values[s] for s in SINGLE], axis=0)
             cells.append(f"{values[surface].mean():.2f} ({(values[surface] - best).min():+.2f})")
         lines.append(f"  {surface:<50}" + "".join(f"{cell:>18}" for cell in cells))

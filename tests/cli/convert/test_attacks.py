@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pickle
@@ -123,23 +124,26 @@ def frames(originals: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFix
 
 
 # --- names ------------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("table", ["sample_data", "lidarseg", "panoptic", "map"])
-def test_names_of_kept_files(table: str, tables: Home) -> None:
-    """``../.bashrc`` of a radar replaced a file beside the output."""
-    token = tables.rename(table, "../.bashrc")
-    assert tables.convert() == 2 and not tables.output.exists()
-    assert all(part in tables.said for part in (f"table {table}: ", repr(token), "filename"))
+OWN_FILES = ("conversion/settings.json", "v1.0-mini/sample.json", "samples/ring_front_center/0.jpg")
+"""Names that the conversion itself writes."""
 
 
 @pytest.mark.parametrize(
-    "name", ["conversion/settings.json", "v1.0-mini/sample.json", "samples/ring_front_center/0.jpg"]
+    ("table", "name"),
+    [
+        *((table, "../.bashrc") for table in ("sample_data", "lidarseg", "panoptic", "map")),
+        *(("sample_data", name) for name in OWN_FILES),
+    ],
 )
-def test_names_of_the_conversions_own_files(name: str, tables: Home) -> None:
-    (tables.source / name).parent.mkdir(parents=True, exist_ok=True)
-    (tables.source / name).touch()
-    tables.rename("sample_data", name)
+def test_names_of_kept_files(table: str, name: str, tables: Home) -> None:
+    """``../.bashrc`` of a radar replaced a file beside the output."""
+    if name in OWN_FILES:
+        (tables.source / name).parent.mkdir(parents=True, exist_ok=True)
+        (tables.source / name).touch()
+    token = tables.rename(table, name)
     assert tables.convert() == 2 and not tables.output.exists()
-    assert f"got one in {Path(name).parent}" in tables.said
+    said = [f"got one in {Path(name).parent}"] if name in OWN_FILES else [f"table {table}: ", repr(token), "filename"]
+    assert all(words in tables.said for words in said)
 
 
 @pytest.mark.parametrize("channel", ["CAM_FRONT__", "LIDAR_TOP"])
@@ -170,16 +174,14 @@ def test_frame_folders_refuse_names(key: str, name: Any, frames: Home) -> None:
         assert type(caught.value).__name__ in ("DataError", "CalibrationError")
 
 
-def test_a_frames_files_may_lie_in_other_frames(frames: Home) -> None:
-    frames.calibrate("file", "../0000/00.jpg")
-    assert FrameFolder(frames.source)[1]["images"].shape[0] == 2
-    with pytest.raises(DataError, match="expected"):
-        FrameFolder(frames.source / "0001")[0]
-
-
-def test_a_frame_alone_shares_masks_of_frames_beside_it(frames: Home) -> None:
-    """A real drive does; anything else beside the frame is refused, and so is a link out of the other frame."""
+def test_a_frame_shares_files_of_frames_beside_it(frames: Home) -> None:
+    """A real drive does, and a frame alone shares masks; anything else beside it is refused, and so is a link."""
     source = frames.source
+    frames.calibrate("file", "../0000/00.jpg")
+    assert FrameFolder(source)[1]["images"].shape[0] == 2
+    with pytest.raises(DataError, match="expected"):
+        FrameFolder(source / "0001")[0]
+    frames.calibrate("file", "00.jpg")
     size = FrameFolder(source)[1]["rig"][0].size
     (source / "other").mkdir()
     for name in ("0000/mask.png", "mask.png", "other/mask.png"):
@@ -250,8 +252,8 @@ def test_links_that_stay_in_the_root(kind: str, request: pytest.FixtureRequest) 
     (home.root / "root").symlink_to(Path("in", "source"))
     assert main(command(home.root / "root", home.output)) == 0
     plain, linked = tree(home.root / "plain"), tree(home.output)
-    own = {"conversion/settings.json", "conversion/provenance.json"}  # the roots have other names
-    assert {name for name in plain if linked.get(name) != plain[name]} <= own and plain.keys() == linked.keys()
+    named = {"conversion/settings.json", "conversion/provenance.json"}  # the roots have other names
+    assert {name for name in plain if linked.get(name) != plain[name]} <= named and plain.keys() == linked.keys()
     assert not any(path.is_symlink() for path in home.output.rglob("*"))
 
 
@@ -300,24 +302,16 @@ def test_a_camera_image_of_tables_with_such_a_name(tables: Home) -> None:
     assert len(NuScenesDataset(tables.output)) == 3
 
 
-def broken_once(monkeypatch: pytest.MonkeyPatch, of: Any, name: str) -> None:
-    """Let the second call of a function raise."""
-    calls, sound = [0], getattr(of, name)
-
-    def broken(*given: Any) -> Any:
-        calls[0] += 1
-        if calls[0] == 2:
-            raise ZeroDivisionError("of something")
-        return sound(*given)
-
-    monkeypatch.setattr(of, name, broken)
+def raises(error: BaseException | None = None) -> Any:
+    raise error or ZeroDivisionError("of something")
 
 
 @pytest.mark.parametrize("step", ["read", "retarget", "write"])
 @pytest.mark.parametrize("on_error", ["report", "skip", "fatal"])
 def test_errors_that_nobody_expects(step: str, on_error: str, frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     steps = {"read": (FrameFolder, "__getitem__"), "retarget": (RigRetarget, "forward"), "write": (job, "rig_of")}
-    broken_once(monkeypatch, *steps[step])
+    calls, sound = itertools.count(1), getattr(*steps[step])
+    monkeypatch.setattr(*steps[step], lambda *inputs: raises() if next(calls) == 2 else sound(*inputs))
     assert frames.convert("--on-error", on_error) == (0 if on_error == "skip" else 1)
     state = "skipped" if on_error == "skip" else "failed"
     assert f"0001: {state}: ZeroDivisionError: of something" in frames.said
@@ -333,10 +327,7 @@ def test_the_depth_command_goes_on(frames: Home, monkeypatch: pytest.MonkeyPatch
 
 
 def test_an_interrupt_is_no_samples_fault(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_: Any) -> Any:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(FrameFolder, "__getitem__", interrupted)
+    monkeypatch.setattr(FrameFolder, "__getitem__", lambda *_: raises(KeyboardInterrupt()))
     assert frames.convert("--on-error", "skip") == 130
     assert "run it again to go on" in frames.said
 
@@ -344,11 +335,8 @@ def test_an_interrupt_is_no_samples_fault(frames: Home, monkeypatch: pytest.Monk
 def test_errors_that_nobody_expects_in_ray_actors(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     """An actor's work: Ray itself is started by the slow test."""
 
-    def broken(*_: Any) -> Any:
-        raise ZeroDivisionError("of \ud800")
-
     asked = Settings(root=frames.source, target=load_rig("argoverse2"), output=frames.output, size=(24, 40))
-    monkeypatch.setattr(FrameFolder, "__getitem__", broken)
+    monkeypatch.setattr(FrameFolder, "__getitem__", lambda *_: raises(ZeroDivisionError("of \ud800")))
     monkeypatch.setattr(ray_runner, "optional_package", lambda *_: SimpleNamespace(get_gpu_ids=list))
     row = Actor(Jobs(asked, asked.open(), range(3), "skip"))({"id": 1})
     done = pickle.loads(row["done"])
@@ -357,17 +345,10 @@ def test_errors_that_nobody_expects_in_ray_actors(frames: Home, monkeypatch: pyt
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_ray_goes_on_without_a_sample(
-    frames: Home, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'arbiview_aug[distributed]'")
-    monkeypatch.setenv("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+@pytest.mark.usefixtures("own_ray")
+def test_ray_goes_on_without_a_sample(frames: Home, capsys: pytest.CaptureFixture[str]) -> None:
     frames.calibrate("file", "a\ud800b")
-    try:
-        assert main(command(frames.source, frames.output, "--runner", "ray", "--on-error", "skip")) == 0
-    finally:
-        ray.shutdown()
+    assert main(command(frames.source, frames.output, "--runner", "ray", "--on-error", "skip")) == 0
     assert "0001: skipped: " in capsys.readouterr().err  # and what Ray logs
 
 

@@ -105,8 +105,8 @@ def test_masks_of_the_targets_own_car(source: Path, tmp_path: Path) -> None:
     asked = command(source, tmp_path / "new", "--target", str(tmp_path / "rig.json"))
     del asked[asked.index("--size") : asked.index("--size") + 2]
     assert main(asked) == 0
-    found = FrameFolder(tmp_path / "new")[0]["rig"]
-    assert np.array_equal(found[0].mask, mask) and found[1].mask.all()
+    written = FrameFolder(tmp_path / "new")[0]["rig"]
+    assert np.array_equal(written[0].mask, mask) and written[1].mask.all()
 
 
 def test_cleaned_masks_are_a_setting(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

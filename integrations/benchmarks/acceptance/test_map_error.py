@@ -56,7 +56,7 @@ class Errors(NamedTuple):
 def errors(plan: RenderPlan, surface: str, scene: Scene, at_most: int, edges: bool = False) -> Errors:
     """Errors at no more pixels of each view, drawn at random."""
     rng = np.random.default_rng(0)
-    found, stepped = [np.zeros(0)], [np.zeros(0, bool)]
+    off, stepped = [np.zeros(0)], [np.zeros(0, bool)]
     for view, camera in zip(plan.targets, plan.target, strict=True):
         seen, pixel_rad = np.flatnonzero(view.coverage), float(1 / camera.K[0, 0])
         some = np.sort(seen[rng.integers(len(seen), size=at_most)]) if len(seen) > at_most else seen
@@ -80,9 +80,9 @@ def errors(plan: RenderPlan, surface: str, scene: Scene, at_most: int, edges: bo
             if slot.level:  # a halved image's outer half pixel is read at its border
                 h, w = slot.size
                 expected = np.clip(expected, (slot.x, slot.y), (slot.x + w - 1, slot.y + h - 1))
-            found.append(np.abs(read[won] - expected).max(axis=-1))
+            off.append(np.abs(read[won] - expected).max(axis=-1))
             stepped.append(edge[y[won], x[won]] if edges else np.zeros(np.count_nonzero(won), bool))
-    return Errors(np.concatenate(found), np.concatenate(stepped))
+    return Errors(np.concatenate(off), np.concatenate(stepped))
 
 
 def near_steps(q: FloatArray) -> BoolArray:

@@ -1,0 +1,76 @@
+"""What several of these checks share: the evaluation protocol's frames, and the moves of synthetic streets."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.synthetic import RenderedViews
+from arbiview_aug.evaluate.lidar import equalised
+from arbiview_aug.evaluate.metrics import psnr_db
+from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
+from tests.helpers import as_camera
+
+FRAMES = [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("ddad-one", marks=pytest.mark.release)]
+MOVES = ("0.6 m higher", "0.5 m forward", "turned by 20°")
+
+
+def moved(rig: Rig) -> dict[str, Rig]:
+    """The rig after each of the moves."""
+    return dict(zip(MOVES, (rig.shifted(z_m=0.6), rig.shifted(x_m=0.5), rig.turned(yaw_deg=20)), strict=True))
+
+
+def psnr_of(out: dict[str, Any], truth: RenderedViews, parts: Iterable[np.ndarray]) -> list[float]:
+    """PSNR in dB of an output against true views, on the covered pixels of each mask (N, h, w); NaN on none."""
+    squares = (out["images"].float() - truth.images).square().mean(1).numpy()
+    masks = (out["coverage"].numpy() & part for part in parts)
+    return [psnr_db(float(squares[mask].mean())) if mask.any() else np.nan for mask in masks]
+
+
+class ProtocolFrame:
+    """A frame at half resolution as the protocol reads it, and as this package does.
+
+    Attributes:
+        cameras: The protocol's cameras; exposures made even unless ``raw``.
+        lidar: (P, 3+) points in the ego frame.
+        rig: The cameras as ours.
+        images: (h, w, 3) uint8 for each camera; exposures made even unless ``raw``.
+    """
+
+    def __init__(self, referee: ModuleType, folder: Path, raw: bool = False) -> None:
+        self.cameras, self.lidar, self.calibration = referee.load_frame(str(folder), 0.5)
+        self.referee, self.ground_z_m = referee, float(self.calibration["ground_z_m"])
+        self.rig = Rig(
+            [
+                as_camera(name, c["K"], c["cam2ego"], c["image"].shape[:2], c["mask"] > 0)
+                for name, c in self.cameras.items()
+            ],
+            ground_z_m=self.ground_z_m,
+            name=folder.name,
+        )
+        self.images = [c["image"] for c in self.cameras.values()]
+        if not raw:
+            self.images = list(equalised(self.rig, self.images, self.lidar))
+            self.cameras = referee.equalised(self.cameras, self.lidar)
+
+    def targets(self) -> dict[str, list[Any]]:
+        """The protocol's own targets by set, turned and raised."""
+        yaws = [self.referee.rotated_targets(self.cameras, yaw) for yaw in YAWS_DEG]
+        return {"yaw": yaws, "up": [self.referee.rotated_targets(self.cameras, 0.0, (0.0, 0.0, UP_M))]}
+
+    def rigs(self, targets: Iterable[Any]) -> list[Rig]:
+        """The protocol's targets as ours."""
+        return [Rig([as_camera(*view) for view in views], ground_z_m=self.ground_z_m) for views in targets]
+
+
+def frame_folder(data_root: Path, name: str) -> Path:
+    """A frame's folder; the check is skipped without it."""
+    if not (data_root / name).is_dir():
+        pytest.skip(f"no frame {name} in {data_root}")
+    return data_root / name
