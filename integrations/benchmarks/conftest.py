@@ -1,4 +1,4 @@
-"""Studies, and checks of times, memory, accuracy and killed conversions (docs/contributing.md); fixtures are the tests'."""
+"""Studies, and checks of times, memory, accuracy and kills (docs/contributing.md); fixtures are the tests'."""
 
 from tests.conftest import (  # noqa: F401
     data_root,
