@@ -119,12 +119,7 @@ def source_sample(images: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -
 
 # --- label maps -------------------------------------------------------------------------------------------------------
 def target_labels(
-    key: str,
-    value: Any,
-    frames: Sequence[Frame],
-    lead: tuple[int, ...],
-    rendered: Sequence[RenderedFrame],
-    fill: float,
+    key: str, value: Any, frames: Sequence[Frame], lead: tuple[int, ...], rendered: Sequence[RenderedFrame], fill: float
 ) -> Any:
     """Render label maps, (..., N, H, W) or a list of (..., Hi, Wi), in the target's views.
 
