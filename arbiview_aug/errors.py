@@ -33,21 +33,11 @@ def described(error: Exception) -> str:
     return str(error) if isinstance(error, ArbiviewError) else f"{type(error).__name__}: {error}"
 
 
-def exit_status(
-    program: str,
-    command: Callable[[], int | None],
-    *,
-    resumable: bool = False,
-) -> int:
-    """Run a command; what the user can fix, Ctrl-C, SIGTERM or SIGHUP becomes one line on stderr.
+def exit_status(program: str, command: Callable[[], int | None], *, resumable: bool = False) -> int:
+    """Run a command; what the user can fix, Ctrl-C, SIGTERM or SIGHUP becomes one line on stderr after ``program``.
 
-    Args:
-        program: Starts that line.
-        command: Returns its exit status; None is 0.
-        resumable: Whether the command continues an interrupted run.
-
-    Returns:
-        The command's exit status, 2 after an error, 130 after Ctrl-C and the other signals.
+    Returns the command's exit status (None is 0), 2 after an error, 130 after Ctrl-C and the other signals, where a
+    ``resumable`` command may be run again to go on.
     """
     try:
         with _signals_as_interrupts():

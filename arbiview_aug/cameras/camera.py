@@ -192,11 +192,9 @@ class Camera:
     @cached_property
     def mask_key(self) -> bytes:
         """Digest of the mask; empty without one."""
-        return (
-            b""
-            if self.mask is None
-            else hashlib.sha256(repr(self.size).encode() + np.packbits(self.mask).tobytes()).digest()
-        )
+        if self.mask is None:
+            return b""
+        return hashlib.sha256(repr(self.size).encode() + np.packbits(self.mask).tobytes()).digest()
 
     @cached_property
     def parameters(self) -> npt.NDArray[np.float32]:

@@ -20,12 +20,9 @@ Range = float | tuple[float, float]
 
 
 def sequence_rng(name: object, epoch: int = 0, rng: torch.Generator | None = None) -> torch.Generator:
-    """A generator that is the same for all frames of a sequence, in all workers of a DataLoader's epoch.
+    """A generator that is the same for all frames of a named sequence, in all workers of a DataLoader's epoch.
 
-    Args:
-        name: Of the sequence.
-        epoch: A number to change the draws by.
-        rng: Takes the place of torch's global generator outside workers: its initial seed counts.
+    ``epoch`` changes the draws. Outside workers the initial seed of ``rng``, else of torch's global generator, counts.
     """
     worker = torch.utils.data.get_worker_info()
     if worker is not None:

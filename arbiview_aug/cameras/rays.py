@@ -38,25 +38,15 @@ def project_rays(
 ) -> tuple[FloatArray, BoolArray]:
     """Source pixels (..., 2) of scene points on target rays, and their validity (...,).
 
-    Args:
-        source: The camera that recorded the image.
-        directions: (..., 3) unit rays of the target in the ego frame.
-        inverse_distance: (...,) along them, 1/m; 0 is infinity.
-        offset_m: (3,) the target's centre minus the source's, metres.
+    ``directions`` (..., 3) are unit rays of the target in the ego frame, ``inverse_distance`` (...,) is along them, 1/m
+    (0 is infinity), and ``offset_m`` (3,) the target's centre minus the source's.
     """
-    uv, _, valid = source.project_cam(source_points(source, directions, inverse_distance, offset_m))
-    return uv, valid
-
-
-def source_points(
-    source: Camera, directions: FloatArray, inverse_distance: FloatArray, offset_m: FloatArray
-) -> FloatArray:
-    """Scene points in the source's frame (..., 3), up to a positive scale; arguments as for ``project_rays``."""
     R = source.cam2ego[:3, :3].T
     points = R @ np.moveaxis(directions, -1, 0).reshape(3, -1)
     if np.any(offset_m):
         points += (R @ offset_m)[:, None] * inverse_distance.reshape(1, -1)
-    return np.moveaxis(points.reshape(3, *directions.shape[:-1]), 0, -1)
+    uv, _, valid = source.project_cam(np.moveaxis(points.reshape(3, *directions.shape[:-1]), 0, -1))
+    return uv, valid
 
 
 def look_apart(camera: Camera, others: Sequence[Camera], nearest: float) -> list[bool]:
@@ -175,11 +165,7 @@ class PixelRays:
 class CameraMaps:
     """Rays and masks of cameras by their content: what is costly and does not change from frame to frame.
 
-    Args:
-        max_bytes: Memory for them.
-
-    Attributes:
-        memory: Memory of what does change.
+    ``memory`` is that of what does change.
     """
 
     def __init__(self, max_bytes: int = 256 * 2**20) -> None:
@@ -239,17 +225,10 @@ def relative_pose(target: Camera, source: Camera) -> tuple[Planes, Planes]:
 def source_pixels(
     target: Camera, rays: Planes, inverse_distance: Planes, source: Camera
 ) -> tuple[Planes, Planes, Planes]:
-    """Pixels of a source for scene points on a target's rays.
+    """Pixels of a source for scene points on a target's rays; both cameras are in one ego frame.
 
-    Args:
-        target: The camera of the rays.
-        rays: (3, h, w) unit rays, camera frame.
-        inverse_distance: (h, w) along them, 1/m.
-        source: The other camera, in the same ego frame.
-
-    Returns:
-        u and v (h, w), ``kernels.FAR_AWAY_PX`` where there is no pixel, and the points' inverse distances from the
-        source (h, w), 1/m.
+    ``rays`` are (3, h, w) unit rays in the target's frame, ``inverse_distance`` (h, w) is along them, 1/m. Returns u
+    and v (h, w), ``kernels.FAR_AWAY_PX`` where there is no pixel, and inverse distances from the source (h, w), 1/m.
     """
     from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, project_image
 

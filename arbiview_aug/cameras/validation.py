@@ -200,11 +200,7 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
         (metres, "positions in millimetres", "divide cam2ego[:3, 3] by 1000"),
         (np.asarray(np.linalg.inv(cam2ego), np.float64), "ego2cam, the inverse", "pass np.linalg.inv(cam2ego)"),
         (cam2ego @ body, "a body's axes (ROS: x forward, z up)", f"multiply cam2ego[:3, :3] {axes} right"),
-        (
-            body @ cam2ego,
-            "an ego frame with a camera's axes (z forward)",
-            f"multiply cam2ego[:3] {axes} left",
-        ),
+        (body @ cam2ego, "an ego frame with a camera's axes (z forward)", f"multiply cam2ego[:3] {axes} left"),
         (cam2ego @ upside_down, "OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]"),
     ):
         if (_stands(right) & is_mounted(right, ground_z_m)).mean() > 0.5:

@@ -28,9 +28,8 @@ from arbiview_aug.favs.stage2_features import NO_MATCHES, FeatureReport, Region,
 from arbiview_aug.favs.stage3_objects import AlignmentReport, align_objects, declined, find_objects
 from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion, source_pixels, warp_perspective
 from arbiview_aug.render.rendered import RenderedFrame, from_winners
+from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.sample.detections import Detection
-
-SAME_CENTER_M = 1e-6  # distance below which two camera centres coincide
 
 
 @dataclass(frozen=True)
@@ -79,16 +78,11 @@ def render_paper(
     config: PaperConfig | None = None,
     detections: Mapping[int, Sequence[Detection]] | None = None,
 ) -> PaperRendering:
-    """Render a target rig by the published stages.
+    """Render a target rig, in the source's ego frame, by the published stages.
 
-    The same images give the same bits in every process, for which OpenCV runs on one thread.
-
-    Args:
-        source: Pinhole cameras. Pixels that their masks hide are never read.
-        target: Pinhole cameras, in the source's ego frame.
-        images: N images (3, H, W) on the CPU: uint8, or float in [0, 1].
-        config: Settings.
-        detections: A detector's boxes by source camera, from which objects take their types.
+    The same images give the same bits in every process, for which OpenCV runs on one thread. N images (3, H, W) are on
+    the CPU: uint8, or float in [0, 1]; pixels that the sources' masks hide are never read. Objects take their types
+    from a detector's boxes by source camera.
 
     Raises:
         CalibrationError: A camera is not a pinhole camera.

@@ -154,16 +154,10 @@ def plan_fills(
     reach: Reach,
     maps: CameraMaps,
 ) -> Fills | None:
-    """Find the holes of a frame and the neighbours that show them; None if none does.
+    """Find the holes of a frame's plan and the neighbours, nearest first, that show them; None if none does.
 
-    Args:
-        plan: The current frame's plan.
-        neighbours: Other frames, the nearest first.
-        scene: Geometry of the current frame, in its ego frame.
-        surface: Name of the surface that the current frame is rendered over.
-        config: Its settings.
-        reach: Area that may be filled.
-        maps: Rays and masks of cameras.
+    ``scene`` is the current frame's, in its ego frame, and ``surface`` the one that it is rendered over. ``reach`` is
+    the area that may be filled.
     """
     full = scene.surface(surface, plan.source.ground_z_m)
     holes = [hole for k in range(len(plan.targets)) if (hole := _hole(plan, k, full, reach, maps)) is not None]
@@ -242,21 +236,12 @@ def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
 
 # --- filling ----------------------------------------------------------------------------------------------------------
 def fill_from_neighbours(
-    rendered: RenderedFrame,
-    fills: Fills,
-    images: Sequence[torch.Tensor],
-    renderer: Renderer,
-    warn: Warn,
+    rendered: RenderedFrame, fills: Fills, images: Sequence[torch.Tensor], renderer: Renderer, warn: Warn
 ) -> RenderedFrame:
-    """Fill the holes of a rendered frame from its neighbours.
+    """Fill the holes of a rendered frame from its neighbours; ``warn`` is called for those that cannot be read.
 
-    Args:
-        rendered: The frame; its maps, and its images where possible, are written into. Its tone curves serve the
-            neighbours' cameras too: the holes overlap the current views too little to estimate others.
-        fills: The planned fills.
-        images: The current frame's source images.
-        renderer: Renders the neighbours.
-        warn: Called for neighbours that cannot be read.
+    The frame's maps, and its images where possible, are written into. Its tone curves serve the neighbours' cameras
+    too: the holes overlap the current views too little to estimate others. ``images`` are its sources.
     """
     tones = None if rendered.curves is None else rendered.curves[[hole.target for hole in fills.holes]]
     neighbours = []
@@ -343,9 +328,8 @@ def merged(
     Args:
         view: (3, h, w) uint8, or float in [0, 1]; gradients reach the pixels that it keeps.
         free: (h, w) bool, True where the view may be filled.
-        seam: (h, w) bool, True where view and candidates should agree.
+        seam: (h, w) bool, ``margin_px`` wide, True where view and candidates should agree.
         candidates: The nearest first.
-        margin_px: Width of the seam.
 
     Returns:
         (3, h, w) filled view, and (h, w) int16 index of the candidate taken, -1 for none.

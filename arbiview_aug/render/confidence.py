@@ -39,9 +39,8 @@ _WINDOWS = (5, 11)  # cells a side: 3 and 6 % of the width
 def certainty(parallax_rad: FloatArray, pixels_per_pixel: FloatArray) -> FloatArray:
     """Share (...,) in [0, 1] of a source's detail that is correct: 1 at the target's own centre and resolution.
 
-    Args:
-        parallax_rad: (...,) displacement that unknown depth is expected to cause.
-        pixels_per_pixel: (...,) source pixels per target pixel along the worse axis; fewer blur, more alias.
+    ``parallax_rad`` (...,) is the displacement that unknown depth is expected to cause; ``pixels_per_pixel`` (...,) are
+    source pixels per target pixel along the worse axis: fewer blur, more alias.
     """
     ratio = np.clip(pixels_per_pixel, 1e-3, 1e3)
     detail = np.minimum(ratio, 1 / ratio) ** RESOLUTION_POWER
@@ -53,11 +52,8 @@ def confidence(
 ) -> torch.Tensor:
     """Confidence (..., h, w) float32 in [0, 1] of a rendered view: 0 where uncovered, 1 where the source is exact.
 
-    Args:
-        view: (..., 3, h, w) as rendered; uint8, or float in [0, 1].
-        certain: (h, w) ``certainty`` in 255ths.
-        covered: (h, w) bool.
-        seam: (..., h, w) float32, in the view's unit: by how much blending a second source changed the winner's colour.
+    The view (..., 3, h, w) is uint8, or float in [0, 1]; ``certain`` (h, w) is ``certainty`` in 255ths; ``seam``
+    (..., h, w), in the view's unit, says by how much blending a second source changed the winner's colour.
     """
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
     with torch.no_grad():

@@ -45,17 +45,11 @@ SHARES = np.float32(1), np.float32(0)
 
 
 def tone_curves(gains: npt.ArrayLike, knee: float = KNEE) -> npt.NDArray[np.float64]:
-    """Curves of gains: x times the gain up to a knee, then a straight line to (1, 1): saturated pixels stay saturated.
+    """Curves of gains (...,): x times the gain up to a knee, then a straight line to (1, 1): saturated pixels stay so.
 
     The knee lies on the brighter axis (the output of a gain above 1, the input of one below), so the curves of g and
-    1 / g invert each other.
-
-    Args:
-        gains: (...,) gains.
-        knee: Where the fade begins, below 1.
-
-    Returns:
-        (..., 2) the slopes of both lines: the lower of them counts for a gain above 1, the higher below 1.
+    1 / g invert each other. (..., 2) are the slopes of both lines: the lower of them counts for a gain above 1, the
+    higher below 1.
     """
     gain = np.asarray(gains, np.float64)
     above, below = (1 - knee) / (1 - knee / np.maximum(gain, 1)), (1 - gain * knee) / (1 - knee)
@@ -158,21 +152,10 @@ def _lattice() -> tuple[FloatArray, BoolArray]:
     return np.stack([x, y], -1)[even].astype(np.float64), odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[y, x][even]
 
 
-def estimate_gains(
-    rig: Rig,
-    images: Sequence[torch.Tensor],
-    *,
-    overlaps: Overlaps | None = None,
-) -> PhotometricReport:
-    """Estimate one gain per camera from one frame.
+def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overlaps | None = None) -> PhotometricReport:
+    """Estimate one gain per camera from one frame's N images (3, H, W): uint8, or float in [0, 1]; on any device.
 
-    Args:
-        rig: The source rig.
-        images: N images (3, H, W): uint8, or float in [0, 1]; any device. They are not changed.
-        overlaps: ``find_overlaps(rig)``, if it is known: it takes longer than the rest.
-
-    Returns:
-        The gains, or gains of 1 and the reason.
+    ``find_overlaps(rig)`` takes longer than the rest: ``overlaps`` are given if they are known. Declined gains are 1.
     """
     from arbiview_aug.render.photometry_kernels import tone
 
@@ -236,10 +219,7 @@ def pair_ratios(pixels: _Pixels, reads: npt.NDArray[np.int64], dark: float, brig
 
 
 def _solve(
-    count: int,
-    pairs: npt.NDArray[np.int64],
-    ratio: npt.NDArray[np.float64],
-    variance: npt.NDArray[np.float64],
+    count: int, pairs: npt.NDArray[np.int64], ratio: npt.NDArray[np.float64], variance: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
     """Least-squares log-gains with the prior; their median is 0 in every connected group of cameras.
 
@@ -307,12 +287,9 @@ class Harmoniser:
     def curves(
         self, rig: Rig, images: Sequence[torch.Tensor], views: Sequence[ViewPlan]
     ) -> npt.NDArray[np.float64] | None:
-        """The tone curves (M, N, 2) of each camera in each view; None if the images stay as they are.
+        """The tone curves (M, N, 2) of each camera in each view; None if the N images (3, H, W) stay as they are.
 
-        Args:
-            rig: The source rig.
-            images: Its N images (3, H, W).
-            views: Plans of the views. Estimated gains leave the source that wins most pixels of a view as it is.
+        Estimated gains leave the source that wins most pixels of a view as it is.
         """
         if self.estimates and all(len(view.pairs) + len(view.bands) < 2 for view in views):
             return None

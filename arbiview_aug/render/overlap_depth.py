@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import cv2
@@ -177,15 +178,10 @@ class _Strip(NamedTuple):
 
 
 def overlap_depth(rig: Rig, images: Sequence[torch.Tensor], boxes: FloatArray | None = None) -> OverlapDepth:
-    """Estimate distances from the overlaps of one frame, over the street surface.
+    """Estimate distances from the overlaps of one frame's N images (3, H, W), over the street surface.
 
-    Args:
-        rig: The source rig.
-        images: N images (3, H, W): uint8, or float in [0, 1]; any device. They are not changed.
-        boxes: (B, 7) labelled objects, as in ``Scene``; pixels that show them are left out: their distance is known.
-
-    Returns:
-        Corrections, and why each pair was accepted or not. They do not depend on the order of the cameras.
+    Images are uint8, or float in [0, 1], on any device; they are not changed. Pixels that show labelled objects (B, 7)
+    are left out: their distance is known. Results do not depend on the order of the cameras.
     """
     order = content_order(rig.cameras)
     rig = rig.with_cameras([rig[k] for k in order])
@@ -397,40 +393,28 @@ def reduced(image: torch.Tensor, level: int) -> npt.NDArray[np.float32]:
 
 
 # --- as a stage of the transform --------------------------------------------------------------------------------------
-_OVERLAP_BYTES = 128 * 2**20
+_OVERLAP_BYTES = 128 * 2**20  # about 4 MB each for six cameras
+
+OverlapCache = LRUCache[tuple[bytes, str | None], OverlapDepth]
+"""Depth from overlap by calibration, and name of what frames share."""
 
 
-class OverlapCache(LRUCache[tuple[bytes, str | None], OverlapDepth]):
-    """Depth from overlap by calibration and name, about 4 MB each for six cameras.
-
-    Args:
-        key: Key of the sample that names what frames share; None for nothing but the calibration.
-    """
-
-    def __init__(self, key: str | None) -> None:
-        super().__init__(_OVERLAP_BYTES, lambda depth: depth.nbytes)
-        self.key = key
-
-    def __reduce__(self) -> tuple[type[OverlapCache], tuple[str | None]]:
-        return OverlapCache, (self.key,)
-
-    @classmethod
-    def of(cls, share: bool | str, config: Any) -> OverlapCache | None:
-        """The cache of ``PlanCache.share_overlap``; ValueError unless the config asks for depth from overlap."""
-        if share is False:
-            return None
-        if not getattr(config, "overlap_depth", False):
-            raise ValueError("PlanCache.share_overlap: expected quality='accurate' (or overlap_depth=True) with it")
-        return cls(None if share is True else share)
+def overlap_cache(share: bool | str, config: Any) -> OverlapCache | None:
+    """The cache of ``PlanCache.share_overlap``; ValueError unless the config asks for depth from overlap."""
+    if share is False:
+        return None
+    if not getattr(config, "overlap_depth", False):
+        raise ValueError("PlanCache.share_overlap: expected quality='accurate' (or overlap_depth=True) with it")
+    return LRUCache(_OVERLAP_BYTES, attrgetter("nbytes"))
 
 
 def estimate_overlap(
-    frame: Frame, scene: Scene, surface: GeometryName, shared: OverlapCache | None
+    frame: Frame, scene: Scene, surface: GeometryName, share: bool | str, shared: OverlapCache | None
 ) -> OverlapDepth | None:
     """Estimate depth from the overlaps of a frame's images, or take it from a cache; None if the surface has no use.
 
     Raises:
-        SampleError: The sample lacks the key by which the cache shares depth.
+        SampleError: The sample lacks the key ``share`` by which the cache shares depth.
     """
     row = GEOMETRIES[scene.best if surface == "auto" else surface]
     if not row.overlap_depth:
@@ -438,7 +422,7 @@ def estimate_overlap(
     boxes = scene.boxes if "boxes" in row.reads else None
     if shared is None:
         return overlap_depth(frame.rig, frame.images, boxes)
-    key = shared.key
+    key = share if isinstance(share, str) else None
     if key is not None and key not in frame.sample:
         raise SampleError(f"PlanCache.share_overlap: expected {key!r} in the sample, to tell which frames share depth")
     name = None if key is None else frame.name(key)

@@ -201,8 +201,6 @@ class AtlasLayout:
         return next(s for s in self.slots if (s.source, s.level) == (source, level))
 
 
-
-
 @dataclass(frozen=True)
 class SourceUse:
     """How one target uses one source; ``explain`` prints it."""

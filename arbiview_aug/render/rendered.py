@@ -49,8 +49,7 @@ def render_opencv(
             winner's colour, mean over the channels, in the images' unit.
 
     Returns:
-        M views (3, h, w) of the images' type, black where no source sees; slices of one (M, 3, h, w) block where all
-        targets have one size.
+        M views (3, h, w) of the images' type, black where no source sees; slices of one block where sizes agree.
     """
     from arbiview_aug.render.kernels import read_ahead
     from arbiview_aug.render.photometry_kernels import tone
@@ -160,13 +159,7 @@ def _remap(
 
 
 def render_labels(plan: RenderPlan, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:
-    """Render label maps by the winning source's nearest label; ``fill`` where uncovered.
-
-    Args:
-        plan: The plan for these labels' rig.
-        labels: N maps (..., H, W) of any type and device.
-        fill: Value of uncovered pixels.
-    """
+    """Render N label maps (..., H, W) of any type by the winning source's nearest label; ``fill`` where uncovered."""
     rendered, device = [], labels[0].device
     for target in plan.targets:
         at, winner = (torch.from_numpy(a).to(device) for a in (target.at.to_float(), target.source_camera))
@@ -275,16 +268,11 @@ class Renderer:
         curves: Sequence[npt.NDArray[np.float64] | None],
         outputs: Collection[str] = (),
     ) -> list[RenderedFrame]:
-        """Render frames; torch renders those that share a plan in one batch.
+        """Render frames by a plan each; torch renders those that share a plan in one batch.
 
-        Args:
-            plans: One for each frame.
-            frames: The frames.
-            curves: For each frame the tone curves (M, N, 2) of each view for each source, or None.
-            outputs: The requested of ``source_camera``, ``source_frame`` and ``confidence``.
-
-        Raises:
-            SampleError: ``backend="opencv"``, and an image is on another device or needs gradients.
+        ``curves`` are for each frame the tone curves (M, N, 2) of each view for each source, or None; ``outputs`` the
+        requested of ``source_camera``, ``source_frame`` and ``confidence``. SampleError for ``backend="opencv"`` and an
+        image on another device or with gradients.
         """
         with_seams = "confidence" in outputs
         rendered: dict[int, RenderedFrame] = {}

@@ -46,12 +46,8 @@ def baselines_m(source: Rig, target: Rig) -> FloatArray:
 def needs_geometry(source: Rig, target: Rig, surface: str, config: RenderConfig) -> bool:
     """Whether the source position of any target pixel depends on the distance of the scene.
 
-    Args:
-        source: The rig that recorded the images.
-        target: The rig to render, in its own ego frame.
-        surface: As in ``build_plan``. ``auto`` ignores pairs of cameras whose worst-case parallax is below
-            ``config.far_parallax_px``, and those without common points beyond ``NEAREST_SCENE_M``.
-        config: Settings.
+    The target is in its own ego frame. Surface ``auto`` ignores pairs of cameras whose worst-case parallax is below
+    ``config.far_parallax_px``, and those without common points beyond ``NEAREST_SCENE_M``.
     """
     target = target.in_frame_of(source)
     for camera, row in zip(target, baselines_m(source, target), strict=True):
@@ -72,13 +68,8 @@ def static_harm(source: Rig, target: Rig, surface: str, config: RenderConfig) ->
     """Explain how a detector suffers from cameras that move over a static surface; None if it does not.
 
     Objects are projected onto the road or the house behind them. A detector trained on such views alone was 3 to 5
-    points of IoU worse; with half of the frames untouched it was 1 point better (``integrations/cross_rig``).
-
-    Args:
-        source: The rig that recorded the images.
-        target: The rig to render, in its own ego frame.
-        surface: The surface that is rendered over, not ``auto``.
-        config: Settings.
+    points of IoU worse; with half of the frames untouched it was 1 point better (``integrations/cross_rig``). The
+    target is in its own ego frame; the surface is the one that is rendered over, not ``auto``.
     """
     if not GEOMETRIES[surface].is_static:
         return None
@@ -99,15 +90,10 @@ def harm_remedies(source: Rig, target: Rig) -> str:
 
 
 def covers_target_exactly(source: Camera, target: Camera, config: RenderConfig) -> bool:
-    """Whether one source certainly wins every pixel of a target camera, so that the others can be skipped.
+    """Whether one source certainly wins every pixel of a target camera in its ego frame, so that others can be skipped.
 
     It must share the target's centre, see all of it, and outweigh every other source. Decided by the corners, so for
     pinholes only: a homography maps the target's rectangle to a convex quadrilateral.
-
-    Args:
-        source: A camera of the source rig.
-        target: A camera to render, in the same ego frame.
-        config: Settings of weights, halving and interpolation.
     """
     if not source.is_rectilinear or not target.is_rectilinear:
         return False

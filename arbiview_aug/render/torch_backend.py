@@ -44,11 +44,9 @@ class ViewMaps:
     @property
     def nbytes(self) -> int:
         """Memory in bytes."""
-        tensors = [self.grid, self.source, *(self.edge or ())]
-        tensors += [] if self.certainty is None else [self.certainty]
-        if self.blend is not None:
-            tensors += [self.blend.pixel, self.blend.grid, self.blend.weight, self.blend.source]
-        return sum(tensor.nbytes for tensor in tensors)
+        blend = () if self.blend is None else vars(self.blend).values()
+        tensors = self.grid, self.source, self.certainty, *(self.edge or ()), *blend
+        return sum(tensor.nbytes for tensor in tensors if tensor is not None)
 
 
 def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
@@ -127,16 +125,10 @@ def render_torch(
     curves: Sequence[npt.NDArray[np.float64] | None] | None = None,
     seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
-    """Render the target views of a batch with ``grid_sample``.
+    """Render the M target views (B, 3, h, w) of a batch of frames that share a plan, with ``grid_sample``.
 
-    Args:
-        plan: The plan for these images' rig, shared by the batch.
-        images: N images (B, 3, H, W): uint8, or float in [0, 1]; sampled in float32.
-        curves: For each frame of the batch None or (M, N, 2): see ``render_opencv``.
-        seams: A list to append (B, h, w) float32 to for each view: see ``render_opencv``.
-
-    Returns:
-        M views (B, 3, h, w) of the images' type.
+    The N images (B, 3, H, W) are uint8, or float in [0, 1], and sampled in float32. ``curves`` are for each frame None
+    or (M, N, 2), and ``seams`` a list to append (B, h, w) float32 to for each view: see ``render_opencv``.
     """
     dtype, device = images[0].dtype, images[0].device
     top = 255 if dtype == torch.uint8 else 1

@@ -62,11 +62,8 @@ LEAST_SHARE = 1 / 256  # a source that adds less than this to a pixel cannot cha
 def seam_weights(winner: npt.NDArray[np.int8], border_px: Sequence[Nodes], radius: int, width_px: float) -> list[Nodes]:
     """Weights on the nodes: each source's winning area, softened over the seams, fading at its own border.
 
-    Args:
-        winner: (ny, nx) source of each node, -1 for none.
-        border_px: (ny, nx) distance to the border of what it sees, target pixels.
-        radius: Half the width of a seam, in nodes.
-        width_px: Width of a seam, target pixels.
+    ``winner`` (ny, nx) is the source of each node, -1 for none; ``border_px`` (ny, nx) for each source the distance to
+    the border of what it sees, and ``width_px`` the width of a seam, in target pixels; ``radius`` half of it in nodes.
     """
     weights: list[Nodes] = []
     for k, border in enumerate(border_px):
@@ -103,11 +100,9 @@ class SecondBest:
         self.images = weight, second, memory.empty(size, np.int32), memory.empty(size, np.uint16)
 
     def blend_regions(self, sources: Sequence[int], best: npt.NDArray[np.float32]) -> list[BlendRegion]:
-        """Rectangles around the pixels that a second source adds to.
+        """Rectangles around the pixels that a second source adds to; ``best`` (h, w) is the winning source's weight.
 
-        Args:
-            sources: All, in content order: rectangles overlap, and blending rounds.
-            best: (h, w) weight of the winning source.
+        ``sources`` are all, in content order: rectangles overlap, and blending rounds.
         """
         from arbiview_aug.render.kernels import cut_bands, find_bands
 

@@ -17,6 +17,7 @@ from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_n
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
+from arbiview_aug.sample.masks import CLEANING, dark_rims
 from arbiview_aug.scene.boxes import checked_boxes
 from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import GEOMETRIES, Scene, believed, motion_camera, points_of_depth
@@ -75,8 +76,7 @@ class Frame:
     def array(self, key: str) -> Points | None:
         """The frame's array of a sample key; None without one.
 
-        Args:
-            key: Holds an array, a tensor with the sample's leading dimensions, or a list with an array for each frame.
+        The key holds an array, a tensor with the sample's leading dimensions, or a list with an array for each frame.
         """
         value = self.sample.get(key)
         if value is None or not self.lead:
@@ -138,11 +138,7 @@ def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
 
 
 def read_scene(frame: Frame, surface: str) -> Scene | None:
-    """Read the geometry that a surface uses, in the source's ego frame; None without any.
-
-    Args:
-        frame: The frame.
-        surface: A name in ``GEOMETRIES``.
+    """Read the geometry that a surface of ``GEOMETRIES`` uses, in the source's ego frame; None without any.
 
     Raises:
         SampleError: The sample lacks what the surface needs, or it is impossible.
@@ -395,10 +391,7 @@ _MAX_ENTRIES = 64  # checked per list: longer lists are tokens or numbers
 
 
 def check_other_keys(
-    sample: Mapping[str, Any],
-    sizes: Sequence[tuple[int, ...]],
-    label_keys: Sequence[str],
-    pass_keys: Sequence[str],
+    sample: Mapping[str, Any], sizes: Sequence[tuple[int, ...]], label_keys: Sequence[str], pass_keys: Sequence[str]
 ) -> list[str]:
     """The keys that hold label maps; refuse others that may be bound to the source's pixels.
 
@@ -453,36 +446,30 @@ def _leaves(value: Any) -> Iterator[Any]:
             waiting += reversed([*entry.values()] if isinstance(entry, Mapping) else entry[:_MAX_ENTRIES])
 
 
-def warn_of_misnamed(
-    sample: Mapping[str, Any],
-    calibrated: bool,
-    static: bool,
-    named: Sequence[str],
-    warn: Callable[[str, str], None],
-) -> None:
-    """Warn, by topic and message, of keys that are probably misnamed and would not be read.
+def misnamed_keys(sample: Mapping[str, Any], calibrated: bool, static: bool = False) -> dict[str, str]:
+    """Keys that are probably misnamed and would not be read, and what is meant.
 
     Where ``calibrated``, a rig stands for ``lens``, ``distortion`` and ``ground_z_m``; where ``static``, no ego-frame
-    key is used. ``named`` keys are named on purpose.
+    key is used.
     """
     lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
-    geometry = () if static else (*EGO_KEYS, "depth_m")
-    for wrong, meant in misnamed(sample, ("neighbours", *lenses, *geometry)).items():
-        if wrong not in (*named, *PIXEL_BOUND_KEYS):
+    keys = misnamed(sample, ("neighbours", *lenses, *(() if static else (*EGO_KEYS, "depth_m"))))
+    return {wrong: meant for wrong, meant in keys.items() if wrong not in PIXEL_BOUND_KEYS}
+
+
+def warn_of_misnamed(
+    sample: Mapping[str, Any], calibrated: bool, static: bool, named: Sequence[str], warn: Callable[[str, str], None]
+) -> None:
+    """Warn, by topic and message, of ``misnamed_keys`` that are not ``named`` on purpose."""
+    for wrong, meant in misnamed_keys(sample, calibrated, static).items():
+        if wrong not in named:
             message = f"the sample's {wrong!r} is not read; did you mean {meant!r}?"
-            warn(
-                f"key {wrong}", f"{message} Rename it, as RigRetarget documents it, or name it in SampleKeys(keep=...)"
-            )
+            fix = "Rename it, as RigRetarget documents it, or name it in SampleKeys(keep=...)"
+            warn(f"key {wrong}", f"{message} {fix}")
 
 
 def warn_of_rims(frames: Iterable[Frame], warn: Callable[[str, str], None]) -> None:
     """Warn, by topic and message, of fisheye images with a dark rim that no mask hides."""
-    lenses = [(c, i) for f in frames for c, i in zip(f.rig, f.images, strict=True) if c.mask is None]
-    if all(camera.is_rectilinear for camera, _ in lenses):
+    for camera, _ in (rim for frame in frames for rim in dark_rims(frame.rig, frame.images)):
+        warn("rim", f"camera {camera.name!r}: the dark rim of the image is read as scene; mask it: {CLEANING}")
         return
-    from arbiview_aug.sample.masks import CLEANING, image_circle
-
-    for camera, image in lenses:
-        if image_circle(camera, image) is not None:
-            warn("rim", f"camera {camera.name!r}: the dark rim of the image is read as scene; mask it: {CLEANING}")
-            return

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -58,16 +58,10 @@ def without_specks(mask: BoolArray) -> BoolArray:
 
 
 def image_circle(camera: Camera, image: torch.Tensor) -> Circle | None:
-    """Find the circle around which a fisheye's image is dark.
+    """Find the circle around which a fisheye's image (3, h, w), uint8 or float in [0, 1], is dark.
 
-    The dark regions at the corners must end in one circle, so that a dark scene is not taken for a rim.
-
-    Args:
-        camera: The camera; None is returned for lenses that keep straight lines straight.
-        image: Its image (3, h, w), uint8 or float in [0, 1].
-
-    Returns:
-        The circle within the vignette; None without a rim.
+    The dark regions at the corners must end in one circle, so that a dark scene is not taken for a rim. The circle is
+    that within the vignette; None without a rim, and for lenses that keep straight lines straight.
     """
     if camera.is_rectilinear:
         return None
@@ -121,6 +115,13 @@ def _circle(points: FloatArray) -> tuple[FloatArray, float]:
     return np.array([x, y]), float(np.sqrt(max(c + x * x + y * y, 0.0)))
 
 
+def dark_rims(rig: Rig, images: Sequence[torch.Tensor]) -> Iterator[tuple[Camera, Circle]]:
+    """Cameras without a mask whose images (3, h, w) have a dark rim, and their image circles."""
+    for camera, image in zip(rig, images, strict=True):
+        if camera.mask is None and (circle := image_circle(camera, image)) is not None:
+            yield camera, circle
+
+
 def cleaned_rig(rig: Rig, images: Sequence[torch.Tensor]) -> Rig:
     """The rig with masks that hide what is no scene.
 
@@ -130,12 +131,10 @@ def cleaned_rig(rig: Rig, images: Sequence[torch.Tensor]) -> Rig:
         rig: The rig.
         images: An image (3, h, w) of each camera, uint8 or float in [0, 1].
     """
+    rims = {camera.name: circle.holds(camera) for camera, circle in dark_rims(rig, images)}
     cameras = []
-    for camera, image in zip(rig, images, strict=True):
-        if camera.mask is not None:
-            mask = without_specks(camera.mask)
-            camera = camera if (mask == camera.mask).all() else replace(camera, mask=mask)
-        elif (circle := image_circle(camera, image)) is not None:
-            camera = replace(camera, mask=circle.holds(camera))
-        cameras.append(camera)
+    for camera in rig:
+        mask = rims.get(camera.name) if camera.mask is None else without_specks(camera.mask)
+        is_same = mask is None or (camera.mask is not None and bool((mask == camera.mask).all()))
+        cameras.append(camera if is_same else replace(camera, mask=mask))
     return rig.with_cameras(cameras)

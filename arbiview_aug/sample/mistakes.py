@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.key_names import misnamed
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_mounted, pose_mistake
 from arbiview_aug.choices import refuse_old_options
-from arbiview_aug.sample.inputs import EGO_KEYS, PIXEL_BOUND_KEYS, Frame, read_frames
-from arbiview_aug.sample.masks import CLEANING, image_circle, without_specks
+from arbiview_aug.sample.inputs import Frame, misnamed_keys, read_frames
+from arbiview_aug.sample.masks import CLEANING, dark_rims, without_specks
 from arbiview_aug.scene.boxes import checked_boxes, points_in
 from arbiview_aug.scene.point_cloud import checked_points, own_car
 from arbiview_aug.scene.surface import Points
@@ -146,10 +145,8 @@ def _arrays(sample: Mapping[str, Any], key: str, frames: Sequence[Frame]) -> lis
 
 
 def _key_findings(sample: Mapping[str, Any], calibrated: bool) -> Iterator[Finding]:
-    lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
-    for wrong, meant in misnamed(sample, ("neighbours", "depth_m", *EGO_KEYS, *lenses)).items():
-        if wrong not in PIXEL_BOUND_KEYS:
-            yield Finding(wrong, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
+    for wrong, meant in misnamed_keys(sample, calibrated).items():
+        yield Finding(wrong, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
 
 
 def _resolution_findings(rig: Rig) -> Iterator[Finding]:
@@ -169,15 +166,13 @@ def _resolution_findings(rig: Rig) -> Iterator[Finding]:
 
 
 def _image_findings(frame: Frame) -> Iterator[Finding]:
-    for camera, image in zip(frame.rig, frame.images, strict=True):
-        circle = None if camera.mask is not None else image_circle(camera, image)
-        if circle is not None:
-            yield Finding(
-                f"camera {camera.name!r}: image",
-                "a mask that hides the dark rim around the image circle",
-                f"no mask, and {1 - circle.holds(camera).mean():.0%} of the image that would be read as scene",
-                f"mask it: {CLEANING}",
-            )
+    for camera, circle in dark_rims(frame.rig, frame.images):
+        yield Finding(
+            f"camera {camera.name!r}: image",
+            "a mask that hides the dark rim around the image circle",
+            f"no mask, and {1 - circle.holds(camera).mean():.0%} of the image that would be read as scene",
+            f"mask it: {CLEANING}",
+        )
 
 
 # --- boxes and points -------------------------------------------------------------------------------------------------

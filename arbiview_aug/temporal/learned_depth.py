@@ -112,11 +112,7 @@ def learned_depth(
 ) -> Iterator[tuple[LearnedDepth, list[CameraFit]]]:
     """Predict the depth of frames, ``batch`` images at a time, and fit it to their geometry.
 
-    Args:
-        model: The network.
-        frames: Frames with what is known of them.
-        batch: Images predicted at once.
-        wanted: What to fit to, the first that a camera has enough points of.
+    A camera is fitted to the first reference of ``wanted`` that it has enough points of.
     """
     views = {
         (n, k): View.of(frame, k, model.takes_prompt) for n, frame in enumerate(frames) for k in range(len(frame.rig))

@@ -96,23 +96,13 @@ Load = Callable[[Neighbour], Sequence[torch.Tensor] | None]
 
 @compilation_announced()
 def motion_depth(
-    rig: Rig,
-    images: Sequence[torch.Tensor],
-    neighbours: Sequence[Neighbour],
-    boxes: FloatArray | None,
-    load: Load,
+    rig: Rig, images: Sequence[torch.Tensor], neighbours: Sequence[Neighbour], boxes: FloatArray | None, load: Load
 ) -> MotionDepth:
     """Estimate depth from one neighbour before the frame and one after it, or from one if there is only one.
 
-    Images are matched at half the size first. Poses are checked on the result (``pose_error``); small errors
-    are corrected and the images matched again.
-
-    Args:
-        rig: Rig of the current frame.
-        images: (3, H, W) of its cameras: uint8, or float in [0, 1].
-        neighbours: Other frames of the drive, in the current frame's ego frame.
-        boxes: (B, 7) labelled objects of the current frame, ego frame, which are left out.
-        load: Reads a neighbour's images.
+    Images (3, H, W) are uint8, or float in [0, 1]; ``load`` reads a neighbour's. They are matched at half the size
+    first. Poses are checked on the result (``pose_error``); small errors are corrected and the images matched again.
+    Neighbours and labelled objects (B, 7), which are left out, are in the current ego frame.
     """
     cameras = [without_objects(motion_camera(camera), boxes) for camera in rig]
 

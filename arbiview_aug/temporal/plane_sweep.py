@@ -31,12 +31,9 @@ WALLS = np.linspace(0, 1 / NEAREST_M, 96, dtype=np.float32)
 
 
 class SweptImage:
-    """A camera's image and the family of surfaces around it.
+    """A camera's grey levels (h, w) float32 and the family of surfaces around it, at the size of ``motion_camera``.
 
-    Args:
-        camera: The camera at the working size (``motion_camera``); its masked pixels are not matched.
-        grey: (h, w) float32 grey levels.
-        ground_z_m: Height of the road in the ego frame.
+    Masked pixels are not matched. The road lies at ``ground_z_m`` in the ego frame.
     """
 
     def __init__(self, camera: Camera, grey: Layer, ground_z_m: float) -> None:
@@ -109,11 +106,9 @@ class SweptImage:
         return np.pad(levels.astype(np.int32), ((0, 0), (RADIUS_PX, RADIUS_PX)), mode="edge"), mean, weight
 
     def costs(self, other: SweptImage, walls: Layer) -> npt.NDArray[np.uint16]:
-        """Costs (K, h, w) of surfaces by the correlation with another image over them.
+        """Costs (K, h, w) of walls, (K,) ascending 1/radius in 1/m, by the correlation with another image over them.
 
-        Args:
-            other: The neighbour's image, in the same ego frame.
-            walls: (K,) 1/radius of the walls, 1/m, ascending.
+        The other image is in the same ego frame.
         """
         from arbiview_aug.cameras.kernels import LENS_CODES
         from arbiview_aug.temporal.kernels import INVALID, match_walls

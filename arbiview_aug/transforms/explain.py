@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.favs.renderer import PaperRendering, SourceReport
 from arbiview_aug.inpaint.neighbours import Fills
 from arbiview_aug.render.harmonise import PhotometricReport
 from arbiview_aug.render.plan import RenderPlan, SourceUse
 from arbiview_aug.render.requirements import harm_remedies
 from arbiview_aug.transforms.plan_cache import FramePlan
-
-if TYPE_CHECKING:
-    from arbiview_aug.favs.renderer import PaperRendering, SourceReport
 
 
 @dataclass(frozen=True)

@@ -46,25 +46,18 @@ class SampleWriter:
         sample, lead = frames[0].sample, frames[0].lead
         out = self._passed_on(sample, labels)
         out["images"] = rewrapped(gathered([stacked(frame.images) for frame in rendered], lead), sample["images"])
-        device = rendered[0].images[0].device
-        parts = [calibration_entries(f.rig, device, lenses=self.lenses, masks=self.masks) for f in rendered]
-        for key in ("K", "cam2ego"):
-            out[key] = like(gathered([part[key] for part in parts], lead), sample.get(key))
-        device = out["K"].device
-        grounds = [part["ground_z_m"] for part in parts]
-        ground_z_m = torch.tensor(grounds, dtype=torch.float64, device=device).reshape(lead) if lead else grounds[0]
-        out["ground_z_m"] = ground_z_m
+        rigs, device = [frame.rig for frame in rendered], rendered[0].images[0].device
+        entries = calibration_entries(rigs, device, lead, lenses=self.lenses, masks=self.masks)
+        entries |= {key: like(entries[key], sample.get(key)) for key in _MATRICES}
+        entries |= {key: entries[key].to(entries["K"].device) for key in ("ground_z_m", "distortion") if key in entries}
+        out |= entries | {"ground_z_m": entries["ground_z_m"] if lead else rigs[0].ground_z_m}
         out["coverage"] = gathered([frame.coverage for frame in rendered], lead)
-        if self.masks:
-            out["ego_mask"] = gathered([part["ego_mask"] for part in parts], lead)
-        if self.lenses:
-            out["distortion"] = gathered([part["distortion"] for part in parts], lead).to(device)
-            out["lens"] = lens_names([part["lens"] for part in parts], lead)
         for key in ("generated", *self.keys.extra) if self.generated else self.keys.extra:
             if key in MAP_KEYS:
                 out[key] = gathered([getattr(frame, key) for frame in rendered], lead)
         if SOURCES_KEY in self.keys.extra:
-            out[SOURCES_KEY] = source_sample(sample["images"], frames, lead)
+            entries = calibration_entries([frame.rig for frame in frames], frames[0].images[0].device, lead)
+            out[SOURCES_KEY] = {"images": sample["images"], **entries}
         for key in labels:
             out[key] = target_labels(key, sample[key], frames, lead, rendered, self.keys.ignore_index)
         if params:
@@ -90,41 +83,33 @@ class SampleWriter:
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
-def calibration_entries(rig: Rig, device: torch.device, *, lenses: bool = True, masks: bool = True) -> dict[str, Any]:
-    """``K``, ``cam2ego`` and ``ground_z_m`` of a rig, its ``distortion`` and ``lens``, and ``ego_mask`` on a device."""
-    part: dict[str, Any] = {
-        "K": torch.from_numpy(rig.K),
-        "cam2ego": torch.from_numpy(rig.cam2ego),
-        "ground_z_m": rig.ground_z_m,
-    }
+def calibration_entries(
+    rigs: Sequence[Rig], device: torch.device, lead: tuple[int, ...], *, lenses: bool = True, masks: bool = True
+) -> dict[str, Any]:
+    """``K``, ``cam2ego`` and ``ground_z_m`` of frames' rigs, their ``distortion`` and ``lens``, and ``ego_mask``.
+
+    Masks alone lie on the device.
+    """
+    parts: dict[str, list[Any]] = {key: [torch.from_numpy(getattr(rig, key)) for rig in rigs] for key in _MATRICES}
     if lenses:
-        padded = [(*c.distortion, *(0.0,) * (8 - len(c.distortion))) for c in rig]
-        part["distortion"] = torch.tensor(padded, dtype=torch.float64)
-        part["lens"] = [c.lens for c in rig]
+        padded = [[(*c.distortion, *(0.0,) * (8 - len(c.distortion))) for c in rig] for rig in rigs]
+        parts["distortion"] = [torch.tensor(of_rig, dtype=torch.float64) for of_rig in padded]
     if masks:
-        ignored = [np.zeros(c.size, bool) if c.mask is None else ~c.mask for c in rig]
-        part["ego_mask"] = stacked([torch.from_numpy(mask).to(device) for mask in ignored])
-    return part
+        ignored = [[np.zeros(c.size, bool) if c.mask is None else ~c.mask for c in rig] for rig in rigs]
+        parts["ego_mask"] = [stacked([torch.from_numpy(mask).to(device) for mask in of_rig]) for of_rig in ignored]
+    entries = {key: gathered(of_rigs, lead) for key, of_rigs in parts.items()}
+    if lenses:
+        entries["lens"] = lens_names([[c.lens for c in rig] for rig in rigs], lead)
+    grounds = torch.tensor([rig.ground_z_m for rig in rigs], dtype=torch.float64)
+    return entries | {"ground_z_m": grounds.reshape(lead)}
 
 
-def source_sample(images: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -> dict[str, Any]:
-    """A sample of the source images, their calibration and masks."""
-    parts = [calibration_entries(frame.rig, frame.images[0].device) for frame in frames]
-    keys = ("K", "cam2ego", "distortion", "ego_mask")
-    entries: dict[str, Any] = {key: gathered([part[key] for part in parts], lead) for key in keys}
-    entries["lens"] = lens_names([part["lens"] for part in parts], lead)
-    grounds = torch.tensor([part["ground_z_m"] for part in parts], dtype=torch.float64)
-    return {"images": images, **entries, "ground_z_m": grounds.reshape(lead)}
+_MATRICES = ("K", "cam2ego")
 
 
 # --- label maps -------------------------------------------------------------------------------------------------------
 def target_labels(
-    key: str,
-    value: Any,
-    frames: Sequence[Frame],
-    lead: tuple[int, ...],
-    rendered: Sequence[RenderedFrame],
-    fill: float,
+    key: str, value: Any, frames: Sequence[Frame], lead: tuple[int, ...], rendered: Sequence[RenderedFrame], fill: float
 ) -> Any:
     """Render label maps, (..., N, H, W) or a list of (..., Hi, Wi), in the target's views.
 

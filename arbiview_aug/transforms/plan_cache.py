@@ -18,12 +18,13 @@ from arbiview_aug.errors import GeometryWarning, UnreachableError, WarnOnce
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.overlap_depth import OverlapDepth
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
-from arbiview_aug.render.requirements import harm_remedies, needs_geometry, static_harm
+from arbiview_aug.render.requirements import needs_geometry, static_harm
 from arbiview_aug.render.view_planner import build_plan, plan_key
 from arbiview_aug.sample.inputs import Frame
 from arbiview_aug.sample.neighbours import Neighbour
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.temporal.motion_depth import MotionDepth
+from arbiview_aug.transforms.settings import is_number
 
 Coverages = Sequence[BoolArray | float]
 """Coverage (h, w) of each target camera, or its share."""
@@ -33,14 +34,7 @@ _SUSPICIOUS = 0.3  # a rig of which less is covered may have wrong poses
 
 
 def check_reach(source: Rig, target: Rig, coverages: Coverages, unseen: str, warn: WarnOnce) -> None:
-    """Warn once of target cameras that the sources hardly cover.
-
-    Args:
-        source: The source rig.
-        target: The target rig.
-        coverages: Coverage of the target's cameras.
-        unseen: A sentence on what becomes of uncovered pixels.
-        warn: Issues the warning.
+    """Warn once of target cameras that the sources hardly cover; ``unseen`` says what becomes of uncovered pixels.
 
     Raises:
         UnreachableError: The sources cover none of the target's pixels.
@@ -58,12 +52,6 @@ def check_reach(source: Rig, target: Rig, coverages: Coverages, unseen: str, war
         cause = f"{_likely_cause(source, target)}. " if np.mean(shares) < _SUSPICIOUS else ""
         covered = f"covered are {', '.join(poor)}. {cause}{unseen}"
         warn("unreachable", f"{lost}: {covered} Or choose another target", GeometryWarning)
-
-
-def warn_of_harm(harm: str, source: Rig, target: Rig, warn: WarnOnce) -> None:
-    """Warn once that ``auto`` falls back to the static street although cameras move, which harms a detector."""
-    message = f"{harm}. Better: {harm_remedies(source, target)}; geometry='street' accepts it"
-    warn("static", message, GeometryWarning)
 
 
 def _likely_cause(source: Rig, target: Rig) -> str:
@@ -92,8 +80,7 @@ class PlanCache:
     share_overlap: bool | str = False
 
     def __post_init__(self) -> None:
-        is_number = isinstance(self.max_bytes, int | float) and not isinstance(self.max_bytes, bool)
-        if not is_number or not self.max_bytes >= 0:
+        if not is_number(self.max_bytes) or not self.max_bytes >= 0:
             raise ValueError(f"PlanCache.max_bytes: expected a number of bytes from 0, got {self.max_bytes!r}")
         if not isinstance(self.share_overlap, bool | str):
             raise ValueError(f"PlanCache.share_overlap: expected a bool or a sample key, got {self.share_overlap!r}")
@@ -135,7 +122,7 @@ class FramePlan:
     pair: RigPair  # its rig and the target
     scene: Scene  # geometry of the sample, with estimated depth
     surface: GeometryName  # name of the surface that the target is rendered over, where centres differ
-    plan: RenderPlan  # the plan
+    plan: RenderPlan
     neighbours: Sequence[Neighbour] = ()  # other frames of the drive that may fill holes, the nearest first
     overlap: OverlapDepth | None = None  # depth from overlap, if it was estimated
     motion: MotionDepth | None = None  # depth from motion, if it was estimated
@@ -147,7 +134,7 @@ class FramePlan:
 
 
 class Plans:
-    """Builds render plans, and caches those of calibrations that come back.
+    """Builds render plans, and caches those of calibrations that come back; ``maps`` are rays and masks of cameras.
 
     Args:
         config: Settings; None for the paper's stages, which depend on every image and have no plans.
@@ -155,10 +142,6 @@ class Plans:
         max_bytes: Memory for plans; the least recently used go first.
         keep_refined: Whether plans over a street that depth from overlap corrected come back.
         check_reach: Called with the source, the target and its coverage for each new plan.
-
-    Attributes:
-        cache: Plans that come back.
-        maps: Rays and masks of cameras.
     """
 
     def __init__(

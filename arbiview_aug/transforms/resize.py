@@ -22,7 +22,7 @@ from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.image_ops import nearest_resized, resized
 from arbiview_aug.sample.batching import is_readable, like, rewrapped
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, PIXEL_BOUND_KEYS, check_other_keys, numbers, read_frames
-from arbiview_aug.transforms.settings import SampleKeys
+from arbiview_aug.transforms.settings import SampleKeys, checked_pixels
 
 _MAPS = ("coverage", "ego_mask", "source_camera", "source_frame", "confidence", "generated", "depth", "depth_m")
 """Keys of maps (..., N, H, W) over the images' pixels, which are resized by the nearest pixel."""
@@ -60,7 +60,10 @@ class _PixelTransform(torch.nn.Module, ABC):
                 self._warn(key, f"{type(self).__name__} drops {key}: it speaks of pixels that have moved")
         out["images"] = rewrapped(_each(images, self._image, 3), images)
         for key in {*_MAPS, *labels} & out.keys() - {*self.keys.keep}:
-            out[key] = rewrapped(_each(_checked_maps(key, out[key]), self._map, 2), out[key])
+            maps = out[key]
+            if not all(map(is_readable, maps if isinstance(maps, list | tuple) else [maps])):
+                raise SampleError(f"{key}: expected maps over the images' pixels as tensors, got {type(maps).__name__}")
+            out[key] = rewrapped(_each(maps, self._map, 2), maps)
         if isinstance(sample.get("rig"), Rig):
             out["rig"] = sample["rig"].with_cameras([self._camera(camera) for camera in sample["rig"]])
         if sample.get("K") is not None:
@@ -95,7 +98,7 @@ class ResizeRig(_PixelTransform):
 
     def __init__(self, size: tuple[int, int], *, keys: SampleKeys = SampleKeys(), **unknown: Any) -> None:  # noqa: B008 - frozen
         super().__init__(keys, unknown)
-        self.size = _checked_pair("size", size, 1)
+        self.size = checked_pixels(size)
 
     def extra_repr(self) -> str:
         return f"size={self.size}"
@@ -133,8 +136,8 @@ class CropRig(_PixelTransform):
         **unknown: Any,
     ) -> None:
         super().__init__(keys, unknown)
-        self.top, self.left = _checked_pair("top, left", (top, left), 0)
-        self.size = _checked_pair("size", size, 1)
+        self.top, self.left = checked_pixels((top, left), "top, left", "two numbers", 0)
+        self.size = checked_pixels(size)
 
     def extra_repr(self) -> str:
         return f"top={self.top}, left={self.left}, size={self.size}"
@@ -166,19 +169,3 @@ def _each(value: Any, change: Callable[[torch.Tensor], torch.Tensor], dims: int)
     lead = plain.shape[: plain.ndim - dims]
     parts = [change(image) for image in plain.reshape(-1, *plain.shape[plain.ndim - dims :])]
     return torch.stack(parts).reshape(*lead, *parts[0].shape)
-
-
-def _checked_maps(key: str, value: Any) -> Any:
-    if not all(map(is_readable, value if isinstance(value, list | tuple) else [value])):
-        raise SampleError(f"{key}: expected maps over the images' pixels as tensors, got {type(value).__name__}")
-    return value
-
-
-def _checked_pair(name: str, value: Any, least: int) -> tuple[int, int]:
-    try:
-        one, two = (int(n) if n == int(n) else -1 for n in value)
-    except (TypeError, ValueError, OverflowError):
-        one = two = -1
-    if min(one, two) < least:
-        raise ValueError(f"{name}: expected two whole numbers of pixels from {least}, got {value!r}")
-    return one, two

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -20,16 +20,18 @@ from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Quality, choice, refuse_old_options
 from arbiview_aug.environment import compilation_announced, warn_about_cv2_wheels
-from arbiview_aug.errors import SampleError, WarnOnce
-from arbiview_aug.favs.renderer import PaperRendering, check_settings, render_paper
+from arbiview_aug.errors import GeometryWarning, SampleError, WarnOnce
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.favs.renderer import PaperRendering, as_rendered, check_settings, render_paper
 from arbiview_aug.favs.stage1_geometry import check_pinhole
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
 from arbiview_aug.inpaint.neighbours import Fills, Reach, fill_from_neighbours, plan_fills
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
-from arbiview_aug.render.overlap_depth import OverlapCache, estimate_overlap
+from arbiview_aug.render.overlap_depth import estimate_overlap, overlap_cache
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, RenderedFrame, Renderer, resize_only
+from arbiview_aug.render.requirements import harm_remedies
 from arbiview_aug.sample.detections import read_detections
 from arbiview_aug.sample.inputs import (
     LEARNED_KEY,
@@ -46,21 +48,17 @@ from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
 from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
 from arbiview_aug.transforms.outputs import SampleWriter
-from arbiview_aug.transforms.plan_cache import FramePlan, PlanCache, Plans, check_reach, warn_of_harm
+from arbiview_aug.transforms.plan_cache import FramePlan, PlanCache, Plans, check_reach
 from arbiview_aug.transforms.settings import (
     SampleKeys,
     checked_instance,
     checked_p,
     checked_params,
-    checked_size,
+    checked_pixels,
     inpainter_of,
     render_config,
     unseen_note,
 )
-
-if TYPE_CHECKING:
-    from arbiview_aug.favs.config import PaperConfig
-    from arbiview_aug.favs.renderer import PaperRendering
 
 _MIXED_P = 0.5
 """At most this share of retargeted samples, views over a static street do not harm a detector
@@ -140,14 +138,14 @@ class RigRetarget(torch.nn.Module):
         self.geometry: GeometryName = choice("geometry", geometry, GEOMETRIES)
         self.neighbours = None if neighbours is None else choice("neighbours", neighbours, get_args(Reach))
         self.fit, self.p = choice("fit", fit, get_args(Fit)), checked_p(p, size)
-        self.size = None if size is None else checked_size(size)
+        self.size = None if size is None else checked_pixels(size)
         self.keys, self.cache = checked_instance("keys", keys, SampleKeys), checked_instance("cache", cache, PlanCache)
         self.inpainter = inpainter_of(holes)  # moves with this module
         self.config = self._checked_config(render_config(quality))
         self.harmoniser = Harmoniser(False if self._is_paper and match_exposure is True else match_exposure)
         self.renderer = Renderer(choice("backend", backend, get_args(Backend)))
         self._check_paper()
-        self.overlaps = OverlapCache.of(cache.share_overlap, self.config)
+        self.overlaps = overlap_cache(cache.share_overlap, self.config)
         self._warn = WarnOnce()
         self._check_reach = partial(check_reach, unseen=unseen_note(self.inpainter), warn=self._warn)
         self._plans = self._empty_plans()
@@ -181,7 +179,6 @@ class RigRetarget(torch.nn.Module):
     def _check_paper(self) -> None:
         if not self._is_paper:
             return
-
         check_pinhole(self._base)
         check_settings(self.geometry, self.renderer.backend)
         if self.harmoniser.is_on:
@@ -250,7 +247,9 @@ class RigRetarget(torch.nn.Module):
         if skip and self.size is not None:
             rendered = [resize_only(frame, self.size, self.fit, self.keys.extra) for frame in frames]
         else:
-            rendered = self._inpainted(self._rendered(frames, target), frames)
+            rendered = self.inpainter.fill(self._rendered(frames, target), frames)
+            if self.size is not None and self.fit == "pad":
+                rendered = [of_frame.between_bars(self.size) for of_frame in rendered]
         return self._writer.write(frames, rendered, labels, target, draws)
 
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
@@ -277,7 +276,7 @@ class RigRetarget(torch.nn.Module):
         scene = (reads_scene and read_scene(frame, self.geometry)) or pair.road
         overlap = motion = None
         if pair.needs_geometry and self.config.overlap_depth:
-            overlap = estimate_overlap(frame, scene, self.geometry, self.overlaps)
+            overlap = estimate_overlap(frame, scene, self.geometry, self.cache.share_overlap, self.overlaps)
         if from_motion:
             motion = estimate_motion(frame, scene, neighbours, self._warn)
         if overlap is not None:
@@ -299,17 +298,17 @@ class RigRetarget(torch.nn.Module):
         return plan_fills(planned.plan, planned.neighbours, planned.scene, *settings)
 
     def _warn_of_harm(self, planned: Sequence[FramePlan]) -> None:
+        """Warn once that ``auto`` falls back to the static street although cameras move, which harms a detector."""
         if self.geometry != "auto" or self.p <= _MIXED_P or "static" in self._warn.topics:
             return
         for one in planned:
             if one.harm is not None:
-                warn_of_harm(one.harm, one.frame.rig, one.pair.target, self._warn)
+                better = harm_remedies(one.frame.rig, one.pair.target)
+                self._warn("static", f"{one.harm}. Better: {better}; geometry='street' accepts it", GeometryWarning)
 
     def _rendered(self, frames: Sequence[Frame], target: Rig) -> list[RenderedFrame]:
         """Render the frames; what sources do not see is filled from neighbouring frames alone."""
         if self._is_paper:
-            from arbiview_aug.favs.renderer import as_rendered
-
             return [as_rendered(self._published(frame, target), self.keys.extra) for frame in frames]
         planned = [self.plan_frame(frame, target) for frame in frames]
         self._warn_of_harm(planned)
@@ -323,7 +322,6 @@ class RigRetarget(torch.nn.Module):
 
     def _published(self, frame: Frame, target: Rig) -> PaperRendering:
         """Render a frame by the paper's stages."""
-
         pair, sample = self._plans.pair(frame.rig, target), frame.sample
         has_detections = any(sample.get(key) is not None for key in ("detections", "boxes_3d"))
         detections = read_detections(frame) if self.config.use_detections and has_detections else {}
@@ -331,23 +329,14 @@ class RigRetarget(torch.nn.Module):
         self._check_reach(pair.source, pair.target, rendering.coverage)
         return rendering
 
-    def _inpainted(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
-        """Fill what no frame shows."""
-        filled = self.inpainter.fill(rendered, frames)
-        if self.size is not None and self.fit == "pad":
-            return [of_frame.between_bars(self.size) for of_frame in filled]
-        return filled
-
     def _make_params(
         self, frames: Sequence[Frame], params: Mapping[str, float] | None
     ) -> tuple[Rig, bool, dict[str, float]]:
         """Draw the target rig and whether to skip; return both, and the parameters that replay them."""
         checked = None if params is None else checked_params(params)
         draws: dict[str, float] = {}
-        if self.p < 1 and checked is None:
-            draws["skipped"] = float(torch.rand(()).item() >= self.p)
-        elif self.p < 1 and checked is not None:
-            draws["skipped"] = checked.pop("skipped", 0.0)
+        if self.p < 1:
+            draws["skipped"] = float(torch.rand(()) >= self.p) if checked is None else checked.pop("skipped", 0.0)
         if isinstance(self.target, RandomRig):
             rig_params = self.target.draw_for(frames[0].sample) if checked is None else checked
             target = self._sized(self.target.rig(rig_params))

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.choices import choice
 from arbiview_aug.errors import SampleError
+from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.inpaint.continued import Continue, Mean
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY, Black, Inpainter
 from arbiview_aug.inpaint.telea import Telea
@@ -64,18 +65,12 @@ def render_config(quality: Any) -> Any:
     Raises:
         ValueError: Anything else.
     """
-    if isinstance(quality, RenderConfig):
+    if isinstance(quality, RenderConfig | PaperConfig):
         return quality
-    if isinstance(quality, str) and quality in PRESETS:
-        return PRESETS[quality]
-    from arbiview_aug.favs.config import PaperConfig
-
-    if quality == "paper":
-        return PaperConfig()
-    if not isinstance(quality, PaperConfig):
-        names = ", ".join((*PRESETS, "paper"))
-        raise ValueError(f"quality: expected one of {names}, a RenderConfig or a PaperConfig, got {quality!r}")
-    return quality
+    presets = {**PRESETS, "paper": PaperConfig()}
+    if isinstance(quality, str) and quality in presets:
+        return presets[quality]
+    raise ValueError(f"quality: expected one of {', '.join(presets)}, a RenderConfig or a PaperConfig, got {quality!r}")
 
 
 def inpainter_of(holes: Any) -> Inpainter:
@@ -132,12 +127,13 @@ def checked_params(params: Any) -> dict[str, float]:
     raise SampleError(f"params: expected the 'retarget_params' of an output, names and numbers, got {params!r}")
 
 
-def checked_size(size: Any) -> tuple[int, int]:
-    """(h, w) in pixels; ValueError for impossible sizes."""
+def checked_pixels(value: Any, name: str = "size", form: str = "(h, w)", least: int = 1) -> tuple[int, int]:
+    """Two whole numbers of pixels, such as a size (h, w); ValueError for others."""
     try:
-        h, w = (operator.index(side) for side in size)  # 10.5 is refused, not cut
+        one, two = (operator.index(number) for number in value)  # 10.5 is refused, not cut
     except (TypeError, ValueError):
-        h, w = 0, 0
-    if not 1 <= min(h, w) <= max(h, w) <= MAX_SIZE_PX:
-        raise ValueError(f"size: expected (h, w) in pixels, got {size!r}; whole numbers from 1 to {MAX_SIZE_PX}")
-    return h, w
+        one = two = -1
+    if not least <= min(one, two) <= max(one, two) <= MAX_SIZE_PX:
+        limits = f"whole numbers from {least} to {MAX_SIZE_PX}"
+        raise ValueError(f"{name}: expected {form} in pixels, got {value!r}; {limits}")
+    return one, two

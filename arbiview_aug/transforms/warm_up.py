@@ -9,10 +9,9 @@ from arbiview_aug.environment import compilation_announced
 
 @cache
 def compile_kernels(*, matching: bool = True) -> None:
-    """Compile all kernels, or load them from numba's cache: each file that has kernels warms its own up.
+    """Compile all kernels, those of depth from motion if ``matching``, or load them from numba's cache.
 
-    Args:
-        matching: With those of depth from motion.
+    Each file that has kernels warms its own up.
     """
     from arbiview_aug.inpaint import kernels as inpaint
     from arbiview_aug.render import photometry_kernels as photometry

@@ -13,7 +13,6 @@ import torch
 
 from arbiview_aug import PlanCache, RigRetarget
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.overlap_depth import OverlapCache
 from tests.extremes import misuse
 
 
@@ -56,12 +55,12 @@ def test_threads_do_not_disturb_each_other(settings: dict[str, Any]) -> None:
     assert retarget.plans.size <= retarget.cache.max_bytes or len(retarget.plans) == 1
 
 
-@pytest.mark.parametrize("cache", [LRUCache(20, attrgetter("nbytes")), OverlapCache(None)])
-def test_caches_keep_count(cache: Any) -> None:
+def test_caches_keep_count() -> None:
+    cache: LRUCache[bytes, Any] = LRUCache(20, attrgetter("nbytes"))
+
     def get(k: int) -> int:
         key = bytes([k * k % 7])
-        name = (key, None) if isinstance(cache, OverlapCache) else key
-        return int(cache.get(name, lambda: SimpleNamespace(nbytes=5, key=key)).key == key)
+        return int(cache.get(key, lambda: SimpleNamespace(nbytes=5, key=key)).key == key)
 
     with ThreadPoolExecutor(4) as threads:
         assert sum(threads.map(get, range(5000))) == 5000

@@ -15,7 +15,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import ego_rays, half_way_view, project_rays
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.render.overlap_depth import LIMITS, MIN_RISE_DB, OverlapCache, OverlapDepth, overlap_depth
+from arbiview_aug.render.overlap_depth import LIMITS, MIN_RISE_DB, OverlapDepth, overlap_cache, overlap_depth
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.scene import Scene
@@ -270,13 +270,13 @@ def test_a_cache_computes_each_scene_once(nearer: tuple[torch.Tensor, OverlapDep
         retarget({"images": images})
     with pytest.raises(SampleError, match="2 frames"):
         retarget({**batch, "token": "a"})
-    assert pickle.loads(pickle.dumps(cache)).key == "token"
+    assert pickle.loads(pickle.dumps(retarget)).cache.share_overlap == "token"
 
 
 def test_a_cache_forgets_the_oldest(nearer: tuple[torch.Tensor, OverlapDepth], monkeypatch: pytest.MonkeyPatch) -> None:
     _, depth = nearer
     monkeypatch.setattr("arbiview_aug.render.overlap_depth._OVERLAP_BYTES", 2 * depth.nbytes)
-    cache = OverlapCache(None)
+    cache = overlap_cache(True, render_config("accurate"))
     for name in "abca":
         cache.get((b"", name), lambda: depth)
     assert cache.misses == 4
