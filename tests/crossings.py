@@ -26,7 +26,7 @@ BOUNDS = {
     "street, plan cached": (15, 47),
     "LiDAR + boxes": (25, 600),
     "learned depth": (26, 600),
-    "generated": (29, 1500),
+    "generated": (27, 1500),
     "neighbours, all": (32, 2500),
     "motion": (36, 2500),
     "paper": (17, 160),
