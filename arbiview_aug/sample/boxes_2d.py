@@ -58,12 +58,21 @@ def project_boxes_3d(boxes_3d: Any, cameras: Rig | Mapping[str, Any]) -> list[Im
         SampleError: Boxes of another shape, not finite or without size; a batch of samples.
     """
     boxes = checked_boxes(boxes_3d)
-    if not isinstance(cameras, Rig):
-        frames = read_frames(cameras, None)
-        if lead := leading_shape(cameras["images"]):
-            raise SampleError(f"cameras: expected one sample, got a batch {lead}; project the boxes of each frame")
-        cameras = frames[0].rig
-    return [_of_camera(camera, boxes) for camera in cameras]
+    return [_of_camera(camera, boxes) for camera in rig_of(cameras)]
+
+
+def rig_of(cameras: Rig | Mapping[str, Any]) -> Rig:
+    """The rig itself, or an unbatched sample's, whose ``coverage`` and ``ego_mask`` mask pixels.
+
+    Raises:
+        SampleError: A batch of samples.
+    """
+    if isinstance(cameras, Rig):
+        return cameras
+    frames = read_frames(cameras, None)
+    if lead := leading_shape(cameras["images"]):
+        raise SampleError(f"cameras: expected one sample, got a batch {lead}; project the boxes of each frame")
+    return frames[0].rig
 
 
 class Outline(NamedTuple):

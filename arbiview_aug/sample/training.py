@@ -10,18 +10,23 @@ import torch
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.errors import SampleError
-from arbiview_aug.sample.boxes_2d import project_boxes_3d
+from arbiview_aug.sample.boxes_2d import rig_of
+from arbiview_aug.scene.boxes import checked_boxes, draw_solids, silhouette_sums
+from arbiview_aug.scene.shapes import PIECES, solids
+
+SEEN_PX = 64
+"""Pixels of an object in one image that are seen however much of it is hidden: 8 x 8, a cell of most detectors."""
 
 
 def visible_boxes(sample: Mapping[str, Any], least: float = 0.1) -> BoolArray:
     """Boxes that some camera of a sample sees, to ignore the others in a detector's loss.
 
-    Only boxes occlude each other: walls and trees are unknown. Pixels count that ``coverage`` holds, generated ones do
-    not. A box counts as a whole, although its object may not fill it.
+    Objects occlude each other by what they fill of their boxes; walls and trees are unknown. Pixels count that
+    ``coverage`` holds, generated ones do not.
 
     Args:
         sample: An unbatched output of ``RigRetarget`` with ``boxes_3d``.
-        least: Share of the box's pixels in one image that must be seen.
+        least: Share of the box's pixels in one image that must be seen, or ``SEEN_PX`` if those are fewer.
 
     Returns:
         (B,) bool.
@@ -31,9 +36,14 @@ def visible_boxes(sample: Mapping[str, Any], least: float = 0.1) -> BoolArray:
     """
     if sample.get("boxes_3d") is None:
         raise SampleError("visible_boxes: expected a sample with 'boxes_3d', got none")
-    visible = np.zeros(len(sample["boxes_3d"]), bool)
-    for of_image in project_boxes_3d(sample["boxes_3d"], sample):
-        visible[of_image.rows[(of_image.visibility >= least) & (of_image.visibility > 0)]] = True
+    boxes, cameras = checked_boxes(sample["boxes_3d"]), rig_of(sample)
+    visible = np.zeros(len(boxes), bool)
+    for camera in cameras if len(boxes) else ():
+        _, piece = draw_solids(camera, boxes, solids(boxes), faces=False)
+        shown = piece >= 0 if camera.mask is None else (piece >= 0) & camera.mask
+        seen_px = np.bincount(piece[shown] // PIECES, minlength=len(boxes))
+        needed_px = np.minimum(least * silhouette_sums(camera, boxes, np.ones(camera.size)), SEEN_PX)
+        visible |= (seen_px > 0) & (seen_px >= needed_px)
     return visible
 
 

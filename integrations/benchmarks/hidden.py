@@ -161,15 +161,21 @@ def tally(views: Views, out: dict[str, Any]) -> npt.NDArray[np.float64]:
     return np.stack(bins, axis=-1).reshape(len(SURFACES), 2, 2, 2)
 
 
-def dropped_cars(views: Views, out: dict[str, Any], box_classes: npt.NDArray[np.int64]) -> tuple[list[int], int]:
-    """Pixels of the cars that B sees and ``visible_boxes`` drops, and the number of those that it sees.
+def cars(views: Views, out: dict[str, Any], box_classes: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Cars that B sees, those that ``visible_boxes`` drops, and the same of those that A sees too; others it keeps.
 
-    A car's pixels are those of the view that shows most of it.
+    B sees a car if one of its views shows ``SEEN_PX`` pixels of it, and A if it sees as many of the same view.
     """
-    rows = len(box_classes)
-    counts = np.stack([np.bincount(one.ravel() + 1, minlength=rows + 1)[1:] for one in views.instances]).max(axis=0)
-    seen = (counts >= SEEN_PX) & (box_classes == BoxClass.CAR)
-    return counts[seen & ~visible_boxes(out)].tolist(), int(seen.sum())
+    is_car, kept = box_classes == BoxClass.CAR, visible_boxes(out)
+
+    def pixels(mask: Bools) -> npt.NDArray[np.int64]:
+        of_views = zip(views.instances, mask, strict=True)
+        return np.max([np.bincount(one[valid] + 1, minlength=len(kept) + 1)[1:] for one, valid in of_views], axis=0)
+
+    of_b, of_both = pixels(np.ones_like(views.seen)), pixels(views.seen)
+    seen, shown = (is_car & (count >= SEEN_PX) for count in (of_b, of_both))
+    sets = seen, seen & ~kept, shown, shown & ~kept, is_car & kept & (of_b == 0)
+    return np.array([np.count_nonzero(one) for one in sets])
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -210,14 +216,14 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
             for setting in arguments.settings:
                 given = {key: value for key, value in sample.items() if key in ("images", "rig", *SETTINGS[setting])}
                 out = RigRetarget(target, neighbours=None)(given)
-                dropped, cars = dropped_cars(views, out, sample["box_classes"].numpy())
-                total = totals.setdefault(f"{name}, {setting}", [0, [], 0])
-                total[0], total[1], total[2] = total[0] + tally(views, out), total[1] + dropped, total[2] + cars
+                total = totals.setdefault(f"{name}, {setting}", [0, 0])
+                total[0] += tally(views, out)
+                total[1] += cars(views, out, sample["box_classes"].numpy())
     rows = {name: _row(*total) for name, total in totals.items()}
     return {"streets": arguments.streets, "seed": arguments.seed, "size": list(arguments.size), "rows": rows}
 
 
-def _row(total: npt.NDArray[np.float64], dropped: list[int], cars: int) -> dict[str, Any]:
+def _row(total: npt.NDArray[np.float64], counts: npt.NDArray[np.int64]) -> dict[str, Any]:
     row: dict[str, Any] = {}
     for surface, of_surface in zip(SURFACES, total, strict=True):
         pixels, errors = np.moveaxis(of_surface, -1, 0)
@@ -231,9 +237,8 @@ def _row(total: npt.NDArray[np.float64], dropped: list[int], cars: int) -> dict[
             "error_hole": errors[:, 1].sum() / max(pixels[:, 1].sum(), 1),
             "error": errors.sum() / pixels.sum(),
         }
-    row["dropped_cars"], row["cars"] = len(dropped) / max(cars, 1), cars
-    row["dropped_px"] = float(np.median(dropped)) if dropped else 0.0
-    return row
+    names = "cars", "dropped", "cars_of_both", "dropped_of_both", "kept_unseen"
+    return row | dict(zip(names, counts.tolist(), strict=True))
 
 
 def table(report: dict[str, Any]) -> str:
@@ -254,8 +259,9 @@ def table(report: dict[str, Any]) -> str:
                 yield f"| {name} | {surface} | " + " | ".join((*shares, *errors)) + " |"
         yield ""
         for name, row in report["rows"].items():
-            dropped = f"{row['dropped_cars']:.1%} of {row['cars']} cars that B sees, median {row['dropped_px']:.0f} px"
-            yield f"{name}: `visible_boxes` drops {dropped}"
+            of_both = f"{row['dropped_of_both']} of {row['cars_of_both']} cars that A and B see"
+            of_b = f"{row['dropped']} of {row['cars']} that B sees; it keeps {row['kept_unseen']} of which B sees nothing"
+            yield f"{name}: `visible_boxes` drops {of_both}, {of_b}"
 
     return "\n".join(lines())
 
