@@ -90,10 +90,10 @@ class DepthFolder:
                 arrays: dict[str, Any] = {name: file[name] for name in file.files}
             depth = tuple(arrays[f"depth_{k:02}"].astype(np.float32) for k in range(len(arrays["K"])))
             words, of = str(arrays["words"]), str(arrays.get("token", token))  # older files name no token
+            kind, origin = _KINDS[str(arrays.get("kind", "motion"))], arrays["neighbours"].tolist()
             if of != token:
                 raise _misfit(path, f"frame {token!r}", f"that of frame {of!r}")
             _check_fits(path, arrays, rig, depth)
-            kind, origin = _KINDS[str(arrays.get("kind", "motion"))], arrays["neighbours"].tolist()
         except DataError:
             raise
         except (*BROKEN_ARRAY, KeyError, TypeError, OverflowError) as error:

@@ -11,8 +11,7 @@ import torch
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.boxes_2d import rig_of
-from arbiview_aug.scene.boxes import checked_boxes, draw_solids, silhouette_sums
-from arbiview_aug.scene.shapes import PIECES, solids
+from arbiview_aug.scene.boxes import PIECES, checked_boxes, draw_solids, silhouette_sums, solids
 
 SEEN_PX = 64
 """Pixels of an object in one image that are seen however much of it is hidden: 8 x 8, a cell of most detectors."""

@@ -22,7 +22,7 @@ from arbiview_aug import RigRetarget, visible_boxes
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_output, command_parser, count, size, writable_folder
-from arbiview_aug.cli.bench.study import benchmark, machine_line, show
+from arbiview_aug.cli.bench.timing import benchmark, machine_line, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.synthetic.dataset import GROUND_CLASSES
 from arbiview_aug.datasets.synthetic.raycast import cast, find_candidates, scene_from
@@ -192,6 +192,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=900, metavar="N", help="of the streets; develop on others")
     parser.add_argument("--targets", nargs="+", choices=MOVES_M, default=list(MOVES_M))
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
+    parser.add_argument("--two-wheelers", action="store_true", help="which no shape fits well")
     add_output(parser)
     arguments = parser.parse_args(argv)
     if any(side % _TILE for side in arguments.size):
@@ -206,7 +207,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """All rows."""
     source = demo_source_rig(arguments.size)
-    drive = SyntheticDrive(source, num_frames=arguments.streets, seed=arguments.seed, two_wheelers=True)
+    street = {"num_frames": arguments.streets, "seed": arguments.seed, "two_wheelers": arguments.two_wheelers}
+    drive = SyntheticDrive(source, **street)
     targets = {name: source.shifted(*MOVES_M[name]) for name in arguments.targets}
     totals: dict[str, list[Any]] = {}
     for index in tqdm(range(len(drive)), leave=False):
@@ -220,7 +222,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
                 total[0] += tally(views, out)
                 total[1] += cars(views, out, sample["box_classes"].numpy())
     rows = {name: _row(*total) for name, total in totals.items()}
-    return {"streets": arguments.streets, "seed": arguments.seed, "size": list(arguments.size), "rows": rows}
+    return {**street, "size": list(arguments.size), "rows": rows}
 
 
 def _row(total: npt.NDArray[np.float64], counts: npt.NDArray[np.int64]) -> dict[str, Any]:
@@ -260,8 +262,9 @@ def table(report: dict[str, Any]) -> str:
         yield ""
         for name, row in report["rows"].items():
             of_both = f"{row['dropped_of_both']} of {row['cars_of_both']} cars that A and B see"
-            of_b = f"{row['dropped']} of {row['cars']} that B sees; it keeps {row['kept_unseen']} of which B sees nothing"
-            yield f"{name}: `visible_boxes` drops {of_both}, {of_b}"
+            of_b = f"{row['dropped']} of {row['cars']} that B sees"
+            kept = f"{row['kept_unseen']} of which B sees nothing"
+            yield f"{name}: `visible_boxes` drops {of_both}, {of_b}; it keeps {kept}"
 
     return "\n".join(lines())
 

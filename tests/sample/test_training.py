@@ -10,7 +10,16 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from arbiview_aug import RetargetedDataset, Rig, RigRetarget, SampleError, collate, lift_mask, visible_boxes
+from arbiview_aug import (
+    RetargetedDataset,
+    Rig,
+    RigRetarget,
+    SampleError,
+    collate,
+    lift_mask,
+    project_boxes_3d,
+    visible_boxes,
+)
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from tests.helpers import camera
 
@@ -29,6 +38,18 @@ def test_boxes_are_seen_before_others_within_the_image_and_where_it_is_covered()
     assert not visible_boxes(out).any()
     with pytest.raises(SampleError, match="expected a sample with 'boxes_3d'"):
         visible_boxes({"images": None})
+
+
+def test_of_a_near_box_few_pixels_suffice() -> None:
+    near = {"images": torch.zeros((1, 3, 640, 960)), "rig": Rig([camera(size=(640, 960))])}
+    near["boxes_3d"] = torch.tensor([[10.0, 0, 1, 4, 2, 2, 0]])
+    left, top, right, bottom = (int(end) for end in project_boxes_3d(near["boxes_3d"], near)[0].boxes[0])
+    assert (right - left) * (bottom - top) > 10 * 80  # a tenth of it is more
+    for seen_px, expected in ((80, True), (40, False)):
+        coverage = torch.zeros((1, 640, 960), dtype=torch.bool)
+        coverage[0, (top + bottom) // 2 :, (left + right) // 2] = True
+        coverage[0, (top + bottom) // 2 + seen_px :] = False
+        assert visible_boxes(near | {"coverage": coverage}).tolist() == [expected]
 
 
 def test_cells_are_lifted_that_are_covered_and_no_own_car() -> None:
