@@ -78,8 +78,9 @@ class Paint:
 
     Attributes:
         pixel: (n,) int32 unseen pixels of objects, into the flattened view.
-        part: (n,) int32 what they show: twice the object's number, 1 more on its top.
-        beside: (n,) int32 the nearest seen pixel of the same part in its row or column, -1 for none nearby.
+        part: (n,) int32 what they show: ``scene.boxes.BoxSurface.face_parts``.
+        beside: (n,) int32 for sides, the nearest seen pixel of the object's sides in its row or column, -1 for none
+            nearby.
         sample: (m,) int32 seen pixels of objects, a sample.
         sample_part: (m,) int32 what those show.
     """
