@@ -34,7 +34,7 @@ angles, sides have wheels and sills. No lamps, plates and windows: these are les
 
 _TOP_LIGHT, _TOP_SHINE = 1.8, 0.05
 """Light on tops over that on the brightest side in view, and reflected sky, as a share of white; in linear light. An
-evenly bright sky gives 1.7, and 4 to 5 % for clear coat. From ``integrations.benchmarks.tops`` on seeds 7000 and 7100."""
+evenly bright sky gives 1.7; clear coat reflects 4 to 5 %. From ``integrations.benchmarks.tops``, seeds 7000, 7100."""
 
 _SURE_SAMPLES = 6
 """Samples of a seen top that weigh as much as its sides."""
