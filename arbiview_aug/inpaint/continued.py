@@ -16,6 +16,7 @@ from arbiview_aug.render.plan import BACKGROUND, OBJECT, Paint
 from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.scene.boxes import PARTS, TOP_PART
 
 CELLS = 64  # cells along a view's shorter side
 
@@ -27,16 +28,28 @@ _WIDE = 2  # halvings of the columns alone: what is hidden looks like what is be
 _SWEEPS = 2
 """Sweeps of smoothing at each size of the cells. Synthetic streets: 0 to 0.08 dB of whole views; 4 sweeps: +0.03."""
 
-_TOP_SHARE = 0.9
-"""Quantile of an object's colours that is nearest to its top's: windows, tyres and shadows are darker, and so is what
-sources see of tops at grazing angles. By pixel of 348 tops on synthetic streets, three sets: 1089, 1486 and 2720 of 255
-squared; the tops' medians, or the sides' times the frame's ratio of tops to sides: 4969, 1565 and 3550."""
+_TOP_SHARE, _BODY_SHARE = 0.9, 0.6
+"""Quantiles of what sources see of tops and of a body's side that are nearest to their paint: tops are seen at grazing
+angles, sides have wheels and sills. No lamps, plates and windows: these are less than the rest, or on other pieces."""
+
+_TOP_LIGHT, _TOP_SHINE = 1.8, 0.05
+"""Light on tops over that on the brightest side in view, and reflected sky, as a share of white; in linear light. An
+evenly bright sky gives 1.7; clear coat reflects 4 to 5 %. From ``integrations.benchmarks.tops``, seeds 7000, 7100."""
+
+_SURE_SAMPLES = 6
+"""Samples of a seen top that weigh as much as its sides."""
+
+_LEAST_SAMPLES = 3
+"""Samples of a body's side that suffice for its paint."""
+
+_GAMMA = 2.2
+"""Exponent of displayed colours in linear light, as sRGB's on average."""
 
 Cells = npt.NDArray[np.float32]
 """(4, ny, nx) colours of a view's cells times their known share, and that share."""
 
 Colour = npt.NDArray[np.float32]
-"""(3,) in the images' unit."""
+"""(3,), or (n, 3) samples, in the images' unit."""
 
 
 class Continue(Inpainter):
@@ -126,23 +139,46 @@ def mean_colour(views: Sequence[npt.NDArray[Any]], coverage: Sequence[npt.NDArra
 def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | None]) -> Colour:
     """Colours (P, 3) of the parts of objects by their numbers in ``Paint``; -1 where unknown.
 
-    Sides take the median of what sources see of them; tops the brighter of what they see of tops and sides.
+    Sides take the median of what sources see of all sides. Tops take the paint of the body's brightest side in the
+    light that falls on tops, and what sources see of them, the more the larger the part that they see.
     """
     painted = [(view.reshape(3, -1), p) for view, p in zip(views, paint, strict=True) if p is not None]
     if not any(len(p.pixel) for _, p in painted):
         return np.zeros((0, 3), np.float32)
     colour = np.concatenate([view[:, p.sample] for view, p in painted], 1).T.astype(np.float32)
     part = np.concatenate([p.sample_part for _, p in painted])
-    ends = np.bincount(part, minlength=2 * (part.max(initial=0) // 2 + 1)).cumsum()
-    parts = np.split(colour[np.argsort(part, kind="stable")], ends[:-1])
+    ends = np.bincount(part, minlength=PARTS * (part.max(initial=0) // PARTS + 1)).cumsum()
+    samples = np.split(colour[np.argsort(part, kind="stable")], ends[:-1])
     colours = np.full((len(ends), 3), -1, np.float32)
-    for k, values in enumerate(np.sort(one, 0) for one in parts):
-        if len(values):
-            top = k | 1
-            colours[top] = np.maximum(colours[top], values[int(_TOP_SHARE * len(values))])
-            if k < top:
-                colours[k] = values[len(values) // 2]
+    white = 255 if views[0].dtype == np.uint8 else 1
+    for first in range(0, len(ends), PARTS):
+        sides, tops = samples[first : first + TOP_PART], samples[first + TOP_PART]
+        of_sides = np.concatenate(sides)
+        if len(of_sides):
+            colours[first : first + TOP_PART] = _quantile(of_sides, 0.5)
+        bodies = [side for side in sides[1:] if len(side) >= _LEAST_SAMPLES] or [of_sides]
+        colours[first + TOP_PART] = _top_colour(bodies, tops, white)
     return colours
+
+
+def _top_colour(bodies: Sequence[Colour], tops: Colour, white: float) -> Colour:
+    """Colour (3,) of an object's tops by samples (n, 3) of its body's sides, and of tops; -1 where there are none."""
+    paints = [_quantile(body, _BODY_SHARE) for body in bodies if len(body)]
+    if not paints and not len(tops):
+        return np.full(3, -1, np.float32)
+    sure = len(tops) / (len(tops) + _SURE_SAMPLES) if paints else 1.0
+    light = np.zeros(3)
+    if paints:
+        brightest = max(paints, key=lambda paint: float(paint.sum()))
+        light += (1 - sure) * (_TOP_LIGHT * (brightest / white) ** _GAMMA + _TOP_SHINE)
+    if len(tops):
+        light += sure * (_quantile(tops, _TOP_SHARE) / white) ** _GAMMA
+    return np.asarray(white * np.minimum(light, 1) ** (1 / _GAMMA), np.float32)
+
+
+def _quantile(values: Colour, share: float) -> Colour:
+    """A quantile of samples (n, 3), channel by channel."""
+    return np.asarray(np.sort(values, 0)[int(share * len(values))])
 
 
 # --- one view ---------------------------------------------------------------------------------------------------------

@@ -172,6 +172,9 @@ TOP = 0.9
 ROOF_M2 = 2.0
 """Least footprint of objects whose tops have a colour of their own: heads, cones and barriers go on as their sides."""
 
+PARTS, TOP_PART = 6, 5
+"""Parts of an object that ``BoxSurface.face_parts`` tells apart, and the one that is its tops."""
+
 _ROUNDING = 1e-4  # of float32 images against float64
 
 
@@ -240,8 +243,16 @@ class BoxSurface(LayeredSurface):
 
     @property
     def face_parts(self) -> npt.NDArray[np.int32]:
-        """Twice the object of each face (n,), 1 more for tops: what fillers paint in one colour."""
-        return (2 * self.face_objects + self.face_is_top).astype(np.int32)
+        """What each face (n,) shows: ``PARTS`` times its object, and ``TOP_PART`` more for tops.
+
+        The sides of the lowest piece, the body under the windows, have 1 to 4 in the order of their planes. All else
+        has 0, also small objects.
+        """
+        pieces = self.solids.shape[1]
+        body = np.tile([1, 2, 3, 4, 0, 0] + [0] * 6 * (pieces - 1), len(self.boxes))
+        is_large = np.repeat(self.boxes[:, 3] * self.boxes[:, 4] > ROOF_M2, 6 * pieces)
+        part = np.where(self.face_is_top, TOP_PART, body * is_large)
+        return np.asarray(PARTS * self.face_objects + part, np.int32)
 
     def _widened(self, origin: FloatArray, pixel_rad: float, lift: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Boxes and planes half a pixel wider, as border pixels mix colours; floors ``lift`` pixels higher."""

@@ -308,7 +308,7 @@ def test_unlabelled_things_before_a_hole_are_found_by_their_distance() -> None:
     assert not layers[:, :20].any() and not layers[:, 33:].any()
 
 
-PARTS = np.array([*[0] * 5, 1, *[2] * 5, 3], np.int32)  # of the faces of two boxes, whose last ones are tops
+FACE_PARTS = np.array([1, 2, 3, 4, 0, 5, 7, 8, 9, 10, 6, 11], np.int32)  # two boxes, whose last faces are tops
 
 
 def painted(top_seen: bool, scale: float = 1.0) -> tuple[torch.Tensor, Paint, torch.Tensor]:
@@ -323,21 +323,47 @@ def painted(top_seen: bool, scale: float = 1.0) -> tuple[torch.Tensor, Paint, to
     seen = torch.ones((64, 64), dtype=torch.bool)
     seen[10:20, 36 if not top_seen else 54 : 60] = False
     view = (view * seen * scale).to(torch.uint8 if scale == 1 else torch.float32)
-    paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), PARTS)
+    paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), FACE_PARTS)
     return view, paint, seen
 
 
-def test_tops_take_the_brightest_colours_of_their_objects() -> None:
-    for top_seen, expected in ((True, 150), (False, 100)):
+def in_light(paint: float) -> float:
+    """A top over a side of this level, in the light of tops."""
+    return float(255 * (1.8 * (paint / 255) ** 2.2 + 0.05) ** (1 / 2.2))
+
+
+def test_tops_take_their_body_s_paint_in_the_light_of_tops() -> None:
+    for top_seen, expected in ((True, None), (False, in_light(100))):
         view, paint, seen = painted(top_seen)
         colours = object_colours([view.numpy()], [paint])
-        np.testing.assert_array_equal(colours[:, 0], [40, 80, 100, expected])
+        np.testing.assert_array_equal(colours[:5, 0], 40)
+        np.testing.assert_array_equal(colours[6:11, 0], 100)
+        assert 80 < colours[5, 0] < in_light(40) and (colours == colours[:, :1]).all()
+        top = colours[11, 0]
+        assert top == pytest.approx(expected, abs=1e-3) if expected else in_light(100) < top < 150
         layers = np.full(seen.shape, OBJECT, np.uint8)
         (out,) = fill_holes([view.clone()], [seen], [layers], [paint])
-        assert (out[:, ~seen] == expected).all() and torch.equal(out[:, seen], view[:, seen])
+        assert (out[:, ~seen] == int(top)).all() and torch.equal(out[:, seen], view[:, seen])
         of_float, paint, _ = painted(top_seen, 1 / 255)
         (out,) = fill_holes([of_float], [seen], [layers], [paint])
-        torch.testing.assert_close(out[:, ~seen], torch.full_like(out[:, ~seen], expected / 255))
+        torch.testing.assert_close(out[:, ~seen], torch.full_like(out[:, ~seen], float(top) / 255))
+
+
+def test_windows_and_lamps_do_not_colour_tops() -> None:
+    view, paint, _ = painted(top_seen=False)
+    lamp = replace(paint, sample_part=np.where(paint.sample_part == 7, 6, paint.sample_part))  # all on the cabin
+    assert object_colours([view.numpy()], [lamp])[11, 0] == pytest.approx(in_light(100), abs=1e-3)
+    side = paint.sample[paint.sample_part == 7]
+    view.reshape(3, -1)[:, side[: len(side) // 3]] = 255  # a lamp on a third of the side
+    assert object_colours([view.numpy()], [paint])[11, 0] == pytest.approx(in_light(100), abs=1e-3)
+
+
+def test_a_top_without_any_seen_part_is_left_to_the_background() -> None:
+    view, paint, seen = painted(top_seen=False)
+    alone = replace(paint, sample=paint.sample[:0], sample_part=paint.sample_part[:0])
+    assert (object_colours([view.numpy()], [alone]) == -1).all()
+    (out,) = fill_holes([view.clone()], [seen], [np.where(seen, 0, 1).astype(np.uint8)], [alone])
+    assert (out[:, ~seen] > 0).all()
 
 
 def test_cracks_in_objects_take_the_colour_beside_them() -> None:
@@ -347,7 +373,7 @@ def test_cracks_in_objects_take_the_colour_beside_them() -> None:
     seen = torch.ones((64, 64), dtype=torch.bool)
     seen[:, 20] = False
     view[:, ~seen] = 0
-    paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), PARTS)
+    paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), FACE_PARTS)
     (out,) = fill_holes([view], [seen], [np.full((64, 64), OBJECT, np.uint8)], [paint])
     assert torch.equal(out[:, 30, 20], expected)
 

@@ -123,6 +123,14 @@ def test_faces_tell_their_object_and_whether_they_are_roofs_or_bonnets() -> None
     assert not BoxSurface(Street(), small, solids(small)).face_is_top.any()
 
 
+def test_parts_tell_the_sides_of_the_body_from_the_cabin_and_the_tops() -> None:
+    surface = BoxSurface(Street(), CAR, solids(CAR))
+    assert surface.face_parts.tolist() == [1, 2, 3, 4, 0, 5, 0, 0, 0, 0, 0, 5]
+    person = boxes_of({"person": SIZES["person"]})  # one colour
+    both = np.concatenate([CAR, person])
+    assert BoxSurface(Street(), both, solids(both)).face_parts[12:].tolist() == [6] * 12
+
+
 @pytest.mark.parametrize("surface", ["boxes", "lidar"])
 def test_a_roof_that_no_source_saw_is_a_hole(surface: str) -> None:
     low = Camera.looking(
