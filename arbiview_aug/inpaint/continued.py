@@ -1,8 +1,13 @@
-"""Default filling of holes: tops of objects painted, the background continued behind them, by a pyramid of cells."""
+"""Default filling of holes: the background continued along lines of the scene and by a pyramid of cells.
+
+A hole pixel knows whether its ray would meet the road next. The road goes on along the ego's heading, in its plane;
+what stands upright goes on along the heading, too, at equal height, and up and down. Each pixel mixes what its lines
+meet first with a blurred completion of all that is beside it. Unseen parts of objects are painted.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -10,18 +15,27 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.inpaint.telea import GREY
 from arbiview_aug.render.rendered import RenderedFrame
-from arbiview_aug.render.view_plan import BACKGROUND, OBJECT, Paint
+from arbiview_aug.render.view_plan import OBJECT, Paint
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import Frame
 
-CELLS = 64  # cells along a view's shorter side
+CELLS = 128  # cells along a view's shorter side; the pyramid starts with half as many
 
-REACH = 1 / 8
-"""Share of a view's shorter side at which the nearest pixels of a column and those all around weigh the same outside
-the sources' images. Synthetic streets: 92 of 255 squared, 94 without fading, 110 without columns; Telea's method 97."""
+REACH = np.array([(0, 0), (0, 1 / 8), (1 / 2, 0), (1 / 16, 1 / 16), (1 / 16, 0)], np.float32)
+"""Distance at which lines along the heading and vertical ones weigh as much as all that is around, as a share of the
+view's shorter side: nothing; upright things and road outside the sources' images; both where something hides them."""
+
+SIDE_REACH = 1 / 4
+"""The same of seen pixels in the row and column of an object's unseen side, against the object's colour."""
+
+_LENS_NODES = 17  # directions of lines are interpolated between so many nodes along each side; a pinhole's are linear
+_MOVE = 1e-4  # by which rays are moved along a line, as a share of their length
+_STEP_PX = 4  # distance of the nodes at which views without a plan know the road
 
 _WIDE = 2  # halvings of the columns alone: what is hidden looks like what is beside it, not above or below
 _SWEEPS = 2
@@ -52,15 +66,15 @@ class Continue(Inpainter):
     def inpaint(
         self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
     ) -> list[torch.Tensor]:
-        none = [None] * len(views)
-        return fill_holes([view.clone() for view in views], [~hole for hole in holes], none, none, self.only_mean)
+        return fill_holes([view.clone() for view in views], [~hole for hole in holes], only_mean=self.only_mean)
 
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
         """Fill rendered frames, in place where possible."""
         return [self._filled(frame) for frame in rendered]
 
     def _filled(self, frame: RenderedFrame) -> RenderedFrame:
-        images = fill_holes(frame.images, list(frame.coverage), frame.layers, frame.paint, self.only_mean)
+        plans = frame.layers, frame.paint, frame.road, frame.rig
+        images = fill_holes(frame.images, list(frame.coverage), *plans, only_mean=self.only_mean)
         return replace(frame, images=images, generated=stacked([~seen for seen in frame.coverage]))
 
 
@@ -74,8 +88,11 @@ class Mean(Continue):
 def fill_holes(
     views: Sequence[torch.Tensor],
     coverage: Sequence[torch.Tensor],
-    layers: Sequence[npt.NDArray[np.uint8] | None],
-    paint: Sequence[Paint | None],
+    layers: Sequence[npt.NDArray[np.uint8] | None] = (),
+    paint: Sequence[Paint | None] = (),
+    road: Sequence[BoolArray | None] = (),
+    cameras: Iterable[Camera] | None = None,
+    *,
     only_mean: bool = False,
 ) -> list[torch.Tensor]:
     """Fill uncovered pixels; covered ones are unchanged and keep their gradients.
@@ -86,28 +103,30 @@ def fill_holes(
         coverage: (h, w) bool of each.
         layers: (h, w) uint8 of each as in ``ViewPlan``, or None: all uncovered pixels lie outside the images.
         paint: Of each as in ``ViewPlan``, or None.
+        road: Of each as in ``ViewPlan``, or None: the road reaches to the horizon.
+        cameras: That of each view; None if unknown: verticals are columns, and there is no road.
         only_mean: Set all to the mean colour of the frame's covered pixels. Else paint tops in their objects' colours,
             and continue objects from objects, background from background.
     """
-    from arbiview_aug.inpaint.kernels import paint as put_paint
-
     seen = [of_view.cpu().numpy() for of_view in coverage]
     if all(of_view.all() for of_view in seen):
         return list(views)
     arrays = [_as_array(view) for view in views]
     needs_mean = only_mean or not all(of_view.any() for of_view in seen)
     mean = mean_colour(arrays, seen) if needs_mean else np.zeros(3, np.float32)
-    colours = object_colours(arrays, paint)
-    for view, known, layer, tops in zip(arrays, seen, layers, paint, strict=True):
+    none = [None] * len(arrays)
+    colours = object_colours(arrays, paint or none)
+    of_views = zip(arrays, seen, layers or none, paint or none, road or none, cameras or none, strict=True)
+    for view, known, layer, objects, on_road, camera in of_views:
         if known.all():
             continue
         if only_mean:
             _put(view, ~known, mean)
             continue
         of_view = np.zeros(known.shape, np.uint8) if layer is None else layer
-        _fill(view, known, of_view, mean)
-        if tops is not None:
-            put_paint(tops.pixel, tops.part, tops.beside, colours, known.reshape(-1), view.reshape(3, -1))
+        _fill(view, known, of_view, on_road, camera, mean)
+        if objects is not None:
+            _paint(view, known, of_view, objects, colours)
     return [_like(*of_view) for of_view in zip(arrays, views, coverage, strict=True)]
 
 
@@ -146,21 +165,63 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
 
 
 # --- one view ---------------------------------------------------------------------------------------------------------
-def _fill(view: npt.NDArray[Any], seen: npt.NDArray[Any], layers: npt.NDArray[np.uint8], mean: Colour) -> None:
-    """Continue the background: what is hidden from beside it, what lies outside the images from columns, too."""
-    from arbiview_aug.inpaint.kernels import continue_columns, put_cells, sum_cells
+def _fill(
+    view: npt.NDArray[Any],
+    seen: BoolArray,
+    layers: npt.NDArray[np.uint8],
+    road: BoolArray | None,
+    camera: Camera | None,
+    mean: Colour,
+) -> None:
+    """Continue the background of a view."""
+    from arbiview_aug.inpaint.kernels import continue_lines, halve, mark_cells, put_cells, sum_cells
 
-    cell, rounding = _cell_px(seen.shape), 0.5 if view.dtype == np.uint8 else 0.0
+    cell = _cell_px(seen.shape)
     known = seen & (layers < OBJECT)
     sums = np.empty((4, *(-(-n // cell) for n in seen.shape)), np.float32)
     sum_cells(view, (known if known.any() else seen).view(np.uint8), cell, sums)
-    background, columns = sums.copy(), np.empty_like(sums)
+    background, around = (np.empty((4, *(-(-n // k) for n in sums.shape[1:])), np.float32) for k in (2, 4))
+    halve(sums, 2, 1 / 4, background)
+    halve(background, 2, 1.0, around)
+    filled = np.empty_like(sums)
     _completed(background, mean, _WIDE)
-    outside = ~seen & (layers == BACKGROUND)
-    if outside.any():
-        continue_columns(sums, background, REACH * min(seen.shape) / cell, columns)
-        put_cells(columns, cell, outside.view(np.uint8), rounding, view)
-    put_cells(background, cell, (~seen & (layers != BACKGROUND)).view(np.uint8), rounding, view)
+    road = _road_below_horizon(camera, seen.shape) if road is None else road
+    kinds = np.empty(sums.shape[1:], np.uint8)
+    mark_cells(seen, layers, road, -(-seen.shape[0] // (len(road) - 1)), cell, kinds)
+    reach = REACH * np.float32(min(seen.shape) / cell)
+    continue_lines(sums, around, background, kinds, _line_directions(camera), reach, filled)
+    put_cells(filled, cell, (~seen).view(np.uint8), 0.5 if view.dtype == np.uint8 else 0.0, view)
+
+
+def _paint(
+    view: npt.NDArray[Any], seen: BoolArray, layers: npt.NDArray[np.uint8], objects: Paint, colours: Colour
+) -> None:
+    """Paint the unseen parts of objects in a view by the colours (P, 3) of their parts."""
+    from arbiview_aug.inpaint.kernels import paint
+
+    of_pixels, reach = (objects.pixel, objects.part, objects.beside, objects.is_top), SIDE_REACH * min(seen.shape)
+    paint(*of_pixels, colours, seen, layers, reach, view.reshape(3, -1))
+
+
+def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
+    """Directions (2, 2, n, n) in the image, x and y, of lines along the heading and vertical ones, as kernels read."""
+    if camera is None:
+        return np.array([(0, 0), (0, 1)], np.float32)[..., None, None].repeat(2, 2).repeat(2, 3)
+    (h, w), n = camera.size, 2 if camera.is_rectilinear else _LENS_NODES
+    at = np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, n), np.linspace(-0.5, h - 0.5, n)), -1)
+    rays = camera.unproject_cam(at).directions
+    rays = rays / rays[..., 2:] if camera.is_rectilinear else rays
+    start = camera.project_cam(rays).uv
+    moved = [camera.project_cam(rays + _MOVE * camera.cam2ego[axis, :3]).uv - start for axis in (0, 2)]
+    return np.nan_to_num(np.moveaxis(np.stack(moved), -1, 1) / _MOVE, posinf=0, neginf=0).astype(np.float32)
+
+
+def _road_below_horizon(camera: Camera | None, size: tuple[int, ...]) -> BoolArray:
+    """Nodes ``_STEP_PX`` apart of a view (h, w) that look down, as in ``ViewPlan.road``."""
+    y, x = (np.arange(0, n + _STEP_PX, _STEP_PX, dtype=np.float64) for n in size)
+    if camera is None:
+        return np.zeros((len(y), len(x)), bool)
+    return camera.unproject(np.stack(np.meshgrid(x, y), -1)).directions[..., 2] < 0
 
 
 def _completed(cells: Cells, mean: Colour, wide: int) -> None:
@@ -173,7 +234,7 @@ def _completed(cells: Cells, mean: Colour, wide: int) -> None:
         return
     tall = 1 if wide and nx > 1 else 2
     coarse = np.empty((4, -(-ny // tall), -(-nx // 2)), np.float32)
-    halve(cells, tall, coarse)
+    halve(cells, tall, 1.0, coarse)
     _completed(coarse, mean, max(wide - 1, 0))
     known = cells.copy()
     complete(coarse, tall, cells)

@@ -62,6 +62,9 @@ BACKGROUND, OCCLUDED, OBJECT = range(3)
 """Layers of a view's pixels: background that is seen, or outside all images; background that something hides; objects,
 and what is nearer than occluded background beside it."""
 
+ROAD_M = 0.3
+"""Height up to which background belongs to the road: kerbs and sidewalks, and the noise of LiDAR."""
+
 NEARER, NEARER_REACH = 1.5, 1 / 16
 """Pixels so many times nearer than occluded background, within this share of the view's shorter side beside it, are not
 what continues it."""
@@ -101,6 +104,11 @@ class Paint:
         return cls(*columns[:3, :hidden].copy(), *columns[3:, :sampled].copy())
 
     @property
+    def is_top(self) -> BoolArray:
+        """(n,) whether ``part`` is a top."""
+        return np.asarray(self.part & 1 == 1)
+
+    @property
     def nbytes(self) -> int:
         """Memory in bytes."""
         return 3 * self.pixel.nbytes + 2 * self.sample.nbytes
@@ -120,6 +128,8 @@ class ViewPlan:
         edge: Pixels that must not be read by cubics.
         layers: (h, w) uint8 layer of each pixel, for fillers; None if no pixel in a source's image is occluded.
         paint: Unseen parts of objects; None without ``layers`` or objects.
+        road: (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the nodes
+            ``config.grid_step_px`` apart; None without holes, or with sources at its own centre alone.
     """
 
     at: FixedMap
@@ -131,6 +141,7 @@ class ViewPlan:
     edge: BilinearFallback | None = None
     layers: npt.NDArray[np.uint8] | None = None
     paint: Paint | None = None
+    road: BoolArray | None = None
 
     @property
     def coverage(self) -> BoolArray:
@@ -159,5 +170,6 @@ class ViewPlan:
     def nbytes(self) -> int:
         """Memory in bytes."""
         bands = sum(b.at.nbytes + b.weight.nbytes for b in self.bands)
-        further = sum(part.nbytes for part in (self.certainty, self.edge, self.layers, self.paint) if part is not None)
+        parts = self.certainty, self.edge, self.layers, self.paint, self.road
+        further = sum(part.nbytes for part in parts if part is not None)
         return self.at.nbytes + self.source_camera.nbytes + bands + further
