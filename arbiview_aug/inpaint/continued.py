@@ -24,7 +24,7 @@ from arbiview_aug.render.view_plan import OBJECT, Paint
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import Frame
 
-CELLS = 128  # cells along a view's shorter side; the pyramid starts with half as many
+CELLS = 64  # cells along a view's shorter side; the pyramid starts with half as many
 
 REACH = np.array([(0, 0), (0, 1 / 8), (1 / 2, 0), (1 / 16, 1 / 16), (1 / 16, 0)], np.float32)
 """Distance at which lines along the heading and vertical ones weigh as much as all that is around, as a share of the
@@ -45,9 +45,6 @@ _TOP_SHARE = 0.9
 """Quantile of an object's colours that is nearest to its top's: windows, tyres and shadows are darker, and so is what
 sources see of tops at grazing angles. By pixel of 348 tops on synthetic streets, three sets: 1089, 1486 and 2720 of 255
 squared; the tops' medians, or the sides' times the frame's ratio of tops to sides: 4969, 1565 and 3550."""
-
-Cells = npt.NDArray[np.float32]
-"""(4, ny, nx) colours of a view's cells times their known share, and that share."""
 
 Colour = npt.NDArray[np.float32]
 """(3,) in the images' unit."""
@@ -174,23 +171,20 @@ def _fill(
     mean: Colour,
 ) -> None:
     """Continue the background of a view."""
-    from arbiview_aug.inpaint.kernels import continue_lines, halve, mark_cells, put_cells, sum_cells
+    from arbiview_aug.inpaint.kernels import complete_cells, continue_lines, mark_cells, put_cells, sum_cells
 
     cell = _cell_px(seen.shape)
     known = seen & (layers < OBJECT)
     sums = np.empty((4, *(-(-n // cell) for n in seen.shape)), np.float32)
     sum_cells(view, (known if known.any() else seen).view(np.uint8), cell, sums)
-    background, around = (np.empty((4, *(-(-n // k) for n in sums.shape[1:])), np.float32) for k in (2, 4))
-    halve(sums, 2, 1 / 4, background)
-    halve(background, 2, 1.0, around)
-    filled = np.empty_like(sums)
-    _completed(background, mean, _WIDE)
+    complete, around = (np.empty((4, *(-(-n // k) for n in sums.shape[1:])), np.float32) for k in (2, 4))
+    complete_cells(sums, mean, _WIDE, _SWEEPS, complete, around)
     road = _road_below_horizon(camera, seen.shape) if road is None else road
     kinds = np.empty(sums.shape[1:], np.uint8)
-    mark_cells(seen, layers, road, -(-seen.shape[0] // (len(road) - 1)), cell, kinds)
+    mark_cells(sums[3], seen, layers, road, -(-seen.shape[0] // (len(road) - 1)), cell, kinds)
     reach = REACH * np.float32(min(seen.shape) / cell)
-    continue_lines(sums, around, background, kinds, _line_directions(camera), reach, filled)
-    put_cells(filled, cell, (~seen).view(np.uint8), 0.5 if view.dtype == np.uint8 else 0.0, view)
+    continue_lines(sums, around, complete, kinds, _line_directions(camera), reach)
+    put_cells(sums, cell, (~seen).view(np.uint8), 0.5 if view.dtype == np.uint8 else 0.0, view)
 
 
 def _paint(
@@ -209,10 +203,12 @@ def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
         return np.array([(0, 0), (0, 1)], np.float32)[..., None, None].repeat(2, 2).repeat(2, 3)
     (h, w), n = camera.size, 2 if camera.is_rectilinear else _LENS_NODES
     at = np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, n), np.linspace(-0.5, h - 0.5, n)), -1)
+    if camera.is_rectilinear:
+        ends = (camera.K @ camera.cam2ego[:3:2, :3].T).T  # vanishing points, homogeneous
+        return np.array([[end[axis] - end[2] * at[..., axis] for axis in (0, 1)] for end in ends], np.float32)
     rays = camera.unproject_cam(at).directions
-    rays = rays / rays[..., 2:] if camera.is_rectilinear else rays
     start = camera.project_cam(rays).uv
-    moved = [camera.project_cam(rays + _MOVE * camera.cam2ego[axis, :3]).uv - start for axis in (0, 2)]
+    moved = [camera.project_cam(rays + _MOVE * axis).uv - start for axis in camera.cam2ego[:3:2, :3]]
     return np.nan_to_num(np.moveaxis(np.stack(moved), -1, 1) / _MOVE, posinf=0, neginf=0).astype(np.float32)
 
 
@@ -222,23 +218,6 @@ def _road_below_horizon(camera: Camera | None, size: tuple[int, ...]) -> BoolArr
     if camera is None:
         return np.zeros((len(y), len(x)), bool)
     return camera.unproject(np.stack(np.meshgrid(x, y), -1)).directions[..., 2] < 0
-
-
-def _completed(cells: Cells, mean: Colour, wide: int) -> None:
-    """Complete cells in place, by the mean colour where nothing is known; the first ``wide`` steps keep the rows."""
-    from arbiview_aug.inpaint.kernels import complete, halve, smooth
-
-    ny, nx = cells.shape[1:]
-    if ny == nx == 1:
-        cells[:] = np.append(mean, 1)[:, None, None] if cells[3, 0, 0] == 0 else cells / cells[3]
-        return
-    tall = 1 if wide and nx > 1 else 2
-    coarse = np.empty((4, -(-ny // tall), -(-nx // 2)), np.float32)
-    halve(cells, tall, 1.0, coarse)
-    _completed(coarse, mean, max(wide - 1, 0))
-    known = cells.copy()
-    complete(coarse, tall, cells)
-    smooth(known, _SWEEPS, cells)
 
 
 def _cell_px(size: tuple[int, ...]) -> int:

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.environment import compiled, inlined
+from arbiview_aug.environment import called, compiled, inlined
 
 _ZERO, _ONE, _HALF, _QUARTER = np.float32(0), np.float32(1), np.float32(0.5), np.float32(0.25)
+_TINY = np.float32(1e-12)
 _LEAST_KNOWN = np.float32(0.25)  # a cell of less known area says nothing of its line
 
 
@@ -38,15 +39,20 @@ def sum_cells(view: Any, known: Any, cell: int, sums: Any) -> None:
                 else:
                     for x in range(w):
                         row[x] += np.float32(mark[x])
+            out, whole = sums[c, j], w // cell
             for i in range(nx):
-                total = _ZERO
-                for x in range(i * cell, min(i * cell + cell, w)):
-                    total += row[x]
-                sums[c, j, i] = total * per_pixel
+                out[i] = _ZERO
+            for k in range(cell):
+                for i in range(whole):
+                    out[i] += row[i * cell + k]
+            for x in range(whole * cell, w):
+                out[whole] += row[x]
+            for i in range(nx):
+                out[i] *= per_pixel
 
 
-@compiled
-def halve(fine: Any, tall: int, weight: float, coarse: Any) -> None:
+@called
+def _halve(fine: Any, tall: int, weight: float, coarse: Any) -> None:
     """Add up cells (4, ny, nx) of a ``weight`` by ``tall`` (1 or 2) rows and 2 columns, at most to full cells."""
     ny, nx = fine.shape[1:]
     share, whole = np.float32(weight) / np.float32(2 // tall), nx // 2
@@ -66,9 +72,9 @@ def halve(fine: Any, tall: int, weight: float, coarse: Any) -> None:
                     coarse[c, j, i] /= known
 
 
-@compiled
-def complete(coarse: Any, tall: int, fine: Any) -> None:
-    """Complete what cells (4, ny, nx) do not know by coarser ones, complete themselves; see ``halve``."""
+@called
+def _complete(coarse: Any, tall: int, fine: Any) -> None:
+    """Complete what cells (4, ny, nx) do not know by coarser ones, complete themselves; see ``_halve``."""
     ny, nx = fine.shape[1:]
     rows, columns = coarse.shape[1:]
     for j in range(ny):
@@ -88,8 +94,8 @@ def complete(coarse: Any, tall: int, fine: Any) -> None:
                 fine[c, j, i] += missing * (above + s * (below - above))
 
 
-@compiled
-def smooth(known: Any, sweeps: int, cells: Any) -> None:
+@called
+def _smooth(known: Any, sweeps: int, cells: Any) -> None:
     """Draw complete cells (4, ny, nx) towards the mean of their neighbours, as far as they are not ``known``.
 
     It takes away the steps at the borders of what is known. Gauss-Seidel sweeps, forwards and backwards in turn.
@@ -111,10 +117,45 @@ def smooth(known: Any, sweeps: int, cells: Any) -> None:
 
 
 @compiled
-def mark_cells(seen: Any, layers: Any, road: Any, step: int, cell: int, kinds: Any) -> None:
+def complete_cells(sums: Any, mean: Any, wide: int, sweeps: int, cells: Any, around: Any) -> None:
+    """Complete cells of twice the size by a pyramid of ever larger ones.
+
+    Args:
+        sums: (4, ny, nx) of ``sum_cells``.
+        mean: (3,) float32 colour where nothing is known.
+        wide: The first so many steps to larger cells keep their height.
+        sweeps: Of smoothing, at each size.
+        cells: (4, ceil(ny / 2), ceil(nx / 2)) float32, written.
+        around: (4, ceil(ny / 4), ceil(nx / 4)) float32, written: ``sums`` added up, not completed.
+    """
+    _halve(sums, 2, _QUARTER, cells)
+    _halve(cells, 2, _ONE, around)
+    levels, heights = [cells], [2]
+    while levels[-1].shape[1] > 1 or levels[-1].shape[2] > 1:
+        fine = levels[-1]
+        tall = 1 if len(levels) <= wide and fine.shape[2] > 1 else 2
+        coarse = np.empty((4, (fine.shape[1] + tall - 1) // tall, (fine.shape[2] + 1) // 2), np.float32)
+        _halve(fine, tall, _ONE, coarse)
+        levels.append(coarse)
+        heights.append(tall)
+    top = levels[-1]
+    known = top[3, 0, 0]
+    for c in range(3):
+        top[c, 0, 0] = top[c, 0, 0] / known if known > _ZERO else mean[c]
+    top[3, 0, 0] = _ONE
+    for k in range(len(levels) - 2, -1, -1):
+        fine = levels[k]
+        sparse = fine.copy()
+        _complete(levels[k + 1], heights[k + 1], fine)
+        _smooth(sparse, sweeps, fine)
+
+
+@compiled
+def mark_cells(known: Any, seen: Any, layers: Any, road: Any, step: int, cell: int, kinds: Any) -> None:
     """Tell what the holes of each cell show: 0 without holes, else 1, 1 more on the road, 2 more where it is hidden.
 
     Args:
+        known: (ny, nx) known shares of the cells.
         seen: (h, w) bool.
         layers: (h, w) uint8 as in ``ViewPlan``.
         road: Nodes ``step`` pixels apart as in ``ViewPlan``.
@@ -126,14 +167,15 @@ def mark_cells(seen: Any, layers: Any, road: Any, step: int, cell: int, kinds: A
     for j in range(kinds.shape[0]):
         at = (j * cell + cell // 2 + step // 2) // step
         for i in range(kinds.shape[1]):
-            kind = 0
+            kinds[j, i] = kind = 0
+            if known[j, i] >= _ONE:
+                continue
             for y in range(j * cell, min(j * cell + cell, h)):
                 for x in range(i * cell, min(i * cell + cell, w)):
                     if not seen[y, x]:
                         kind |= 2 if layers[y, x] else 1
             if kind:
-                kind = 1 + (kind & 2) + road[at, (i * cell + cell // 2 + step // 2) // step]
-            kinds[j, i] = kind
+                kinds[j, i] = 1 + (kind & 2) + road[at, (i * cell + cell // 2 + step // 2) // step]
 
 
 @inlined
@@ -148,107 +190,111 @@ def _node(nodes: Any, y: Any, x: Any) -> Any:
 
 
 @compiled
-def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: Any, reach: Any, out: Any) -> None:
+def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: Any, reach: Any) -> None:
     """Continue what is known along lines of the scene, fading into the complete cells.
 
     Every cell mixes what its lines meet first on both sides, by the inverse of the distance, with its complete value.
     What lines of hidden cells meet is averaged: there it is the border of something nearer, which mixes colours.
 
     Args:
-        sums: (4, ny, nx) of ``sum_cells``.
+        sums: (4, ny, nx) of ``sum_cells``; becomes the colours of all cells.
         around: (4, ceil(ny / 4), ceil(nx / 4)) ``sums`` added up.
         complete: (4, ceil(ny / 2), ceil(nx / 2)) complete cells.
         kinds: (ny, nx) of ``mark_cells``.
         fields: (F, 2, my, mx) float32 horizontal and vertical direction of F families of lines, on nodes whose
             outermost ones are the view's corners.
         reach: (5, F) float32 distance in cells at which a line weighs as much as the complete value, by kind.
-        out: (4, ny, nx) float32, written.
     """
     (ny, nx), families = kinds.shape, fields.shape[0]
-    first, number = np.zeros(ny + 1, np.int64), np.empty((ny, nx), np.int32)
-    count = 0
+    number, first = np.zeros((ny, nx), np.int32), np.zeros((families, ny + 1), np.int64)
+    most = 0
     for j in range(ny):
         for i in range(nx):
-            number[j, i] = count
-            count += kinds[j, i] > 0
-        first[j + 1] = count
-    column, quadrant = np.empty(count, np.int32), np.empty((count, families), np.uint8)
-    slope, met = np.empty((count, families), np.float32), np.zeros((count, 2 * families, 4), np.float32)
+            number[j, i] = most
+            most += kinds[j, i] > 0
+    column, code, slope = np.empty(most, np.int32), np.empty(most, np.uint8), np.empty(most, np.float32)
+    met = np.zeros((2 * families, most, 4), np.float32)
     wide, high = np.float32(fields.shape[3] - 1) / np.float32(nx), np.float32(fields.shape[2] - 1) / np.float32(ny)
-    for j in range(ny):
-        for i in range(nx):
-            if not kinds[j, i]:
-                continue
-            n = number[j, i]
-            column[n] = i
-            for f in range(families):
-                y, x = (np.float32(j) + _HALF) * high, (np.float32(i) + _HALF) * wide
-                dx, dy = _node(fields[f, 0], y, x), _node(fields[f, 1], y, x)
-                across, down = abs(dx), abs(dy)
-                quadrant[n, f] = (dx >= _ZERO) + 2 * (dy >= _ZERO) + 4 * (down > across)
-                slope[n, f] = min(across, down) / max(across, down, np.float32(1e-12))
-    for part in range(4):  # lines lead to cells that are ready: those to the right for odd parts, below for 2 and 3
-        sx, sy = 2 * (part & 1) - 1, (part & 2) - 1
-        for row in range(ny):
-            j = ny - 1 - row if sy > 0 else row
-            for k in range(first[j], first[j + 1]):
-                n = first[j] + first[j + 1] - 1 - k if sx > 0 else k
-                i = column[n]
-                is_hidden = kinds[j, i] > 2
-                for f in range(families):
-                    code = quadrant[n, f]
-                    if code & 3 != part and code & 3 != 3 - part:
+    for f in range(families):
+        across, down, runs = fields[f, 0], fields[f, 1], first[f]
+        count = 0
+        for j in range(ny):
+            for i in range(nx):
+                if reach[kinds[j, i], f] > _ZERO:
+                    y, x = (np.float32(j) + _HALF) * high, (np.float32(i) + _HALF) * wide
+                    dx, dy = _node(across, y, x), _node(down, y, x)
+                    ahead, aside = max(abs(dx), abs(dy)), min(abs(dx), abs(dy))
+                    column[count] = i
+                    code[count] = (dx >= _ZERO) + 2 * (dy >= _ZERO) + 4 * (abs(dy) > abs(dx))
+                    slope[count] = aside / max(ahead, _TINY)
+                    count += 1
+            runs[j + 1] = count
+        for part in range(4):  # cells that lines come from are ready: to the right for odd parts, below for 2 and 3
+            sx, sy = 2 * (part & 1) - 1, (part & 2) - 1
+            for row in range(ny):
+                j = ny - 1 - row if sy > 0 else row
+                for k in range(runs[j], runs[j + 1]):
+                    n = runs[j] + runs[j + 1] - 1 - k if sx > 0 else k
+                    turned = code[n] & 3
+                    if turned != part and turned != 3 - part:
                         continue
-                    line = met[n, 2 * f + (code & 3 != part)]
-                    t, total = slope[n, f], _ZERO
+                    i, t, lines = column[n], slope[n], met[2 * f + (turned != part)]
+                    r = g = b = far = total = _ZERO
                     for side in range(2):
-                        y, x = j + sy * (side or code > 3), i + sx * (side or code <= 3)
+                        y, x = j + sy * (side or code[n] > 3), i + sx * (side or code[n] <= 3)
                         weight = t if side else _ONE - t
                         if y < 0 or x < 0 or y >= ny or x >= nx or weight <= _ZERO:
                             continue
                         known = sums[3, y, x]
                         if known > _LEAST_KNOWN:
-                            if is_hidden:
+                            total += weight
+                            if kinds[j, i] > 2:
                                 yy = max((np.float32(y) + _HALF) * _QUARTER - _HALF, _ZERO)
                                 xx = max((np.float32(x) + _HALF) * _QUARTER - _HALF, _ZERO)
-                                known = _node(around[3], yy, xx)
-                                for c in range(3):
-                                    line[c] += weight * _node(around[c], yy, xx) / known
+                                weight /= _node(around[3], yy, xx)
+                                r += weight * _node(around[0], yy, xx)
+                                g += weight * _node(around[1], yy, xx)
+                                b += weight * _node(around[2], yy, xx)
                             else:
-                                for c in range(3):
-                                    line[c] += weight * sums[c, y, x] / known
-                            total += weight
+                                weight /= known
+                                r += weight * sums[0, y, x]
+                                g += weight * sums[1, y, x]
+                                b += weight * sums[2, y, x]
                         elif kinds[y, x]:
-                            beyond = met[number[y, x], 2 * f + (code & 3 != part)]
+                            beyond = lines[number[y, x]]
                             if beyond[3] > _ZERO:
-                                for c in range(4):
-                                    line[c] += weight * beyond[c]
                                 total += weight
+                                r += weight * beyond[0]
+                                g += weight * beyond[1]
+                                b += weight * beyond[2]
+                                far += weight * beyond[3]
                     if total > _ZERO:
-                        for c in range(4):
-                            line[c] /= total
-                        line[3] += np.sqrt(_ONE + t * t)
+                        line, share = lines[number[j, i]], _ONE / total
+                        line[0], line[1], line[2] = r * share, g * share, b * share
+                        line[3] = far * share + np.sqrt(_ONE + t * t)
+    mixed = np.empty(3, np.float32)
     for j in range(ny):
         for i in range(nx):
             known = sums[3, j, i]
-            if known >= _ONE or (known > _ZERO and not kinds[j, i]):
+            if known >= _ONE:
+                continue
+            if known > _ZERO and not kinds[j, i]:
                 for c in range(3):
-                    out[c, j, i] = sums[c, j, i] / known
+                    sums[c, j, i] /= known
                 continue
             y, x = max((np.float32(j) - _HALF) * _HALF, _ZERO), max((np.float32(i) - _HALF) * _HALF, _ZERO)
             total = _ONE
             for c in range(3):
-                out[c, j, i] = _node(complete[c], y, x)
-            if kinds[j, i]:
-                for k in range(2 * families):
-                    line = met[number[j, i], k]
-                    if line[3] > _ZERO:
-                        weight = reach[kinds[j, i], k // 2] / line[3]
-                        for c in range(3):
-                            out[c, j, i] += weight * line[c]
-                        total += weight
+                mixed[c] = _node(complete[c], y, x)
+            for k in range(2 * families if kinds[j, i] else 0):
+                line = met[k, number[j, i]]
+                if line[3] > _ZERO:
+                    weight = reach[kinds[j, i], k // 2] / line[3]
+                    for c in range(3):
+                        mixed[c] += weight * line[c]
+                    total += weight
             for c in range(3):
-                out[c, j, i] = sums[c, j, i] + (_ONE - known) * out[c, j, i] / total
+                sums[c, j, i] += (_ONE - known) * mixed[c] / total
 
 
 @compiled
@@ -345,12 +391,10 @@ def warm_up() -> None:
     """Compile these kernels, or load them from numba's cache."""
     cells, pixel, colours = np.ones((3, 4, 2, 2), np.float32), np.zeros(1, np.int32), np.ones((1, 3), np.float32)
     chosen, seen = np.zeros((2, 2), np.uint8), np.zeros((2, 2), bool)
-    halve(cells[0], 2, 1.0, cells[1])
-    complete(cells[0], 2, cells[1])
-    smooth(cells[0], 1, cells[1])
-    mark_cells(seen, chosen, np.zeros((2, 2), bool), 2, 1, chosen.copy())
+    complete_cells(cells[0], colours[0], 1, 1, cells[1, :, :1, :1].copy(), cells[2, :, :1, :1].copy())
+    mark_cells(cells[0, 3], seen, chosen, seen, 2, 1, chosen.copy())
     fields, reach = np.ones((2, 2, 2, 2), np.float32), np.ones((5, 2), np.float32)
-    continue_lines(cells[0], cells[1], cells[1], chosen, fields, reach, cells[2])
+    continue_lines(cells[0], cells[1], cells[1], chosen, fields, reach)
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
         sum_cells(view, chosen, 1, cells[0])
         put_cells(cells[0], 1, chosen, 0.5, view)
