@@ -26,12 +26,14 @@ from arbiview_aug.sample.inputs import Frame
 
 CELLS = 64  # cells along a view's shorter side; the pyramid starts with half as many
 
-REACH = np.array([(0, 0), (0, 1 / 8), (1 / 2, 0), (1 / 16, 1 / 16), (1 / 16, 0)], np.float32)
+REACH = np.array([(0, 0), (0, 1 / 8), (1 / 2, 0), (1 / 16, 1 / 16), (1 / 4, 0)], np.float32)
 """Distance at which lines along the heading and vertical ones weigh as much as all that is around, as a share of the
-view's shorter side: nothing; upright things and road outside the sources' images; both where something hides them."""
+view's shorter side: nothing; upright things and road outside the sources' images; both where something hides them.
+Half or twice as much changes synthetic streets (seed 31) by less than 0.1 dB; no lines cost up to 1 dB."""
 
 SIDE_REACH = 1 / 4
-"""The same of seen pixels in the row and column of an object's unseen side, against the object's colour."""
+"""The same of seen pixels in the row and column of an object's unseen side, against the object's colour. Sides on the
+same streets, one metre aside: half as much -0.2 dB, up to four times the same, the object's colour alone -3.8."""
 
 _LENS_NODES = 17  # directions of lines are interpolated between so many nodes along each side; a pinhole's are linear
 _MOVE = 1e-4  # by which rays are moved along a line, as a share of their length
@@ -51,10 +53,10 @@ Colour = npt.NDArray[np.float32]
 
 
 class Continue(Inpainter):
-    """Continues the background behind objects, mostly along rows, and outside all source images mostly along columns.
+    """Continues the road along the heading, and what stands upright along the heading and vertically.
 
-    Unseen parts of labelled objects take their object's colour: tops that of its top as a source sees it, else of its
-    sides in the frame's light. Covered pixels do not change.
+    Unseen parts of labelled objects: tops take the colour of their object's top as a source sees it, else of its sides
+    in the frame's light; sides go on from their seen pixels. Covered pixels do not change.
     """
 
     outcome: ClassVar[str] = "filled in from its surroundings"
@@ -102,8 +104,8 @@ def fill_holes(
         paint: Of each as in ``ViewPlan``, or None.
         road: Of each as in ``ViewPlan``, or None: the road reaches to the horizon.
         cameras: That of each view; None if unknown: verticals are columns, and there is no road.
-        only_mean: Set all to the mean colour of the frame's covered pixels. Else paint tops in their objects' colours,
-            and continue objects from objects, background from background.
+        only_mean: Set all to the mean colour of the frame's covered pixels. Else continue background from background,
+            sides of objects from objects, and paint tops in their objects' colours.
     """
     seen = [of_view.cpu().numpy() for of_view in coverage]
     if all(of_view.all() for of_view in seen):
@@ -181,7 +183,7 @@ def _fill(
     complete_cells(sums, mean, _WIDE, _SWEEPS, complete, around)
     road = _road_below_horizon(camera, seen.shape) if road is None else road
     kinds = np.empty(sums.shape[1:], np.uint8)
-    mark_cells(sums[3], seen, layers, road, -(-seen.shape[0] // (len(road) - 1)), cell, kinds)
+    mark_cells(sums[3], seen, layers, road, cell, kinds)
     reach = REACH * np.float32(min(seen.shape) / cell)
     continue_lines(sums, around, complete, kinds, _line_directions(camera), reach)
     put_cells(sums, cell, (~seen).view(np.uint8), 0.5 if view.dtype == np.uint8 else 0.0, view)

@@ -151,21 +151,20 @@ def complete_cells(sums: Any, mean: Any, wide: int, sweeps: int, cells: Any, aro
 
 
 @compiled
-def mark_cells(known: Any, seen: Any, layers: Any, road: Any, step: int, cell: int, kinds: Any) -> None:
+def mark_cells(known: Any, seen: Any, layers: Any, road: Any, cell: int, kinds: Any) -> None:
     """Tell what the holes of each cell show: 0 without holes, else 1, 1 more on the road, 2 more where it is hidden.
 
     Args:
         known: (ny, nx) known shares of the cells.
         seen: (h, w) bool.
         layers: (h, w) uint8 as in ``ViewPlan``.
-        road: Nodes ``step`` pixels apart as in ``ViewPlan``.
-        step: As said.
+        road: Nodes (my, mx) as in ``ViewPlan``, at equal distances from the first to the last row and column.
         cell: Side of a cell, pixels.
         kinds: (ny, nx) uint8, written.
     """
-    h, w = seen.shape
+    (h, w), (my, mx) = seen.shape, road.shape
     for j in range(kinds.shape[0]):
-        at = (j * cell + cell // 2 + step // 2) // step
+        row = min(((j * cell + cell // 2) * (my - 1) + h // 2) // h, my - 1)
         for i in range(kinds.shape[1]):
             kinds[j, i] = kind = 0
             if known[j, i] >= _ONE:
@@ -175,7 +174,8 @@ def mark_cells(known: Any, seen: Any, layers: Any, road: Any, step: int, cell: i
                     if not seen[y, x]:
                         kind |= 2 if layers[y, x] else 1
             if kind:
-                kinds[j, i] = 1 + (kind & 2) + road[at, (i * cell + cell // 2 + step // 2) // step]
+                column = min(((i * cell + cell // 2) * (mx - 1) + w // 2) // w, mx - 1)
+                kinds[j, i] = 1 + (kind & 2) + road[row, column]
 
 
 @inlined
@@ -221,8 +221,8 @@ def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: An
         for j in range(ny):
             for i in range(nx):
                 if reach[kinds[j, i], f] > _ZERO:
-                    y, x = (np.float32(j) + _HALF) * high, (np.float32(i) + _HALF) * wide
-                    dx, dy = _node(across, y, x), _node(down, y, x)
+                    yy, xx = (np.float32(j) + _HALF) * high, (np.float32(i) + _HALF) * wide
+                    dx, dy = _node(across, yy, xx), _node(down, yy, xx)
                     ahead, aside = max(abs(dx), abs(dy)), min(abs(dx), abs(dy))
                     column[count] = i
                     code[count] = (dx >= _ZERO) + 2 * (dy >= _ZERO) + 4 * (abs(dy) > abs(dx))
@@ -282,10 +282,10 @@ def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: An
                 for c in range(3):
                     sums[c, j, i] /= known
                 continue
-            y, x = max((np.float32(j) - _HALF) * _HALF, _ZERO), max((np.float32(i) - _HALF) * _HALF, _ZERO)
+            yy, xx = max((np.float32(j) - _HALF) * _HALF, _ZERO), max((np.float32(i) - _HALF) * _HALF, _ZERO)
             total = _ONE
             for c in range(3):
-                mixed[c] = _node(complete[c], y, x)
+                mixed[c] = _node(complete[c], yy, xx)
             for k in range(2 * families if kinds[j, i] else 0):
                 line = met[k, number[j, i]]
                 if line[3] > _ZERO:
@@ -392,7 +392,7 @@ def warm_up() -> None:
     cells, pixel, colours = np.ones((3, 4, 2, 2), np.float32), np.zeros(1, np.int32), np.ones((1, 3), np.float32)
     chosen, seen = np.zeros((2, 2), np.uint8), np.zeros((2, 2), bool)
     complete_cells(cells[0], colours[0], 1, 1, cells[1, :, :1, :1].copy(), cells[2, :, :1, :1].copy())
-    mark_cells(cells[0, 3], seen, chosen, seen, 2, 1, chosen.copy())
+    mark_cells(cells[0, 3], seen, chosen, seen, 1, chosen.copy())
     fields, reach = np.ones((2, 2, 2, 2), np.float32), np.ones((5, 2), np.float32)
     continue_lines(cells[0], cells[1], cells[1], chosen, fields, reach)
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
