@@ -332,7 +332,8 @@ def paint(
 ) -> None:
     """Paint the unseen pixels of objects in a view: by the pixel beside them, tops in their part's colour.
 
-    Sides mix their part's colour, where it is known, with the nearest seen pixels of objects in their row and column.
+    Sides mix their part's colour with the nearest seen pixels of objects in their row and column. Without a colour
+    they stay background.
 
     Args:
         pixel: (n,) into the flattened view; as are ``part``, ``beside`` and ``is_top`` an attribute of
@@ -369,12 +370,11 @@ def paint(
             for c in range(3):
                 view[c, at] = view[c, source]
             continue
-        total = _ZERO
-        mixed[:] = _ZERO
-        if part[k] < table.shape[0] and table[part[k], 0] >= _ZERO:
-            total = _ONE
-            for c in range(3):
-                mixed[c] = table[part[k], c]
+        if part[k] >= table.shape[0] or table[part[k], 0] < _ZERO:
+            continue  # nothing of it is seen: another object's pixels would make it a ghost
+        total = _ONE
+        for c in range(3):
+            mixed[c] = table[part[k], c]
         for way in range(0 if is_top[k] else 4):
             source = nearest[k, way]
             if source >= 0:
@@ -382,9 +382,8 @@ def paint(
                 total += weight
                 for c in range(3):
                     mixed[c] += weight * np.float32(view[c, source])
-        if total > _ZERO:
-            for c in range(3):
-                view[c, at] = mixed[c] / total
+        for c in range(3):
+            view[c, at] = mixed[c] / total
 
 
 def warm_up() -> None:

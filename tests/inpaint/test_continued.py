@@ -447,6 +447,18 @@ def test_sides_take_the_seen_pixels_in_their_row_and_column() -> None:
     assert abs(int(out[0, 42, 35]) - (median + 120 * reach / far) / (1 + reach / far)) <= 1
 
 
+def test_objects_that_nobody_sees_are_background() -> None:
+    face = np.full((64, 64), -1, np.int32)
+    face[20:50, 10:30], face[20:50, 30:44] = 0, 6  # the second one stands behind the first
+    view = torch.full((3, 64, 64), 120, dtype=torch.uint8)
+    view[:, 20:50, 10:30] = 10
+    seen = torch.from_numpy(face != 6)
+    paint = Paint.of(face, np.where(seen.numpy(), 0, -1).astype(np.int8), PARTS)
+    layers = np.where(face >= 0, OBJECT, 0).astype(np.uint8)
+    (out,) = fill_holes([view * seen], [seen], [layers], [paint])
+    assert (out[:, 22:48, 31:42].float() - 120).abs().max() <= 1
+
+
 @pytest.mark.slow
 def test_both_executions_and_types_fill_alike_with_held_plans(street: dict[str, Any]) -> None:
     as_float = street | {"images": street["images"].float() / 255}
