@@ -1,4 +1,4 @@
-"""Compiled inner loops of filling holes: a pyramid of cells, continued columns, painted objects."""
+"""Compiled inner loops of filling holes: a pyramid of cells, continued lines, painted objects."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.environment import compiled
+from arbiview_aug.environment import called, compiled, inlined
 
-_ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
-_LEAST_KNOWN = np.float32(0.25)  # a cell of less known area says nothing of its column
+_ZERO, _ONE, _HALF, _QUARTER = np.float32(0), np.float32(1), np.float32(0.5), np.float32(0.25)
+_TINY = np.float32(1e-12)
+_LEAST_KNOWN = np.float32(0.25)  # a cell of less known area says nothing of its line
 
 
 @compiled
@@ -38,18 +39,23 @@ def sum_cells(view: Any, known: Any, cell: int, sums: Any) -> None:
                 else:
                     for x in range(w):
                         row[x] += np.float32(mark[x])
+            out, whole = sums[c, j], w // cell
             for i in range(nx):
-                total = _ZERO
-                for x in range(i * cell, min(i * cell + cell, w)):
-                    total += row[x]
-                sums[c, j, i] = total * per_pixel
+                out[i] = _ZERO
+            for k in range(cell):
+                for i in range(whole):
+                    out[i] += row[i * cell + k]
+            for x in range(whole * cell, w):
+                out[whole] += row[x]
+            for i in range(nx):
+                out[i] *= per_pixel
 
 
-@compiled
-def halve(fine: Any, tall: int, coarse: Any) -> None:
-    """Add up cells (4, ny, nx) by ``tall`` (1 or 2) rows and 2 columns, at most to full cells."""
+@called
+def _halve(fine: Any, tall: int, weight: float, coarse: Any) -> None:
+    """Add up cells (4, ny, nx) of a ``weight`` by ``tall`` (1 or 2) rows and 2 columns, at most to full cells."""
     ny, nx = fine.shape[1:]
-    share, whole = _ONE / np.float32(2 // tall), nx // 2
+    share, whole = np.float32(weight) / np.float32(2 // tall), nx // 2
     for j in range(coarse.shape[1]):
         y, below = j * tall, min(j * tall + tall, ny) - 1
         lower = _ONE if below > y else _ZERO
@@ -66,9 +72,9 @@ def halve(fine: Any, tall: int, coarse: Any) -> None:
                     coarse[c, j, i] /= known
 
 
-@compiled
-def complete(coarse: Any, tall: int, fine: Any) -> None:
-    """Complete what cells (4, ny, nx) do not know by coarser ones, complete themselves; see ``halve``."""
+@called
+def _complete(coarse: Any, tall: int, fine: Any) -> None:
+    """Complete what cells (4, ny, nx) do not know by coarser ones, complete themselves; see ``_halve``."""
     ny, nx = fine.shape[1:]
     rows, columns = coarse.shape[1:]
     for j in range(ny):
@@ -88,14 +94,13 @@ def complete(coarse: Any, tall: int, fine: Any) -> None:
                 fine[c, j, i] += missing * (above + s * (below - above))
 
 
-@compiled
-def smooth(known: Any, sweeps: int, cells: Any) -> None:
+@called
+def _smooth(known: Any, sweeps: int, cells: Any) -> None:
     """Draw complete cells (4, ny, nx) towards the mean of their neighbours, as far as they are not ``known``.
 
     It takes away the steps at the borders of what is known. Gauss-Seidel sweeps, forwards and backwards in turn.
     """
     ny, nx = known.shape[1:]
-    quarter = np.float32(0.25)
     for sweep in range(sweeps):
         back = sweep % 2
         for y in range(ny):
@@ -108,43 +113,188 @@ def smooth(known: Any, sweeps: int, cells: Any) -> None:
                     left, right = max(i - 1, 0), min(i + 1, nx - 1)
                     for c in range(3):
                         around = (cells[c, up, i] + cells[c, down, i]) + (cells[c, j, left] + cells[c, j, right])
-                        cells[c, j, i] = known[c, j, i] + missing * quarter * around
+                        cells[c, j, i] = known[c, j, i] + missing * _QUARTER * around
 
 
 @compiled
-def continue_columns(sums: Any, complete: Any, reach: float, out: Any) -> None:
-    """Continue the nearest known cells of each column, fading into the complete ones within ``reach`` cells.
+def complete_cells(sums: Any, mean: Any, wide: int, sweeps: int, cells: Any, around: Any) -> None:
+    """Complete cells of twice the size by a pyramid of ever larger ones.
 
     Args:
         sums: (4, ny, nx) of ``sum_cells``.
-        complete: (4, ny, nx) complete cells.
-        reach: Distance at which both weigh the same.
-        out: (4, ny, nx) float32, written.
+        mean: (3,) float32 colour where nothing is known.
+        wide: The first so many steps to larger cells keep their height.
+        sweeps: Of smoothing, at each size.
+        cells: (4, ceil(ny / 2), ceil(nx / 2)) float32, written.
+        around: (4, ceil(ny / 4), ceil(nx / 4)) float32, written: ``sums`` added up, not completed.
     """
-    ny, nx = sums.shape[1:]
-    above = np.empty(ny, np.int64)
-    for i in range(nx):
-        last = -1
-        for j in range(ny):
-            last = j if sums[3, j, i] > _LEAST_KNOWN else last
-            above[j] = last
-        below = ny
-        for j in range(ny - 1, -1, -1):
-            below = j if sums[3, j, i] > _LEAST_KNOWN else below
-            if sums[3, j, i] >= _ONE:
-                for c in range(4):
-                    out[c, j, i] = sums[c, j, i]
+    _halve(sums, 2, _QUARTER, cells)
+    _halve(cells, 2, _ONE, around)
+    levels, heights = [cells], [2]
+    while levels[-1].shape[1] > 1 or levels[-1].shape[2] > 1:
+        fine = levels[-1]
+        tall = 1 if len(levels) <= wide and fine.shape[2] > 1 else 2
+        coarse = np.empty((4, (fine.shape[1] + tall - 1) // tall, (fine.shape[2] + 1) // 2), np.float32)
+        _halve(fine, tall, _ONE, coarse)
+        levels.append(coarse)
+        heights.append(tall)
+    top = levels[-1]
+    known = top[3, 0, 0]
+    for c in range(3):
+        top[c, 0, 0] = top[c, 0, 0] / known if known > _ZERO else mean[c]
+    top[3, 0, 0] = _ONE
+    for k in range(len(levels) - 2, -1, -1):
+        fine = levels[k]
+        sparse = fine.copy()
+        _complete(levels[k + 1], heights[k + 1], fine)
+        _smooth(sparse, sweeps, fine)
+
+
+@compiled
+def mark_cells(known: Any, seen: Any, layers: Any, road: Any, cell: int, kinds: Any) -> None:
+    """Tell what the holes of each cell show: 0 without holes, else 1, 1 more on the road, 2 more where it is hidden.
+
+    Args:
+        known: (ny, nx) known shares of the cells.
+        seen: (h, w) bool.
+        layers: (h, w) uint8 as in ``ViewPlan``.
+        road: Nodes (my, mx) as in ``ViewPlan``, at equal distances from the first to the last row and column.
+        cell: Side of a cell, pixels.
+        kinds: (ny, nx) uint8, written.
+    """
+    (h, w), (my, mx) = seen.shape, road.shape
+    for j in range(kinds.shape[0]):
+        row = min(((j * cell + cell // 2) * (my - 1) + h // 2) // h, my - 1)
+        for i in range(kinds.shape[1]):
+            kinds[j, i] = kind = 0
+            if known[j, i] >= _ONE:
                 continue
-            up = _ONE / np.float32(max(j - above[j], 1)) if above[j] >= 0 else _ZERO
-            down = _ONE / np.float32(max(below - j, 1)) if below < ny else _ZERO
-            weight = np.float32(reach) / (_ONE + np.float32(reach) * (up + down))
-            for c in range(4):
-                value = complete[c, j, i] * (_ONE - weight * (up + down))
-                if above[j] >= 0:
-                    value += weight * up * sums[c, above[j], i] / sums[3, above[j], i]
-                if below < ny:
-                    value += weight * down * sums[c, below, i] / sums[3, below, i]
-                out[c, j, i] = value
+            for y in range(j * cell, min(j * cell + cell, h)):
+                for x in range(i * cell, min(i * cell + cell, w)):
+                    if not seen[y, x]:
+                        kind |= 2 if layers[y, x] else 1
+            if kind:
+                column = min(((i * cell + cell // 2) * (mx - 1) + w // 2) // w, mx - 1)
+                kinds[j, i] = 1 + (kind & 2) + road[row, column]
+
+
+@inlined
+def _node(nodes: Any, y: Any, x: Any) -> Any:
+    """Interpolate nodes (ny, nx) at a place in units of their distance."""
+    j, i = int(y), int(x)
+    s, t = y - np.float32(j), x - np.float32(i)
+    j1, i1 = min(j + 1, nodes.shape[0] - 1), min(i + 1, nodes.shape[1] - 1)
+    above = nodes[j, i] + t * (nodes[j, i1] - nodes[j, i])
+    below = nodes[j1, i] + t * (nodes[j1, i1] - nodes[j1, i])
+    return above + s * (below - above)
+
+
+@compiled
+def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: Any, reach: Any) -> None:
+    """Continue what is known along lines of the scene, fading into the complete cells.
+
+    Every cell mixes what its lines meet first on both sides, by the inverse of the distance, with its complete value.
+    What lines of hidden cells meet is averaged: there it is the border of something nearer, which mixes colours.
+
+    Args:
+        sums: (4, ny, nx) of ``sum_cells``; becomes the colours of all cells.
+        around: (4, ceil(ny / 4), ceil(nx / 4)) ``sums`` added up.
+        complete: (4, ceil(ny / 2), ceil(nx / 2)) complete cells.
+        kinds: (ny, nx) of ``mark_cells``.
+        fields: (F, 2, my, mx) float32 horizontal and vertical direction of F families of lines, on nodes whose
+            outermost ones are the view's corners.
+        reach: (5, F) float32 distance in cells at which a line weighs as much as the complete value, by kind.
+    """
+    (ny, nx), families = kinds.shape, fields.shape[0]
+    number, first = np.zeros((ny, nx), np.int32), np.zeros((families, ny + 1), np.int64)
+    most = 0
+    for j in range(ny):
+        for i in range(nx):
+            number[j, i] = most
+            most += kinds[j, i] > 0
+    column, code, slope = np.empty(most, np.int32), np.empty(most, np.uint8), np.empty(most, np.float32)
+    met = np.zeros((2 * families, most, 4), np.float32)
+    wide, high = np.float32(fields.shape[3] - 1) / np.float32(nx), np.float32(fields.shape[2] - 1) / np.float32(ny)
+    for f in range(families):
+        across, down, runs = fields[f, 0], fields[f, 1], first[f]
+        count = 0
+        for j in range(ny):
+            for i in range(nx):
+                if reach[kinds[j, i], f] > _ZERO:
+                    yy, xx = (np.float32(j) + _HALF) * high, (np.float32(i) + _HALF) * wide
+                    dx, dy = _node(across, yy, xx), _node(down, yy, xx)
+                    ahead, aside = max(abs(dx), abs(dy)), min(abs(dx), abs(dy))
+                    column[count] = i
+                    code[count] = (dx >= _ZERO) + 2 * (dy >= _ZERO) + 4 * (abs(dy) > abs(dx))
+                    slope[count] = aside / max(ahead, _TINY)
+                    count += 1
+            runs[j + 1] = count
+        for part in range(4):  # cells that lines come from are ready: to the right for odd parts, below for 2 and 3
+            sx, sy = 2 * (part & 1) - 1, (part & 2) - 1
+            for row in range(ny):
+                j = ny - 1 - row if sy > 0 else row
+                for k in range(runs[j], runs[j + 1]):
+                    n = runs[j] + runs[j + 1] - 1 - k if sx > 0 else k
+                    turned = code[n] & 3
+                    if turned != part and turned != 3 - part:
+                        continue
+                    i, t, lines = column[n], slope[n], met[2 * f + (turned != part)]
+                    r = g = b = far = total = _ZERO
+                    for side in range(2):
+                        y, x = j + sy * (side or code[n] > 3), i + sx * (side or code[n] <= 3)
+                        weight = t if side else _ONE - t
+                        if y < 0 or x < 0 or y >= ny or x >= nx or weight <= _ZERO:
+                            continue
+                        known = sums[3, y, x]
+                        if known > _LEAST_KNOWN:
+                            total += weight
+                            if kinds[j, i] > 2:
+                                yy = max((np.float32(y) + _HALF) * _QUARTER - _HALF, _ZERO)
+                                xx = max((np.float32(x) + _HALF) * _QUARTER - _HALF, _ZERO)
+                                weight /= _node(around[3], yy, xx)
+                                r += weight * _node(around[0], yy, xx)
+                                g += weight * _node(around[1], yy, xx)
+                                b += weight * _node(around[2], yy, xx)
+                            else:
+                                weight /= known
+                                r += weight * sums[0, y, x]
+                                g += weight * sums[1, y, x]
+                                b += weight * sums[2, y, x]
+                        elif kinds[y, x]:
+                            beyond = lines[number[y, x]]
+                            if beyond[3] > _ZERO:
+                                total += weight
+                                r += weight * beyond[0]
+                                g += weight * beyond[1]
+                                b += weight * beyond[2]
+                                far += weight * beyond[3]
+                    if total > _ZERO:
+                        line, share = lines[number[j, i]], _ONE / total
+                        line[0], line[1], line[2] = r * share, g * share, b * share
+                        line[3] = far * share + np.sqrt(_ONE + t * t)
+    mixed = np.empty(3, np.float32)
+    for j in range(ny):
+        for i in range(nx):
+            known = sums[3, j, i]
+            if known >= _ONE:
+                continue
+            if known > _ZERO and not kinds[j, i]:
+                for c in range(3):
+                    sums[c, j, i] /= known
+                continue
+            yy, xx = max((np.float32(j) - _HALF) * _HALF, _ZERO), max((np.float32(i) - _HALF) * _HALF, _ZERO)
+            total = _ONE
+            for c in range(3):
+                mixed[c] = _node(complete[c], yy, xx)
+            for k in range(2 * families if kinds[j, i] else 0):
+                line = met[k, number[j, i]]
+                if line[3] > _ZERO:
+                    weight = reach[kinds[j, i], k // 2] / line[3]
+                    for c in range(3):
+                        mixed[c] += weight * line[c]
+                    total += weight
+            for c in range(3):
+                sums[c, j, i] += (_ONE - known) * mixed[c] / total
 
 
 @compiled
@@ -177,37 +327,74 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
 
 
 @compiled
-def paint(pixel: Any, part: Any, beside: Any, table: Any, seen: Any, view: Any) -> None:
-    """Paint the unseen pixels of a view: by the pixel beside them, else in their part's colour where it is known.
+def paint(
+    pixel: Any, part: Any, beside: Any, is_top: Any, table: Any, seen: Any, layers: Any, reach: float, view: Any
+) -> None:
+    """Paint the unseen pixels of objects in a view: by the pixel beside them, tops in their part's colour.
+
+    Sides mix their part's colour with the nearest seen pixels of objects in their row and column. Without a colour
+    they stay background.
 
     Args:
-        pixel: (n,) into the flattened view; as are ``part`` and ``beside`` an attribute of ``view_plan.Paint``.
+        pixel: (n,) into the flattened view; as are ``part``, ``beside`` and ``is_top`` an attribute of
+            ``view_plan.Paint``.
         part: (n,).
         beside: (n,).
+        is_top: (n,).
         table: (P, 3) float32 colours of the parts; the first is negative where unknown.
-        seen: (h w,) bool.
+        seen: (h, w) bool.
+        layers: (h, w) uint8 as in ``ViewPlan``.
+        reach: Distance in pixels at which a seen pixel weighs as much as the part's colour.
         view: (3, h w), painted.
     """
+    h, w = seen.shape
+    number, nearest = np.full((h, w), -1, np.int32), np.full((pixel.shape[0], 4), -1, np.int32)
     for k in range(pixel.shape[0]):
-        at, source, number = pixel[k], beside[k], part[k]
-        if seen[at]:
+        number[pixel[k] // w, pixel[k] % w] = k
+    for way in range(4):  # to the left, above, to the right, below
+        dy, dx = (way == 3) - (way == 1), (way == 2) - (way == 0)
+        for n in range(pixel.shape[0]):
+            k = pixel.shape[0] - 1 - n if way > 1 else n
+            y, x = pixel[k] // w + dy, pixel[k] % w + dx
+            if 0 <= y < h and 0 <= x < w:
+                if seen[y, x]:
+                    nearest[k, way] = y * w + x if layers[y, x] == 2 else -1
+                elif number[y, x] >= 0:
+                    nearest[k, way] = nearest[number[y, x], way]
+    mixed = np.empty(3, np.float32)
+    for k in range(pixel.shape[0]):
+        at, source = pixel[k], beside[k]
+        if seen[at // w, at % w]:
             continue
-        for c in range(3):
-            if source >= 0:
+        if source >= 0:
+            for c in range(3):
                 view[c, at] = view[c, source]
-            elif number < table.shape[0] and table[number, 0] >= _ZERO:
-                view[c, at] = table[number, c]
+            continue
+        if part[k] >= table.shape[0] or table[part[k], 0] < _ZERO:
+            continue  # nothing of it is seen: another object's pixels would make it a ghost
+        total = _ONE
+        for c in range(3):
+            mixed[c] = table[part[k], c]
+        for way in range(0 if is_top[k] else 4):
+            source = nearest[k, way]
+            if source >= 0:
+                weight = np.float32(reach) / np.float32(abs(source // w - at // w) + abs(source % w - at % w))
+                total += weight
+                for c in range(3):
+                    mixed[c] += weight * np.float32(view[c, source])
+        for c in range(3):
+            view[c, at] = mixed[c] / total
 
 
 def warm_up() -> None:
     """Compile these kernels, or load them from numba's cache."""
-    cells, pixel, colours = np.ones((2, 4, 2, 2), np.float32), np.zeros(1, np.int32), np.ones((1, 3), np.float32)
-    chosen, seen = np.zeros((2, 2), np.uint8), np.zeros(4, bool)
-    halve(cells[0], 2, cells[1])
-    complete(cells[0], 2, cells[1])
-    smooth(cells[0], 1, cells[1])
-    continue_columns(cells[0], cells[0], 1.0, cells[1])
+    cells, pixel, colours = np.ones((3, 4, 2, 2), np.float32), np.zeros(1, np.int32), np.ones((1, 3), np.float32)
+    chosen, seen = np.zeros((2, 2), np.uint8), np.zeros((2, 2), bool)
+    complete_cells(cells[0], colours[0], 1, 1, cells[1, :, :1, :1].copy(), cells[2, :, :1, :1].copy())
+    mark_cells(cells[0, 3], seen, chosen, seen, 1, chosen.copy())
+    fields, reach = np.ones((2, 2, 2, 2), np.float32), np.ones((5, 2), np.float32)
+    continue_lines(cells[0], cells[1], cells[1], chosen, fields, reach)
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
         sum_cells(view, chosen, 1, cells[0])
         put_cells(cells[0], 1, chosen, 0.5, view)
-        paint(pixel, pixel, pixel, colours, seen, view.reshape(3, 4))
+        paint(pixel, pixel, pixel, seen[0], colours, seen, chosen, 1.0, view.reshape(3, 4))

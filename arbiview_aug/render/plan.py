@@ -28,6 +28,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.image_ops import FRESH, Memory, level_size
+from arbiview_aug.scene.boxes import PARTS, TOP_PART
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,6 +248,9 @@ BACKGROUND, OCCLUDED, OBJECT = range(3)
 """Layers of a view's pixels: background that is seen, or outside all images; background that something hides; objects,
 and what is nearer than occluded background beside it."""
 
+ROAD_M = 0.3
+"""Height up to which background belongs to the road: kerbs and sidewalks, and the noise of LiDAR."""
+
 NEARER, NEARER_REACH = 1.5, 1 / 16
 """Pixels so many times nearer than occluded background, within this share of the view's shorter side beside it, are not
 what continues it."""
@@ -262,11 +266,16 @@ class Paint:
     """Parts of objects that no source sees, and where their colours are read in the view."""
 
     pixel: npt.NDArray[np.int32]  # (n,) int32 unseen pixels of objects, into the flattened view
-    part: npt.NDArray[np.int32]  # (n,) int32 what they show: twice the object's number, 1 more on its top
-    # (n,) int32 the nearest seen pixel of the same part in its row or column, -1 for none nearby
+    part: npt.NDArray[np.int32]  # (n,) int32 what they show: ``scene.boxes.BoxSurface.face_parts``
+    # (n,) int32 for sides, the nearest seen pixel of the object's sides in its row or column, -1 for none nearby
     beside: npt.NDArray[np.int32]
     sample: npt.NDArray[np.int32]  # (m,) int32 seen pixels of objects, a sample
     sample_part: npt.NDArray[np.int32]  # (m,) int32 what those show
+
+    @property
+    def is_top(self) -> BoolArray:
+        """(n,) whether ``part`` is a top."""
+        return np.asarray(self.part % PARTS == TOP_PART)
 
     @property
     def nbytes(self) -> int:
@@ -289,6 +298,9 @@ class ViewPlan:
     # (h, w) uint8 layer of each pixel, for fillers; None if no pixel in a source's image is occluded
     layers: npt.NDArray[np.uint8] | None = None
     paint: Paint | None = None  # unseen parts of objects; None without ``layers`` or objects
+    # (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the nodes ``config.grid_step_px``
+    # apart; None without holes, or with sources at its own centre alone
+    road: BoolArray | None = None
 
     @property
     def coverage(self) -> BoolArray:
@@ -317,7 +329,8 @@ class ViewPlan:
     def nbytes(self) -> int:
         """Memory in bytes."""
         bands = sum(b.at.nbytes + b.weight.nbytes for b in self.bands)
-        further = sum(part.nbytes for part in (self.certainty, self.edge, self.layers, self.paint) if part is not None)
+        parts = self.certainty, self.edge, self.layers, self.paint, self.road
+        further = sum(part.nbytes for part in parts if part is not None)
         return self.at.nbytes + self.source_camera.nbytes + bands + further
 
 

@@ -202,6 +202,7 @@ class RenderedFrame:
         generated: Bool, True where a filler made up the pixel; None before filling.
         layers: (h, w) uint8 of each view as in ``ViewPlan``, or None.
         paint: That of each view as in ``ViewPlan``, or None.
+        road: That of each view as in ``ViewPlan``, or None.
         certainty: (h, w) uint8 of each view as in ``ViewPlan``, for ``confidence_of``.
         seams: (h, w) float32 of each view, by how much blending changed it, for ``confidence_of``.
         curves: (M, N, 2) tone curves of each view for each source; None if exposures are as recorded.
@@ -217,6 +218,7 @@ class RenderedFrame:
     generated: Maps | None = None
     layers: Sequence[npt.NDArray[np.uint8] | None] = ()
     paint: Sequence[Paint | None] = ()
+    road: Sequence[npt.NDArray[np.bool_] | None] = ()
     certainty: Sequence[npt.NDArray[np.uint8] | torch.Tensor] = ()
     seams: Sequence[torch.Tensor] = ()
     curves: npt.NDArray[np.float64] | None = None
@@ -323,8 +325,8 @@ def _rendered(
     views, on_device = plan.targets, plan.on_devices.get(images[0].device)
     winners = [view.source for view in on_device or ()] or [torch.from_numpy(view.source_camera) for view in views]
     rendered = from_winners(images, plan.target, winners, partial(render_labels, plan), outputs)
-    layers, paint = [view.layers for view in views], [view.paint for view in views]
-    rendered = replace(rendered, layers=layers, paint=paint, curves=curves)
+    layers, paint, road = zip(*((view.layers, view.paint, view.road) for view in views), strict=True)
+    rendered = replace(rendered, layers=layers, paint=paint, road=road, curves=curves)
     if "confidence" not in outputs:
         return rendered
     certainty = [view.certainty for view in on_device or views if view.certainty is not None]

@@ -34,6 +34,7 @@ from arbiview_aug.image_ops import at_level, level_size
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.plan import (
     NEARER,
+    ROAD_M,
     AtlasLayout,
     BilinearFallback,
     FixedMap,
@@ -382,20 +383,35 @@ class ViewPlanner:
             fixed = fixed.rounded()
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
-        layers = ((winner < 0) & (in_image > 0)).view(np.uint8)
+        holes = winner < 0
+        layers = (holes & (in_image > 0)).view(np.uint8)
+        road = self._road() if holes.any() else None
         if not layers.any():
-            return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
+            return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, road=road)
         paint = self._mark_objects(winner, layers)
-        return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, layers, paint)
+        return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, layers, paint, road)
+
+    @property
+    def _near(self) -> _Region | None:
+        """The first source elsewhere."""
+        return next((region for region in self.regions if region.surface != "infinity"), None)
+
+    def _road(self) -> BoolArray | None:
+        """The nodes (ny + 1, nx + 1) behind which the road lies; None without sources elsewhere."""
+        if self._near is None:
+            return None
+        behind = self._near.geometry.behind
+        down = self._directions[..., 2] / np.maximum(behind, np.float32(1e-9))
+        height_m = self.camera.center_m[2] - self.ground_z_m + down
+        return np.asarray((height_m < ROAD_M) & (behind > 0))
 
     def _mark_objects(self, winner: npt.NDArray[np.int8], layers: npt.NDArray[np.uint8]) -> Paint | None:
         """Complete a view's layers where sources elsewhere show what is near."""
         from arbiview_aug.render.kernels import farthest_occluded, mark_objects
 
-        near = next((region for region in self.regions if region.surface != "infinity"), None)
-        if near is None:
+        if self._near is None:
             return None
-        geometry = near.geometry
+        geometry = self._near.geometry
         farthest = np.empty(self._open.shape, np.float32)
         farthest_occluded(geometry.q, geometry.face, layers, self.step, farthest)
         side = 2 * nearer_cells(self.camera.size, self.step) + 1

@@ -1,9 +1,13 @@
-"""``python -m integrations.benchmarks.generator``: cost and accuracy of filled holes on synthetic streets."""
+"""``python -m integrations.benchmarks.generator``: cost and accuracy of filled holes on synthetic streets.
+
+With ``--behind``: errors of the fast fillers in the holes of cameras moved up or aside, by what truly lies there.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,14 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
 
-from arbiview_aug import SampleKeys
+from arbiview_aug import RigRetarget, SampleKeys
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_output, command_parser, count, device_named, size, writable_folder
 from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, show
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.methods import retargeting
+from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.generator import Diffusion, Generator
 from integrations.benchmarks.study import study
@@ -31,6 +38,18 @@ HELD_OUT_SEED = 77
 CLOCKS = {"cpu": "CPU time of the process, one thread", "cuda": "Time between two events of the GPU's empty stream"}
 YAW_DEG, FOCAL = 20.0, 0.7
 """Turn and relative focal length of the target: 84° instead of 65°, with a quarter of it in holes."""
+
+MOVES_M = {"0.7 m up": (0.0, 0.0, 0.7), "1 m aside": (0.0, 1.0, 0.0)}
+KNOWN = {"LiDAR and boxes": {}, "boxes": {"points": None}}
+"""What takes away from a sample what is not known."""
+
+BEHIND = {
+    "road": GROUND_CLASSES,
+    "upright": (SceneClass.BUILDING, SceneClass.VEGETATION, SceneClass.POLE),
+    "sky": (SceneClass.SKY,),
+    "object": (SceneClass.VEHICLE, SceneClass.PEDESTRIAN, SceneClass.TWO_WHEELER),
+}
+FILLERS = ("telea", "continue")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -47,8 +66,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--generator", metavar="DIR", help="a trained one (default: the package's own)")
     parser.add_argument("--steps", nargs="+", type=count, default=STEPS, metavar="N", help="(default: 1 4)")
     parser.add_argument("--frames", type=count, default=2, metavar="N", help="number of streets")
+    parser.add_argument("--seed", type=int, default=HELD_OUT_SEED, metavar="N", help="of the streets")
+    parser.add_argument("--behind", action="store_true", help="by what lies in the holes of moved cameras")
     arguments = parser.parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)
+    if arguments.behind:
+        report = measure_behind(arguments)
+        show(table_behind(report), report, folder / "behind.json")
+        return 0
     report = measure(arguments)
     show(table(report), report, folder / "generator.json")
     return 0
@@ -77,7 +102,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     device = device_named(None)
     generator.to(device)
     source = demo_source_rig(arguments.size)
-    drive = SyntheticDrive(source, num_frames=arguments.frames, seed=HELD_OUT_SEED, lidar=False)
+    drive = SyntheticDrive(source, num_frames=arguments.frames, seed=arguments.seed, lidar=False)
     target = wide_target(source)
     frames = [make_frame(drive[k], truth=partial(drive.render, k), exposures=()) for k in range(arguments.frames)]
     make = partial(retargeting, "fast", "auto", keys=SampleKeys(extra=("confidence",)))
@@ -132,6 +157,53 @@ def table(report: Mapping[str, Any]) -> str:
         f"{report['device']}; {machine_line(report)}. {report['clock']}. {NOTES}"
     )
     return f"{title}\n\n{metric_table([{'name': name, **row} for name, row in rows.items()], COLUMNS)}"
+
+
+# --- what lies in the holes -------------------------------------------------------------------------------------------
+@benchmark
+def measure_behind(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Mean squared errors of the fast fillers in the holes of moved cameras, over all streets together."""
+    source = demo_source_rig(arguments.size)
+    drive = SyntheticDrive(source, num_frames=arguments.frames, seed=arguments.seed)
+    sums: dict[str, npt.NDArray[np.float64]] = defaultdict(lambda: np.zeros((2, len(BEHIND))))
+    fills = {
+        (move, holes): RigRetarget(source.shifted(*by_m), holes=holes)
+        for move, by_m in MOVES_M.items()
+        for holes in FILLERS
+    }
+    for k in tqdm(range(len(drive)), desc="streets", leave=False):
+        sample = drive[k]
+        for move, by_m in MOVES_M.items():
+            truth = drive.render(k, source.shifted(*by_m))
+            true, classes = np.stack(list(truth.images)).astype(np.float32), np.stack(list(truth.classes))
+            for known, without in KNOWN.items():
+                for holes in FILLERS:
+                    out = fills[move, holes]({**sample, **without})
+                    square = np.square(np.stack(list(out["images"])) - true).mean(axis=1)
+                    hole = ~np.stack(list(out["coverage"]))
+                    of_class = [square[hole & np.isin(classes, kinds)] for kinds in BEHIND.values()]
+                    row = [[len(one) for one in of_class], [one.sum() for one in of_class]]
+                    sums[f"{move}, {known}: {holes}"] += np.array(row, float)
+    rows = {}
+    for name, (pixels, squares) in sums.items():
+        parts = zip(BEHIND, pixels, squares, strict=True)
+        rows[name] = {
+            "all_db": psnr_db(squares.sum() / pixels.sum()),
+            **{f"{part}_{key}": value for part, n, total in parts for key, value in _part(n, total, pixels).items()},
+        }
+    return {"streets": arguments.frames, "seed": arguments.seed, "size": list(arguments.size), "rows": rows}
+
+
+def _part(pixels: float, square: float, of_all: npt.NDArray[np.float64]) -> dict[str, float]:
+    return {"db": psnr_db(square / max(pixels, 1)), "share": pixels / of_all.sum()}
+
+
+def table_behind(report: Mapping[str, Any]) -> str:
+    """Title and Markdown table of a report of ``measure_behind``."""
+    columns = [("all holes dB", "{all_db:.2f}")]
+    columns += [(f"{part} dB (share)", f"{{{part}_db:.2f}} ({{{part}_share:.0%}})") for part in BEHIND]
+    title = f"{report['streets']} synthetic streets of seed {report['seed']}; {machine_line(report)}."
+    return f"{title}\n\n{metric_table([{'name': name, **row} for name, row in report['rows'].items()], columns)}"
 
 
 if __name__ == "__main__":

@@ -18,3 +18,13 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert list(report["rows"]) == ["holes black", "filled", "inpainted", "1 step"] and report["size"] == [32, 56]
     printed = capsys.readouterr().out
     assert all(f"| {name} " in printed for name in report["rows"])
+
+
+@pytest.mark.slow
+def test_errors_by_what_lies_behind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--behind", "--size", "64x176", "--frames", "1", "--output", str(tmp_path)]) == 0
+    rows = json.loads((tmp_path / "behind.json").read_text())["rows"]
+    assert len(rows) == 8 and "| 1 m aside, boxes: continue " in capsys.readouterr().out
+    for row in rows.values():
+        shares = [row[f"{part}_share"] for part in ("road", "upright", "sky", "object")]
+        assert abs(sum(shares) - 1) < 1e-9 and 5 < row["all_db"] < 40
