@@ -162,7 +162,7 @@ def test_families_have_tables_of_their_own(done):
     assert list(run(more, 1, lambda line: None)) == [4, 3, 2, 1, 0]
     report = write_report(more)
     assert set(report["changes"]) == {"fov50", "fov50-depths", "fov50-queries"} and report["tests_done"] == 6
-    assert "**FOV 65° → 50°, queries**, seeds 0" in markdown(report)
+    assert "**FOV 65° → 50°, queries**, 6 samples seen, seeds 0" in markdown(report)
     losses = [more._trained(job)[1]["losses"][-1] for job in jobs(more.settings) if job.variant.name == "raw"]
     assert len(set(losses)) == 3
 
