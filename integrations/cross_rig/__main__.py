@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from arbiview_aug.cli.arguments import device_named
 from arbiview_aug.errors import ArbiviewError
@@ -17,9 +17,9 @@ from integrations.cross_rig.experiment import Run, run
 from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.real import recorded_run
 from integrations.cross_rig.report import markdown, write_report
-from integrations.cross_rig.settings import Settings, full, jobs, large, pilot, quick, real, small
+from integrations.cross_rig.settings import LONGER, Length, Settings, full, jobs, large, pilot, quick, real, small
 from integrations.cross_rig.variants import VARIANTS
-from integrations.cross_rig.worlds import CHANGES
+from integrations.cross_rig.worlds import CHANGES, World
 
 PRESETS = {"quick": quick, "small": small, "pilot": pilot, "full": full, "large": large}
 
@@ -82,6 +82,9 @@ def _parser() -> argparse.ArgumentParser:
     change.add_argument(
         "--variants", "--arms", nargs="+", choices=VARIANTS, metavar="VARIANT", help=", ".join(VARIANTS)
     )
+    change.add_argument("--world", choices=get_args(World), help="what makes the streets")
+    lengths = get_args(Length)
+    change.add_argument("--schedules", nargs="+", choices=lengths, help=f"long: {LONGER} times the steps")
     change.add_argument("--families", nargs="+", choices=FAMILIES, metavar="FAMILY", help=", ".join(FAMILIES))
     change.add_argument("--seeds", nargs="+", type=int, metavar="SEED")
     change.add_argument("--streets", type=int, metavar="N", help="another world of streets: 200, 300, …")
@@ -109,7 +112,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     settings = PRESETS[arguments.preset]()
     settings = real(settings) if arguments.real else settings
     names = (
-        *("changes", "variants", "families", "seeds", "streets", "two_wheelers"),
+        *("changes", "variants", "families", "schedules", "seeds", "streets", "two_wheelers", "world"),
         *("train_frames", "val_frames", "test_frames"),
     )
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}

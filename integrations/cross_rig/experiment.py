@@ -20,7 +20,7 @@ from integrations.cross_rig.cache import FrameStore, code_hash, content_hash
 from integrations.cross_rig.frames import Source, box_store, make_boxes, make_frames, one_thread
 from integrations.cross_rig.labels import Grid, covered_cells
 from integrations.cross_rig.model import Detector
-from integrations.cross_rig.settings import Job, Settings, jobs
+from integrations.cross_rig.settings import LONGER, Job, Length, Settings, jobs
 from integrations.cross_rig.training import Draws, FrameSet, Schedule, Tested, evaluate, train
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.worlds import CHANGES, SPLITS, Split
@@ -47,6 +47,7 @@ class Run:
             variant=variant,
             streets=s.streets,
             two_wheelers=s.two_wheelers,
+            world=s.world,
         )
 
     def sources(self) -> list[tuple[Source, int]]:
@@ -100,7 +101,9 @@ class Run:
 
     def schedule(self, job: Job) -> Schedule:
         """Schedule of a job's training."""
-        return replace(self.settings.schedule, family=job.family)
+        schedule = self.settings.schedule
+        steps = schedule.steps if job.length == "short" else round(LONGER * schedule.steps)
+        return replace(schedule, family=job.family, steps=steps)
 
     def draws(self, job: Job) -> Draws:
         """The batches of a job's training."""
@@ -268,21 +271,28 @@ def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
             yield len(missing) - done
 
 
-def load_results(setup: Run, family: str) -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
-    """The results of a family that are there: by change, variant and seed."""
+def jobs_of(setup: Run, family: str, length: Length) -> list[Job]:
+    """The jobs of a family on a schedule."""
+    return [job for job in jobs(setup.settings) if (job.family, job.length) == (family, length)]
+
+
+def load_results(
+    setup: Run, family: str, length: Length = "short"
+) -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
+    """The results of a family on a schedule that are there: by change, variant and seed."""
     found: dict[str, dict[str, dict[int, dict[str, Any]]]] = {}
-    for job in (job for job in jobs(setup.settings) if job.family == family):
+    for job in jobs_of(setup, family, length):
         for change, path in setup.result_paths(job).items():
             if path.is_file():
                 found.setdefault(change, {}).setdefault(job.variant.name, {})[job.seed] = json.loads(path.read_text())
     return found
 
 
-def same_frames(setup: Run, change: str, family: str) -> dict[str, str]:
+def same_frames(setup: Run, change: str, family: str, length: Length) -> dict[str, str]:
     """For each variant whose frames equal another's bit by bit, the first with the same frames."""
     first: dict[Path, str] = {}
     same = {}
-    for job in (job for job in jobs(setup.settings) if job.family == family):
+    for job in jobs_of(setup, family, length):
         path = setup.result_paths(job).get(change)
         if path is not None and first.setdefault(path, job.variant.name) != job.variant.name:
             same[job.variant.name] = first[path]

@@ -23,11 +23,12 @@ from arbiview_aug.generator.generator import shipped_weights
 from arbiview_aug.scene.scene import motion_camera
 from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
+from integrations.cross_rig.cuboids import CuboidDrive
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
 from integrations.cross_rig.noise import LATE_S, noisy_boxes, noisy_depth, thinned, turned
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.views import ViewMaker
-from integrations.cross_rig.worlds import CHANGES, STREETS, Size, Split, source_rig, street_seed
+from integrations.cross_rig.worlds import CHANGES, STREETS, Size, Split, World, source_rig, street_seed
 
 _WORLD = "arbiview_aug.datasets.synthetic"
 _FORMAT = 1
@@ -59,6 +60,7 @@ class Source:
         variant: Whose training set; None: the rig's own true frames. Variants that only draw differently share one.
         streets: The world, by ``worlds.street_seed``.
         two_wheelers: Whether bicycles and motorcycles are in the streets.
+        world: The generator of the streets.
     """
 
     root: Path
@@ -68,6 +70,7 @@ class Source:
     variant: Variant | None = None
     streets: int = STREETS
     two_wheelers: bool = False
+    world: World = "drive"
 
     @property
     def street_seed(self) -> int:
@@ -76,9 +79,14 @@ class Source:
 
     def drive(self, rig: Rig) -> SyntheticDrive:
         """The streets' dataset, as a rig sees them."""
-        return SyntheticDrive(
-            rig, num_frames=_MAX_FRAMES, seed=self.street_seed, lidar=False, two_wheelers=self.two_wheelers
-        )
+        make = CuboidDrive if self.world == "cuboids" else partial(SyntheticDrive, two_wheelers=self.two_wheelers)
+        return make(rig, num_frames=_MAX_FRAMES, seed=self.street_seed, lidar=False)
+
+    def world_spec(self) -> dict[str, Any]:
+        """What names the streets: their seed and the code that builds and renders them."""
+        # Not the cameras' code: theirs is pinned by tests, and a change there must not cost hours of rendering.
+        spec = {"streets": self.street_seed, "world": code_hash(_WORLD, within=_WORLD)}
+        return spec | ({"cuboids": code_hash("integrations.cross_rig.cuboids")} if self.world == "cuboids" else {})
 
     @property
     def rig(self) -> Rig:
@@ -90,10 +98,8 @@ class Source:
         spec: dict[str, Any] = {
             "format": _FORMAT,
             "rig": self.rig.content_key.hex(),
-            "streets": self.street_seed,
             "grid": vars(Grid()),
-            # Not the cameras' code: theirs is pinned by tests, and a change there must not cost hours of rendering.
-            "world": code_hash(_WORLD, within=_WORLD),
+            **self.world_spec(),
             "labels": code_hash("integrations.cross_rig.labels"),
         }
         if self.two_wheelers:
@@ -153,8 +159,7 @@ def box_store(source: Source) -> FrameStore:
     spec = {
         "format": _FORMAT,
         "boxes": code_hash("integrations.cross_rig.boxes"),
-        "streets": source.street_seed,
-        "world": code_hash(_WORLD, within=_WORLD),
+        **source.world_spec(),
     }
     return FrameStore(source.root, spec)
 
@@ -282,13 +287,11 @@ class _Later(SyntheticDrive):
     """The same streets, so much later."""
 
     def __init__(self, drive: SyntheticDrive, seconds: float) -> None:
-        super().__init__(
-            drive.rig, num_frames=len(drive), seed=drive.seed, lidar=False, two_wheelers=drive.two_wheelers
-        )
-        self.seconds = seconds
+        super().__init__(drive.rig, num_frames=len(drive), seed=drive.seed, lidar=False)
+        self.drive, self.seconds, self._renderer = drive, seconds, drive._renderer
 
     def scene(self, index: int) -> Scene:
-        return super().scene(index).after(self.seconds)
+        return self.drive.scene(index).after(self.seconds)
 
 
 class _ChangedFrames:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from integrations.cross_rig.cell_counts import DISTANCES_M, HEIGHTS_M, iou
-from integrations.cross_rig.experiment import Run, load_results, rendering_seconds, same_frames
+from integrations.cross_rig.experiment import Run, jobs_of, load_results, rendering_seconds, same_frames
 from integrations.cross_rig.scoring import ap_scores, iou_scores
 from integrations.cross_rig.settings import jobs
 from integrations.cross_rig.variants import VARIANTS
@@ -25,14 +25,17 @@ Results = Mapping[str, Mapping[int, Mapping[str, Any]]]
 def write_report(setup: Run) -> dict[str, Any]:
     """Write ``report.json``, ``report.md`` and ``report.png`` from the results that are there; returns the first."""
     changes, there = {}, 0
-    for family in setup.settings.families:
-        results = load_results(setup, family)
+    for family, length in product(setup.settings.families, setup.settings.schedules):
+        results = load_results(setup, family, length)
         there += sum(len(seeds) for variants in results.values() for seeds in variants.values())
+        schedule = setup.schedule(jobs_of(setup, family, length)[0])
+        unusual = [name for name in (family, length) if name not in ("voxels", "short")]
         for name in (name for name in setup.settings.changes if name in results):
-            changes[name if family == "voxels" else f"{name}-{family}"] = {
-                "title": setup.title(name) + ("" if family == "voxels" else f", {family}"),
+            changes["-".join([name, *unusual])] = {
+                "title": ", ".join([setup.title(name), *unusual]),
+                "samples_seen": schedule.steps * schedule.batch,
                 **_of_change(results[name], rendering_seconds(setup, name), setup.drives(name)),
-                "same_frames": same_frames(setup, name, family),
+                "same_frames": same_frames(setup, name, family, length),
             }
     total = sum(len(setup.tested_on(job)) for job in jobs(setup.settings))
     report = {
@@ -91,10 +94,12 @@ def markdown(report: Mapping[str, Any]) -> str:
     s = report["settings"]
     rows = [row for change in report["changes"].values() for row in change["variants"].values()]
     shown = ", [95 % interval] over seeds and frames" if all("low" in row["iou"] for row in rows) else ""
-    wheels = " with two-wheelers" if s.get("two_wheelers") else ""  # reports from before them do not say
+    # Reports from before two-wheelers and worlds do not say.
+    streets = " with two-wheelers" if s.get("two_wheelers") else ""
+    streets += f" on streets of {s['world']}" if s.get("world", "drive") != "drive" else ""
     lines = [
-        f"{s['train_frames']} training and {s['test_frames']} test frames{wheels} at {s['size'][0]}×{s['size'][1]}, "
-        f"{s['schedule']['steps']} steps of {s['schedule']['batch']}, {report['tests_done']} of {report['tests']} "
+        f"{s['train_frames']} training and {s['test_frames']} test frames{streets} at {s['size'][0]}×{s['size'][1]}, "
+        f"batches of {s['schedule']['batch']}, {report['tests_done']} of {report['tests']} "
         f"tests done. IoU of vehicle cells in %{shown}; closed gap: (variant − raw) / "
         "(oracle − raw), where oracle − raw is at least 5 points; loading: CPU ms that the variant adds to a frame "
         "that is drawn.",
@@ -115,7 +120,7 @@ def markdown(report: Mapping[str, Any]) -> str:
         if not change["variants"]:
             continue
         title, seeds = change.get("title") or CHANGES[name].title, ", ".join(map(str, change["seeds"]))
-        lines += ["", f"**{title}**, seeds {seeds}", ""]
+        lines += ["", f"**{title}**, {_samples_seen(report, name)} samples seen, seeds {seeds}", ""]
         lines += ["| " + " | ".join(head) + " |", "| --- |" + " ---: |" * (len(head) - 1)]
         for variant, row in change["variants"].items():
             same = change["same_frames"].get(variant)
@@ -135,18 +140,27 @@ def summary(report: Mapping[str, Any]) -> str:
 
     Shares are means of the seeds with t-intervals, from three seeds on; with fewer they have those of the bootstrap.
     """
-    changes = {change["title"]: change["variants"] for change in report["changes"].values() if change["variants"]}
+    changes = {name: change for name, change in report["changes"].items() if change["variants"]}
     lone = len(changes) == 1
-    table = [["trained on" if lone else "B", "IoU", "closed gap %", "AP", "closed gap % by AP"], ["---", *["---:"] * 4]]
-    for title, variants in changes.items():
+    head = ["trained on" if lone else "B", "samples seen", "IoU", "closed gap %", "AP", "closed gap % by AP"]
+    table = [head, ["---", *["---:"] * (len(head) - 1)]]
+    for change_name, change in changes.items():
+        title, variants = change["title"], change["variants"]
         named = [name for name in variants if lone or name not in ("raw", "oracle")]
         for name in named:
             row = variants[name]
             shown = [row] if lone else [variants["raw"], row, variants["oracle"]]
             table.append([row["title"] if lone else title if len(named) == 1 else f"{title}; {row['title']}"])
+            table[-1] += [str(_samples_seen(report, change_name))]
             table[-1] += [", ".join(f"{100 * one['iou']['value']:.1f}" for one in shown), _share(row)]
             table[-1] += [", ".join(f"{100 * one['ap']['value']['value']:.1f}" for one in shown), _share(row["ap"])]
     return "".join("| " + " | ".join(cells) + " |\n" for cells in table)
+
+
+def _samples_seen(report: Mapping[str, Any], change: str) -> int:
+    """Samples that each training of a change drew; reports from before the long schedule have one for all."""
+    schedule = report["settings"]["schedule"]
+    return int(report["changes"][change].get("samples_seen", schedule["steps"] * schedule["batch"]))
 
 
 def _share(score: Mapping[str, Any]) -> str:

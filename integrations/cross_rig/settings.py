@@ -6,15 +6,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
-from typing import TypeVar
+from typing import Literal, TypeVar, get_args
 
 from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.training import Schedule
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.variants import VARIANTS
-from integrations.cross_rig.worlds import CHANGES, STREETS, Size
+from integrations.cross_rig.worlds import CHANGES, STREETS, Size, World
 
 T = TypeVar("T")
+
+Length = Literal["short", "long"]
+"""Names of schedules."""
+
+LONGER = 2.6
+"""Steps of the long schedule over those of the short one. It is long enough where B's own frames gain less than a point
+of IoU by twice as many steps."""
 
 REAL = "real"
 """The change from one recorded data set to another."""
@@ -41,14 +48,16 @@ class Settings:
         train_frames, val_frames, test_frames: Of the three sets of streets.
         streets: The world that all three come from, a whole hundred: ``worlds.street_seed``.
         two_wheelers: Whether bicycles and motorcycles are in its streets.
+        world: What makes the streets.
         seeds: Of the trainings; each variant is trained once with each.
         changes: Names of ``worlds.CHANGES``, or ``REAL`` alone.
         variants: Names of ``variants.VARIANTS``.
         families: Names of ``families.FAMILIES``.
-        schedule: Of every training; each job's family replaces its own.
+        schedules: Every variant is trained on each.
+        schedule: The short one of every training; each job's family and length replace its own.
 
     Raises:
-        ValueError: Unknown names, or a count below 1.
+        ValueError: Unknown names, a count below 1, or two-wheelers in a world that has none.
     """
 
     size: Size = (96, 256)
@@ -57,10 +66,12 @@ class Settings:
     test_frames: int = 1000
     streets: int = STREETS
     two_wheelers: bool = False
+    world: World = "drive"
     seeds: tuple[int, ...] = (0, 1, 2)
     changes: tuple[str, ...] = tuple(CHANGES)
     variants: tuple[str, ...] = tuple(VARIANTS)
     families: tuple[str, ...] = ("voxels",)
+    schedules: tuple[Length, ...] = ("short",)
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=900))
 
     def __post_init__(self) -> None:
@@ -68,6 +79,10 @@ class Settings:
         if self.changes != (REAL,):
             named_rows("changes", self.changes, CHANGES)
         named_rows("families", self.families, FAMILIES)
+        named_rows("schedules", self.schedules, dict.fromkeys(get_args(Length)))
+        if self.world not in get_args(World) or (self.two_wheelers and self.world != "drive"):
+            worlds = "drive" if self.two_wheelers else ", ".join(get_args(World))
+            raise ValueError(f"world: expected {worlds}, got {self.world}" + " with two-wheelers" * self.two_wheelers)
         if self.streets % 100 or self.streets < STREETS:
             raise ValueError(f"streets: expected a whole hundred from {STREETS} on, got {self.streets}")
         for name in ("train_frames", "val_frames", "test_frames"):
@@ -84,25 +99,28 @@ class Job:
         change: For which vehicle B; None where B does not matter (raw frames): one training serves every change.
         seed: Of its initialisation and its draws, the same for every variant.
         family: Of the detector.
+        length: Of its schedule.
     """
 
     variant: Variant
     change: str | None
     seed: int
     family: str = "voxels"
+    length: Length = "short"
 
     @property
     def name(self) -> str:
         """For files and logs."""
-        return f"{self.variant.name}-{self.change or 'any'}-{self.family}-{self.seed}"
+        longer = "" if self.length == "short" else f"-{self.length}"
+        return f"{self.variant.name}-{self.change or 'any'}-{self.family}-{self.seed}{longer}"
 
 
 def jobs(settings: Settings) -> list[Job]:
     """All trainings; a whole seed before the next, so that an interrupted run has every variant."""
     found = []
     variants = named_rows("variants", settings.variants, VARIANTS)
-    for seed, family in product(settings.seeds, settings.families):
-        made = partial(Job, seed=seed, family=family)
+    for seed, length, family in product(settings.seeds, settings.schedules, settings.families):
+        made = partial(Job, seed=seed, family=family, length=length)
         found += [made(variant=variant, change=None) for variant in variants if variant.kind == "raw"]
         for change in settings.changes:
             found += [made(variant=variant, change=change) for variant in variants if variant.kind != "raw"]
@@ -110,15 +128,17 @@ def jobs(settings: Settings) -> list[Job]:
 
 
 def quick() -> Settings:
-    """One change, one seed, minutes: does everything run, and is the oracle above raw?"""
+    """One change, one seed, both schedules on the streets of cuboids, minutes: is the oracle above raw?"""
     return Settings(
         train_frames=100,
         val_frames=20,
         test_frames=60,
         seeds=(0,),
         changes=("up70",),
-        variants=("raw", "auto", "oracle"),
-        schedule=Schedule(steps=250),
+        variants=("raw", "auto_fill", "oracle"),
+        world="cuboids",
+        schedules=("short", "long"),
+        schedule=Schedule(steps=150),
     )
 
 

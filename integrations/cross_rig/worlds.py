@@ -17,6 +17,9 @@ Size = tuple[int, int]
 
 Split = Literal["train", "val", "test"]
 
+World = Literal["drive", "cuboids"]
+"""Generators of streets: ``SyntheticDrive``, and the one of ``cuboids`` with other shapes, textures and light."""
+
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 
 STREETS = 100

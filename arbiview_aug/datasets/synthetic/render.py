@@ -126,13 +126,16 @@ def _from_tiles(a: Tensor, size: tuple[int, int]) -> Tensor:
 class Renderer:
     """Renders scenes; keeps the rays of the last cameras and the tables of the last scene."""
 
+    shade = staticmethod(shade)
+    """Colours of hits; a subclass may have others."""
+
     def __init__(self, *, supersampling: int = 2, device: torch.device | str = "cpu") -> None:
         self.supersampling, self.device = supersampling, torch.device(device)
         self._rays: LRUCache[bytes, CameraRays] = LRUCache(_CACHED_CAMERAS, lambda _: 1)
         self._tables: SceneTables | None = None
 
     def __reduce__(self) -> tuple[Any, tuple[()]]:
-        return partial(Renderer, supersampling=self.supersampling, device=self.device), ()  # without the caches
+        return partial(type(self), supersampling=self.supersampling, device=self.device), ()  # without the caches
 
     @contextmanager
     def run(self) -> Iterator[None]:
@@ -157,11 +160,11 @@ class Renderer:
         first = self._cast(scene, cameras, ground_z_m)
         hits = first.hits
         face = faces(tables, hits.point, hits.primitive)
-        color = shade(tables, hits, face)
+        color = self.shade(tables, hits, face)
         if self.supersampling > 1:
             key = torch.where(hits.primitive >= 0, hits.primitive * 8 + face, hits.primitive)
             chosen, hits = self._cast_outlines(first, key, scene)
-            fine = shade(tables, hits, faces(tables, hits.point, hits.primitive))
+            fine = self.shade(tables, hits, faces(tables, hits.point, hits.primitive))
             samples = fine.view(-1, self.supersampling**2, 3).unbind(1)
             color[chosen] = reduce(torch.add, samples) / len(samples)  # a fixed order of summation
         return self._views(scene, first, color)

@@ -12,7 +12,7 @@ from integrations.cross_rig import __main__ as command
 from integrations.cross_rig import cache, experiment, views
 from integrations.cross_rig.experiment import Run, load_results, run
 from integrations.cross_rig.labels import HIDDEN
-from integrations.cross_rig.report import markdown, write_report
+from integrations.cross_rig.report import markdown, summary, write_report
 from integrations.cross_rig.settings import Settings, full, jobs, pilot, quick
 from integrations.cross_rig.training import Schedule
 
@@ -162,9 +162,28 @@ def test_families_have_tables_of_their_own(done):
     assert list(run(more, 1, lambda line: None)) == [4, 3, 2, 1, 0]
     report = write_report(more)
     assert set(report["changes"]) == {"fov50", "fov50-depths", "fov50-queries"} and report["tests_done"] == 6
-    assert "**FOV 65° → 50°, queries**, seeds 0" in markdown(report)
+    assert "**FOV 65° → 50°, queries**, 6 samples seen, seeds 0" in markdown(report)
     losses = [more._trained(job)[1]["losses"][-1] for job in jobs(more.settings) if job.variant.name == "raw"]
     assert len(set(losses)) == 3
+
+
+@pytest.mark.slow
+def test_schedules_have_tables_of_their_own_that_say_how_many_samples_were_seen(done):
+    """The short one is trained already; frames are the same."""
+    more = replace(done, settings=replace(TINY, variants=("raw", "oracle"), schedules=("short", "long")))
+    assert list(run(more, 1, lambda line: None)) == [2, 1, 0]
+    report = write_report(more)
+    assert {name: change["samples_seen"] for name, change in report["changes"].items()} == {
+        "fov50": 3 * 2,
+        "fov50-long": 8 * 2,
+    }
+    assert report["tests_done"] == report["tests"] == 4
+    text, short = markdown(report), summary(report)
+    assert "**FOV 65° → 50°**, 6 samples seen, seeds 0" in text
+    assert "**FOV 65° → 50°, long**, 16 samples seen, seeds 0" in text
+    assert "samples seen" in short.splitlines()[0]
+    alone = {**report, "changes": {"fov50-long": report["changes"]["fov50-long"]}}
+    assert [row.split(" | ")[1] for row in summary(alone).splitlines()[2:]] == ["16", "16"]
 
 
 @pytest.mark.slow
@@ -195,7 +214,7 @@ def test_mixed_variants_draw_raw_frames_half_of_the_time(done):
 
 
 def test_presets():
-    assert len(jobs(quick())) == 3
+    assert len(jobs(quick())) == 2 * 3  # schedules, variants
     # Raw and scale/crop once for each seed, five variants for each change: 3 * (2 + 3 * 5).
     assert len(jobs(pilot())) == 51
     names = [job.name for job in jobs(full())]
@@ -227,9 +246,23 @@ def test_command_lists_and_refuses(capsys, tmp_path):
     assert "expected cpu or a CUDA device that is there" in capsys.readouterr().err
 
 
+def test_command_chooses_world_and_schedules(tmp_path):
+    given = ["--small", "--world", "cuboids", "--schedules", "short", "long", "--steps", "10"]
+    setup = Run(settings=command._settings(command._parser().parse_args(given)), output=tmp_path)
+    assert {source.world for source, _ in setup.sources()} == {"cuboids"}
+    steps = {job.length: setup.schedule(job).steps for job in jobs(setup.settings)}
+    assert steps == {"short": 10, "long": 26}
+    assert {job.name.endswith("-long") for job in jobs(setup.settings) if job.length == "long"} == {True}
+    assert command._settings(command._parser().parse_args(["--small"])).world == "drive"
+    with pytest.raises(ValueError, match="world: expected drive, got cuboids with two-wheelers"):
+        command._settings(command._parser().parse_args([*given, "--two-wheelers"]))
+    with pytest.raises(ValueError, match="schedules: expected some of short, long, got longest"):
+        Settings(schedules=("longest",))
+
+
 def test_command_puts_two_wheelers_into_every_set(tmp_path):
     for given in ([], ["--two-wheelers"]):
-        settings = command._settings(command._parser().parse_args(["--quick", *given]))
+        settings = command._settings(command._parser().parse_args(["--small", *given]))
         setup = Run(settings=settings, output=tmp_path)
         assert {source.two_wheelers for source, _ in setup.sources()} == {bool(given)}
 
@@ -244,6 +277,9 @@ def test_the_large_run_is_planned_on_a_machine_without_a_gpu(tmp_path):
 def test_quick_oracle_is_above_raw(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(cache, "CHUNK_FRAMES", 20)
     assert command.main(["--quick", "--output", str(tmp_path)]) == 0
-    variants = json.loads((tmp_path / "report.json").read_text())["changes"]["up70"]["variants"]
-    assert variants["oracle"]["iou"]["value"] > variants["raw"]["iou"]["value"]
-    assert set(variants) == {"raw", "auto", "oracle"}
+    changes = json.loads((tmp_path / "report.json").read_text())["changes"]
+    assert set(changes) == {"up70", "up70-long"}
+    for change in changes.values():
+        variants = change["variants"]
+        assert variants["oracle"]["iou"]["value"] > variants["raw"]["iou"]["value"]
+        assert set(variants) == {"raw", "auto_fill", "oracle"}

@@ -52,13 +52,14 @@ def test_reports_without_intervals_are_written_as_points():
 
 def test_a_short_table_of_one_change_has_a_row_for_each_variant():
     table = summary(json.loads((FOLDER / "results" / "recipe.json").read_text())).splitlines()
-    assert table[0].startswith("| trained on | IoU ") and table[2].startswith("| raw A |") and " – |" in table[2]
+    assert table[0].startswith("| trained on | samples seen | IoU ")
+    assert table[2].startswith("| raw A | 1600 |") and " – |" in table[2]
 
 
 def test_a_short_table_of_several_changes_has_a_row_for_each_between_both_ends():
     report = json.loads((FOLDER / "results" / "families.json").read_text())
     table = summary(report).splitlines()
-    assert table[0].startswith("| B | IoU ") and len(table) == 2 + len(report["changes"])
+    assert table[0].startswith("| B | samples seen | IoU ") and len(table) == 2 + len(report["changes"])
     first = next(iter(report["changes"].values()))
     ends = [f"{100 * first['variants'][name]['iou']['value']:.1f}" for name in ("raw", "recipe", "oracle")]
-    assert table[2].startswith(f"| {first['title']} | {', '.join(ends)} |")
+    assert table[2].startswith(f"| {first['title']} | 1600 | {', '.join(ends)} |")

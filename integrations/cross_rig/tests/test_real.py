@@ -112,7 +112,7 @@ def test_the_command_runs_goes_on_and_reports(roots, tmp_path, capsys, monkeypat
     given = ["--quick", "--real", *roots, *variants, "--workers", "1", "--output", str(tmp_path)]
     assert command.main(given) == 0
     out, err = capsys.readouterr()
-    assert "**A to B**, seeds 0" in out and "4 of 4 trainings to do" in err
+    assert "**A to B**, 4 samples seen, seeds 0" in out and "4 of 4 trainings to do" in err
     rows = json.loads((tmp_path / "report.json").read_text())["changes"][REAL]["variants"]
     assert list(rows) == ["raw", "auto_fill", "auto_fill_mixed", "oracle"]
     assert command.main(given) == 0
