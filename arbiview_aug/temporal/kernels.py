@@ -22,6 +22,10 @@ STEP, JUMP = np.uint16(PER_CORRELATION // 10), np.uint16(PER_CORRELATION * 6 // 
 PEAK, CLEAR = 2, np.float32(1.3)
 """The least cost must be so much less than those of walls farther from it than so many steps."""
 
+SCALES = 64  # steps of the scale of things that hang above the road
+_FARTHEST_SCALE = 0.1  # of a road that can be told from infinity
+_ABOVE_FOOT = 2 / 3  # of the foot's scale, down to which a thing must match better than the road
+
 _UNSEEN = np.uint16(INVALID)
 _NOISE = np.float32(NOISE_LEVELS**2)
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
@@ -227,3 +231,80 @@ def find_least(total: Any, spacing: float, road: Any) -> Any:
                 if curvature > _ZERO:
                     wall[y, x] += _HALF * (before - after) / curvature * spacing
     return wall, clear
+
+
+@compiled
+def find_feet(
+    labels: Any, boxes: Any, horizontal: Any, road: Any, costs: Any, spacing: float, least_gap_px: float, least: Any,
+    q: Any, valid: Any,
+) -> None:  # fmt: skip
+    """Scale things that hang above the road, in place, to where matching changes from them to the road below.
+
+    ``labels`` (h, w) and ``boxes`` (n, 5) are OpenCV's of the things, the background first. ``least`` holds the least
+    scale, the least evidence, and the shares of columns that must agree and may stand. Other arguments are those of
+    ``moving.stand_on_road``.
+    """
+    scaled, evidence, agreeing, standing = least
+    h, w = labels.shape
+    walls, unit = np.empty(w, np.int64), np.float32(1 / PER_CORRELATION)
+    gains = np.empty(SCALES, np.float64)
+    for thing in range(1, boxes.shape[0]):
+        x0, y0, x1 = boxes[thing, 0], boxes[thing, 1], boxes[thing, 0] + boxes[thing, 2]
+        y1 = y0 + boxes[thing, 3]
+        if boxes[thing, 4] < (2 * RADIUS_PX + 1) ** 2:
+            continue
+        gains[:] = 0
+        for x in range(x0, x1):
+            total, n = 0.0, 0
+            for y in range(y0, y1):
+                if labels[y, x] == thing:
+                    total += q[y, x] / horizontal[y, x]
+                    n += 1
+            walls[x] = min(max(int(total / n / spacing + 0.5), 1), costs.shape[0] - 1)
+            for y in range(y0, h):
+                scale = road[y, x] / (horizontal[y, x] * walls[x] * spacing)
+                if _FARTHEST_SCALE < scale < 1:
+                    gain = np.float32(costs[walls[x], y, x]) - np.float32(costs[0, y, x])
+                    gains[int(scale * SCALES)] += gain * unit
+        best, sum_below, foot = 0.0, 0.0, SCALES
+        for k in range(SCALES - 1, -1, -1):
+            sum_below += gains[k]
+            if sum_below > best:
+                best, foot = sum_below, k
+        scale_of_foot = foot / SCALES
+        if best < evidence or scale_of_foot < scaled:
+            continue
+        sum_above, agree, stand, gap_px = 0.0, 0, 0, 0
+        for x in range(x0, x1):
+            above, below = np.float32(0), np.float32(0)
+            for y in range(y0, h):
+                scale = road[y, x] / (horizontal[y, x] * walls[x] * spacing)
+                if not _FARTHEST_SCALE < scale < 1:
+                    continue
+                gain = (np.float32(costs[walls[x], y, x]) - np.float32(costs[0, y, x])) * unit
+                if scale >= scale_of_foot:
+                    below += gain
+                    gap_px += 1
+                elif scale >= scale_of_foot * _ABOVE_FOOT:
+                    above -= gain
+            sum_above += above
+            agree += (above > 0) & (below > 0)
+            stand += below < 0
+        n = x1 - x0
+        if sum_above < evidence or gap_px < least_gap_px * n or agree < agreeing * n or stand > standing * n:
+            continue
+        for x in range(x0, x1):
+            top, wall = y0, walls[x] * spacing
+            while labels[top, x] != thing:
+                top += 1
+            for y in range(top, h):
+                own = road[y, x] / (horizontal[y, x] * wall)
+                if own >= 1 and labels[y, x] != thing:
+                    break
+                if own >= scale_of_foot:
+                    if labels[y, x] == thing:
+                        q[y, x] = road[y, x]
+                elif labels[y, x] == thing:
+                    q[y, x] *= scale_of_foot
+                elif not valid[y, x] or q[y, x] > scale_of_foot * wall * horizontal[y, x]:
+                    q[y, x], valid[y, x] = scale_of_foot * wall * horizontal[y, x], True
