@@ -26,6 +26,8 @@ SCALES = 64  # steps of the scale of things that hang above the road
 _FARTHEST_SCALE = 0.1  # of a road that can be told from infinity
 _ABOVE_FOOT = 2 / 3  # of the foot's scale, down to which a thing must match better than the road
 
+_MATCHING = np.uint16(PER_CORRELATION // 2)  # the largest cost of a match, half a correlation
+
 _UNSEEN = np.uint16(INVALID)
 _NOISE = np.float32(NOISE_LEVELS**2)
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
@@ -233,6 +235,13 @@ def find_least(total: Any, spacing: float, road: Any) -> Any:
     return wall, clear
 
 
+@inlined
+def _gain(wall: Any, road: Any) -> Any:
+    """Correlation with the road above that with a wall; 0 where neither matches."""
+    both = min(wall, road) > _MATCHING
+    return _ZERO if both else (np.float32(wall) - np.float32(road)) * np.float32(1 / PER_CORRELATION)
+
+
 @compiled
 def find_feet(
     labels: Any, boxes: Any, horizontal: Any, road: Any, costs: Any, spacing: float, least_gap_px: float, least: Any,
@@ -244,10 +253,9 @@ def find_feet(
     scale, the least evidence, and the shares of columns that must agree and may stand. Other arguments are those of
     ``moving.stand_on_road``.
     """
-    scaled, evidence, agreeing, standing = least
+    scaled, evidence, standing = least
     h, w = labels.shape
-    walls, unit = np.empty(w, np.int64), np.float32(1 / PER_CORRELATION)
-    gains = np.empty(SCALES, np.float64)
+    walls, gains = np.empty(w, np.int64), np.empty(SCALES, np.float64)
     for thing in range(1, boxes.shape[0]):
         x0, y0, x1 = boxes[thing, 0], boxes[thing, 1], boxes[thing, 0] + boxes[thing, 2]
         y1 = y0 + boxes[thing, 3]
@@ -264,8 +272,7 @@ def find_feet(
             for y in range(y0, h):
                 scale = road[y, x] / (horizontal[y, x] * walls[x] * spacing)
                 if _FARTHEST_SCALE < scale < 1:
-                    gain = np.float32(costs[walls[x], y, x]) - np.float32(costs[0, y, x])
-                    gains[int(scale * SCALES)] += gain * unit
+                    gains[int(scale * SCALES)] += _gain(costs[walls[x], y, x], costs[0, y, x])
         best, sum_below, foot = 0.0, 0.0, SCALES
         for k in range(SCALES - 1, -1, -1):
             sum_below += gains[k]
@@ -274,25 +281,31 @@ def find_feet(
         scale_of_foot = foot / SCALES
         if best < evidence or scale_of_foot < scaled:
             continue
-        sum_above, agree, stand, gap_px = 0.0, 0, 0, 0
+        sum_above, hang, stand, gap_px, sharp = 0.0, 0.0, 0.0, 0, 0.0
         for x in range(x0, x1):
             above, below = np.float32(0), np.float32(0)
+            y = y0
+            while y < h - 1 and road[y, x] / (horizontal[y, x] * walls[x] * spacing) < scale_of_foot:
+                y += 1
+            y = max(y - RADIUS_PX, y0)
+            sharp += road[y, x] / (horizontal[y, x] * walls[x] * spacing)
             for y in range(y0, h):
                 scale = road[y, x] / (horizontal[y, x] * walls[x] * spacing)
                 if not _FARTHEST_SCALE < scale < 1:
                     continue
-                gain = (np.float32(costs[walls[x], y, x]) - np.float32(costs[0, y, x])) * unit
+                gain = _gain(costs[walls[x], y, x], costs[0, y, x])
                 if scale >= scale_of_foot:
                     below += gain
                     gap_px += 1
                 elif scale >= scale_of_foot * _ABOVE_FOOT:
                     above -= gain
             sum_above += above
-            agree += (above > 0) & (below > 0)
-            stand += below < 0
+            hang += max(below, _ZERO)
+            stand -= min(below, _ZERO)
         n = x1 - x0
-        if sum_above < evidence or gap_px < least_gap_px * n or agree < agreeing * n or stand > standing * n:
+        if sum_above < evidence or gap_px < least_gap_px * n or stand > standing * hang:
             continue
+        scale_of_foot = max(sharp / n, scaled)
         for x in range(x0, x1):
             top, wall = y0, walls[x] * spacing
             while labels[top, x] != thing:

@@ -29,10 +29,10 @@ UPRIGHT = 1.05
 MOST_SCALED = 0.3
 """Least scale of a copy: traffic that comes at twice the vehicle's speed."""
 
-EVIDENCE = 10.0
+EVIDENCE = 5.0
 """Sums of differences of correlation, over pixels, that tell a foot: a fifth over the 49 of a window."""
 
-AGREEING, STANDING = 0.7, 0.25
+STANDING = 0.1
 """Shares of a thing's columns that must show the same foot, and that may show it to reach down to the road."""
 
 
@@ -59,6 +59,6 @@ def stand_on_road(
     q, valid = q.copy(), valid.copy()
     find_feet(
         labels, boxes[:count], image.horizontal, image.road, costs, spacing, least_gap_px,
-        (MOST_SCALED, EVIDENCE, AGREEING, STANDING), q, valid,
+        (MOST_SCALED, EVIDENCE, STANDING), q, valid,
     )  # fmt: skip
     return q, valid
