@@ -244,7 +244,7 @@ def _gain(wall: Any, road: Any) -> Any:
 
 @compiled
 def find_feet(
-    labels: Any, boxes: Any, horizontal: Any, road: Any, costs: Any, spacing: float, least_gap_px: float, least: Any,
+    labels: Any, boxes: Any, horizontal: Any, road: Any, slope: Any, costs: Any, spacing: float, least_gap_px: float, least: Any,
     q: Any, valid: Any,
 ) -> None:  # fmt: skip
     """Scale things that hang above the road, in place, to where matching changes from them to the road below.
@@ -253,7 +253,7 @@ def find_feet(
     scale, the least evidence, and the shares of columns that must agree and may stand. Other arguments are those of
     ``moving.stand_on_road``.
     """
-    scaled, evidence, standing = least
+    scaled, evidence, standing, height_m, tallest_m = least
     h, w = labels.shape
     walls, gains = np.empty(w, np.int64), np.empty(SCALES, np.float64)
     for thing in range(1, boxes.shape[0]):
@@ -272,7 +272,9 @@ def find_feet(
             for y in range(y0, h):
                 scale = road[y, x] / (horizontal[y, x] * walls[x] * spacing)
                 if _FARTHEST_SCALE < scale < 1:
-                    gains[int(scale * SCALES)] += _gain(costs[walls[x], y, x], costs[0, y, x])
+                    gain = _gain(costs[walls[x], y, x], costs[0, y, x])
+                    if gain < 0 or labels[y, x] == thing or labels[y, x] == 0:
+                        gains[int(scale * SCALES)] += gain
         best, sum_below, foot = 0.0, 0.0, SCALES
         for k in range(SCALES - 1, -1, -1):
             sum_below += gains[k]
@@ -294,6 +296,8 @@ def find_feet(
                 if not _FARTHEST_SCALE < scale < 1:
                     continue
                 gain = _gain(costs[walls[x], y, x], costs[0, y, x])
+                if gain > 0 and labels[y, x] != thing and labels[y, x] != 0:
+                    gain = _ZERO
                 if scale >= scale_of_foot:
                     below += gain
                     gap_px += 1
@@ -306,6 +310,14 @@ def find_feet(
         if sum_above < evidence or gap_px < least_gap_px * n or stand > standing * hang:
             continue
         scale_of_foot = max(sharp / n, scaled)
+        tall = 0
+        for x in range(x0, x1):
+            y = y0
+            while labels[y, x] != thing:
+                y += 1
+            tall += height_m + slope[y, x] / (scale_of_foot * walls[x] * spacing) > tallest_m
+        if 2 * tall > n:
+            continue
         for x in range(x0, x1):
             top, wall = y0, walls[x] * spacing
             while labels[top, x] != thing:

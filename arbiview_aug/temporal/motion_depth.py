@@ -206,7 +206,7 @@ def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands
     valid = clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0)
     if stands:
         q, valid = stand_on_road(image, costs[0], float(walls[1]), q, valid)
-        q, valid = moving_off_road(image, others, q, valid)
+        q, valid = moving_off_road(image, others, q, valid, costs[0], float(walls[1]))
     return _Estimate(q, valid)
 
 

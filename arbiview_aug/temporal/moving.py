@@ -33,6 +33,7 @@ EVIDENCE = 5.0
 """Sums of differences of correlation, over pixels, that tell a foot: a fifth over the 49 of a window."""
 
 STANDING = 0.1
+TALLEST_M = 4.5
 """Shares of a thing's columns that must show the same foot, and that may show it to reach down to the road."""
 
 
@@ -58,8 +59,8 @@ def stand_on_road(
     least_gap_px = RADIUS_PX + math.tan(math.radians(SLOPE_DEG)) * float(image.camera.K[1, 1])
     q, valid = q.copy(), valid.copy()
     find_feet(
-        labels, boxes[:count], image.horizontal, image.road, costs, spacing, least_gap_px,
-        (MOST_SCALED, EVIDENCE, STANDING), q, valid,
+        labels, boxes[:count], image.horizontal, image.road, (image.directions[..., 2] / np.maximum(image.horizontal, 1e-6)).astype(np.float32), costs, spacing, least_gap_px,
+        (MOST_SCALED, EVIDENCE, STANDING, float(image.camera.center_m[2]) - image.ground_z_m, TALLEST_M), q, valid,
     )  # fmt: skip
     return q, valid
 
@@ -103,7 +104,10 @@ def zncc(image, warped, S):
     return (b(one * two) - m1 * m2) / np.sqrt(v1 * v2)
 
 
-def moving_off_road(image: SweptImage, others, q: Layer, valid: BoolArray):
+def moving_off_road(image: SweptImage, others, q: Layer, valid: BoolArray, costs, spacing):
+    chosen = np.where(q > image.road * 1.0001, q / image.horizontal / spacing, 0)
+    chosen = np.take_along_axis(costs, np.rint(chosen).astype(int).clip(0, len(costs) - 1)[None], 0)[0]
+    chosen = 1 - chosen.astype(np.float32) / 2500
     road = lowest_road(image)
     flows, seens, ats = [], [], []
     for other in others:
@@ -151,7 +155,7 @@ def moving_off_road(image: SweptImage, others, q: Layer, valid: BoolArray):
             pos = image.positions(other.camera, image.road)[ROI]
             corr_road.append(zncc(image, cv2.remap(other.grey, pos, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), ROI))
         st = thing > 0
-        info = [c[st].mean() for c in corr], [c[st].mean() for c in corr_road], S[:, y : y + hh, x : x + ww][:, strong].mean(1)
+        info = [c[st].mean() for c in corr], [c[st].mean() for c in corr_road], [chosen[y : y + hh, x : x + ww][strong].mean()]
         thing = cv2.morphologyEx(thing, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
         free = ~valid[ROI]
         # upwards through what is unknown
@@ -161,7 +165,8 @@ def moving_off_road(image: SweptImage, others, q: Layer, valid: BoolArray):
         below = (image.road[ROI] / np.maximum(image.horizontal[ROI], 1e-6)) > wall
         thing &= ~below
         LOG.append((k, x, y, ww, hh, area, 1 / wall, thing, info))
-        if min(info[0]) < CORR:
+        merged = 0.75 * np.max(info[0]) + 0.25 * np.min(info[0])
+        if min(info[0]) < CORR or merged < info[2][0]:
             continue
         q[ROI] = np.where(thing, wall * image.horizontal[ROI], q[ROI])
         valid[ROI] |= thing
