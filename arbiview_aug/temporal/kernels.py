@@ -236,100 +236,77 @@ def find_least(total: Any, spacing: float, road: Any) -> Any:
 
 
 @inlined
-def _gain(wall: Any, road: Any) -> Any:
-    """Correlation with the road above that with a wall; 0 where neither matches."""
-    both = min(wall, road) > _MATCHING
-    return _ZERO if both else (np.float32(wall) - np.float32(road)) * np.float32(1 / PER_CORRELATION)
+def _gain(costs: Any, wall: Any, y: Any, x: Any, label: Any, thing: Any) -> Any:
+    """Correlation with the road above that with a wall; 0 where neither matches or another thing hides the road."""
+    own, road = costs[wall, y, x], costs[0, y, x]
+    if min(own, road) > _MATCHING or (own > road and label != thing and label != 0):
+        return 0.0
+    return (np.float64(own) - np.float64(road)) / PER_CORRELATION
 
 
 @compiled
 def find_feet(
-    labels: Any, boxes: Any, horizontal: Any, road: Any, slope: Any, costs: Any, spacing: float, least_gap_px: float, least: Any,
-    q: Any, valid: Any,
-) -> None:  # fmt: skip
+    labels: Any, boxes: Any, surfaces: Any, costs: Any, spacing: float, limits: Any, q: Any, valid: Any
+) -> None:
     """Scale things that hang above the road, in place, to where matching changes from them to the road below.
 
-    ``labels`` (h, w) and ``boxes`` (n, 5) are OpenCV's of the things, the background first. ``least`` holds the least
-    scale, the least evidence, and the shares of columns that must agree and may stand. Other arguments are those of
-    ``moving.stand_on_road``.
+    ``labels`` (h, w) and ``boxes`` (n, 5) are OpenCV's of the things, the background first. ``surfaces`` and ``limits``
+    are made by ``moving``; other arguments are those of ``moving.stand_on_road``.
     """
-    scaled, evidence, standing, height_m, tallest_m = least
+    horizontal, road, slope = surfaces
+    least_scale, evidence, standing, least_gap_px, height_m, tallest_m = limits
     h, w = labels.shape
-    walls, gains = np.empty(w, np.int64), np.empty(SCALES, np.float64)
+    walls, tops, gains = np.empty(w, np.float64), np.empty(w, np.int64), np.empty(SCALES, np.float64)
     for thing in range(1, boxes.shape[0]):
-        x0, y0, x1 = boxes[thing, 0], boxes[thing, 1], boxes[thing, 0] + boxes[thing, 2]
-        y1 = y0 + boxes[thing, 3]
+        x0, y0, n = boxes[thing, 0], boxes[thing, 1], boxes[thing, 2]
         if boxes[thing, 4] < (2 * RADIUS_PX + 1) ** 2:
             continue
         gains[:] = 0
-        for x in range(x0, x1):
-            total, n = 0.0, 0
-            for y in range(y0, y1):
+        for x in range(x0, x0 + n):
+            total, count = 0.0, 0
+            for y in range(y0 + boxes[thing, 3] - 1, y0 - 1, -1):
                 if labels[y, x] == thing:
                     total += q[y, x] / horizontal[y, x]
-                    n += 1
-            walls[x] = min(max(int(total / n / spacing + 0.5), 1), costs.shape[0] - 1)
+                    count += 1
+                    tops[x] = y
+            walls[x] = min(max(round(total / count / spacing), 1), costs.shape[0] - 1) * spacing
             for y in range(y0, h):
-                scale = road[y, x] / (horizontal[y, x] * walls[x] * spacing)
+                scale = road[y, x] / (horizontal[y, x] * walls[x])
                 if _FARTHEST_SCALE < scale < 1:
-                    gain = _gain(costs[walls[x], y, x], costs[0, y, x])
-                    if gain < 0 or labels[y, x] == thing or labels[y, x] == 0:
-                        gains[int(scale * SCALES)] += gain
-        best, sum_below, foot = 0.0, 0.0, SCALES
+                    gains[int(scale * SCALES)] += _gain(costs, round(walls[x] / spacing), y, x, labels[y, x], thing)
+        most, below, scaled = 0.0, 0.0, 1.0
         for k in range(SCALES - 1, -1, -1):
-            sum_below += gains[k]
-            if sum_below > best:
-                best, foot = sum_below, k
-        scale_of_foot = foot / SCALES
-        if best < evidence or scale_of_foot < scaled:
+            below += gains[k]
+            if below > most:
+                most, scaled = below, k / SCALES
+        if most < evidence or scaled < least_scale:
             continue
-        sum_above, hang, stand, gap_px, sharp = 0.0, 0.0, 0.0, 0, 0.0
-        for x in range(x0, x1):
-            above, below = np.float32(0), np.float32(0)
-            y = y0
-            while y < h - 1 and road[y, x] / (horizontal[y, x] * walls[x] * spacing) < scale_of_foot:
-                y += 1
-            y = max(y - RADIUS_PX, y0)
-            sharp += road[y, x] / (horizontal[y, x] * walls[x] * spacing)
-            for y in range(y0, h):
-                scale = road[y, x] / (horizontal[y, x] * walls[x] * spacing)
-                if not _FARTHEST_SCALE < scale < 1:
-                    continue
-                gain = _gain(costs[walls[x], y, x], costs[0, y, x])
-                if gain > 0 and labels[y, x] != thing and labels[y, x] != 0:
-                    gain = _ZERO
-                if scale >= scale_of_foot:
-                    below += gain
-                    gap_px += 1
-                elif scale >= scale_of_foot * _ABOVE_FOOT:
-                    above -= gain
+        sum_above, hanging, stands, gap_px, sharp, tall = 0.0, 0.0, 0.0, 0, 0.0, 0
+        for x in range(x0, x0 + n):
+            above, below, foot = 0.0, 0.0, h - 1
+            for y in range(h - 1, y0 - 1, -1):
+                scale = road[y, x] / (horizontal[y, x] * walls[x])
+                foot = y if scale >= scaled else foot
+                if _FARTHEST_SCALE < scale < 1:
+                    gain = _gain(costs, round(walls[x] / spacing), y, x, labels[y, x], thing)
+                    if scale >= scaled:
+                        below += gain
+                        gap_px += 1
+                    elif scale >= scaled * _ABOVE_FOOT:
+                        above -= gain
+            foot = max(foot - RADIUS_PX, y0)  # windows that touch an outline are matched by it
+            sharp += road[foot, x] / (horizontal[foot, x] * walls[x])
             sum_above += above
-            hang += max(below, _ZERO)
-            stand -= min(below, _ZERO)
-        n = x1 - x0
-        if sum_above < evidence or gap_px < least_gap_px * n or stand > standing * hang:
+            hanging += max(below, 0.0)
+            stands -= min(below, 0.0)
+            tall += height_m + slope[tops[x], x] / (scaled * walls[x]) > tallest_m
+        if sum_above < evidence or gap_px < least_gap_px * n or stands > standing * hanging or 2 * tall > n:
             continue
-        scale_of_foot = max(sharp / n, scaled)
-        tall = 0
-        for x in range(x0, x1):
-            y = y0
-            while labels[y, x] != thing:
-                y += 1
-            tall += height_m + slope[y, x] / (scale_of_foot * walls[x] * spacing) > tallest_m
-        if 2 * tall > n:
-            continue
-        for x in range(x0, x1):
-            top, wall = y0, walls[x] * spacing
-            while labels[top, x] != thing:
-                top += 1
-            for y in range(top, h):
-                own = road[y, x] / (horizontal[y, x] * wall)
-                if own >= 1 and labels[y, x] != thing:
-                    break
-                if own >= scale_of_foot:
-                    if labels[y, x] == thing:
-                        q[y, x] = road[y, x]
-                elif labels[y, x] == thing:
-                    q[y, x] *= scale_of_foot
-                elif not valid[y, x] or q[y, x] > scale_of_foot * wall * horizontal[y, x]:
-                    q[y, x], valid[y, x] = scale_of_foot * wall * horizontal[y, x], True
+        scaled = max(sharp / n, least_scale)
+        for x in range(x0, x0 + n):
+            for y in range(tops[x], h):
+                upright = scaled * walls[x] * horizontal[y, x]
+                if labels[y, x] == thing:
+                    q[y, x] = max(scaled * q[y, x], road[y, x])
+                elif upright > road[y, x] and (not valid[y, x] or q[y, x] > upright):
+                    q[y, x], valid[y, x] = upright, True

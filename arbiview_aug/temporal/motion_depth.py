@@ -27,7 +27,7 @@ from arbiview_aug.scene.depth_maps import motion_camera, points_of_depth
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.scene.surface import Points
 from arbiview_aug.temporal.change import BOX_MARGIN_M
-from arbiview_aug.temporal.moving import moving_off_road, stand_on_road
+from arbiview_aug.temporal.moving import stand_on_road
 from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, reduced_grey
 from arbiview_aug.temporal.pose_check import CORRECTED_PX, MAX_CORRECTIONS, MAX_ERROR_PX, PoseSamples, pose_error
 
@@ -205,8 +205,7 @@ def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands
     visible = [cv2.remap(o.unmasked, image.positions(o.camera, q), None, cv2.INTER_NEAREST) for o in others]  # type: ignore[call-overload]
     valid = clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0)
     if stands:
-        q, valid = stand_on_road(image, costs[0], float(walls[1]), q, valid)
-        q, valid = moving_off_road(image, others, q, valid, costs[0], float(walls[1]))
+        q, valid = stand_on_road(image, others, costs[0], float(walls[1]), q, valid)
     return _Estimate(q, valid)
 
 

@@ -1,16 +1,17 @@
 """Traffic that moves without labels, in depth from motion: it is put upright on the road where its foot is.
 
 Two images show a thing that moves along with the vehicle, or against it, as a copy that is scaled about the camera: it
-stays on its epipolar lines, and both neighbours agree. A copy that is too near hangs above the road: below it, the
-images match the road that lies beyond it. The place where matching changes from the thing to the road is its foot, and
-the foot's distance is its own. A copy that is too far lies below the road, where nothing is; it moves less than the
-road that it hides. What crosses leaves its epipolar lines. ``docs/drives.md`` (Constants) says how the constants were
-chosen.
+stays on its epipolar lines, and both neighbours agree. A copy that is too near hangs above the road. Below it the
+images match the road beyond, so the row where matching changes is the thing's foot, which gives the scale. A copy that
+is too far lies below the road, where nothing is: it moves less than the road that it hides. Crossing traffic leaves its
+epipolar lines. ``docs/drives.md`` (Constants) says how the constants were chosen.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -21,161 +22,198 @@ from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.temporal.plane_sweep import SweptImage
 
 SLOPE_DEG = 1.0
-"""Pitch of the vehicle against its road, and of the road against a plane: a foot that is so far off may stand."""
+"""Pitch of the vehicle against its road, and of the road against a plane: feet that are so far off may be right."""
 
 UPRIGHT = 1.05
-"""Inverse distance over the road's, of pixels that are no road."""
+"""Least inverse distance of what is not road, over the road's."""
 
-MOST_SCALED = 0.3
-"""Least scale of a copy: traffic that comes at twice the vehicle's speed."""
+TALLEST_M = 4.5
+"""Height of the tallest traffic."""
+
+LEAST_SCALE = 0.3
+"""Scale of a thing that comes at twice the vehicle's speed."""
 
 EVIDENCE = 5.0
-"""Sums of differences of correlation, over pixels, that tell a foot: a fifth over the 49 of a window."""
+"""Least gain in correlation, summed over pixels, on both sides of a foot: a tenth over the 49 pixels of a window."""
 
 STANDING = 0.1
-TALLEST_M = 4.5
-"""Shares of a thing's columns that must show the same foot, and that may show it to reach down to the road."""
+"""Largest share of the evidence below a foot that columns give which show the thing to reach down to the road."""
+
+FLOW_PX, _FLOW_SHARE = 0.5, 0.5
+"""Optical flow that noise and pose errors leave, and the share of it by which two neighbours may differ on top."""
+
+_PATCH_PX = 4  # half of a patch of DIS flow, in which an outline moves the road beside it
+
+_LEAST_DIS_PX = 16  # two patches; OpenCV fails on smaller images
+
+_LEAST_CORRELATION = 0.5
+
+_MOST_SLENDER = 1.5  # height over width: a truck from behind
+
+_FOOT = 0.75  # quantile of the columns' feet, from the farthest: the corner that is near, but for outliers
 
 
 def stand_on_road(
-    image: SweptImage, costs: npt.NDArray[np.uint16], spacing: float, q: Layer, valid: BoolArray
+    image: SweptImage,
+    others: Sequence[SweptImage],
+    costs: npt.NDArray[np.uint16],
+    spacing: float,
+    q: Layer,
+    valid: BoolArray,
 ) -> tuple[Layer, BoolArray]:
-    """Move things that hang above the road to the distance at which their foot touches it.
+    """Move what hangs above the road, lies below it or crosses it to the distance at which its foot is on it.
 
     Args:
         image: The image.
+        others: Those of the neighbours.
         costs: (K, h, w) of walls at multiples of ``spacing``, 1/m; the first is the road alone.
+        spacing: 1/radius between the walls, 1/m.
         q: (h, w) inverse distances that were found, 1/m.
-        valid: (h, w) whether they are believed; outlines are not.
+        valid: (h, w) whether they are believed.
 
     Returns:
-        Inverse distances and validity with the things moved, and the road below their feet.
+        The inverse distances and their validity, with the moved things filled.
     """
-    from arbiview_aug.temporal.kernels import RADIUS_PX, find_feet
-
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(
-        (valid & (q > UPRIGHT * image.road)).astype(np.uint8), connectivity=4
-    )
-    least_gap_px = RADIUS_PX + math.tan(math.radians(SLOPE_DEG)) * float(image.camera.K[1, 1])
+    walls = np.where(q > image.road, q / np.maximum(image.horizontal, 1e-6) / spacing, 0)
+    chosen = np.rint(walls).astype(np.int64).clip(0, len(costs) - 1)
+    chosen_costs = np.take_along_axis(costs, chosen[None], 0)[0]
     q, valid = q.copy(), valid.copy()
-    find_feet(
-        labels, boxes[:count], image.horizontal, image.road, (image.directions[..., 2] / np.maximum(image.horizontal, 1e-6)).astype(np.float32), costs, spacing, least_gap_px,
-        (MOST_SCALED, EVIDENCE, STANDING, float(image.camera.center_m[2]) - image.ground_z_m, TALLEST_M), q, valid,
-    )  # fmt: skip
+    _stand_hanging(image, costs, spacing, q, valid)
+    _stand_off_road(image, others, chosen_costs, q, valid)
     return q, valid
 
 
-def lowest_road(image: SweptImage) -> Layer:
-    """(h, w) inverse distance to the farthest road that slopes or a pitching vehicle may show, 1/m."""
+def _stand_hanging(
+    image: SweptImage, costs: npt.NDArray[np.uint16], spacing: float, q: Layer, valid: BoolArray
+) -> None:
+    """Scale things that hang above the road, in place."""
+    from arbiview_aug.temporal.kernels import RADIUS_PX, find_feet
+
+    upright = (valid & (q > UPRIGHT * image.road)).astype(np.uint8)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(upright, connectivity=4)
+    height_m = float(image.camera.center_m[2]) - image.ground_z_m
+    least_gap_px = RADIUS_PX + math.tan(math.radians(SLOPE_DEG)) * float(image.camera.K[1, 1])
+    limits = LEAST_SCALE, EVIDENCE, STANDING, least_gap_px, height_m, TALLEST_M
+    surfaces = image.horizontal, image.road, image.slope
+    find_feet(labels, boxes[:count], surfaces, costs, spacing, limits, q, valid)
+
+
+class _RoadFlow(NamedTuple):
+    """Optical flow to a neighbour beyond that of the road.
+
+    Attributes:
+        other: The neighbour's image.
+        flow: (h, w, 2) px, along the epipolar line towards nearer places and across it.
+        seen: (h, w) whether the neighbour sees the road there.
+        at: (h, w, 2) pixels of the neighbour that match.
+    """
+
+    other: SweptImage
+    flow: Layer
+    seen: BoolArray
+    at: Layer
+
+
+def _lowest_road(image: SweptImage) -> Layer:
+    """(h, w) inverse distance to the farthest road that a slope or a pitching vehicle may show, 1/m."""
     height_m = max(float(image.camera.center_m[2]) - image.ground_z_m, 1e-3)
     slope = np.float32(math.tan(math.radians(SLOPE_DEG)) / height_m)
     return np.maximum(image.road - slope * image.horizontal, 0)
 
 
-def off_road_flow(image: SweptImage, other: SweptImage, road: Layer) -> tuple[Layer, BoolArray, Layer]:
-    """Optical flow (h, w, 2) to a neighbour beyond that of a road (h, w), px, and where the neighbour sees that road.
-
-    The first component goes along the epipolar line towards nearer places, the second across it.
-    """
+def _road_flow(image: SweptImage, other: SweptImage, road: Layer) -> _RoadFlow:
+    """The flow in the rows that show some road; above them, nothing is seen."""
+    first = max(0, int((road > 0).any(1).argmax()) - 2 * _PATCH_PX)
     at = image.positions(other.camera, road)
-    seen = cv2.remap(other.unmasked, at, None, cv2.INTER_NEAREST) > 0  # type: ignore[call-overload]
-    warped = cv2.remap(other.grey, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-    one, two = (np.rint(grey).astype(np.uint8) for grey in (image.grey, np.where(seen, warped, image.grey)))
-    flow = _FLOW(one, two)
-    x, y = np.moveaxis(image.camera.pixel_grid().astype(np.float32) + flow, -1, 0)
-    there = cv2.remap(at, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    moved = there - at
-    line = image.shift(other.camera, np.maximum(road, np.float32(1e-3)))
-    line /= np.maximum(np.hypot(line[..., 0], line[..., 1]), 1e-9)[..., None]
-    along = (moved * line).sum(-1)
-    return np.stack([along, moved[..., 1] * line[..., 0] - moved[..., 0] * line[..., 1]], -1), seen, there
+    seen = _read(other.unmasked, at, cv2.INTER_NEAREST) > 0
+    seen[:first] = False
+    warped = np.where(seen, _read(other.grey, at), image.grey)
+    grey, warped = (np.rint(one[first:]).astype(np.uint8) for one in (image.grey, warped))
+    moved, empty = np.zeros_like(at), None
+    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    moved[first:] = dis.calc(grey, warped, empty) if min(grey.shape) >= _LEAST_DIS_PX else 0
+    matching = _read(at, image.camera.pixel_grid().astype(np.float32) + moved)
+    moved, line = matching - at, image.shift(other.camera, np.maximum(road, np.float32(1e-3)))
+    line /= np.maximum(np.hypot(line[..., 0], line[..., 1]), np.float32(1e-9))[..., None]
+    along, across = (moved * line).sum(-1), moved[..., 1] * line[..., 0] - moved[..., 0] * line[..., 1]
+    return _RoadFlow(other, np.stack([along, across], -1), seen, matching)
 
 
-def _FLOW(one, two):
-    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(one, two, None)
+def _read(image: Any, at: Layer, interpolation: int = cv2.INTER_LINEAR) -> Any:
+    return cv2.remap(image, at, None, interpolation, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
 
 
-def zncc(image, warped, S):
-    from arbiview_aug.temporal.kernels import NOISE_LEVELS
-    one, two = image.grey[S], warped
-    b = lambda a: cv2.blur(a, (7, 7), borderType=cv2.BORDER_REPLICATE)
-    m1, m2 = b(one), b(two)
-    v1, v2 = np.maximum(b(one * one) - m1 * m1, 0) + NOISE_LEVELS**2, np.maximum(b(two * two) - m2 * m2, 0) + NOISE_LEVELS**2
-    return (b(one * two) - m1 * m2) / np.sqrt(v1 * v2)
+def _stand_off_road(
+    image: SweptImage, others: Sequence[SweptImage], costs: npt.NDArray[np.uint16], q: Layer, valid: BoolArray
+) -> None:
+    """Put things upright, in place, that move less than the road or off its epipolar lines, alike in all neighbours.
+
+    ``costs`` (h, w) are those of what was found: a thing must match better as one that moves.
+    """
+    road = _lowest_road(image)
+    flows = [_road_flow(image, other, road) for other in others]
+    for thing in _off_road(flows, (road > 0) & ~(valid & (q > UPRIGHT * image.road))):
+        rows, columns = thing.nonzero()
+        left, right, top = columns.min(), columns.max() + 1, rows.min()
+        if _correlation(image, flows, rows, columns) < max(_LEAST_CORRELATION, _mean_correlation(costs[thing])):
+            continue
+        shown = thing[:, left:right].any(0)
+        feet = np.maximum(len(thing) - 1 - thing[::-1, left:right].argmax(0) - _PATCH_PX, top)[shown]
+        below = np.arange(left, right)[shown]
+        wall = np.quantile(image.road[feet, below] / image.horizontal[feet, below], _FOOT)
+        if not wall > 0:
+            continue
+        first = max(0, min(top, int(np.median(feet) - _MOST_SLENDER * (right - left))))
+        part = np.s_[first : rows.max() + 1, left:right]
+        upright = wall * image.horizontal[part]
+        filled = cv2.morphologyEx(thing[part].astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)) > 0
+        for row in range(len(filled) - 2, -1, -1):  # upwards through what is unknown
+            filled[row] |= filled[row + 1] & ~valid[part][row]
+        filled &= upright > image.road[part]
+        q[part] = np.where(filled, upright, q[part])
+        valid[part] |= filled
 
 
-def moving_off_road(image: SweptImage, others, q: Layer, valid: BoolArray, costs, spacing):
-    chosen = np.where(q > image.road * 1.0001, q / image.horizontal / spacing, 0)
-    chosen = np.take_along_axis(costs, np.rint(chosen).astype(int).clip(0, len(costs) - 1)[None], 0)[0]
-    chosen = 1 - chosen.astype(np.float32) / 2500
-    road = lowest_road(image)
-    flows, seens, ats = [], [], []
-    for other in others:
-        flow, seen, at = off_road_flow(image, other, road)
-        flows.append(flow)
-        seens.append(seen)
-        ats.append(at)
-    F, S = np.stack(flows), np.stack(seens)
-    three = np.stack([-F[..., 0], F[..., 1], -F[..., 1]])
-    ok = ((three > FLOW_PX) | ~S).all(1).any(0) & S.any(0)
-    size = np.where(S, np.hypot(F[..., 0], F[..., 1]), np.inf).min(0)
-    if len(others) == 2:
-        differ = np.hypot(*np.moveaxis(F[0] - F[1], -1, 0))
-        ok &= (differ < FLOW_PX + SAME * size) | ~S.all(0)
-    standing = valid & (q > UPRIGHT * image.road)
-    mask = ok & ~standing & (road > 0)
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
-    q, valid = q.copy(), valid.copy()
-    h, w = q.shape
+def _off_road(flows: Sequence[_RoadFlow], free: BoolArray) -> Iterator[BoolArray]:
+    """Masks (h, w) of patches in which the flow is off the road, in the same way in all neighbours that see it."""
+    from arbiview_aug.temporal.kernels import RADIUS_PX
+
+    seen = np.stack([one.seen for one in flows])
+    ways = np.stack([[-one.flow[..., 0], one.flow[..., 1], -one.flow[..., 1]] for one in flows])
+    off = ((ways > FLOW_PX) | ~seen[:, None]).all(0).any(0) & seen.any(0)
+    size = np.min([np.where(one.seen, np.hypot(*np.moveaxis(one.flow, -1, 0)), np.inf) for one in flows], axis=0)
+    difference = np.hypot(*np.moveaxis(flows[0].flow - flows[-1].flow, -1, 0))
+    off &= (difference < FLOW_PX + _FLOW_SHARE * size) | ~seen.all(0)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats((off & free).astype(np.uint8), connectivity=4)
     for k in range(1, count):
-        x, y, ww, hh, area = boxes[k]
-        if area < 49:
-            continue
-        inside = labels[y : y + hh, x : x + ww] == k
-        strong = inside & (size[y : y + hh, x : x + ww] >= 0.5 * np.median(size[y : y + hh, x : x + ww][inside]))
-        columns = strong.any(0)
-        low = y + hh - 1 - strong[::-1].argmax(0)
-        xs = np.arange(x, x + ww)[columns]
-        low = np.maximum(low[columns] - HALO, y)
-        wall = np.quantile(image.road[low, xs] / image.horizontal[low, xs], FOOT_Q)
-        top = max(0, min(y, int(np.median(low)) - int(1.5 * ww)))
-        ROI = np.s_[top : y + hh, x : x + ww]
-        thing = np.zeros((y + hh - top, ww), np.uint8)
-        thing[y - top :] = strong
-        # match
-        rows, cols = np.nonzero(strong)
-        A = np.stack([cols + x, rows + y, np.ones(len(rows))], -1).astype(float)
-        corr, corr_road = [], []
-        yy, xx = np.mgrid[top : y + hh, x : x + ww]
-        for at, seen, other in zip(ats, seens, others):
-            p = at[rows + y, cols + x]
-            T = np.linalg.lstsq(A, p, rcond=None)[0]
-            pos = (np.stack([xx, yy, np.ones_like(xx)], -1) @ T).astype(np.float32)
-            corr.append(zncc(image, cv2.remap(other.grey, pos, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), ROI))
-            pos = image.positions(other.camera, image.road)[ROI]
-            corr_road.append(zncc(image, cv2.remap(other.grey, pos, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), ROI))
-        st = thing > 0
-        info = [c[st].mean() for c in corr], [c[st].mean() for c in corr_road], [chosen[y : y + hh, x : x + ww][strong].mean()]
-        thing = cv2.morphologyEx(thing, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
-        free = ~valid[ROI]
-        # upwards through what is unknown
-        for r in range(len(thing) - 2, -1, -1):
-            thing[r] |= thing[r + 1] & free[r]
-        thing = thing > 0
-        below = (image.road[ROI] / np.maximum(image.horizontal[ROI], 1e-6)) > wall
-        thing &= ~below
-        LOG.append((k, x, y, ww, hh, area, 1 / wall, thing, info))
-        merged = 0.75 * np.max(info[0]) + 0.25 * np.min(info[0])
-        if min(info[0]) < CORR or merged < info[2][0]:
-            continue
-        q[ROI] = np.where(thing, wall * image.horizontal[ROI], q[ROI])
-        valid[ROI] |= thing
-    return q, valid
+        if boxes[k, 4] >= (2 * RADIUS_PX + 1) ** 2:
+            thing = labels == k
+            yield thing & (size >= np.median(size[thing]) / 2)  # half-way down to the road's
 
 
-LOG: list = []
-FLOW_PX = 0.5
-FOOT_Q = 0.75
-SAME = 0.5
-HALO = 4
-CORR = 0.5
+def _correlation(image: SweptImage, flows: Sequence[_RoadFlow], rows: Any, columns: Any) -> float:
+    """Mean correlation of windows of pixels (n,) with the neighbours that see them, where the flow is one affine map."""
+    from arbiview_aug.temporal.kernels import NOISE_LEVELS, RADIUS_PX
+
+    left, top, right, bottom = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+    ones, side = np.ones(len(rows)), (2 * RADIUS_PX + 1,) * 2
+    x, y = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
+    grid = np.stack([x, y, np.ones_like(x)], -1)
+    one, values = image.grey[top:bottom, left:right], []
+    for flow in flows:
+        if not flow.seen[rows, columns].any():
+            continue
+        affine = np.linalg.lstsq(np.stack([columns, rows, ones], -1), flow.at[rows, columns], rcond=None)[0]
+        two = _read(flow.other.grey, (grid @ affine).astype(np.float32))
+        products = one, two, one * one, two * two, one * two
+        means = [cv2.blur(x, side, borderType=cv2.BORDER_REPLICATE) for x in products]
+        variances = [np.maximum(means[k + 2] - means[k] ** 2, 0) + NOISE_LEVELS**2 for k in range(2)]
+        correlation = (means[4] - means[0] * means[1]) / np.sqrt(variances[0] * variances[1])
+        values.append(float(correlation[rows - top, columns - left].mean()))
+    return (3 * max(values) + min(values)) / 4  # as costs are merged
+
+
+def _mean_correlation(costs: npt.NDArray[np.uint16]) -> float:
+    from arbiview_aug.temporal.kernels import PER_CORRELATION
+
+    return 1 - float(costs.mean()) / PER_CORRELATION

@@ -38,8 +38,11 @@ Image = npt.NDArray[np.uint8]
 
 MOVES = {"1 m aside": {"y_m": 1.0}, "0.6 m higher": {"z_m": 0.6}}
 METHODS = ("copy", "street", "motion")
-FAR_M, MOVING_MPS, AROUND_PX, RIGHT = 60.0, 0.5, 8, 0.1
-"""Objects that count: nearest pixel and least speed. Pixels around them that score, and a right distance's error."""
+FAR_M, MOVING_MPS, LEAST_PX = 60.0, 0.5, 60
+"""Moving objects that count: greatest median distance, least speed, least number of pixels."""
+
+AROUND_PX, RIGHT = 8, 0.15
+"""Pixels around them that score, and the relative error of a right distance."""
 
 ROADWORTHY = (0, 1, 2, 3, 5, 7)
 """COCO's classes of people and vehicles: person, bicycle, car, motorcycle, bus, truck."""
@@ -54,7 +57,8 @@ SEGMENTED = (640, 360)
 def without_labels(sample: Mapping[str, Any]) -> dict[str, Any]:
     """A sample and its neighbours without boxes."""
     near = [{key: entry[key] for key in entry if key != "boxes_3d"} for entry in sample["neighbours"]]
-    return {key: value for key, value in sample.items() if key not in ("boxes_3d", "box_classes")} | {"neighbours": near}
+    kept = {key: value for key, value in sample.items() if key not in ("boxes_3d", "box_classes")}
+    return kept | {"neighbours": near}
 
 
 def depth_of(sample: Mapping[str, Any]) -> tuple[Floats, ...]:
@@ -69,49 +73,51 @@ def moving_rows(drive: SyntheticDrive, index: int) -> npt.NDArray[np.int64]:
     return np.flatnonzero(np.linalg.norm(drive.scene(index).velocities, axis=1) > MOVING_MPS)
 
 
-def distances(depth_m: Sequence[Floats], true_m: Floats, moving: Bools) -> dict[str, list[Floats]]:
-    """Relative errors of known distances on moving pixels and on all others, and what is known of the moving ones."""
-    errors = [np.where(one > 0, one / true - 1, np.nan) for one, true in zip(depth_m, true_m, strict=True)]
-    error, ask = np.stack(errors), true_m < FAR_M
-    return {"moving": error[moving & ask], "still": error[~moving & ask]}
+def objects_seen(instances: npt.NDArray[Any], depth_m: Floats, rows: npt.NDArray[np.int64]) -> Iterator[Bools]:
+    """Masks (h, w) of the moving objects in an image that are near and large enough to count."""
+    for row in rows:
+        shown = instances == row
+        if np.count_nonzero(shown) >= LEAST_PX and np.median(depth_m[shown]) < FAR_M:
+            yield shown
 
 
 def synthetic_rows(drive: SyntheticDrive) -> dict[str, dict[str, float]]:
-    """A row for each move and method, and one for the distances."""
-    errors: dict[str, list[Floats]] = {"moving": [], "still": []}
-    squares: dict[str, list[list[float]]] = {f"{move}, {method}": [] for move in MOVES for method in METHODS[1:]}
+    """A row for each move and method, and one for the distances; every object weighs the same, whatever its size."""
+    distances: dict[str, list[list[float]]] = {"moving": [], "still": []}
+    levels: dict[str, list[list[float]]] = {f"{move}, {method}": [] for move in MOVES for method in METHODS[1:]}
+    still: dict[str, list[float]] = {name: [] for name in levels}
+    matched = drive.rig.with_cameras(list(map(motion_camera, drive.rig)))
     for index in tqdm(range(len(drive)), desc="streets", leave=False):
-        sample, rows = without_labels(drive[index]), moving_rows(drive, index)
-        depth_m, true = depth_of(sample), drive.render(index, drive.rig.with_cameras(map(motion_camera, drive.rig)))
-        on_moving = np.isin(np.asarray(true.instances), rows)
-        for part, values in distances(depth_m, np.asarray(true.depth_m), on_moving).items():
-            errors[part].append(values)
+        sample, rows, true = without_labels(drive[index]), moving_rows(drive, index), drive.render(index, matched)
+        depth_m = depth_of(sample)
+        for one, instances, true_m in zip(depth_m, *map(np.asarray, (true.instances, true.depth_m)), strict=True):
+            known, right = one > 0, np.abs(one / true_m - 1) <= RIGHT
+            masks = {"moving": list(objects_seen(instances, true_m, rows))}
+            masks["still"] = [~np.isin(instances, rows) & (true_m < FAR_M)]
+            for part, of_part in masks.items():
+                distances[part] += [[known[m].mean(), (known & right)[m].mean()] for m in of_part]
         given = sample | {MOTION_KEY: [torch.from_numpy(one) for one in depth_m]}
         for move, shift in MOVES.items():
             target = drive.rig.shifted(**shift)
             view = drive.render(index, target)
-            near = np.isin(np.asarray(view.instances), rows) & (np.asarray(view.depth_m) < FAR_M)
-            side = 2 * AROUND_PX + 1
-            around = np.stack([cv2.dilate(one.astype(np.uint8), np.ones((side, side))) > 0 for one in near])
             for method in METHODS[1:]:
-                out = RigRetarget(target, geometry=method, neighbours=None)(given)
+                out, name = RigRetarget(target, geometry=method, neighbours=None)(given), f"{move}, {method}"
                 square = ((out["images"].float() - view.images.float()) ** 2).mean(1).numpy()
-                squares[f"{move}, {method}"].append(
-                    [square[around].sum(), around.sum(), square[~around].sum(), (~around).sum()]
-                )
-    table: dict[str, dict[str, float]] = {}
-    for part, values in errors.items():
-        error = np.concatenate(values)
-        known = np.abs(error[np.isfinite(error)])
-        table[f"distances, {part}"] = {
-            "known": len(known) / max(len(error), 1),
-            "right": float((known <= RIGHT).mean()),
-            "median_error": float(np.median(known)),
-        }
-    for name, rows in squares.items():
-        a, n, b, m = np.sum(rows, axis=0)
-        table[name] = {"around_moving_db": _decibels(a / n), "elsewhere_db": _decibels(b / m)}
-    return table
+                elsewhere = np.ones(square.shape, bool)
+                for k, (instances, true_m) in enumerate(zip(*map(np.asarray, view[3:0:-2]), strict=True)):
+                    for shown in objects_seen(instances, true_m, rows):
+                        around = cv2.dilate(shown.astype(np.uint8), np.ones((2 * AROUND_PX + 1,) * 2)) > 0
+                        elsewhere[k] &= ~around
+                        levels[name].append([_decibels(square[k][around].mean())])
+                still[name].append(square[elsewhere].mean())
+    table = {
+        f"distances, {part}": dict(zip(("known", "right"), np.mean(rows_of_part, axis=0).tolist(), strict=True))
+        for part, rows_of_part in distances.items()
+    }
+    return table | {
+        name: {"around_moving_db": float(np.mean(levels[name])), "elsewhere_db": _decibels(float(np.mean(still[name])))}
+        for name in levels
+    }
 
 
 def _decibels(square: float) -> float:
@@ -126,9 +132,7 @@ class Detections(NamedTuple):
     scores: Floats
 
 
-def average_precision(
-    found: Sequence[Detections], true: Sequence[Floats], overlap: float
-) -> float:
+def average_precision(found: Sequence[Detections], true: Sequence[Floats], overlap: float) -> float:
     """AP of detections in several images, of which each has boxes (m, 4): the area under precision over recall.
 
     Detections in the order of their scores take the free box of the largest IoU.
@@ -281,13 +285,11 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     if isinstance(judges, str):
         print(judges, file=sys.stderr)
     rig = demo_source_rig(arguments.size)
-    drive = SyntheticDrive(
-        rig, num_frames=arguments.streets, seed=arguments.seed, lidar=False, neighbours=Neighbours()
-    )
+    streets = {"num_frames": arguments.streets, "seed": arguments.seed}
+    drive = SyntheticDrive(rig, **streets, lidar=False, neighbours=Neighbours())
     rows = {name: photograph_rows(name, judges) for name in arguments.data}
     return {
-        "streets": arguments.streets,
-        "seed": arguments.seed,
+        **streets,
         "size": list(arguments.size),
         "judges": judges if isinstance(judges, str) else arguments.judges,
         "rows": {"synthetic": synthetic_rows(drive)} | rows,
