@@ -27,8 +27,8 @@ SLOPE_DEG = 1.0
 UPRIGHT = 1.05
 """Least inverse distance of what is not road, over the road's."""
 
-TALLEST_M = 4.5
-"""Height of the tallest traffic."""
+LOWEST_M, TALLEST_M = 1.4, 4.5
+"""Heights of the lowest vehicles and of the tallest."""
 
 LEAST_SCALE = 0.3
 """Scale of a thing that comes at twice the vehicle's speed."""
@@ -40,7 +40,8 @@ STANDING = 0.1
 """Largest share of the evidence below a foot that columns give which show the thing to reach down to the road."""
 
 FLOW_PX, _FLOW_SHARE = 0.5, 0.5
-"""Optical flow that noise and pose errors leave, and the share of it by which two neighbours may differ on top."""
+"""Optical flow that noise and pose errors leave (half of it below the lowest road), and the share of the flow by which
+two neighbours may differ on top."""
 
 _PATCH_PX = 4  # half of a patch of DIS flow, in which an outline moves the road beside it
 
@@ -129,11 +130,12 @@ def _road_flow(image: SweptImage, other: SweptImage, road: Layer) -> _RoadFlow:
     seen[:first] = False
     warped = np.where(seen, _read(other.grey, at), image.grey)
     grey, warped = (np.rint(one[first:]).astype(np.uint8) for one in (image.grey, warped))
-    moved, empty = np.zeros_like(at), None
-    dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    moved[first:] = dis.calc(grey, warped, empty) if min(grey.shape) >= _LEAST_DIS_PX else 0
+    moved, _empty = np.zeros_like(at), None
+    cv: Any = cv2  # whose stubs lack DIS flow
+    dis = cv.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    moved[first:] = dis.calc(grey, warped, None) if min(grey.shape) >= _LEAST_DIS_PX else 0
     matching = _read(at, image.camera.pixel_grid().astype(np.float32) + moved)
-    moved, line = matching - at, image.shift(other.camera, np.maximum(road, np.float32(1e-3)))
+    moved, line = matching - at, image.positions(other.camera, np.float32(1.1) * road + np.float32(1e-4)) - at
     line /= np.maximum(np.hypot(line[..., 0], line[..., 1]), np.float32(1e-9))[..., None]
     along, across = (moved * line).sum(-1), moved[..., 1] * line[..., 0] - moved[..., 0] * line[..., 1]
     return _RoadFlow(other, np.stack([along, across], -1), seen, matching)
@@ -150,7 +152,7 @@ def _stand_off_road(
 
     ``costs`` (h, w) are those of what was found: a thing must match better as one that moves.
     """
-    road = _lowest_road(image)
+    road, camera_m = _lowest_road(image), float(image.camera.center_m[2]) - image.ground_z_m
     flows = [_road_flow(image, other, road) for other in others]
     for thing in _off_road(flows, (road > 0) & ~(valid & (q > UPRIGHT * image.road))):
         rows, columns = thing.nonzero()
@@ -165,10 +167,11 @@ def _stand_off_road(
             continue
         first = max(0, min(top, int(np.median(feet) - _MOST_SLENDER * (right - left))))
         part = np.s_[first : rows.max() + 1, left:right]
-        upright = wall * image.horizontal[part]
+        upright, height_m = wall * image.horizontal[part], camera_m + image.slope[part] / wall
         filled = cv2.morphologyEx(thing[part].astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)) > 0
-        for row in range(len(filled) - 2, -1, -1):  # upwards through what is unknown
-            filled[row] |= filled[row + 1] & ~valid[part][row]
+        free = (~valid[part] & (height_m < TALLEST_M)) | ((height_m < LOWEST_M) & (q[part] < upright))
+        for row in range(len(filled) - 2, -1, -1):  # upwards
+            filled[row] |= filled[row + 1] & free[row]
         filled &= upright > image.road[part]
         q[part] = np.where(filled, upright, q[part])
         valid[part] |= filled
@@ -178,12 +181,15 @@ def _off_road(flows: Sequence[_RoadFlow], free: BoolArray) -> Iterator[BoolArray
     """Masks (h, w) of patches in which the flow is off the road, in the same way in all neighbours that see it."""
     from arbiview_aug.temporal.kernels import RADIUS_PX
 
-    seen = np.stack([one.seen for one in flows])
-    ways = np.stack([[-one.flow[..., 0], one.flow[..., 1], -one.flow[..., 1]] for one in flows])
-    off = ((ways > FLOW_PX) | ~seen[:, None]).all(0).any(0) & seen.any(0)
-    size = np.min([np.where(one.seen, np.hypot(*np.moveaxis(one.flow, -1, 0)), np.inf) for one in flows], axis=0)
-    difference = np.hypot(*np.moveaxis(flows[0].flow - flows[-1].flow, -1, 0))
-    off &= (difference < FLOW_PX + _FLOW_SHARE * size) | ~seen.all(0)
+    ways = [(-2 * one.flow[..., 0], one.flow[..., 1], -one.flow[..., 1]) for one in flows]
+    sizes = [np.where(one.seen, np.hypot(one.flow[..., 0], one.flow[..., 1]), np.inf) for one in flows]
+    unseen = [~one.seen for one in flows]
+    alike = [((ways[0][k] > FLOW_PX) | unseen[0]) & ((ways[-1][k] > FLOW_PX) | unseen[-1]) for k in range(3)]
+    size = np.minimum(sizes[0], sizes[-1])
+    difference = flows[0].flow - flows[-1].flow
+    both = flows[0].seen & flows[-1].seen
+    off = np.any(alike, 0) & (flows[0].seen | flows[-1].seen)
+    off &= (np.hypot(difference[..., 0], difference[..., 1]) < FLOW_PX + _FLOW_SHARE * size) | ~both
     count, labels, boxes, _ = cv2.connectedComponentsWithStats((off & free).astype(np.uint8), connectivity=4)
     for k in range(1, count):
         if boxes[k, 4] >= (2 * RADIUS_PX + 1) ** 2:
@@ -192,7 +198,7 @@ def _off_road(flows: Sequence[_RoadFlow], free: BoolArray) -> Iterator[BoolArray
 
 
 def _correlation(image: SweptImage, flows: Sequence[_RoadFlow], rows: Any, columns: Any) -> float:
-    """Mean correlation of windows of pixels (n,) with the neighbours that see them, where the flow is one affine map."""
+    """Mean correlation of windows of pixels (n,) with the neighbours that see them, by one affine map of the flow."""
     from arbiview_aug.temporal.kernels import NOISE_LEVELS, RADIUS_PX
 
     left, top, right, bottom = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
