@@ -152,13 +152,13 @@ def _stand_off_road(
 
     ``costs`` (h, w) are those of what was found: a thing must match better as one that moves.
     """
+    from arbiview_aug.temporal.kernels import PER_CORRELATION
+
     road, camera_m = _lowest_road(image), float(image.camera.center_m[2]) - image.ground_z_m
     flows = [_road_flow(image, other, road) for other in others]
     for thing in _off_road(flows, (road > 0) & ~(valid & (q > UPRIGHT * image.road))):
         rows, columns = thing.nonzero()
         left, right, top = columns.min(), columns.max() + 1, rows.min()
-        if _correlation(image, flows, rows, columns) < max(_LEAST_CORRELATION, _mean_correlation(costs[thing])):
-            continue
         shown = thing[:, left:right].any(0)
         feet = np.maximum(len(thing) - 1 - thing[::-1, left:right].argmax(0) - _PATCH_PX, top)[shown]
         below = np.arange(left, right)[shown]
@@ -167,9 +167,14 @@ def _stand_off_road(
             continue
         first = max(0, min(top, int(np.median(feet) - _MOST_SLENDER * (right - left))))
         part = np.s_[first : rows.max() + 1, left:right]
+        moving, still = _correlations(image, flows, rows, columns, part), 1 - costs[part] / np.float32(PER_CORRELATION)
+        seed = thing[part]
+        if moving[seed].mean() < max(_LEAST_CORRELATION, still[seed].mean()):
+            continue
         upright, height_m = wall * image.horizontal[part], camera_m + image.slope[part] / wall
-        filled = cv2.morphologyEx(thing[part].astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)) > 0
-        free = (~valid[part] & (height_m < TALLEST_M)) | ((height_m < LOWEST_M) & (q[part] < upright))
+        filled = cv2.morphologyEx(seed.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)) > 0
+        nearer = (height_m < LOWEST_M) & (q[part] < upright) & (moving > still)
+        free = np.where(valid[part], nearer, height_m < TALLEST_M)
         for row in range(len(filled) - 2, -1, -1):  # upwards
             filled[row] |= filled[row + 1] & free[row]
         filled &= upright > image.road[part]
@@ -197,29 +202,21 @@ def _off_road(flows: Sequence[_RoadFlow], free: BoolArray) -> Iterator[BoolArray
             yield thing & (size >= np.median(size[thing]) / 2)  # half-way down to the road's
 
 
-def _correlation(image: SweptImage, flows: Sequence[_RoadFlow], rows: Any, columns: Any) -> float:
-    """Mean correlation of windows of pixels (n,) with the neighbours that see them, by one affine map of the flow."""
+def _correlations(image: SweptImage, flows: Sequence[_RoadFlow], rows: Any, columns: Any, part: Any) -> Layer:
+    """Correlations (h, w) of a part's windows with the neighbours, by one affine map of the flow of pixels (n,)."""
     from arbiview_aug.temporal.kernels import NOISE_LEVELS, RADIUS_PX
 
-    left, top, right, bottom = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
-    ones, side = np.ones(len(rows)), (2 * RADIUS_PX + 1,) * 2
-    x, y = np.meshgrid(np.arange(left, right), np.arange(top, bottom))
-    grid = np.stack([x, y, np.ones_like(x)], -1)
-    one, values = image.grey[top:bottom, left:right], []
+    side = (2 * RADIUS_PX + 1,) * 2
+    y, x = np.mgrid[part]
+    grid, pixels = np.stack([x, y, np.ones_like(x)], -1), np.stack([columns, rows, np.ones_like(rows)], -1)
+    one, found = image.grey[part], []
     for flow in flows:
         if not flow.seen[rows, columns].any():
             continue
-        affine = np.linalg.lstsq(np.stack([columns, rows, ones], -1), flow.at[rows, columns], rcond=None)[0]
+        affine = np.linalg.lstsq(pixels.astype(np.float64), flow.at[rows, columns], rcond=None)[0]
         two = _read(flow.other.grey, (grid @ affine).astype(np.float32))
         products = one, two, one * one, two * two, one * two
-        means = [cv2.blur(x, side, borderType=cv2.BORDER_REPLICATE) for x in products]
+        means = [cv2.blur(product, side, borderType=cv2.BORDER_REPLICATE) for product in products]
         variances = [np.maximum(means[k + 2] - means[k] ** 2, 0) + NOISE_LEVELS**2 for k in range(2)]
-        correlation = (means[4] - means[0] * means[1]) / np.sqrt(variances[0] * variances[1])
-        values.append(float(correlation[rows - top, columns - left].mean()))
-    return (3 * max(values) + min(values)) / 4  # as costs are merged
-
-
-def _mean_correlation(costs: npt.NDArray[np.uint16]) -> float:
-    from arbiview_aug.temporal.kernels import PER_CORRELATION
-
-    return 1 - float(costs.mean()) / PER_CORRELATION
+        found.append((means[4] - means[0] * means[1]) / np.sqrt(variances[0] * variances[1]))
+    return np.asarray((3 * np.max(found, axis=0) + np.min(found, axis=0)) / 4)  # as costs are merged
