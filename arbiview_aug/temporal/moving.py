@@ -43,15 +43,13 @@ FLOW_PX, _FLOW_SHARE = 0.5, 0.5
 """Optical flow that noise and pose errors leave (half of it below the lowest road), and the share of the flow by which
 two neighbours may differ on top."""
 
-_PATCH_PX = 4  # half of a patch of DIS flow, in which an outline moves the road beside it
+_PATCH_PX = 4  # half of a patch of DIS flow, within which it moves the road beside a thing, too
 
 _LEAST_DIS_PX = 16  # two patches; OpenCV fails on smaller images
 
-_LEAST_CORRELATION = 0.5
+_LEAST_CORRELATION, _AS_GOOD = 0.5, 0.1  # of a match, and the difference of two that tell nothing
 
 _MOST_SLENDER = 1.5  # height over width: a truck from behind
-
-_FOOT = 0.75  # quantile of the columns' feet, from the farthest: the corner that is near, but for outliers
 
 
 def stand_on_road(
@@ -80,7 +78,7 @@ def stand_on_road(
     chosen_costs = np.take_along_axis(costs, chosen[None], 0)[0]
     q, valid = q.copy(), valid.copy()
     _stand_hanging(image, costs, spacing, q, valid)
-    _stand_off_road(image, others, chosen_costs, q, valid)
+    _stand_off_road(image, others, chosen_costs, costs[0], q, valid)
     return q, valid
 
 
@@ -146,35 +144,37 @@ def _read(image: Any, at: Layer, interpolation: int = cv2.INTER_LINEAR) -> Any:
 
 
 def _stand_off_road(
-    image: SweptImage, others: Sequence[SweptImage], costs: npt.NDArray[np.uint16], q: Layer, valid: BoolArray
+    image: SweptImage, others: Sequence[SweptImage], costs: Any, road_costs: Any, q: Layer, valid: BoolArray
 ) -> None:
     """Put things upright, in place, that move less than the road or off its epipolar lines, alike in all neighbours.
 
     ``costs`` (h, w) are those of what was found: a thing must match better as one that moves.
     """
-    from arbiview_aug.temporal.kernels import PER_CORRELATION
+    from arbiview_aug.temporal.kernels import PER_CORRELATION, RADIUS_PX
 
     road, camera_m = _lowest_road(image), float(image.camera.center_m[2]) - image.ground_z_m
     flows = [_road_flow(image, other, road) for other in others]
     for thing in _off_road(flows, (road > 0) & ~(valid & (q > UPRIGHT * image.road))):
         rows, columns = thing.nonzero()
         left, right, top = columns.min(), columns.max() + 1, rows.min()
-        shown = thing[:, left:right].any(0)
-        feet = np.maximum(len(thing) - 1 - thing[::-1, left:right].argmax(0) - _PATCH_PX, top)[shown]
-        below = np.arange(left, right)[shown]
-        wall = np.quantile(image.road[feet, below] / image.horizontal[feet, below], _FOOT)
-        if not wall > 0:
-            continue
-        first = max(0, min(top, int(np.median(feet) - _MOST_SLENDER * (right - left))))
-        part = np.s_[first : rows.max() + 1, left:right]
-        moving, still = _correlations(image, flows, rows, columns, part), 1 - costs[part] / np.float32(PER_CORRELATION)
+        first = max(0, min(top, int(rows.max() - _MOST_SLENDER * (right - left))))
+        part = np.s_[first : min(rows.max() + 1 + 2 * _PATCH_PX, len(q)), left:right]
+        moving = _correlations(image, flows, rows, columns, part)
+        still, of_road = (1 - one[part] / np.float32(PER_CORRELATION) for one in (costs, road_costs))
         seed = thing[part]
         if moving[seed].mean() < max(_LEAST_CORRELATION, still[seed].mean()):
             continue
+        gains = np.where(np.maximum(moving, of_road) < _LEAST_CORRELATION, 0, of_road - moving).sum(1)
+        below = np.cumsum(gains[::-1])[::-1]
+        middle = int(np.median(rows)) - first
+        foot = first + middle + int(below[middle:].argmax()) - RADIUS_PX  # windows that touch it are matched by it
+        wall = np.median(image.road[foot, left:right] / image.horizontal[foot, left:right])
+        if not wall > 0:
+            continue
         upright, height_m = wall * image.horizontal[part], camera_m + image.slope[part] / wall
         filled = cv2.morphologyEx(seed.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)) > 0
-        nearer = (height_m < LOWEST_M) & (q[part] < upright) & (moving > still)
-        free = np.where(valid[part], nearer, height_m < TALLEST_M)
+        low = (height_m < LOWEST_M) & (~valid[part] | ((q[part] < upright) & (moving > still - _AS_GOOD)))
+        free = low | (~valid[part] & (height_m < TALLEST_M) & (moving > _LEAST_CORRELATION))  # without the sky
         for row in range(len(filled) - 2, -1, -1):  # upwards
             filled[row] |= filled[row + 1] & free[row]
         filled &= upright > image.road[part]
