@@ -2,8 +2,8 @@
 
 Each neighbour is matched by a plane sweep. The costs of both are merged and aggregated. A pixel is kept where one
 distance fits clearly better than all others, away from outlines, and where enough of its neighbours are kept too.
-Labelled objects are masked in both frames. Unlabelled traffic that keeps pace or comes straight ahead cannot be told
-apart from the static scene. ``docs/drives.md`` (Constants) says how the constants were chosen.
+Labelled objects are masked in both frames. Unlabelled traffic is put upright where its foot is on the road
+(``arbiview_aug.temporal.moving``). ``docs/drives.md`` (Constants) says how the constants were chosen.
 """
 
 from __future__ import annotations

@@ -134,9 +134,10 @@ def _road_flow(image: SweptImage, other: SweptImage, road: Layer) -> _RoadFlow:
     moved[first:] = dis.calc(grey, warped, None) if min(grey.shape) >= _LEAST_DIS_PX else 0
     matching = _read(at, image.camera.pixel_grid().astype(np.float32) + moved)
     moved, line = matching - at, image.positions(other.camera, np.float32(1.1) * road + np.float32(1e-4)) - at
-    line /= np.maximum(np.hypot(line[..., 0], line[..., 1]), np.float32(1e-9))[..., None]
-    along, across = (moved * line).sum(-1), moved[..., 1] * line[..., 0] - moved[..., 0] * line[..., 1]
-    return _RoadFlow(other, np.stack([along, across], -1), seen, matching)
+    (x, y), (ex, ey) = (np.ascontiguousarray(np.moveaxis(one, -1, 0)) for one in (moved, line))
+    length = np.maximum(np.sqrt(ex * ex + ey * ey), np.float32(1e-9))
+    flow = np.stack([(x * ex + y * ey) / length, (y * ex - x * ey) / length], -1)
+    return _RoadFlow(other, flow, seen, matching)
 
 
 def _read(image: Any, at: Layer, interpolation: int = cv2.INTER_LINEAR) -> Any:
