@@ -22,6 +22,12 @@ STEP, JUMP = np.uint16(PER_CORRELATION // 10), np.uint16(PER_CORRELATION * 6 // 
 PEAK, CLEAR = 2, np.float32(1.3)
 """The least cost must be so much less than those of walls farther from it than so many steps."""
 
+SCALES = 64  # steps of the scale of things that hang above the road
+_FARTHEST_SCALE = 0.1  # of a road that can be told from infinity
+_ABOVE_FOOT = 2 / 3  # of the foot's scale, down to which a thing must match better than the road
+
+_MATCHING = np.uint16(PER_CORRELATION // 2)  # the largest cost of a match, half a correlation
+
 _UNSEEN = np.uint16(INVALID)
 _NOISE = np.float32(NOISE_LEVELS**2)
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
@@ -227,3 +233,80 @@ def find_least(total: Any, spacing: float, road: Any) -> Any:
                 if curvature > _ZERO:
                     wall[y, x] += _HALF * (before - after) / curvature * spacing
     return wall, clear
+
+
+@inlined
+def _gain(costs: Any, wall: Any, y: Any, x: Any, label: Any, thing: Any) -> Any:
+    """Correlation with the road above that with a wall; 0 where neither matches or another thing hides the road."""
+    own, road = costs[wall, y, x], costs[0, y, x]
+    if min(own, road) > _MATCHING or (own > road and label != thing and label != 0):
+        return 0.0
+    return (np.float64(own) - np.float64(road)) / PER_CORRELATION
+
+
+@compiled
+def find_feet(
+    labels: Any, boxes: Any, surfaces: Any, costs: Any, spacing: float, limits: Any, q: Any, valid: Any
+) -> None:
+    """Scale things that hang above the road, in place, to where matching changes from them to the road below.
+
+    ``labels`` (h, w) and ``boxes`` (n, 5) are OpenCV's of the things, the background first. ``surfaces`` and ``limits``
+    are made by ``moving``; other arguments are those of ``moving.stand_on_road``.
+    """
+    horizontal, road, slope = surfaces
+    least_scale, evidence, standing, least_gap_px, height_m, tallest_m = limits
+    h, w = labels.shape
+    walls, tops, gains = np.empty(w, np.float64), np.empty(w, np.int64), np.empty(SCALES, np.float64)
+    for thing in range(1, boxes.shape[0]):
+        x0, y0, n = boxes[thing, 0], boxes[thing, 1], boxes[thing, 2]
+        if boxes[thing, 4] < (2 * RADIUS_PX + 1) ** 2:
+            continue
+        gains[:] = 0
+        for x in range(x0, x0 + n):
+            total, count = 0.0, 0
+            for y in range(y0 + boxes[thing, 3] - 1, y0 - 1, -1):
+                if labels[y, x] == thing:
+                    total += q[y, x] / horizontal[y, x]
+                    count += 1
+                    tops[x] = y
+            walls[x] = min(max(round(total / count / spacing), 1), costs.shape[0] - 1) * spacing
+            for y in range(y0, h):
+                scale = road[y, x] / (horizontal[y, x] * walls[x])
+                if _FARTHEST_SCALE < scale < 1:
+                    gains[int(scale * SCALES)] += _gain(costs, round(walls[x] / spacing), y, x, labels[y, x], thing)
+        most, below, scaled = 0.0, 0.0, 1.0
+        for k in range(SCALES - 1, -1, -1):
+            below += gains[k]
+            if below > most:
+                most, scaled = below, k / SCALES
+        if most < evidence or scaled < least_scale:
+            continue
+        sum_above, hanging, stands, gap_px, sharp, tall = 0.0, 0.0, 0.0, 0, 0.0, 0
+        for x in range(x0, x0 + n):
+            above, below, foot = 0.0, 0.0, h - 1
+            for y in range(h - 1, y0 - 1, -1):
+                scale = road[y, x] / (horizontal[y, x] * walls[x])
+                foot = y if scale >= scaled else foot
+                if _FARTHEST_SCALE < scale < 1:
+                    gain = _gain(costs, round(walls[x] / spacing), y, x, labels[y, x], thing)
+                    if scale >= scaled:
+                        below += gain
+                        gap_px += 1
+                    elif scale >= scaled * _ABOVE_FOOT:
+                        above -= gain
+            foot = max(foot - RADIUS_PX, y0)  # windows that touch an outline are matched by it
+            sharp += road[foot, x] / (horizontal[foot, x] * walls[x])
+            sum_above += above
+            hanging += max(below, 0.0)
+            stands -= min(below, 0.0)
+            tall += height_m + slope[tops[x], x] / (scaled * walls[x]) > tallest_m
+        if sum_above < evidence or gap_px < least_gap_px * n or stands > standing * hanging or 2 * tall > n:
+            continue
+        scaled = max(sharp / n, least_scale)
+        for x in range(x0, x0 + n):
+            for y in range(tops[x], h):
+                upright = scaled * walls[x] * horizontal[y, x]
+                if labels[y, x] == thing:
+                    q[y, x] = max(scaled * q[y, x], road[y, x])
+                elif upright > road[y, x] and (not valid[y, x] or q[y, x] > upright):
+                    q[y, x], valid[y, x] = upright, True

@@ -2,14 +2,15 @@
 
 Each neighbour is matched by a plane sweep. The costs of both are merged and aggregated. A pixel is kept where one
 distance fits clearly better than all others, away from outlines, and where enough of its neighbours are kept too.
-Labelled objects are masked in both frames. Unlabelled traffic that keeps pace or comes straight ahead cannot be told
-apart from the static scene. ``docs/drives.md`` (Constants) says how the constants were chosen.
+Labelled objects are masked in both frames. Unlabelled traffic is put upright where its foot is on the road
+(``arbiview_aug.temporal.moving``). ``docs/drives.md`` (Constants) says how the constants were chosen.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
@@ -29,6 +30,7 @@ from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.scene.scene import GEOMETRIES, Scene, motion_camera, points_of_depth
 from arbiview_aug.scene.surface import Points
+from arbiview_aug.temporal.moving import stand_on_road
 from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, reduced_grey
 
 BEST_TRAVEL_M, TRAVEL_M = 1.2, (0.4, 3.0)
@@ -139,7 +141,7 @@ def motion_depth(
             ]
         elif worst.error_px > MAX_ERROR_PX:
             return declined(f"the pose of frame {sides[measured.index(worst)].neighbour.name} errs by {worst}")
-    fine = map(_match, swept, others, map(_walls, swept, coarse))
+    fine = map(partial(_match, stands=True), swept, others, map(_walls, swept, coarse))
     return MotionDepth(tuple(map(_depth_m, swept, fine)), words)
 
 
@@ -173,10 +175,11 @@ def without_objects(camera: Camera, boxes: FloatArray | None) -> Camera:
     return replace(camera, mask=mask)
 
 
-def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer) -> _Estimate:
+def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands: bool = False) -> _Estimate:
     """Estimate the distances of one camera's pixels from the costs of all sides together.
 
-    Valid are clear matches away from the outlines of objects, which windows blur.
+    Valid are clear matches away from the outlines of objects, which windows blur. With ``stands``, things that hang
+    above the road are put upon it.
     """
     from arbiview_aug.temporal.kernels import aggregate, find_least, merge_costs
 
@@ -188,14 +191,17 @@ def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer) -> _Es
     q = image.inverse_distance(wall)
     step = cv2.dilate(q, _AROUND) - cv2.erode(q, _AROUND)
     visible = [cv2.remap(o.unmasked, image.positions(o.camera, q), None, cv2.INTER_NEAREST) for o in others]  # type: ignore[call-overload]
-    return _Estimate(q, clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0))
+    valid = clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0)
+    if stands:
+        q, valid = stand_on_road(image, others, costs[0], float(walls[1]), q, valid)
+    return _Estimate(q, valid)
 
 
 def warm_up() -> None:
     """Compile the kernels of matching, or load them from numba's cache."""
     camera = Camera.looking(name="small", azimuth_deg=0, width_px=16, height_px=16, horizontal_fov_deg=90)
     image = SweptImage(camera, np.zeros((16, 16), np.float32), 0.0)
-    _match(image, [image], WALLS[:2])
+    _match(image, [image], WALLS[:2], stands=True)
 
 
 def _coarse(image: SweptImage, others: Sequence[SweptImage]) -> _Estimate:

@@ -72,6 +72,11 @@ class SweptImage:
         """(h, w) length of each unit ray's horizontal part, the factor from 1/radius to inverse distance."""
         return np.hypot(self.directions[..., 0], self.directions[..., 1]).astype(np.float32)
 
+    @cached_property
+    def slope(self) -> Layer:
+        """(h, w) rise of each ray over its horizontal part."""
+        return (self.directions[..., 2] / np.maximum(self.horizontal, 1e-6)).astype(np.float32)
+
     def inverse_distance(self, wall: Any) -> Any:
         """(h, w) inverse distance along the rays, 1/m; ``wall`` is 1/radius, one or (h, w)."""
         return np.maximum(self.road, wall * self.horizontal)

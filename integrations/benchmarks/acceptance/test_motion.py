@@ -95,7 +95,7 @@ def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -
 def test_depth_is_right_and_renders_better_than_the_street(
     standing: bool, labels: bool, turned_deg: float, density: float, share: float, least_db: float
 ) -> None:
-    """Less is asked with unlabelled traffic: it is put at wrong distances."""
+    """Less is asked with unlabelled traffic: some of it is put at wrong distances."""
     counts, gains = np.zeros(3), {move: [] for move in MOVES}
     for index in STREETS:
         sample = sample_of(index, standing, labels, turned_deg)
