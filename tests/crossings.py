@@ -28,8 +28,8 @@ BOUNDS = {
     "learned depth": (26, 600),
     "generated": (27, 1500),
     "neighbours, all": (32, 2500),
-    "motion": (36, 2500),
-    "paper": (17, 160),
+    "motion": (37, 2550),
+    "paper": (19, 180),
 }
 """Most files and crossings that a call may have."""
 
