@@ -231,8 +231,8 @@ def _paint(
     """Paint the unseen parts of objects in a view by the colours (P, 3) of their parts."""
     from arbiview_aug.inpaint.kernels import paint
 
-    of_pixels, reach = (objects.pixel, objects.part, objects.beside, objects.is_top), SIDE_REACH * min(seen.shape)
-    paint(*of_pixels, colours, seen, layers, reach, view.reshape(3, -1))
+    reach = SIDE_REACH * min(seen.shape)
+    paint(objects.pixel, objects.part, colours, seen, layers, reach, view.reshape(3, -1))
 
 
 def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.environment import called, compiled, inlined
+from arbiview_aug.scene.boxes import PARTS, TOP_PART
 
 _ZERO, _ONE, _HALF, _QUARTER = np.float32(0), np.float32(1), np.float32(0.5), np.float32(0.25)
 _TINY = np.float32(1e-12)
@@ -327,20 +328,14 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
 
 
 @compiled
-def paint(
-    pixel: Any, part: Any, beside: Any, is_top: Any, table: Any, seen: Any, layers: Any, reach: float, view: Any
-) -> None:
-    """Paint the unseen pixels of objects in a view: by the pixel beside them, tops in their part's colour.
+def paint(pixel: Any, part: Any, table: Any, seen: Any, layers: Any, reach: float, view: Any) -> None:
+    """Paint the unseen pixels of objects in a view: tops in their part's colour, without a colour not at all.
 
-    Sides mix their part's colour with the nearest seen pixels of objects in their row and column. Without a colour
-    they stay background.
+    Sides mix their part's colour with the nearest seen pixels of objects in their row and column.
 
     Args:
-        pixel: (n,) into the flattened view; as are ``part``, ``beside`` and ``is_top`` an attribute of
-            ``view_plan.Paint``.
-        part: (n,).
-        beside: (n,).
-        is_top: (n,).
+        pixel: (n,) into the flattened view, ascending.
+        part: (n,) what they show, as in ``Paint``.
         table: (P, 3) float32 colours of the parts; the first is negative where unknown.
         seen: (h, w) bool.
         layers: (h, w) uint8 as in ``ViewPlan``.
@@ -363,19 +358,13 @@ def paint(
                     nearest[k, way] = nearest[number[y, x], way]
     mixed = np.empty(3, np.float32)
     for k in range(pixel.shape[0]):
-        at, source = pixel[k], beside[k]
-        if seen[at // w, at % w]:
-            continue
-        if source >= 0:
-            for c in range(3):
-                view[c, at] = view[c, source]
-            continue
-        if part[k] >= table.shape[0] or table[part[k], 0] < _ZERO:
+        at = pixel[k]
+        if seen[at // w, at % w] or part[k] >= table.shape[0] or table[part[k], 0] < _ZERO:
             continue  # nothing of it is seen: another object's pixels would make it a ghost
         total = _ONE
         for c in range(3):
             mixed[c] = table[part[k], c]
-        for way in range(0 if is_top[k] else 4):
+        for way in range(0 if part[k] % PARTS == TOP_PART else 4):
             source = nearest[k, way]
             if source >= 0:
                 weight = np.float32(reach) / np.float32(abs(source // w - at // w) + abs(source % w - at % w))
@@ -397,4 +386,4 @@ def warm_up() -> None:
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
         sum_cells(view, chosen, 1, cells[0])
         put_cells(cells[0], 1, chosen, 0.5, view)
-        paint(pixel, pixel, pixel, seen[0], colours, seen, chosen, 1.0, view.reshape(3, 4))
+        paint(pixel, pixel, colours, seen, chosen, 1.0, view.reshape(3, 4))

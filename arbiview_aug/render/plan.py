@@ -28,7 +28,6 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.image_ops import FRESH, Memory, level_size
-from arbiview_aug.scene.boxes import PARTS, TOP_PART
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +40,6 @@ class RenderConfig:
         antialias: Read from a source halved until the target no longer minifies it by two or more.
         seam_width: Width of the blended band along a seam, as a fraction of the target's width; 0 switches blending
             off. Wider bands show double images of near objects, narrower ones the exposure step.
-        distance_gamma: γ of w_distance = (d / d_max)^γ.
-        primary_bonus: w_primary of a source at the target's own centre: it is exact, so it wins wherever it sees.
         far_parallax_px: Largest shift of scene points beyond 2 m at which ``auto`` takes a pair of cameras as far.
         grid_step_px: Spacing of the nodes between which weights are interpolated. Positions are evaluated per pixel.
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
@@ -52,8 +49,6 @@ class RenderConfig:
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
     antialias: bool = True
     seam_width: float = 0.03
-    distance_gamma: float = 1.0
-    primary_bonus: float = 1e6
     far_parallax_px: float = 0.5
     grid_step_px: int = 8
     overlap_depth: bool = False
@@ -69,12 +64,7 @@ class RenderConfig:
             )
 
 
-_RANGES: dict[str, tuple[float, float]] = {
-    "seam_width": (0.0, 0.5),
-    "distance_gamma": (0.0, 16.0),
-    "primary_bonus": (1.0, 1e12),
-    "far_parallax_px": (0.0, 1e3),
-}
+_RANGES = {"seam_width": (0.0, 0.5), "far_parallax_px": (0.0, 1e3)}
 
 
 def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
@@ -267,20 +257,13 @@ class Paint:
 
     pixel: npt.NDArray[np.int32]  # (n,) int32 unseen pixels of objects, into the flattened view
     part: npt.NDArray[np.int32]  # (n,) int32 what they show: ``scene.boxes.BoxSurface.face_parts``
-    # (n,) int32 for sides, the nearest seen pixel of the object's sides in its row or column, -1 for none nearby
-    beside: npt.NDArray[np.int32]
     sample: npt.NDArray[np.int32]  # (m,) int32 seen pixels of objects, a sample
     sample_part: npt.NDArray[np.int32]  # (m,) int32 what those show
 
     @property
-    def is_top(self) -> BoolArray:
-        """(n,) whether ``part`` is a top."""
-        return np.asarray(self.part % PARTS == TOP_PART)
-
-    @property
     def nbytes(self) -> int:
         """Memory in bytes."""
-        return 3 * self.pixel.nbytes + 2 * self.sample.nbytes
+        return 2 * self.pixel.nbytes + 2 * self.sample.nbytes
 
 
 @dataclass(frozen=True)

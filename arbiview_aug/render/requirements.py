@@ -15,7 +15,6 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import look_apart
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.render.plan import RenderConfig
-from arbiview_aug.render.weights import distance_weight
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.scene.surface import NEAREST_SCENE_M, worst_parallax_px
 
@@ -34,7 +33,6 @@ HELPFUL_DATA = (
 _COARSE_MASK_PX = 16  # margin that must be unmasked: weights know masks by blocks of 8 px
 _ROUNDING_PX = 1e-6  # of float64 at the outermost pixel centres; plans allow for 1e-3
 _MAP_ERROR_PX = 1 / 32  # rounding of fixed-point maps, with as much again
-_LEAST_QUALITY = 0.05  # ``quality_weight`` of the coarsest exact source
 
 
 def baselines_m(source: Rig, target: Rig) -> FloatArray:
@@ -92,17 +90,12 @@ def harm_remedies(source: Rig, target: Rig) -> str:
 def covers_target_exactly(source: Camera, target: Camera, config: RenderConfig) -> bool:
     """Whether one source certainly wins every pixel of a target camera in its ego frame, so that others can be skipped.
 
-    It must share the target's centre, see all of it, and outweigh every other source. Decided by the corners, so for
-    pinholes only: a homography maps the target's rectangle to a convex quadrilateral.
+    It must share the target's centre, so that it outweighs every other source, and see all of it. Decided by the
+    corners, so for pinholes only: a homography maps the target's rectangle to a convex quadrilateral.
     """
     if not source.is_rectilinear or not target.is_rectilinear:
         return False
     if float(np.linalg.norm(source.center_m - target.center_m)) >= SAME_CENTER_M:
-        return False
-    # No weight of another source exceeds 1; at the border the outermost pixel centres have the least one.
-    nearest_px, middle_px = np.array(0.5), min(source.size) / 2
-    least = float(distance_weight(nearest_px, middle_px, config.distance_gamma)) * _LEAST_QUALITY
-    if least * config.primary_bonus <= 1:
         return False
     H = source.K @ source.cam2ego[:3, :3].T @ target.cam2ego[:3, :3] @ np.linalg.inv(target.K)
     (h, w), (source_h, source_w) = target.size, source.size

@@ -55,7 +55,6 @@ SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at ev
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
 _SAMPLES = 64  # colours of objects are read so many times along a view's shorter side
 _INSIDE_PX = 2  # this far inside their faces: pixels at a border mix two colours
-_BESIDE_PX = 8  # cracks are narrower than twice this
 MAGNIFIED = 0.8
 """A view is read by cubics where it has this few source pixels per pixel, or fewer, and most of it is read at its own
 centre: it is sharper for it, and a cubic costs 2.6 to 4.7 times as much. On synthetic streets, dB over bilinear by
@@ -297,9 +296,8 @@ class ViewPlanner:
         on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
         visible = seen_image(*on_nodes, (*kernel[:-1], positions))
         self.counters[f"pairs_{name}"] += 1
-        of_config = self.config.distance_gamma, self.config.primary_bonus
         is_primary = baseline_m < SAME_CENTER_M
-        score = source_weight(edge_px, min(source.size) / 2, parallax, resolution, is_primary, *of_config)
+        score = source_weight(edge_px, min(source.size) / 2, parallax, resolution, is_primary)
         certain = 255 * certainty(parallax_rad, resolution) if self.config.certainty else None
         return _Region(
             source=index,
@@ -551,9 +549,9 @@ def find_paint(face: npt.NDArray[np.int32], winner: npt.NDArray[np.int8], parts:
     from arbiview_aug.render import kernels
 
     step = max(1, min(face.shape) // _SAMPLES)
-    columns = np.empty((5, face.size), np.int32)
-    hidden, sampled = kernels.find_paint(face, parts, winner, _BESIDE_PX, step, _INSIDE_PX, columns)
-    return Paint(*columns[:3, :hidden].copy(), *columns[3:, :sampled].copy())
+    columns = np.empty((4, face.size), np.int32)
+    hidden, sampled = kernels.find_paint(face, parts, winner, step, _INSIDE_PX, columns)
+    return Paint(*columns[:2, :hidden].copy(), *columns[2:, :sampled].copy())
 
 
 # --- all views of a rig -----------------------------------------------------------------------------------------------
