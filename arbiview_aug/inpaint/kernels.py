@@ -239,8 +239,8 @@ def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: An
                     turned = code[n] & 3
                     if turned != part and turned != 3 - part:
                         continue
-                    i, t, lines = column[n], slope[n], met[2 * f + (turned != part)]
-                    r = g = b = far = total = _ZERO
+                    i, t, lines, total = column[n], slope[n], met[2 * f + (turned != part)], _ZERO
+                    line = lines[number[j, i]]
                     for side in range(2):
                         y, x = j + sy * (side or code[n] > 3), i + sx * (side or code[n] <= 3)
                         weight = t if side else _ONE - t
@@ -249,30 +249,22 @@ def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: An
                         known = sums[3, y, x]
                         if known > _LEAST_KNOWN:
                             total += weight
+                            cells, yy, xx = sums, np.float32(y), np.float32(x)
                             if kinds[j, i] > 2:
-                                yy = max((np.float32(y) + _HALF) * _QUARTER - _HALF, _ZERO)
-                                xx = max((np.float32(x) + _HALF) * _QUARTER - _HALF, _ZERO)
-                                weight /= _node(around[3], yy, xx)
-                                r += weight * _node(around[0], yy, xx)
-                                g += weight * _node(around[1], yy, xx)
-                                b += weight * _node(around[2], yy, xx)
-                            else:
-                                weight /= known
-                                r += weight * sums[0, y, x]
-                                g += weight * sums[1, y, x]
-                                b += weight * sums[2, y, x]
-                        elif kinds[y, x]:
-                            beyond = lines[number[y, x]]
-                            if beyond[3] > _ZERO:
-                                total += weight
-                                r += weight * beyond[0]
-                                g += weight * beyond[1]
-                                b += weight * beyond[2]
-                                far += weight * beyond[3]
+                                cells = around
+                                yy = max((yy + _HALF) * _QUARTER - _HALF, _ZERO)
+                                xx = max((xx + _HALF) * _QUARTER - _HALF, _ZERO)
+                            weight /= _node(cells[3], yy, xx)
+                            for c in range(3):
+                                line[c] += weight * _node(cells[c], yy, xx)
+                        elif kinds[y, x] and lines[number[y, x], 3] > _ZERO:
+                            total += weight
+                            for c in range(4):
+                                line[c] += weight * lines[number[y, x], c]
                     if total > _ZERO:
-                        line, share = lines[number[j, i]], _ONE / total
-                        line[0], line[1], line[2] = r * share, g * share, b * share
-                        line[3] = far * share + np.sqrt(_ONE + t * t)
+                        for c in range(4):
+                            line[c] *= _ONE / total
+                        line[3] += np.sqrt(_ONE + t * t)
     mixed = np.empty(3, np.float32)
     for j in range(ny):
         for i in range(nx):

@@ -14,7 +14,7 @@ An atlas holds the source images that a plan reads, below and beside each other,
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
@@ -40,8 +40,6 @@ class RenderConfig:
         antialias: Read from a source halved until the target no longer minifies it by two or more.
         seam_width: Width of the blended band along a seam, as a fraction of the target's width; 0 switches blending
             off. Wider bands show double images of near objects, narrower ones the exposure step.
-        far_parallax_px: Largest shift of scene points beyond 2 m at which ``auto`` takes a pair of cameras as far.
-        grid_step_px: Spacing of the nodes between which weights are interpolated. Positions are evaluated per pixel.
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
         certainty: Store the geometry's accuracy in plans, one byte a pixel; ``outputs=("confidence",)`` needs it.
     """
@@ -49,22 +47,15 @@ class RenderConfig:
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
     antialias: bool = True
     seam_width: float = 0.03
-    far_parallax_px: float = 0.5
-    grid_step_px: int = 8
     overlap_depth: bool = False
     certainty: bool = False
 
     def __post_init__(self) -> None:
-        check_ranges(self, _RANGES)
-        if self.grid_step_px not in (1, 4, 8, 16, 32):
-            raise ValueError(f"RenderConfig.grid_step_px: expected 1, 4, 8, 16 or 32, got {self.grid_step_px!r}")
+        check_ranges(self, {"seam_width": (0.0, 0.5)})
         if self.interpolation not in ("nearest", "linear", "cubic"):
             raise ValueError(
                 f"RenderConfig.interpolation: expected 'nearest', 'linear' or 'cubic', got {self.interpolation!r}"
             )
-
-
-_RANGES = {"seam_width": (0.0, 0.5), "far_parallax_px": (0.0, 1e3)}
 
 
 def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
@@ -82,6 +73,9 @@ PRESETS = {
 }
 """Settings by ``quality``."""
 
+
+GRID_STEP_PX = 8
+"""Spacing of the nodes between which weights are interpolated; positions are evaluated for every pixel."""
 
 OUTSIDE = -16
 """Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
@@ -183,10 +177,6 @@ class AtlasLayout:
             )
         return layout
 
-    def without_others(self, read: Collection[tuple[int, int]]) -> AtlasLayout:
-        """The same places for the (source, level) pairs that are read: images that win no pixel are not copied."""
-        return AtlasLayout(tuple(slot for slot in self.slots if (slot.source, slot.level) in read))
-
     def slot(self, source: int, level: int) -> Slot:
         """The place of one source at one level."""
         return next(s for s in self.slots if (s.source, s.level) == (source, level))
@@ -281,7 +271,7 @@ class ViewPlan:
     # (h, w) uint8 layer of each pixel, for fillers; None if no pixel in a source's image is occluded
     layers: npt.NDArray[np.uint8] | None = None
     paint: Paint | None = None  # unseen parts of objects; None without ``layers`` or objects
-    # (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the nodes ``config.grid_step_px``
+    # (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the nodes ``GRID_STEP_PX``
     # apart; None without holes, or with sources at its own centre alone
     road: BoolArray | None = None
 
@@ -325,7 +315,7 @@ class RenderPlan:
     target: Rig  # in the source's ego frame, on the source's road
     layout: AtlasLayout  # the sources' places in the atlas
     targets: tuple[ViewPlan, ...]  # one plan for each target camera
-    counters: dict[str, int] = field(default_factory=dict)  # pairs by surface, cells, pixels of solids, bands
+    counters: dict[str, int] = field(default_factory=dict)  # pairs by surface, cells, dense pixels, bands
     # The maps as tensors, by device (``torch_backend.maps_on``); not pickled.
     on_devices: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 

@@ -16,7 +16,7 @@ from arbiview_aug.cameras.rays import look_apart
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.scene.scene import GEOMETRIES
-from arbiview_aug.scene.surface import NEAREST_SCENE_M, worst_parallax_px
+from arbiview_aug.scene.surface import FAR_PARALLAX_PX, NEAREST_SCENE_M, worst_parallax_px
 
 SAME_CENTER_M = 1e-6
 """Centres closer than this coincide: a homography is exact."""
@@ -45,7 +45,7 @@ def needs_geometry(source: Rig, target: Rig, surface: str, config: RenderConfig)
     """Whether the source position of any target pixel depends on the distance of the scene.
 
     The target is in its own ego frame. Surface ``auto`` ignores pairs of cameras whose worst-case parallax is below
-    ``config.far_parallax_px``, and those without common points beyond ``NEAREST_SCENE_M``.
+    ``FAR_PARALLAX_PX``, and those without common points beyond ``NEAREST_SCENE_M``.
     """
     target = target.in_frame_of(source)
     for camera, row in zip(target, baselines_m(source, target), strict=True):
@@ -55,7 +55,7 @@ def needs_geometry(source: Rig, target: Rig, surface: str, config: RenderConfig)
             continue
         focal_px = float(camera.K[0, 0])
         for apart, b in zip(look_apart(camera, source.cameras, 1 / NEAREST_SCENE_M), row.tolist(), strict=True):
-            if surface == "auto" and (worst_parallax_px(b, focal_px) < config.far_parallax_px or apart):
+            if surface == "auto" and (worst_parallax_px(b, focal_px) < FAR_PARALLAX_PX or apart):
                 continue
             if b >= SAME_CENTER_M:
                 return True

@@ -33,6 +33,7 @@ from arbiview_aug.environment import compilation_announced
 from arbiview_aug.image_ops import at_level, level_size
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.plan import (
+    GRID_STEP_PX,
     NEARER,
     ROAD_M,
     AtlasLayout,
@@ -49,7 +50,7 @@ from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.weights import SecondBest, seam_weights, source_weight
 from arbiview_aug.scene.point_cloud import occlusion_level, seen_through
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
-from arbiview_aug.scene.surface import is_within_wall, worst_parallax_px
+from arbiview_aug.scene.surface import FAR_PARALLAX_PX, is_within_wall, worst_parallax_px
 
 SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
@@ -117,7 +118,7 @@ class ViewPlanner:
     """Builds one target's plan in two steps: what each source sees, then who wins and where ``seams`` are blended.
 
     Positions, visibility and winners are evaluated at every pixel (``kernels``). Weights are smooth: they are known on
-    nodes ``config.grid_step_px`` apart, which lie on pixel centres, and interpolated between.
+    nodes ``GRID_STEP_PX`` apart, which lie on pixel centres, and interpolated between.
     """
 
     def __init__(
@@ -139,7 +140,7 @@ class ViewPlanner:
         # From outside, the far wall is a narrow strip with edges, which cells could step over.
         coarse = min(camera.size) >= SMALL_SIDE_PX
         coarse &= is_within_wall(camera.center_m) or not GEOMETRIES[surface].has_wall
-        self.step = config.grid_step_px if coarse else 1
+        self.step = GRID_STEP_PX if coarse else 1
         corners = [np.minimum(np.arange(0, n + self.step, self.step), n - 1) for n in camera.size]
         # The outermost nodes lie half a cell inside: a magnified source does not see the outermost pixels.
         inset = self.step // 2
@@ -172,7 +173,7 @@ class ViewPlanner:
             return "infinity", "centres coincide: exact"
         if self.surface != "auto":
             return self.surface, "asked for"
-        if worst < self.config.far_parallax_px:
+        if worst < FAR_PARALLAX_PX:
             return "infinity", f"worst-case parallax {worst:.2f} px"
         return self.scene.best, f"centres {baseline_m:.2f} m apart"
 
@@ -232,9 +233,7 @@ class ViewPlanner:
             solid, face = (widened(*one) for one in zip(surface.drawn(camera, rays, memory), (0, -1), strict=True))
             shown = face >= 0
             np.copyto(q, solid, where=shown)
-            solid_px = int(np.count_nonzero(shown))
-            self.counters["solid_pixels"] += solid_px
-            face = face if solid_px else np.zeros((0, 0), np.int32)
+            face = face if shown.any() else np.zeros((0, 0), np.int32)
         at_nodes = q[self.at_nodes], face[self.at_nodes] if face.size else face
         uncertainty = surface.uncertainty(center, self._directions, at_nodes[0])
         nearest, farthest = np.empty((2, *self._open.shape), np.float32)
@@ -577,8 +576,7 @@ def build_plan(
         source: The rig that recorded the images.
         target: The rig to render, in its own ego frame: the two roads are made to coincide.
         geometry: A name in ``GEOMETRIES``; ``auto``: for each pair of cameras ``infinity`` where their centres
-            coincide or the worst-case parallax is below
-            ``config.far_parallax_px``, else the scene's best.
+            coincide or the worst-case parallax is below ``FAR_PARALLAX_PX``, else the scene's best.
         config: Settings; the ``fast`` preset by default.
         scene: Known geometry, in the source's ego frame.
         maps: Rays and masks of cameras, to be reused by later plans.
@@ -628,6 +626,7 @@ def _built(
     for planner, view in zip(planners, targets, strict=True):
         sources = view.sources
         read |= {(region.source, region.level) for region in planner.regions if region.source in sources}
-    layout = layout.without_others(read)
+    # The same places for what is read: images that win no pixel are not copied.
+    layout = AtlasLayout(tuple(slot for slot in layout.slots if (slot.source, slot.level) in read))
     counters["bands"] = sum(len(t.bands) for t in targets)
     return RenderPlan(source, target, layout, targets, dict(counters))
