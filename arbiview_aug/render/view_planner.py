@@ -57,11 +57,8 @@ _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop ou
 _SAMPLES = 64  # colours of objects are read so many times along a view's shorter side
 _INSIDE_PX = 2  # this far inside their faces: pixels at a border mix two colours
 MAGNIFIED = 0.8
-"""A view is read by cubics where it has this few source pixels per pixel, or fewer, and most of it is read at its own
-centre: it is sharper for it, and a cubic costs 2.6 to 4.7 times as much. On synthetic streets, dB over bilinear by
-source pixels per pixel: 0.57 +0.6, 0.73 +0.7 (there a detector recovers 91 instead of 77 % of the gap), 0.94 +0.5, 1.06
-+0.1, 1.3 -0.2. Real frames turned by up to 35 degrees, 0.8 to 1, gain nothing: -0.04 dB on DDAD. Nor do other centres,
-where the surface is what errs: 0.7 m higher -0.1 dB, and the detector 75 instead of 77 %."""
+"""A view is read by cubics where it has at most this many source pixels per pixel, and is mostly read at its own
+centre: docs/benchmarks.md (Ablation)."""
 
 
 @dataclass(frozen=True)
