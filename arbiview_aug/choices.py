@@ -100,6 +100,7 @@ SETTINGS = {
     "moved": "p_translate",
     "known": "known_weight",
     "transplanted": "p_mask_transfer",
+    **dict.fromkeys(("leave_one_out", "virtual", "real_sources"), "gone: no measurement showed a gain"),
 }
 """Settings of a training."""
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import inspect
 import itertools
+import json
 import math
+import re
 import signal
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +21,7 @@ import torch
 from hypothesis import HealthCheck, Phase, given, settings
 
 from arbiview_aug import Camera, Rig
+from arbiview_aug.datasets.frame_folder import SEQUENCE_FILE, write_frame
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.lidar import ColouredPoints, sparse_metrics
 from arbiview_aug.evaluate.metrics import mean_of
@@ -251,3 +254,18 @@ def score_targets(
     """Mean sparse metrics over all cameras of all target rigs, rendered to one image per camera."""
     pairs = ((camera, image) for target in targets for camera, image in zip(target, render(target), strict=True))
     return mean_of([score for camera, image in pairs if (score := sparse_metrics(image, camera, points)) is not None])
+
+
+def told_db(reason: str) -> tuple[float, float]:
+    """PSNR before and after, as a report's reason tells them."""
+    ((before, after),) = re.findall(r"([\d.]+) to ([\d.]+) dB", reason)
+    return float(before), float(after)
+
+
+def write_drive(root: Path, frames: Sequence[Mapping[str, Any]]) -> None:
+    """Write the frames of one drive (with ``ego2world`` and ``time_s``) in order of time, and ``sequence.json``."""
+    entries = []
+    for k, frame in enumerate(sorted(frames, key=lambda frame: float(frame["time_s"]))):
+        entries.append({"name": f"{k:04}", "time_s": float(frame["time_s"])})
+        write_frame(root / f"{k:04}", frame)
+    (root / SEQUENCE_FILE).write_text(json.dumps({"frames": entries}))

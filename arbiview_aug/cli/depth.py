@@ -26,9 +26,9 @@ from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.environment import compilation_announced
-from arbiview_aug.errors import ArbiviewError, WarnOnce, described
+from arbiview_aug.errors import WarnOnce, described
 from arbiview_aug.sample.inputs import read_frames, read_scene
-from arbiview_aug.sample.neighbours import Neighbour, read_neighbours, warn_lost
+from arbiview_aug.sample.neighbours import Neighbour, neighbour_images, read_neighbours
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, learned_depth
 from arbiview_aug.temporal.motion_depth import motion_depth, warm_up
@@ -83,12 +83,10 @@ def _from_motion(depths: DepthFolder, token: str, sample: dict[str, Any]) -> Don
     boxes = None if sample.get("boxes_3d") is None else sample["boxes_3d"].numpy().astype(float)
 
     def load(neighbour: Neighbour) -> Sequence[torch.Tensor] | None:
-        try:
-            return neighbour.images(frame.images)
-        except (ArbiviewError, OSError) as error:
-            warn_lost(warn, neighbour.name, error)
+        images = neighbour_images(neighbour, frame.images, warn)
+        if images is None:
             used.remove(neighbour.name)  # the frame is done again once the neighbour can be read
-            return None
+        return images
 
     depth = motion_depth(frame.rig, frame.images, neighbours, boxes, load)
     depths.write(token, sample["rig"], depth, used)

@@ -404,12 +404,3 @@ def write_frame(folder: Path, sample: Mapping[str, Any]) -> None:
     if "points" in sample:
         np.save(folder / POINTS_FILE, sample["points"].numpy())
     (folder / CALIBRATION_FILE).write_text(json.dumps(calib, indent=1))
-
-
-def write_drive(root: Path, frames: Sequence[Mapping[str, Any]]) -> None:
-    """Write the frames of one drive (with ``ego2world`` and ``time_s``) in order of time, and ``sequence.json``."""
-    entries = []
-    for k, frame in enumerate(sorted(frames, key=lambda frame: float(frame["time_s"]))):
-        entries.append({"name": f"{k:04}", "time_s": float(frame["time_s"])})
-        write_frame(root / f"{k:04}", frame)
-    (root / SEQUENCE_FILE).write_text(json.dumps({"frames": entries}))

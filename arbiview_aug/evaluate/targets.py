@@ -43,11 +43,6 @@ def paper_target(rig: Rig, share: float) -> Rig:
     return without_masks(rig.with_cameras(cameras))
 
 
-def shifted_target(rig: Rig, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0, *, yaw_deg: float = 0.0) -> Rig:
-    """All cameras moved along the ego's axes, and turned."""
-    return without_masks(rig.shifted(x_m, y_m, z_m).turned(yaw_deg=yaw_deg))
-
-
 VEHICLES = ("waymo", "argoverse2", "lyft_l5", "nuplan")  # shipped rigs used as other vehicles
 TRUCK_UP_M = 1.0  # height of a truck's cameras over a sedan's
 
@@ -71,7 +66,7 @@ def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:
         return {f"yaw {yaw:+g}": without_masks(rig.turned(yaw_deg=yaw)) for yaw in YAWS_DEG}
     if kind == "vehicles":
         return vehicle_targets(rig)
-    return {"truck": shifted_target(rig, z_m=TRUCK_UP_M)}
+    return {"truck": without_masks(rig.shifted(z_m=TRUCK_UP_M))}
 
 
 def without_masks(rig: Rig) -> Rig:

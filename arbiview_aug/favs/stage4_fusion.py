@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.render.weights import distance_weight, primary_weight
+from arbiview_aug.render.weights import distance_weight
 
 Float32Image = npt.NDArray[np.float32]
 
@@ -92,15 +92,15 @@ def fusion_weight(
     weight = coverage.astype(np.float64)
     if config.use_distance_weight and not coverage.all():  # without a border there is no distance to it
         distance = cv2.distanceTransform(coverage.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        weight = weight * distance_weight(distance.astype(np.float64), float(distance.max()), config.distance_gamma)
+        weight = weight * distance_weight(distance.astype(np.float64), float(distance.max())) ** config.distance_gamma
     if config.use_gradient_weight:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         gradient = [cv2.Sobel(grey, cv2.CV_32F, dx, dy, scale=1 / 8) for dx, dy in ((1, 0), (0, 1))]
         weight = weight * gradient_weight(np.asarray(cv2.magnitude(*gradient), np.float64), config.gradient_sigma)
     if config.use_quality_weight and not primary:
         weight = weight * (config.unmatched_quality + (1 - config.unmatched_quality) * quality)
-    if config.use_primary_weight:
-        weight = weight * primary_weight(primary, config.primary_bonus)
+    if config.use_primary_weight and primary:
+        weight = weight * config.primary_bonus
     # Small weights may underflow in float32, but covered pixels must stay covered.
     return np.where(coverage, np.maximum(weight, np.finfo(np.float32).tiny), 0).astype(np.float32)
 

@@ -7,7 +7,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -88,33 +87,24 @@ class Diffusion(Inpainter, torch.nn.Module):
         return [put(one, list(views.images), list(views.generated)) for one, views in zip(rendered, done, strict=True)]
 
 
-def load_inpainter(
-    where: str | Path | None = None,
-    *,
-    steps: int | None = None,
-    guidance: float | None = None,
-    min_confidence: float = 0.0,
-    seed: int = 0,
-) -> Diffusion | NetworkInpainter:
+def load_inpainter(where: str | Path | None = None, *, steps: int | None = None) -> Diffusion | NetworkInpainter:
     """Load what fills holes: a generator's folder, a TorchScript file, or an inpainting pipeline of diffusers.
 
     Args:
         where: The folder, file or hub id; None loads the shipped generator.
-        steps: Settings as for ``Diffusion``; TorchScript files have no ``steps`` and ``guidance``.
+        steps: As for ``Diffusion``; TorchScript files have none.
 
     Raises:
         GeneratorError: None of these.
     """
-    settings: dict[str, Any] = {"min_confidence": min_confidence, "seed": seed}
-    if where is not None and os.path.isfile(where):
-        return TorchScriptInpainter(where, **settings)
-    settings |= {"steps": steps, "guidance": guidance}
     if where is None:
-        return Diffusion(**settings)
+        return Diffusion(steps=steps)
+    if os.path.isfile(where):
+        return TorchScriptInpainter(where)
     is_there = os.path.isdir(where)
     if not is_there and not _HUB_ID.fullmatch(str(where)):
         expected = "a folder of a generator or of diffusers, a TorchScript file, or OWNER/NAME on the Hugging Face Hub"
         raise GeneratorError(f"generator {where}: expected {expected}, found none")
     if not is_there or (Path(where) / "model_index.json").is_file():
-        return PipelineInpainter.from_pretrained(where, **settings)
-    return Diffusion(Generator.from_pretrained(where), **settings)
+        return PipelineInpainter.from_pretrained(where, steps=steps)
+    return Diffusion(Generator.from_pretrained(where), steps=steps)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.environment import called, compiled, inlined
+from arbiview_aug.scene.boxes import PARTS, TOP_PART
 
 _ZERO, _ONE, _HALF, _QUARTER = np.float32(0), np.float32(1), np.float32(0.5), np.float32(0.25)
 _TINY = np.float32(1e-12)
@@ -238,8 +239,8 @@ def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: An
                     turned = code[n] & 3
                     if turned != part and turned != 3 - part:
                         continue
-                    i, t, lines = column[n], slope[n], met[2 * f + (turned != part)]
-                    r = g = b = far = total = _ZERO
+                    i, t, lines, total = column[n], slope[n], met[2 * f + (turned != part)], _ZERO
+                    line = lines[number[j, i]]
                     for side in range(2):
                         y, x = j + sy * (side or code[n] > 3), i + sx * (side or code[n] <= 3)
                         weight = t if side else _ONE - t
@@ -248,30 +249,22 @@ def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: An
                         known = sums[3, y, x]
                         if known > _LEAST_KNOWN:
                             total += weight
+                            cells, yy, xx = sums, np.float32(y), np.float32(x)
                             if kinds[j, i] > 2:
-                                yy = max((np.float32(y) + _HALF) * _QUARTER - _HALF, _ZERO)
-                                xx = max((np.float32(x) + _HALF) * _QUARTER - _HALF, _ZERO)
-                                weight /= _node(around[3], yy, xx)
-                                r += weight * _node(around[0], yy, xx)
-                                g += weight * _node(around[1], yy, xx)
-                                b += weight * _node(around[2], yy, xx)
-                            else:
-                                weight /= known
-                                r += weight * sums[0, y, x]
-                                g += weight * sums[1, y, x]
-                                b += weight * sums[2, y, x]
-                        elif kinds[y, x]:
-                            beyond = lines[number[y, x]]
-                            if beyond[3] > _ZERO:
-                                total += weight
-                                r += weight * beyond[0]
-                                g += weight * beyond[1]
-                                b += weight * beyond[2]
-                                far += weight * beyond[3]
+                                cells = around
+                                yy = max((yy + _HALF) * _QUARTER - _HALF, _ZERO)
+                                xx = max((xx + _HALF) * _QUARTER - _HALF, _ZERO)
+                            weight /= _node(cells[3], yy, xx)
+                            for c in range(3):
+                                line[c] += weight * _node(cells[c], yy, xx)
+                        elif kinds[y, x] and lines[number[y, x], 3] > _ZERO:
+                            total += weight
+                            for c in range(4):
+                                line[c] += weight * lines[number[y, x], c]
                     if total > _ZERO:
-                        line, share = lines[number[j, i]], _ONE / total
-                        line[0], line[1], line[2] = r * share, g * share, b * share
-                        line[3] = far * share + np.sqrt(_ONE + t * t)
+                        for c in range(4):
+                            line[c] *= _ONE / total
+                        line[3] += np.sqrt(_ONE + t * t)
     mixed = np.empty(3, np.float32)
     for j in range(ny):
         for i in range(nx):
@@ -327,20 +320,14 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
 
 
 @compiled
-def paint(
-    pixel: Any, part: Any, beside: Any, is_top: Any, table: Any, seen: Any, layers: Any, reach: float, view: Any
-) -> None:
-    """Paint the unseen pixels of objects in a view: by the pixel beside them, tops in their part's colour.
+def paint(pixel: Any, part: Any, table: Any, seen: Any, layers: Any, reach: float, view: Any) -> None:
+    """Paint the unseen pixels of objects in a view: tops in their part's colour, without a colour not at all.
 
-    Sides mix their part's colour with the nearest seen pixels of objects in their row and column. Without a colour
-    they stay background.
+    Sides mix their part's colour with the nearest seen pixels of objects in their row and column.
 
     Args:
-        pixel: (n,) into the flattened view; as are ``part``, ``beside`` and ``is_top`` an attribute of
-            ``view_plan.Paint``.
-        part: (n,).
-        beside: (n,).
-        is_top: (n,).
+        pixel: (n,) into the flattened view, ascending.
+        part: (n,) what they show, as in ``Paint``.
         table: (P, 3) float32 colours of the parts; the first is negative where unknown.
         seen: (h, w) bool.
         layers: (h, w) uint8 as in ``ViewPlan``.
@@ -363,19 +350,13 @@ def paint(
                     nearest[k, way] = nearest[number[y, x], way]
     mixed = np.empty(3, np.float32)
     for k in range(pixel.shape[0]):
-        at, source = pixel[k], beside[k]
-        if seen[at // w, at % w]:
-            continue
-        if source >= 0:
-            for c in range(3):
-                view[c, at] = view[c, source]
-            continue
-        if part[k] >= table.shape[0] or table[part[k], 0] < _ZERO:
+        at = pixel[k]
+        if seen[at // w, at % w] or part[k] >= table.shape[0] or table[part[k], 0] < _ZERO:
             continue  # nothing of it is seen: another object's pixels would make it a ghost
         total = _ONE
         for c in range(3):
             mixed[c] = table[part[k], c]
-        for way in range(0 if is_top[k] else 4):
+        for way in range(0 if part[k] % PARTS == TOP_PART else 4):
             source = nearest[k, way]
             if source >= 0:
                 weight = np.float32(reach) / np.float32(abs(source // w - at // w) + abs(source % w - at % w))
@@ -397,4 +378,4 @@ def warm_up() -> None:
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
         sum_cells(view, chosen, 1, cells[0])
         put_cells(cells[0], 1, chosen, 0.5, view)
-        paint(pixel, pixel, pixel, seen[0], colours, seen, chosen, 1.0, view.reshape(3, 4))
+        paint(pixel, pixel, colours, seen, chosen, 1.0, view.reshape(3, 4))

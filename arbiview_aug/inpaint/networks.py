@@ -139,12 +139,11 @@ class PipelineInpainter(NetworkInpainter):
         *,
         steps: int | None = None,
         guidance: float | None = None,
-        min_confidence: float = 0.0,
-        seed: int = 0,
+        **settings: Any,
     ) -> None:
         parts = {name: part for name, part in pipeline.components.items() if isinstance(part, torch.nn.Module)}
-        super().__init__(torch.nn.ModuleDict(parts), size, multiple, batch, min_confidence=min_confidence, seed=seed)
-        checked_settings(min_confidence, seed, steps, guidance)
+        super().__init__(torch.nn.ModuleDict(parts), size, multiple, batch, **settings)
+        checked_settings(self.min_confidence, self.seed, steps, guidance)
         self.pipeline, self.prompt, self.steps, self.guidance = pipeline, prompt, steps, guidance
         pipeline.set_progress_bar_config(disable=True)
 
@@ -188,8 +187,9 @@ class PipelineInpainter(NetworkInpainter):
         multiple = int(pipeline.vae_scale_factor)
         core = getattr(pipeline, "unet", None) or pipeline.transformer
         native_px = int(getattr(core.config, "sample_size", None) or 64) * multiple
-        of_inpainter = {"steps": steps, "guidance": guidance, "min_confidence": min_confidence, "seed": seed}
-        return cls(pipeline, native_px if size is None else size, multiple, batch, prompt, **of_inpainter)  # type: ignore[arg-type]
+        of_all: dict[str, Any] = {"min_confidence": min_confidence, "seed": seed}
+        size = native_px if size is None else size
+        return cls(pipeline, size, multiple, batch, prompt, steps=steps, guidance=guidance, **of_all)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         h, w = images.shape[-2:]
@@ -217,28 +217,21 @@ class TorchScriptInpainter(NetworkInpainter):
         size: Longest side of an image that it sees.
         multiple: Of which sides are multiples.
         batch: Images that it sees at once.
-        min_confidence: As for every ``Inpainter``, like ``seed``.
+        settings: ``min_confidence`` and ``seed``, as for every ``Inpainter``.
 
     Raises:
         GeneratorError: No such file, or no TorchScript.
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        size: int = 512,
-        multiple: int = 8,
-        batch: int = 4,
-        min_confidence: float = 0.0,
-        seed: int = 0,
+        self, path: str | Path, *, size: int = 512, multiple: int = 8, batch: int = 4, **settings: Any
     ) -> None:
         try:
             network = torch.jit.load(str(path), map_location="cpu")
         except (RuntimeError, ValueError, OSError) as error:
             text = " ".join(str(error).split())[:300]
             raise GeneratorError(f"{path}: expected a TorchScript file: {text}") from None
-        super().__init__(network, size, multiple, batch, min_confidence=min_confidence, seed=seed)
+        super().__init__(network, size, multiple, batch, **settings)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         done: torch.Tensor = self.network(images, holes[:, None].to(images.dtype))

@@ -85,8 +85,6 @@ class PhotometricReport:
     gains: tuple[float, ...]  # one for each source camera, median 1 before clipping; all 1 if they were declined
     accepted: bool  # whether the images are changed
     reason: str  # why, or why not
-    raw_db_before: float | None = None  # PSNR between neighbours on held-out tiles, mean over pairs; None without a fit
-    raw_db_after: float | None = None  # the same with the estimated gains, accepted or not
 
     def __str__(self) -> str:
         if not self.accepted:
@@ -181,8 +179,8 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
     after = _held_out_db(pixels, overlaps)
     reason = f"overlap {before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < MIN_RISE_DB:
-        return PhotometricReport(none, False, f"gains would not help, {reason}", before, after)
-    return PhotometricReport(tuple(gains[np.argsort(overlaps.order)].tolist()), True, reason, before, after)
+        return PhotometricReport(none, False, f"gains would not help, {reason}")
+    return PhotometricReport(tuple(gains[np.argsort(overlaps.order)].tolist()), True, reason)
 
 
 def _read(images: Sequence[torch.Tensor], overlaps: Overlaps) -> _Pixels:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_row, turn_row
 from arbiview_aug.environment import called, compiled, inlined
 from arbiview_aug.render.plan import OUTSIDE
-from arbiview_aug.scene.boxes import PARTS, PIECES, TOP_PART
+from arbiview_aug.scene.boxes import PIECES
 from arbiview_aug.scene.kernels import upsampled_row
 
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
@@ -614,19 +614,16 @@ def mark_objects(q: Any, face: Any, winner: Any, limit: Any, cell: int, layers: 
 
 
 @compiled
-def find_paint(
-    face: Any, part: Any, winner: Any, reach: int, step: int, margin: int, table: Any
-) -> tuple[int, int]:  # fmt: skip
+def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table: Any) -> tuple[int, int]:
     """Find the unseen pixels of objects, and a sample of seen ones; return their numbers.
 
     Args:
         face: (h, w) int32 faces of objects, -1 elsewhere.
         part: (F,) int32 ``scene.boxes.BoxSurface.face_parts``.
         winner: (h, w) int8 source, -1 for none.
-        reach: Distance up to which seen pixels of an object's sides are looked for; those beside a top are its border.
         step: Distance of samples.
         margin: Distance at which pixels around a sample must be of its face.
-        table: (5, h w) int32, written: the attributes of ``view_plan.Paint``.
+        table: (4, h w) int32, written: the attributes of ``view_plan.Paint``.
     """
     h, w = face.shape
     hidden, sampled = 0, 0
@@ -636,17 +633,7 @@ def find_paint(
             if number < 0:
                 continue
             if winner[y, x] < 0:
-                item, kind = divmod(part[number], PARTS)
-                beside = -1
-                for far in range(1, 1 if kind == TOP_PART else reach + 1):
-                    for way in range(4):
-                        yy, xx = y + (way == 2) * far - (way == 3) * far, x + (way == 0) * far - (way == 1) * far
-                        if beside < 0 and 0 <= yy < h and 0 <= xx < w and winner[yy, xx] >= 0 and face[yy, xx] >= 0:
-                            there = divmod(part[face[yy, xx]], PARTS)
-                            beside = yy * w + xx if there[0] == item and there[1] != TOP_PART else -1
-                    if beside >= 0:
-                        break
-                table[0, hidden], table[1, hidden], table[2, hidden] = y * w + x, part[number], beside
+                table[0, hidden], table[1, hidden] = y * w + x, part[number]
                 hidden += 1
             elif y % step == 0 and x % step == 0 and min(y, x, h - 1 - y, w - 1 - x) >= margin:
                 if (
@@ -655,7 +642,7 @@ def find_paint(
                     and face[y, x - margin] == number
                     and face[y, x + margin] == number
                 ):
-                    table[3, sampled], table[4, sampled] = y * w + x, part[number]
+                    table[2, sampled], table[3, sampled] = y * w + x, part[number]
                     sampled += 1
     return hidden, sampled
 

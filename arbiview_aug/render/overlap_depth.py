@@ -135,11 +135,7 @@ class OverlapReport:
     first: str  # names of the two cameras
     second: str
     accepted: bool  # whether the surface changes
-    reason: str  # why, or why not
-    # PSNR between the two in their half-way view on held-out tiles, after a gain and an offset per channel fitted on
-    # others; None without a fit.
-    db_before: float | None = None
-    db_after: float | None = None  # the same with the estimated distances, accepted or not
+    reason: str  # why, or why not; PSNR is that of the two in their half-way view, fitted as ``overlap_psnr`` does
 
     def __str__(self) -> str:
         return f"{self.first} and {self.second}: {'' if self.accepted else 'distances as they were, '}{self.reason}"
@@ -271,11 +267,11 @@ def _refine(
     after = _fitted_db(one, two, fit, test)
     reason = f"{before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < MIN_RISE_DB:
-        return None, OverlapReport(*names, False, f"refining would not help, {reason}", before, after)
+        return None, OverlapReport(*names, False, f"refining would not help, {reason}")
     final = _smoothed(along, epipolar, trust * (fit | test))
     if not final.valid.any():
-        return None, OverlapReport(*names, False, "too little is found in both images", before, after)
-    return _extended(strip, final), OverlapReport(*names, True, reason, before, after)
+        return None, OverlapReport(*names, False, "too little is found in both images")
+    return _extended(strip, final), OverlapReport(*names, True, reason)
 
 
 def _read_over(q: FloatArray, strip: _Strip, camera: Camera, small: _Small) -> npt.NDArray[np.float32]:

@@ -14,7 +14,7 @@ An atlas holds the source images that a plan reads, below and beside each other,
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
@@ -28,7 +28,6 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.image_ops import FRESH, Memory, level_size
-from arbiview_aug.scene.boxes import PARTS, TOP_PART
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,10 +40,6 @@ class RenderConfig:
         antialias: Read from a source halved until the target no longer minifies it by two or more.
         seam_width: Width of the blended band along a seam, as a fraction of the target's width; 0 switches blending
             off. Wider bands show double images of near objects, narrower ones the exposure step.
-        distance_gamma: γ of w_distance = (d / d_max)^γ.
-        primary_bonus: w_primary of a source at the target's own centre: it is exact, so it wins wherever it sees.
-        far_parallax_px: Largest shift of scene points beyond 2 m at which ``auto`` takes a pair of cameras as far.
-        grid_step_px: Spacing of the nodes between which weights are interpolated. Positions are evaluated per pixel.
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
         certainty: Store the geometry's accuracy in plans, one byte a pixel; ``outputs=("confidence",)`` needs it.
     """
@@ -52,29 +47,15 @@ class RenderConfig:
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
     antialias: bool = True
     seam_width: float = 0.03
-    distance_gamma: float = 1.0
-    primary_bonus: float = 1e6
-    far_parallax_px: float = 0.5
-    grid_step_px: int = 8
     overlap_depth: bool = False
     certainty: bool = False
 
     def __post_init__(self) -> None:
-        check_ranges(self, _RANGES)
-        if self.grid_step_px not in (1, 4, 8, 16, 32):
-            raise ValueError(f"RenderConfig.grid_step_px: expected 1, 4, 8, 16 or 32, got {self.grid_step_px!r}")
+        check_ranges(self, {"seam_width": (0.0, 0.5)})
         if self.interpolation not in ("nearest", "linear", "cubic"):
             raise ValueError(
                 f"RenderConfig.interpolation: expected 'nearest', 'linear' or 'cubic', got {self.interpolation!r}"
             )
-
-
-_RANGES: dict[str, tuple[float, float]] = {
-    "seam_width": (0.0, 0.5),
-    "distance_gamma": (0.0, 16.0),
-    "primary_bonus": (1.0, 1e12),
-    "far_parallax_px": (0.0, 1e3),
-}
 
 
 def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
@@ -92,6 +73,9 @@ PRESETS = {
 }
 """Settings by ``quality``."""
 
+
+GRID_STEP_PX = 8
+"""Spacing of the nodes between which weights are interpolated; positions are evaluated for every pixel."""
 
 OUTSIDE = -16
 """Whole-pixel coordinate of a map entry that reads nothing: far enough that no bilinear tap touches the atlas."""
@@ -193,10 +177,6 @@ class AtlasLayout:
             )
         return layout
 
-    def without_others(self, read: Collection[tuple[int, int]]) -> AtlasLayout:
-        """The same places for the (source, level) pairs that are read: images that win no pixel are not copied."""
-        return AtlasLayout(tuple(slot for slot in self.slots if (slot.source, slot.level) in read))
-
     def slot(self, source: int, level: int) -> Slot:
         """The place of one source at one level."""
         return next(s for s in self.slots if (s.source, s.level) == (source, level))
@@ -267,20 +247,13 @@ class Paint:
 
     pixel: npt.NDArray[np.int32]  # (n,) int32 unseen pixels of objects, into the flattened view
     part: npt.NDArray[np.int32]  # (n,) int32 what they show: ``scene.boxes.BoxSurface.face_parts``
-    # (n,) int32 for sides, the nearest seen pixel of the object's sides in its row or column, -1 for none nearby
-    beside: npt.NDArray[np.int32]
     sample: npt.NDArray[np.int32]  # (m,) int32 seen pixels of objects, a sample
     sample_part: npt.NDArray[np.int32]  # (m,) int32 what those show
 
     @property
-    def is_top(self) -> BoolArray:
-        """(n,) whether ``part`` is a top."""
-        return np.asarray(self.part % PARTS == TOP_PART)
-
-    @property
     def nbytes(self) -> int:
         """Memory in bytes."""
-        return 3 * self.pixel.nbytes + 2 * self.sample.nbytes
+        return 2 * self.pixel.nbytes + 2 * self.sample.nbytes
 
 
 @dataclass(frozen=True)
@@ -298,7 +271,7 @@ class ViewPlan:
     # (h, w) uint8 layer of each pixel, for fillers; None if no pixel in a source's image is occluded
     layers: npt.NDArray[np.uint8] | None = None
     paint: Paint | None = None  # unseen parts of objects; None without ``layers`` or objects
-    # (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the nodes ``config.grid_step_px``
+    # (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the nodes ``GRID_STEP_PX``
     # apart; None without holes, or with sources at its own centre alone
     road: BoolArray | None = None
 
@@ -342,7 +315,7 @@ class RenderPlan:
     target: Rig  # in the source's ego frame, on the source's road
     layout: AtlasLayout  # the sources' places in the atlas
     targets: tuple[ViewPlan, ...]  # one plan for each target camera
-    counters: dict[str, int] = field(default_factory=dict)  # pairs by surface, cells, pixels of solids, bands
+    counters: dict[str, int] = field(default_factory=dict)  # pairs by surface, cells, dense pixels, bands
     # The maps as tensors, by device (``torch_backend.maps_on``); not pickled.
     on_devices: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 

@@ -15,9 +15,8 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import look_apart
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.render.plan import RenderConfig
-from arbiview_aug.render.weights import distance_weight
 from arbiview_aug.scene.scene import GEOMETRIES
-from arbiview_aug.scene.surface import NEAREST_SCENE_M, worst_parallax_px
+from arbiview_aug.scene.surface import FAR_PARALLAX_PX, NEAREST_SCENE_M, worst_parallax_px
 
 SAME_CENTER_M = 1e-6
 """Centres closer than this coincide: a homography is exact."""
@@ -34,7 +33,6 @@ HELPFUL_DATA = (
 _COARSE_MASK_PX = 16  # margin that must be unmasked: weights know masks by blocks of 8 px
 _ROUNDING_PX = 1e-6  # of float64 at the outermost pixel centres; plans allow for 1e-3
 _MAP_ERROR_PX = 1 / 32  # rounding of fixed-point maps, with as much again
-_LEAST_QUALITY = 0.05  # ``quality_weight`` of the coarsest exact source
 
 
 def baselines_m(source: Rig, target: Rig) -> FloatArray:
@@ -47,7 +45,7 @@ def needs_geometry(source: Rig, target: Rig, surface: str, config: RenderConfig)
     """Whether the source position of any target pixel depends on the distance of the scene.
 
     The target is in its own ego frame. Surface ``auto`` ignores pairs of cameras whose worst-case parallax is below
-    ``config.far_parallax_px``, and those without common points beyond ``NEAREST_SCENE_M``.
+    ``FAR_PARALLAX_PX``, and those without common points beyond ``NEAREST_SCENE_M``.
     """
     target = target.in_frame_of(source)
     for camera, row in zip(target, baselines_m(source, target), strict=True):
@@ -57,7 +55,7 @@ def needs_geometry(source: Rig, target: Rig, surface: str, config: RenderConfig)
             continue
         focal_px = float(camera.K[0, 0])
         for apart, b in zip(look_apart(camera, source.cameras, 1 / NEAREST_SCENE_M), row.tolist(), strict=True):
-            if surface == "auto" and (worst_parallax_px(b, focal_px) < config.far_parallax_px or apart):
+            if surface == "auto" and (worst_parallax_px(b, focal_px) < FAR_PARALLAX_PX or apart):
                 continue
             if b >= SAME_CENTER_M:
                 return True
@@ -92,17 +90,12 @@ def harm_remedies(source: Rig, target: Rig) -> str:
 def covers_target_exactly(source: Camera, target: Camera, config: RenderConfig) -> bool:
     """Whether one source certainly wins every pixel of a target camera in its ego frame, so that others can be skipped.
 
-    It must share the target's centre, see all of it, and outweigh every other source. Decided by the corners, so for
-    pinholes only: a homography maps the target's rectangle to a convex quadrilateral.
+    It must share the target's centre, so that it outweighs every other source, and see all of it. Decided by the
+    corners, so for pinholes only: a homography maps the target's rectangle to a convex quadrilateral.
     """
     if not source.is_rectilinear or not target.is_rectilinear:
         return False
     if float(np.linalg.norm(source.center_m - target.center_m)) >= SAME_CENTER_M:
-        return False
-    # No weight of another source exceeds 1; at the border the outermost pixel centres have the least one.
-    nearest_px, middle_px = np.array(0.5), min(source.size) / 2
-    least = float(distance_weight(nearest_px, middle_px, config.distance_gamma)) * _LEAST_QUALITY
-    if least * config.primary_bonus <= 1:
         return False
     H = source.K @ source.cam2ego[:3, :3].T @ target.cam2ego[:3, :3] @ np.linalg.inv(target.K)
     (h, w), (source_h, source_w) = target.size, source.size

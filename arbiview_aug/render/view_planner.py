@@ -33,6 +33,7 @@ from arbiview_aug.environment import compilation_announced
 from arbiview_aug.image_ops import at_level, level_size
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.plan import (
+    GRID_STEP_PX,
     NEARER,
     ROAD_M,
     AtlasLayout,
@@ -49,19 +50,15 @@ from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.weights import SecondBest, seam_weights, source_weight
 from arbiview_aug.scene.point_cloud import occlusion_level, seen_through
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
-from arbiview_aug.scene.surface import is_within_wall, worst_parallax_px
+from arbiview_aug.scene.surface import FAR_PARALLAX_PX, is_within_wall, worst_parallax_px
 
 SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
 _SAMPLES = 64  # colours of objects are read so many times along a view's shorter side
 _INSIDE_PX = 2  # this far inside their faces: pixels at a border mix two colours
-_BESIDE_PX = 8  # cracks are narrower than twice this
 MAGNIFIED = 0.8
-"""A view is read by cubics where it has this few source pixels per pixel, or fewer, and most of it is read at its own
-centre: it is sharper for it, and a cubic costs 2.6 to 4.7 times as much. On synthetic streets, dB over bilinear by
-source pixels per pixel: 0.57 +0.6, 0.73 +0.7 (there a detector recovers 91 instead of 77 % of the gap), 0.94 +0.5, 1.06
-+0.1, 1.3 -0.2. Real frames turned by up to 35 degrees, 0.8 to 1, gain nothing: -0.04 dB on DDAD. Nor do other centres,
-where the surface is what errs: 0.7 m higher -0.1 dB, and the detector 75 instead of 77 %."""
+"""A view is read by cubics where it has at most this many source pixels per pixel, and is mostly read at its own
+centre: docs/benchmarks.md (Ablation)."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +115,7 @@ class ViewPlanner:
     """Builds one target's plan in two steps: what each source sees, then who wins and where ``seams`` are blended.
 
     Positions, visibility and winners are evaluated at every pixel (``kernels``). Weights are smooth: they are known on
-    nodes ``config.grid_step_px`` apart, which lie on pixel centres, and interpolated between.
+    nodes ``GRID_STEP_PX`` apart, which lie on pixel centres, and interpolated between.
     """
 
     def __init__(
@@ -140,7 +137,7 @@ class ViewPlanner:
         # From outside, the far wall is a narrow strip with edges, which cells could step over.
         coarse = min(camera.size) >= SMALL_SIDE_PX
         coarse &= is_within_wall(camera.center_m) or not GEOMETRIES[surface].has_wall
-        self.step = config.grid_step_px if coarse else 1
+        self.step = GRID_STEP_PX if coarse else 1
         corners = [np.minimum(np.arange(0, n + self.step, self.step), n - 1) for n in camera.size]
         # The outermost nodes lie half a cell inside: a magnified source does not see the outermost pixels.
         inset = self.step // 2
@@ -173,7 +170,7 @@ class ViewPlanner:
             return "infinity", "centres coincide: exact"
         if self.surface != "auto":
             return self.surface, "asked for"
-        if worst < self.config.far_parallax_px:
+        if worst < FAR_PARALLAX_PX:
             return "infinity", f"worst-case parallax {worst:.2f} px"
         return self.scene.best, f"centres {baseline_m:.2f} m apart"
 
@@ -233,9 +230,7 @@ class ViewPlanner:
             solid, face = (widened(*one) for one in zip(surface.drawn(camera, rays, memory), (0, -1), strict=True))
             shown = face >= 0
             np.copyto(q, solid, where=shown)
-            solid_px = int(np.count_nonzero(shown))
-            self.counters["solid_pixels"] += solid_px
-            face = face if solid_px else np.zeros((0, 0), np.int32)
+            face = face if shown.any() else np.zeros((0, 0), np.int32)
         at_nodes = q[self.at_nodes], face[self.at_nodes] if face.size else face
         uncertainty = surface.uncertainty(center, self._directions, at_nodes[0])
         nearest, farthest = np.empty((2, *self._open.shape), np.float32)
@@ -297,9 +292,8 @@ class ViewPlanner:
         on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
         visible = seen_image(*on_nodes, (*kernel[:-1], positions))
         self.counters[f"pairs_{name}"] += 1
-        of_config = self.config.distance_gamma, self.config.primary_bonus
         is_primary = baseline_m < SAME_CENTER_M
-        score = source_weight(edge_px, min(source.size) / 2, parallax, resolution, is_primary, *of_config)
+        score = source_weight(edge_px, min(source.size) / 2, parallax, resolution, is_primary)
         certain = 255 * certainty(parallax_rad, resolution) if self.config.certainty else None
         return _Region(
             source=index,
@@ -551,9 +545,9 @@ def find_paint(face: npt.NDArray[np.int32], winner: npt.NDArray[np.int8], parts:
     from arbiview_aug.render import kernels
 
     step = max(1, min(face.shape) // _SAMPLES)
-    columns = np.empty((5, face.size), np.int32)
-    hidden, sampled = kernels.find_paint(face, parts, winner, _BESIDE_PX, step, _INSIDE_PX, columns)
-    return Paint(*columns[:3, :hidden].copy(), *columns[3:, :sampled].copy())
+    columns = np.empty((4, face.size), np.int32)
+    hidden, sampled = kernels.find_paint(face, parts, winner, step, _INSIDE_PX, columns)
+    return Paint(*columns[:2, :hidden].copy(), *columns[2:, :sampled].copy())
 
 
 # --- all views of a rig -----------------------------------------------------------------------------------------------
@@ -579,8 +573,7 @@ def build_plan(
         source: The rig that recorded the images.
         target: The rig to render, in its own ego frame: the two roads are made to coincide.
         geometry: A name in ``GEOMETRIES``; ``auto``: for each pair of cameras ``infinity`` where their centres
-            coincide or the worst-case parallax is below
-            ``config.far_parallax_px``, else the scene's best.
+            coincide or the worst-case parallax is below ``FAR_PARALLAX_PX``, else the scene's best.
         config: Settings; the ``fast`` preset by default.
         scene: Known geometry, in the source's ego frame.
         maps: Rays and masks of cameras, to be reused by later plans.
@@ -630,6 +623,7 @@ def _built(
     for planner, view in zip(planners, targets, strict=True):
         sources = view.sources
         read |= {(region.source, region.level) for region in planner.regions if region.source in sources}
-    layout = layout.without_others(read)
+    # The same places for what is read: images that win no pixel are not copied.
+    layout = AtlasLayout(tuple(slot for slot in layout.slots if (slot.source, slot.level) in read))
     counters["bands"] = sum(len(t.bands) for t in targets)
     return RenderPlan(source, target, layout, targets, dict(counters))

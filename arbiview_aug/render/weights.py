@@ -16,13 +16,17 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.image_ops import Memory
 from arbiview_aug.render.plan import BlendRegion, FixedMap
 
+PRIMARY_BONUS = 1e6
+"""w_primary of a source at the target's own centre: it is exact, so it wins wherever it sees, down to the border of an
+image of 32767 px, where the other weights make 1.5e-6 at least; those of other sources make 1 at most."""
 
-def distance_weight(distance_px: FloatArray, d_max_px: float, gamma: float) -> FloatArray:
-    """w_distance(x, y) = (d(x, y) / d_max)^γ: 0 at the border of a source's coverage, 1 at its middle.
 
-    d (...,) is the distance to the border, negative outside; d_max > 0; γ >= 0.
+def distance_weight(distance_px: FloatArray, d_max_px: float) -> FloatArray:
+    """w_distance(x, y) = d(x, y) / d_max, with γ = 1: 0 at the border of a source's coverage, 1 at its middle.
+
+    d (...,) is the distance to the border, negative outside; d_max > 0.
     """
-    return np.clip(distance_px / d_max_px, 0.0, 1.0) ** gamma
+    return np.clip(distance_px / d_max_px, 0.0, 1.0)
 
 
 def quality_weight(parallax_px: FloatArray, resolution: FloatArray) -> FloatArray:
@@ -34,23 +38,12 @@ def quality_weight(parallax_px: FloatArray, resolution: FloatArray) -> FloatArra
     return np.clip(resolution, 0.05, 1.0) / (1.0 + parallax_px)
 
 
-def primary_weight(is_primary: bool, bonus: float) -> float:
-    """w_primary: ``bonus`` for the primary camera, 1 for the others."""
-    return bonus if is_primary else 1.0
-
-
 def source_weight(
-    edge_px: FloatArray,
-    d_max_px: float,
-    parallax_px: FloatArray,
-    resolution: FloatArray,
-    is_primary: bool,
-    gamma: float,
-    bonus: float,
+    edge_px: FloatArray, d_max_px: float, parallax_px: FloatArray, resolution: FloatArray, is_primary: bool
 ) -> FloatArray:
     """w_distance · w_quality · w_primary (...,); arguments as for its factors."""
-    distance = distance_weight(edge_px, d_max_px, gamma)
-    return distance * quality_weight(parallax_px, resolution) * primary_weight(is_primary, bonus)
+    weight = distance_weight(edge_px, d_max_px) * quality_weight(parallax_px, resolution)
+    return weight * PRIMARY_BONUS if is_primary else weight
 
 
 Nodes = npt.NDArray[np.float32]

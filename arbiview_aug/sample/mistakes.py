@@ -97,7 +97,10 @@ def check(sample: Mapping[str, Any], source: Rig | None = None, **unknown: Any) 
     refuse_old_options("check", unknown)
     frames = read_frames(sample, source)
     boxes, points = (_arrays(sample, key, frames) for key in ("boxes_3d", "points"))
-    findings = list(_key_findings(sample, source is not None or sample.get("rig") is not None))
+    findings = [
+        Finding(wrong, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
+        for wrong, meant in misnamed_keys(sample, source is not None or sample.get("rig") is not None).items()
+    ]
     for frame, of_frame, cloud in zip(frames, boxes, points, strict=True):
         # Holes of an earlier retargeting are masks too, of any shape.
         own_masks = sample.get("coverage") is None and sample.get("ego_mask") is None
@@ -142,11 +145,6 @@ def _arrays(sample: Mapping[str, Any], key: str, frames: Sequence[Frame]) -> lis
         return [None] * len(frames)
     checked: Callable[[Any], Any] = checked_boxes if key == "boxes_3d" else checked_points
     return [checked(frame.array(key)) for frame in frames]
-
-
-def _key_findings(sample: Mapping[str, Any], calibrated: bool) -> Iterator[Finding]:
-    for wrong, meant in misnamed_keys(sample, calibrated).items():
-        yield Finding(wrong, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
 
 
 def _resolution_findings(rig: Rig) -> Iterator[Finding]:

@@ -125,7 +125,7 @@ def read_neighbours(frame: Frame, warn: Warn) -> list[Neighbour]:
         try:
             neighbour = _neighbour(frame, boxes, entry, number, name)
         except (ArbiviewError, OSError) as error:
-            warn_lost(warn, name, error)
+            _warn_lost(warn, name, error)
             continue
         if neighbour is not None:
             neighbours.append(neighbour)
@@ -155,11 +155,11 @@ def neighbour_images(neighbour: Neighbour, like: Sequence[torch.Tensor], warn: W
     try:
         return neighbour.images(like)
     except (ArbiviewError, OSError) as error:
-        warn_lost(warn, neighbour.name, error)
+        _warn_lost(warn, neighbour.name, error)
         return None
 
 
-def warn_lost(warn: Warn, name: str, error: Exception) -> None:
+def _warn_lost(warn: Warn, name: str, error: Exception) -> None:
     """Warn that a neighbour is not used."""
     warn(f"neighbour {name}", f"neighbour {name} is left out: {error}; the frame is rendered without it")
 

@@ -292,6 +292,10 @@ NEAREST_SCENE_M = 2.0
 """Distance of the nearest scene point assumed for worst-case parallax."""
 
 
+FAR_PARALLAX_PX = 0.5
+"""Worst-case parallax below which ``auto`` takes a pair of cameras as far."""
+
+
 def worst_parallax_px(baseline_m: Any, focal_px: float) -> Any:
     """Largest pixel shift between two centres if the scene is anywhere from ``NEAREST_SCENE_M`` to infinity."""
     return focal_px * baseline_m / NEAREST_SCENE_M

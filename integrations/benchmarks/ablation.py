@@ -32,7 +32,7 @@ from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, Sample, retargeting
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
-from arbiview_aug.evaluate.targets import UP_M, named_targets, shifted_target
+from arbiview_aug.evaluate.targets import UP_M, named_targets, without_masks
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
@@ -246,7 +246,7 @@ def _frames(data: Sequence[str], reduce: Reduce, seed: int, size: tuple[int, int
 def _motion(sample: Mapping[str, Any]) -> list[torch.Tensor]:
     """Depth from motion, without the labels."""
     frames = [{key: frame[key] for key in frame if key != "boxes_3d"} for frame in (sample, *sample["neighbours"])]
-    raised = RigRetarget(shifted_target(sample["rig"], z_m=UP_M), geometry="motion", neighbours=None)
+    raised = RigRetarget(without_masks(sample["rig"].shifted(z_m=UP_M)), geometry="motion", neighbours=None)
     explained = raised.explain(frames[0] | {"neighbours": frames[1:]})
     assert isinstance(explained, Explanation) and explained.planned.motion is not None
     return [torch.from_numpy(depth) for depth in explained.planned.motion.depth_m]
@@ -265,7 +265,7 @@ def _learned(drive: SyntheticDrive) -> torch.Tensor:
 def _rows(data: str, frame: ScoredFrame, names: set[str]) -> dict[str, dict[str, Any]]:
     """Mean metrics of each row by move (``turned``, ``raised``), and its times on each target."""
     rig: Rig = frame.sample["rig"]
-    targets = {"turned": [*named_targets("paper", rig).values()], "raised": [shifted_target(rig, z_m=UP_M)]}
+    targets = {"turned": [*named_targets("paper", rig).values()], "raised": [without_masks(rig.shifted(z_m=UP_M))]}
     found: dict[str, dict[str, Any]] = {}
     for reduce in sorted({ROWS[name].reduce for name in names}):
         methods = [row.method(name) for name, row in ROWS.items() if name in names and row.reduce == reduce]

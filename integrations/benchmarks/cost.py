@@ -87,13 +87,13 @@ def step_cost(config: TrainConfig) -> dict[str, float]:
         forward = counter.get_total_flops()
         loss.backward()
     flop = counter.get_total_flops() + config.checkpointing * forward
-    # --- the autoencoder: condition, sources, virtual targets; the decoder of L_perceptual
+    # --- the autoencoder: condition and sources; the decoder of L_perceptual
     encoded, decoded = 0.0, 0.0
     if vae is not None:
         image = torch.zeros(1, 3, *config.generator.image_size, device="meta", dtype=torch.bfloat16)
         with FlopCounterMode(display=False) as counter, torch.no_grad():
             vae.encode(image)
-        encoded = B * (N + S + config.pseudo_views.virtual * N) * counter.get_total_flops()
+        encoded = B * (N + S) * counter.get_total_flops()
         with FlopCounterMode(display=False) as counter:
             one = torch.zeros(1, *latent, device="meta", dtype=torch.bfloat16, requires_grad=True)
             vae.decode(one).sample.sum().backward()

@@ -10,7 +10,7 @@ from integrations.benchmarks.cost import main, step_cost
 
 @pytest.mark.slow
 def test_a_steps_cost(capsys: pytest.CaptureFixture[str]) -> None:
-    small = ["pseudo_views.real_sources=0", "pseudo_views.p_translate=0"]
+    small = ["pseudo_views.p_translate=0"]
     one, two = (step_cost(overridden(tiny(), [*small, f"batch={n}"])) for n in (2, 4))
     assert two["flop"] == pytest.approx(2 * one["flop"], rel=0.1)
     assert one["frozen"] == 0 < one["trained"] == two["trained"] and one["vae"] == 0

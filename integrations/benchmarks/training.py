@@ -29,17 +29,13 @@ from arbiview_aug.generator.training.trainer import Trainer
 
 _AS_WRITTEN = (
     "pseudo_views.p_mask_transfer=0",
-    "pseudo_views.leave_one_out=0",
-    "pseudo_views.virtual=0",
-    "pseudo_views.real_sources=0",
     "generator.prefilled=false",
 )
 
 VARIANTS: dict[str, tuple[str, ...]] = {
     "as written": _AS_WRITTEN,
-    "+ transferred masks": (*_AS_WRITTEN[1:],),
-    "+ pre-filled condition": (*_AS_WRITTEN[1:-1],),
-    "all additions": (),
+    "+ transferred masks": _AS_WRITTEN[1:],
+    "+ pre-filled condition": (),
     "without L_geo": ("loss.geo=0",),
     "without attention": ("attention=false",),
 }
@@ -77,14 +73,7 @@ def seen_scores(generator: Generator, batch: Batch) -> dict[str, float]:
 
 def seen_batch(frames: Frames, indices: Sequence[int], config: TrainConfig, masks: torch.Tensor) -> Batch:
     """Items whose holes a source branch shows, which attention can fill."""
-    settings = PseudoViewConfig(
-        p_mask_transfer=1.0,
-        hidden=0.0,
-        leave_one_out=0.0,
-        virtual=0.0,
-        real_sources=0.0,
-        p_translate=config.pseudo_views.p_translate,
-    )
+    settings = PseudoViewConfig(p_mask_transfer=1.0, hidden=0.0, p_translate=config.pseudo_views.p_translate)
     items = PseudoViews(frames, indices, settings, config.generator, masks, seed=77)
     return collate([items[k] for k in range(SEEN_ITEMS)])
 

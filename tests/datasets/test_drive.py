@@ -12,8 +12,8 @@ import torch
 from arbiview_aug import DataError, Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import FrameFolder, LazyFrame, Neighbours, NuScenesDataset
 from arbiview_aug.datasets.drive import Drive, parts_of_clock, travelled_m
-from arbiview_aug.datasets.frame_folder import write_drive
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from tests.helpers import write_drive
 
 SIZE = (64, 176)
 

@@ -22,7 +22,7 @@ from arbiview_aug.evaluate.lidar import (
     sparse_metrics,
 )
 from arbiview_aug.evaluate.methods import retargeting
-from arbiview_aug.evaluate.targets import paper_target, shifted_target
+from arbiview_aug.evaluate.targets import paper_target, without_masks
 from tests.helpers import ring, score_targets
 
 AGREEMENT_DB = 0.01
@@ -62,7 +62,7 @@ def test_sparse_metrics_agree(referee: ModuleType, frame: Frame) -> None:
     assert len(points) == len(want_points)
     np.testing.assert_allclose(points.colours, want_colours, atol=1.0)
 
-    target = shifted_target(frame.rig, z_m=0.6, yaw_deg=22.0)
+    target = without_masks(frame.rig.shifted(z_m=0.6).turned(yaw_deg=22.0))
     theirs = referee.rotated_targets(cameras, 22.0, (0.0, 0.0, 0.6))
     for camera, image, (_, K, cam2ego, _) in zip(target, render(theirs), theirs, strict=True):
         np.testing.assert_allclose(camera.cam2ego, cam2ego, atol=1e-9)
@@ -81,7 +81,8 @@ def test_mean_score_agrees(referee: ModuleType, frame: Frame) -> None:
     render = referee.reference_renderer(frame.cameras, "far", own_camera_only=True)
     want = referee.score(render, frame.cameras, frame.points, [referee.rotated_targets(frame.cameras, -11.0)])
     points = coloured_points(frame.rig, frame.images, frame.points)
-    got = score_targets(lambda rig: render(referee_targets(rig)), points, [shifted_target(frame.rig, yaw_deg=-11.0)])
+    target = without_masks(frame.rig.turned(yaw_deg=-11.0))
+    got = score_targets(lambda rig: render(referee_targets(rig)), points, [target])
     assert got["psnr_db"] == pytest.approx(want["psnr"], abs=AGREEMENT_DB)
     assert got["ssim"] == pytest.approx(want["ssim"], abs=1e-4)
     assert got["points"] == pytest.approx(want["n"], abs=0.5)

@@ -12,8 +12,8 @@ from arbiview_aug.evaluate.targets import (
     VEHICLES,
     named_targets,
     paper_target,
-    shifted_target,
     spacing_deg,
+    without_masks,
 )
 
 
@@ -51,10 +51,10 @@ def test_spacing_of_other_rigs() -> None:
 
 def test_yaw_and_shift() -> None:
     rig = load_rig("waymo")
-    left, right = (shifted_target(rig, yaw_deg=yaw) for yaw in (22.0, -22.0))
+    left, right = (without_masks(rig.turned(yaw_deg=yaw)) for yaw in (22.0, -22.0))
     assert set(turned_by(rig, left).values()) == {22.0} and set(turned_by(rig, right).values()) == {-22.0}
     np.testing.assert_array_equal(left.cam2ego[:, :3, 3], rig.cam2ego[:, :3, 3])
-    moved = shifted_target(rig, 0.5, 0.3, 0.7, yaw_deg=11.0)
+    moved = without_masks(rig.shifted(0.5, 0.3, 0.7).turned(yaw_deg=11.0))
     np.testing.assert_allclose(moved.cam2ego[:, :3, 3] - rig.cam2ego[:, :3, 3], [[0.5, 0.3, 0.7]] * 5)
     assert moved.ground_z_m == rig.ground_z_m, "the road stays"
 
@@ -64,7 +64,7 @@ def test_targets_carry_no_masks() -> None:
         name="a", azimuth_deg=0, width_px=8, height_px=8, horizontal_fov_deg=50.0, mask=np.zeros((8, 8), bool)
     )
     rig = Rig([camera], ground_z_m=0.1, name="masked")
-    for target in (paper_target(rig, 0.2), shifted_target(rig, yaw_deg=5.0), shifted_target(rig, z_m=1.0)):
+    for target in (paper_target(rig, 0.2), named_targets("truck", rig)["truck"]):
         assert target[0].mask is None and target.name == "masked"
 
 

@@ -171,7 +171,7 @@ SETTING_JUNK: tuple[Callable[[], Any], ...] = (
     lambda: [8, 9],
     lambda: ["fast"],
     lambda: {"quality": "fast"},
-    lambda: RenderConfig(grid_step_px=1),
+    lambda: RenderConfig(seam_width=0.0),
     lambda: PaperConfig(use_feature_matching=False),
     lambda: (1.0, "x"),
     lambda: (0.0, 1.0),

@@ -10,17 +10,18 @@ from arbiview_aug.favs.stage4_fusion import (
     fusion_weight,
     gradient_weight,
 )
-from arbiview_aug.render.weights import distance_weight, primary_weight, quality_weight
+from arbiview_aug.render.weights import distance_weight, quality_weight, source_weight
 
 OFF = PaperConfig(**{f.name: False for f in fields(PaperConfig) if f.name.startswith("use_")})
 
 
 def test_weights_by_hand() -> None:
-    assert np.allclose(distance_weight(np.array([-3.0, 0.0, 25.0, 100.0, 200.0]), 100.0, 2.0), [0, 0, 0.0625, 1, 1])
-    assert np.allclose(distance_weight(np.array([0.0, 50.0]), 100.0, 0.0), [1, 1])  # γ = 0 switches it off
+    assert np.allclose(distance_weight(np.array([-3.0, 0.0, 25.0, 100.0, 200.0]), 100.0), [0, 0, 0.25, 1, 1])
     assert np.allclose(gradient_weight(np.array([0.0, 10.0, 30.0]), 10.0), [1, 0.5, 0.25])
     assert np.allclose(quality_weight(np.array([0.0, 3.0, 0.0]), np.array([2.0, 1.0, 0.5])), [1, 0.25, 0.5])
-    assert primary_weight(True, 8.0) == 8.0 and primary_weight(False, 8.0) == 1.0
+    border, coarsest = np.array(0.5), np.array(0.01)  # the outermost pixel centres of the largest image
+    assert source_weight(border, 32767 / 2, np.array(0.0), coarsest, True) > 1
+    assert source_weight(np.array(9.0), 4.0, np.array(0.0), np.array(2.0), False) == 1
 
 
 def test_the_product_of_weights_by_hand() -> None:
@@ -33,9 +34,12 @@ def test_the_product_of_weights_by_hand() -> None:
     assert np.allclose(only(use_quality_weight=True), 0.75)
     assert np.allclose(only(use_distance_weight=True), 1)  # no border, no distance to it
     assert np.allclose(fusion_weight(image, seen, 0.0, True, replace(OFF, use_primary_weight=True)), 4)
+    assert np.allclose(only(use_primary_weight=True), 1)
     seen[:, 0] = False
     distance = only(use_distance_weight=True)
     assert np.allclose(distance[2], np.arange(9) / 8)
+    assert np.allclose(only(use_distance_weight=True, distance_gamma=2.0)[2], (np.arange(9) / 8) ** 2)
+    assert np.allclose(only(use_distance_weight=True, distance_gamma=0.0), seen)  # γ = 0 switches it off
     assert np.allclose(fusion_weight(image, seen, 1.0, False, OFF), seen)
 
 

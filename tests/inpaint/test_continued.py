@@ -441,13 +441,13 @@ def test_a_top_without_any_seen_part_is_left_to_the_background() -> None:
 def test_cracks_in_objects_take_the_colour_beside_them() -> None:
     face = np.zeros((64, 64), np.int32)
     view = gradient(64, 64)[0].clone()
-    expected = view[:, 30, 20].clone()
+    expected = view[:, :, 20].clone()
     seen = torch.ones((64, 64), dtype=torch.bool)
     seen[:, 20] = False
     view[:, ~seen] = 0
     paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), FACE_PARTS)
     (out,) = fill_holes([view], [seen], [np.full((64, 64), OBJECT, np.uint8)], [paint])
-    assert torch.equal(out[:, 30, 20], expected)
+    assert (out[:, :, 20].int() - expected.int()).abs().max() <= 3  # a 33rd of it is the object's own colour
 
 
 def test_sides_take_the_seen_pixels_in_their_row_and_column() -> None:

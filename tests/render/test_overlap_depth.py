@@ -23,7 +23,7 @@ from arbiview_aug.scene.surface import CorrectedSurface, Correction, StaticSurfa
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import render_config
 from tests import helpers
-from tests.helpers import in_atlas
+from tests.helpers import in_atlas, told_db
 
 SIZE = (225, 400)
 
@@ -66,7 +66,8 @@ def nearer() -> tuple[torch.Tensor, OverlapDepth]:
 def test_finds_a_nearer_wall(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
     _, depth = nearer
     (report,), (correction,) = depth.reports, depth.corrections
-    assert report.accepted and report.db_after > report.db_before + 3
+    before, after = told_db(report.reason)
+    assert report.accepted and after > before + 3
     view = half_way_view(RIG[0], RIG[1], SIZE)
     refined, assumed = CorrectedSurface(Street(), depth.corrections), Street()
     ahead = view.unproject(np.stack(np.meshgrid(np.linspace(170, 230, 7), np.linspace(60, 100, 5)), -1)).directions

@@ -46,9 +46,7 @@ def same(one: RenderPlan, two: RenderPlan) -> bool:
     return one.layout.size == two.layout.size
 
 
-@pytest.mark.parametrize(
-    "config", [FAST, render_config("draft"), RenderConfig(distance_gamma=1.5)], ids=["fast", "draft", "gamma"]
-)
+@pytest.mark.parametrize("config", [FAST, render_config("draft")], ids=["fast", "draft"])
 @pytest.mark.parametrize(
     "view", [lambda c: c, lambda c: zoomed(c, 1.2), lambda c: zoomed(c, 1.4).turned(yaw_deg=2, pitch_deg=1)]
 )
@@ -120,18 +118,16 @@ def test_what_does_not_serve_alone() -> None:
     hidden = np.ones(source.size, bool)
     hidden[40:50, 70:90] = False
     assert covers_target_exactly(source, source, FAST)
-    for one, target, config in (
-        (source, source.turned(yaw_deg=0.5), FAST),  # looks past its border
-        (source, zoomed(source, 0.99), FAST),
-        (source, source.turned(yaw_deg=180), FAST),
-        (source, zoomed(source, 1.5).shifted(x_m=2e-6), FAST),  # another centre
-        (replace(source, mask=hidden), zoomed(source, 1.5), FAST),
-        (source, source, RenderConfig(primary_bonus=1.0)),  # exactness counts for nothing
-        (source, source, RenderConfig(distance_gamma=8.0)),  # at the border others weigh more
-        (fish, fish, FAST),  # past its fold a lens sees nothing
-        (nuscenes((91, 161))[0], nuscenes((91, 161))[0].resize((45, 80)), FAST),  # halving drops a row and a column
+    for one, target in (
+        (source, source.turned(yaw_deg=0.5)),  # looks past its border
+        (source, zoomed(source, 0.99)),
+        (source, source.turned(yaw_deg=180)),
+        (source, zoomed(source, 1.5).shifted(x_m=2e-6)),  # another centre
+        (replace(source, mask=hidden), zoomed(source, 1.5)),
+        (fish, fish),  # past its fold a lens sees nothing
+        (nuscenes((91, 161))[0], nuscenes((91, 161))[0].resize((45, 80))),  # halving drops a row and a column
     ):
-        assert not covers_target_exactly(one, target, config)
+        assert not covers_target_exactly(one, target, FAST)
     assert covers_target_exactly(nuscenes((92, 160))[0], nuscenes((92, 160))[0].resize((46, 80)), FAST)
 
 

@@ -14,7 +14,6 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import GeometryWarning
-from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.boxes import BoxSurface, checked_boxes, solids, whole
@@ -176,13 +175,14 @@ def test_what_a_car_hid_is_a_hole_and_not_its_colour() -> None:
 
 
 @pytest.mark.parametrize("size", [(128, 352), (64, 176)])
-def test_coarse_grid_equals_pixel_by_pixel_evaluation(size: tuple[int, int]) -> None:
+def test_coarse_grid_equals_pixel_by_pixel_evaluation(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     """64x176 reads halved images: their shadows are drawn at that size."""
     source = demo_source_rig((128, 352))
     boxes = checked_boxes(SyntheticDrive(source, num_frames=1, seed=0, lidar=False).scene(0).boxes_ego(0.0))
     target = source.shifted(z_m=0.7).resized(size)
     coarse = build_plan(source, target, geometry="boxes", scene=Scene(boxes))
-    exact = build_plan(source, target, geometry="boxes", scene=Scene(boxes), config=RenderConfig(grid_step_px=1))
+    monkeypatch.setattr("arbiview_aug.render.view_planner.GRID_STEP_PX", 1)
+    exact = build_plan(source, target, geometry="boxes", scene=Scene(boxes))
     for a, b in zip(coarse.targets, exact.targets, strict=True):
         assert (a.coverage != b.coverage).mean() < 0.001
         same = (a.source_camera == b.source_camera) & a.coverage

@@ -10,7 +10,6 @@ from arbiview_aug import SampleError
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.panorama import REACH_RAD
 from arbiview_aug.scene.point_cloud import Cells, PointCloudSurface, PointCloudWithBoxes, checked_points
@@ -289,13 +288,13 @@ def test_images_say_what_single_rays_say(name: str, all_around: bool) -> None:
     assert np.median(off) < 1e-5 and (off > 1e-3).mean() < 0.03
 
 
-def test_coarse_grid_equals_pixel_by_pixel_evaluation() -> None:
+def test_coarse_grid_equals_pixel_by_pixel_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = demo_source_rig((128, 352))
     scene = Scene(points=np.concatenate([NEAR, FAR]))
-    plans = [
-        build_plan(rig, rig.shifted(z_m=0.7), geometry="lidar", scene=scene, config=RenderConfig(grid_step_px=step))
-        for step in (8, 1)
-    ]
+    plans = []
+    for step in (8, 1):
+        monkeypatch.setattr("arbiview_aug.render.view_planner.GRID_STEP_PX", step)
+        plans.append(build_plan(rig, rig.shifted(z_m=0.7), geometry="lidar", scene=scene))
     for a, b in zip(*(plan.targets for plan in plans), strict=True):
         assert (a.coverage != b.coverage).mean() < 0.003
         same = (a.source_camera == b.source_camera) & a.coverage

@@ -207,7 +207,8 @@ class Jobs(Dataset[Done]):
         files = self.data.files(index)
         if isinstance(self.samples, WithDepth):
             files += [folder.path(self.data.tokens[index]) for folder in self.samples.folders]
-        return {_below(path, self.data.root): path for path in files}
+        root = self.data.root  # files of a frame that is its own root, or beside it, are not below it
+        return {path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name: path for path in files}
 
 
 def checksum_once(path: Path) -> str:
@@ -223,8 +224,3 @@ def _checksum_of(path: Path, size: int, time_ns: int) -> str:
 
 def _total_bytes(files: Iterable[Path]) -> int:
     return sum(path.stat().st_size for path in files)
-
-
-def _below(path: Path, root: Path) -> str:
-    # Files of a frame that is its own root, or beside it, are not below ``root``.
-    return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name

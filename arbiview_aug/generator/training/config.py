@@ -33,14 +33,10 @@ class PseudoViewConfig:
     focal: tuple[float, float] = (0.7, 1.3)  # range of the factor of the focal length
     p_mask_transfer: float = 0.8  # probability of a target's coverage mask; Algorithm 1 leaves next to no holes
     hidden: float = 0.5  # share of these masks that hide the pixels from the source branches too, as at inference
-    leave_one_out: float = 0.1  # probability that the real view is not among FAVS's sources
-    virtual: float = 0.3  # probability that the target is the real view under a random turn and focal length
-    real_sources: float = 0.3  # probability that the source branches are the nearest real cameras, as at inference
     mask_bank: int = 128  # coverage masks drawn from the retarget distribution before training
 
     def __post_init__(self) -> None:
-        shares = ("p_translate", "p_mask_transfer", "hidden", "leave_one_out", "virtual", "real_sources")
-        _check(self, "a probability", lambda p: 0 <= p <= 1, *shares)
+        _check(self, "a probability", lambda p: 0 <= p <= 1, "p_translate", "p_mask_transfer", "hidden")
         _check(self, "fast or paper", lambda q: q in ("fast", "paper"), "quality")
         _check(self, "at least 1", lambda n: n >= 1, "targets", "mask_bank")
         _check(self, "0 <= low <= high <= 90", lambda yaw: 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
@@ -150,9 +146,7 @@ def paper() -> TrainConfig:
     """
     return TrainConfig(
         generator=generators.paper(),
-        pseudo_views=PseudoViewConfig(
-            quality="paper", p_translate=1.0, p_mask_transfer=0.0, leave_one_out=0.0, virtual=0.0, real_sources=0.0
-        ),
+        pseudo_views=PseudoViewConfig(quality="paper", p_translate=1.0, p_mask_transfer=0.0),
         loss=LossConfig(snr_limit=0.0, known_weight=1.0, regression=0.0),
         steps=100_000,
         batch=8,

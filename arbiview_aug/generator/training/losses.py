@@ -170,7 +170,7 @@ class Step(nn.Module):
         super().__init__()
         self.config, self.denoiser = config, denoiser
         self._frozen = (autoencoder, perceptual)  # a tuple: not among this module's parameters
-        self._cache: dict[tuple[int, int] | None, torch.Tensor] = {}  # x0 of real views, by frame and camera
+        self._cache: dict[tuple[int, int], torch.Tensor] = {}  # x0 of real views, by frame and camera
         schedule = noise_schedule(prediction=config.generator.prediction, zero_snr=config.generator.zero_snr)
         self.diffusion = Diffusion(schedule.alphas_cumprod, config.generator.prediction)
 
@@ -226,7 +226,7 @@ class Step(nn.Module):
             latent = self._cache.get(view)
             if latent is None:
                 latent = autoencoder.encode(image[None])[0].float().cpu()
-                if view is not None and len(self._cache) * latent.nbytes < LATENT_BYTES:
+                if len(self._cache) * latent.nbytes < LATENT_BYTES:
                     self._cache[view] = latent
             latents.append(latent)
         return torch.stack(latents).unflatten(0, batch.truth.shape[:2]).to(batch.truth.device)

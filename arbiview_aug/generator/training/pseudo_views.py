@@ -2,14 +2,9 @@
 
 For a real view, pseudo poses are drawn to its left and right, and FAVS renders the frame's cameras there. The pair is
 the model's source branches and, warped to the target pose, its condition. FAVS of all cameras at the target pose would
-be the answer itself. An item may have several targets, of neighbouring cameras, each with its pair. Additions, each
-with its own probability:
-
-- *transferred masks*: holes of real targets, imposed on the real view before FAVS, which hides them from the branches
-  too, or on the condition alone;
-- *leave-one-out*: the real view is not among FAVS's sources;
-- *virtual targets*: the target is the real view under a random turn and focal length, with the loss on valid pixels;
-- *real sources*: the branches are the nearest real cameras, as at inference.
+be the answer itself. An item may have several targets, of neighbouring cameras, each with its pair. Added to it are
+*transferred masks*: holes of real targets, imposed on the real view before FAVS, which hides them from the branches
+too, or on the condition alone.
 
 Item k is drawn from (seed, k) alone: a resumed run, or one with other workers, sees the same items.
 """
@@ -44,7 +39,6 @@ _PITCH_DEG = (5.0, 12.0)
 _FOCAL = (0.4, 0.85)  # of a 65° lens: 74 to 115°
 _MIN_HOLES, _MAX_HOLES = 0.02, 0.75
 _TRIES = 8
-_VIRTUAL_YAW_DEG, _VIRTUAL_PITCH_DEG = 20.0, 8.0
 _FAVS = RenderConfig(certainty=True)
 
 
@@ -110,7 +104,7 @@ class Batch(NamedTuple):
     seen: torch.Tensor  # (B, S, H, W) bool, valid pixels of the sources
     geometry: FrameGeometry  # of their cameras
     tokens: tuple[str, ...]  # names of the items
-    views: tuple[tuple[tuple[int, int] | None, ...], ...]  # (B, N) frame and camera of the truth; None: a virtual view
+    views: tuple[tuple[tuple[int, int], ...], ...]  # (B, N) frame and camera of the truth
 
     def to(self, device: torch.device | str) -> Batch:
         return Batch._make([*(value.to(device) for value in self[:-2]), *self[-2:]])
@@ -183,21 +177,16 @@ class PseudoViews(Dataset[Batch]):
         first = one_of(rng, len(frame.rig))
         axes = [camera.cam2ego[:3, 2] for camera in frame.rig]
         places = sorted(range(len(axes)), key=lambda i: (i != first, -float(axes[i] @ axes[first])))[: config.targets]
-        drawn = [self._target(frame.images[i], frame.rig[i], rng) for i in places]
-        targets, truths, valids = zip(*drawn, strict=True)
+        targets = [frame.rig[i] for i in places]
         rng = seeded(self.seed, "pair", k)
         # --- FAVS's sources
         is_transferred = uniform(rng, 0, 1) < config.p_mask_transfer
         is_hidden = uniform(rng, 0, 1) < config.hidden
         masks = [self.masks[one_of(rng, len(self.masks))] for _ in places]
-        left_out = uniform(rng, 0, 1) < config.leave_one_out and len(frame.rig) > len(places)
-        images, cameras = list(frame.images), list(frame.rig)
-        for i, mask in sorted(zip(places, masks, strict=True), key=lambda pair: -pair[0]):
-            if left_out:
-                del images[i], cameras[i]
-            elif is_transferred and is_hidden:
-                own_mask = cameras[i].mask
-                cameras[i] = replace(cameras[i], mask=mask.numpy() if own_mask is None else own_mask & mask.numpy())
+        cameras = list(frame.rig)
+        for i, mask in zip(places, masks, strict=True) if is_transferred and is_hidden else ():
+            own_mask = cameras[i].mask
+            cameras[i] = replace(cameras[i], mask=mask.numpy() if own_mask is None else own_mask & mask.numpy())
         rig = frame.rig.with_cameras(cameras)
         # --- the pairs, and their views at the target poses
         branches: list[Camera] = []
@@ -205,7 +194,7 @@ class PseudoViews(Dataset[Batch]):
         for target, mask in zip(targets, masks, strict=True):
             pair = self._pair(target, rng)
             branches += pair
-            pseudo.append(favs(images, rig, pair, config.quality))
+            pseudo.append(favs(frame.images, rig, pair, config.quality))
             masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, pseudo[-1].covered, strict=True)]
             at_target = favs(list(pseudo[-1].images), Rig(masked, ground_z_m=rig.ground_z_m), [target], config.quality)
             if is_transferred and not is_hidden:
@@ -213,21 +202,11 @@ class PseudoViews(Dataset[Batch]):
             shown.append(at_target)
         view_at, known, confidence = (torch.cat(maps) for maps in zip(*shown, strict=True))
         view_at = view_at * known[:, None]
-        # --- the source branches
         sources, seen, _ = (torch.cat(maps) for maps in zip(*pseudo, strict=True))
-        shows_answer = not (left_out or (is_transferred and is_hidden))
-        others = [n for n in range(len(cameras)) if not (shows_answer and n in places)]
-        if uniform(rng, 0, 1) < config.real_sources and len(others) >= len(branches):
-            candidates = rig.with_cameras([cameras[n] for n in others])
-            near = [n for target in targets for n in nearest_sources(target, candidates)]
-            used = [others[n] for n in dict.fromkeys((*near, *range(len(others))))][: len(branches)]
-            branches = [cameras[n] for n in used]
-            seen = torch.stack([valid_pixels(camera).to(known.device) for camera in branches])
-            sources = torch.stack([images[n].float() / 255 for n in used])
         geometry = frame_geometry(targets, branches, rig.ground_z_m, self.generator)
         return Batch(
-            torch.stack(truths)[None],
-            torch.stack(valids)[None],
+            torch.stack([frame.images[i].float() / 255 for i in places])[None],
+            torch.stack([valid_pixels(camera).to(known.device) for camera in targets])[None],
             view_at[None],
             torch.stack([telea(image, ~is_known) for image, is_known in zip(view_at, known, strict=True)])[None],
             known[None],
@@ -236,22 +215,8 @@ class PseudoViews(Dataset[Batch]):
             seen[None],
             geometry,
             (f"{frame.token}/{frame.rig[first].name}/{k}",),
-            (tuple((index, i) if target is frame.rig[i] else None for i, target in zip(places, targets, strict=True)),),
+            (tuple((index, i) for i in places),),
         )
-
-    # --- draws --------------------------------------------------------------------------------------------------------
-    def _target(
-        self, image: torch.Tensor, camera: Camera, rng: torch.Generator
-    ) -> tuple[Camera, torch.Tensor, torch.Tensor]:
-        """Draw the target camera, with its true image (3, h, w) in [0, 1] and valid pixels (h, w)."""
-        virtual = uniform(rng, 0, 1) < self.config.virtual
-        yaw, pitch = (uniform(rng, -limit, limit) for limit in (_VIRTUAL_YAW_DEG, _VIRTUAL_PITCH_DEG))
-        focal = uniform(rng, *self.config.focal)
-        if not virtual:
-            return camera, image.float() / 255, valid_pixels(camera).to(image.device)
-        target = replace(with_focal(camera.turned(yaw_deg=yaw, pitch_deg=pitch), focal), mask=None)
-        rendered = favs([image], Rig([camera]), [target])
-        return target, rendered.images[0], rendered.covered[0]
 
     def _pair(self, target: Camera, rng: torch.Generator) -> list[Camera]:
         """Draw a pseudo pose to the left and one to the right of a camera."""

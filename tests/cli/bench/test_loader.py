@@ -15,8 +15,8 @@ from arbiview_aug import RetargetedDataset, RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.loader import PLAIN, Repeated, loader_rates
 from arbiview_aug.datasets import Neighbours
-from arbiview_aug.datasets.frame_folder import write_drive
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from tests.helpers import write_drive
 
 
 @pytest.fixture

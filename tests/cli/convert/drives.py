@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from arbiview_aug import Rig
-from arbiview_aug.datasets.frame_folder import write_drive
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from tests.datasets.nuscenes_root import Tables, streets, tables_of, write_root
+from tests.helpers import write_drive
 
 SIZE = (32, 56)
 FRAMES = Rig(demo_source_rig(SIZE).cameras[:2], ground_z_m=-0.1, name="two")

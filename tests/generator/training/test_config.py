@@ -23,7 +23,7 @@ def test_the_papers_settings() -> None:
     config = paper()
     assert (config.lr, config.batch, config.loss.geo, config.loss.perceptual) == (1e-4, 8, 0.1, 0.01)
     assert config.pseudo_views.quality == "paper" and config.pseudo_views.targets == 1
-    assert config.pseudo_views.p_mask_transfer == config.pseudo_views.virtual == config.loss.regression == 0.0
+    assert config.pseudo_views.p_mask_transfer == config.loss.regression == 0.0
     assert config.generator.frozen_unet and config.generator.prediction == "epsilon"
 
 
@@ -48,7 +48,8 @@ def test_overrides() -> None:
         ("steps=0", "TrainConfig.steps: expected at least 1, got 0"),
         ("precision=fp16", "never fp16"),
         ("loss.geo_mode=sum", "expected normalised or frobenius_sum"),
-        ("pseudo_views.virtual=2", "expected a probability"),
+        ("pseudo_views.hidden=2", "expected a probability"),
+        ("pseudo_views.virtual=0", "since 0.3 virtual is gone: no measurement showed a gain"),
         ("pseudo_views.quality=draft", "PseudoViewConfig.quality: expected fast or paper, got 'draft'"),
         ("loss.regression=1", r"LossConfig.regression: expected a value in \[0, 1\), got 1"),
     ],

@@ -18,9 +18,6 @@ from tests.generator.training.small import SIZE, config, frames
 AS_WRITTEN: Mapping[str, Any] = {
     "p_mask_transfer": 0.0,
     "hidden": 0.0,
-    "leave_one_out": 0.0,
-    "virtual": 0.0,
-    "real_sources": 0.0,
     "p_translate": 0.0,
     "mask_bank": 4,
 }
@@ -39,14 +36,7 @@ def flat(item: Batch) -> list[torch.Tensor]:
 
 
 def test_an_item_is_its_number() -> None:
-    every = {
-        "p_mask_transfer": 0.5,
-        "hidden": 0.5,
-        "leave_one_out": 0.3,
-        "virtual": 0.5,
-        "real_sources": 0.5,
-        "p_translate": 0.5,
-    }
+    every = {"p_mask_transfer": 0.5, "hidden": 0.5, "p_translate": 0.5}
     first, second = items(**every), items(**every)
     for k in (3, 0, 17):
         torch.manual_seed(k)
@@ -57,7 +47,7 @@ def test_an_item_is_its_number() -> None:
 
 
 def test_shapes_and_ranges() -> None:
-    made = items(p_mask_transfer=0.8, hidden=0.5, leave_one_out=0.2, virtual=0.4, real_sources=0.4, p_translate=0.5)
+    made = items(p_mask_transfer=0.8, hidden=0.5, p_translate=0.5)
     batch = collate([made[k] for k in range(12)])
     h, w = SIZE
     assert batch.truth.shape == batch.favs.shape == batch.condition.shape == (12, 1, 3, h, w)
@@ -95,7 +85,7 @@ def answer_is_shown(k: int, **changes: Any) -> tuple[bool, bool]:
     made = items(**changes)
     plain = made[k]
     for frame in made.frames._cache._values.values():
-        for _, place in filter(None, plain.views[0]):
+        for _, place in plain.views[0]:
             image = frame.images[place].clone()
             image[:, ~HOLE[0]] = 255 - image[:, ~HOLE[0]]
             frame.images[place] = image
@@ -107,34 +97,24 @@ def answer_is_shown(k: int, **changes: Any) -> tuple[bool, bool]:
 @pytest.mark.parametrize("k", range(4))
 def test_hidden_holes_are_shown_nowhere(k: int) -> None:
     assert answer_is_shown(k, p_mask_transfer=1.0, hidden=1.0) == (False, False)
-    assert answer_is_shown(k, p_mask_transfer=1.0, hidden=1.0, real_sources=1.0) == (False, False)
-    assert answer_is_shown(k, leave_one_out=1.0) == (False, False)
 
 
 @pytest.mark.parametrize("k", range(2))
 def test_no_target_shows_the_answer_of_another(k: int) -> None:
-    two = {"targets": 2, "p_mask_transfer": 1.0}
-    assert answer_is_shown(k, **two, hidden=1.0) == (False, False)
-    assert answer_is_shown(k, **two, hidden=1.0, real_sources=1.0) == (False, False)
-    assert answer_is_shown(k, **two, hidden=0.0, real_sources=1.0)[1] is False
-    assert answer_is_shown(k, targets=2, leave_one_out=1.0) == (False, False)
+    assert answer_is_shown(k, targets=2, p_mask_transfer=1.0, hidden=1.0) == (False, False)
 
 
-@pytest.mark.parametrize("real_sources", [0.0, 1.0])
-def test_several_targets_are_neighbours_that_read_each_other(real_sources: float) -> None:
-    made = items(targets=2, virtual=0.5, real_sources=real_sources)
+def test_several_targets_are_neighbours_that_read_each_other() -> None:
+    made = items(targets=2)
     batch, (h, w) = collate([made[k] for k in range(6)]), SIZE
     assert batch.truth.shape == (6, 2, 3, h, w) and batch.sources.shape == (6, 4, 3, h, w)
-    views = [view for of_item in batch.views for view in of_item]
-    assert None in views and any(views)  # virtual ones, which no real view is
     for k, (one, other) in enumerate(batch.views):
-        if one and other:
-            assert one[0] == other[0] and (one[1] - other[1]) % 6 in (1, 5)
-            assert torch.equal(batch.truth[k, 1], made.frames[other[0]].images[other[1]].float() / 255)
+        assert one[0] == other[0] and (one[1] - other[1]) % 6 in (1, 5)
+        assert torch.equal(batch.truth[k, 1], made.frames[other[0]].images[other[1]].float() / 255)
     finest = batch.geometry.target_reads[0]
     of_targets = finest.neighbour >= 4  # four sources, then the two targets
     assert bool((of_targets & finest.valid.flatten(3).any(3)).flatten(1).any(1).float().mean() > 0.5)
-    alone = items(virtual=0.5)[0]
+    alone = items()[0]
     assert torch.equal(alone.truth[0, 0], batch.truth[0, 0])  # further targets change nothing of the first
 
 
@@ -142,22 +122,6 @@ def test_holes_that_are_not_hidden_are_shown_by_the_sources() -> None:
     shown = [answer_is_shown(k, p_mask_transfer=1.0, hidden=0.0) for k in range(4)]
     assert all(branches for _, branches in shown)
     assert all(answer_is_shown(k, p_mask_transfer=0.0) == (True, True) for k in range(2))
-
-
-def test_real_sources_never_hold_the_answer() -> None:
-    for k in range(4):
-        assert answer_is_shown(k, p_mask_transfer=1.0, hidden=0.0, real_sources=1.0)[1] is False
-
-
-def test_leaving_the_real_view_out_leaves_little() -> None:
-    batch = collate([items(leave_one_out=1.0)[k] for k in range(12)])
-    assert float(batch.known.float().mean()) < 0.6
-
-
-def test_virtual_targets_are_valid_where_the_real_view_is() -> None:
-    batch = collate([items(virtual=1.0, focal=(0.7, 0.8))[k] for k in range(8)])
-    assert 0.3 < float(batch.valid.float().mean()) < 0.95
-    assert bool((batch.truth.sum(2)[~batch.valid] == 0).all())
 
 
 def test_masks_have_holes_of_all_sizes_and_repeat() -> None:

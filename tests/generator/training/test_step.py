@@ -65,11 +65,10 @@ def test_the_perceptual_term_compares_the_prediction_with_the_truth() -> None:
 
 
 def test_a_vae_encodes_each_real_view_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And alone, so that a resumed run, whose batches are others, has the same bits; virtual views each time."""
+    """And alone, so that a resumed run, whose batches are others, has the same bits."""
     shape = AutoencoderConfig(widths=(16, 16), latent_channels=4, layers=1)
     settings = config(
         generator=replace(config().generator, autoencoder=shape),
-        pseudo_views=replace(config().pseudo_views, virtual=0.4),
         loss=LossConfig(geo=0.0, perceptual=0.0, regression=0.0),
     )
     step, batch, _ = step_of(settings, [300] * 4)
@@ -82,11 +81,9 @@ def test_a_vae_encodes_each_real_view_once(monkeypatch: pytest.MonkeyPatch) -> N
         return plain(images)
 
     monkeypatch.setattr(autoencoder, "encode", encode)
-    virtual = sum(view is None for of_item in batch.views for view in of_item)
-    real = {view for of_item in batch.views for view in of_item if view is not None}
-    assert virtual and real
+    views = {view for of_item in batch.views for view in of_item}
     with torch.no_grad():
         first = step._latents(batch)
-        assert len(encoded) == virtual + len(real)
-        assert torch.equal(step._latents(batch), first) and len(encoded) == 2 * virtual + len(real)
+        assert len(encoded) == len(views)
+        assert torch.equal(step._latents(batch), first) and len(encoded) == len(views)
         assert all(torch.allclose(first[b, 0], plain(batch.truth[b])[0], atol=1e-5) for b in range(4))
