@@ -2,8 +2,8 @@
 
 A rig file (YAML or JSON) holds ``name``, ``ground_z_m`` and ``cameras``, each with ``name``, ``width``, ``height``,
 ``K`` (3x3), ``cam2ego`` (4x4), ``distortion`` (null or ``{model: radtan|fisheye, coeffs: [...]}``) and optionally
-``mask`` (a PNG beside the file, white = scene); optionally ``lidars``, each as ``Lidar.to_dict`` gives it. ``source``, ``notes``, ``ego_frame``, ``ground_source``, ``dataset``,
-``kind`` and ``license`` document it.
+``mask`` (a PNG beside the file, white = scene); optionally ``lidars``, each with the arguments of ``Lidar``.
+``source``, ``notes``, ``ego_frame``, ``ground_source``, ``dataset``, ``kind`` and ``license`` document it.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ class Rig:
     @cached_property
     def content_key(self) -> bytes:
         """Digest of the calibration, without names."""
-        keys = (sensor.content_key for sensor in (*self.cameras, *self.lidars))
+        keys = *(camera.content_key for camera in self.cameras), *(lidar.content_key for lidar in self.lidars)
         return hashlib.sha256(np.float64(self.ground_z_m).tobytes() + b"".join(keys)).digest()
 
     # --- changed copies -------------------------------------------------------------------------------------------
