@@ -6,6 +6,7 @@ from arbiview_aug.environment import lazy_names
 
 if TYPE_CHECKING:
     from arbiview_aug.cameras.camera import Camera as Camera
+    from arbiview_aug.cameras.lidar import Lidar as Lidar
     from arbiview_aug.cameras.random_rig import RandomRig as RandomRig
     from arbiview_aug.cameras.rig import Rig as Rig
     from arbiview_aug.cameras.rig import load_rig as load_rig
@@ -39,6 +40,7 @@ else:
         __name__,
         {
             "cameras.camera": "Camera",
+            "cameras.lidar": "Lidar",
             "cameras.random_rig": "RandomRig",
             "cameras.rig": "Rig load_rig",
             "cameras.shipped": "shipped_rigs",

@@ -2,8 +2,8 @@
 
 A rig file (YAML or JSON) holds ``name``, ``ground_z_m`` and ``cameras``, each with ``name``, ``width``, ``height``,
 ``K`` (3x3), ``cam2ego`` (4x4), ``distortion`` (null or ``{model: radtan|fisheye, coeffs: [...]}``) and optionally
-``mask`` (a PNG beside the file, white = scene). ``source``, ``notes``, ``ego_frame``, ``ground_source``, ``dataset``,
-``kind`` and ``license`` document it.
+``mask`` (a PNG beside the file, white = scene); optionally ``lidars``, each with the arguments of ``Lidar``.
+``source``, ``notes``, ``ego_frame``, ``ground_source``, ``dataset``, ``kind`` and ``license`` document it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -29,12 +29,13 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.plain_yaml import parse_json, parse_yaml
 from arbiview_aug.cameras.shipped import shipped_rigs
 from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import CalibrationError, shown
 
-MOST_CAMERAS, MOST_BYTES = 128, 1 << 20
+MOST_CAMERAS, MOST_LIDARS, MOST_BYTES = 128, 32, 1 << 20
 """Largest rig, and largest rig file: 8 KiB a camera."""
 
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
@@ -42,12 +43,13 @@ _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """The cameras of one vehicle.
+    """The cameras of one vehicle, and its LiDAR scanners.
 
     Args:
         cameras: One or more cameras with different names; all ``cam2ego`` are in this rig's ego frame.
         ground_z_m: Height of the road in that frame (-0.33 where the origin is a rear axle 0.33 m above it).
         name: A label for tables and messages.
+        lidars: Scanners with different names, in the same frame; none by default.
 
     Raises:
         CalibrationError: No cameras, duplicate names, or a ground height that is not finite.
@@ -56,19 +58,23 @@ class Rig:
     cameras: Sequence[Camera]
     ground_z_m: float = field(default=0.0, kw_only=True)
     name: str = field(default="", kw_only=True)
+    lidars: Sequence[Lidar] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         cameras = tuple(self.cameras)
         where = f"rig {self.name!r}" if self.name else "rig"
         if not cameras:
             raise CalibrationError(f"{where}: expected at least one camera, got none")
-        for camera in cameras:
-            if not isinstance(camera, Camera):
-                raise CalibrationError(f"{where}: expected Camera objects, got {type(camera).__name__}")
-        twice = sorted(name for name, count in Counter(camera.name for camera in cameras).items() if count > 1)
-        if twice:
-            got = ", ".join(name[:100] for name in twice[:5])
-            raise CalibrationError(f"{where}: expected different camera names, got {got} more than once")
+        lidars = tuple(self.lidars) if isinstance(self.lidars, Sequence) else (self.lidars,)
+        sensors: tuple[Any, ...]
+        for kind, sensors in ((Camera, cameras), (Lidar, lidars)):
+            for sensor in sensors:
+                if not isinstance(sensor, kind):
+                    raise CalibrationError(f"{where}: expected {kind.__name__} objects, got {type(sensor).__name__}")
+            twice = sorted(name for name, count in Counter(sensor.name for sensor in sensors).items() if count > 1)
+            if twice:
+                kinds, got = kind.__name__.lower(), ", ".join(name[:100] for name in twice[:5])
+                raise CalibrationError(f"{where}: expected different {kinds} names, got {got} more than once")
         try:
             ground = math.nan if isinstance(self.ground_z_m, bool) else float(self.ground_z_m)
         except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: tensors of several heights
@@ -79,6 +85,7 @@ class Rig:
                 f"most {MOST_M:g} m"
             )
         object.__setattr__(self, "cameras", cameras)
+        object.__setattr__(self, "lidars", lidars)
         object.__setattr__(self, "ground_z_m", ground)
 
     def __len__(self) -> int:
@@ -98,13 +105,13 @@ class Rig:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Rig):
             return NotImplemented
-        return self.cameras == other.cameras and self.ground_z_m == other.ground_z_m
+        return (self.cameras, self.lidars, self.ground_z_m) == (other.cameras, other.lidars, other.ground_z_m)
 
     def __hash__(self) -> int:
-        return hash((self.cameras, self.ground_z_m))
+        return hash((self.cameras, self.lidars, self.ground_z_m))
 
     def __repr__(self) -> str:
-        """A table with one line per camera, as ``inspect`` prints it."""
+        """A table with one line per camera and scanner, as ``inspect`` prints it."""
         head = f"Rig {self.name or '(unnamed)'}: {len(self)} cameras, road at z = {self.ground_z_m:+.2f} m"
         width = max(len(n) for n in self.names)
         lines = [
@@ -119,6 +126,10 @@ class Rig:
                 f"  {c.azimuth_deg:+7.1f}  {c.elevation_deg:+6.1f}  {x:6.2f} {y:6.2f} {z - self.ground_z_m:8.2f} m"
                 + ("" if c.mask is None else f"  mask: {1 - c.mask.mean():.0%} own car")
             )
+        for lidar in self.lidars:
+            x, y, z = lidar.center_m
+            place = f"at ({x:.2f}, {y:.2f}), {z - self.ground_z_m:.2f} m above the road"
+            lines.append(f"  lidar {lidar.name}: {lidar.words}, {place}")
         return "\n".join([head, *lines])
 
     @property
@@ -144,13 +155,13 @@ class Rig:
     @cached_property
     def content_key(self) -> bytes:
         """Digest of the calibration, without names."""
-        keys = (camera.content_key for camera in self.cameras)
+        keys = *(camera.content_key for camera in self.cameras), *(lidar.content_key for lidar in self.lidars)
         return hashlib.sha256(np.float64(self.ground_z_m).tobytes() + b"".join(keys)).digest()
 
     # --- changed copies -------------------------------------------------------------------------------------------
     def with_cameras(self, cameras: Sequence[Camera]) -> Rig:
         """The same rig with other cameras."""
-        return Rig(cameras, ground_z_m=self.ground_z_m, name=self.name)
+        return replace(self, cameras=cameras)
 
     def resized(self, size: tuple[int, int] | float, fit: Fit = "stretch") -> Rig:
         """All cameras resized to (h, w), see ``Camera.resize``, or by a scale."""
@@ -160,12 +171,13 @@ class Rig:
         return self.with_cameras([c.resize(to, fit) for c, to in zip(self, sizes, strict=True)])
 
     def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Rig:
-        """Each camera turned about its own centre, see ``Camera.turned``."""
+        """Each camera turned about its own centre, see ``Camera.turned``; scanners stay."""
         return self.with_cameras([c.turned(yaw_deg=yaw_deg, pitch_deg=pitch_deg, roll_deg=roll_deg) for c in self])
 
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Rig:
-        """All cameras moved along the ego axes; the road stays."""
-        return self.with_cameras([c.shifted(x_m, y_m, z_m) for c in self])
+        """All cameras and scanners moved along the ego axes; the road stays."""
+        lidars = [lidar.shifted(x_m, y_m, z_m) for lidar in self.lidars]
+        return replace(self, cameras=[c.shifted(x_m, y_m, z_m) for c in self], lidars=lidars)
 
     def undistorted(self) -> Rig:
         """The rig with pinhole cameras of the same K, sizes and poses."""
@@ -182,14 +194,17 @@ class Rig:
         if self.ground_z_m == other.ground_z_m:
             return self
         T = self.ego2ego(other)
-        return Rig([c.moved(T) for c in self], ground_z_m=other.ground_z_m, name=self.name)
+        cameras, lidars = [c.moved(T) for c in self], [lidar.moved(T) for lidar in self.lidars]
+        return replace(self, cameras=cameras, lidars=lidars, ground_z_m=other.ground_z_m)
 
     # --- files ----------------------------------------------------------------------------------------------------
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the rig file's format, without masks, which ``save`` writes as files."""
+        lidars = {"lidars": [lidar.to_dict() for lidar in self.lidars]} if self.lidars else {}
         return {
             "name": self.name,
             "ground_z_m": self.ground_z_m,
+            **lidars,
             "cameras": [
                 {
                     "name": c.name,
@@ -221,9 +236,16 @@ class Rig:
             raise CalibrationError(f"{where}: expected at most {MOST_CAMERAS} cameras, got {len(data['cameras'])}")
         _refuse_misnamed(data, "ground_z_m", where)
         cameras = [_camera_from_dict(entry, k, folder, where) for k, entry in enumerate(data["cameras"])]
+        entries = data.get("lidars") or []
+        if not isinstance(entries, list) or len(entries) > MOST_LIDARS:
+            raise CalibrationError(f"{where}: lidars: expected a list of at most {MOST_LIDARS}, got {shown(entries)}")
+        lidars = [
+            Lidar.from_dict(entry, f"{where}: lidar {shown(entry.get('name', k) if isinstance(entry, Mapping) else k)}")
+            for k, entry in enumerate(entries)
+        ]
         name = data.get("name", data.get("dataset", ""))
         try:
-            return cls(cameras, ground_z_m=data.get("ground_z_m", 0.0), name=str(name))
+            return cls(cameras, ground_z_m=data.get("ground_z_m", 0.0), name=str(name), lidars=lidars)
         except CalibrationError as error:
             raise CalibrationError(f"{where}: {error}") from None
 

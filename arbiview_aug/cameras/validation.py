@@ -121,31 +121,31 @@ def checked_intrinsics(name: str, value: Any) -> FloatArray:
     return K
 
 
-def checked_pose(name: str, value: Any) -> FloatArray:
-    """(4, 4) cam2ego; a rotation within ``ROTATION_TOLERANCE`` is made exact."""
-    cam2ego = checked_array(name, "cam2ego", value, (4, 4))
-    if np.abs(cam2ego[3] - (0, 0, 0, 1)).max() > 1e-9:
-        fix = "pass cam2ego.T" if np.any(cam2ego[3, :3]) and not np.any(cam2ego[:3, 3]) else ""
-        raise _error(name, "cam2ego", "last row (0, 0, 0, 1)", f"{cam2ego[3].tolist()}", fix)
-    R = cam2ego[:3, :3]
+def checked_pose(name: str, value: Any, field: str = "cam2ego") -> FloatArray:
+    """(4, 4) pose; a rotation within ``ROTATION_TOLERANCE`` is made exact."""
+    pose = checked_array(name, field, value, (4, 4))
+    if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-9:
+        fix = f"pass {field}.T" if np.any(pose[3, :3]) and not np.any(pose[:3, 3]) else ""
+        raise _error(name, field, "last row (0, 0, 0, 1)", f"{pose[3].tolist()}", fix)
+    R = pose[:3, :3]
     largest = float(np.abs(R).max())
     if largest > 2:  # the products below could overflow
         fix = f"the nearest rotation is {nearest_rotation(R / largest).round(9).tolist()}"
-        raise _error(name, "cam2ego", "a rotation, with entries from -1 to 1", f"{R.tolist()}", fix)
+        raise _error(name, field, "a rotation, with entries from -1 to 1", f"{R.tolist()}", fix)
     deviation = float(np.abs(R @ R.T - np.eye(3)).max())
     determinant = float(np.linalg.det(R))
     if deviation > ROTATION_TOLERANCE or determinant < 0:
         expected = f"a rotation (|R Rᵀ - I| <= {ROTATION_TOLERANCE:g}, determinant +1)"
         fix = f"the nearest rotation is {nearest_rotation(R).round(9).tolist()}"
-        raise _error(name, "cam2ego", expected, f"deviation {deviation:.3g}, determinant {determinant:.6g}", fix)
-    if np.abs(cam2ego[:3, 3]).max() > MOST_M:
-        raise _error(name, "cam2ego", f"a position within {MOST_M:g} m of the ego frame", f"{cam2ego[:3, 3].tolist()}")
+        raise _error(name, field, expected, f"deviation {deviation:.3g}, determinant {determinant:.6g}", fix)
+    if np.abs(pose[:3, 3]).max() > MOST_M:
+        raise _error(name, field, f"a position within {MOST_M:g} m of the ego frame", f"{pose[:3, 3].tolist()}")
     # Residual scale and skew of rounded digits would bend straight lines by a fraction of a pixel.
     if deviation > 1e-12:
-        cam2ego = cam2ego.copy()
-        cam2ego[:3, :3] = nearest_rotation(R)
-        cam2ego.setflags(write=False)
-    return cam2ego
+        pose = pose.copy()
+        pose[:3, :3] = nearest_rotation(R)
+        pose.setflags(write=False)
+    return pose
 
 
 def checked_lens(name: str, value: Any) -> LensName:

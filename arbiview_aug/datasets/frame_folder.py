@@ -129,7 +129,8 @@ class FrameFolder(WritableRecording):
         frame = self._frames[index]
         calib = _read_calibration(frame)
         rig = self._rig(calib, frame)
-        for entries, read in ((calib, ("boxes_3d", "ego2world", "lidar")), *((c, ("mask",)) for c in calib["cameras"])):
+        keys = "boxes_3d", "ego2world", "lidar", "lidars"
+        for entries, read in ((calib, keys), *((c, ("mask",)) for c in calib["cameras"])):
             for wrong, meant in misnamed(entries, read).items():
                 self._warn(wrong, f"{frame.where}: {wrong!r} is not read; did you mean {meant!r}?")
         sample = camera_fields(rig, self._images(calib, frame, rig), frame.name)
@@ -199,7 +200,7 @@ class FrameFolder(WritableRecording):
         masks = [_mask_file(entry, frame) for entry in calib["cameras"]]
         bare = [_calibration_of(entry) for entry in calib["cameras"]]
         data = {"name": calib.get("name", calib.get("dataset", "")), "cameras": bare}
-        data |= {key: calib[key] for key in ("ground_z_m", *misnamed(calib, ("ground_z_m",))) if key in calib}
+        data |= {key: calib[key] for key in ("ground_z_m", "lidars", *misnamed(calib, ("ground_z_m",))) if key in calib}
         key = json.dumps([data, [mask and os.path.realpath(mask) for mask in masks]])
         last = self._last_rig  # read once, for threads
         if last is None or last[0] != key:

@@ -74,19 +74,24 @@ class Frame:
         return int(np.ravel_multi_index(self.index, self.lead)) if self.lead else 0
 
     def array(self, key: str) -> Points | None:
-        """The frame's array of a sample key; None without one.
+        """``entry`` as an array."""
+        value = self.entry(key)
+        return None if value is None else as_array(key, value)
+
+    def entry(self, key: str) -> Any:
+        """The frame's entry of a sample key; None without one.
 
         The key holds an array, a tensor with the sample's leading dimensions, or a list with an array for each frame.
         """
         value = self.sample.get(key)
         if value is None or not self.lead:
-            return None if value is None else as_array(key, value)
+            return value
         count = math.prod(self.lead)
         if isinstance(value, list | tuple):
             if len(value) == count:
-                return as_array(key, value[self.number])
+                return value[self.number]
         elif tuple(getattr(value, "shape", ()))[: len(self.lead)] == self.lead:
-            return as_array(key, value[self.index])
+            return value[self.index]
         got = f"shape {tuple(value.shape)}" if hasattr(value, "shape") else type(value).__name__
         raise SampleError(f"{key}: expected a tensor {self.lead} + (n, ...), or a list of {count} of them, got {got}")
 

@@ -119,9 +119,13 @@ def solids(boxes: FloatArray) -> FloatArray:
     return _planes(boxes, PROFILES[OF_KIND[kinds(boxes), 0]])
 
 
-def solids_among(boxes: FloatArray, points: Points) -> tuple[FloatArray, BoolArray]:
+ByBox = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
+
+
+def solids_among(boxes: FloatArray, points: Points, within: ByBox | None = None) -> tuple[FloatArray, BoolArray]:
     """Shapes in boxes (B, 7), as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs.
 
+    ``within`` are ``points_by_box`` with ``AIR_M``, if they are known.
     Of the profiles that fit a box it is the one whose faces lie nearest to its points. Points within ``AIR_M`` of it
     are its own: mirrors, and the noise of points and labels. This far over the box's floor they may be the road's.
     """
@@ -130,14 +134,12 @@ def solids_among(boxes: FloatArray, points: Points) -> tuple[FloatArray, BoolArr
     boxes = np.ascontiguousarray(boxes)
     planes_and_own = np.empty((len(boxes), PIECES, 6, 4)), np.zeros(len(points), bool)
     points = np.ascontiguousarray(points, np.float32)
-    within = points_by_box(boxes, points, AIR_M)
+    within = within or points_by_box(boxes, points, AIR_M)
     fit_profiles(boxes, PROFILES, OF_KIND[kinds(boxes)], points, *within, LEAST_POINTS, AIR_M, *planes_and_own)
     return planes_and_own
 
 
-def points_by_box(
-    boxes: FloatArray, points: Points, air_m: float
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def points_by_box(boxes: FloatArray, points: Points, air_m: float) -> ByBox:
     """Indices (n,) of the points (P, 3) in boxes (B, 7) widened by ``air_m``, box by box; where each box ends (B,)."""
     from arbiview_aug.scene.kernels import points_in
 

@@ -213,6 +213,31 @@ def spread(code: Any) -> None:
                 row[x] = last
 
 
+@compiled
+def nearest_returns(rows: Any, columns: Any, code: Any, number: Any, up: int, side: int, nearest: Any) -> None:
+    """Find the point that supports a ray: the nearest one, if it lies within so many cells above or below and aside.
+
+    Args:
+        rows: (ny, nx) rows of the rays in a panorama.
+        columns: (ny, nx) their columns.
+        code: (h + 4, w + 4) codes of the cells' nearest seeds.
+        number: (h, w) the points' numbers.
+        up: Cells above and below.
+        side: Cells aside.
+        nearest: (ny, nx) int32, written: the point's number, -1 where none is near.
+    """
+    h, w = number.shape
+    for y in range(rows.shape[0]):
+        for x in range(rows.shape[1]):
+            row, column = int(np.rint(rows[y, x])), int(np.rint(columns[y, x]))
+            nearest[y, x] = -1
+            if 0 <= row < h and 0 <= column < w:
+                down, right = seed(code[row + 2, column + 2])
+                near = code[row + 2, column + 2] < _NO_SEED and abs(down) <= up and abs(right) <= side
+                if near and 0 <= row + down < h and 0 <= column + right < w:
+                    nearest[y, x] = number[row + down, column + right]
+
+
 @inlined
 def seed(code: int) -> tuple[int, int]:
     """Rows and columns from a cell to its nearest seed."""

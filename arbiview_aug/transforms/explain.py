@@ -27,6 +27,7 @@ class Explanation:
     harmonisation: PhotometricReport | None = None  # the sources' gains and why, if they are harmonised
     learned: str | None = None  # the model of learned depth and how it was fitted, if the surface is made of it
     fills: Fills | None = None  # how other frames of the drive fill holes, if there are any
+    points: str | None = None  # what the target's scanners measure, if it has any
 
     @property
     def plan(self) -> RenderPlan:
@@ -74,6 +75,8 @@ class Explanation:
             lines += self.learned.splitlines()
         if self.fills is not None:
             lines += self.fills.lines(self.plan)
+        if self.points is not None:
+            lines.append(self.points)
         head = [_head(self.plan.source, self.plan.target), *(f"  {line}" for line in lines)]
         return "\n".join([*head, *_lines(self.as_dict(), _source_line)])
 

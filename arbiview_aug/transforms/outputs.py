@@ -17,6 +17,7 @@ from arbiview_aug.inpaint.inpainter import SOURCES_KEY
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, is_readable, lens_names, like, rewrapped, split, stacked
 from arbiview_aug.sample.inputs import CALIBRATION_KEYS, PIXEL_BOUND_KEYS, Frame
+from arbiview_aug.transforms.scans import RetargetedPoints, entries_of
 from arbiview_aug.transforms.settings import SampleKeys
 
 
@@ -38,13 +39,15 @@ class SampleWriter:
         labels: Sequence[str],
         target: Rig,
         params: Mapping[str, float],
+        points: Sequence[RetargetedPoints] = (),
     ) -> dict[str, Any]:
         """Write the output sample of a sample's frames; the input is not changed.
 
-        ``labels`` are the sample's keys that hold label maps; ``target`` is in its own ego frame.
+        ``labels`` are the sample's keys that hold label maps; ``target`` is in its own ego frame; ``points`` are those
+        of its scanners.
         """
         sample, lead = frames[0].sample, frames[0].lead
-        out = self._passed_on(sample, labels)
+        out = self._passed_on(sample, labels) | entries_of(points, lead)
         out["images"] = rewrapped(gathered([stacked(frame.images) for frame in rendered], lead), sample["images"])
         rigs, device = [frame.rig for frame in rendered], rendered[0].images[0].device
         entries = calibration_entries(rigs, device, lead, lenses=self.lenses, masks=self.masks)

@@ -49,6 +49,7 @@ from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
 from arbiview_aug.transforms.outputs import SampleWriter
 from arbiview_aug.transforms.plan_cache import FramePlan, PlanCache, Plans, check_reach
+from arbiview_aug.transforms.scans import retarget_frames, words_of
 from arbiview_aug.transforms.settings import (
     SampleKeys,
     checked_instance,
@@ -71,8 +72,9 @@ class RigRetarget(torch.nn.Module):
     A sample is a dict with ``images``, (..., N, 3, H, W) or a list of (..., 3, Hi, Wi), uint8 or float in [0, 1], and
     its calibration: ``rig``, or ``K`` (..., N, 3, 3) and ``cam2ego`` (..., N, 4, 4). The output has M images of the
     target, their ``K`` and ``cam2ego`` in the source's ego frame, and ``coverage`` (..., M, h, w) bool, True where a
-    camera saw the pixel. Points and boxes are in the ego frame and stay; label maps are rendered too; what depends on
-    the source's pixels is dropped. ``docs/formats.md`` lists all keys.
+    camera saw the pixel. Boxes are in the ego frame and stay. So do points, unless the target has scanners
+    (``Rig.lidars``): then they are what these would have measured. Label maps are rendered too; what depends on the
+    source's pixels is dropped. ``docs/formats.md`` lists all keys.
 
     Args:
         target: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
@@ -250,7 +252,7 @@ class RigRetarget(torch.nn.Module):
             rendered = self.inpainter.fill(self._rendered(frames, target), frames)
             if self.size is not None and self.fit == "pad":
                 rendered = [of_frame.between_bars(self.size) for of_frame in rendered]
-        return self._writer.write(frames, rendered, labels, target, draws)
+        return self._writer.write(frames, rendered, labels, target, draws, retarget_frames(frames, target, skip))
 
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
         """Check the sample's further keys, and return those that hold label maps."""
@@ -413,7 +415,8 @@ class RigRetarget(torch.nn.Module):
         gains = self.harmonisation(sample) if self.harmoniser.is_on else None
         words = sample.get(LEARNED_WORDS_KEY) if LEARNED_KEY in self._row.reads else None
         learned = words if isinstance(words, str) or words is None else words[0]  # a batch has one for each frame
-        return Explanation(planned, gains, learned, self.plan_fills(planned))
+        points = [words_of(part, frame, target) for part in retarget_frames([frame], target, False)]
+        return Explanation(planned, gains, learned, self.plan_fills(planned), *points)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; for a batch, its first frame's."""

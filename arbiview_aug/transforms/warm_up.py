@@ -16,8 +16,9 @@ def compile_kernels(*, matching: bool = True) -> None:
     from arbiview_aug.inpaint import kernels as inpaint
     from arbiview_aug.render import photometry_kernels as photometry
     from arbiview_aug.render import view_planner
+    from arbiview_aug.scene import scan
     from arbiview_aug.temporal import motion_depth
 
     with compilation_announced():
-        for module in (view_planner, photometry, inpaint, *((motion_depth,) if matching else ())):
+        for module in (view_planner, photometry, inpaint, scan, *((motion_depth,) if matching else ())):
             module.warm_up()

@@ -156,38 +156,63 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         views = self._renderer.render(self.scene(index), rig.cameras, rig.ground_z_m)
         return RenderedViews(*(stack_or_list([v[k] for v in views]) for k in range(4)))
 
-    def points(self, index: int) -> Tensor:
-        """(P, 4) float32 LiDAR-like points x y z intensity (0 to 255) of scene ``index``, in the rig's ego frame."""
-        index = self._checked_index(index)
-        return self._points(self.scene(index), (self.seed, index, 1))
+    def points(self, index: int, rig: Rig | None = None) -> Tensor:
+        """(P, 4) float32 LiDAR-like points x y z intensity (0 to 255) of scene ``index``, in the rig's ego frame.
 
-    def _points(self, scene: Scene, noise: tuple[int, ...]) -> Tensor:
+        They are those of the rig's ``lidars``, by default the dataset's own; a rig without any has a scanner like an
+        HDL-32E.
+
+        Raises:
+            IndexError: Past the end.
+            TypeError: ``rig`` is not a ``Rig``.
+        """
+        index = self._checked_index(index)
+        return self._points(self.scene(index), (self.seed, index, 1), None if rig is None else _checked_rig(rig))
+
+    def _points(self, scene: Scene, noise: tuple[int, ...], rig: Rig | None = None) -> Tensor:
         """The points of a scene, whose noise has a seed of its own."""
-        elevation = np.radians(np.linspace(*LIDAR_BEAMS_DEG, _BEAMS))
-        azimuth = np.linspace(0, 2 * math.pi, LIDAR_COLUMNS, endpoint=False)
-        el, az = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing="xy"))  # columns are neighbours
-        ego = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], 1)
-        R, position = scene.ego2street[:3, :3], np.array(LIDAR_POSITION_M)
+        rig = self.rig if rig is None else rig
+        road = np.array([0.0, 0.0, rig.ground_z_m])
+        parts = [
+            self._scan(scene, noise if k == 0 else (*noise, k), lidar.center_m - road, lidar.rays.T, lidar.range_m)
+            for k, lidar in enumerate(rig.lidars)
+        ]
+        points = np.concatenate(parts or [self._scan(scene, noise, np.array(LIDAR_POSITION_M), _usual_rays())])
+        points[:, 2] += rig.ground_z_m
+        return torch.from_numpy(points.astype(np.float32))
+
+    def _scan(
+        self,
+        scene: Scene,
+        noise: tuple[int, ...],
+        position: np.ndarray,
+        rays: np.ndarray,
+        range_m: tuple[float, float] = LIDAR_RANGE_M,
+    ) -> np.ndarray:
+        """Points (P, 4) of rays (columns, beams, 3) from a position (3,) over the ego origin's road; z is over it."""
+        columns, beams, _ = rays.shape
+        ego = rays.reshape(-1, 3).astype(np.float64)
+        R = scene.ego2street[:3, :3]
         origin = R @ position + scene.ego2street[:3, 3]
-        street = (ego @ R.T).astype(np.float32).reshape(LIDAR_COLUMNS // 8, 8 * _BEAMS, 3)
+        street = (ego @ R.T).astype(np.float32).reshape(columns, beams, 3)
+        packets = np.pad(street, ((0, -columns % 8), (0, 0), (0, 0)), mode="edge").reshape(-1, 8 * beams, 3)
         with self._renderer.run():
-            rays = torch.as_tensor(street).transpose(1, 2).contiguous()
+            directions = torch.as_tensor(packets).transpose(1, 2).contiguous()
             local = scene_from(scene, origin)
             start = torch.as_tensor(origin[None].astype(np.float32))
-            distance, hit = cast(local, start, rays, find_candidates(local, rays))
-        t, row = distance.cpu().numpy().ravel().astype(np.float64), hit.cpu().numpy().ravel()
+            distance, hit = cast(local, start, directions, find_candidates(local, directions))
+        t, row = (a.cpu().numpy().ravel()[: len(ego)] for a in (distance.double(), hit))  # without the padding
         rng = np.random.default_rng(np.random.SeedSequence(noise))
         noise_m, gain = rng.normal(0, LIDAR_NOISE_M, len(t)), rng.uniform(0.8, 1.2, len(t))
-        keep = (t > LIDAR_RANGE_M[0]) & (t < LIDAR_RANGE_M[1])
+        keep = (t > range_m[0]) & (t < range_m[1])
         points = position + ego[keep] * (t + noise_m)[keep, None]
-        points[:, 2] += self.rig.ground_z_m
         albedo = scene.color.mean(1)[row.clip(0)]
         albedo = np.where(row == GROUND_ID, 0.5 * scene.street.asphalt, albedo)[keep]
         # Glass returns little light, retro-reflective plates much.
         material = np.where(row[keep] >= 0, scene.material[row[keep].clip(0)], -1)
         albedo = albedo * np.select([material == Material.GLASSHOUSE, material == Material.SIGN], [0.3, 3.0], 1.0)
         intensity = (albedo * gain[keep] * 90).clip(0, 255)
-        return torch.from_numpy(np.concatenate([points, intensity[:, None]], 1).astype(np.float32))
+        return np.concatenate([points, intensity[:, None]], 1)
 
     def _checked_index(self, index: int) -> int:
         if not isinstance(index, int | np.integer) or isinstance(index, bool):
@@ -196,6 +221,14 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         if not -n <= index < n:
             raise IndexError(f"SyntheticDrive has {n} frames, got index {index}")
         return int(index) % n
+
+
+def _usual_rays() -> np.ndarray:
+    """Rays (columns, beams, 3) of the scanner of rigs without any, float64; columns are neighbours."""
+    elevation = np.radians(np.linspace(*LIDAR_BEAMS_DEG, _BEAMS))
+    azimuth = np.linspace(0, 2 * math.pi, LIDAR_COLUMNS, endpoint=False)
+    el, az = np.meshgrid(elevation, azimuth, indexing="xy")
+    return np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], -1)
 
 
 def _checked_rig(rig: Any) -> Rig:

@@ -1,0 +1,175 @@
+"""LiDAR scanners: pose, beam table, columns and range."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.key_names import hint
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.validation import checked_numbers, checked_pose
+from arbiview_aug.errors import CalibrationError, shown
+
+MOST_BEAMS, MOST_RAYS = 1024, 1 << 21
+"""Largest scanner; sensors on sale have 128 beams and 500,000 rays."""
+
+_KEYS = ("name", "lidar2ego", "elevations_deg", "azimuth_step_deg", "range_m")
+
+
+@dataclass(frozen=True, eq=False)
+class Lidar:
+    """One scanner. Its rays leave one centre: a beam for each elevation, a column for each azimuth.
+
+    Args:
+        name: Unique among the scanners of its rig.
+        lidar2ego: (4, 4) pose, ``p_ego = lidar2ego @ p_lidar``; scanner axes x forward, y left, z up.
+        elevations_deg: Angle of each beam over the scanner's x-y plane, -90 to 90; a beam's place here is its ring.
+        azimuth_step_deg: Angle from column to column.
+        range_m: Least and largest distance of returns.
+        azimuth_deg: First azimuth and the end, which has no column of its own; 0 along x, 90 along y.
+
+    Raises:
+        CalibrationError: An impossible value; the message names the scanner.
+    """
+
+    name: str
+    lidar2ego: FloatArray
+    elevations_deg: tuple[float, ...]
+    azimuth_step_deg: float
+    range_m: tuple[float, float]
+    azimuth_deg: tuple[float, float] = (-180.0, 180.0)
+
+    def __post_init__(self) -> None:
+        name = self.name
+        if not isinstance(name, str) or not name:
+            raise CalibrationError(f"lidar name: expected a non-empty string, got {shown(name)}")
+        try:
+            checked = self._checked()
+        except CalibrationError as error:  # the checks are those of cameras
+            raise CalibrationError(f"lidar{str(error).removeprefix('camera')}") from None
+        self.__dict__.update(checked)
+
+    def _checked(self) -> dict[str, Any]:
+        name, elevations = self.name, self.elevations_deg
+        count = len(elevations) if hasattr(elevations, "__len__") else 0
+        beams = f"1 to {MOST_BEAMS} elevations from -90 to 90 degrees"
+        table = checked_numbers(name, "elevations_deg", elevations, max(count, 1), beams)
+        if count > MOST_BEAMS or max(map(abs, table)) > 90:
+            raise CalibrationError(f"camera {shown(name)}: elevations_deg: expected {beams}, got {shown(elevations)}")
+        span = "two azimuths in degrees, the first below the second by at most 360"
+        first, end = checked_numbers(name, "azimuth_deg", self.azimuth_deg, 2, span)
+        ranges = "two distances in metres, 0 <= the least < the largest"
+        least, most = checked_numbers(name, "range_m", self.range_m, 2, ranges)
+        (step,) = checked_numbers(name, "azimuth_step_deg", [self.azimuth_step_deg], 1, "a number of degrees")
+        pose = checked_pose(name, self.lidar2ego, "lidar2ego")
+        fewest = (end - first) * count / MOST_RAYS
+        for field, is_valid, expected, got in (
+            ("azimuth_deg", 0 < end - first <= 360, span, (first, end)),
+            ("range_m", 0 <= least < most, ranges, (least, most)),
+            ("azimuth_step_deg", fewest <= step <= 360 and step > 0, f"more than {fewest:.2g} and at most 360", step),
+        ):
+            if not is_valid:
+                raise CalibrationError(f"camera {shown(name)}: {field}: expected {expected}, got {got}")
+        return {
+            "lidar2ego": pose,
+            "elevations_deg": table,
+            "azimuth_step_deg": step,
+            "range_m": (least, most),
+            "azimuth_deg": (first, end),
+        }
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Lidar):
+            return NotImplemented
+        return self.name == other.name and self.content_key == other.content_key
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.content_key))
+
+    def __repr__(self) -> str:
+        x, y, z = self.center_m
+        return f"Lidar({self.name} {self.words} at ({x:.2f}, {y:.2f}, {z:.2f}) m)"
+
+    @property
+    def words(self) -> str:
+        """Beams, columns, elevations and range, for tables."""
+        low, high = min(self.elevations_deg), max(self.elevations_deg)
+        beams, columns = self.shape
+        return f"{beams} x {columns} rays, {low:+.1f} to {high:+.1f} deg, {self.range_m[0]:g} to {self.range_m[1]:g} m"
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Beams and columns."""
+        first, end = self.azimuth_deg
+        return len(self.elevations_deg), max(1, round((end - first) / self.azimuth_step_deg))
+
+    @property
+    def center_m(self) -> FloatArray:
+        """(3,) origin of the rays in the ego frame."""
+        return np.asarray(self.lidar2ego[:3, 3])
+
+    @cached_property
+    def content_key(self) -> bytes:
+        """Digest of the calibration, without the name."""
+        numbers = *self.elevations_deg, self.azimuth_step_deg, *self.range_m, *self.azimuth_deg
+        return hashlib.sha256(self.lidar2ego.tobytes() + np.array(numbers, np.float64).tobytes()).digest()
+
+    @cached_property
+    def rays(self) -> npt.NDArray[np.float32]:
+        """(3, beams, columns) unit rays in the ego frame."""
+        beams, columns = self.shape
+        azimuth = np.radians(self.azimuth_deg[0] + self.azimuth_step_deg * np.arange(columns))
+        elevation = np.radians(self.elevations_deg)[:, None]
+        up = np.broadcast_to(np.sin(elevation), (beams, columns))
+        local = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), up])
+        return np.tensordot(self.lidar2ego[:3, :3], local, 1).astype(np.float32)
+
+    def moved(self, ego2ego: FloatArray) -> Lidar:
+        """The same scanner in another ego frame."""
+        return replace(self, lidar2ego=ego2ego @ self.lidar2ego)
+
+    def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Lidar:
+        """Moved along the ego's axes."""
+        T = np.eye(4)
+        T[:3, 3] = x_m, y_m, z_m
+        return self.moved(T)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data in the rig file's format."""
+        return {
+            "name": self.name,
+            "lidar2ego": self.lidar2ego.tolist(),
+            "elevations_deg": list(self.elevations_deg),
+            "azimuth_step_deg": self.azimuth_step_deg,
+            "range_m": list(self.range_m),
+            "azimuth_deg": list(self.azimuth_deg),
+        }
+
+    @classmethod
+    def from_dict(cls, entry: Any, where: str) -> Lidar:
+        """A scanner from an entry of a rig file; ``where`` is named in errors."""
+        if not isinstance(entry, Mapping):
+            raise CalibrationError(f"{where}: expected a mapping, got {type(entry).__name__}")
+        if missing := [key for key in _KEYS if entry.get(key) is None]:
+            expected, guesses = ", ".join((*_KEYS, "azimuth_deg")), hint(entry, missing)
+            raise CalibrationError(f"{where}: expected keys {expected}, missing {', '.join(missing)}{guesses}")
+        try:
+            return cls(**{key: entry[key] for key in (*_KEYS, "azimuth_deg") if key in entry})
+        except CalibrationError as error:
+            raise CalibrationError(f"{where}: {error}") from None
+
+
+def hdl64e(lidar2ego: Any, name: str = "hdl64e") -> Lidar:
+    """Velodyne's HDL-64E S2 at 10 Hz, KITTI's scanner (there 1.73 m over the road).
+
+    Source: user's manual of the S2. Upper block: 32 beams from +2 degrees down by 1/3, lower block: 32 from -8.83 down
+    by 1/2; 1.333 million rays a second; 120 m.
+    """
+    upper, lower = 2 - np.arange(32) / 3, -8.83 - np.arange(32) / 2
+    return Lidar(name, lidar2ego, tuple(np.concatenate([upper, lower]).tolist()), 0.1728, (0.9, 120.0))

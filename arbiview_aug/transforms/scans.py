@@ -1,0 +1,119 @@
+"""Points of a sample as the target's scanners would have measured them, and points in each box."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import SampleTypeError
+from arbiview_aug.sample.batching import is_readable
+from arbiview_aug.sample.inputs import Frame, as_array
+from arbiview_aug.scene.boxes import checked_boxes, points_by_box
+from arbiview_aug.scene.point_cloud import checked_points, finite_rows
+from arbiview_aug.scene.scan import scan
+
+RINGS_KEY, COUNTS_KEY = "point_rings", "num_points"
+
+
+class RetargetedPoints(NamedTuple):
+    """Points of one frame.
+
+    Attributes:
+        points: (n, C) of the type, dtype and device of the measured ones, in their ego frame.
+        rings: (n,) int32 beam, counted on from scanner to scanner; -1 where they are as measured.
+        counts: (B,) int64 points in each box; None without boxes.
+        unsupported: Share of rays near which nothing was measured; the sky's are among them.
+    """
+
+    points: Any
+    rings: torch.Tensor
+    counts: torch.Tensor | None
+    unsupported: float = 0.0
+
+
+def retarget_points(
+    points: Any, target: Rig, *, boxes_3d: Any = None, ground_z_m: float = 0.0, skip: bool = False
+) -> RetargetedPoints:
+    """Measure a frame's scene by a target's scanners, as ``RigRetarget`` does; no images are needed.
+
+    Args:
+        points: (P, C >= 3) float tensor or array x y z ... in the frame's ego frame. Columns beyond z are taken from
+            the nearest measured point.
+        target: A rig with ``lidars``.
+        boxes_3d: (B, >= 7) labelled objects.
+        ground_z_m: Height of the road in the frame's ego frame.
+        skip: Leave the points as they are, and count those in boxes.
+
+    Raises:
+        SampleError: Points or boxes of another shape.
+        SampleTypeError: Points that are no floats.
+        CalibrationError: A scanner that is not over the road.
+    """
+    if not (isinstance(points, np.ndarray) and points.dtype.kind == "f"):
+        if not is_readable(points) or not points.is_floating_point():
+            kind = points.dtype if isinstance(points, torch.Tensor) else type(points).__name__
+            raise SampleTypeError(f"points: expected a float tensor or array to scan, got {kind}")
+    array = as_array("points", points)
+    measured = checked_points(array)
+    boxes = None if boxes_3d is None else checked_boxes(boxes_3d)
+    unsupported, rings = 0.0, torch.full((len(measured),), -1, dtype=torch.int32)
+    if not skip:
+        up = ground_z_m - target.ground_z_m
+        lidars = [lidar.shifted(z_m=up) for lidar in target.lidars]
+        hits, nearest, rings_of, unsupported = scan(
+            lidars, measured, np.zeros((0, 7)) if boxes is None else boxes, ground_z_m
+        )
+        rows = np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest
+        points, measured, rings = _at(points, rows, hits), hits, torch.from_numpy(rings_of)
+    counts = None
+    if boxes is not None:
+        _, ends = points_by_box(boxes, measured, 0.0)
+        counts = torch.from_numpy(np.diff(ends, prepend=0))
+    return RetargetedPoints(points, rings, counts, unsupported)
+
+
+def _at(points: Any, rows: Any, hits: Any) -> Any:
+    """The rows (n,) of points (P, C), with places (n, 3)."""
+    if isinstance(points, np.ndarray):
+        out = points[rows]
+        out[:, :3] = hits
+        return out
+    out = points.detach()[torch.from_numpy(rows).to(points.device, torch.int64)]
+    if out.ndim == 2:
+        out[:, :3] = torch.from_numpy(hits).to(out)
+    return out
+
+
+def retarget_frames(frames: Sequence[Frame], target: Rig, skip: bool) -> list[RetargetedPoints]:
+    """``retarget_points`` of a sample's frames; empty if the target has no scanners or the sample no points."""
+    if not target.lidars or frames[0].sample.get("points") is None:
+        return []
+    return [
+        retarget_points(
+            frame.entry("points"), target, boxes_3d=frame.array("boxes_3d"), ground_z_m=frame.rig.ground_z_m, skip=skip
+        )
+        for frame in frames
+    ]
+
+
+def entries_of(parts: Sequence[RetargetedPoints], lead: tuple[int, ...]) -> dict[str, Any]:
+    """Entries of the output sample: with leading dimensions, a list with an entry for each frame."""
+    keys = {"points": [p.points for p in parts], RINGS_KEY: [p.rings for p in parts]}
+    if parts and parts[0].counts is not None:
+        keys[COUNTS_KEY] = [p.counts for p in parts]
+    return {key: values if lead else values[0] for key, values in keys.items() if values}
+
+
+def words_of(part: RetargetedPoints, frame: Frame, target: Rig) -> str:
+    """One line for ``explain``."""
+    rays = sum(math.prod(lidar.shape) for lidar in target.lidars)
+    return (
+        f"points: {len(frame.entry('points'))} measured, {len(part.points)} by the target's "
+        f"{', '.join(lidar.name for lidar in target.lidars)} ({rays} rays); nothing was measured near "
+        f"{part.unsupported:.0%} of the rays, the sky's among them"
+    )

@@ -1,0 +1,172 @@
+"""``python -m integrations.benchmarks.lidar``: scans as another scanner would have measured them, against true ones.
+
+Synthetic streets scanned by both scanners, and DDAD's next scan, 1.26 m ahead, where ARBIVIEW_DATA names the real
+frames. Returns and ranges count at rays within half a line spacing of which A measured something. Baselines: A's points
+as they are, and those of its rings that are next to one of B's (LiDAR-Distillation's way to fewer beams).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from arbiview_aug import Lidar, Rig
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cli.arguments import command_parser, count
+from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.environment import one_thread
+from arbiview_aug.evaluate.scans import chamfer_m, scan_metrics
+from arbiview_aug.scene.point_cloud import own_car
+from arbiview_aug.transforms.scans import retarget_points
+
+COLUMNS = ("recall", "precision", "range_error_m", "chamfer_m")
+PLACE_M = (0.9, 0.0, 1.9)
+UP_M = 0.7
+_GRID_DEG = 0.05
+
+
+def scanner(beams: int, up_m: float = 0.0) -> Lidar:
+    """Evenly spaced beams: 32 as an HDL-32E's, or 64 that reach as far up."""
+    pose = np.eye(4)
+    pose[:3, 3] = np.add(PLACE_M, (0, 0, up_m))
+    low, step = {32: (-30.67, 0.332), 64: (-24.8, 0.17)}[beams]
+    return Lidar(f"{beams} beams", pose, np.linspace(low, 10.67, beams).tolist(), step, (1.0, 90.0))
+
+
+PAIRS = {
+    f"{a} -> {b}{words}": (scanner(a), scanner(b, up_m))
+    for words, up_m in (("", 0.0), (f", {UP_M} m higher", UP_M))
+    for a, b in ((32, 64), (64, 32))
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print a table of both studies."""
+    arguments = _parser().parse_args(argv)
+    print(f"| scene | points | {' | '.join(COLUMNS)} |\n| --- | --- |{' ---: |' * len(COLUMNS)}")
+    for scene, name, metrics in (*synthetic(arguments.frames, arguments.seed), *ddad(arguments.data)):
+        cells = (f"{metrics[key]:.3f}" if key in metrics else "" for key in COLUMNS)
+        print(f"| {scene} | {name} | {' | '.join(cells)} |")
+    print(f"\n{speed(arguments.seed)}")
+    return 0
+
+
+def speed(seed: int) -> str:
+    """Times of one scan in this process, without and with boxes."""
+    rig = replace(demo_source_rig((8, 22)), lidars=[scanner(64)])
+    drive = SyntheticDrive(rig, num_frames=1, seed=seed)
+    points, boxes = drive.points(0)[:120_000], drive[0]["boxes_3d"]
+    target = replace(rig, lidars=[replace(scanner(64, UP_M), azimuth_step_deg=360 / 2650)])
+    times = []
+    with one_thread():
+        for labels in (None, boxes):
+            retarget_points(points, target, boxes_3d=labels)
+            starts = [time.perf_counter()]
+            for _ in range(15):
+                retarget_points(points, target, boxes_3d=labels)
+                starts.append(time.perf_counter())
+            times.append(1000 * np.median(np.diff(starts)))
+    size = f"{len(points)} points to {' x '.join(map(str, target.lidars[0].shape))} rays"
+    return f"{size}, one thread: {times[0]:.0f} ms; with {len(boxes)} boxes {times[1]:.0f} ms"
+
+
+def synthetic(frames: int, seed: int) -> Iterator[tuple[str, str, dict[str, float]]]:
+    """Scene, name of the points, and their metrics, for each pair of scanners: means over streets."""
+    for scene, (a, b) in PAIRS.items():
+        rows: dict[str, list[dict[str, float]]] = {}
+        rig = replace(demo_source_rig((8, 22)), lidars=[a])
+        target, drive = replace(rig, lidars=[b]), SyntheticDrive(rig, num_frames=frames, seed=seed)
+        for k in range(frames):
+            points, truth, boxes = drive.points(k), drive.points(k, target).numpy(), drive[k]["boxes_3d"]
+            ours = retarget_points(points, target, boxes_3d=boxes).points.numpy()
+            clouds = {"as they are": points.numpy(), "rings dropped": next_rings(a, b, points.numpy()), "scanned": ours}
+            where = measured_near(a, b, points.numpy())
+            for name, cloud in clouds.items():
+                rows.setdefault(name, []).append(scan_metrics(b, cloud, truth, where))
+        for name, metrics in rows.items():
+            yield scene, name, {key: float(np.mean([m[key] for m in metrics])) for key in COLUMNS}
+
+
+def measured_near(a: Lidar, b: Lidar, points: FloatArray) -> BoolArray:
+    """(beams, columns) rays of ``b`` within half a line and a column spacing of which ``a`` measured a point."""
+    half = np.diff(np.sort(a.elevations_deg)).mean() / 2, a.azimuth_step_deg / 2 + _GRID_DEG
+    local = (points[:, :3].astype(float) - b.center_m) @ b.lidar2ego[:3, :3]
+    elevation = np.degrees(np.arcsin(local[:, 2] / np.linalg.norm(local, axis=1)))
+    row, column = np.rint((elevation + 90) / _GRID_DEG), np.rint(np.degrees(np.arctan2(*local.T[1::-1])) / _GRID_DEG)
+    turn = round(360 / _GRID_DEG)
+    grid = np.zeros((turn // 2 + 1, turn), np.uint8)
+    grid[row.astype(int), column.astype(int) % turn] = 1
+    near = cv2.dilate(grid, np.ones([2 * round(angle / _GRID_DEG) + 1 for angle in half], np.uint8))
+    azimuth = b.azimuth_deg[0] + b.azimuth_step_deg * np.arange(b.shape[1])
+    rows = np.rint((np.array(b.elevations_deg) + 90) / _GRID_DEG).astype(int)
+    return np.asarray(near[rows[:, None], np.rint(azimuth / _GRID_DEG).astype(int) % turn] > 0)
+
+
+def next_rings(a: Lidar, b: Lidar, points: FloatArray) -> FloatArray:
+    """The points of those rings of ``a`` that are nearest to a ring of ``b``."""
+    local = (points[:, :3].astype(float) - a.center_m) @ a.lidar2ego[:3, :3]
+    elevation = np.degrees(np.arcsin(local[:, 2] / np.linalg.norm(local, axis=1)))
+    table = np.array(a.elevations_deg)
+    kept = np.unique(np.abs(np.array(b.elevations_deg)[:, None] - table).argmin(1))
+    return np.asarray(points[np.isin(np.abs(elevation[:, None] - table).argmin(1), kept)])
+
+
+def ddad(data: Path | None) -> Iterator[tuple[str, str, dict[str, float]]]:
+    """DDAD's scan seen from the next frame's place, against the next frame's own scan.
+
+    Its four solid-state sensors have no beam table, so a dense scanner on the roof stands for them: the return nearest
+    to the direction of each true point within 0.2 degrees is compared. The mean error of range is that at rays that
+    both clouds have. Static is a true point with one of A's within 2 m: the scans are a second apart.
+    """
+    if data is None or not (data / "ddad-next").is_dir():
+        return
+    from sklearn.neighbors import KDTree
+
+    one, two = FrameFolder(data / "ddad-one")[0], FrameFolder(data / "ddad-next")[0]
+    rig: Rig = two["rig"]
+    move = np.linalg.inv(two["ego2world"].numpy()) @ one["ego2world"].numpy()
+    moved = one["points"].numpy().astype(np.float64)
+    moved[:, :3] = moved[:, :3] @ move[:3, :3].T + move[:3, 3]
+    truth = two["points"].numpy().astype(np.float64)
+    centre = np.array([1.5, 0.0, rig.ground_z_m + 1.9])
+    away = np.linalg.norm(truth[:, :3] - centre, axis=1)
+    static = KDTree(moved[:, :3]).query(truth[:, :3])[0][:, 0] <= 2
+    kept = static & ~own_car(truth) & (away > 2) & (away < 100)
+    truth, away = truth[kept], away[kept]
+    pose = np.eye(4)
+    pose[:3, 3] = centre
+    dense = Lidar("roof", pose, np.arange(-35.0, 15.0, 0.1).tolist(), 0.1, (1.0, 120.0))
+    scanned = retarget_points(moved, replace(rig, lidars=[dense]), ground_z_m=rig.ground_z_m).points
+    rays, at_rays = (truth[:, :3] - centre) / away[:, None], {}
+    for name, cloud in (("moved", moved[~own_car(moved)]), ("scanned", scanned)):
+        distance = np.linalg.norm(cloud[:, :3] - centre, axis=1)
+        angle, nearest = KDTree((cloud[:, :3] - centre) / distance[:, None]).query(rays)
+        at_rays[name] = angle[:, 0] <= np.radians(0.2), distance[nearest[:, 0]] - away, cloud[nearest[:, 0]]
+    both = at_rays["moved"][0] & at_rays["scanned"][0]
+    for name, (near, error, cloud) in at_rays.items():
+        right = near & (np.abs(error) <= np.maximum(0.2, 0.02 * away))
+        metrics = {"recall": right.mean(), "precision": right.sum() / near.sum()}
+        metrics |= {"range_error_m": np.abs(error[both]).mean(), "chamfer_m": chamfer_m(cloud[near], truth)}
+        yield "DDAD's next scan", name, metrics
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = command_parser("", __doc__, "--frames 4", program="python -m integrations.benchmarks.lidar")
+    parser.add_argument("--frames", type=count, default=12, metavar="N", help="streets (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=8000, help="seed of the streets (default: %(default)s)")
+    folder = os.environ.get("ARBIVIEW_DATA")
+    parser.add_argument("--data", type=Path, default=folder and Path(folder), help="folder of the real frames")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

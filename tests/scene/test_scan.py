@@ -1,0 +1,152 @@
+"""Scans by other scanners: ranges of a wall, a box and the road are known by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from arbiview_aug import CalibrationError, Lidar
+from arbiview_aug.scene.scan import Scan, scan
+
+WALL_M = 10.0  # a wall across, over a road at z = 0
+BOX = np.array([[6.0, 0.0, 1.25, 2.0, 2.0, 2.5, 0.0]])  # its front is at x = 5, its sides at y = -1 and 1
+
+
+def at(x: float = 0.0, y: float = 0.0, z: float = 1.9) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def scanner(beams: int, pose: np.ndarray, **changes: Any) -> Lidar:
+    usual: dict[str, Any] = {"azimuth_step_deg": 0.25, "range_m": (0.5, 60.0), "azimuth_deg": (-60, 60)}
+    return Lidar("top", pose, tuple(np.linspace(-25, 10, beams)), **(usual | changes))
+
+
+def true_ranges(lidar: Lidar, with_box: bool = False) -> np.ndarray:
+    """Ranges (beams, columns) of the wall, up to y = 12 on both sides, the road, and the box's front and sides."""
+    x, y, z = lidar.rays.astype(np.float64)
+    cx, cy, cz = lidar.center_m
+    with np.errstate(divide="ignore", invalid="ignore"):
+        road = np.where(z < 0, -cz / z, np.inf)
+        wall = np.where(x > 0, (WALL_M - cx) / x, np.inf)
+        wall[np.abs(cy + y * wall) > 12] = np.inf
+        distance = np.minimum(road, wall)
+        if with_box:
+            front = np.where(x > 0, (5 - cx) / x, np.inf)
+            front[(np.abs(cy + y * front) > 1) | (cz + z * front > 2.5)] = np.inf
+            side = np.where(y < 0, (1 - cy) / y, np.inf) if cy > 1 else np.full(x.shape, np.inf)
+            side[(cx + x * side < 5) | (cx + x * side > 7) | (cz + z * side > 2.5)] = np.inf
+            distance = np.minimum(distance, np.minimum(front, side))
+    return np.where(distance <= lidar.range_m[1], distance, 0)
+
+
+def measured(lidar: Lidar, **scene: Any) -> np.ndarray:
+    """(P, 3) points of what a scanner measures."""
+    distance = true_ranges(lidar, **scene)
+    return (lidar.center_m + (lidar.rays * distance)[:, distance > 0].T).astype(np.float32)
+
+
+def ranges(lidar: Lidar, result: Scan) -> np.ndarray:
+    """(beams, columns) ranges of returns, 0 for none."""
+    away = result.points - lidar.center_m
+    azimuth = np.degrees(np.arctan2(away[:, 1], away[:, 0]))
+    column = np.rint((azimuth - lidar.azimuth_deg[0]) / lidar.azimuth_step_deg).astype(int)
+    image = np.zeros(lidar.shape)
+    image[result.rings, column] = np.linalg.norm(away, axis=1)
+    return image
+
+
+def no_boxes() -> np.ndarray:
+    return np.zeros((0, 7))
+
+
+@pytest.mark.parametrize(("beams", "new_beams", "up"), [(32, 64, 0.0), (64, 32, 0.0), (32, 64, 0.7)])
+def test_wall_and_road_are_where_they_are(beams: int, new_beams: int, up: float) -> None:
+    a, b = scanner(beams, at()), scanner(new_beams, at(z=1.9 + up))
+    result = scan([b], measured(a), no_boxes(), 0.0)
+    got, true = ranges(b, result), true_ranges(b)
+    seen = got > 0
+    assert seen[true > 0].mean() > (0.9 if up == 0 else 0.8)
+    error = np.abs(got - true)[seen]
+    assert np.median(error) < 0.01 and (error > 0.2).mean() < 0.045  # at the wall's foot and ends
+    assert result.unsupported == pytest.approx(1 - seen.mean(), abs=0.02)
+
+
+def test_an_object_is_its_shape_and_hides_the_wall() -> None:
+    a = scanner(32, at())
+    b = scanner(64, at(y=4.0))
+    points = measured(a, with_box=True)
+    result = scan([b], points, BOX, 0.0)
+    got, true = ranges(b, result), true_ranges(b, with_box=True)
+    x = b.center_m[0] + b.rays[0] * true
+    on_front = (np.abs(x - 5) < 0.01) & (true > 0)
+    front = got[on_front]
+    assert (front > 0).mean() > 0.9
+    assert (np.abs(front - true[on_front])[front > 0] < 0.05).mean() > 0.97
+    # From (0, 0) the box hides the wall where |y| < 2: it must not be made up, although B's rays reach it.
+    hits = b.center_m + (b.rays * true).transpose(1, 2, 0)
+    unseen = (np.abs(hits[..., 0] - WALL_M) < 0.01) & (np.abs(hits[..., 1]) < 1.7) & (hits[..., 2] < 2.0)
+    assert unseen.any() and (got[unseen] == 0).mean() > 0.95
+
+
+def test_returns_name_their_point_and_ring() -> None:
+    a = scanner(32, at())
+    points = measured(a)
+    result = scan([scanner(16, at()), scanner(8, at(), azimuth_deg=(0, 30))], points, no_boxes(), 0.0)
+    apart = np.linalg.norm(points[result.nearest] - result.points, axis=1)
+    assert np.quantile(apart, 0.95) < 2 and result.nearest.dtype == result.rings.dtype == np.int32
+    assert set(result.rings[result.rings >= 16]) <= set(range(16, 24)) and (result.rings >= 16).any()
+    assert result.points.dtype == np.float32
+
+
+def test_beams_in_any_order() -> None:
+    points, usual = measured(scanner(32, at())), scanner(16, at())
+    mixed = Lidar("top", at(), usual.elevations_deg[::-1], 0.25, usual.range_m, usual.azimuth_deg)
+    one, two = scan([usual], points, no_boxes(), 0.0), scan([mixed], points, no_boxes(), 0.0)
+    np.testing.assert_array_equal(ranges(usual, one), ranges(mixed, two)[::-1])
+
+
+def test_own_car_and_range_limits_leave_no_points() -> None:
+    hood = np.stack([np.full(500, 2.0), np.linspace(-1, 1, 500), np.full(500, 0.9)], 1).astype(np.float32)
+    assert len(scan([scanner(32, at())], hood, no_boxes(), 0.0).points) == 0
+    near = scanner(32, at(), range_m=(0.5, 8.0))
+    result = scan([near], measured(scanner(32, at())), no_boxes(), 0.0)
+    away = np.linalg.norm(result.points - near.center_m, axis=1)
+    assert 0 < away.max() <= 8.0
+
+
+@pytest.mark.parametrize("beams", [1, 1024])
+def test_extreme_scanners(beams: int) -> None:
+    lidar = scanner(beams, at(), azimuth_step_deg=90.0 if beams == 1 else 1.0)
+    result = scan([lidar], measured(scanner(32, at())), BOX, 0.0)
+    assert np.isfinite(result.points).all() and result.rings.max(initial=0) < beams
+
+
+def test_upside_down() -> None:
+    a = scanner(32, at())
+    turned = at() @ np.diag([1.0, -1, -1, 1])
+    usual, hanging = scanner(16, at()), Lidar("h", turned, tuple(-np.linspace(-25, 10, 16)), 0.25, (0.5, 60), (-60, 60))
+    one, two = (scan([lidar], measured(a), no_boxes(), 0.0).points for lidar in (usual, hanging))
+    assert abs(len(one) - len(two)) < 0.02 * len(one)
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.array([[-20.0, 0, 1]]), np.full((5, 3), [0.0, 0.0, 1.9])])
+def test_no_or_useless_points_give_an_empty_scan(points: np.ndarray) -> None:
+    """Nothing at all, all behind the sector, or all at the scanner itself."""
+    result = scan([scanner(32, at())], points, BOX, 0.0)
+    assert result.points.shape == (0, 3) and len(result.nearest) == len(result.rings) == 0
+    assert result.unsupported == 1
+
+
+def test_a_scanner_inside_an_object_sees_past_it() -> None:
+    around = np.array([[0.0, 0.0, 1.9, 6.0, 3.0, 4.0, 0.0]])
+    result = scan([scanner(32, at())], measured(scanner(32, at())), around, 0.0)
+    assert (result.points[:, 0] > WALL_M - 0.5).any()
+
+
+def test_under_the_road_is_refused() -> None:
+    with pytest.raises(CalibrationError, match=r"lidar 'top': expected a place over the road at z = 0 m, got z = -1 m"):
+        scan([scanner(32, at(z=-1.0))], np.ones((5, 3)), no_boxes(), 0.0)

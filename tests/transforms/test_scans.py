@@ -1,0 +1,114 @@
+"""Points in ``RigRetarget``'s output where the target has scanners."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug import CalibrationError, Lidar, RetargetedDataset, RigRetarget, SampleError, SampleKeys, collate
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.errors import SampleTypeError
+from arbiview_aug.transforms.scans import retarget_points
+from tests.helpers import street_sample
+
+POSE = np.array([[1.0, 0, 0, 0.9], [0, 1, 0, 0], [0, 0, 1, 2.2], [0, 0, 0, 1]])
+TOP = Lidar("top", POSE, tuple(np.linspace(-25, 5, 12)), 2.0, (1.0, 80.0))
+SIZE = (64, 176)
+
+
+def target(**changes: Any) -> Any:
+    return replace(demo_source_rig(SIZE), **({"lidars": [TOP]} | changes))
+
+
+@pytest.fixture(scope="module")
+def sample() -> dict[str, Any]:
+    return street_sample(SIZE)
+
+
+def test_points_are_those_of_the_target(sample: dict[str, Any]) -> None:
+    out = RigRetarget(target())(sample)
+    points, rings, counts = out["points"], out["point_rings"], out["num_points"]
+    assert points.dtype == torch.float32 and points.shape[1] == 4
+    assert 500 < len(points) == len(rings) <= 12 * 180
+    away = points[:, :3].double().numpy() - POSE[:3, 3]
+    elevation = np.degrees(np.arcsin(away[:, 2] / np.linalg.norm(away, axis=1)))
+    np.testing.assert_allclose(elevation, np.array(TOP.elevations_deg)[rings], atol=0.01)
+    assert set(points[:, 3].tolist()) <= set(sample["points"][:, 3].tolist())
+    assert counts.shape == (len(sample["boxes_3d"]),) and counts.dtype == torch.int64 and counts.sum() > 0
+    assert "top (2160 rays)" in str(RigRetarget(target()).explain(sample))
+
+
+def test_points_pass_without_scanners(sample: dict[str, Any]) -> None:
+    out = RigRetarget(target(lidars=()))(sample)
+    assert out["points"] is sample["points"] and "point_rings" not in out and "num_points" not in out
+    bare = {key: value for key, value in sample.items() if key not in ("points", "boxes_3d", "box_classes")}
+    assert not {"points", "point_rings", "num_points"} & RigRetarget(target())(bare).keys()
+
+
+def test_arrays_and_dtypes_stay(sample: dict[str, Any]) -> None:
+    retarget = RigRetarget(target())
+    expected = retarget(sample)["points"]
+    array = retarget(sample | {"points": sample["points"].numpy()})["points"]
+    assert isinstance(array, np.ndarray)
+    np.testing.assert_array_equal(array, expected.numpy())
+    double = retarget(sample | {"points": sample["points"].double()})["points"]
+    assert double.dtype == torch.float64 and torch.equal(double.float(), expected)
+
+
+def test_batches_are_their_frames() -> None:
+    drive = SyntheticDrive(demo_source_rig(SIZE), num_frames=2)
+    retarget = RigRetarget(target())
+    singles, batch = [retarget(drive[k]) for k in range(2)], retarget(collate([drive[0], drive[1]]))
+    for key in ("points", "point_rings", "num_points"):
+        assert all(torch.equal(one[key], two) for one, two in zip(singles, batch[key], strict=True))
+
+
+def test_in_a_data_loader() -> None:
+    drive = SyntheticDrive(demo_source_rig((32, 88)), num_frames=2)
+    data = RetargetedDataset(drive, RigRetarget(target(), size=(32, 88)))
+    (batch,) = torch.utils.data.DataLoader(data, batch_size=2, num_workers=1, collate_fn=collate)
+    assert [len(points) for points in batch["points"]] == [len(rings) for rings in batch["point_rings"]]
+
+
+def test_skipped_samples_have_the_same_keys(sample: dict[str, Any]) -> None:
+    retarget = RigRetarget(target(), p=0.5, size=SIZE)
+    skipped, scanned = (retarget(sample, params={"skipped": skip}) for skip in (1.0, 0.0))
+    assert skipped.keys() == scanned.keys() and skipped["points"] is sample["points"]
+    assert (skipped["point_rings"] == -1).all() and len(skipped["point_rings"]) == len(sample["points"])
+
+
+def test_both_roads_coincide(sample: dict[str, Any]) -> None:
+    """A target whose frame is 0.3 m higher has its scanner 0.3 m lower there; the points are the same."""
+    lower = replace(demo_source_rig(SIZE).shifted(z_m=-0.3), ground_z_m=-0.3, lidars=[TOP.shifted(z_m=-0.3)])
+    one, two = RigRetarget(target())(sample)["points"], RigRetarget(lower)(sample)["points"]
+    torch.testing.assert_close(one, two, atol=1e-3, rtol=0)
+    moved = RigRetarget(lower, keys=SampleKeys(frame="target"))(sample)["points"]
+    torch.testing.assert_close(moved[:, 2], two[:, 2] - 0.3, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("shape", [(0,), (0, 4), (0, 3)])
+def test_no_points(sample: dict[str, Any], shape: tuple[int, ...]) -> None:
+    out = RigRetarget(target(), geometry="street")(sample | {"points": torch.zeros(shape)})
+    assert out["points"].shape == shape and len(out["point_rings"]) == 0 and out["num_points"].sum() == 0
+
+
+def test_missing_returns_are_left_out() -> None:
+    points = torch.tensor([[10.0, 0.0, 1.0, 7.0], [float("nan")] * 4, [10.0, 0.1, 1.0, 8.0]])
+    with pytest.warns(UserWarning, match="rows with NaN"):
+        out = retarget_points(points, target())
+    assert torch.isfinite(out.points).all() and set(out.points[:, 3].tolist()) <= {7.0, 8.0}
+
+
+def test_what_is_refused() -> None:
+    with pytest.raises(SampleTypeError, match="points: expected a float tensor or array to scan, got torch"):
+        retarget_points(torch.ones((5, 4), dtype=torch.int32), target())
+    with pytest.raises(SampleTypeError, match="got list"):
+        retarget_points([[1.0, 2.0, 3.0]], target())
+    with pytest.raises(SampleError, match="points: expected shape"):
+        retarget_points(torch.ones((5, 2)), target())
+    with pytest.raises(CalibrationError, match="lidar 'top': expected a place over the road"):
+        retarget_points(torch.ones((5, 4)), target(lidars=[TOP.shifted(z_m=-3)]))
