@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from arbiview_aug.transforms.resize import CropRig as CropRig
     from arbiview_aug.transforms.resize import ResizeRig as ResizeRig
     from arbiview_aug.transforms.rig_retarget import RigRetarget as RigRetarget
+    from arbiview_aug.transforms.scans import retarget_points as retarget_points
     from arbiview_aug.transforms.settings import SampleKeys as SampleKeys
 else:
     __getattr__, __dir__, __all__ = lazy_names(
@@ -55,6 +56,7 @@ else:
             "transforms.plan_cache": "PlanCache",
             "transforms.resize": "CropRig ResizeRig",
             "transforms.rig_retarget": "RigRetarget",
+            "transforms.scans": "retarget_points",
             "transforms.settings": "SampleKeys",
         },
     )

@@ -63,11 +63,10 @@ def retarget_points(
     boxes = None if boxes_3d is None else checked_boxes(boxes_3d)
     unsupported, rings = 0.0, torch.full((len(measured),), -1, dtype=torch.int32)
     if not skip:
-        up = ground_z_m - target.ground_z_m
-        lidars = [lidar.shifted(z_m=up) for lidar in target.lidars]
-        hits, nearest, rings_of, unsupported = scan(
-            lidars, measured, np.zeros((0, 7)) if boxes is None else boxes, ground_z_m
-        )
+        up = ground_z_m - target.ground_z_m  # scanners keep their rays where nothing moves
+        lidars = [lidar.shifted(z_m=up) for lidar in target.lidars] if up else target.lidars
+        objects = np.zeros((0, 7)) if boxes is None else boxes
+        hits, nearest, rings_of, unsupported = scan(lidars, measured, objects, ground_z_m)
         rows = np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest
         points, measured, rings = _at(points, rows, hits), hits, torch.from_numpy(rings_of)
     counts = None

@@ -18,7 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from arbiview_aug import Lidar, Rig
+from arbiview_aug import Lidar, Rig, retarget_points
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cli.arguments import command_parser, count
 from arbiview_aug.datasets import FrameFolder
@@ -26,7 +26,6 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.scans import chamfer_m, scan_metrics
 from arbiview_aug.scene.point_cloud import own_car
-from arbiview_aug.transforms.scans import retarget_points
 
 COLUMNS = ("recall", "precision", "range_error_m", "chamfer_m")
 PLACE_M = (0.9, 0.0, 1.9)

@@ -222,7 +222,7 @@ def test_content_key_and_order_depend_on_calibration_alone() -> None:
 def test_repr_is_a_table() -> None:
     lines = repr(load_rig("argoverse2")).splitlines()
     assert lines[0] == "Rig argoverse2: 7 cameras, road at z = -0.33 m"
-    assert len(lines) == 2 + 7
+    assert len(lines) == 2 + 7 + 2 and "lidar up_lidar: 32 x 1808 rays" in lines[-2]
     assert "ring_front_center" in lines[2] and "1550x2048" in lines[2] and lines[2].endswith("1.73 m")
     assert "mask: 15% own car" in repr(rig_with_everything())
     assert repr(Rig([camera()])).startswith("Rig (unnamed): 1 cameras")

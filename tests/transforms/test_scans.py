@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import CalibrationError, Lidar, RetargetedDataset, RigRetarget, SampleError, SampleKeys, collate
+from arbiview_aug import (
+    CalibrationError,
+    Lidar,
+    RetargetedDataset,
+    RigRetarget,
+    SampleError,
+    SampleKeys,
+    collate,
+    retarget_points,
+)
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleTypeError
-from arbiview_aug.transforms.scans import retarget_points
 from tests.helpers import street_sample
 
 POSE = np.array([[1.0, 0, 0, 0.9], [0, 1, 0, 0], [0, 0, 1, 2.2], [0, 0, 0, 1]])

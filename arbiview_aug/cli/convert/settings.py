@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,7 +64,7 @@ class Settings:
     def retarget(self) -> RigRetarget:
         """The transform; each process or actor makes one."""
         return RigRetarget(
-            self.target,
+            replace(self.target, lidars=()),  # the points' files are kept
             holes=self._inpainter(),
             keys=SampleKeys(extra=() if self.quality == "paper" else ("confidence",)),
             **{name: getattr(self, name) for name in RETARGET_OPTIONS},
