@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from integrations.benchmarks.lidar import PAIRS, ddad, main, synthetic
@@ -26,7 +25,8 @@ def test_the_next_scan_is_nearer_than_moved_points(data_root: Path) -> None:
         pytest.skip("DDAD's next frame is missing")
     for key in ("range_error_m", "chamfer_m"):
         assert rows["scanned"][key] < rows["moved"][key]
-    assert all(np.greater([rows["scanned"][key] for key in ("recall", "precision")], 0.7))
+    for key in ("recall", "precision"):
+        assert rows["scanned"][key] > rows["moved"][key]
 
 
 @pytest.mark.slow
