@@ -8,6 +8,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -25,6 +26,7 @@ PACKAGE = str(Path(arbiview_aug.__file__).parent)
 BOUNDS = {
     "street, plan cached": (15, 47),
     "LiDAR + boxes": (25, 600),
+    "LiDAR + boxes, points scanned": (30, 650),
     "learned depth": (26, 600),
     "generated": (27, 1500),
     "neighbours, all": (32, 2500),
@@ -68,10 +70,12 @@ def traced_calls() -> dict[str, Tracer]:
     bare = {key: value for key, value in sample.items() if key not in ("points", "boxes_3d")}
     of_network = bare | {LEARNED_KEY: [torch.full(motion_camera(camera).size, 12.0) for camera in rig]}
     unmeasured = {key: value for key, value in drive.items() if key != "points"}
-    target = load_rig("argoverse2").undistorted().resized((64, 96))
+    scanned = load_rig("argoverse2").undistorted().resized((64, 96))
+    target = replace(scanned, lidars=())
     calls = {
         "street, plan cached": (RigRetarget(target), bare),
         "LiDAR + boxes": (RigRetarget(target), sample),
+        "LiDAR + boxes, points scanned": (RigRetarget(scanned), sample),
         "learned depth": (RigRetarget(target, geometry="learned"), of_network),
         "generated": (RigRetarget(target, holes="diffusion"), bare),
         "neighbours, all": (RigRetarget(target, neighbours="all"), drive),

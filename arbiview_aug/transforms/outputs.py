@@ -47,7 +47,7 @@ class SampleWriter:
         of its scanners.
         """
         sample, lead = frames[0].sample, frames[0].lead
-        out = self._passed_on(sample, labels) | entries_of(points, lead)
+        out = self._passed_on(sample, labels) | (entries_of(points, lead) if points else {})
         out["images"] = rewrapped(gathered([stacked(frame.images) for frame in rendered], lead), sample["images"])
         rigs, device = [frame.rig for frame in rendered], rendered[0].images[0].device
         entries = calibration_entries(rigs, device, lead, lenses=self.lenses, masks=self.masks)

@@ -252,7 +252,8 @@ class RigRetarget(torch.nn.Module):
             rendered = self.inpainter.fill(self._rendered(frames, target), frames)
             if self.size is not None and self.fit == "pad":
                 rendered = [of_frame.between_bars(self.size) for of_frame in rendered]
-        return self._writer.write(frames, rendered, labels, target, draws, retarget_frames(frames, target, skip))
+        points = retarget_frames(frames, target, skip) if target.lidars else ()
+        return self._writer.write(frames, rendered, labels, target, draws, points)
 
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
         """Check the sample's further keys, and return those that hold label maps."""

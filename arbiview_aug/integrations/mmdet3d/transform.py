@@ -51,6 +51,9 @@ class RigRetargetMultiView:
     ) -> None:
         if isinstance(keys := settings.get("keys"), Mapping):
             settings["keys"] = SampleKeys(**keys)
+        target = load_rig(target) if isinstance(target, str | Path) else target
+        if isinstance(target, Rig):
+            target = replace(target, lidars=())  # the results' points stay
         self.retarget = RigRetarget(target, **settings)
         held = self.retarget.target
         rig = held.base if isinstance(held, RandomRig) else held
