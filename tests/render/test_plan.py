@@ -223,7 +223,7 @@ def test_plans_pickle_and_the_cache_is_bounded() -> None:
 def test_plan_key_knows_content_not_names() -> None:
     rig = load_rig("nuscenes")
     cameras = [replace(c, name=c.name + "x") for c in rig]
-    renamed = Rig(cameras, ground_z_m=rig.ground_z_m, name="other")
+    renamed = replace(rig, cameras=cameras, name="other")
     config = RenderConfig()
     assert plan_key(rig, renamed, "auto", config) == plan_key(renamed, rig, "auto", config)
     for other in (

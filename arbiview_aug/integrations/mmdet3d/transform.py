@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError, SampleKeys
+from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError, SampleKeys, load_rig
 from arbiview_aug.cameras.random_rig import sequence_rng
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, retarget_img_inputs
 from arbiview_aug.integrations.mmdet3d.images import Norm
