@@ -26,7 +26,7 @@ import torch
 from arbiview_aug import Rig
 from arbiview_aug.cameras.rays import project_rays
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
-from arbiview_aug.datasets.synthetic.scene import BoxClass, Material, Scene, SceneBuilder
+from arbiview_aug.datasets.synthetic.scene import BoxClass, Look, Material, Scene, SceneBuilder
 from arbiview_aug.render.rendered import render_labels
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.boxes import PIECES, BoxSurface, checked_boxes, draw_boxes, whole
@@ -69,7 +69,7 @@ def blocks(scene: Scene) -> Scene:
         of = SceneClass.PEDESTRIAN if box_class == BoxClass.PEDESTRIAN else SceneClass.VEHICLE
         x, y, z = box[3:6] / 2
         place = builder.place(tuple(box[:3]), box[6], of, row)
-        place.box((-x, x), (-y, y), (-z, z), Material.PLAIN, (0.5, 0.5, 0.5))
+        place.box((-x, x), (-y, y), (-z, z), Look(Material.PLAIN, (0.5, 0.5, 0.5)))
     unlabelled, new = scene.instance < 0, builder.arrays()
     parts = [name for name in new if name not in ("boxes", "box_classes")]
     joined = {name: np.concatenate([getattr(scene, name)[unlabelled], new[name]]) for name in parts}
