@@ -53,8 +53,8 @@ evenly bright sky gives 1.7; clear coat reflects 4 to 5 %. From ``integrations.b
 _SURE_SAMPLES = 6
 """Samples of a seen top that weigh as much as its sides."""
 
-_LEAST_SAMPLES = 3
-"""Samples of a body's side that suffice for its paint."""
+_LEAST_SAMPLES, _LEAST_SHARE = 3, 0.1
+"""Samples of a body's side that suffice for its paint, and the body's least share of those of all sides."""
 
 _GAMMA = 2.2
 """Exponent of displayed colours in linear light, as sRGB's on average."""
@@ -172,14 +172,16 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
         of_sides = np.concatenate(sides)
         if len(of_sides):
             colours[first : first + TOP_PART] = _quantile(of_sides, 0.5)
-        bodies = [side for side in sides[1:] if len(side) >= _LEAST_SAMPLES] or [of_sides]
-        colours[first + TOP_PART] = _top_colour(bodies, tops, white)
+        paints = [_quantile(side, _BODY_SHARE) for side in sides[1:] if len(side) >= _LEAST_SAMPLES]
+        is_seen = len(of_sides) - len(sides[0]) >= _LEAST_SHARE * len(of_sides)  # few pixels may be another object's
+        if len(of_sides) and not (paints and is_seen):
+            paints = [_quantile(of_sides, _TOP_SHARE)]  # windows are darker than the paint around them
+        colours[first + TOP_PART] = _top_colour(paints, tops, white)
     return colours
 
 
-def _top_colour(bodies: Sequence[Colour], tops: Colour, white: float) -> Colour:
-    """Colour (3,) of an object's tops by samples (n, 3) of its body's sides, and of tops; -1 where there are none."""
-    paints = [_quantile(body, _BODY_SHARE) for body in bodies if len(body)]
+def _top_colour(paints: Sequence[Colour], tops: Colour, white: float) -> Colour:
+    """Colour (3,) of an object's tops by the paints (3,) of its sides and samples (n, 3) of tops; -1 without any."""
     if not paints and not len(tops):
         return np.full(3, -1, np.float32)
     sure = len(tops) / (len(tops) + _SURE_SAMPLES) if paints else 1.0
