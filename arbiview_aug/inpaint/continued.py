@@ -53,7 +53,7 @@ evenly bright sky gives 1.7; clear coat reflects 4 to 5 %. From ``integrations.b
 _SURE_SAMPLES = 6
 """Samples of a seen top that weigh as much as its sides."""
 
-_LEAST_SAMPLES, _LEAST_SHARE = 3, 0.1
+_LEAST_SAMPLES, _LEAST_SHARE = 3, 0.03
 """Samples of a body's side that suffice for its paint, and the body's least share of those of all sides."""
 
 _GAMMA = 2.2
