@@ -66,8 +66,8 @@ Colour = npt.NDArray[np.float32]
 class Continue(Inpainter):
     """Continues the road along the heading, and what stands upright along the heading and vertically.
 
-    Unseen parts of labelled objects: tops take the colour of their object's top as a source sees it, else of its sides
-    in the frame's light; sides go on from their seen pixels. Covered pixels do not change.
+    Unseen parts of labelled objects: tops take the paint of their object's body and what a source sees of its tops
+    (``object_colours``); sides go on from their seen pixels. Covered pixels do not change.
     """
 
     outcome: ClassVar[str] = "filled in from its surroundings"

@@ -128,7 +128,7 @@ def _road_flow(image: SweptImage, other: SweptImage, road: Layer) -> _RoadFlow:
     seen[:first] = False
     warped = np.where(seen, _read(other.grey, at), image.grey)
     grey, warped = (np.rint(one[first:]).astype(np.uint8) for one in (image.grey, warped))
-    moved, _empty = np.zeros_like(at), None
+    moved = np.zeros_like(at)
     cv: Any = cv2  # whose stubs lack DIS flow
     dis = cv.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     moved[first:] = dis.calc(grey, warped, None) if min(grey.shape) >= _LEAST_DIS_PX else 0
@@ -210,7 +210,7 @@ def _correlations(image: SweptImage, flows: Sequence[_RoadFlow], rows: Any, colu
     side = (2 * RADIUS_PX + 1,) * 2
     y, x = np.mgrid[part]
     grid, pixels = np.stack([x, y, np.ones_like(x)], -1), np.stack([columns, rows, np.ones_like(rows)], -1)
-    one, found = image.grey[part], []
+    one, correlations = image.grey[part], []
     for flow in flows:
         if not flow.seen[rows, columns].any():
             continue
@@ -219,5 +219,5 @@ def _correlations(image: SweptImage, flows: Sequence[_RoadFlow], rows: Any, colu
         products = one, two, one * one, two * two, one * two
         means = [cv2.blur(product, side, borderType=cv2.BORDER_REPLICATE) for product in products]
         variances = [np.maximum(means[k + 2] - means[k] ** 2, 0) + NOISE_LEVELS**2 for k in range(2)]
-        found.append((means[4] - means[0] * means[1]) / np.sqrt(variances[0] * variances[1]))
-    return np.asarray((3 * np.max(found, axis=0) + np.min(found, axis=0)) / 4)  # as costs are merged
+        correlations.append((means[4] - means[0] * means[1]) / np.sqrt(variances[0] * variances[1]))
+    return np.asarray((3 * np.max(correlations, axis=0) + np.min(correlations, axis=0)) / 4)  # as costs are merged
