@@ -72,12 +72,12 @@ def scan(lidars: Sequence[Lidar], points: Points, boxes: FloatArray, ground_z_m:
     points, boxes = np.ascontiguousarray(points, np.float32), np.ascontiguousarray(boxes)
     within = points_by_box(boxes, points, AIR_M)
     planes, is_own = solids_among(boxes, points, within)
-    static = np.flatnonzero(~(own_car(points) | is_own))
+    static = np.flatnonzero(~(own_car(points) | is_own)).astype(np.int32)
     inside, ends = within
     own = inside[is_own[inside]]
     ends = np.append(0, np.cumsum(is_own[inside]))[ends]
     objects = planes, points[own], ends, len(static), _MOST_OWN, AIR_M, SUPPORT_RAD
-    numbers, scene = np.concatenate([static, own]).astype(np.int32), points[static]
+    numbers, scene = np.concatenate([static, own], dtype=np.int32), points[static]
     street, first = Street(ground_z_m=ground_z_m), 0
     parts: list[tuple[Layer, Numbers, Numbers]] = []
     silent = 0
@@ -122,21 +122,20 @@ def _static_returns(lidar: Lidar, rays: Layer, points: Points, street: Street) -
     up, side = (round(angle / SCANNED.rad) for angle in (SUPPORT_RAD, SIDE_SUPPORT_RAD))
     nearest_returns(*cells, *view.seeds, up, side, nearest)
     # Cells and averages blur what was measured: the nearest point tells by how much, and whether it is of the surface.
-    is_used = np.zeros(len(points) + 1, bool)
-    is_used[nearest] = True
-    used = np.flatnonzero(is_used[:-1])
+    is_used = np.zeros(len(points), bool)
+    is_used[nearest[nearest >= 0]] = True
+    used, place = np.flatnonzero(is_used), np.cumsum(is_used, dtype=np.int32)[nearest] - 1
     away = points[used] - origin.astype(np.float32)
     exact = 1 / np.maximum(np.linalg.norm(away, axis=1), np.float32(NEAREST_M))
     to_points = np.ascontiguousarray((away * exact[:, None]).T[:, None])
     blurred, blurred_residual, *_ = _read(view, origin, to_points, street)
-    error, tolerance, measured = np.zeros((3, len(points) + 1), np.float32)
-    tolerance[used] = STEP * exact + STEP_PER_M
-    error[used] = exact - blurred[0]
-    measured[used] = blurred_residual[0] + error[used]
+    error, tolerance = exact - blurred[0], STEP * exact + STEP_PER_M
+    measured = blurred_residual[0] + error
     error[np.abs(error) > tolerance] = 0
-    q += error[nearest]
-    is_same = np.abs(residual + error[nearest] - measured[nearest]) <= tolerance[nearest]
-    supported = (nearest >= 0) & is_same & (q > 0)
+    supported = nearest >= 0
+    if len(used):
+        q += np.where(supported, error[place], np.float32(0))
+        supported &= (np.abs(residual + error[place] - measured[place]) <= tolerance[place]) & (q > 0)
     return np.where(supported, q, np.float32(0)), np.where(supported, nearest, np.int32(-1))
 
 
