@@ -23,10 +23,10 @@ from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import repeatable_opencv
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.favs.stage1_geometry import check_pinhole, h_geom_of_visible
+from arbiview_aug.favs.stage1_geometry import check_pinhole, cones_meet, h_geom
 from arbiview_aug.favs.stage2_features import NO_MATCHES, FeatureReport, Region, optimise_transformation, unmatched
 from arbiview_aug.favs.stage3_objects import AlignmentReport, align_objects, declined, find_objects
-from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion, source_pixels, warp_perspective
+from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, fuse, fusion_weight, source_pixels, warp_perspective
 from arbiview_aug.render.rendered import RenderedFrame, from_winners
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.sample.detections import Detection
@@ -133,13 +133,9 @@ def _render_view(
 ) -> PaperView:
     size, cameras = target.size, source.cameras
     # Stage 1.
-    homographies = h_geom_of_visible(cameras, target)
-    warps: dict[int, Warp] = {}
-    for k in order:
-        if k in homographies:
-            warp = warp_perspective(arrays[k], homographies[k], size, cameras[k].mask)
-            if warp.coverage.any():
-                warps[k] = warp
+    homographies = {k: h_geom(cameras[k], target) for k in order if cones_meet(cameras[k], target)}
+    visible = ((k, warp_perspective(arrays[k], H, size, cameras[k].mask)) for k, H in homographies.items())
+    warps = {k: warp for k, warp in visible if warp.coverage.any()}
     if not warps:
         return PaperView(torch.zeros(3, *size, dtype=dtype), np.full(size, -1, np.int8), ())
     # Stages 2 and 3.
@@ -163,8 +159,7 @@ def _render_view(
         if not config.use_feature_matching:
             features = unmatched(H, "feature matching is switched off", matches)
         if config.use_object_alignment:
-            boxes = detections.get(k, ())
-            candidates = find_objects(matches, H, features.H_base, target, source.ground_z_m, boxes)
+            candidates = find_objects(matches, H, features.H_base, target, source.ground_z_m, detections.get(k, ()))
             objects = align_objects(candidates, features.H_base, size[1], config)
         else:
             objects = declined(features.H_base, "object alignment is switched off")
@@ -173,9 +168,12 @@ def _render_view(
     for k, (features, objects) in results.items():
         if features.case != "geometric" or objects.shift_px.any():
             warps[k] = warp_perspective(arrays[k], objects.H_aligned, size, cameras[k].mask)
-    qualities = [features.quality for features, _ in results.values()]
-    fused, best = adaptive_fusion(list(warps.values()), qualities, list(warps).index(primary), config)
-    winners = np.where(best < 0, -1, np.array(list(warps))[best]).astype(np.int8)
+    weights = [
+        fusion_weight(warps[k].image, warps[k].coverage, features.quality, k == primary, config)
+        for k, (features, _) in results.items()
+    ]
+    fused, covered = fuse(np.stack([warp.image for warp in warps.values()]), np.stack(weights))
+    winners = np.where(covered, np.array(list(warps))[np.argmax(weights, axis=0)], -1).astype(np.int8)
     reports = tuple(
         SourceReport(k, k == primary, objects.H_aligned, features, objects, float((winners == k).mean()))
         for k, (features, objects) in results.items()
@@ -207,9 +205,7 @@ def paper_labels(rendering: PaperRendering, labels: Sequence[torch.Tensor], fill
 def _visible(warp: Warp) -> Region:
     """Bounding box, in source pixels, of the part of a source that the target shows."""
     uv = warp.uv[warp.coverage]
-    x0, y0 = np.floor(uv.min(0)).astype(int)
-    x1, y1 = np.ceil(uv.max(0)).astype(int)
-    return Region(int(x0), int(y0), int(x1), int(y1))
+    return Region(*map(int, (*np.floor(uv.min(0)), *np.ceil(uv.max(0)))))
 
 
 def _masked(camera: Camera, image: torch.Tensor) -> Float32Image:
@@ -227,8 +223,8 @@ def _grey(image: Float32Image) -> npt.NDArray[np.uint8]:
     return np.clip(np.round(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), 0, 255).astype(np.uint8)
 
 
-def _as_tensor(image: Float32Image, dtype: torch.dtype) -> torch.Tensor:
-    planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))
+def _as_tensor(image: FloatArray, dtype: torch.dtype) -> torch.Tensor:
+    planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1), np.float32))
     return planes.round().clamp(0, 255).to(dtype) if dtype == torch.uint8 else (planes / 255).clamp(0, 1).to(dtype)
 
 

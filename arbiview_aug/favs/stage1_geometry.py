@@ -14,7 +14,7 @@ The paper's R_i is ``cam2ego[:3, :3].T``: it takes ego directions to camera i. B
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -32,17 +32,14 @@ def h_geom(source: Camera, target: Camera) -> FloatArray:
     CalibrationError for a camera that is not a pinhole camera.
     """
     check_pinhole((source, target))
-    return target.K @ _relative_rotation(source, target) @ np.linalg.inv(source.K)
+    R = target.cam2ego[:3, :3].T @ source.cam2ego[:3, :3]
+    return target.K @ R @ np.linalg.inv(source.K)
 
 
-def h_geom_of_visible(sources: Sequence[Camera], target: Camera) -> dict[int, FloatArray]:
-    """Compute H_geom for the sources, by index, whose viewing cones meet the target's."""
-    homographies = {}
-    for k, source in enumerate(sources):
-        angle_rad = np.arccos(np.clip(source.cam2ego[:3, 2] @ target.cam2ego[:3, 2], -1, 1))
-        if angle_rad <= source.half_angle_rad + target.half_angle_rad:
-            homographies[k] = h_geom(source, target)
-    return homographies
+def cones_meet(source: Camera, target: Camera) -> bool:
+    """Whether the viewing cones of two cameras meet."""
+    angle_rad = np.arccos(np.clip(source.cam2ego[:3, 2] @ target.cam2ego[:3, 2], -1, 1))
+    return bool(angle_rad <= source.half_angle_rad + target.half_angle_rad)
 
 
 def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: float) -> FloatArray:
@@ -56,7 +53,7 @@ def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: flo
     if not distance_m > 0:
         raise CalibrationError(f"h_planar: distance_m: expected a positive distance, got {distance_m!r}")
     t = target.cam2ego[:3, :3].T @ (source.center_m - target.center_m)
-    R = _relative_rotation(source, target)
+    R = target.cam2ego[:3, :3].T @ source.cam2ego[:3, :3]
     return target.K @ (R - np.outer(t, normal) / distance_m) @ np.linalg.inv(source.K)
 
 
@@ -83,11 +80,6 @@ def check_homography(H: FloatArray, size: tuple[int, int]) -> bool:
         return False
     area = cv2.contourArea(quad.astype(np.float32)) / max((w - 1) * (h - 1), 1)
     return bool(1 / MAX_AREA_RATIO <= area <= MAX_AREA_RATIO)
-
-
-def _relative_rotation(source: Camera, target: Camera) -> FloatArray:
-    """R2 R1⁻¹, from camera 1's frame to camera 2's."""
-    return target.cam2ego[:3, :3].T @ source.cam2ego[:3, :3]
 
 
 def check_pinhole(cameras: Iterable[Camera]) -> None:

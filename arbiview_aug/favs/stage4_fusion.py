@@ -12,7 +12,6 @@ The weights that do not depend on image content are those of render plans (``arb
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -118,18 +117,3 @@ def fuse(images: FloatArray, weights: FloatArray) -> tuple[FloatArray, BoolArray
     total = scaled.sum(axis=0)
     fused = (images * scaled[..., None]).sum(axis=0) / np.where(covered, total, 1.0)[..., None]
     return np.where(covered[..., None], fused, 0.0), covered
-
-
-def adaptive_fusion(
-    warps: Sequence[Warp], qualities: Sequence[float], primary: int, config: PaperConfig
-) -> tuple[Float32Image, npt.NDArray[np.int64]]:
-    """Weight and fuse the warped sources of one target view.
-
-    (h, w, 3) fused image; (h, w) index of the source with the largest weight, -1 where there is none.
-    """
-    weights = [
-        fusion_weight(warp.image, warp.coverage, quality, k == primary, config)
-        for k, (warp, quality) in enumerate(zip(warps, qualities, strict=True))
-    ]
-    fused, covered = fuse(np.stack([warp.image for warp in warps]), np.stack(weights))
-    return fused.astype(np.float32), np.where(covered, np.argmax(weights, axis=0), -1)
