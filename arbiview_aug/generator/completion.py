@@ -22,7 +22,7 @@ from arbiview_aug.generator.correspondence import TokenWindow
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, GeneratorNetworks
 from arbiview_aug.generator.sampler import guided, noise_schedule, sample
 from arbiview_aug.image_ops import resized
-from arbiview_aug.inpaint.inpainter import check_device, known_and_holes, seeded
+from arbiview_aug.inpaint.inpainter import check_device, holes_of, seeded
 from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.batching import stacked
@@ -167,7 +167,7 @@ def _draft(rendered: RenderedFrame, source: Frame, name: str, min_confidence: fl
         raise SampleError(f"complete: expected {len(source.rig)} source images, got {len(source.images)}")
     _check_sizes(images, rendered.coverage, rig)
     trust = rendered.coverage if rendered.confidence is None else rendered.confidence
-    known, holes = known_and_holes(rig, rendered.coverage, trust, min_confidence)
+    known, holes = holes_of(rendered, min_confidence)
     for m, hole in enumerate(holes):
         if float(hole.float().mean()) > 1 - ALMOST_COMPLETE:
             left.append(m)

@@ -14,7 +14,7 @@ from arbiview_aug.errors import GeneratorError, WarnOnce
 from arbiview_aug.generator.completion import complete_together
 from arbiview_aug.generator.denoiser import GeneratorNetworks
 from arbiview_aug.generator.generator import Generator
-from arbiview_aug.inpaint.inpainter import Inpainter, checked_settings, frame_names, put
+from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, checked_settings, frame_names, put
 from arbiview_aug.inpaint.networks import NetworkInpainter, PipelineInpainter, TorchScriptInpainter
 from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.inputs import Frame
@@ -65,9 +65,7 @@ class Diffusion(Inpainter, torch.nn.Module):
     def needs_confidence(self) -> bool:
         return True
 
-    def inpaint(
-        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
-    ) -> list[torch.Tensor]:
+    def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         raise NotImplementedError("a generator needs whole frames: call fill")
 
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:

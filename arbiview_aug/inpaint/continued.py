@@ -17,7 +17,7 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
-from arbiview_aug.inpaint.inpainter import Inpainter
+from arbiview_aug.inpaint.inpainter import Inpainter, Tensors
 from arbiview_aug.inpaint.telea import GREY
 from arbiview_aug.render.plan import OBJECT, Paint
 from arbiview_aug.render.rendered import RenderedFrame
@@ -73,19 +73,17 @@ class Continue(Inpainter):
     outcome: ClassVar[str] = "filled in from its surroundings"
     only_mean: ClassVar[bool] = False
 
-    def inpaint(
-        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
-    ) -> list[torch.Tensor]:
+    def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         return fill_holes([view.clone() for view in views], [~hole for hole in holes], only_mean=self.only_mean)
 
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
         """Fill rendered frames, in place where possible."""
-        return [self._filled(frame) for frame in rendered]
-
-    def _filled(self, frame: RenderedFrame) -> RenderedFrame:
-        plans = frame.layers, frame.paint, frame.road, frame.rig
-        images = fill_holes(frame.images, list(frame.coverage), *plans, only_mean=self.only_mean)
-        return replace(frame, images=images, generated=stacked([~seen for seen in frame.coverage]))
+        filled = []
+        for frame in rendered:
+            plans = frame.layers, frame.paint, frame.road, frame.rig
+            images = fill_holes(frame.images, list(frame.coverage), *plans, only_mean=self.only_mean)
+            filled.append(replace(frame, images=images, generated=stacked([~seen for seen in frame.coverage])))
+        return filled
 
 
 class Mean(Continue):
@@ -118,6 +116,8 @@ def fill_holes(
         only_mean: Set all to the mean colour of the frame's covered pixels. Else continue background from background,
             sides of objects from objects, and paint tops in their objects' colours.
     """
+    from arbiview_aug.inpaint import kernels
+
     seen = [of_view.cpu().numpy() for of_view in coverage]
     if all(of_view.all() for of_view in seen):
         return list(views)
@@ -131,12 +131,13 @@ def fill_holes(
         if known.all():
             continue
         if only_mean:
-            _put(view, ~known, mean)
+            view[:, ~known] = (mean + (0.5 if view.dtype == np.uint8 else 0.0))[:, None].astype(view.dtype)
             continue
         of_view = np.zeros(known.shape, np.uint8) if layer is None else layer
         _fill(view, known, of_view, on_road, camera, mean)
         if objects is not None:
-            _paint(view, known, of_view, objects, colours)
+            reach = SIDE_REACH * min(known.shape)
+            kernels.paint(objects.pixel, objects.part, colours, known, of_view, reach, view.reshape(3, -1))
     return [_like(*of_view) for of_view in zip(arrays, views, coverage, strict=True)]
 
 
@@ -225,16 +226,6 @@ def _fill(
     put_cells(sums, cell, (~seen).view(np.uint8), 0.5 if view.dtype == np.uint8 else 0.0, view)
 
 
-def _paint(
-    view: npt.NDArray[Any], seen: BoolArray, layers: npt.NDArray[np.uint8], objects: Paint, colours: Colour
-) -> None:
-    """Paint the unseen parts of objects in a view by the colours (P, 3) of their parts."""
-    from arbiview_aug.inpaint.kernels import paint
-
-    reach = SIDE_REACH * min(seen.shape)
-    paint(objects.pixel, objects.part, colours, seen, layers, reach, view.reshape(3, -1))
-
-
 def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
     """Directions (2, 2, n, n) in the image, x and y, of lines along the heading and vertical ones, as kernels read."""
     if camera is None:
@@ -278,7 +269,3 @@ def _like(array: npt.NDArray[Any], view: torch.Tensor, seen: torch.Tensor) -> to
     if filled.data_ptr() == view.data_ptr():
         return view
     return torch.where(seen, view, filled.to(view.device, view.dtype))
-
-
-def _put(view: npt.NDArray[Any], chosen: npt.NDArray[Any], colour: Colour) -> None:
-    view[:, chosen] = (colour + (0.5 if view.dtype == np.uint8 else 0.0))[:, None].astype(view.dtype)

@@ -23,18 +23,12 @@ _WORTH = 0.8  # a hole is cut where the windows of both parts have at most this 
 
 
 class Window(NamedTuple):
-    """A rectangle of a view, and the pixels in it that it fills.
+    """A rectangle of a view, and the pixels in it that it fills."""
 
-    Attributes:
-        view: Index of the view.
-        top, left: Of the rectangle, pixels.
-        fills: (h, w) bool, of the rectangle's size.
-    """
-
-    view: int
-    top: int
+    view: int  # index of the view
+    top: int  # first row and column
     left: int
-    fills: BoolArray
+    fills: BoolArray  # (h, w) of the rectangle's size
 
     def of(self, array: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """This part of an array (..., h, w) of the view."""
@@ -43,15 +37,10 @@ class Window(NamedTuple):
 
 
 class Canvas(NamedTuple):
-    """Windows that a network sees in one image.
+    """Windows that a network sees in one image."""
 
-    Attributes:
-        size: (h, w) in pixels, multiples of the network's.
-        windows: With the row and the column of each on the canvas, in order of these.
-    """
-
-    size: tuple[int, int]
-    windows: list[tuple[Window, int, int]]
+    size: tuple[int, int]  # (h, w) in pixels, multiples of the network's
+    windows: list[tuple[Window, int, int]]  # with the row and the column of each on the canvas, in order of these
 
 
 def windows(holes: Sequence[BoolArray], size: int) -> list[list[Window]]:

@@ -11,11 +11,12 @@ from typing import Any, ClassVar
 
 import torch
 
-from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import GeneratorError, SampleError
-from arbiview_aug.render.rendered import MAP_KEYS, Maps, RenderedFrame
+from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
 from arbiview_aug.sample.inputs import Frame, read_frames
+
+Tensors = Sequence[torch.Tensor]
 
 SOURCES_KEY = "sources"
 """Sample key of the source images and calibration, for inpainting after collating."""
@@ -30,21 +31,21 @@ class Inpainter(ABC):
         outcome: What becomes of holes, for warnings: "The rest is ...".
         is_random: Whether ``inpaint`` reads its seeds.
         needs_confidence: Whether frames must bring their confidence.
+        fills_own_car: Whether ``inpaint`` gets the own car, which is black, as a hole too, so that it does not bleed.
     """
 
     min_confidence: float = 0.0
     seed: int = 0
     outcome: ClassVar[str] = "inpainted"
     is_random: ClassVar[bool] = False
+    fills_own_car: ClassVar[bool] = False
 
     @property
     def needs_confidence(self) -> bool:
         return self.min_confidence > 0
 
     @abstractmethod
-    def inpaint(
-        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
-    ) -> list[torch.Tensor]:
+    def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         """Fill the holes (h, w) bool of views (3, h, w), uint8 or float in [0, 1], of any frames together.
 
         Args:
@@ -60,7 +61,8 @@ class Inpainter(ABC):
         Filled pixels are no longer covered: ``coverage`` False, ``confidence`` 0, ``source_camera`` and
         ``source_frame`` -1. Gradients of the others stay.
         """
-        holes = [holes_of(frame, self.min_confidence)[1] for frame in rendered]
+        parts = [holes_of(frame, self.min_confidence) for frame in rendered]
+        unknown = [~seen if self.fills_own_car else hole for maps in parts for seen, hole in zip(*maps, strict=True)]
         names = frame_names(frames) if self.is_random else [""] * len(frames)
         seeds = [
             seeded(self.seed, name, str(k)).initial_seed() if self.is_random else 0
@@ -68,9 +70,9 @@ class Inpainter(ABC):
             for k in range(len(frame.rig))
         ]
         views = [view for frame in rendered for view in frame.images]
-        filled = iter(self.inpaint(views, [hole for of_frame in holes for hole in of_frame], seeds))
-        frames_and_holes = zip(rendered, holes, strict=True)
-        return [put(frame, [next(filled) for _ in of_frame], of_frame) for frame, of_frame in frames_and_holes]
+        filled = iter(self.inpaint(views, unknown, seeds))
+        frames_and_holes = zip(rendered, parts, strict=True)
+        return [put(frame, [next(filled) for _ in holes], holes) for frame, (_, holes) in frames_and_holes]
 
     def complete_batch(self, batch: Mapping[str, Any]) -> dict[str, Any]:
         """Fill collated samples, on the device of a network: DataLoader workers cannot use a GPU.
@@ -121,9 +123,7 @@ class Black(Inpainter):
 
     outcome = "black: train with 'coverage' as a mask"
 
-    def inpaint(
-        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
-    ) -> list[torch.Tensor]:
+    def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         return list(views)
 
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
@@ -134,19 +134,9 @@ class Black(Inpainter):
 def holes_of(frame: RenderedFrame, min_confidence: float) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     """Pixels (h, w) of each view that are seen with enough confidence, and the others that are not the own car."""
     trust = frame.coverage if frame.confidence is None else frame.confidence
-    return known_and_holes(frame.rig, frame.coverage, trust, min_confidence)
-
-
-def known_and_holes(
-    targets: Rig, coverage: Maps | Sequence[torch.Tensor], confidence: Any, min_confidence: float
-) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    """As ``holes_of``, of coverage (h, w) bool and confidence (h, w) of each target camera."""
-    known = [seen & (c >= min_confidence) for seen, c in zip(coverage, confidence, strict=True)]
-    masks = [camera.mask for camera in targets]
-    holes = [
-        ~k if mask is None else ~k & torch.tensor(mask, device=k.device) for k, mask in zip(known, masks, strict=True)
-    ]
-    return known, holes
+    known = [seen & (c >= min_confidence) for seen, c in zip(frame.coverage, trust, strict=True)]
+    views = zip(known, frame.rig, strict=True)
+    return known, [~k if c.mask is None else ~k & torch.tensor(c.mask, device=k.device) for k, c in views]
 
 
 def put(rendered: RenderedFrame, images: Sequence[torch.Tensor], holes: Sequence[torch.Tensor]) -> RenderedFrame:

@@ -476,8 +476,7 @@ def _offset(pixel: npt.NDArray[np.int64], error: Levels, size: tuple[int, ...], 
     """(3, h, w) smooth offset of a candidate: the local error near the seam, its mean farther away."""
     h, w = (-(-n // cell) for n in size)
     y, x = np.divmod(pixel, size[1])
-    place = y // cell * w + x // cell
-    sums = [np.bincount(place, part, h * w) for part in (*error, np.ones(len(pixel)))]
+    sums = [np.bincount(y // cell * w + x // cell, part, h * w) for part in (*error, np.ones(len(pixel)))]
     around: Any = np.stack(sums, axis=-1).reshape(h, w, 4) / cell**2
     for _ in range(2):
         around = cv2.blur(around, (5, 5), borderType=cv2.BORDER_CONSTANT)

@@ -15,11 +15,10 @@ import cv2
 import numpy as np
 import torch
 
-from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.inpaint.crops import Canvas, drawn, packed, windows
-from arbiview_aug.inpaint.inpainter import Inpainter, check_device, checked_settings
+from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, check_device, checked_settings
 from arbiview_aug.inpaint.telea import telea
 
 NARROW_PX = 5  # holes narrower than this are inpainted by Telea's method: half of the pixels around objects
@@ -72,15 +71,15 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         """Inpaint images (B, 3, h, w) in [0, 1], black in their holes (B, h, w) bool; the same shape comes back."""
 
     @torch.no_grad()
-    def inpaint(
-        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
-    ) -> list[torch.Tensor]:
+    def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         """Fill the holes of views in windows around them; pixels outside the holes do not change."""
         check_device(self)
         tops = [255.0 if view.dtype == torch.uint8 else 1.0 for view in views]
         # The network sees narrow holes inpainted, and they stay so.
         pixels = [telea(v, hole).float().cpu().numpy() / top for v, hole, top in zip(views, holes, tops, strict=True)]
-        left = [_wide(hole.cpu().numpy()) for hole in holes]
+        # Squares of NARROW_PX fit into what is left; the rest are cracks and edges.
+        masks, square = [hole.cpu().numpy().astype(np.uint8) for hole in holes], np.ones((NARROW_PX,) * 2, np.uint8)
+        left = [cv2.morphologyEx(mask, cv2.MORPH_OPEN, square).astype(bool) for mask in masks]
         for together in windows(left, self.size):
             alike: dict[tuple[int, int], list[Canvas]] = defaultdict(list)
             for canvas in packed(together, self.size, self.multiple):
@@ -105,8 +104,7 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         """Inpaint canvases of one size, and put their pixels where they belong; their holes are no longer left."""
         images, holes = zip(*(drawn(canvas, pixels, left) for canvas in canvases), strict=True)
         inputs = torch.from_numpy(np.stack(images)).to(self.device), torch.from_numpy(np.stack(holes)).to(self.device)
-        canvas_seeds = [seeds[canvas.windows[0][0].view] for canvas in canvases]
-        outputs = self.run(*inputs, canvas_seeds)
+        outputs = self.run(*inputs, [seeds[canvas.windows[0][0].view] for canvas in canvases])
         if outputs.shape != inputs[0].shape:
             raise GeneratorError(f"inpainting: expected images {tuple(inputs[0].shape)}, got {tuple(outputs.shape)}")
         if not bool(torch.isfinite(outputs).all()):
@@ -119,11 +117,6 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
                 h, w = window.fills.shape
                 window.of(pixels[window.view])[:, window.fills] = image[:, top : top + h, at : at + w][:, window.fills]
                 window.of(left[window.view])[window.fills] = False
-
-
-def _wide(hole: BoolArray) -> BoolArray:
-    """The parts of a hole (h, w) that a square of ``NARROW_PX`` fits into; the others are cracks and edges."""
-    return cv2.morphologyEx(hole.astype(np.uint8), cv2.MORPH_OPEN, np.ones((NARROW_PX,) * 2, np.uint8)).astype(bool)
 
 
 class PipelineInpainter(NetworkInpainter):
@@ -187,9 +180,8 @@ class PipelineInpainter(NetworkInpainter):
         multiple = int(pipeline.vae_scale_factor)
         core = getattr(pipeline, "unet", None) or pipeline.transformer
         native_px = int(getattr(core.config, "sample_size", None) or 64) * multiple
-        of_all: dict[str, Any] = {"min_confidence": min_confidence, "seed": seed}
-        size = native_px if size is None else size
-        return cls(pipeline, size, multiple, batch, prompt, steps=steps, guidance=guidance, **of_all)
+        of_all: dict[str, Any] = {"steps": steps, "guidance": guidance, "min_confidence": min_confidence, "seed": seed}
+        return cls(pipeline, native_px if size is None else size, multiple, batch, prompt, **of_all)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         h, w = images.shape[-2:]
@@ -234,5 +226,4 @@ class TorchScriptInpainter(NetworkInpainter):
         super().__init__(network, size, multiple, batch, **settings)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
-        done: torch.Tensor = self.network(images, holes[:, None].to(images.dtype))
-        return done
+        return self.network(images, holes[:, None].to(images.dtype))

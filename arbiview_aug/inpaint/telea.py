@@ -8,9 +8,7 @@ import cv2
 import numpy as np
 import torch
 
-from arbiview_aug.inpaint.inpainter import Inpainter, checked_settings, holes_of, put
-from arbiview_aug.render.rendered import RenderedFrame
-from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, checked_settings
 
 RADIUS_PX = 3.0  # radius of Telea's neighbourhood, from OpenCV's example
 _MARGIN_PX = 8  # margin around holes that Telea's method reads
@@ -42,20 +40,10 @@ def telea(image: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:
 class Telea(Inpainter):
     """Fills holes by Telea's method; seen pixels of low confidence too, by ``min_confidence``."""
 
+    fills_own_car = True
+
     def __init__(self, *, min_confidence: float = 0.0) -> None:
         self.min_confidence, _ = checked_settings(min_confidence)
 
-    def inpaint(
-        self, views: Sequence[torch.Tensor], holes: Sequence[torch.Tensor], seeds: Sequence[int]
-    ) -> list[torch.Tensor]:
+    def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         return [telea(view, hole) for view, hole in zip(views, holes, strict=True)]
-
-    @torch.no_grad()
-    def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
-        """Fill rendered frames; the own car, which is black, does not bleed into holes."""
-        filled = []
-        for frame in rendered:
-            known, holes = holes_of(frame, self.min_confidence)
-            views = self.inpaint(frame.images, [~of_view for of_view in known], ())
-            filled.append(put(frame, views, holes))
-        return filled
