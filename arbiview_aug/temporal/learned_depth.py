@@ -95,16 +95,13 @@ class CameraFit(NamedTuple):
     declined: str = ""
 
     def __str__(self) -> str:
+        to = f"{self.points} points of {self.reference}"
         if self.declined:
-            by = (
-                ""
-                if self.residual is None
-                else f" (residual {self.residual:.1%}, {self.points} points of {self.reference})"
-            )
+            by = "" if self.residual is None else f" (residual {self.residual:.1%}, {to})"
             return f"{self.camera}: declined, {self.declined}{by}"
         if self.residual is None:
             return f"{self.camera}: scale of the other cameras, at its own focal length"
-        return f"{self.camera}: fitted to {self.points} points of {self.reference}, residual {self.residual:.1%}"
+        return f"{self.camera}: fitted to {to}, residual {self.residual:.1%}"
 
 
 def learned_depth(
@@ -157,11 +154,9 @@ class View(NamedTuple):
             uv = camera.project_cam(pinhole.unproject_cam(pinhole.pixel_grid()).directions).uv.astype(np.float32)
             pixels: Any = cv2.remap(image.permute(1, 2, 0).numpy(), uv, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
             image = torch.from_numpy(pixels).permute(2, 0, 1)
-        small = motion_camera(camera)
-        prompt = None
-        if takes_prompt and frame.points is not None:
-            prompt = dense_depth(motion_camera(pinhole), frame.points)
-        return View(small, pinhole, frame.rig.ground_z_m, image, prompt)
+        points = frame.points if takes_prompt else None
+        prompt = None if points is None else dense_depth(motion_camera(pinhole), points)
+        return View(motion_camera(camera), pinhole, frame.rig.ground_z_m, image, prompt)
 
     def sampled(self, values: Layer) -> tuple[Layer, BoolArray]:
         """A prediction over the pinhole image at the pixels of the depth map, and where it has any."""
@@ -211,8 +206,11 @@ def _references(frame: DepthInputs, k: int, view: View, seen: BoolArray) -> Iter
     if frame.motion is not None:
         pixels = np.nonzero(seen & (frame.motion.depth_m[k] > 0))
         yield "motion", pixels, frame.motion.depth_m[k][pixels].astype(float)
-    pixels = np.nonzero(seen & _on_road(camera, frame.rig.ground_z_m, frame.boxes))
-    yield "road", pixels, _road_depth(camera, frame.rig.ground_z_m)[pixels]
+    road_m = _road_depth(camera, frame.rig.ground_z_m)
+    near = seen & (road_m > _NEAREST_M) & (road_m < _ROAD_M)
+    if frame.boxes is not None and len(frame.boxes):
+        near &= draw_boxes(camera, frame.boxes[:, :7])[1] < 0
+    yield "road", np.nonzero(near), road_m[near]
 
 
 def _road_depth(camera: Camera, ground_z_m: float) -> FloatArray:
@@ -221,14 +219,6 @@ def _road_depth(camera: Camera, ground_z_m: float) -> FloatArray:
     with np.errstate(divide="ignore", invalid="ignore"):
         along = (ground_z_m - camera.center_m[2]) / rays[..., 2]
         return np.where(along > 0, along * (rays @ camera.cam2ego[:3, 2]), np.inf)
-
-
-def _on_road(camera: Camera, ground_z_m: float, boxes: FloatArray | None) -> BoolArray:
-    depth_m = _road_depth(camera, ground_z_m)
-    near = (depth_m > _NEAREST_M) & (depth_m < _ROAD_M)
-    if boxes is not None and len(boxes):
-        near &= draw_boxes(camera, boxes[:, :7])[1] < 0
-    return near
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------
@@ -268,13 +258,12 @@ def _fitted(
     lines: list[_Line | None] = []
     ratios: list[float] = []  # true over predicted inverse depth, of metric networks
     samples = [_at_one_focal_length(view, one) for view, one in predicted]
+    too_few = f"fewer than {LEAST_POINTS} points of {', '.join(wanted)}"
     for k, ((view, one), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
         known = (of for of in _references(frame, k, view, seen) if of[0] in wanted and len(of[2]) >= LEAST_POINTS)
         reference, pixels, depth_m = next(known, (None, (), np.zeros(0)))
         if reference is None:
-            fits.append(
-                CameraFit(view.camera.name, declined=f"fewer than {LEAST_POINTS} points of {', '.join(wanted)}")
-            )
+            fits.append(CameraFit(view.camera.name, declined=too_few))
             lines.append(None)
             continue
         step = -(-len(depth_m) // _MOST_POINTS)

@@ -8,7 +8,7 @@ Labelled objects are masked in both frames. Unlabelled traffic is put upright wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -106,19 +106,15 @@ def motion_depth(
     first. Poses are checked on the result (``pose_error``); small errors are corrected and the images matched again.
     Neighbours and labelled objects (B, 7), which are left out, are in the current ego frame.
     """
-    cameras = [without_objects(motion_camera(camera), boxes) for camera in rig]
 
     def declined(reason: str) -> MotionDepth:
-        return MotionDepth(tuple(np.zeros(camera.size, np.float32) for camera in cameras), reason)
+        return MotionDepth(tuple(np.zeros(motion_camera(camera).size, np.float32) for camera in rig), reason)
 
-    sides = []
-    for candidates in _by_side(neighbours):
-        side = next((loaded for one in candidates if (loaded := _loaded(one, load, rig.ground_z_m)) is not None), None)
-        sides += [] if side is None else [side]
+    sides = list(_sides(neighbours, load, rig.ground_z_m))
     if not sides:
         least, most = TRAVEL_M
         return declined(f"no frame {least:g} to {most:g} m before or after it can be used")
-    swept = _swept(rig, cameras, images, rig.ground_z_m)
+    swept = _swept(rig, images, boxes, rig.ground_z_m)
     if any(min(one.camera.size) < 2 for part in (swept, *(side.images for side in sides)) for one in part):
         return declined("images one pixel wide or high have nothing to interpolate")
     words = f"from {' and '.join(side.neighbour.name for side in sides)}"
@@ -145,24 +141,24 @@ def motion_depth(
     return MotionDepth(tuple(map(_depth_m, swept, fine)), words)
 
 
-def _by_side(neighbours: Sequence[Neighbour]) -> tuple[list[Neighbour], list[Neighbour]]:
-    """Split neighbours into those behind the vehicle and those ahead of it, the best travel first."""
+def _sides(neighbours: Sequence[Neighbour], load: Load, ground_z_m: float) -> Iterator[_Side]:
+    """A neighbour behind the vehicle and one ahead of it: those of the best travel that can be loaded."""
     usable = [one for one in neighbours if TRAVEL_M[0] <= one.travel_m <= TRAVEL_M[1]]
     usable.sort(key=lambda one: (abs(one.travel_m - BEST_TRAVEL_M), one.number))
-    return [one for one in usable if one.ahead_m <= 0], [one for one in usable if one.ahead_m > 0]
+    for is_ahead in (False, True):
+        for one in usable:
+            if (one.ahead_m > 0) == is_ahead and (images := load(one)) is not None:
+                yield _Side(one, _swept(one.rig, images, one.boxes, ground_z_m))
+                break
 
 
-def _loaded(neighbour: Neighbour, load: Load, ground_z_m: float) -> _Side | None:
-    images = load(neighbour)
-    if images is None:
-        return None
-    cameras = [without_objects(motion_camera(camera), neighbour.boxes) for camera in neighbour.rig]
-    return _Side(neighbour, _swept(neighbour.rig, cameras, images, ground_z_m))
-
-
-def _swept(rig: Rig, cameras: list[Camera], images: Sequence[torch.Tensor], ground_z_m: float) -> list[SweptImage]:
-    greys = [reduced_grey(camera, image) for camera, image in zip(rig, images, strict=True)]
-    return [SweptImage(camera, grey, ground_z_m) for camera, grey in zip(cameras, greys, strict=True)]
+def _swept(
+    rig: Rig, images: Sequence[torch.Tensor], boxes: FloatArray | None, ground_z_m: float
+) -> list[SweptImage]:
+    return [
+        SweptImage(without_objects(motion_camera(camera), boxes), reduced_grey(camera, image), ground_z_m)
+        for camera, image in zip(rig, images, strict=True)
+    ]
 
 
 def without_objects(camera: Camera, boxes: FloatArray | None) -> Camera:
@@ -265,10 +261,8 @@ def estimates_motion(frame: Frame, surface: GeometryName) -> bool:
 def estimate_motion(frame: Frame, scene: Scene, neighbours: Sequence[Neighbour], warn: WarnOnce) -> MotionDepth:
     """Estimate depth from the motion between a frame and its neighbours; warn once if it is declined."""
 
-    def images(neighbour: Neighbour) -> tuple[torch.Tensor, ...] | None:
-        return neighbour_images(neighbour, frame.images, warn)
-
-    motion = motion_depth(frame.rig, frame.images, neighbours, scene.boxes, images)
+    load = partial(neighbour_images, like=frame.images, warn=warn)
+    motion = motion_depth(frame.rig, frame.images, neighbours, scene.boxes, load)
     if not motion.density:
         warn("motion", str(motion))
     return motion

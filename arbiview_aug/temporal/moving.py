@@ -73,51 +73,29 @@ def stand_on_road(
     Returns:
         The inverse distances and their validity, with the moved things filled.
     """
+    from arbiview_aug.temporal.kernels import RADIUS_PX, find_feet
+
     walls = np.where(q > image.road, q / np.maximum(image.horizontal, 1e-6) / spacing, 0)
     chosen = np.rint(walls).astype(np.int64).clip(0, len(costs) - 1)
     chosen_costs = np.take_along_axis(costs, chosen[None], 0)[0]
     q, valid = q.copy(), valid.copy()
-    _stand_hanging(image, costs, spacing, q, valid)
+    upright = (valid & (q > UPRIGHT * image.road)).astype(np.uint8)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(upright, connectivity=4)
+    least_gap_px = RADIUS_PX + math.tan(math.radians(SLOPE_DEG)) * float(image.camera.K[1, 1])
+    limits = LEAST_SCALE, EVIDENCE, STANDING, least_gap_px, image.height_m, TALLEST_M
+    surfaces = image.horizontal, image.road, image.slope
+    find_feet(labels, boxes[:count], surfaces, costs, spacing, limits, q, valid)
     _stand_off_road(image, others, chosen_costs, costs[0], q, valid)
     return q, valid
 
 
-def _stand_hanging(
-    image: SweptImage, costs: npt.NDArray[np.uint16], spacing: float, q: Layer, valid: BoolArray
-) -> None:
-    """Scale things that hang above the road, in place."""
-    from arbiview_aug.temporal.kernels import RADIUS_PX, find_feet
-
-    upright = (valid & (q > UPRIGHT * image.road)).astype(np.uint8)
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(upright, connectivity=4)
-    height_m = float(image.camera.center_m[2]) - image.ground_z_m
-    least_gap_px = RADIUS_PX + math.tan(math.radians(SLOPE_DEG)) * float(image.camera.K[1, 1])
-    limits = LEAST_SCALE, EVIDENCE, STANDING, least_gap_px, height_m, TALLEST_M
-    surfaces = image.horizontal, image.road, image.slope
-    find_feet(labels, boxes[:count], surfaces, costs, spacing, limits, q, valid)
-
-
 class _RoadFlow(NamedTuple):
-    """Optical flow to a neighbour beyond that of the road.
+    """Optical flow to a neighbour beyond that of the road."""
 
-    Attributes:
-        other: The neighbour's image.
-        flow: (h, w, 2) px, along the epipolar line towards nearer places and across it.
-        seen: (h, w) whether the neighbour sees the road there.
-        at: (h, w, 2) pixels of the neighbour that match.
-    """
-
-    other: SweptImage
-    flow: Layer
-    seen: BoolArray
-    at: Layer
-
-
-def _lowest_road(image: SweptImage) -> Layer:
-    """(h, w) inverse distance to the farthest road that a slope or a pitching vehicle may show, 1/m."""
-    height_m = max(float(image.camera.center_m[2]) - image.ground_z_m, 1e-3)
-    slope = np.float32(math.tan(math.radians(SLOPE_DEG)) / height_m)
-    return np.maximum(image.road - slope * image.horizontal, 0)
+    other: SweptImage  # the neighbour's image
+    flow: Layer  # (h, w, 2) px, along the epipolar line towards nearer places and across it
+    seen: BoolArray  # (h, w) whether the neighbour sees the road there
+    at: Layer  # (h, w, 2) pixels of the neighbour that match
 
 
 def _road_flow(image: SweptImage, other: SweptImage, road: Layer) -> _RoadFlow:
@@ -153,7 +131,8 @@ def _stand_off_road(
     """
     from arbiview_aug.temporal.kernels import PER_CORRELATION, RADIUS_PX
 
-    road, camera_m = _lowest_road(image), float(image.camera.center_m[2]) - image.ground_z_m
+    slope = np.float32(math.tan(math.radians(SLOPE_DEG)) / max(image.height_m, 1e-3))
+    road = np.maximum(image.road - slope * image.horizontal, 0)  # the farthest that a slope or a pitch may show
     flows = [_road_flow(image, other, road) for other in others]
     for thing in _off_road(flows, (road > 0) & ~(valid & (q > UPRIGHT * image.road))):
         rows, columns = thing.nonzero()
@@ -172,7 +151,7 @@ def _stand_off_road(
         wall = np.median(image.road[foot, left:right] / image.horizontal[foot, left:right])
         if not wall > 0:
             continue
-        upright, height_m = wall * image.horizontal[part], camera_m + image.slope[part] / wall
+        upright, height_m = wall * image.horizontal[part], image.height_m + image.slope[part] / wall
         filled = cv2.morphologyEx(seed.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)) > 0
         low = (height_m < LOWEST_M) & (~valid[part] | ((q[part] < upright) & (moving > still - _AS_GOOD)))
         free = low | (~valid[part] & (height_m < TALLEST_M) & (moving > _LEAST_CORRELATION))  # without the sky

@@ -39,6 +39,11 @@ class SweptImage:
     def __init__(self, camera: Camera, grey: Layer, ground_z_m: float) -> None:
         self.camera, self.grey, self.ground_z_m = camera, grey, ground_z_m
 
+    @property
+    def height_m(self) -> float:
+        """Height of the camera above the road."""
+        return float(self.camera.center_m[2]) - self.ground_z_m
+
     def moved(self, ego2ego: FloatArray) -> SweptImage:
         """The image with its camera in another ego frame."""
         return SweptImage(self.camera.moved(ego2ego), self.grey, self.ground_z_m)
@@ -116,7 +121,7 @@ class SweptImage:
         The other image is in the same ego frame.
         """
         from arbiview_aug.cameras.kernels import LENS_CODES
-        from arbiview_aug.temporal.kernels import INVALID, match_walls
+        from arbiview_aug.temporal.kernels import match_walls
 
         h, w = self.camera.size
         kind, positions = LENS_CODES.get(other.camera.lens, -1), np.zeros((0, 2, h, w), np.float32)
@@ -124,9 +129,7 @@ class SweptImage:
             positions = np.stack([self.positions(other.camera, self.inverse_distance(wall)) for wall in walls])
             positions = positions.transpose(0, 3, 1, 2)
         pose, lens = relative_pose(self.camera, other.camera), (kind, other.camera.parameters, positions)
-        costs = np.full((len(walls), h, w), INVALID, np.uint16)
-        if min(other.camera.size) < 2:  # nothing lies between its pixels
-            return costs
+        costs = np.empty((len(walls), h, w), np.uint16)
         walls = np.ascontiguousarray(walls)  # another layout would be compiled, too
         match_walls(
             self.rays, self.road, self.horizontal, self.windows, walls, pose, lens, other.grey, other.unmasked, costs

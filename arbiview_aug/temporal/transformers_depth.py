@@ -51,10 +51,8 @@ class TransformersDepth:
         self._processor = _loaded(transformers.AutoImageProcessor, name, "preprocessor_config.json beside the model")
         model = _loaded(transformers.AutoModelForDepthEstimation, name, "weights of the model")
         self.model, self.device = model.float().eval().to(device), device
-        self.name = folder.resolve().name if folder.is_dir() else name
-        self.revision = (
-            _weights_of(folder) if folder.is_dir() else str(getattr(config, "_commit_hash", None) or "unknown")[:12]
-        )
+        commit = str(getattr(config, "_commit_hash", None) or "unknown")[:12]
+        self.name, self.revision = (folder.resolve().name, _weights_of(folder)) if folder.is_dir() else (name, commit)
         self.licence = _licence(folder / "README.md" if folder.is_dir() else name)
         self.kind = str(config.model_type)
         self.takes_prompt = self.kind == "prompt_depth_anything"
