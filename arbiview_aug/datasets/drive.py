@@ -27,17 +27,11 @@ Direction = Literal["both", "past", "future"]
 
 
 class Recording(Dataset[dict[str, Any]]):
-    """Base class of the readers: samples on disk, each with a token.
+    """Base class of the readers: samples on disk, each with a token."""
 
-    Attributes:
-        root: Folder of the data.
-        tokens: Unique name of each sample, in order.
-        load_points: Whether to read the LiDAR's points.
-    """
-
-    root: Path
-    tokens: list[str]
-    load_points: bool
+    root: Path  # folder of the data
+    tokens: list[str]  # unique name of each sample, in order
+    load_points: bool  # whether to read the LiDAR's points
 
     @cached_property
     def _index(self) -> dict[str, int]:
@@ -157,18 +151,7 @@ def camera_fields(rig: Rig, images: Any, token: str) -> dict[str, Any]:
 
 
 class WritableRecording(Recording, ABC):
-    """Base class of readers that ``convert`` has a writer for, with the options that all of the package's have.
-
-    Args:
-        root: Folder of the data.
-        reduce: Decode the images at 1, 1/2 or 1/4 of their size.
-        load_points: Whether to read the LiDAR's points.
-        neighbours: Which other frames of the drive come with a sample; None for none.
-
-    Raises:
-        TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
-        ValueError: ``reduce`` is not 1, 2 or 4.
-    """
+    """Base class of readers that ``convert`` has a writer for; ``FrameFolder`` explains the options that all have."""
 
     def __init__(self, root: str | Path, reduce: Reduce, load_points: bool, neighbours: Neighbours | None) -> None:
         check_reduce(reduce)

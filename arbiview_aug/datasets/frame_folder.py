@@ -309,8 +309,7 @@ def _named(entry: Mapping[str, Any], key: str, frame: _Frame, error: type[Arbivi
     """The file that a camera names under a key, and its description for messages."""
     label, file = f"camera {entry.get('name')!r}: {key}", entry.get(key)
     if not isinstance(file, str) or not file:
-        got = f"{file!r}{hint(entry, (key,))}"
-        raise error(f"{frame.where}: {label}: expected an image's file name, got {got}")
+        raise error(f"{frame.where}: {label}: expected an image's file name, got {file!r}{hint(entry, (key,))}")
     return file, label
 
 

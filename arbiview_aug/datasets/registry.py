@@ -20,11 +20,6 @@ CALIBRATION_FILE = "calib.json"  # of a frame folder
 _LOGS = ("sync.arrow", "*/sync.arrow", "*/*/sync.arrow", "logs/*/*/sync.arrow")
 
 
-def has_frames(root: Path) -> bool:
-    """Whether a folder is a frame, or has folders that are."""
-    return (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}"))
-
-
 def table_folders(root: Path) -> list[str]:
     """Names of a nuScenes root's folders of tables: v1.0-mini and v1.0-trainval first."""
     names = (path.name for path in root.glob("v1.0-*") if path.is_dir())
@@ -49,7 +44,7 @@ class Reader:
 READERS = {
     "frames": Reader(
         f"frame folder ({CALIBRATION_FILE} in it or in its folders)",
-        has_frames,
+        lambda root: (root / CALIBRATION_FILE).is_file() or any(root.glob(f"*/{CALIBRATION_FILE}")),
         lambda root, **options: imported("arbiview_aug.datasets.frame_folder:FrameFolder")(root, **options),
         options=("clean_masks",),
         writer="arbiview_aug.cli.convert.frame_folders:FrameFolders",

@@ -83,8 +83,7 @@ class MixedDataset(Dataset[Any]):
         return len(self.raw)
 
     def __getitem__(self, index: Any) -> Any:
-        chosen = self.retargeted if torch.rand(()).item() < self.share else self.raw
-        return chosen[index]
+        return (self.retargeted if torch.rand(()).item() < self.share else self.raw)[index]
 
 
 class RetargetedIterable(IterableDataset[Any]):
@@ -131,6 +130,5 @@ def _checked_retarget(retarget: Any, name: str) -> Retarget:
     if not callable(retarget):
         raise SampleTypeError(f"{name}: expected a callable such as RigRetarget, got {type(retarget).__name__}")
     if isinstance(retarget, RigRetarget):
-        matching = GEOMETRIES[str(retarget.geometry)].needs == "motion"
-        compile_kernels(matching=matching)  # here, once, and not in every worker
+        compile_kernels(matching=GEOMETRIES[str(retarget.geometry)].needs == "motion")  # here, not in every worker
     return retarget  # type: ignore[no-any-return]
