@@ -114,8 +114,7 @@ class PoseContext(nn.Module):
 
     def __init__(self, width: int, prompt_tokens: int = 0) -> None:
         super().__init__()
-        inner = POSE_WIDTH * (1 + 2 * _OCTAVES)
-        self.mlp = nn.Sequential(nn.Linear(inner, width), nn.SiLU(), nn.Linear(width, width))
+        self.mlp = nn.Sequential(nn.Linear(POSE_WIDTH * (1 + 2 * _OCTAVES), width), nn.SiLU(), nn.Linear(width, width))
         self.register_buffer("empty_prompt", torch.zeros(prompt_tokens, width))
 
     def forward(self, pose: torch.Tensor) -> torch.Tensor:
@@ -126,8 +125,7 @@ class PoseContext(nn.Module):
         dtype = self.empty_prompt.dtype
         is_given = pose.abs().amax(-1, keepdim=True) > 0  # a pose is never 0, since R is not
         token = self.mlp(features.to(dtype)) * is_given
-        prompt = self.empty_prompt.expand(len(pose), -1, -1)
-        return torch.cat([prompt, token[:, None]], 1)
+        return torch.cat([self.empty_prompt.expand(len(pose), -1, -1), token[:, None]], 1)
 
 
 # --- the cameras of a frame -------------------------------------------------------------------------------------------

@@ -47,39 +47,28 @@ class Denoiser(nn.Module):
 
     Args:
         unet: A diffusers ``UNet2DConditionModel`` as ``UNetConfig`` describes; ``conv_in`` is widened by zeros.
-        prompt_tokens: Tokens of the empty prompt's embedding.
-        cross_view: Whether views read each other at each level, the finest first; empty: at all.
+        config: Its ``inpainting``, ``lora_rank`` (by peft), ``prompt_tokens`` and ``unet.cross_view`` are read.
         signal: (T,) √ᾱ_t of the schedule: the network then predicts the residual between image and condition. None
             leaves its output as it is, for Stable Diffusion's weights.
-        inpainting: Whether the U-Net's input begins as that of Stable Diffusion's inpainting.
-        lora_rank: Rank of LoRA on the U-Net's own attention, by peft; 0 for none.
     """
 
     deviation: torch.Tensor  # (2,) of the residual inside holes and outside; measured before training
 
-    def __init__(
-        self,
-        unet: Any,
-        prompt_tokens: int = 0,
-        cross_view: Sequence[bool] = (),
-        signal: torch.Tensor | None = None,
-        inpainting: bool = False,
-        lora_rank: int = 0,
-    ) -> None:
+    def __init__(self, unet: Any, config: GeneratorConfig, signal: torch.Tensor | None = None) -> None:
         super().__init__()
         self.latent_channels = int(unet.config.out_channels)
         widen(unet, input_channels(self.latent_channels))
-        if lora_rank:
+        if rank := config.lora_rank:
             lora = optional_package("peft", "generator").LoraConfig
-            unet.add_adapter(lora(r=lora_rank, lora_alpha=lora_rank, target_modules=list(_LORA_LAYERS)))
-        self.unet, self.inpainting = unet, inpainting
+            unet.add_adapter(lora(r=rank, lora_alpha=rank, target_modules=list(_LORA_LAYERS)))
+        self.unet, self.inpainting = unet, config.inpainting
         widths = tuple(unet.config.block_out_channels)
-        used = tuple(cross_view) or (True,) * len(widths)
+        used = config.unet.cross_view or (True,) * len(widths)
         of_blocks = zip((*widths, widths[-1], *widths[::-1]), (*used, used[-1], *used[::-1]), strict=True)
         self.cross_view = nn.ModuleDict(
             {str(k): CrossViewAttention(width, len(LEVELS)) for k, (width, is_used) in enumerate(of_blocks) if is_used}
         )
-        self.context = PoseContext(int(unet.config.cross_attention_dim), prompt_tokens)
+        self.context = PoseContext(int(unet.config.cross_attention_dim), config.prompt_tokens)
         self.regression = nn.Conv2d(widths[0], self.latent_channels, 3, padding=1)
         nn.init.zeros_(self.regression.weight)
         nn.init.zeros_(self.regression.bias)  # type: ignore[arg-type]
@@ -333,8 +322,7 @@ class GeneratorNetworks(nn.Module):
     def __init__(self, config: GeneratorConfig, unet: Any, vae: Any | None, signal: torch.Tensor | None = None) -> None:
         super().__init__()
         self.config = config
-        cross_view, lora_rank = config.unet.cross_view, config.lora_rank
-        self.denoiser = Denoiser(unet, config.prompt_tokens, cross_view, signal, config.inpainting, lora_rank)
+        self.denoiser = Denoiser(unet, config, signal)
         self.autoencoder = Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch)
         if config.frozen_unet:
             self.requires_grad_(False)

@@ -36,8 +36,7 @@ def noise_schedule(*, prediction: str, zero_snr: bool) -> Any:
 
 def timesteps(steps: int, strength: float) -> list[int]:
     """At most ``steps`` times from T · strength − 1 down, with trailing spacing; no time twice."""
-    start = TIMESTEPS * strength
-    spaced = [round(start * (1 - k / steps)) - 1 for k in range(steps)]
+    spaced = [round(TIMESTEPS * strength * (1 - k / steps)) - 1 for k in range(steps)]
     return sorted({t for t in spaced if t >= 0}, reverse=True) or [0]
 
 

@@ -48,7 +48,7 @@ def test_untrained_attention_leaves_the_plain_unet(size: tuple[int, int], checkp
     torch.manual_seed(0)
     config = small_config(image_size=size)
     plain = UNet2DConditionModel(**config.unet.arguments(3, 3))
-    denoiser = Denoiser(copy.deepcopy(plain))
+    denoiser = Denoiser(copy.deepcopy(plain), config)
     denoiser.gradient_checkpointing = checkpointing
     geometry = frame_geometry(list(ring(3, name="t")), list(ring(3)), 0.0, config)
     targets = views(geometry, "target")

@@ -65,7 +65,7 @@ def test_the_paper_configuration_has_stable_diffusions_layout() -> None:
     with torch.device("meta"):
         unet, vae = UNet2DConditionModel.from_config(UNET_15), AutoencoderKL.from_config(VAE_15)
         plain, made = shapes(unet), Generator.from_config(paper())
-        attached = Denoiser(unet, prompt_tokens=77)
+        attached = Denoiser(unet, paper())
     assert sum(torch.Size(s).numel() for s in plain.values()) == 859_520_964 and len(plain) == 686
     assert sum(torch.Size(s).numel() for s in shapes(vae).values()) == 83_653_863
     wide = {**plain, "conv_in.weight": (320, 16, 3, 3)}

@@ -120,8 +120,7 @@ def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
 def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: str) -> None:
     name = path[0]
     if name not in data:
-        hint = setting_hint([name])
-        raise TrainingError(f"--set {setting}: expected one of {', '.join(data)}, got {name!r}{hint}")
+        raise TrainingError(f"--set {setting}: expected one of {', '.join(data)}, got {name!r}{setting_hint([name])}")
     default = data[name]
     if len(path) > 1:
         if not isinstance(default, dict):

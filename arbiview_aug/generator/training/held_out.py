@@ -63,12 +63,11 @@ class Interval(NamedTuple):
         return f"{self.mean:+.2f} ({self.low:+.2f} to {self.high:+.2f})"
 
 
-def bootstrap(values: Sequence[float], seed: int = 0, draws: int = 2000) -> Interval:
+def bootstrap(values: Sequence[float]) -> Interval:
     """Mean and 95 % percentile interval of paired differences."""
     array = np.asarray(values, np.float64)
-    rng = np.random.default_rng(seed)
-    means = array[rng.integers(len(array), size=(draws, len(array)))].mean(1)
-    low, high = np.quantile(means, [0.025, 0.975])
+    drawn = np.random.default_rng(0).integers(len(array), size=(2000, len(array)))
+    low, high = np.quantile(array[drawn].mean(1), [0.025, 0.975])
     return Interval(float(array.mean()), float(low), float(high))
 
 

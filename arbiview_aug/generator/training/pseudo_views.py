@@ -228,8 +228,7 @@ class PseudoViews(Dataset[Batch]):
             camera = with_focal(target.turned(yaw_deg=yaw, pitch_deg=pitch), uniform(rng, *config.focal))
             aside, up = (uniform(rng, -half, half) for half in (config.lateral_m, config.vertical_m))
             if is_moved:
-                right = target.cam2ego[:3, 0]
-                x_m, y_m = (-abs(aside) * side * right[:2]).tolist()  # to the pose's own side
+                x_m, y_m = (-abs(aside) * side * target.cam2ego[:2, 0]).tolist()  # to the pose's own side
                 camera = camera.shifted(x_m, y_m, up)
             cameras.append(replace(camera, name=name, mask=None))
         return cameras

@@ -191,8 +191,7 @@ class Trainer:
         config, world = self.config, self.accelerator.num_processes
         first = range(self.done * world + self.accelerator.process_index, config.steps * world, world)
         numbers: Any = [range(n * config.batch, (n + 1) * config.batch) for n in first]
-        workers = item_workers(config.workers)
-        return iter(DataLoader(self.items, batch_sampler=numbers, collate_fn=collate, **workers))
+        return iter(DataLoader(self.items, batch_sampler=numbers, collate_fn=collate, **item_workers(config.workers)))
 
     # --- saving -------------------------------------------------------------------------------------------------------
     def save(self) -> None:
