@@ -82,8 +82,7 @@ def run(program: str, name: str, command: Command, argv: Sequence[str] | None) -
         parser = getattr(parsers, name)()
         arguments = parser.parse_args(argv)
         parsers.check_together(name, parser, arguments)
-        status: int | None = imported(f"arbiview_aug.{command.module}:run")(arguments)
-        return status
+        return imported(f"arbiview_aug.{command.module}:run")(arguments)
 
     return exit_status(program, parsed_and_run, resumable=command.resumable)
 

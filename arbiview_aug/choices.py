@@ -123,10 +123,10 @@ def choice(option: str, value: object, choices: Iterable[str]) -> Any:
     Raises:
         ValueError: Another value; old ones with their new name.
     """
-    if isinstance(value, str) and value in (allowed := tuple(choices)):
+    allowed = tuple(choices)
+    if isinstance(value, str) and value in allowed:
         return value
     new = VALUES.get((option, value)) if isinstance(value, str) else None
-    allowed = tuple(choices)
     hint = f"; since 0.3 it is {new!r}" if new else ""
     raise ValueError(f"{option}: expected one of {', '.join(allowed)}, got {value!r}{hint}")
 

@@ -86,28 +86,12 @@ def optional_package(name: str, extra: str | None = None) -> Any:
         raise MissingPackageError(f"{top} is not installed: pip install {wanted}") from None
 
 
-def compiled(function: Any) -> Any:
+def compiled(function: Any, **options: Any) -> Any:
     """Compile a function by numba at its first call, and keep the result in a cache folder where one can be written.
 
     Division by zero gives infinity, as in numpy. Operations keep their order, so results do not depend on the number of
-    threads or processes; kinds of CPU may differ in the last bit.
+    threads or processes; kinds of CPU may differ in the last bit. ``options`` are those of ``numba.njit``.
     """
-    return _kernel(function)
-
-
-def called(function: Any) -> Any:
-    """Compile a function as ``compiled`` does, for other kernels alone: Python cannot call it."""
-    return _kernel(function, no_cpython_wrapper=True)
-
-
-def inlined(function: Any) -> Any:
-    """Let numba compile a function within its callers: for small parts of few kernels."""
-    from numba import njit
-
-    return njit(error_model="numpy", nogil=True, inline="always")(function)
-
-
-def _kernel(function: Any, **options: Any) -> Any:
     from numba import njit
 
     _compilation()
@@ -116,6 +100,18 @@ def _kernel(function: Any, **options: Any) -> Any:
     with suppress(RuntimeError):  # no locator available: neither the package's folder nor the user's can be written
         kernel._cache = _kernel_cache()(function)
     return kernel
+
+
+def called(function: Any) -> Any:
+    """Compile a function as ``compiled`` does, for other kernels alone: Python cannot call it."""
+    return compiled(function, no_cpython_wrapper=True)
+
+
+def inlined(function: Any) -> Any:
+    """Let numba compile a function within its callers: for small parts of few kernels."""
+    from numba import njit
+
+    return njit(error_model="numpy", nogil=True, inline="always")(function)
 
 
 @contextmanager

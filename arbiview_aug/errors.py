@@ -43,8 +43,7 @@ def exit_status(program: str, command: Callable[[], int | None], *, resumable: b
         with _signals_as_interrupts():
             return int(command() or 0)
     except KeyboardInterrupt:
-        fix = "; run it again to go on" if resumable else ""
-        print(f"{program}: interrupted{fix}", file=sys.stderr)
+        print(f"{program}: interrupted{'; run it again to go on' if resumable else ''}", file=sys.stderr)
         return INTERRUPTED
     except (ArbiviewError, OSError) as error:
         print(f"{program}: {' '.join(str(error).splitlines())}", file=sys.stderr)
@@ -54,15 +53,11 @@ def exit_status(program: str, command: Callable[[], int | None], *, resumable: b
 @contextmanager
 def _signals_as_interrupts() -> Iterator[None]:
     """SIGTERM and SIGHUP raise KeyboardInterrupt, unless someone handles or ignores them (nohup)."""
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     in_main = threading.current_thread() is threading.main_thread()
     taken = [number for number in numbers if in_main and signal.getsignal(number) == signal.SIG_DFL]
     for number in taken:
-        signal.signal(number, interrupt)
+        signal.signal(number, signal.default_int_handler)
     try:
         yield
     finally:

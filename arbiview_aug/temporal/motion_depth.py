@@ -152,9 +152,7 @@ def _sides(neighbours: Sequence[Neighbour], load: Load, ground_z_m: float) -> It
                 break
 
 
-def _swept(
-    rig: Rig, images: Sequence[torch.Tensor], boxes: FloatArray | None, ground_z_m: float
-) -> list[SweptImage]:
+def _swept(rig: Rig, images: Sequence[torch.Tensor], boxes: FloatArray | None, ground_z_m: float) -> list[SweptImage]:
     return [
         SweptImage(without_objects(motion_camera(camera), boxes), reduced_grey(camera, image), ground_z_m)
         for camera, image in zip(rig, images, strict=True)

@@ -41,8 +41,7 @@ class Recorded:
 
     def sample(self, index: int, reduce: Reduce = 1) -> dict[str, Any]:
         """Read a frame with images at 1 / ``reduce``."""
-        sample: dict[str, Any] = open_data(self.root, reduce=reduce)[index]
-        return sample
+        return open_data(self.root, reduce=reduce)[index]
 
     def reader(self, reduce: Reduce) -> Callable[[], Any]:
         """Function that reads the first frame from disk, without its points."""

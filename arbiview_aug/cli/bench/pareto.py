@@ -29,15 +29,7 @@ from arbiview_aug.choices import GeometryName, Holes, Quality, Reduce
 from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
 from arbiview_aug.cli.bench.speed import remap_floor
-from arbiview_aug.cli.bench.timing import (
-    Quartiles,
-    benchmark,
-    machine_line,
-    peak_mib,
-    quartiles,
-    show,
-    timed_rounds,
-)
+from arbiview_aug.cli.bench.timing import Quartiles, benchmark, machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.cli.parsers import EXECUTIONS
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import ScoredFrame, scores

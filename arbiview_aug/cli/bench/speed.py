@@ -116,8 +116,7 @@ def measure(
             chosen = {name: calls[name] for name in (floor, *(name for name in others if only in name))}
             if len(chosen) == 1:
                 continue
-            label = f"{w}x{h} {target}"
-            times = timed_rounds(chosen, repeats, label, enough_ms=_ENOUGH_MS, clock=clock_of(device))
+            times = timed_rounds(chosen, repeats, f"{w}x{h} {target}", enough_ms=_ENOUGH_MS, clock=clock_of(device))
             for name, taken in times.items():
                 ratio = statistics.median(a / b for a, b in zip(taken, times[floor], strict=False))
                 row = {"size": [h, w], "target": target, "name": name, **quartiles(taken)._asdict(), "ratio": ratio}
