@@ -37,28 +37,6 @@ if TYPE_CHECKING:
     from arbiview_aug.transforms.scans import retarget_points as retarget_points
     from arbiview_aug.transforms.settings import SampleKeys as SampleKeys
 else:
-    __getattr__, __dir__, __all__ = lazy_names(
-        __name__,
-        {
-            "cameras.camera": "Camera",
-            "cameras.lidar": "Lidar",
-            "cameras.random_rig": "RandomRig",
-            "cameras.rig": "Rig load_rig",
-            "cameras.shipped": "shipped_rigs",
-            "datasets.wrappers": "MixedDataset RetargetedDataset RetargetedIterable",
-            "errors": "ArbiviewError CalibrationError DataError GeometryWarning SampleError SampleTypeError",
-            "favs.config": "PaperConfig",
-            "render.plan": "RenderConfig",
-            "sample.boxes_2d": "ImageBoxes project_boxes_3d",
-            "sample.collate": "collate",
-            "sample.mistakes": "CheckReport Finding check",
-            "sample.training": "lift_mask visible_boxes",
-            "transforms.plan_cache": "PlanCache",
-            "transforms.resize": "CropRig ResizeRig",
-            "transforms.rig_retarget": "RigRetarget",
-            "transforms.scans": "retarget_points",
-            "transforms.settings": "SampleKeys",
-        },
-    )
+    __getattr__, __dir__, __all__ = lazy_names(__name__)
 
 __version__ = "0.3.0"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import gc
 import os
+import pkgutil
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from hashlib import sha256
@@ -51,19 +53,19 @@ def imported(name: str) -> Any:
     return getattr(import_module(module), attribute)
 
 
-def lazy_names(
-    package: str, homes: Mapping[str, str]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names are imported on first use (PEP 562).
 
-    ``homes`` are modules of ``arbiview_aug``, and the names that each defines, separated by blanks.
+    The names are those that its ``__init__.py`` imports for type checkers, as ``from module import Name as Name``.
     """
-    modules = {name: module for module, names in homes.items() for name in names.split()}
+    tree = ast.parse(pkgutil.get_data(package, "__init__.py") or b"")
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    modules = {alias.name: node.module for node in imports for alias in node.names if alias.asname}
 
     def get(name: str) -> Any:
         if name not in modules:
             raise removed_name(package, name)
-        value = imported(f"arbiview_aug.{modules[name]}:{name}")
+        value = imported(f"{modules[name]}:{name}")
         setattr(sys.modules[package], name, value)
         return value
 

@@ -21,17 +21,4 @@ if TYPE_CHECKING:
     from arbiview_aug.datasets.wrappers import RetargetedIterable as RetargetedIterable
     from arbiview_aug.sample.masks import cleaned_rig as cleaned_rig
 else:
-    __getattr__, __dir__, __all__ = lazy_names(
-        __name__,
-        {
-            "datasets.depth_folder": "WithDepth WithMotionDepth",
-            "datasets.drive": "LazyFrame Neighbours",
-            "datasets.frame_folder": "FrameFolder",
-            "datasets.image_io": "decode_images reduced_camera reduced_rig",
-            "datasets.nuscenes.reader": "NuScenesDataset",
-            "datasets.py123d": "Py123dDataset",
-            "datasets.registry": "open_data",
-            "datasets.wrappers": "MixedDataset RetargetedDataset RetargetedIterable",
-            "sample.masks": "cleaned_rig",
-        },
-    )
+    __getattr__, __dir__, __all__ = lazy_names(__name__)
