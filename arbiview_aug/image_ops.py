@@ -55,23 +55,14 @@ def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     On the CPU by halving and then bilinearly, as target views are read: a tenth of torch's time. Torch resizes images
     that need gradients or lie on other devices.
     """
-    if image.device.type == "cpu" and not image.requires_grad:
-        return _resized_by_opencv(image, size)
-    if tuple(image.shape[-2:]) == size:
-        return image.clone()
-    out = torch.nn.functional.interpolate(
-        image[None].float(), size=size, mode="bilinear", antialias=True, align_corners=False
-    )[0]
-    return out.round().clamp(0, 255).to(image.dtype) if image.dtype == torch.uint8 else out.to(image.dtype)
-
-
-def _resized_by_opencv(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
+    if image.device.type != "cpu" or image.requires_grad:
+        if tuple(image.shape[-2:]) == size:
+            return image.clone()
+        out = torch.nn.functional.interpolate(image[None].float(), size, mode="bilinear", antialias=True)[0]
+        return out.round().clamp(0, 255).to(image.dtype) if image.dtype == torch.uint8 else out.to(image.dtype)
     work = image if image.dtype == torch.uint8 else image.float()
-    level = 0
-    while all(
-        n % 2 ** (level + 1) == 0 and 1.02 * n / 2 ** (level + 1) >= to
-        for n, to in zip(image.shape[1:], size, strict=True)
-    ):
+    level, sides = 0, list(zip(image.shape[1:], size, strict=True))
+    while all(n % (2 << level) == 0 and 1.02 * n / (2 << level) >= to for n, to in sides):
         level += 1  # halving an odd side would lose the last row
     out = torch.empty((3, *size), dtype=work.dtype)
     array = interleaved(work)

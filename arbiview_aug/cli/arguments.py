@@ -161,8 +161,7 @@ def device_named(name: str | None) -> torch.device:
         device = torch.device(name)
     except RuntimeError:
         raise DataError(f"--device: expected cpu, cuda, cuda:1, ..., got {name!r}") from None
-    is_there = device.type == "cpu" or (device.type == "cuda" and (device.index or 0) < torch.cuda.device_count())
-    if not is_there:
+    if device.type != "cpu" and not (device.type == "cuda" and (device.index or 0) < torch.cuda.device_count()):
         raise DataError(f"--device: expected cpu or a CUDA device that is there, got {name!r}")
     return device
 

@@ -123,8 +123,7 @@ def depth() -> argparse.ArgumentParser:
     )
     add_data(parser)
     add = parser.add_argument
-    output = "where to write (default: motion_depth or learned_depth beside the data)"
-    add("--output", metavar="FOLDER", help=output)
+    add("--output", metavar="FOLDER", help="where to write (default: motion_depth or learned_depth beside the data)")
     add("--workers", type=count, default=1, metavar="N", help="processes")
     add("--model", metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub")
     add("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... (default: the GPU, if there is one)")
@@ -219,8 +218,7 @@ def pareto() -> argparse.ArgumentParser:
     add("--geometry", nargs="+", choices=surfaces, help="(default: what the samples offer)")
     reduces = [*get_args(Reduce)]
     add("--downscale", dest="reduce", nargs="+", type=int, choices=reduces, default=reduces, help="decode at 1/N")
-    executions = "backends (default: those of this machine)"
-    add("--execution", nargs="+", choices=EXECUTIONS, help=executions)
+    add("--execution", nargs="+", choices=EXECUTIONS, help="backends (default: those of this machine)")
     add("--generator", nargs="+", default=[], metavar="PATH", help=f"also fill holes by a {_GENERATOR}")
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-ms", type=positive, metavar="MS", help="recommend the most accurate within it")

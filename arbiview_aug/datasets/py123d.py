@@ -104,10 +104,9 @@ class Py123dDataset(WritableRecording):
             with _reading(folder):
                 log = _open(folder, scene_of(folder), cameras)
                 times_us = [int(time.time_us) for time in log.scene.get_all_iteration_timestamps()]
-                dataset = str(log.scene.get_log_metadata().dataset)
+                self.datasets.append(str(log.scene.get_log_metadata().dataset))
             frames += [(len(self._logs), k, time_us) for k, time_us in enumerate(times_us)]
             self._logs.append(log)
-            self.datasets.append(dataset)
         self._frames = frames
         self.tokens = [f"{self._logs[n].folder.parent.name}-{self._logs[n].folder.name}-{us}" for n, _, us in frames]
         self._drive = None if neighbours is None else self._find_drive()
@@ -131,8 +130,7 @@ class Py123dDataset(WritableRecording):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         index = range(len(self))[index]  # IndexError, and negative indices
-        number = self._frames[index][0]
-        with _reading(self._logs[number].folder):
+        with _reading(self._logs[self._frames[index][0]].folder):
             fields = self._fields(index)
             sample = fields | camera_fields(fields["rig"], self._images(index, fields["rig"]), self.tokens[index])
             if self.load_points and (points := self._points(index)) is not None:
@@ -264,8 +262,7 @@ def _fisheye(metadata: Any, where: str) -> tuple[FloatArray, FloatArray]:
         raise CalibrationError(
             f"{where}: expected a MEI lens within {_MEI_ERROR_PX} px of a fisheye lens, got {error_px:.2f} px"
         )
-    K = np.array([[to.gamma1 / (1 + xi), 0, to.u0], [0, to.gamma2 / (1 + xi), to.v0], [0, 0, 1]])
-    return K, coefficients
+    return np.array([[to.gamma1 / (1 + xi), 0, to.u0], [0, to.gamma2 / (1 + xi), to.v0], [0, 0, 1]]), coefficients
 
 
 def _boxes(detections: Any, world2ego: FloatArray) -> Any:

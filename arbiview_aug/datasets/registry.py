@@ -28,8 +28,7 @@ def table_folders(root: Path) -> list[str]:
 
 def log_folders(root: Path) -> list[Path]:
     """Folders of the logs below py123d's data root, its ``logs``, or one split; a log's folder is the only one."""
-    folders = (sorted(path.parent for path in root.glob(pattern)) for pattern in _LOGS)
-    return next(filter(None, folders), [])
+    return next(filter(None, (sorted(path.parent for path in root.glob(pattern)) for pattern in _LOGS)), [])
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,13 @@ from arbiview_aug.generator.sampler import guided, noise_schedule, sample
 from arbiview_aug.image_ops import resized
 from arbiview_aug.inpaint.inpainter import check_device, holes_of, seeded
 from arbiview_aug.inpaint.telea import telea
-from arbiview_aug.render.rendered import RenderedFrame
+from arbiview_aug.render.rendered import Maps, RenderedFrame
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import Frame
 
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
 SOURCES_PER_TARGET = 2  # source branches of a target camera, as in training (Algorithm 1: left and right)
 VIEWS_AT_ONCE = 24  # views that the denoiser sees in one call; a whole frame in any case
-Maps = torch.Tensor | Sequence[torch.Tensor]  # with a leading camera dimension, or a tensor per camera
 
 
 class Completed(NamedTuple):
@@ -99,8 +98,7 @@ def complete(
         frame: Name of the frame, for the noise.
         settings: Those of ``complete_together``.
     """
-    trust = None if confidence is None else list(confidence)
-    rendered = RenderedFrame(list(views), targets, list(coverage), confidence=trust)
+    rendered = RenderedFrame(list(views), targets, coverage, confidence=confidence)
     return complete_together(generator, [rendered], [Frame(tuple(source_images), sources)], [str(frame)], **settings)[0]
 
 
@@ -266,8 +264,7 @@ def _paste(generated: torch.Tensor, image: torch.Tensor, hole: torch.Tensor) -> 
     """The view (3, h, w) with the generated image in its hole; all other pixels are unchanged."""
     generated = generated.to(image.device)
     if generated.shape != image.shape:
-        size = tuple(image.shape[-2:])
-        generated = functional.interpolate(generated[None], size, mode="bicubic", antialias=True)[0]
+        generated = functional.interpolate(generated[None], image.shape[-2:], mode="bicubic", antialias=True)[0]
     generated = generated.clamp(0, 1)
     generated = (generated * 255).round() if image.dtype == torch.uint8 else generated
     return torch.where(hole, generated.to(image.dtype), image)

@@ -122,8 +122,7 @@ def learned_depth(
         for part in (keys[start : start + batch] for start in range(0, len(keys), batch)):
             predictions |= zip(part, model.predict([views[key] for key in part]), strict=True)
     for n, frame in enumerate(frames):
-        of_frame = [(views[n, k], predictions[n, k]) for k in range(len(frame.rig))]
-        depth_m, fits = _fitted(frame, of_frame, wanted)
+        depth_m, fits = _fitted(frame, [(views[n, k], predictions[n, k]) for k in range(len(frame.rig))], wanted)
         words = [f"{model.name}, revision {model.revision}, licence {model.licence}", *map(str, fits)]
         yield LearnedDepth(tuple(depth_m), "\n  ".join(words)), fits
 

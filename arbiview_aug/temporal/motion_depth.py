@@ -225,17 +225,12 @@ def _depth_m(image: SweptImage, estimate: _Estimate) -> Layer:
     """z-depth (h, w), 0 outside the mask, where invalid, and in small patches."""
     camera, (q, valid) = image.camera, estimate
     q = np.maximum(q, 1 / FARTHEST_M)
-    valid = _without_speckles(q, valid if camera.mask is None else valid & camera.mask)
-    z = image.directions @ camera.cam2ego[:3, 2]
-    return np.where(valid & (z > 1e-6), z / q, 0).astype(np.float32)
-
-
-def _without_speckles(q: Layer, valid: BoolArray) -> BoolArray:
-    """Drop small patches; within a patch, neighbouring inverse distances differ by less than ``_SPECKLE_STEP``."""
+    valid = valid if camera.mask is None else valid & camera.mask
     scale = 1000.0  # fits logarithms from 1 mm up into int16
     log_q: Any = np.where(valid, np.log(np.maximum(q, 1e-3) / 1e-3) * scale + 1, 0).astype(np.int16)
     cv2.filterSpeckles(log_q, 0, _SPECKLE_PX, _SPECKLE_STEP * scale)
-    return log_q > 0
+    z = image.directions @ camera.cam2ego[:3, 2]
+    return np.where((log_q > 0) & (z > 1e-6), z / q, 0).astype(np.float32)
 
 
 # --- as a stage of the transform --------------------------------------------------------------------------------------

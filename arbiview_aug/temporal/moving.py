@@ -83,8 +83,7 @@ def stand_on_road(
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(upright, connectivity=4)
     least_gap_px = RADIUS_PX + math.tan(math.radians(SLOPE_DEG)) * float(image.camera.K[1, 1])
     limits = LEAST_SCALE, EVIDENCE, STANDING, least_gap_px, image.height_m, TALLEST_M
-    surfaces = image.horizontal, image.road, image.slope
-    find_feet(labels, boxes[:count], surfaces, costs, spacing, limits, q, valid)
+    find_feet(labels, boxes[:count], (image.horizontal, image.road, image.slope), costs, spacing, limits, q, valid)
     _stand_off_road(image, others, chosen_costs, costs[0], q, valid)
     return q, valid
 

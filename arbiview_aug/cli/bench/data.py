@@ -69,8 +69,7 @@ class Recorded:
         if reduce == reference:
             return frame
         points = make_frame(self.sample(index, reference), exposures=("even",), hand_over_points=True)
-        even = LidarReference(frame.lidar["even"].sample, points.lidar["even"].points)
-        return replace(frame, lidar={"even": even})
+        return replace(frame, lidar={"even": LidarReference(frame.lidar["even"].sample, points.lidar["even"].points)})
 
 
 @contextmanager

@@ -224,9 +224,7 @@ def _lidar_case(
     return Case(target, view, sources, psnr_db, None)
 
 
-def _pixels_of(
-    camera: Camera, points: FloatArray
-) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+def _pixels_of(camera: Camera, points: FloatArray) -> tuple[npt.NDArray[np.intp], ...]:
     """Indices of the visible points (P, 3), and the rows and columns of the pixels that they fall on."""
     h, w = camera.size
     scale = max(1, -(-_Z_BUFFER_WIDTH // w))
