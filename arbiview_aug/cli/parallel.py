@@ -33,7 +33,7 @@ def results(
         jobs,
         batch_size=None,
         num_workers=workers if workers > 1 else 0,
-        collate_fn=_as_it_is,
+        collate_fn=unchanged,
         multiprocessing_context=context,
         worker_init_fn=_begin,
     )
@@ -54,7 +54,7 @@ def with_progress(
             yield one
 
 
-def _as_it_is(value: Any) -> Any:
+def unchanged(value: Any) -> Any:
     return value
 
 

@@ -95,10 +95,9 @@ def render_paper(
             "derivative; use quality='fast'"
         )
     arrays = [_masked(camera, image) for camera, image in zip(source.cameras, images, strict=True)]
-    order = content_order(source.cameras)
     with repeatable_opencv():
         views = [
-            _render_view(source, order, camera, arrays, images[0].dtype, config or PaperConfig(), detections or {})
+            _render_view(source, camera, arrays, images[0].dtype, config or PaperConfig(), detections or {})
             for camera in target.cameras
         ]
     return PaperRendering(source, target, tuple(views))
@@ -124,7 +123,6 @@ def primary_camera(sources: Sequence[Camera], target: Camera, candidates: Sequen
 
 def _render_view(
     source: Rig,
-    order: Sequence[int],
     target: Camera,
     arrays: Sequence[Float32Image],
     dtype: torch.dtype,
@@ -133,7 +131,7 @@ def _render_view(
 ) -> PaperView:
     size, cameras = target.size, source.cameras
     # Stage 1.
-    homographies = {k: h_geom(cameras[k], target) for k in order if cones_meet(cameras[k], target)}
+    homographies = {k: h_geom(cameras[k], target) for k in content_order(cameras) if cones_meet(cameras[k], target)}
     visible = ((k, warp_perspective(arrays[k], H, size, cameras[k].mask)) for k, H in homographies.items())
     warps = {k: warp for k, warp in visible if warp.coverage.any()}
     if not warps:

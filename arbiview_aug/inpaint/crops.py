@@ -7,6 +7,7 @@ each part sees what the parts before it filled.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import zip_longest
 from typing import Any, NamedTuple
 
 import cv2
@@ -49,18 +50,15 @@ def windows(holes: Sequence[BoolArray], size: int) -> list[list[Window]]:
     Parts of one hole come in different rounds, so that a later one can see an earlier one's pixels. No pixel is filled
     twice.
     """
-    rounds: list[list[Window]] = []
+    of_holes: list[list[Window]] = []
     for view, hole in enumerate(holes):
         joined = cv2.dilate(hole.astype(np.uint8), np.ones((_JOINED_PX + 1, _JOINED_PX + 1), np.uint8))
         count, labels, boxes, _ = cv2.connectedComponentsWithStats(joined)
         for label in range(1, count):
             x, y, w, h, _ = boxes[label].tolist()
             part = (labels[y : y + h, x : x + w] == label) & hole[y : y + h, x : x + w]
-            for number, window in enumerate(_parts(Window(view, y, x, part), hole.shape, size)):
-                if number == len(rounds):
-                    rounds.append([])
-                rounds[number].append(window)
-    return rounds
+            of_holes.append(list(_parts(Window(view, y, x, part), hole.shape, size)))
+    return [[window for window in together if window is not None] for together in zip_longest(*of_holes)]
 
 
 def _parts(hole: Window, shape: tuple[int, ...], size: int) -> Iterator[Window]:

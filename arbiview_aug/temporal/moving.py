@@ -62,16 +62,9 @@ def stand_on_road(
 ) -> tuple[Layer, BoolArray]:
     """Move what hangs above the road, lies below it or crosses it to the distance at which its foot is on it.
 
-    Args:
-        image: The image.
-        others: Those of the neighbours.
-        costs: (K, h, w) of walls at multiples of ``spacing``, 1/m; the first is the road alone.
-        spacing: 1/radius between the walls, 1/m.
-        q: (h, w) inverse distances that were found, 1/m.
-        valid: (h, w) whether they are believed.
-
-    Returns:
-        The inverse distances and their validity, with the moved things filled.
+    ``others`` are the neighbours' images. ``costs`` (K, h, w) are those of walls at multiples of ``spacing``, 1/radius
+    in 1/m; the first is the road alone. Returns inverse distances ``q`` (h, w), 1/m, and whether they are valid, with
+    the moved things filled.
     """
     from arbiview_aug.temporal.kernels import RADIUS_PX, find_feet
 

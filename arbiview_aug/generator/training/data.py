@@ -14,6 +14,7 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.parallel import unchanged
 from arbiview_aug.datasets.frame_folder import SEQUENCE_FILE
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
 from arbiview_aug.datasets.registry import READERS, open_data
@@ -70,12 +71,12 @@ class Frames:
 
     def prepare(self, indices: Sequence[int], *, workers: int = 0, show: bool = True) -> None:
         """Cache frames, read by ``workers`` processes, before the workers that make items fork and share the memory."""
-        settings: Any = {"batch_size": None, "sampler": indices, "collate_fn": _unchanged, **item_workers(workers)}
+        settings: Any = {"batch_size": None, "sampler": indices, "collate_fn": unchanged, **item_workers(workers)}
         read: DataLoader[TrainingFrame] = DataLoader(self, **settings)  # type: ignore[arg-type]
         for index, frame in zip(indices, tqdm(read, desc="frames", unit="frame", disable=not show), strict=True):
             if workers:  # copied, since each tensor in shared memory keeps a file open
                 frame = frame._replace(images=[image.clone() for image in frame.images])
-            self._cache.get(index, partial(_unchanged, frame))
+            self._cache.get(index, partial(unchanged, frame))
 
     def check_fits(self, indices: Sequence[int]) -> None:
         """Raise TrainingError if these frames do not fit into memory together."""
@@ -118,10 +119,6 @@ def one_thread_worker(worker: int) -> None:
     torch.set_num_threads(1)
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-
-
-def _unchanged(value: Any) -> Any:
-    return value
 
 
 def open_frames(
