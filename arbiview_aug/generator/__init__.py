@@ -7,28 +7,20 @@ Needs diffusers and safetensors, imported where they are used: ``pip install arb
 - ``generator``: ``Generator``, which loads and saves them; ``inpainter``: ``Diffusion``, which fills views by one.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING
 
-from arbiview_aug.choices import removed_name
-from arbiview_aug.generator.completion import Completed
-from arbiview_aug.generator.config import GeneratorConfig, compact, inpaint, paper, small, tiny
-from arbiview_aug.generator.generator import Generator
-from arbiview_aug.generator.inpainter import Diffusion, load_inpainter
+from arbiview_aug.environment import lazy_names
 
-__all__ = [
-    "Completed",
-    "Diffusion",
-    "Generator",
-    "GeneratorConfig",
-    "compact",
-    "inpaint",
-    "load_inpainter",
-    "paper",
-    "small",
-    "tiny",
-]
-
-
-def __getattr__(name: str) -> Any:
-    """Old names raise an error that gives the new one."""
-    raise removed_name(__name__, name)
+if TYPE_CHECKING:
+    from arbiview_aug.generator.completion import Completed as Completed
+    from arbiview_aug.generator.config import GeneratorConfig as GeneratorConfig
+    from arbiview_aug.generator.config import compact as compact
+    from arbiview_aug.generator.config import inpaint as inpaint
+    from arbiview_aug.generator.config import paper as paper
+    from arbiview_aug.generator.config import small as small
+    from arbiview_aug.generator.config import tiny as tiny
+    from arbiview_aug.generator.generator import Generator as Generator
+    from arbiview_aug.generator.inpainter import Diffusion as Diffusion
+    from arbiview_aug.generator.inpainter import load_inpainter as load_inpainter
+else:
+    __getattr__, __dir__, __all__ = lazy_names(__name__)
