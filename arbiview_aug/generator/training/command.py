@@ -22,8 +22,6 @@ from arbiview_aug.generator.training.held_out import held_out_scores, report
 from arbiview_aug.generator.training.losses import load_perceptual
 from arbiview_aug.generator.training.trainer import Trainer, silent
 
-COMMANDS = ("train", "evaluate")
-
 _TIMEOUT = timedelta(hours=3)  # of a process that waits for the others: they prepare frames, validate and save
 
 
