@@ -23,10 +23,10 @@ from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import repeatable_opencv
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.favs.stage1_geometry import check_pinhole, cones_meet, h_geom
+from arbiview_aug.favs.stage1_geometry import check_pinhole, h_geom_of_visible
 from arbiview_aug.favs.stage2_features import NO_MATCHES, FeatureReport, Region, optimise_transformation, unmatched
 from arbiview_aug.favs.stage3_objects import AlignmentReport, align_objects, declined, find_objects
-from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, fuse, fusion_weight, source_pixels, warp_perspective
+from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion, source_pixels, warp_perspective
 from arbiview_aug.render.rendered import RenderedFrame, from_winners
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.sample.detections import Detection
@@ -95,9 +95,10 @@ def render_paper(
             "derivative; use quality='fast'"
         )
     arrays = [_masked(camera, image) for camera, image in zip(source.cameras, images, strict=True)]
+    order = content_order(source.cameras)
     with repeatable_opencv():
         views = [
-            _render_view(source, camera, arrays, images[0].dtype, config or PaperConfig(), detections or {})
+            _render_view(source, order, camera, arrays, images[0].dtype, config or PaperConfig(), detections or {})
             for camera in target.cameras
         ]
     return PaperRendering(source, target, tuple(views))
@@ -123,6 +124,7 @@ def primary_camera(sources: Sequence[Camera], target: Camera, candidates: Sequen
 
 def _render_view(
     source: Rig,
+    order: Sequence[int],
     target: Camera,
     arrays: Sequence[Float32Image],
     dtype: torch.dtype,
@@ -131,9 +133,10 @@ def _render_view(
 ) -> PaperView:
     size, cameras = target.size, source.cameras
     # Stage 1.
-    homographies = {k: h_geom(cameras[k], target) for k in content_order(cameras) if cones_meet(cameras[k], target)}
-    visible = ((k, warp_perspective(arrays[k], H, size, cameras[k].mask)) for k, H in homographies.items())
-    warps = {k: warp for k, warp in visible if warp.coverage.any()}
+    homographies = h_geom_of_visible(cameras, target)
+    visible = [k for k in order if k in homographies]
+    warped = ((k, warp_perspective(arrays[k], homographies[k], size, cameras[k].mask)) for k in visible)
+    warps = {k: warp for k, warp in warped if warp.coverage.any()}
     if not warps:
         return PaperView(torch.zeros(3, *size, dtype=dtype), np.full(size, -1, np.int8), ())
     # Stages 2 and 3.
@@ -166,12 +169,8 @@ def _render_view(
     for k, (features, objects) in results.items():
         if features.case != "geometric" or objects.shift_px.any():
             warps[k] = warp_perspective(arrays[k], objects.H_aligned, size, cameras[k].mask)
-    weights = [
-        fusion_weight(warps[k].image, warps[k].coverage, features.quality, k == primary, config)
-        for k, (features, _) in results.items()
-    ]
-    fused, covered = fuse(np.stack([warp.image for warp in warps.values()]), np.stack(weights))
-    winners = np.where(covered, np.array(list(warps))[np.argmax(weights, axis=0)], -1).astype(np.int8)
+    qualities = [features.quality for features, _ in results.values()]
+    fused, winners = adaptive_fusion(warps, qualities, primary, config)
     reports = tuple(
         SourceReport(k, k == primary, objects.H_aligned, features, objects, float((winners == k).mean()))
         for k, (features, objects) in results.items()

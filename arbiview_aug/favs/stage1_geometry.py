@@ -14,7 +14,7 @@ The paper's R_i is ``cam2ego[:3, :3].T``: it takes ego directions to camera i. B
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
@@ -36,10 +36,14 @@ def h_geom(source: Camera, target: Camera) -> FloatArray:
     return target.K @ R @ np.linalg.inv(source.K)
 
 
-def cones_meet(source: Camera, target: Camera) -> bool:
-    """Whether the viewing cones of two cameras meet."""
-    angle_rad = np.arccos(np.clip(source.cam2ego[:3, 2] @ target.cam2ego[:3, 2], -1, 1))
-    return bool(angle_rad <= source.half_angle_rad + target.half_angle_rad)
+def h_geom_of_visible(sources: Sequence[Camera], target: Camera) -> dict[int, FloatArray]:
+    """Compute H_geom for the sources, by index, whose viewing cones meet the target's."""
+    homographies = {}
+    for k, source in enumerate(sources):
+        angle_rad = np.arccos(np.clip(source.cam2ego[:3, 2] @ target.cam2ego[:3, 2], -1, 1))
+        if angle_rad <= source.half_angle_rad + target.half_angle_rad:
+            homographies[k] = h_geom(source, target)
+    return homographies
 
 
 def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: float) -> FloatArray:

@@ -12,6 +12,7 @@ The weights that do not depend on image content are those of render plans (``arb
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -117,3 +118,15 @@ def fuse(images: FloatArray, weights: FloatArray) -> tuple[FloatArray, BoolArray
     total = scaled.sum(axis=0)
     fused = (images * scaled[..., None]).sum(axis=0) / np.where(covered, total, 1.0)[..., None]
     return np.where(covered[..., None], fused, 0.0), covered
+
+
+def adaptive_fusion(
+    warps: Mapping[int, Warp], qualities: Sequence[float], primary: int, config: PaperConfig
+) -> tuple[FloatArray, npt.NDArray[np.int8]]:
+    """Weight and fuse the warped sources of one target view: (h, w, 3), and as in ``PaperView.source_camera``."""
+    weights = [
+        fusion_weight(warp.image, warp.coverage, quality, k == primary, config)
+        for (k, warp), quality in zip(warps.items(), qualities, strict=True)
+    ]
+    fused, covered = fuse(np.stack([warp.image for warp in warps.values()]), np.stack(weights))
+    return fused, np.where(covered, np.array(list(warps))[np.argmax(weights, axis=0)], -1).astype(np.int8)

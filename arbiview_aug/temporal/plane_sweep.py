@@ -39,7 +39,7 @@ class SweptImage:
     def __init__(self, camera: Camera, grey: Layer, ground_z_m: float) -> None:
         self.camera, self.grey, self.ground_z_m = camera, grey, ground_z_m
 
-    @property
+    @cached_property
     def height_m(self) -> float:
         """Height of the camera above the road."""
         return float(self.camera.center_m[2]) - self.ground_z_m
