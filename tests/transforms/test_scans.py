@@ -111,6 +111,46 @@ def test_missing_returns_are_left_out() -> None:
     assert torch.isfinite(out.points).all() and set(out.points[:, 3].tolist()) <= {7.0, 8.0}
 
 
+BEHIND = torch.tensor([[-20.0, 0.3 * k, 1.0, 5.0] for k in range(100)])
+AROUND = torch.tensor([[0.9, 0.0, 1.5, 6.0, 3.0, 4.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("lidar", "more", "is_empty"),
+    [
+        ({}, {"boxes_3d": AROUND}, False),  # inside an object
+        ({"lidar2ego": POSE @ np.diag([1.0, -1, -1, 1])}, {}, False),  # upside down
+        ({"elevations_deg": (-5.0,)}, {}, False),  # one beam
+        ({"elevations_deg": tuple(np.linspace(-25, 15, 1024)), "azimuth_step_deg": 30.0}, {}, False),
+        ({"azimuth_step_deg": 360.0}, {}, False),  # one column
+        ({"azimuth_deg": (-30, 30)}, {"points": BEHIND}, True),  # all points behind
+        ({}, {"points": torch.zeros(0, 4)}, True),  # no points
+        ({}, {"points": torch.full((9, 4), float("nan"))}, True),
+        ({}, {"points": torch.full((9, 4), 1e30)}, True),
+        ({}, {"points": torch.tensor([[0.9, 0, 2.2, 1.0]]).repeat(9, 1)}, True),  # ranges of zero
+        ({}, {"points": torch.zeros(9, 4)}, True),  # missing returns as zeros, in the own car
+        ({"range_m": (0.0, 1e-3)}, {}, True),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:points. rows with NaN")
+def test_extremes(sample: dict[str, Any], lidar: dict[str, Any], more: dict[str, Any], is_empty: bool) -> None:
+    scanner = replace(TOP, **lidar)
+    out = RigRetarget(target(lidars=[scanner]), geometry="street")(sample | more)
+    points, rings = out["points"], out["point_rings"]
+    assert points.shape == (len(rings), 4) and points.dtype == torch.float32 and torch.isfinite(points).all()
+    assert (len(points) == 0) == is_empty and rings.max() < scanner.shape[0] if len(rings) else is_empty
+    assert out["num_points"].sum() <= len(points)
+
+
+def test_impossible_scanners() -> None:
+    for change, message in (
+        ({"elevations_deg": (0.0,) * 10_000}, "lidar 'top': elevations_deg: expected 1 to 1024"),
+        ({"range_m": (0.0, 0.0)}, "lidar 'top': range_m: expected two distances"),
+    ):
+        with pytest.raises(CalibrationError, match=message):
+            replace(TOP, **change)
+
+
 def test_what_is_refused() -> None:
     with pytest.raises(SampleTypeError, match="points: expected a float tensor or array to scan, got torch"):
         retarget_points(torch.ones((5, 4), dtype=torch.int32), target())
