@@ -29,7 +29,8 @@ class ScanErrors:
         noise_m: One sigma of the range, not negative.
         divergence_deg: Angle between the edges of a beam, 0 to 5: it returns from what its middle and four rays at its
             edge meet. 0 for a single ray.
-        echo: Whether the ``first`` or the ``last`` surface in a beam returns; surfaces within ``PULSE_M`` are averaged.
+        echo: Whether the ``first`` or the ``last`` surface in a beam returns; surfaces within ``PULSE_M`` of it are
+            mixed.
         reach_m: Distance at which 63 % of the rays return from a white surface that faces the scanner. Others return
             with a probability of 1 - exp(-albedo cos(incidence) (reach_m / distance)²). Infinite: all return.
 
@@ -125,13 +126,16 @@ def _echoes(t: FloatArray, row: IntArray, rays: int, echo: Echo) -> tuple[FloatA
         return t, row
     t, row = t.reshape(-1, rays), row.reshape(-1, rays)
     finite = np.isfinite(t)
-    surface = (t if echo == "first" else np.where(finite, t, -np.inf)).argsort(1)[:, 0 if echo == "first" else -1]
+    # One surface has one echo, from its middle: at grazing incidence its part of the beam is longer than a pulse.
+    same = row[:, :, None] == row[:, None]
+    t = np.where(finite, (np.where(finite, t, 0)[:, None] * same).sum(2) / same.sum(2), np.inf)
+    order = (t if echo == "first" else np.where(finite, -t, np.inf)).argmin(1)
     n = np.arange(len(t))
-    chosen = t[n, surface]
+    chosen = t[n, order]
     with np.errstate(invalid="ignore"):  # of the sky
         together = finite & (np.abs(t - chosen[:, None]) <= PULSE_M)
     mean = np.where(together, t, 0).sum(1) / np.maximum(together.sum(1), 1)
-    return np.where(np.isfinite(chosen), mean, np.inf), row[n, surface]
+    return np.where(np.isfinite(chosen), mean, np.inf), row[n, order]
 
 
 def _albedo(scene: Scene, row: IntArray) -> FloatArray:
