@@ -12,8 +12,8 @@ or lowered. *Depth maps* from motion and from a network cost the same; these say
 LiDAR point. *Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it the plan; every other call
 plans anew. Images are decoded at half size where they are then still larger than the views. They lie channels-last in
 one block, as this package's readers give them; contiguous ones are planes, torch's usual layout. Holes stay black
-unless they are *filled*. *Points by rays*: ``retarget_points`` alone. With ``--device`` the floor is a copy there of as many bytes as rendering must move; the clock
-of a GPU is its events.
+unless they are *filled*. *Points by rays*: ``retarget_points`` alone. With ``--device`` the floor is a copy there of as
+many bytes as rendering must move; the clock of a GPU is its events.
 """
 
 from __future__ import annotations
