@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.lidar import MOST_BEAMS
 from arbiview_aug.errors import CalibrationError
 
 LEAST_POINTS = 100
@@ -66,7 +65,7 @@ def fitted_fields(name: str, scans: Sequence[FloatArray], rings: Sequence[Number
         table = np.array([np.median(elevation[ring == k]) for k in range(len(numbers))])
         order = np.argsort(table)
         is_at_beam = order[_nearest(elevation, table[order])] == ring
-    if not (1 <= len(table) <= MOST_BEAMS and is_at_beam.mean() >= _AT_BEAMS):
+    if is_at_beam.mean() < _AT_BEAMS:
         got = f"{len(elevation)} points of which {is_at_beam.mean():.0%} are at one of {len(table)}"
         fix = "give the sensor's own pose, and scans that are not merged; motion-compensated ones need rings"
         raise _error(name, f"elevations that gather at beams, got {got}; {fix}")

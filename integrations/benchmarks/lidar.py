@@ -1,14 +1,15 @@
 """``python -m integrations.benchmarks.lidar``: scans as another scanner would have measured them, against true ones.
 
-Synthetic streets scanned by both scanners, which err as real ones do (``ERRORS``), and DDAD's next scan, 1.26 m ahead,
-where ARBIVIEW_DATA names the real frames. Returns and ranges count at rays within half a line spacing of which A
-measured something; ``recall of all`` counts at all rays. Baselines: A's points as they are, and those of its rings that
-are next to one of B's (LiDAR-Distillation's way to fewer beams).
+Synthetic streets scanned by both scanners, which err as real ones do (``ERRORS``), but for rays of B that would be lost
+by chance; and DDAD's next scan, 1.26 m ahead, where ARBIVIEW_DATA names the real frames. Returns and ranges count at
+rays within half a line spacing of which A measured something; ``recall of all`` counts at all rays. Baselines: A's
+points as they are, and those of its rings that are next to one of B's (LiDAR-Distillation's way to fewer beams).
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import time
@@ -93,8 +94,9 @@ def synthetic(frames: int, seed: int) -> Iterator[tuple[str, str, dict[str, floa
         rig = replace(demo_source_rig((8, 22)), lidars=[a])
         target, around = replace(rig, lidars=[b]), Neighbours(count=1)
         drive = SyntheticDrive(rig, num_frames=frames, seed=seed, lidar=ERRORS, neighbours=around)
+        complete = SyntheticDrive(target, num_frames=frames, seed=seed, lidar=replace(ERRORS, reach_m=math.inf))
         for k in range(frames):
-            sample, truth = drive[k], drive.points(k, target).numpy()
+            sample, truth = drive[k], complete.points(k).numpy()
             points = sample["points"].numpy()
             clouds = {"as they are": points, "rings dropped": next_rings(a, b, points)}
             for name, neighbours in NEIGHBOURS.items():
