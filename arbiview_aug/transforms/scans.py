@@ -112,13 +112,17 @@ def _at(points: Any, rows: Any, hits: Any) -> Any:
     return out
 
 
-def retarget_frames(frames: Sequence[Frame], target: Rig, skip: bool, warn: Warn | None) -> list[RetargetedPoints]:
+def retarget_frames(
+    frames: Sequence[Frame], target: Rig, skip: bool, warn: Warn | None = None
+) -> list[RetargetedPoints]:
     """``retarget_points`` of a sample's frames; empty if the sample has no points.
 
     Neighbouring frames fill what one does not see, unless ``warn``, which tells why one cannot, is None.
     """
-    if frames[0].sample.get("points") is None:
+    sample = frames[0].sample
+    if sample.get("points") is None:
         return []
+    reading = None if skip or sample.get("neighbours") is None else warn
     return [
         retarget_points(
             frame.entry("points"),
@@ -126,7 +130,7 @@ def retarget_frames(frames: Sequence[Frame], target: Rig, skip: bool, warn: Warn
             boxes_3d=frame.array("boxes_3d"),
             ground_z_m=frame.rig.ground_z_m,
             skip=skip,
-            sweeps=() if skip or warn is None else _sweeps(frame, warn),
+            sweeps=() if reading is None else _sweeps(frame, reading),
         )
         for frame in frames
     ]
