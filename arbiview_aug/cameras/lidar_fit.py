@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.errors import CalibrationError, shown
 
 LEAST_POINTS = 100
 """Fewest points of all scans together."""
@@ -33,7 +33,10 @@ def checked_scans(name: str, points: Any, rings: Any) -> tuple[list[FloatArray],
         CalibrationError: Other shapes.
     """
     parts = points if isinstance(points, list | tuple) else [points]
-    scans = [np.asarray(part, np.float64) for part in parts]
+    try:
+        scans = [np.asarray(part, np.float64) for part in parts]
+    except (TypeError, ValueError, RuntimeError) as error:  # of words, and of tensors elsewhere or with gradients
+        raise _error(name, f"arrays or CPU tensors of numbers, got {shown(points)} ({error})") from None
     if not scans or any(scan.ndim != 2 or scan.shape[1] < 3 for scan in scans):
         raise _error(name, f"scans of shape (P, >= 3), got {[scan.shape for scan in scans]}")
     scans = [scan[:, :3] for scan in scans]

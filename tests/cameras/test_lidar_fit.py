@@ -75,6 +75,7 @@ def _random(count: int) -> np.ndarray:
         (_random(20_000), {"rings": np.arange(20_000) % 32}, "got 20000 points of which 3% are at one of 32"),
         (np.zeros((5, 2)), {}, r"expected scans of shape \(P, >= 3\), got \[\(5, 2\)\]"),
         ([], {}, "expected scans of shape"),
+        ("scan.npy", {}, r"expected arrays or CPU tensors of numbers, got 'scan\.npy'"),
         (_random(200), {"rings": np.zeros(100)}, r"rings: expected the ring of each point, \[\(200,\)\], got"),
         (_random(200), {"lidar2ego": np.zeros((4, 4))}, "lidar2ego"),
     ],
