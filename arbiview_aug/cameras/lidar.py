@@ -140,6 +140,31 @@ class Lidar:
         T[:3, 3] = x_m, y_m, z_m
         return self.moved(T)
 
+    @classmethod
+    def fitted(cls, points: Any, lidar2ego: Any, *, rings: Any = None, name: str = "fitted") -> Lidar:
+        """Estimate a scanner from its scans: beams, azimuth step, range, and a sector's azimuths.
+
+        Scans must be of one scanner, not merged with others'. Those that are corrected for the vehicle's motion during
+        the scan need rings, as near points then leave their beam.
+
+        Args:
+            points: (P, >= 3) one scan in the ego frame, metres, or a list of them; rows that are not finite, and those
+                within 1 m of the scanner, are missing returns.
+            lidar2ego: (4, 4) pose of the sensor.
+            rings: (P,) ring of each point, or a list of such arrays; by default beams are where elevations gather.
+                Rings without points are left out of the table.
+            name: The scanner's.
+
+        Raises:
+            CalibrationError: Too few points, or no distinct beams.
+        """
+        from arbiview_aug.cameras.lidar_fit import checked_scans, fitted_fields
+
+        pose = checked_pose(name, lidar2ego, "lidar2ego")
+        scans, numbers = checked_scans(name, points, rings)
+        local = [(scan - pose[:3, 3]) @ pose[:3, :3] for scan in scans]
+        return cls(name=name, lidar2ego=pose, **fitted_fields(name, local, numbers))
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the rig file's format."""
         return {
@@ -173,3 +198,12 @@ def hdl64e(lidar2ego: Any, name: str = "hdl64e") -> Lidar:
     """
     upper, lower = 2 - np.arange(32) / 3, -8.83 - np.arange(32) / 2
     return Lidar(name, lidar2ego, tuple(np.concatenate([upper, lower]).tolist()), 0.1728, (0.9, 120.0))
+
+
+def at128(lidar2ego: Any, name: str = "at128") -> Lidar:
+    """Hesai's AT128P, a front scanner: 128 fixed beams and a turning mirror, so that its rays are rows and columns.
+
+    Source: user manual of the AT128P. Elevations from +12.9 to -12.5 degrees by 0.2, azimuths from -60 to 60 by 0.1;
+    200 m on surfaces of 10 % reflectivity. The least distance, 1 m, is an assumption.
+    """
+    return Lidar(name, lidar2ego, tuple((12.9 - 0.2 * np.arange(128)).tolist()), 0.1, (1.0, 200.0), (-60.0, 60.0))

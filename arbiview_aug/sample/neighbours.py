@@ -19,7 +19,7 @@ from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError
 from arbiview_aug.sample.batching import check_container, checked_images
 from arbiview_aug.sample.inputs import Frame, as_array, frame_from, numbers
 from arbiview_aug.scene.boxes import carried, checked_boxes, moved_boxes, points_in
-from arbiview_aug.scene.point_cloud import checked_points, own_car, seen_through
+from arbiview_aug.scene.point_cloud import checked_points, finite_rows, own_car, seen_through
 from arbiview_aug.scene.surface import Points
 
 MAX_NEIGHBOURS = 120  # frame numbers are int8
@@ -77,12 +77,18 @@ class Neighbour:
         return moved_boxes(self.boxes_now, self.boxes)
 
     def points(self) -> FloatArray | None:
-        """(P, 3) its points in the current ego frame, those of labelled objects where these are now; None without."""
+        """(P, C) its points in the current ego frame, those of labelled objects where these are now; None without.
+
+        Columns beyond x, y, z stay.
+        """
         value = self.given.get("points")
         if value is None:
             return None
-        own_points = checked_points(as_array("points", value))
-        points = own_points[~own_car(own_points)] @ self.ego2ego[:3, :3].T + self.ego2ego[:3, 3]
+        array = as_array("points", value)
+        own_points = checked_points(array)
+        kept = ~own_car(own_points)
+        points = np.array(array[finite_rows(array)][kept] if len(own_points) else own_points, np.float64)
+        points[:, :3] = own_points[kept] @ self.ego2ego[:3, :3].T + self.ego2ego[:3, 3]
         return points if self.boxes is None or self.boxes_now is None else carried(points, self.boxes, self.boxes_now)
 
     def images(self, like: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -132,8 +138,8 @@ def read_neighbours(frame: Frame, warn: Warn) -> list[Neighbour]:
     return sorted(neighbours, key=lambda neighbour: neighbour.travel_m)
 
 
-def points_of_neighbours(rig: Rig, points: Points, neighbours: Sequence[Neighbour], warn: Warn) -> FloatArray | None:
-    """(P, 3) LiDAR points of other frames in the current ego frame, metres; None if there are none.
+def points_of_neighbours(rig: Rig, points: Points, neighbours: Sequence[Neighbour], warn: Warn) -> list[FloatArray]:
+    """Points (P, C) of other frames in the current ego frame, metres: an array for each frame that has some.
 
     Points that the frame's own (Q, 3) contradict are left out, and points that cannot be read, with a warning.
     """
@@ -146,8 +152,8 @@ def points_of_neighbours(rig: Rig, points: Points, neighbours: Sequence[Neighbou
             warn(f"points of {neighbour.name}", f"points of neighbour {neighbour.name} are left out: {error}")
             continue
         if others is not None:
-            parts.append(others[~seen_through(points, others, origin)])
-    return np.concatenate(parts) if parts else None
+            parts.append(others[~seen_through(points, others[:, :3], origin)])
+    return parts
 
 
 def neighbour_images(neighbour: Neighbour, like: Sequence[torch.Tensor], warn: Warn) -> tuple[torch.Tensor, ...] | None:

@@ -389,7 +389,7 @@ SAME_SIZE_M = 0.2
 
 
 def carried(points: Points, one: FloatArray, two: FloatArray) -> FloatArray:
-    """The points (P, 3), those in boxes ``one`` (B, 7) moved to where the same objects are in ``two`` (C, 7).
+    """The points (P, >= 3), those in boxes ``one`` (B, 7) moved to where the same objects are in ``two`` (C, 7).
 
     The same are boxes of one size that are each other's nearest. Points in other boxes are left out.
     """
@@ -402,7 +402,7 @@ def carried(points: Points, one: FloatArray, two: FloatArray) -> FloatArray:
         if is_same:
             c, s = np.cos(two[match, 6]), np.sin(two[match, 6])
             to_ego = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-            moved[rows] = _in_box_frame(one[k], points[rows] - one[k, :3]) @ to_ego + two[match, :3]
+            moved[rows, :3] = _in_box_frame(one[k], points[rows, :3] - one[k, :3]) @ to_ego + two[match, :3]
     return moved[kept]
 
 

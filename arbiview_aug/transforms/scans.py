@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import SampleTypeError
+from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.sample.batching import is_readable
 from arbiview_aug.sample.inputs import Frame, as_array
+from arbiview_aug.sample.neighbours import Warn, points_of_neighbours, read_neighbours
 from arbiview_aug.scene.boxes import checked_boxes, points_by_box
 from arbiview_aug.scene.point_cloud import checked_points, finite_rows
 from arbiview_aug.scene.scan import scan
@@ -37,7 +39,13 @@ class RetargetedPoints(NamedTuple):
 
 
 def retarget_points(
-    points: Any, target: Rig, *, boxes_3d: Any = None, ground_z_m: float = 0.0, skip: bool = False
+    points: Any,
+    target: Rig,
+    *,
+    boxes_3d: Any = None,
+    ground_z_m: float = 0.0,
+    skip: bool = False,
+    sweeps: Sequence[FloatArray] = (),
 ) -> RetargetedPoints:
     """Measure a frame's scene by a target's scanners, as ``RigRetarget`` does; no images are needed.
 
@@ -48,6 +56,8 @@ def retarget_points(
         boxes_3d: (B, >= 7) labelled objects.
         ground_z_m: Height of the road in the frame's ego frame.
         skip: Leave the points as they are, and count those in boxes.
+        sweeps: Points (Q, C) of other frames in this frame's ego frame, with the same columns. They fill what the
+            frame's own do not see.
 
     Raises:
         SampleError: Points or boxes of another shape.
@@ -66,6 +76,10 @@ def retarget_points(
         up = ground_z_m - target.ground_z_m  # scanners keep their rays where nothing moves
         lidars = [lidar.shifted(z_m=up) for lidar in target.lidars] if up else target.lidars
         objects = np.zeros((0, 7)) if boxes is None else boxes
+        if len(sweeps):
+            points = _joined(points, sweeps)
+            array = as_array("points", points)
+            measured = checked_points(array)
         hits, nearest, rings_of, unsupported = scan(lidars, measured, objects, ground_z_m)
         rows = np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest
         points, measured, rings = _at(points, rows, hits), hits, torch.from_numpy(rings_of)
@@ -74,6 +88,16 @@ def retarget_points(
         _, ends = points_by_box(boxes, measured, 0.0)
         counts = torch.from_numpy(np.diff(ends, prepend=0))
     return RetargetedPoints(points, rings, counts, unsupported)
+
+
+def _joined(points: Any, sweeps: Sequence[FloatArray]) -> Any:
+    """Points (P, C), then those of sweeps (Q, C)."""
+    for k, sweep in enumerate(sweeps):
+        if points.ndim != 2 or sweep.ndim != 2 or sweep.shape[1] != points.shape[1]:
+            raise SampleError(f"sweeps[{k}]: expected the columns of points {tuple(points.shape)}, got {sweep.shape}")
+    if isinstance(points, np.ndarray):
+        return np.concatenate([points, *sweeps], dtype=points.dtype)
+    return torch.cat([points.detach(), *(torch.from_numpy(sweep).to(points) for sweep in sweeps)])
 
 
 def _at(points: Any, rows: Any, hits: Any) -> Any:
@@ -88,16 +112,40 @@ def _at(points: Any, rows: Any, hits: Any) -> Any:
     return out
 
 
-def retarget_frames(frames: Sequence[Frame], target: Rig, skip: bool) -> list[RetargetedPoints]:
-    """``retarget_points`` of a sample's frames; empty if the target has no scanners or the sample no points."""
-    if not target.lidars or frames[0].sample.get("points") is None:
+def retarget_frames(
+    frames: Sequence[Frame], target: Rig, skip: bool, warn: Warn | None = None
+) -> list[RetargetedPoints]:
+    """``retarget_points`` of a sample's frames; empty if the sample has no points.
+
+    Neighbouring frames fill what one does not see, unless ``warn``, which tells why one cannot, is None.
+    """
+    sample = frames[0].sample
+    if sample.get("points") is None:
         return []
+    reading = None if skip or sample.get("neighbours") is None else warn
     return [
         retarget_points(
-            frame.entry("points"), target, boxes_3d=frame.array("boxes_3d"), ground_z_m=frame.rig.ground_z_m, skip=skip
+            frame.entry("points"),
+            target,
+            boxes_3d=frame.array("boxes_3d"),
+            ground_z_m=frame.rig.ground_z_m,
+            skip=skip,
+            sweeps=() if reading is None else _sweeps(frame, reading),
         )
         for frame in frames
     ]
+
+
+def _sweeps(frame: Frame, warn: Warn) -> list[FloatArray]:
+    """Points (Q, C) of a frame's neighbours with the columns of its own."""
+    neighbours, points = read_neighbours(frame, warn), frame.array("points")
+    if not neighbours or points is None:
+        return []
+    parts = points_of_neighbours(frame.rig, checked_points(points), neighbours, warn)
+    columns = [part.shape[1] for part in parts]
+    if any(count != points.shape[-1] for count in columns):
+        warn("columns of points", f"points of neighbours: expected {points.shape[-1]} columns, got {columns}")
+    return [part for part in parts if part.shape[1] == points.shape[-1]]
 
 
 def entries_of(parts: Sequence[RetargetedPoints], lead: tuple[int, ...]) -> dict[str, Any]:

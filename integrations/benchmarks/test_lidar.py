@@ -1,12 +1,21 @@
-"""``python -m integrations.benchmarks.lidar``: the goals, on one street and on DDAD's next scan."""
+"""``python -m integrations.benchmarks.lidar``: the goals, on one street and on DDAD's next scan; times and memory."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from integrations.benchmarks.lidar import PAIRS, ddad, main, synthetic
+from arbiview_aug import retarget_points
+from arbiview_aug.cli.bench.timing import memory_mib
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from integrations.benchmarks.lidar import PAIRS, ddad, main, scanner, speed, synthetic
+from integrations.benchmarks.test_loader import MOST_GROWTH_MIB
+
+SOAKED, WARM_UP = 500, 50
 
 
 @pytest.mark.slow
@@ -33,3 +42,25 @@ def test_the_next_scan_is_nearer_than_moved_points(data_root: Path) -> None:
 def test_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["--frames", "1", "--data", str(tmp_path)]) == 0
     assert "| 32 -> 64 | scanned |" in capsys.readouterr().out
+
+
+@pytest.mark.release
+def test_120_000_points(report_bound: Callable[..., None]) -> None:
+    alone, boxes = min([float(ms) for ms in re.findall(r"(\d+) ms", speed(8000))] for _ in range(3))
+    report_bound("ms of 120,000 points to 64 x 2,650 rays", alone, at_most=80)
+    report_bound("ms with boxes", boxes, at_most=100)
+
+
+@pytest.mark.release
+def test_memory_over_500_frames(report_bound: Callable[..., None]) -> None:
+    """Frames that drift, with boxes."""
+    rig = replace(demo_source_rig((8, 22)), lidars=[scanner(32)])
+    target, sample = replace(rig, lidars=[scanner(64, 0.7)]), SyntheticDrive(rig, num_frames=1)[0]
+    used_mib = []
+    for k in range(SOAKED):
+        moved = {key: sample[key] + 1e-3 * k for key in ("points", "boxes_3d")}
+        retarget_points(moved["points"], target, boxes_3d=moved["boxes_3d"])
+        if k in (WARM_UP, SOAKED - 1):
+            used_mib.append(memory_mib("status", "RssAnon"))
+    print(f"MiB after {WARM_UP} and {SOAKED} frames: {used_mib}")
+    report_bound("MiB by which a process grows", used_mib[1] - used_mib[0], at_most=MOST_GROWTH_MIB)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug import CalibrationError, Lidar, Rig, load_rig, shipped_rigs
-from arbiview_aug.cameras.lidar import hdl64e
+from arbiview_aug.cameras.lidar import at128, hdl64e
 from tests.helpers import ring
 
 AT_2_M = np.array([[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]])
@@ -113,4 +113,15 @@ def test_shipped_scanners() -> None:
         assert all(1.5 < lidar.center_m[2] - rig.ground_z_m < 2.5 for lidar in rig.lidars)
     down = load_rig("argoverse2").lidars[1]
     assert down.lidar2ego[2, 2] < -0.9  # it hangs upside down
+    spacing = np.diff(load_rig("waymo").lidars[0].elevations_deg)
+    assert 0.1 < spacing.min() < spacing[-20:].mean() < spacing[:20].mean() / 2  # denser near the horizon
+    upper, lower = np.split(np.array(hdl64e(np.eye(4)).elevations_deg), 2)
+    np.testing.assert_allclose([upper[0], upper[-1], lower[0], lower[-1]], [2, -8.33, -8.83, -24.33], atol=0.01)
     assert hdl64e(np.eye(4)).shape == (64, 2083)
+
+
+def test_a_front_scanner() -> None:
+    """128 x 1,200 rays, 120 x 25.4 degrees."""
+    front = at128(AT_2_M)
+    assert front.shape == (128, 1200) and (front.rays[0] > 0.4).all()
+    np.testing.assert_allclose([front.elevations_deg[0], front.elevations_deg[-1]], [12.9, -12.5], atol=1e-9)

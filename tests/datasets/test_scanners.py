@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +13,18 @@ import torch
 
 from arbiview_aug import Lidar
 from arbiview_aug.datasets import FrameFolder
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import ScanErrors, SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.scans import range_image
 from tests.helpers import ring
 
 POSE = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, 0.2], [0, 0, 1, 2.0], [0, 0, 0, 1]])  # it looks to the left
 SIDE = Lidar("side", POSE, (-20.0, -5.0, 2.0), 3.0, (1.0, 40.0), (-60, 60))
+
+TOP = replace(SIDE, lidar2ego=np.array([[1.0, 0, 0, 0.9], [0, 1, 0, 0], [0, 0, 1, 1.9], [0, 0, 0, 1]]))
+RIG = replace(
+    demo_source_rig((8, 22)),
+    lidars=[replace(TOP, elevations_deg=(-15, -8, -4, -2, 1), azimuth_step_deg=0.5, azimuth_deg=(-180, 180))],
+)
 
 
 def test_synthetic_scans_are_those_of_the_rigs_scanners() -> None:
@@ -47,6 +55,40 @@ def test_two_scanners_have_their_own_noise() -> None:
     points = SyntheticDrive(rig, num_frames=1).points(0)
     one, two = points.chunk(2)
     assert 0 < (one - two)[:, :3].abs().max() < 0.3
+
+
+def _ranges(**errors: Any) -> np.ndarray:
+    """Ranges of the rays of a scanner's returns by ray, (beams, columns), 0 for none."""
+    drive = SyntheticDrive(RIG, num_frames=1, seed=2, lidar=ScanErrors(noise_m=0, **errors))
+    return range_image(RIG.lidars[0], drive.points(0).numpy())
+
+
+def test_beams_that_diverge_have_two_echoes_at_edges() -> None:
+    exact, first, last = _ranges(), _ranges(divergence_deg=0.4), _ranges(divergence_deg=0.4, echo="last")
+    everywhere = (exact > 0) & (first > 0) & (last > 0)
+    nearer, farther = (exact - first)[everywhere], (last - exact)[everywhere]
+    # Surfaces within a pulse are mixed, and a surface's middle is not the middle ray's.
+    assert np.quantile(nearer, 0.005) > -0.5 and np.quantile(farther, 0.005) > -0.5
+    at_edges = nearer + farther > 1
+    assert 0.01 < at_edges.mean() < 0.2
+    assert (np.abs(nearer + farther) < 1e-6).mean() > 0.5
+    road = everywhere & np.isclose(exact, 1.9 / np.sin(np.radians(8)), rtol=1e-3)
+    assert road.sum() > 100 and np.median(np.abs(first - exact)[road]) < 0.01
+
+
+def test_rays_drop_far_away_and_at_grazing_incidence() -> None:
+    exact, some = _ranges(), _ranges(reach_m=60.0)
+    assert set(some[some > 0]) <= set(exact[exact > 0])
+    returns = [(some > 0)[(exact > low) & (exact <= high)].mean() for low, high in ((1, 8), (8, 20), (20, 60))]
+    assert returns[0] > returns[1] > returns[2] and returns[0] > 0.9 > returns[2]
+    road, near = np.isclose(exact, 1.9 / np.sin(np.radians(4)), rtol=0.02), (exact > 24) & (exact < 30)
+    assert (some > 0)[near & road].mean() < (some > 0)[near & ~road].mean()
+
+
+def test_scan_errors_are_checked() -> None:
+    for change in ({"noise_m": -1}, {"divergence_deg": 9}, {"echo": "all"}, {"reach_m": 0}, {"noise_m": float("nan")}):
+        with pytest.raises(ValueError, match=f"scan errors: {next(iter(change))}: expected"):
+            ScanErrors(**change)
 
 
 def test_frame_folders_carry_scanners(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:

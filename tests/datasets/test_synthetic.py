@@ -113,7 +113,7 @@ def test_one_torch_thread_while_a_street_is_cast(drive, monkeypatch):
         return cast(*args)
 
     usual = torch.get_num_threads()
-    for module in ("render", "dataset"):
+    for module in ("render", "scanning"):
         monkeypatch.setattr(f"arbiview_aug.datasets.synthetic.{module}.cast", noting)
     try:
         torch.set_num_threads(3)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug import CalibrationError, Lidar
+from arbiview_aug.scene.point_cloud import own_car
 from arbiview_aug.scene.scan import Scan, scan
 
 WALL_M = 10.0  # a wall across, over a road at z = 0
@@ -116,6 +117,16 @@ def test_own_car_and_range_limits_leave_no_points() -> None:
     result = scan([near], measured(scanner(32, at())), no_boxes(), 0.0)
     away = np.linalg.norm(result.points - near.center_m, axis=1)
     assert 0 < away.max() <= 8.0
+
+
+def test_no_return_is_on_either_own_car() -> None:
+    """A labelled object reaches into the own car's box: its points there are A's own car's, its face there B's."""
+    box, behind = np.array([[4.0, 0.0, 1.0, 2.0, 2.0, 2.0, 0.0]]), scanner(32, at(x=-2.0))
+    y, z = np.meshgrid(np.linspace(-1, 1, 60), np.linspace(0.1, 1.9, 40))
+    for x in (3.0, 4.1):
+        face = np.stack([np.full(y.size, x), y.ravel(), z.ravel()], 1)
+        result = scan([behind], np.concatenate([face, measured(scanner(32, at()))]), box, 0.0)
+        assert len(result.points) and not own_car(result.points).any()
 
 
 @pytest.mark.parametrize("beams", [1, 1024])

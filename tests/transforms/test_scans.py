@@ -111,6 +111,90 @@ def test_missing_returns_are_left_out() -> None:
     assert torch.isfinite(out.points).all() and set(out.points[:, 3].tolist()) <= {7.0, 8.0}
 
 
+# --- neighbouring scans -----------------------------------------------------------------------------------------------
+WALL = torch.tensor([[15.0, y, z, 30.0] for y in np.arange(-6, 6, 0.05) for z in np.arange(0.1, 4, 0.1)]).float()
+
+
+def with_wall(sample: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """A frame that sees the right half of a wall; its neighbour, 1.2 m behind, saw all of it."""
+    behind = torch.eye(4, dtype=torch.float64)
+    behind[0, 3] = -1.2
+    seen = WALL + torch.tensor([1.2, 0, 0, 5.0])
+    neighbour = {key: sample[key] for key in ("images", "rig")} | {"ego2ego": behind, "points": seen}
+    kept = {key: sample[key] for key in ("images", "rig")}
+    return kept | {"points": WALL[WALL[:, 1] < 0], "neighbours": [neighbour | more]}
+
+
+def test_neighbouring_scans_fill_what_one_does_not_see(sample: dict[str, Any]) -> None:
+    alone, filled = (RigRetarget(target(), neighbours=n)(with_wall(sample))["points"] for n in (None, "road"))
+    left = filled[:, 1] > 1
+    assert (alone[:, 1] < 0.5).all() and len(alone) > 50
+    assert left.sum() > 0.3 * len(filled)
+    assert (filled[left, 0] - 15).abs().median() < 0.01
+    assert (filled[left, 3] == 35).all() and set(filled[:, 3].tolist()) == {30.0, 35.0}  # the nearest point's columns
+    explained = [RigRetarget(target(), neighbours=n).explain(with_wall(sample)) for n in (None, "road")]
+    near = [int(str(one).split("near ")[1].split("%")[0]) for one in explained]
+    assert near[1] < near[0]
+
+
+def test_neighbours_without_fitting_points(sample: dict[str, Any]) -> None:
+    expected = RigRetarget(target(), neighbours=None)(with_wall(sample))["points"]
+    for points, message in (("unreadable", "points of neighbour 0 are left out"), (WALL[:, :3], "4 columns, got .3.")):
+        with pytest.warns(UserWarning, match=message):
+            out = RigRetarget(target())(with_wall(sample, points=points))
+        assert torch.equal(out["points"], expected)
+
+
+def test_sweeps_of_users() -> None:
+    own, other = WALL[WALL[:, 1] < 0], WALL[WALL[:, 1] >= 0].numpy()
+    both = retarget_points(torch.cat([own, torch.from_numpy(other)]), target()).points
+    assert torch.equal(retarget_points(own, target(), sweeps=[other[:50], other[50:]]).points, both)
+    assert isinstance(retarget_points(own.numpy(), target(), sweeps=[other]).points, np.ndarray)
+    with pytest.raises(SampleError, match=r"sweeps\[0\]: expected the columns of points .*, got \(5, 3\)"):
+        retarget_points(own, target(), sweeps=[np.zeros((5, 3))])
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+BEHIND = torch.tensor([[-20.0, 0.3 * k, 1.0, 5.0] for k in range(100)])
+AROUND = torch.tensor([[0.9, 0.0, 1.5, 6.0, 3.0, 4.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("lidar", "more", "is_empty"),
+    [
+        ({}, {"boxes_3d": AROUND}, False),  # inside an object
+        ({"lidar2ego": POSE @ np.diag([1.0, -1, -1, 1])}, {}, False),  # upside down
+        ({"elevations_deg": (-5.0,)}, {}, False),  # one beam
+        ({"elevations_deg": tuple(np.linspace(-25, 15, 1024)), "azimuth_step_deg": 30.0}, {}, False),
+        ({"azimuth_step_deg": 360.0}, {}, False),  # one column
+        ({"azimuth_deg": (-30, 30)}, {"points": BEHIND}, True),  # all points behind
+        ({}, {"points": torch.zeros(0, 4)}, True),  # no points
+        ({}, {"points": torch.full((9, 4), float("nan"))}, True),
+        ({}, {"points": torch.full((9, 4), 1e30)}, True),
+        ({}, {"points": torch.tensor([[0.9, 0, 2.2, 1.0]]).repeat(9, 1)}, True),  # ranges of zero
+        ({}, {"points": torch.zeros(9, 4)}, True),  # missing returns as zeros, in the own car
+        ({"range_m": (0.0, 1e-3)}, {}, True),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:points. rows with NaN")
+def test_extremes(sample: dict[str, Any], lidar: dict[str, Any], more: dict[str, Any], is_empty: bool) -> None:
+    scanner = replace(TOP, **lidar)
+    out = RigRetarget(target(lidars=[scanner]), geometry="street")(sample | more)
+    points, rings = out["points"], out["point_rings"]
+    assert points.shape == (len(rings), 4) and points.dtype == torch.float32 and torch.isfinite(points).all()
+    assert (len(points) == 0) == is_empty and rings.max() < scanner.shape[0] if len(rings) else is_empty
+    assert out["num_points"].sum() <= len(points)
+
+
+def test_impossible_scanners() -> None:
+    for change, message in (
+        ({"elevations_deg": (0.0,) * 10_000}, "lidar 'top': elevations_deg: expected 1 to 1024"),
+        ({"range_m": (0.0, 0.0)}, "lidar 'top': range_m: expected two distances"),
+    ):
+        with pytest.raises(CalibrationError, match=message):
+            replace(TOP, **change)
+
+
 def test_what_is_refused() -> None:
     with pytest.raises(SampleTypeError, match="points: expected a float tensor or array to scan, got torch"):
         retarget_points(torch.ones((5, 4), dtype=torch.int32), target())

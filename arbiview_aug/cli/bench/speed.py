@@ -12,8 +12,8 @@ or lowered. *Depth maps* from motion and from a network cost the same; these say
 LiDAR point. *Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it the plan; every other call
 plans anew. Images are decoded at half size where they are then still larger than the views. They lie channels-last in
 one block, as this package's readers give them; contiguous ones are planes, torch's usual layout. Holes stay black
-unless they are *filled*. With ``--device`` the floor is a copy there of as many bytes as rendering must move; the clock
-of a GPU is its events.
+unless they are *filled*. *Points by rays*: ``retarget_points`` alone. With ``--device`` the floor is a copy there of as
+many bytes as rendering must move; the clock of a GPU is its events.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import count, cycle
 from pathlib import Path
@@ -50,9 +51,12 @@ from arbiview_aug.render.torch_backend import maps_on, render_torch
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from arbiview_aug.transforms.scans import retarget_points
 from arbiview_aug.transforms.warm_up import compile_kernels
 
 BOXES = (10, 30, 75, 150)
+SCANNED = 120_000
+"""Points of the scans that other scanners measure."""
 BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
     SIZE: {
         **{"street, held": 1.2, "street": 3.5, "LiDAR": 8.0, "LiDAR, 75 boxes": 11.0},
@@ -139,7 +143,7 @@ def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tup
             calls |= _both_layouts("street, held, cropped from full size", full, cropped)
         yield name, calls
     if is_small:
-        yield "own", {_FLOOR: remap_floor(sample["images"], size)} | _own(sample, size)
+        yield "own", {_FLOOR: remap_floor(sample["images"], size)} | _own(sample, size) | _scans(sample)
 
 
 def table(report: Mapping[str, Any]) -> str:
@@ -166,6 +170,19 @@ def _calls(sample: Sample, target: Rig) -> Calls:
         "LiDAR, 75 boxes": _anew({**sample, "boxes_3d": boxes_around(75)}, target, "lidar"),
         "depth maps": _anew(sample, target, "learned"),
         "fused, 75 boxes": _anew({**sample, "boxes_3d": boxes_around(75)}, target, "fused"),
+    }
+
+
+def _scans(sample: Sample) -> Calls:
+    """A dense scan by Waymo's scanner, without images."""
+    rig, waymo = sample["rig"], load_rig("waymo").lidars
+    beams = tuple(np.linspace(-30, 15, 256).tolist())
+    dense = retarget_points(sample["points"], replace(rig, lidars=[replace(waymo[0], elevations_deg=beams)])).points
+    points, target = dense[torch.linspace(0, len(dense) - 1, SCANNED).long()], replace(rig, lidars=waymo)
+    name = f"{SCANNED:,} points by 64 x 2,650 rays"
+    return {
+        name: partial(retarget_points, points, target),
+        f"{name}, 75 boxes": partial(retarget_points, points, target, boxes_3d=boxes_around(75)),
     }
 
 

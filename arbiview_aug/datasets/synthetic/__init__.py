@@ -7,6 +7,7 @@ from arbiview_aug.datasets.synthetic.dataset import (
     demo_source_rig,
     demo_target_rig,
 )
+from arbiview_aug.datasets.synthetic.scanning import ScanErrors
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
 
@@ -14,6 +15,7 @@ __all__ = [
     "GROUND_CLASSES",
     "BoxClass",
     "RenderedViews",
+    "ScanErrors",
     "Scene",
     "SceneClass",
     "SyntheticDrive",

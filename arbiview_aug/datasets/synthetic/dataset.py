@@ -16,16 +16,15 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import LazyFrame, Neighbours, camera_fields, check_neighbours
 from arbiview_aug.datasets.image_io import stack_or_list
-from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
 from arbiview_aug.datasets.synthetic.render import Renderer
-from arbiview_aug.datasets.synthetic.scene import Material, Scene, SceneClass
+from arbiview_aug.datasets.synthetic.scanning import ScanErrors, scan_scene
+from arbiview_aug.datasets.synthetic.scene import Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
 
 LIDAR_POSITION_M = (0.9, 0.0, 1.9)  # ego x, y and height over the road: on the roof, as on nuScenes' vehicles
 LIDAR_BEAMS_DEG = (-30.67, 10.67)  # elevations of the lowest and the highest of 32 beams (Velodyne HDL-32E)
 LIDAR_COLUMNS = 1088
 LIDAR_RANGE_M = (1.0, 90.0)
-LIDAR_NOISE_M = 0.02  # one sigma
 _BEAMS = 32
 
 
@@ -67,7 +66,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         num_frames: Length of the dataset.
         seed: Seed of the world, not negative.
         supersampling: Rays across a pixel at outlines; 1 for no antialiasing.
-        lidar: Whether samples carry ``points``.
+        lidar: Whether samples carry ``points``; or how the scanners err.
         neighbours: Which other frames of the drive come with a sample; None for none.
         two_wheelers: Whether bicycles and motorcycles join the same streets; their boxes come last.
         device: Device to render on; samples lie on the CPU. Different kinds of device agree up to rounding.
@@ -84,7 +83,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         num_frames: int,
         seed: int = 0,
         supersampling: int = 2,
-        lidar: bool = True,
+        lidar: bool | ScanErrors = True,
         neighbours: Neighbours | None = None,
         two_wheelers: bool = False,
         device: torch.device | str = "cpu",
@@ -93,6 +92,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         self.num_frames = _checked_count("num_frames", num_frames, 1, 1 << 40)
         self.seed = _checked_count("seed", seed, 0, 1 << 60)
         self.lidar = bool(lidar)
+        self._errors = lidar if isinstance(lidar, ScanErrors) else ScanErrors()
         check_neighbours(neighbours)
         self.neighbours = neighbours
         self.two_wheelers = bool(two_wheelers)
@@ -173,46 +173,15 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         """The points of a scene, whose noise has a seed of its own."""
         rig = self.rig if rig is None else rig
         road = np.array([0.0, 0.0, rig.ground_z_m])
-        parts = [
-            self._scan(scene, noise if k == 0 else (*noise, k), lidar.center_m - road, lidar.rays.T, lidar.range_m)
-            for k, lidar in enumerate(rig.lidars)
-        ]
-        points = np.concatenate(parts or [self._scan(scene, noise, np.array(LIDAR_POSITION_M), _usual_rays())])
+        scanners = [(lidar.center_m - road, lidar.rays.T, lidar.range_m) for lidar in rig.lidars]
+        points = np.concatenate(
+            [
+                scan_scene(scene, self._renderer, *scanner, self._errors, (*noise, k) if k else noise)
+                for k, scanner in enumerate(scanners or [(np.array(LIDAR_POSITION_M), _usual_rays(), LIDAR_RANGE_M)])
+            ]
+        )
         points[:, 2] += rig.ground_z_m
         return torch.from_numpy(points.astype(np.float32))
-
-    def _scan(
-        self,
-        scene: Scene,
-        noise: tuple[int, ...],
-        position: np.ndarray,
-        rays: np.ndarray,
-        range_m: tuple[float, float] = LIDAR_RANGE_M,
-    ) -> np.ndarray:
-        """Points (P, 4) of rays (columns, beams, 3) from a position (3,) over the ego origin's road; z is over it."""
-        columns, beams, _ = rays.shape
-        ego = rays.reshape(-1, 3).astype(np.float64)
-        R = scene.ego2street[:3, :3]
-        origin = R @ position + scene.ego2street[:3, 3]
-        street = (ego @ R.T).astype(np.float32).reshape(columns, beams, 3)
-        packets = np.pad(street, ((0, -columns % 8), (0, 0), (0, 0)), mode="edge").reshape(-1, 8 * beams, 3)
-        with self._renderer.run():
-            directions = torch.as_tensor(packets).transpose(1, 2).contiguous()
-            local = scene_from(scene, origin)
-            start = torch.as_tensor(origin[None].astype(np.float32))
-            distance, hit = cast(local, start, directions, find_candidates(local, directions))
-        t, row = (a.cpu().numpy().ravel()[: len(ego)] for a in (distance.double(), hit))  # without the padding
-        rng = np.random.default_rng(np.random.SeedSequence(noise))
-        noise_m, gain = rng.normal(0, LIDAR_NOISE_M, len(t)), rng.uniform(0.8, 1.2, len(t))
-        keep = (t > range_m[0]) & (t < range_m[1])
-        points = position + ego[keep] * (t + noise_m)[keep, None]
-        albedo = scene.color.mean(1)[row.clip(0)]
-        albedo = np.where(row == GROUND_ID, 0.5 * scene.street.asphalt, albedo)[keep]
-        # Glass returns little light, retro-reflective plates much.
-        material = np.where(row[keep] >= 0, scene.material[row[keep].clip(0)], -1)
-        albedo = albedo * np.select([material == Material.GLASSHOUSE, material == Material.SIGN], [0.3, 3.0], 1.0)
-        intensity = (albedo * gain[keep] * 90).clip(0, 255)
-        return np.concatenate([points, intensity[:, None]], 1)
 
     def _checked_index(self, index: int) -> int:
         if not isinstance(index, int | np.integer) or isinstance(index, bool):
