@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from arbiview_aug.sample.boxes_2d import ImageBoxes as ImageBoxes
     from arbiview_aug.sample.boxes_2d import project_boxes_3d as project_boxes_3d
     from arbiview_aug.sample.collate import collate as collate
+    from arbiview_aug.sample.depth_maps import depth_maps as depth_maps
     from arbiview_aug.sample.mistakes import CheckReport as CheckReport
     from arbiview_aug.sample.mistakes import Finding as Finding
     from arbiview_aug.sample.mistakes import check as check
@@ -51,6 +52,7 @@ else:
             "render.plan": "RenderConfig",
             "sample.boxes_2d": "ImageBoxes project_boxes_3d",
             "sample.collate": "collate",
+            "sample.depth_maps": "depth_maps",
             "sample.mistakes": "CheckReport Finding check",
             "sample.training": "lift_mask visible_boxes",
             "transforms.plan_cache": "PlanCache",

@@ -1,7 +1,8 @@
 """``python -m arbiview_aug evaluate``: the quality of rendered views, in numbers and pictures.
 
 Real frames are scored by sparse LiDAR metrics, overlap and consistency; synthetic streets by the true views.
-``--displaced`` scores real frames by photographs that another camera took, or the next frame's cameras.
+``--displaced`` scores real frames by photographs that another camera took, or the next frame's cameras; ``--lidar``
+scores points instead of images.
 """
 
 from __future__ import annotations
@@ -41,6 +42,11 @@ from arbiview_aug.transforms.settings import SampleKeys
 def run(arguments: argparse.Namespace) -> None:
     """Measure, print the tables, write JSON, pictures and the report."""
     folder = writable_folder(Path(arguments.output), arguments.output)
+    if arguments.lidar:
+        from arbiview_aug.cli.scans import evaluate_scans
+
+        evaluate_scans(arguments, folder)
+        return
     notes: list[str] = []
     if arguments.displaced:
         methods, done = _displaced(arguments, notes)

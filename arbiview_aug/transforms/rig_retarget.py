@@ -49,7 +49,7 @@ from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
 from arbiview_aug.transforms.outputs import SampleWriter
 from arbiview_aug.transforms.plan_cache import FramePlan, PlanCache, Plans, check_reach
-from arbiview_aug.transforms.scans import retarget_frames, words_of
+from arbiview_aug.transforms.scans import RetargetedPoints, retarget_frames, words_of
 from arbiview_aug.transforms.settings import (
     SampleKeys,
     checked_instance,
@@ -252,8 +252,12 @@ class RigRetarget(torch.nn.Module):
             rendered = self.inpainter.fill(self._rendered(frames, target), frames)
             if self.size is not None and self.fit == "pad":
                 rendered = [of_frame.between_bars(self.size) for of_frame in rendered]
-        points = retarget_frames(frames, target, skip) if target.lidars else ()
+        points = self._scanned(frames, target, skip)
         return self._writer.write(frames, rendered, labels, target, draws, points)
+
+    def _scanned(self, frames: Sequence[Frame], target: Rig, skip: bool) -> Sequence[RetargetedPoints]:
+        """Points of the frames by the target's scanners, if it has any and they are wanted."""
+        return retarget_frames(frames, target, skip) if target.lidars and self.keys.points == "target" else ()
 
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
         """Check the sample's further keys, and return those that hold label maps."""
@@ -416,7 +420,7 @@ class RigRetarget(torch.nn.Module):
         gains = self.harmonisation(sample) if self.harmoniser.is_on else None
         words = sample.get(LEARNED_WORDS_KEY) if LEARNED_KEY in self._row.reads else None
         learned = words if isinstance(words, str) or words is None else words[0]  # a batch has one for each frame
-        points = [words_of(part, frame, target) for part in retarget_frames([frame], target, False)]
+        points = [words_of(part, frame, target) for part in self._scanned([frame], target, False)]
         return Explanation(planned, gains, learned, self.plan_fills(planned), *points)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +52,6 @@ class RigRetargetMultiView:
         if isinstance(keys := settings.get("keys"), Mapping):
             settings["keys"] = SampleKeys(**keys)
         target = load_rig(target) if isinstance(target, str | Path) else target
-        if isinstance(target, Rig):
-            target = replace(target, lidars=())  # the results' points stay
         self.retarget = RigRetarget(target, **settings)
         held = self.retarget.target
         rig = held.base if isinstance(held, RandomRig) else held
