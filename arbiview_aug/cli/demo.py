@@ -11,8 +11,8 @@ from timeit import timeit
 import cv2
 
 from arbiview_aug.choices import GeometryName, Holes, Quality
-from arbiview_aug.cli.arguments import gathered_warnings, writable_folder
-from arbiview_aug.cli.evaluate import frames_text, measured, open_frames
+from arbiview_aug.cli.arguments import frames_text, gathered_warnings, writable_folder
+from arbiview_aug.cli.evaluate import measured, open_frames
 from arbiview_aug.environment import working_s
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting, views_of

@@ -14,9 +14,9 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.cli.arguments import REAL_TARGET, named_steps
-from arbiview_aug.cli.evaluate import frames_text, open_frames
-from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.cli.arguments import REAL_TARGET, frames_text, named_steps
+from arbiview_aug.datasets import FrameFolder, open_data
+from arbiview_aug.datasets.depth_folder import WANTED
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.synthetic.dataset import LIDAR_BEAMS_DEG, LIDAR_COLUMNS, LIDAR_POSITION_M, LIDAR_RANGE_M
 from arbiview_aug.errors import DataError
@@ -120,20 +120,21 @@ def _displaced(arguments: argparse.Namespace) -> Iterator[TrueScan]:
     """Scans of a drive, each against the next one, from where that was taken; of static things."""
     from sklearn.neighbors import KDTree
 
-    data, left = open_frames(arguments, ["motion"]), arguments.frames or 1
+    options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
+    data, left = open_data(arguments.data, neighbours=WANTED, **options), arguments.frames or 1
     chosen = None if arguments.target is None else load_rig(arguments.target)
     for index in range(len(data)):
         sample = data[index]
         later = FrameFolder(arguments.displaced)[0] if isinstance(arguments.displaced, str) else _next_frame(sample)
         if left and later is not None and "points" in later and "points" in sample:
             move = np.linalg.inv(np.asarray(later["ego2world"])) @ np.asarray(sample["ego2world"])
-            points, boxes = np.array(sample["points"], np.float64), np.zeros((0, 7))
+            points, boxes = sample["points"].double().numpy(), np.zeros((0, 7))
             points[:, :3] = points[:, :3] @ move[:3, :3].T + move[:3, 3]
             if "boxes_3d" in later and "boxes_3d" in sample:
                 boxes, before = (np.asarray(one["boxes_3d"], np.float64)[:, :7] for one in (later, sample))
                 apart = boxes[:, None, :3] - (before[:, :3] @ move[:3, :3].T + move[:3, 3])
                 boxes = boxes[(np.linalg.norm(apart, axis=-1) < _PARKED_M).any(axis=1)]
-            truth = np.asarray(later["points"], np.float64)
+            truth = later["points"].double().numpy()
             truth = truth[KDTree(points[:, :3]).query(truth[:, :3])[0][:, 0] <= _STATIC_M]
             rig = _with_scanners(later["rig"], chosen, str(arguments.data))
             yield TrueScan(str(sample["token"]), rig, points, boxes, truth)

@@ -162,7 +162,9 @@ def measured_near(a: Lidar, b: Lidar, points: FloatArray) -> BoolArray:
     turn = round(360 / _GRID_DEG)
     grid = np.zeros((turn // 2 + 1, turn), np.uint8)
     grid[row.astype(int), column.astype(int) % turn] = 1
-    near = cv2.dilate(grid, np.ones([2 * round(angle / _GRID_DEG) + 1 for angle in half], np.uint8))
+    up, aside = (round(angle / _GRID_DEG) for angle in half)
+    around = np.pad(grid, ((0, 0), (aside, aside)), mode="wrap")
+    near = cv2.dilate(around, np.ones((2 * up + 1, 2 * aside + 1), np.uint8))[:, aside : aside + turn]
     azimuth = b.azimuth_deg[0] + b.azimuth_step_deg * np.arange(b.shape[1])
     rows = np.rint((np.array(b.elevations_deg) + 90) / _GRID_DEG).astype(int)
     return np.asarray(near[rows[:, None], np.rint(azimuth / _GRID_DEG).astype(int) % turn] > 0)

@@ -13,7 +13,8 @@ from arbiview_aug.evaluate.report.pictures import PAPER, Picture, contact_sheet
 from arbiview_aug.evaluate.scans import range_image
 
 _REACH_M = 32.0  # from above: ahead and aside
-_SIDE_PX, _TALL_PX = 560, 150  # from above; height of a range image
+_SIDE_PX = 560  # from above
+_LEAST_PX, _ASPECT = 1800, 12  # width of range images, and over their height
 _LOW_M, _HIGH_M = -0.5, 3.5  # heights over the road, blue to red
 _NEAR_M, _FAR_M = 2.0, 80.0
 _BOX = (40, 40, 40)
@@ -39,8 +40,9 @@ def range_picture(lidar: Lidar, points: FloatArray) -> Picture:
     ranges = range_image(lidar, points)[np.argsort(lidar.elevations_deg)[::-1], ::-1]
     shade = np.log(ranges.clip(_NEAR_M, _FAR_M) / _NEAR_M) / np.log(_FAR_M / _NEAR_M)
     picture = np.where(ranges[..., None] > 0, _coloured(1 - shade.ravel()).reshape(*ranges.shape, 3), PAPER)
-    tall = max(1, round(_TALL_PX / len(ranges)))
-    return np.repeat(picture, tall, axis=0).astype(np.uint8)
+    width_px = max(_LEAST_PX, ranges.shape[1])
+    size = width_px, max(len(ranges), width_px // _ASPECT)
+    return np.asarray(cv2.resize(picture.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
 
 
 def scan_sheet(

@@ -375,7 +375,7 @@ def test_what_differs_is_named(source: Path, tmp_path: Path, capsys: pytest.Capt
     changed = [tmp_path / "drive" / "0000" / "00.jpg", tmp_path / "new" / "0001" / "lidar.npy"]
     changed += [tmp_path / "new" / "0002" / "ring_front_left.jpg", tmp_path / "new" / "sequence.json"]
     for path in changed:
-        path.write_bytes(path.read_bytes()[:-1] + b"?")
+        path.write_bytes(path.read_bytes()[:-1] + b"!")
     missing = tmp_path / "new" / "0002" / "calib.json"
     missing.unlink()
     assert main([*asked, "--verify"]) == 1
