@@ -44,6 +44,7 @@ TINY_BENCH = ["--quality", "draft", "--downscale", "4", "--size", "40x72", "--re
 TINY = {
     "demo": TINY_DEMO,  # the install line's
     "demo --seed 2 --width 1400 --output docs/images/demo.jpg": TINY_DEMO,
+    "demo --target waymo --seed 2 --size 96x160 --width 460 --output docs/images/scans.jpg": TINY_DEMO,
     "demo --target truck.yaml --seed 2 --width 1000 --output docs/images/truck.jpg": TINY_DEMO,
     "demo --target truck.yaml": TINY_DEMO,
     "demo --data FOLDER --target waymo": ["--size", "64x112"],
