@@ -50,6 +50,7 @@ TINY = {
     "demo --data FOLDER --target waymo": ["--size", "64x112"],
     "evaluate --data FOLDER --target-set paper": ["--downscale", "4", "--size", "40x72"],
     "evaluate --data FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
+    "evaluate --lidar --target waymo": [],
     "evaluate --displaced --data FOLDER": ["--geometry", "street", "--downscale", "4", "--frames", "1"],
     "check FOLDER": ["--downscale", "4"],
     "check FOLDER --frames 5 --output output": ["--downscale", "4"],

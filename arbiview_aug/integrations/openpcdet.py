@@ -70,6 +70,7 @@ class RigRetargetDataDict:
         self.step = RigRetargetMultiView(target, lidar2ego=lidar2ego, **settings)
         self.lidar2ego = _upright_pose("lidar2ego", lidar2ego)
         to = self.lidar2ego if target_lidar2ego is None else _upright_pose("target_lidar2ego", target_lidar2ego)
+        self.ego2lidar = np.asarray(np.linalg.inv(self.lidar2ego))
         self.move = np.linalg.inv(to) @ self.lidar2ego  # to the frame of what comes out
         if not is_number(p) or not 0 <= p <= 1:
             raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
@@ -103,7 +104,7 @@ class RigRetargetDataDict:
         given = geometry(_labels(data_dict), self.lidar2ego)
         boxes, ground_z_m = given.get("boxes_3d"), self.step.ground_z_m
         scan = retarget_points(given["points"], rig, boxes_3d=boxes, ground_z_m=ground_z_m)
-        return moved_points(scan.points, np.linalg.inv(self.lidar2ego)).numpy().astype(data_dict["points"].dtype)
+        return moved_points(scan.points, self.ego2lidar).numpy().astype(data_dict["points"].dtype)
 
     def _with_cameras(self, data_dict: Mapping[str, Any]) -> DataDict:
         """``NuScenesDataset`` with ``CAMERA_CONFIG``: PIL images, resized and cropped by ``img_process_infos``."""
@@ -202,7 +203,7 @@ def _moved(out: DataDict, move: FloatArray) -> DataDict:
     if np.array_equal(move, np.eye(4)):
         return out
     back, turn = np.linalg.inv(move), np.arctan2(move[1, 0], move[0, 0])
-    changed = {"points": moved_points(out["points"], move).numpy().astype(out["points"].dtype)}
+    changed: DataDict = {"points": moved_points(out["points"], move).numpy().astype(out["points"].dtype)}
     if (boxes := out.get("gt_boxes")) is not None:
         boxes = np.array(boxes)
         boxes[:, :3] = boxes[:, :3] @ move[:3, :3].T + move[:3, 3]
@@ -216,8 +217,8 @@ def _moved(out: DataDict, move: FloatArray) -> DataDict:
     if "camera2lidar" in out:
         changed["camera2lidar"] = _each(out["camera2lidar"], lambda matrix: move @ matrix)
     if (calib := out.get("calib")) is not None:
-        changed["calib"] = copy(calib)
-        changed["calib"].V2C = (np.asarray(calib.V2C, np.float64) @ back).astype(calib.V2C.dtype)
+        new = changed["calib"] = copy(calib)
+        new.V2C = (np.asarray(calib.V2C, np.float64) @ back).astype(calib.V2C.dtype)
     return out | changed
 
 

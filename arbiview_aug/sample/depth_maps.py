@@ -9,12 +9,13 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.boxes_2d import rig_of
 from arbiview_aug.sample.inputs import as_array
+from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.scene.point_cloud import checked_points
+from arbiview_aug.scene.surface import Points
 
 
 def depth_maps(points: Any, cameras: Rig | Mapping[str, Any]) -> torch.Tensor | list[torch.Tensor]:
@@ -37,7 +38,7 @@ def depth_maps(points: Any, cameras: Rig | Mapping[str, Any]) -> torch.Tensor | 
     return stacked([torch.from_numpy(_of_camera(camera, array)) for camera in rig_of(cameras)])
 
 
-def _of_camera(camera: Camera, points: FloatArray) -> FloatArray:
+def _of_camera(camera: Camera, points: Points) -> Layer:
     uv, depth_m, valid = camera.project(points)
     pixel, (h, w) = np.rint(uv), camera.size
     seen = valid & (depth_m > 0) & (pixel >= 0).all(axis=1) & (pixel < (w, h)).all(axis=1)

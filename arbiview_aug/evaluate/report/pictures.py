@@ -268,8 +268,8 @@ def _draw_scanners(above: Any, side: Any, rig: Rig) -> None:
             lines = np.stack([np.broadcast_to([[x], [z]], to.shape), to])
             side.plot(*lines.transpose(1, 0, 2), color=_SCANNER, linewidth=0.5)
     heights = ((lidar, lidar.center_m[2] - rig.ground_z_m) for lidar in rig.lidars)
-    lines = "\n".join(f"{lidar.name} {z:.2f} m, {len(lidar.elevations_deg)} beams" for lidar, z in heights)
-    side.text(0.5, 0.96, lines, transform=side.transAxes, ha="center", va="top", fontsize=8, color=_SCANNER)
+    text = "\n".join(f"{lidar.name} {z:.2f} m, {len(lidar.elevations_deg)} beams" for lidar, z in heights)
+    side.text(0.5, 0.96, text, transform=side.transAxes, ha="center", va="top", fontsize=8, color=_SCANNER)
 
 
 def _label_from_above(axes: Any, rig: Rig) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.lidar import Lidar
@@ -64,7 +66,7 @@ def scan_sheet(
     return contact_sheet([("From above, forward is up", views, captions), *ranges], width_px=width_px)
 
 
-def _pixels(points: FloatArray) -> FloatArray:
+def _pixels(points: Any) -> npt.NDArray[np.int64]:
     """(n, 2) int rows and columns of points (n, >=2)."""
     return np.floor((1 - points[:, :2] / _REACH_M) * _SIDE_PX / 2).astype(int)
 

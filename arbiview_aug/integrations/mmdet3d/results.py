@@ -246,7 +246,7 @@ def scanned(results: Mapping[str, Any], out: Mapping[str, Any], lidar2ego: Float
     """
     if RINGS_KEY not in out or out.get("retarget_params", {}).get("skipped"):
         return {}
-    given, points = results["points"], moved_points(out["points"], np.linalg.inv(lidar2ego))
+    given, points = results["points"], moved_points(out["points"], np.asarray(np.linalg.inv(lidar2ego)))
     changed = {"points": given.new_point(points) if hasattr(given, "new_point") else like_array(given, points)}
     counts = out[COUNTS_KEY].numpy() if COUNTS_KEY in out else np.zeros(0, np.int64)
     if isinstance(annotated := results.get("ann_info"), Mapping):
