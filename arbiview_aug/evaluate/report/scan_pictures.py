@@ -74,4 +74,6 @@ def _pixels(points: Any) -> npt.NDArray[np.int64]:
 def _coloured(values: FloatArray) -> Picture:
     """(n, 3) colours of values (n,): blue at 0 to red at 1."""
     levels = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    if not len(levels):  # OpenCV gives none
+        return np.zeros((0, 3), np.uint8)
     return np.ascontiguousarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1])
