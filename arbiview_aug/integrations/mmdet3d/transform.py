@@ -19,6 +19,8 @@ from arbiview_aug.integrations.mmdet3d.results import check_no_lenses, retarget_
 class RigRetargetMultiView:
     """Re-renders the images of a ``results`` dict as another vehicle's cameras, and rewrites all that describes them.
 
+    Points become those of the target's scanners, if it has any; ``keys=dict(points="source")`` keeps them.
+
     It stands right after what loads images (and points and annotations, where they are loaded: geometry), before
     resizing, cropping, flipping and whatever turns points and boxes. Several frames in one dict (BEVDet4D, collected
     queues) share one draw of ``p`` and of a ``RandomRig``. Where each frame of a drive passes the pipeline by itself,
