@@ -1,8 +1,9 @@
 """``python -m integrations.cross_rig.scans``: does a LiDAR detector trained on retargeted scans of A work on B's?
 
 Both vehicles drive the same streets. A pillar network is trained on A's points as they are, on those of its rings next
-to B's, on A's points as B's scanner would have measured them, and on B's own; all are tested on B's own scans. Scans
-are cast anew for each run; a result is a file, so that a killed run goes on where it was.
+to B's, on A's points as B's scanner would have measured them (with the shapes of labelled boxes, and without), and on
+B's own; all are tested on B's own scans. Scans are cast anew for each run; a result is a file, so that a killed run
+goes on where it was.
 """
 
 from __future__ import annotations
@@ -37,12 +38,13 @@ from integrations.cross_rig.scoring import VariantScore, ap_scores, iou_scores
 from integrations.cross_rig.training import Draws, Schedule, evaluate, train
 from integrations.cross_rig.worlds import Split, street_seed
 
-Kind = Literal["raw", "dropped", "retargeted", "oracle"]
+Kind = Literal["raw", "dropped", "retargeted", "unlabelled", "oracle"]
 
 TITLES: dict[Kind, str] = {
     "raw": "A's points",
     "dropped": "A's points, rings dropped",
     "retargeted": "A's points, retargeted",
+    "unlabelled": "A's points, retargeted without boxes",
     "oracle": "B's own points",
 }
 
@@ -117,7 +119,9 @@ def _frame(drive: SyntheticDrive, a: Lidar, b: Lidar, kind: Kind, index: int) ->
 def _points(points: Any, a: Lidar, b: Lidar, kind: Kind, boxes: FloatArray) -> Any:
     if kind == "dropped":
         return rings_dropped(a, b, points)
-    return retarget_points(points, rig_of(b), boxes_3d=boxes).points if kind == "retargeted" else points
+    if kind in ("retargeted", "unlabelled"):
+        return retarget_points(points, rig_of(b), boxes_3d=boxes if kind == "retargeted" else None).points
+    return points
 
 
 # --- trainings and tests ----------------------------------------------------------------------------------------------
