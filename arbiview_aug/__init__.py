@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from arbiview_aug.sample.boxes_2d import ImageBoxes as ImageBoxes
     from arbiview_aug.sample.boxes_2d import project_boxes_3d as project_boxes_3d
     from arbiview_aug.sample.collate import collate as collate
+    from arbiview_aug.sample.depth_maps import depth_maps as depth_maps
     from arbiview_aug.sample.mistakes import CheckReport as CheckReport
     from arbiview_aug.sample.mistakes import Finding as Finding
     from arbiview_aug.sample.mistakes import check as check

@@ -44,11 +44,13 @@ TINY_BENCH = ["--quality", "draft", "--downscale", "4", "--size", "40x72", "--re
 TINY = {
     "demo": TINY_DEMO,  # the install line's
     "demo --seed 2 --width 1400 --output docs/images/demo.jpg": TINY_DEMO,
+    "demo --target waymo --seed 2 --size 96x160 --width 460 --output docs/images/scans.jpg": TINY_DEMO,
     "demo --target truck.yaml --seed 2 --width 1000 --output docs/images/truck.jpg": TINY_DEMO,
     "demo --target truck.yaml": TINY_DEMO,
     "demo --data FOLDER --target waymo": ["--size", "64x112"],
     "evaluate --data FOLDER --target-set paper": ["--downscale", "4", "--size", "40x72"],
     "evaluate --data FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
+    "evaluate --lidar --target waymo": [],
     "evaluate --displaced --data FOLDER": ["--geometry", "street", "--downscale", "4", "--frames", "1"],
     "check FOLDER": ["--downscale", "4"],
     "check FOLDER --frames 5 --output output": ["--downscale", "4"],

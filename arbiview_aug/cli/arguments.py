@@ -174,6 +174,11 @@ def size(text: str) -> tuple[int, int]:
     return int(height), int(width)
 
 
+def frames_text(count_of: int) -> str:
+    """Number of frames, for titles."""
+    return f"{count_of} frame{'s' * (count_of > 1)}"
+
+
 def writable_folder(path: Path, asked: str) -> Path:
     """Create a folder before any work starts; DataError names ``asked``, the value of ``--output``."""
     try:

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import argparse
 import statistics
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from timeit import timeit
+from typing import Any
 
 import cv2
+import numpy as np
 
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Holes, Quality
-from arbiview_aug.cli.arguments import gathered_warnings, writable_folder
-from arbiview_aug.cli.evaluate import frames_text, measured, open_frames
+from arbiview_aug.cli.arguments import frames_text, gathered_warnings, writable_folder
+from arbiview_aug.cli.evaluate import measured, open_frames
+from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.environment import working_s
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.methods import Method, retargeting, views_of
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
+from arbiview_aug.evaluate.report.scan_pictures import scan_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from arbiview_aug.transforms.scans import retarget_points
 
 PICTURE_FILE = "demo.png"
 _COMPARED: tuple[GeometryName, ...] = ("street", "ground", "infinity")
@@ -61,7 +69,25 @@ def run(arguments: argparse.Namespace) -> None:
     )
     truth = None if done.first is None else done.first.true_images(target)
     sheet = frame_sheet(source, as_arrays(sample["images"]), target, views, truth, width_px=arguments.width)
+    if target.lidars and (clouds := _scans(data, sample, target)):
+        boxes, mounted = sample.get("boxes_3d"), target.in_frame_of(source)
+        boxes = np.zeros((0, 7)) if boxes is None else boxes.numpy()
+        scans = scan_sheet(mounted.lidars[0], clouds, boxes, source.ground_z_m, width_px=arguments.width)
+        sheet = np.concatenate([sheet, scans])
     print(f"picture: {save_picture(path, sheet)}")
+
+
+def _scans(data: Any, sample: Mapping[str, Any], target: Rig) -> dict[str, FloatArray]:
+    """Points of a sample as they were measured, by the target's scanners, and if they are known the true ones."""
+    is_synthetic, rig = isinstance(data, SyntheticDrive), sample["rig"]
+    points = data.points(0) if is_synthetic else sample.get("points")
+    if points is None:
+        return {}
+    scan = retarget_points(points, target, boxes_3d=sample.get("boxes_3d"), ground_z_m=rig.ground_z_m)
+    clouds = {"measured": points, f"as {target.name or 'the target'} would have": scan.points}
+    if is_synthetic:
+        clouds["true"] = data.points(0, target.in_frame_of(rig))
+    return {name: cloud.numpy() for name, cloud in clouds.items()}
 
 
 def _compared(quality: Quality, geometry: GeometryName, holes: Holes) -> list[Method]:

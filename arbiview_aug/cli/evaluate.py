@@ -1,7 +1,8 @@
 """``python -m arbiview_aug evaluate``: the quality of rendered views, in numbers and pictures.
 
 Real frames are scored by sparse LiDAR metrics, overlap and consistency; synthetic streets by the true views.
-``--displaced`` scores real frames by photographs that another camera took, or the next frame's cameras.
+``--displaced`` scores real frames by photographs that another camera took, or the next frame's cameras; ``--lidar``
+scores points instead of images.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from typing import Any
 from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.arguments import REAL_TARGET, named_steps, writable_folder
+from arbiview_aug.cli.arguments import REAL_TARGET, frames_text, named_steps, writable_folder
+from arbiview_aug.cli.scans import evaluate_scans
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
 from arbiview_aug.datasets.registry import split_kind
@@ -41,6 +43,9 @@ from arbiview_aug.transforms.settings import SampleKeys
 def run(arguments: argparse.Namespace) -> None:
     """Measure, print the tables, write JSON, pictures and the report."""
     folder = writable_folder(Path(arguments.output), arguments.output)
+    if arguments.lidar:
+        evaluate_scans(arguments, folder)
+        return
     notes: list[str] = []
     if arguments.displaced:
         methods, done = _displaced(arguments, notes)
@@ -140,11 +145,6 @@ def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
         else:
             methods.append(make(holes=holes))
     return methods
-
-
-def frames_text(count_of: int) -> str:
-    """Number of evaluated frames, for titles."""
-    return f"{count_of} frame{'s' * (count_of > 1)}"
 
 
 def measured(

@@ -72,6 +72,8 @@ def convert() -> argparse.ArgumentParser:
     add("--size", type=size, metavar="HxW", help="height and width of every view (default: the target's own)")
     fit = "with --size: cut at the top and the sides (default), add black bars there, or stretch"
     add("--fit", choices=get_args(Fit), default="crop", help=fit)
+    points = "as the target's scanners would have measured them, if it has any (default), or as they are"
+    add("--points", choices=("target", "source"), default="target", help=points)
     add_reading(parser)
     neighbours = "let N frames of the drive before and after each fill holes (default: none)"
     add("--neighbours", type=seed, default=0, metavar="N", help=neighbours)
@@ -158,6 +160,11 @@ def evaluate() -> argparse.ArgumentParser:
         "with NEXT of this frame folder's first frame. Surfaces: a copy, and all that the data offers"
     )
     add("--displaced", nargs="?", const=True, metavar="NEXT", help=displaced)
+    lidar = (
+        "instead of images, score points as the target's scanners would have measured them, against true scans: of "
+        "synthetic streets; with --displaced, the next frame's, by the target's scanners or those in calib.json"
+    )
+    add("--lidar", action="store_true", help=lidar)
     return parser
 
 
@@ -276,8 +283,11 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
     if name == "evaluate":
         if arguments.generator and "diffusion" not in arguments.holes:
             parser.error("argument --generator: expected it with --holes diffusion")
-        for option in _FIXED if arguments.displaced else ():
+        fixed = _FIXED if not arguments.lidar else [name for name in _FIXED if name != "target"]
+        for option in fixed if arguments.displaced else ():
             if getattr(arguments, option) != parser.get_default(option):
                 parser.error(f"argument --{option.replace('_', '-')}: --displaced has its own; expected none")
+        if arguments.lidar and arguments.data is not None and not arguments.displaced:
+            parser.error("argument --lidar: expected --displaced with --data: a drive's truth is its next scan")
         if arguments.displaced and arguments.data is None:
             parser.error("argument --displaced: expected --data FOLDER with it, found none")

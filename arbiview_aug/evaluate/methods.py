@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -19,7 +19,7 @@ from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from arbiview_aug.transforms.settings import inpainter_of, render_config
+from arbiview_aug.transforms.settings import SampleKeys, inpainter_of, render_config
 
 Sample = Mapping[str, Any]
 
@@ -66,7 +66,8 @@ def retargeting(
     inpainter = inpainter_of(holes)  # once, not for each target
     fills = not isinstance(inpainter, Black)
     settings = dict[str, Any](cache=PlanCache(max_bytes=0)) | settings
-    settings |= {"holes": inpainter, "match_exposure": match_exposure}
+    images_alone = replace(settings.get("keys", SampleKeys()), points="source")
+    settings |= {"holes": inpainter, "match_exposure": match_exposure, "keys": images_alone}
 
     @lru_cache(_CACHED_TRANSFORMS)
     def transform(target: Rig) -> RigRetarget:
@@ -87,6 +88,7 @@ def retargeting(
             match_exposure=False if gains is None else gains[camera : camera + 1],
             cache=PlanCache(share_overlap=depth is not None, max_bytes=0),
             holes="black",
+            keys=SampleKeys(points="source"),
         )
         if depth is not None and retarget.overlaps is not None:
             known = depth

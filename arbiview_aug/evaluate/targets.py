@@ -70,7 +70,7 @@ def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:
 
 
 def without_masks(rig: Rig) -> Rig:
-    """The same rig without car-body masks, and without scanners: images are compared."""
-    if all(camera.mask is None for camera in rig) and not rig.lidars:
+    """The same rig without car-body masks."""
+    if all(camera.mask is None for camera in rig):
         return rig
-    return replace(rig, cameras=[replace(camera, mask=None) for camera in rig], lidars=())
+    return rig.with_cameras([replace(camera, mask=None) for camera in rig])

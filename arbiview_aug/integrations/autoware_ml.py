@@ -55,6 +55,8 @@ class RigRetargetMultiViewImages:
         out = self.step(results)
         changed = {key: out[key] for key in (*IMAGE_KEYS, "coverage", "generated", "retarget_params") if key in out}
         changed["img"] = (out["img"].numpy() / scale).astype(images.dtype)
+        if "points" in input_dict:
+            changed["points"] = out["points"]
         if "camera_names" in input_dict:
             skipped = out.get("retarget_params", {}).get("skipped")
             changed["camera_names"] = list(input_dict["camera_names"] if skipped else self.step.names)

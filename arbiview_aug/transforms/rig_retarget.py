@@ -256,8 +256,8 @@ class RigRetarget(torch.nn.Module):
         return self._writer.write(frames, rendered, labels, target, draws, points)
 
     def _scanned(self, frames: Sequence[Frame], target: Rig, skip: bool = False) -> list[RetargetedPoints]:
-        """The points of the target's scanners; empty without scanners or points."""
-        if not target.lidars:
+        """Points of the frames by the target's scanners, if it has any and they are wanted."""
+        if not target.lidars or self.keys.points != "target":
             return []
         return retarget_frames(frames, target, skip, self._warn if self.neighbours is not None else None)
 

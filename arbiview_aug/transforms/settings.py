@@ -35,6 +35,7 @@ class SampleKeys:
             ``sources``: the source images and calibration, for ``Inpainter.complete_batch``.
         frame: Ego frame of output poses, points and boxes. ``target`` moves them, and ``ego2world``, into the target's
             and adds ``ego2ego`` (..., 4, 4).
+        points: ``target``: as its scanners would have measured them, if it has any. ``source``: as they are.
 
     Raises:
         ValueError: Impossible values.
@@ -45,6 +46,7 @@ class SampleKeys:
     keep: tuple[str, ...] = ()
     extra: tuple[str, ...] = ()
     frame: Literal["source", "target"] = "source"
+    points: Literal["source", "target"] = "target"
 
     def __post_init__(self) -> None:
         for name in ("labels", "keep", "extra"):
@@ -57,6 +59,7 @@ class SampleKeys:
         if not is_number(self.ignore_index):
             raise ValueError(f"SampleKeys.ignore_index: expected a number, got {self.ignore_index!r}")
         choice("SampleKeys.frame", self.frame, ("source", "target"))
+        choice("SampleKeys.points", self.points, ("source", "target"))
 
 
 def render_config(quality: Any) -> Any:

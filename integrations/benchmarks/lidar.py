@@ -17,24 +17,21 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from arbiview_aug import Lidar, Rig, RigRetarget, retarget_points
-from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cli.arguments import command_parser, count
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import ScanErrors, SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.lidar import lidar_split
-from arbiview_aug.evaluate.scans import chamfer_m, scan_metrics
+from arbiview_aug.evaluate.scans import chamfer_m, measured_near, rings_dropped, scan_metrics
 from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.scene.point_cloud import own_car
 
 COLUMNS = ("recall", "precision", "range_error_m", "chamfer_m", "recall of all")
 PLACE_M = (0.9, 0.0, 1.9)
 UP_M = 0.7
-_GRID_DEG = 0.05
 
 ERRORS = ScanErrors(divergence_deg=0.17, reach_m=150.0)
 """An HDL-32E's divergence, 3 mrad. Of rays between others that return from one surface, 95, 94 and 84 % return at 20 to
@@ -98,7 +95,7 @@ def synthetic(frames: int, seed: int) -> Iterator[tuple[str, str, dict[str, floa
         for k in range(frames):
             sample, truth = drive[k], complete.points(k).numpy()
             points = sample["points"].numpy()
-            clouds = {"as they are": points, "rings dropped": next_rings(a, b, points)}
+            clouds = {"as they are": points, "rings dropped": rings_dropped(a, b, points)}
             for name, neighbours in NEIGHBOURS.items():
                 retarget = RigRetarget(target, geometry="street", holes="black", neighbours=neighbours)
                 clouds[name] = retarget(sample)["points"].numpy()
@@ -108,30 +105,6 @@ def synthetic(frames: int, seed: int) -> Iterator[tuple[str, str, dict[str, floa
                 rows.setdefault(name, []).append(scan_metrics(b, cloud, truth, where) | of_all)
         for name, metrics in rows.items():
             yield scene, name, {key: float(np.mean([m[key] for m in metrics])) for key in COLUMNS}
-
-
-def measured_near(a: Lidar, b: Lidar, points: FloatArray) -> BoolArray:
-    """(beams, columns) rays of ``b`` within half a line and a column spacing of which ``a`` measured a point."""
-    half = np.diff(np.sort(a.elevations_deg)).mean() / 2, a.azimuth_step_deg / 2 + _GRID_DEG
-    local = (points[:, :3].astype(float) - b.center_m) @ b.lidar2ego[:3, :3]
-    elevation = np.degrees(np.arcsin(local[:, 2] / np.linalg.norm(local, axis=1)))
-    row, column = np.rint((elevation + 90) / _GRID_DEG), np.rint(np.degrees(np.arctan2(*local.T[1::-1])) / _GRID_DEG)
-    turn = round(360 / _GRID_DEG)
-    grid = np.zeros((turn // 2 + 1, turn), np.uint8)
-    grid[row.astype(int), column.astype(int) % turn] = 1
-    near = cv2.dilate(grid, np.ones([2 * round(angle / _GRID_DEG) + 1 for angle in half], np.uint8))
-    azimuth = b.azimuth_deg[0] + b.azimuth_step_deg * np.arange(b.shape[1])
-    rows = np.rint((np.array(b.elevations_deg) + 90) / _GRID_DEG).astype(int)
-    return np.asarray(near[rows[:, None], np.rint(azimuth / _GRID_DEG).astype(int) % turn] > 0)
-
-
-def next_rings(a: Lidar, b: Lidar, points: FloatArray) -> FloatArray:
-    """The points of those rings of ``a`` that are nearest to a ring of ``b``."""
-    local = (points[:, :3].astype(float) - a.center_m) @ a.lidar2ego[:3, :3]
-    elevation = np.degrees(np.arcsin(local[:, 2] / np.linalg.norm(local, axis=1)))
-    table = np.array(a.elevations_deg)
-    kept = np.unique(np.abs(np.array(b.elevations_deg)[:, None] - table).argmin(1))
-    return np.asarray(points[np.isin(np.abs(elevation[:, None] - table).argmin(1), kept)])
 
 
 def ddad(data: Path | None) -> Iterator[tuple[str, str, dict[str, float]]]:

@@ -9,11 +9,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from arbiview_aug import load_rig
 from arbiview_aug.__main__ import main
 from tests.cli.convert.drives import SURROUND, command, tree, write_frames, write_nuscenes
 
@@ -59,7 +61,8 @@ def test_killed_at_any_moment_it_goes_on(kind: str, shards: int, least: int, tmp
         source = write_frames(tmp_path / "source", 42)
     else:
         source = write_nuscenes(tmp_path / "source", 21)
-    SURROUND.with_cameras(SURROUND.cameras[:2]).shifted(x_m=0.3).save(tmp_path / "two.json")
+    two = SURROUND.with_cameras(SURROUND.cameras[:2]).shifted(x_m=0.3)
+    replace(two, lidars=load_rig("nuscenes").lidars).save(tmp_path / "two.json")
     target = ("--target", str(tmp_path / "two.json"))
     (whole,) = started([command(source, tmp_path / "whole", *target)])  # starts the server, which takes the longest
     whole.join()

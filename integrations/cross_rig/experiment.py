@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from integrations.cross_rig.cache import FrameStore, code_hash, content_hash
 from integrations.cross_rig.frames import Source, box_store, make_boxes, make_frames, one_thread
 from integrations.cross_rig.labels import Grid, covered_cells
-from integrations.cross_rig.model import Detector
 from integrations.cross_rig.settings import LONGER, Job, Length, Settings, jobs
-from integrations.cross_rig.training import Draws, FrameSet, Schedule, Tested, evaluate, train
+from integrations.cross_rig.training import Draws, FrameSet, Schedule, Tested, evaluate, train, untrained
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.worlds import CHANGES, SPLITS, Split
 
@@ -196,12 +196,12 @@ class Run:
                 lines.append(f"{change} val {100 * tested.val_iou:.1f}")
         return f"{job.name}: {trained['cpu_s']:.0f} s of training, {', '.join(lines)}"
 
-    def _trained(self, job: Job) -> tuple[Detector, dict[str, Any]]:
+    def _trained(self, job: Job) -> tuple[nn.Module, dict[str, Any]]:
         path = self.output / "models" / f"{self.training_key(job)}.pt"
         schedule = self.schedule(job)
         if path.is_file():
             saved = torch.load(path, weights_only=True, map_location=schedule.device)
-            model = Detector(Grid(), schedule.family, schedule.backbone).to(schedule.device)
+            model = untrained(schedule).to(schedule.device)
             model.load_state_dict(saved["weights"])
             return model.eval(), saved["trained"]
         start = time.process_time()

@@ -34,6 +34,30 @@ class Answer(NamedTuple):
     boxes: Tensor
 
 
+class Heads(nn.Module):
+    """Occupancy of cells and boxes, of a map.
+
+    Args:
+        width: Of the map.
+        queries: Cells of the map are queries, which answer for their 16 cells; else for four.
+    """
+
+    def __init__(self, width: int, *, queries: bool = False) -> None:
+        super().__init__()
+        finer = 4 if queries else 1
+        last = nn.Conv2d(width // 2, finer**2, 1)
+        nn.init.constant_(last.bias, _PRIOR_LOGIT)  # type: ignore[arg-type]
+        before = nn.Sequential(nn.Conv2d(width, width // 2, 1), nn.ReLU()) if queries else conv(width, width // 2)
+        self.occupancy = nn.Sequential(before, last, nn.PixelShuffle(finer))
+        self.enlarge = 1 if queries else 2
+        self.boxes = nn.Conv2d(width, BOX_CHANNELS, 1)
+        nn.init.constant_(self.boxes.bias[:1], _PRIOR_LOGIT)  # type: ignore[arg-type,index]
+
+    def forward(self, bev: Tensor) -> Answer:
+        fine = F.interpolate(bev, scale_factor=2, mode="bilinear") if self.enlarge == 2 else bev
+        return Answer(self.occupancy(fine)[:, 0], self.boxes(bev))
+
+
 class Detector(nn.Module):
     """An encoder, a family's map, and two heads.
 
@@ -48,21 +72,12 @@ class Detector(nn.Module):
         self.encoder: nn.Module = SmallEncoder() if backbone == "small" else ResNetEncoder()
         width = 48 if backbone == "small" else 128
         self.family = FAMILIES[family](grid, int(self.encoder.channels), width)  # type: ignore[arg-type]
-        queries = family == "queries"
-        finer = 4 if queries else 1  # a query answers for its 16 cells
-        last = nn.Conv2d(width // 2, finer**2, 1)
-        nn.init.constant_(last.bias, _PRIOR_LOGIT)  # type: ignore[arg-type]
-        before = nn.Sequential(nn.Conv2d(width, width // 2, 1), nn.ReLU()) if queries else conv(width, width // 2)
-        self.occupancy = nn.Sequential(before, last, nn.PixelShuffle(finer))
-        self.enlarge = 1 if queries else 2
-        self.boxes = nn.Conv2d(width, BOX_CHANNELS, 1)
-        nn.init.constant_(self.boxes.bias[:1], _PRIOR_LOGIT)  # type: ignore[arg-type,index]
+        self.heads = Heads(width, queries=family == "queries")
 
     def features(self, batch: Batch) -> Tensor:
         """(T, C, h / 4, w / 4) of the images, uncovered pixels at the mean colour."""
         return self.encoder((batch.images.float() / 255 - _MEAN) / _STD * batch.coverage[:, None])
 
     def forward(self, batch: Batch) -> Answer:
-        bev = self.family(self.features(batch), batch)
-        fine = F.interpolate(bev, scale_factor=2, mode="bilinear") if self.enlarge == 2 else bev
-        return Answer(self.occupancy(fine)[:, 0], self.boxes(bev))
+        answer: Answer = self.heads(self.family(self.features(batch), batch))
+        return answer

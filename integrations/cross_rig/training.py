@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import torch
 import torch.nn.functional as F
+from torch import nn
 
 from arbiview_aug import Rig
 from integrations.cross_rig.augmentation import scaled_and_cropped
@@ -20,6 +22,7 @@ from integrations.cross_rig.encoders import Backbone
 from integrations.cross_rig.families import Batch
 from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid
 from integrations.cross_rig.model import Answer, Detector
+from integrations.cross_rig.pillars import PillarDetector, PointBatch, PointSet
 
 THRESHOLDS = tuple(round(0.05 * k, 2) for k in range(1, 20))
 FIXED_THRESHOLD = 0.3
@@ -87,6 +90,14 @@ class FrameSet:
                 covered = np.unpackbits(packed, axis=-1, count=images.shape[-1]).astype(bool)
         return _Frame(images, covered, K, cam2ego, self.state[index], self.counts, self.boxes[index])
 
+    @staticmethod
+    def joined(frames: Sequence[_Frame]) -> Batch:
+        """Frames as one batch."""
+        return batched(frames)
+
+
+Frames = FrameSet | PointSet
+
 
 @dataclass(frozen=True)
 class _Frame:
@@ -99,7 +110,7 @@ class _Frame:
     boxes: npt.NDArray[np.float32]
 
 
-def batched(frames: list[_Frame]) -> Batch:
+def batched(frames: Sequence[_Frame]) -> Batch:
     """Frames of any number of cameras as one batch."""
 
     def joined(name: str) -> torch.Tensor:
@@ -122,7 +133,7 @@ class Draws:
     """The batches of a training: which frames they hold depends on the seed alone, so that variants are paired.
 
     Args:
-        own: The variant's frames.
+        own: The variant's frames, images or scans.
         raw: A's frames, half of which are drawn instead; None: none.
         num_frames: Of each.
         seed: Of the training.
@@ -133,7 +144,7 @@ class Draws:
     """
 
     def __init__(
-        self, own: FrameSet, raw: FrameSet | None, num_frames: int, seed: int, *, augmented: bool = False
+        self, own: Frames, raw: Frames | None, num_frames: int, seed: int, *, augmented: bool = False
     ) -> None:
         self.own, self.raw, self.num_frames, self.augmented = own, raw, num_frames, augmented
         self.order = np.random.default_rng([seed, 0])
@@ -141,25 +152,25 @@ class Draws:
         self.left: list[int] = []
         self.augment_s = 0.0
 
-    def batch(self, size: int) -> Batch:
+    def batch(self, size: int) -> Batch | PointBatch:
         """The next batch; every frame once before any comes again."""
-        frames = []
+        frames: list[Any] = []
         for _ in range(size):
             if not self.left:
                 self.left = [int(k) for k in self.order.permutation(self.num_frames)]
             index = self.left.pop()
             drawn_from = self.raw if self.raw is not None and self.rng.random() < 0.5 else self.own
-            frame = drawn_from.frame(index)
+            frame: Any = drawn_from.frame(index)
             if self.augmented:
                 start = time.process_time()
                 images, coverage, K = scaled_and_cropped(frame.images, frame.K, self.rng)
                 frame = replace(frame, images=images, coverage=coverage, K=K)
                 self.augment_s += time.process_time() - start
             frames.append(frame)
-        return batched(frames)
+        return self.own.joined(frames)
 
 
-def loss(answer: Answer, batch: Batch) -> torch.Tensor:
+def loss(answer: Answer, batch: Batch | PointBatch) -> torch.Tensor:
     """Mean binary cross-entropy over the cells that count, and a share of the boxes' loss."""
     counts = batch.counts & (batch.state != HIDDEN)
     truth = (batch.state == VEHICLE)[counts].float()
@@ -167,11 +178,18 @@ def loss(answer: Answer, batch: Batch) -> torch.Tensor:
     return cells + _BOXES * box_loss(answer.boxes, batch.boxes, batch.state, batch.counts, Grid())
 
 
-def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[Detector, list[float]]:
+def untrained(schedule: Schedule) -> nn.Module:
+    """A detector of a schedule's family."""
+    if schedule.family == "pillars":
+        return PillarDetector(Grid())
+    return Detector(Grid(), schedule.family, schedule.backbone)
+
+
+def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[float]]:
     """A trained detector and its mean loss over each tenth of the steps."""
     torch.manual_seed(seed)
     device = torch.device(schedule.device)
-    model = Detector(Grid(), schedule.family, schedule.backbone).to(device).to(memory_format=torch.channels_last)
+    model = untrained(schedule).to(device).to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(model.parameters(), lr=schedule.lr)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, schedule.lr, total_steps=schedule.steps)
     losses = []
@@ -196,13 +214,14 @@ def _autocast(schedule: Schedule) -> torch.autocast:
 
 @torch.no_grad()
 def answers(
-    model: Detector, frames: FrameSet, num_frames: int, schedule: Schedule
+    model: nn.Module, frames: Frames, num_frames: int, schedule: Schedule
 ) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.float32]]:
     """Probabilities of cells (F, cells, cells), and detections (F, k, 8) of ``boxes.decode``."""
     cells, detections = [], []
     for start in range(0, num_frames, _EVAL_BATCH):
         indices = range(start, min(start + _EVAL_BATCH, num_frames))
-        batch = batched([frames.frame(k) for k in indices]).to(torch.device(schedule.device))
+        own: Any = [frames.frame(k) for k in indices]
+        batch = frames.joined(own).to(torch.device(schedule.device))
         with _autocast(schedule):
             answer = model(batch)
         cells.append(answer.occupancy.float().sigmoid().cpu().numpy().astype(np.float16))
@@ -210,7 +229,7 @@ def answers(
     return np.concatenate(cells), np.concatenate(detections)
 
 
-def best_threshold(probability: np.ndarray, frames: FrameSet) -> tuple[float, float]:
+def best_threshold(probability: np.ndarray, frames: Frames) -> tuple[float, float]:
     """The threshold with the highest IoU on these frames, and that IoU."""
     counts = frames.counts[None] & (frames.state != HIDDEN)
     p, truth = probability[counts], (frames.state == VEHICLE)[counts]
@@ -241,7 +260,7 @@ class Tested:
     cpu_s: float
 
 
-def evaluate(model: Detector, val: FrameSet, test_set: FrameSet, height_dm: np.ndarray, schedule: Schedule) -> Tested:
+def evaluate(model: nn.Module, val: Frames, test_set: Frames, height_dm: np.ndarray, schedule: Schedule) -> Tested:
     """Threshold on validation streets, counts on test streets; both as B sees them, with B's calibration."""
     start = time.process_time()
     threshold, val_iou = best_threshold(answers(model, val, len(val.state), schedule)[0], val)

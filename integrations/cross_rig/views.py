@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug import Camera, RandomRig, Rig, RigRetarget, visible_boxes
+from arbiview_aug import Camera, RandomRig, Rig, RigRetarget, SampleKeys, visible_boxes
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.sample.inputs import read_frames
@@ -47,6 +47,7 @@ class ViewMaker:
             geometry=variant.surface,
             neighbours=reach,
             holes="continue" if variant.holes == "fill" else "black",  # the generator completes black views
+            keys=SampleKeys(points="source"),
         )
 
     def __call__(self, index: int, frame: Mapping[str, Any]) -> Arrays:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -90,7 +90,7 @@ def _argoverse2(size: Size) -> Rig:
         height = min(camera.height_px, round(camera.width_px * size[0] / size[1]))
         top = int(np.clip(round(camera.K[1, 2] - height / 2), 0, camera.height_px - height))
         cameras.append(camera.crop(top, 0, (height, camera.width_px)).resize(size))
-    return replace(rig, cameras=cameras, lidars=()).in_frame_of(source_rig(size))
+    return rig.with_cameras(cameras).in_frame_of(source_rig(size))
 
 
 CHANGES: dict[str, Change] = {

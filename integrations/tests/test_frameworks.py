@@ -17,7 +17,7 @@ FRAMEWORK_TESTS = {
     "lightning": "test_datamodule.py",
     "webdataset": "test_stream.py",
 }
-EXAMPLES = ("kornia", "lightning", "mmdet3d", "nuscenes", "webdataset")
+EXAMPLES = ("kornia", "lightning", "mmdet3d", "nuscenes", "openpcdet", "webdataset")
 
 
 def run(*arguments: str) -> str:

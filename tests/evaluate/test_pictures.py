@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.pictures import (
@@ -20,6 +21,7 @@ from arbiview_aug.evaluate.report.pictures import (
     rig_figure,
     save_picture,
 )
+from arbiview_aug.evaluate.report.scan_pictures import from_above, range_picture, scan_sheet
 
 
 def plain(h: int, w: int, colour: tuple[int, int, int]) -> np.ndarray:
@@ -88,7 +90,9 @@ def test_rig_figure_has_a_column_per_rig() -> None:
         assert len(axes.patches) == len(load_rig("waymo")) + len(load_rig("argoverse2")), "the other behind it"
         assert sum(patch.get_facecolor()[3] > 0 for patch in axes.patches) == len(rig), "its own wedges are filled"
     heights = {line for text in two.axes[3].texts for line in text.get_text().splitlines()}
-    assert heights == {f"{c.name} {c.center_m[2] - rig.ground_z_m:.2f} m" for c in rig}, "over its own road"
+    over_road = {f"{c.name} {c.center_m[2] - rig.ground_z_m:.2f} m" for c in rig}
+    beams = {f"{s.name} {s.center_m[2] - rig.ground_z_m:.2f} m, {len(s.elevations_deg)} beams" for s in rig.lidars}
+    assert heights == over_road | beams and len(beams) == 2, "over its own road"
     picture = draw_rigs([load_rig("waymo")])
     assert picture.shape == (1050, 800, 3) and picture.std() > 20
 
@@ -118,3 +122,37 @@ def test_rig_picture_of_extreme_lenses(fov_deg: float) -> None:
         position_m=(300.0, -50.0, 80.0),
     )
     assert draw_rigs([Rig([camera]), load_rig("ddad")]).dtype == np.uint8
+
+
+def test_scanners_are_drawn_in_their_places() -> None:
+    pose = np.eye(4)
+    pose[:3, 3] = 1.0, 0.4, 1.7
+    front = Lidar("front", pose, (-20.0, 0.0), 1.0, (1.0, 50.0), (-60.0, 60.0))
+    camera = Camera.looking(name="a", azimuth_deg=0, width_px=64, height_px=48, horizontal_fov_deg=60.0)
+    above, side = rig_figure([Rig([camera], lidars=[front], ground_z_m=-0.3)]).axes
+    dot, ends = (np.transpose(line.get_data()) for line in above.lines)
+    assert np.allclose(dot, [[0.4, 1.0]]) and np.allclose(np.linalg.norm(ends - dot, axis=1), 1.6, atol=1e-3)
+    assert ends[:, 1].min() > 1.7  # ahead alone
+    starts = [line.get_xydata()[0] for line in side.lines[:-1]]  # the last is the road
+    assert len(starts) >= 2 and np.allclose(starts, (1.0, 2.0))
+
+
+def test_scans_from_above_and_as_range_images() -> None:
+    pose = np.eye(4)
+    pose[2, 3] = 2.0
+    lidar = Lidar("top", pose, (-10.0, 0.0, 10.0), 10.0, (1.0, 50.0))
+    ahead, left = [10.0, 0.0, 2.0], [0.0, 20.0, 2.0]
+    points = np.array([ahead, left])
+    picture = from_above(points, np.array([[10.0, 0, 1, 4, 2, 2, 0]]), 0.0)
+    row, column = np.nonzero((picture != 255).any(axis=2))
+    size = len(picture)
+    assert row.min() > size * (0.5 - 13 / 64) and column.min() == round(size * (0.5 - 20 / 64))
+    ranges = range_picture(lidar, points)
+    inked = (ranges != 255).any(axis=2)
+    h, w = inked.shape
+    rows, columns = np.nonzero(inked)
+    assert set(rows * 3 // h) == {1} and set(columns * 36 // w) == {8, 17}  # left of the middle is left
+    near, far = ranges[h // 2, w // 2 - 5].astype(int), ranges[h // 2, round(w * 8.5 / 36)].astype(int)
+    assert near[0] - near[2] > far[0] - far[2]  # red is near
+    sheet = scan_sheet(lidar, {"one": points, "none": points[:0]}, np.zeros((0, 7)), 0.0, width_px=600)
+    assert sheet.shape[1] == 600 and sheet.std() > 5

@@ -12,6 +12,8 @@ import torch
 from arbiview_aug import (
     CalibrationError,
     Lidar,
+    MixedDataset,
+    RandomRig,
     RetargetedDataset,
     RigRetarget,
     SampleError,
@@ -21,6 +23,7 @@ from arbiview_aug import (
 )
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleTypeError
+from arbiview_aug.scene.boxes import checked_boxes, points_by_box
 from tests.helpers import street_sample
 
 POSE = np.array([[1.0, 0, 0, 0.9], [0, 1, 0, 0], [0, 0, 1, 2.2], [0, 0, 0, 1]])
@@ -55,6 +58,68 @@ def test_points_pass_without_scanners(sample: dict[str, Any]) -> None:
     assert out["points"] is sample["points"] and "point_rings" not in out and "num_points" not in out
     bare = {key: value for key, value in sample.items() if key not in ("points", "boxes_3d", "box_classes")}
     assert not {"points", "point_rings", "num_points"} & RigRetarget(target())(bare).keys()
+
+
+def test_points_stay_on_demand(sample: dict[str, Any]) -> None:
+    """Also where the target is drawn around a rig with scanners."""
+    keys = SampleKeys(points="source")
+    for to in (target(), RandomRig(target(), height_m=0.3)):
+        retarget = RigRetarget(to, keys=keys)
+        out = retarget(sample)
+        assert out["points"] is sample["points"] and "point_rings" not in out and "num_points" not in out
+        assert "measured" not in str(retarget.explain(sample)).splitlines()[-1]
+    with pytest.raises(ValueError, match=r"SampleKeys\.points"):
+        SampleKeys(points="both")  # type: ignore[arg-type]
+
+
+def assert_of_one_rig(out: dict[str, Any], rig: Any) -> None:
+    """Cameras, points, rings and numbers of points all belong to a rig in the ego frame of the sample."""
+    np.testing.assert_allclose(out["cam2ego"], rig.cam2ego, atol=1e-9)
+    np.testing.assert_allclose(out["K"], rig.K, atol=1e-9)
+    points, (scanner,) = out["points"].double().numpy(), rig.lidars
+    away = points[:, :3] - scanner.center_m
+    elevation = np.degrees(np.arcsin(away[:, 2] / np.linalg.norm(away, axis=1)))
+    assert len(points) > 200
+    np.testing.assert_allclose(elevation, np.array(scanner.elevations_deg)[out["point_rings"]], atol=0.02)
+    _, ends = points_by_box(checked_boxes(out["boxes_3d"]), points[:, :3].astype(np.float32), 0.0)
+    np.testing.assert_array_equal(out["num_points"], np.diff(ends, prepend=0))
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_everything_of_a_sample_is_of_one_rig(workers: int) -> None:
+    """Each sample has its own draw of the rig, and of whether to retarget."""
+    size = (32, 88)
+    drive, base = SyntheticDrive(demo_source_rig(size), num_frames=8), replace(demo_source_rig(size), lidars=[TOP])
+    random = RandomRig(base, yaw_deg=8.0, height_m=0.4, forward_m=0.3)
+    data = RetargetedDataset(drive, RigRetarget(random, p=0.6, size=size, geometry="street"))
+    torch.manual_seed(4)
+    skipped = set()
+    for batch in torch.utils.data.DataLoader(data, batch_size=4, num_workers=workers, collate_fn=collate):
+        for k, params in enumerate(batch["retarget_params"]):
+            out = {key: value[k] for key, value in batch.items()}
+            drawn = {name: value for name, value in params.items() if name != "skipped"}
+            skipped.add(bool(params["skipped"]))
+            if params["skipped"]:
+                np.testing.assert_allclose(out["cam2ego"], drive.rig.cam2ego)
+                (index,) = (n for n in range(len(drive)) if torch.equal(drive.points(n), out["points"]))
+                assert torch.equal(out["images"], drive[index]["images"]) and (out["point_rings"] == -1).all()
+            else:
+                assert_of_one_rig(out, random.rig(drawn))
+    assert skipped == {True, False}
+
+
+def test_a_mixture_has_whole_samples() -> None:
+    drive = SyntheticDrive(demo_source_rig((32, 88)), num_frames=4)
+    mixed = MixedDataset(drive, RetargetedDataset(drive, RigRetarget(target(), size=(32, 88))), share=0.5)
+    torch.manual_seed(0)
+    kinds = set()
+    for k, (out,) in enumerate(torch.utils.data.DataLoader(mixed, collate_fn=list)):
+        kinds.add("point_rings" in out)
+        if "point_rings" in out:
+            assert_of_one_rig(out, target().resized((32, 88), "crop"))
+        else:
+            assert torch.equal(out["points"], drive.points(k)) and torch.equal(out["images"], drive[k]["images"])
+    assert kinds == {True, False}
 
 
 def test_arrays_and_dtypes_stay(sample: dict[str, Any]) -> None:

@@ -154,6 +154,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         motion_depth=None if depth is None else depth.absolute(),
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
         link=arguments.link,
+        points=arguments.points,
         **{
             name: getattr(arguments, name)
             for name in ("version", *RETARGET_OPTIONS, "holes", "steps", "reduce", "clean_masks", "neighbours")

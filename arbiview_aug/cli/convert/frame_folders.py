@@ -18,6 +18,7 @@ from arbiview_aug.cli.convert.writer import Converted, Writer
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE
 from arbiview_aug.datasets.py123d import NOT_SHARED
 from arbiview_aug.errors import DataError
+from arbiview_aug.transforms.scans import RINGS_KEY
 
 
 class FrameFolders(Writer):
@@ -38,17 +39,19 @@ class FrameFolders(Writer):
         return f"{self.data.tokens[index]}/{file_name(name).replace('.', '%2E')}"
 
     def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Path], dict[str, Any]]:
-        """The calibration, which is written last and makes the folder a frame; the points are kept."""
+        """Scanned points, and the calibration, which is written last and makes the folder a frame; or kept points."""
         calibration, *_ = files = self.data.files(converted.index)
         source = json.loads(calibration.read_text(encoding="utf-8"))
         calib = _calibration(converted)
         kept = {key: value for key, value in source.items() if key not in (*calib, "dataset", "lidar")}
-        folder = calibration.parent.name
-        points = {f"{folder}/{POINTS_FILE}": files[-1]} if "points" in converted.sample else {}
-        if points:
+        folder, points = calibration.parent.name, converted.out.get("points")
+        name, is_scanned = f"{folder}/{POINTS_FILE}", RINGS_KEY in converted.out
+        if points is not None:
             kept["lidar"] = {"file": POINTS_FILE}
         text = json.dumps({**calib, **kept}, indent=1).encode()
-        return {f"{folder}/{CALIBRATION_FILE}": text}, points, {}
+        scan = {name: _npy(points)} if is_scanned else {}
+        links = {} if points is None or is_scanned else {name: files[-1]}
+        return {**scan, f"{folder}/{CALIBRATION_FILE}": text}, links, {}
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
         """Write the frames' sequence, without those that were left out."""
@@ -83,9 +86,7 @@ class LogFrames(FrameFolders):
         sample, folder, files = converted.sample, self.data.tokens[converted.index], {}
         calib = _calibration(converted) | {"licences": self.data.licences, "ego2world": sample["ego2world"].tolist()}
         if "points" in sample:
-            points = BytesIO()
-            np.save(points, sample["points"].numpy())
-            files[f"{folder}/{POINTS_FILE}"] = points.getvalue()
+            files[f"{folder}/{POINTS_FILE}"] = _npy(converted.out["points"])
             calib["lidar"] = {"file": POINTS_FILE}
         if "boxes_3d" in sample:
             boxes = sample["boxes_3d"].tolist()
@@ -109,8 +110,15 @@ class LogFrames(FrameFolders):
         return [SEQUENCE_FILE] if self.data.is_one_drive else []
 
 
+def _npy(points: Any) -> bytes:
+    """A .npy file of points, a tensor."""
+    file = BytesIO()
+    np.save(file, points.numpy())
+    return file.getvalue()
+
+
 def _calibration(converted: Converted) -> dict[str, Any]:
-    """The cameras with the names of their files."""
+    """The rig with the names of its cameras' files."""
     calib = converted.rig.to_dict()
     for entry, names in zip(calib["cameras"], converted.views, strict=True):
         for suffix, name in names.items():

@@ -30,6 +30,7 @@ from arbiview_aug.datasets.registry import find_reader
 from arbiview_aug.environment import repeatable_opencv, working_s
 from arbiview_aug.errors import DataError, OutputError, described
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from arbiview_aug.transforms.scans import RINGS_KEY
 
 MASKS = {"coverage": "coverage", "confidence": "confidence", "generated": "generated", "ego_mask": "mask"}
 """Outputs of a retargeted sample and the names of their files, ``<image>.<name>.png``. ``coverage``: 255 where some
@@ -49,11 +50,15 @@ def encode_views(out: Mapping[str, Any], suffix: str) -> list[dict[str, bytes]]:
     return views
 
 
-def rig_of(target: Rig, out: Mapping[str, Any]) -> Rig:
-    """Cameras of a retargeted sample, in its ego frame; ``target`` has the views' size and lenses."""
+def rig_of(target: Rig, out: Mapping[str, Any], source: Rig) -> Rig:
+    """Cameras of a retargeted sample, and the scanners that measured its points, in the ego frame of ``source``.
+
+    ``target`` has the views' size and lenses.
+    """
     poses, K = out["cam2ego"].numpy(), out["K"].numpy()
     cameras = [replace(camera, K=K[k], cam2ego=poses[k]) for k, camera in enumerate(target)]
-    return Rig(cameras, ground_z_m=float(out["ground_z_m"]), name=target.name)
+    lidars = target.in_frame_of(source).lidars if RINGS_KEY in out else source.lidars
+    return Rig(cameras, ground_z_m=float(out["ground_z_m"]), name=target.name, lidars=lidars)
 
 
 def coverage_of(image: Path) -> BoolArray:
@@ -145,7 +150,7 @@ class Jobs(Dataset[Done]):
 
     def _write(self, index: int, sample: Mapping[str, Any], out: Mapping[str, Any]) -> float:
         """Write a sample's files, then its record; returns the share of pixels that some source saw."""
-        output, rig = self.settings.output, rig_of(self.settings.sized_target, out)
+        output, rig = self.settings.output, rig_of(self.settings.sized_target, out, sample["rig"])
         files: dict[str, bytes] = {}
         names: list[dict[str, str]] = []
         for k, (camera, view) in enumerate(zip(rig, encode_views(out, self.settings.suffix), strict=True)):

@@ -1,7 +1,8 @@
-"""nuScenes v1.0 out of nuScenes v1.0: new cameras at the LiDAR's times, everything else kept or linked.
+"""nuScenes v1.0 out of nuScenes v1.0: new cameras and scans at the LiDAR's times, everything else kept or linked.
 
-Keyframes are converted; camera images between them are left out. A new camera has the LiDAR's time and ego pose: its
-views are rendered there, whenever the source's cameras exposed.
+Keyframes are converted; images between them are left out, and if the target has scanners, scans too. A new camera has
+the LiDAR's time and ego pose: its views are rendered there, whenever the source's cameras exposed. Returns of all the
+target's scanners are one ``LIDAR_TOP`` in the frame of the first.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+import torch
 
 from arbiview_aug.atomic_io import check_name, checksum, inside, link_whole, whole_file
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cli.convert.manifest import Record
-from arbiview_aug.cli.convert.nuscenes_rows import NewCameras, Remaining, kept_sensors, view_stem, visible_shares
+from arbiview_aug.cli.convert.nuscenes_rows import NewSensors, Remaining, kept_sensors, view_stem, visible_shares
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
 from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
+from arbiview_aug.datasets.nuscenes.recordings import IntArray
 from arbiview_aug.datasets.nuscenes.tables import (
     COUNTS,
     FILES,
@@ -36,6 +40,7 @@ from arbiview_aug.datasets.nuscenes.tables import (
     on_circle,
 )
 from arbiview_aug.errors import CalibrationError, DataError
+from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
 _TABLES = (
     *("attribute", "category", "log", "map", "visibility", "sensor", "calibrated_sensor", "ego_pose", "scene"),
@@ -76,15 +81,19 @@ _NEEDED: Mapping[str, Mapping[str, Kind]] = {
 }
 """Columns without which rows cannot be kept."""
 
+_OF_POINTS = ("lidarseg", "panoptic")
+"""Tables that label the source's points."""
+
 
 class NuScenes(Writer):
     """Tables, images and masks of the new cameras; CalibrationError for lenses, and names of other sensors."""
 
     def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
         self.output, self.data, self.suffix, self.how = settings.output, data, settings.suffix, settings.link
-        self.target = settings.target
+        self.target, self.scanned = settings.target, bool(settings.target.lidars) and settings.points == "target"
         self.tables = Tables(data.root, data.version, None)
         self.there = [name for name in _TABLES if self.tables.path(name).is_file()]  # in writing order
+        self.written = [name for name in self.there if not (self.scanned and name in _OF_POINTS)]
         lenses = [f"{camera.name} ({camera.lens})" for camera in self.target if not camera.is_rectilinear]
         if lenses:
             name = self.target.name or "the target"
@@ -169,30 +178,40 @@ class NuScenes(Writer):
         return view_stem(self.data.files(index)[-1].name, name)
 
     def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Path], dict[str, Any]]:
-        """No files, but the visible share of each annotation's box in the new cameras."""
-        sample = converted.sample
-        if "boxes_3d" not in sample:
-            return {}, {}, {"visible": {}}
-        coverage = [mask.numpy() for mask in converted.out["coverage"]]
-        shares = np.round(visible_shares(converted.rig, coverage, sample["boxes_3d"].numpy()), 3).tolist()
-        return {}, {}, {"visible": dict(zip(sample["box_tokens"], shares, strict=True))}
+        """The scan; the visible share of each annotation's box in the new cameras, and its number of points."""
+        sample, out = converted.sample, converted.out
+        files, facts, tokens = {}, dict[str, Any](visible={}), sample.get("box_tokens", ())
+        if "boxes_3d" in sample:
+            coverage = [mask.numpy() for mask in out["coverage"]]
+            shares = np.round(visible_shares(converted.rig, coverage, sample["boxes_3d"].numpy()), 3).tolist()
+            facts["visible"] = dict(zip(tokens, shares, strict=True))
+        if self.scanned:
+            name = self.data.files(converted.index)[-1].relative_to(self.data.root).as_posix()
+            lidar2ego = converted.rig.lidars[0].lidar2ego
+            if not len(out["points"]):
+                fix = "--points source keeps those that were measured"
+                raise DataError(f"{name}: expected returns of the target's scanners, got none; {fix}")
+            files[name] = _scan_file(out["points"].numpy(), out[RINGS_KEY].numpy(), lidar2ego)
+            facts |= {"lidar2ego": lidar2ego.tolist()}
+            facts["num_lidar_pts"] = dict(zip(tokens, out.get(COUNTS_KEY, torch.empty(0)).tolist(), strict=True))
+        return files, {}, facts
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
         """Write the tables and link the files of the remaining sensors."""
         source = self.tables
-        remaining = Remaining(source, left_out)
-        cameras = NewCameras(records, self.suffix)
+        remaining = Remaining(source, left_out, self.scanned)
+        new = NewSensors(records, self.suffix, remaining.lidar_sensor)
         keyframes, poses = remaining.moments()
         self._missing = 0
         rows: dict[str, Callable[[], Iterable[Row]]] = {
-            "sensor": lambda: chain(remaining.sensor(), cameras.sensor()),
-            "calibrated_sensor": lambda: chain(remaining.calibrated_sensor(), cameras.calibrated_sensor()),
+            "sensor": lambda: chain(remaining.sensor(), new.sensor()),
+            "calibrated_sensor": lambda: chain(remaining.calibrated_sensor(), new.calibrated_sensor()),
             "ego_pose": lambda: remaining.ego_pose(poses),
             "scene": remaining.scene,
             "instance": remaining.instance,
-            "sample_annotation": lambda: remaining.sample_annotation(cameras.visible),
+            "sample_annotation": lambda: remaining.sample_annotation(new.visible, new.num_lidar_pts),
             "sample_data": lambda: chain(
-                self._linked("sample_data", remaining.sample_data()), cameras.sample_data(remaining.drives, keyframes)
+                self._linked("sample_data", remaining.sample_data()), new.sample_data(remaining.drives, keyframes)
             ),
             "lidarseg": lambda: self._linked("lidarseg", source.rows("lidarseg")),
             "panoptic": lambda: self._linked("panoptic", source.rows("panoptic")),
@@ -200,24 +219,26 @@ class NuScenes(Writer):
         }
         for path in self._maps():
             link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"), how=self.how)
-        for name in self.there:
+        for name in self.written:
             _write_table(self.output / self.data.version / f"{name}.json", rows.get(name, partial(source.rows, name))())
         notes = []
         if self._missing:
             notes.append(f"{self._missing} files that sample_data names are not in the source: were sweeps not copied?")
+        if unfit := sorted({*self.there} - {*self.written}):
+            notes.append(f"left out, since they label the points that were measured: tables {', '.join(unfit)}")
         unknown = sorted({path.stem for path in (self.data.root / self.data.version).glob("*.json")} - {*_TABLES})
         if unknown:
             notes.append(f"left out, since they may describe the source's images: tables {', '.join(unknown)}")
         return notes
 
     def finished(self) -> list[str]:
-        return [f"{self.data.version}/{name}.json" for name in self.there]
+        return [f"{self.data.version}/{name}.json" for name in self.written]
 
     def kept(self, left_out: set[str]) -> Iterator[tuple[Path, Path]]:
         for path in self._maps():
             yield self._kept(path.relative_to(self.data.root).as_posix(), "maps")
-        tables: dict[str, Iterable[Row]] = {"sample_data": Remaining(self.tables, left_out).sample_data()}
-        tables |= {name: self.tables.rows(name) for name in ("lidarseg", "panoptic") if name in self.there}
+        tables: dict[str, Iterable[Row]] = {"sample_data": Remaining(self.tables, left_out, self.scanned).sample_data()}
+        tables |= {name: self.tables.rows(name) for name in _OF_POINTS if name in self.written}
         for table, rows in tables.items():
             for row in rows:
                 yield self._kept(row["filename"], self._where(table, row))
@@ -239,6 +260,12 @@ class NuScenes(Writer):
 
     def _where(self, table: str, row: Row) -> str:
         return f"nuScenes {self.data.root} {self.data.version}: table {table}: row {row.get('token')!r}: filename"
+
+
+def _scan_file(points: FloatArray, rings: IntArray, lidar2ego: FloatArray) -> bytes:
+    """A LiDAR file of points (P, >=4) in the ego frame: x y z in the scanner's frame, intensity, ring; float32."""
+    xyz = (points[:, :3] - lidar2ego[:3, 3]) @ lidar2ego[:3, :3]
+    return np.column_stack([xyz, points[:, 3], rings]).astype("<f4").tobytes()
 
 
 def _write_table(path: Path, rows: Iterable[Row]) -> None:

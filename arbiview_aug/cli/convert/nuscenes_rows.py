@@ -1,4 +1,4 @@
-"""nuScenes rows of a converted root: remaining rows of the source, rows of the new cameras, visible shares of boxes."""
+"""nuScenes rows of a converted root: remaining rows of the source, rows of the new sensors, visible shares of boxes."""
 
 from __future__ import annotations
 
@@ -85,11 +85,12 @@ def kept_sensors(tables: Tables) -> tuple[set[str], set[str]]:
 class Remaining:
     """The source's rows without its cameras and without the samples ``left_out``; chains between rows are closed again.
 
-    A LiDAR keyframe of a sample that was left out becomes a sweep of the next sample of its scene.
+    A LiDAR keyframe of a sample that was left out becomes a sweep of the next sample of its scene. With ``scanned``
+    scans go as cameras do: the target's replace them.
     """
 
-    def __init__(self, tables: Tables, left_out: set[str]) -> None:
-        self.tables, self.left_out = tables, left_out
+    def __init__(self, tables: Tables, left_out: set[str], scanned: bool) -> None:
+        self.tables, self.left_out, self.scanned = tables, left_out, scanned
         self._drives: dict[str, list[str]] = {}
         self._stand_in: dict[str, str] = {}
         rows_of_scenes: dict[str, list[Row]] = {}
@@ -104,8 +105,10 @@ class Remaining:
                 self._stand_in[token] = later
         self.drives = [*self._drives.values()]  # tokens by scene, in order of time
         self._sensors, self._calibrated = kept_sensors(tables)
-        lidar = {row["token"] for row in tables.rows("sensor") if row["channel"] == LIDAR}
-        self._lidar = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] in lidar}
+        self.lidar_sensor = next(row["token"] for row in tables.rows("sensor") if row["channel"] == LIDAR)
+        calibrated = tables.rows("calibrated_sensor")
+        self._lidar = {row["token"] for row in calibrated if row["sensor_token"] == self.lidar_sensor}
+        self._kept = self._calibrated - self._lidar if scanned else self._calibrated
         self._annotations_left_out = {
             row["token"]: (row.get("prev", ""), row.get("next", ""), row["instance_token"])
             for batch in (tables.batches("sample_annotation") if left_out else ())
@@ -119,7 +122,7 @@ class Remaining:
         return (row for row in self.tables.rows("sensor") if row["token"] in self._sensors)
 
     def calibrated_sensor(self) -> Iterator[Row]:
-        return (row for row in self.tables.rows("calibrated_sensor") if row["token"] in self._calibrated)
+        return (row for row in self.tables.rows("calibrated_sensor") if row["token"] in self._kept)
 
     def sample(self) -> Iterator[Row]:
         place = {token: (drive, k) for drive in self.drives for k, token in enumerate(drive)}
@@ -149,8 +152,8 @@ class Remaining:
                 }
                 yield self._changed(row, values)
 
-    def sample_annotation(self, visible: Mapping[str, float]) -> Iterator[Row]:
-        """``visible``: share of each annotation's box that the new cameras show."""
+    def sample_annotation(self, visible: Mapping[str, float], num_lidar_pts: Mapping[str, int]) -> Iterator[Row]:
+        """``visible``: share of each annotation's box that the new cameras show; ``num_lidar_pts``: its new points."""
         for batch in self.tables.batches("sample_annotation"):
             for row in batch:
                 if row["token"] in self._annotations_left_out:
@@ -159,9 +162,15 @@ class Remaining:
                 row = self._changed(row, around)
                 if "visibility_token" in row:
                     row = {**row, "visibility_token": level(visible[row["token"]], row["visibility_token"])}
+                if row["token"] in num_lidar_pts:
+                    row = {**row, "num_lidar_pts": num_lidar_pts[row["token"]]}
                 yield row
 
     def sample_data(self) -> Iterator[Row]:
+        return (row for row in self._recorded() if row["calibrated_sensor_token"] in self._kept)
+
+    def _recorded(self) -> Iterator[Row]:
+        """Rows of ``sample_data`` without the cameras'."""
         for batch in self.tables.batches("sample_data"):
             for row in batch:
                 if row["calibrated_sensor_token"] not in self._calibrated:
@@ -175,10 +184,12 @@ class Remaining:
     def moments(self) -> tuple[dict[str, Row], set[str]]:
         """The LiDAR's keyframe of each sample, and the tokens of all ego poses in use."""
         keyframes, poses = {}, set()
-        for row in self.sample_data():
-            poses.add(row["ego_pose_token"])
-            if row["is_key_frame"] and row["calibrated_sensor_token"] in self._lidar:
+        for row in self._recorded():
+            is_moment = row["is_key_frame"] and row["calibrated_sensor_token"] in self._lidar
+            if is_moment:
                 keyframes[row["sample_token"]] = row
+            if is_moment or row["calibrated_sensor_token"] in self._kept:
+                poses.add(row["ego_pose_token"])
         return keyframes, poses
 
     def ego_pose(self, used: set[str]) -> Iterator[Row]:
@@ -195,17 +206,25 @@ class Remaining:
         return token
 
 
-class NewCameras:
-    """Rows of the target's cameras, from the records of the converted samples; ``suffix`` is that of their images."""
+class NewSensors:
+    """Rows of the target's cameras and scanners, from the records of the converted samples.
 
-    def __init__(self, records: Iterable[Record], suffix: str) -> None:
+    ``suffix`` is that of images, ``lidar_sensor`` the LiDAR's token in ``sensor``.
+    """
+
+    def __init__(self, records: Iterable[Record], suffix: str, lidar_sensor: str) -> None:
         self.suffix = suffix
         self.visible: dict[str, float] = {}  # visible share of each annotation's box
+        self.num_lidar_pts: dict[str, int] = {}  # points in it, where scans are the target's
         self._calibrations: dict[str, Row] = {}
         self._views: dict[str, list[tuple[str, Row]]] = {}
+        self._scans: dict[str, str] = {}  # calibration of each sample's scan, where it is the target's
         for record in records:
             self.visible |= record["visible"]
             self._views[record["token"]] = [self._view(camera) for camera in record["cameras"]]
+            if "lidar2ego" in record:
+                self.num_lidar_pts |= record["num_lidar_pts"]
+                self._scans[record["token"]] = self._calibrated(LIDAR, lidar_sensor, record["lidar2ego"], [])
 
     def sensor(self) -> Iterator[Row]:
         names = dict.fromkeys(name for views in self._views.values() for name, _ in views)
@@ -217,34 +236,42 @@ class NewCameras:
     def sample_data(self, drives: Sequence[Sequence[str]], keyframes: Mapping[str, Row]) -> Iterator[Row]:
         """Rows at the time and ego pose of the LiDAR's ``keyframes``; ``drives``: samples by scene, in time."""
         for drive in drives:
-            for k, sample in enumerate(drive):
+            for before, sample, after in zip(["", *drive], drive, [*drive[1:], ""], strict=False):
+                moment = keyframes[sample]
+                if sample in self._scans:
+                    around = (token and keyframes[token]["token"] for token in (before, after))
+                    calibrated = {"calibrated_sensor_token": self._scans[sample]}
+                    yield {**moment, **calibrated, **dict(zip(("prev", "next"), around, strict=True))}
                 for name, view in self._views[sample]:
                     yield {
                         "token": token_of(sample, name),
                         "sample_token": sample,
-                        "ego_pose_token": keyframes[sample]["ego_pose_token"],
-                        "timestamp": keyframes[sample]["timestamp"],
+                        "ego_pose_token": moment["ego_pose_token"],
+                        "timestamp": moment["timestamp"],
                         "fileformat": self.suffix.removeprefix("."),
                         "is_key_frame": True,
                         **view,
-                        "prev": token_of(drive[k - 1], name) if k else "",
-                        "next": token_of(drive[k + 1], name) if k + 1 < len(drive) else "",
+                        "prev": before and token_of(before, name),
+                        "next": after and token_of(after, name),
                     }
 
     def _view(self, camera: Mapping[str, Any]) -> tuple[str, Row]:
         """A camera's name and its columns of ``sample_data``; collects its calibration."""
-        name, pose = camera["name"], np.array(camera["cam2ego"])
-        token = token_of("calibrated_sensor", name, json.dumps([camera["K"], camera["cam2ego"]]))
-        if token not in self._calibrations:
-            self._calibrations[token] = {
-                "token": token,
-                "sensor_token": token_of("sensor", name),
-                "translation": pose[:3, 3].tolist(),
-                "rotation": quaternion_from_rotation(pose[:3, :3]).tolist(),
-                "camera_intrinsic": camera["K"],
-            }
-        size = {"height": camera["height"], "width": camera["width"]}
+        name, size = camera["name"], {"height": camera["height"], "width": camera["width"]}
+        token = self._calibrated(name, token_of("sensor", name), camera["cam2ego"], camera["K"])
         return name, {"calibrated_sensor_token": token, **size, "filename": camera["file"]}
+
+    def _calibrated(self, name: str, sensor: str, sensor2ego: list[list[float]], K: list[list[float]]) -> str:
+        """Token of a calibration, which is collected."""
+        token, pose = token_of("calibrated_sensor", name, json.dumps([K, sensor2ego])), np.array(sensor2ego)
+        self._calibrations[token] = {
+            "token": token,
+            "sensor_token": sensor,
+            "translation": pose[:3, 3].tolist(),
+            "rotation": quaternion_from_rotation(pose[:3, :3]).tolist(),
+            "camera_intrinsic": K,
+        }
+        return token
 
 
 def view_stem(lidar: str, name: str) -> str:

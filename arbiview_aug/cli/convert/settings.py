@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,8 +28,8 @@ class Settings:
     """Source, output and what decides the output's bytes; ``convert --help`` explains each.
 
     ``root``, ``kind``, ``version``, ``reduce`` and ``clean_masks`` are those of ``open_data``, ``RETARGET_OPTIONS``
-    those of ``RigRetarget``. ``motion_depth`` is None where depth is estimated from the neighbours. Only
-    ``link`` does not decide bytes.
+    those of ``RigRetarget``, ``points`` that of ``SampleKeys``. ``motion_depth`` is None where depth is estimated from
+    the neighbours. Only ``link`` does not decide bytes.
     """
 
     root: Path
@@ -44,6 +44,7 @@ class Settings:
     geometry: GeometryName = "auto"
     size: tuple[int, int] | None = None
     fit: Fit = "crop"
+    points: Literal["source", "target"] = "target"
     reduce: Reduce = 1
     clean_masks: bool = False
     neighbours: int = 0
@@ -64,9 +65,9 @@ class Settings:
     def retarget(self) -> RigRetarget:
         """The transform; each process or actor makes one."""
         return RigRetarget(
-            replace(self.target, lidars=()),  # the points' files are kept
+            self.target,
             holes=self._inpainter(),
-            keys=SampleKeys(extra=() if self.quality == "paper" else ("confidence",)),
+            keys=SampleKeys(extra=() if self.quality == "paper" else ("confidence",), points=self.points),
             **{name: getattr(self, name) for name in RETARGET_OPTIONS},
         )
 
@@ -89,6 +90,7 @@ class Settings:
             **{name: getattr(self, name) for name in names},
             **({} if self.size is None else {"fit": self.fit}),
             **({"clean_masks": True} if self.clean_masks else {}),
+            **({"points": self.points} if self.target.lidars else {}),
             "motion_depth": self.motion_depth is not None,
             "generator": {
                 path.name if path == of else path.relative_to(of).as_posix(): checksum(path) for path in files

@@ -19,7 +19,7 @@ class Converted:
     index: int  # number of the sample in the source
     sample: Mapping[str, Any]  # the sample as read
     out: Mapping[str, Any]  # the retargeted sample
-    rig: Rig  # its cameras
+    rig: Rig  # its cameras, and the scanners of its points
     views: Sequence[Mapping[str, str]]  # for each camera the names of its files, by what follows their stem
 
 

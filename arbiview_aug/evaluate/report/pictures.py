@@ -29,6 +29,9 @@ _FARTHEST_M = 80.0  # points there, and beyond, are blue
 
 RIG_COLOURS = ("#1f64c8", "#d65414", "#1e8c3c", "#8c3caa", "#966e14")  # of rigs, in their order
 
+_SCANNER = "#00a0a0"  # colour of scanners
+_BEAM_M, _BEAMS = 1.6, 9  # length and number of their drawn beams
+
 _GAP_PX = 6
 _CAPTION_PX, _CAPTION_SCALE = 20, 0.42
 _TITLE_PX = 28
@@ -217,7 +220,8 @@ def rig_figure(rigs: Sequence[Rig]) -> Figure:
     """Draw one column per rig: from above (forward is up) and from the side (forward is to the right).
 
     Wedges show horizontal fields of view above and vertical ones below. A telephoto camera's wedge is longer. All
-    columns share one scale, with the other rigs' outlines behind. Heights are over each rig's own road.
+    columns share one scale, with the other rigs' outlines behind. Heights are over each rig's own road. Scanners are
+    dots above, with the ends of their middle beam where they do not look all around; below are their beams.
     """
     from matplotlib.figure import Figure
 
@@ -236,6 +240,7 @@ def rig_figure(rigs: Sequence[Rig]) -> Figure:
             if here:
                 _label_from_above(above, rig)
                 _label_from_side(side, rig)
+                _draw_scanners(above, side, rig)
                 above.set_title(f"{rig.name or 'rig'}: {len(rig)} cameras", color=colour)
         above.set(xlabel="left (m)", ylabel="forward (m)", aspect="equal")
         side.set(xlabel="forward (m)", ylabel="height over the road (m)", aspect="equal")
@@ -246,6 +251,25 @@ def rig_figure(rigs: Sequence[Rig]) -> Figure:
         side.margins(0.7, 0.05)
     above.invert_xaxis()
     return figure
+
+
+def _draw_scanners(above: Any, side: Any, rig: Rig) -> None:
+    """Scanners' places and azimuths from above; their beams, forward and backward, from the side."""
+    for lidar in rig.lidars:
+        x, y, z = lidar.center_m - (0, 0, rig.ground_z_m)
+        rays = lidar.rays.astype(np.float64)
+        above.plot(y, x, "o", color=_SCANNER, markersize=7, markeredgecolor="white", zorder=3)
+        if lidar.azimuth_deg[1] - lidar.azimuth_deg[0] < 360:
+            ends = np.array([y, x])[:, None] + _BEAM_M * rays[1::-1, len(lidar.elevations_deg) // 2]
+            above.plot(*ends, color=_SCANNER, linewidth=1)
+        some = np.linspace(0, len(lidar.elevations_deg) - 1, _BEAMS).round().astype(int)
+        for column in {int(np.argmax(rays[0, 0])), int(np.argmin(rays[0, 0]))}:
+            to = np.array([x, z])[:, None] + _BEAM_M * rays[::2, some, column]
+            lines = np.stack([np.broadcast_to([[x], [z]], to.shape), to])
+            side.plot(*lines.transpose(1, 0, 2), color=_SCANNER, linewidth=0.5)
+    heights = ((lidar, lidar.center_m[2] - rig.ground_z_m) for lidar in rig.lidars)
+    text = "\n".join(f"{lidar.name} {z:.2f} m, {len(lidar.elevations_deg)} beams" for lidar, z in heights)
+    side.text(0.5, 0.96, text, transform=side.transAxes, ha="center", va="top", fontsize=8, color=_SCANNER)
 
 
 def _label_from_above(axes: Any, rig: Rig) -> None:

@@ -74,6 +74,23 @@ OVERLAP_NOTES = (
     "to their half-way view over the street's surface. Compare methods of one surface: views rendered over the street "
     "agree there even where the street is wrong."
 )
+SCAN_COLUMNS = (
+    ("recall", "{recall:.1%}"),
+    ("precision", "{precision:.1%}"),
+    ("range m", "{range_error_m:.3f}"),
+    ("Chamfer m", "{chamfer_m:.3f}"),
+    ("returns", "{returns:.2f}"),
+    ("rings", "{by_ring:.1%}"),
+    ("ranges", "{by_range:.1%}"),
+    ("in boxes", "{in_boxes:.1%}"),
+)
+SCAN_NOTES = (
+    "recall: true returns that the points have at the scanner's rays, within 0.2 m or 2 % of the range. precision: the "
+    "points' returns that are true. range: median error at rays where both return. Chamfer: mean distance to the other "
+    "cloud's nearest point. returns: the number of points over the true one. rings, ranges: share of the points that "
+    "would have to move to another ring, or by 10 m of range, for the true densities. in boxes: how far the numbers of "
+    "points in boxes are apart, over the true ones."
+)
 _HELD_OUT = "Methods get the points of every other degree of azimuth; the points between score (the count above)."
 
 

@@ -9,10 +9,19 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.datasets.nuscenes.tables import poses_from
 from arbiview_aug.errors import SampleError
 from arbiview_aug.integrations.mmdet3d.images import Norm, levels, normalised
 from arbiview_aug.integrations.mmdet3d.matrices import Views, padded, upper_triangular
-from arbiview_aug.integrations.mmdet3d.results import Retarget, source_rig, target_outputs, target_views, without_stale
+from arbiview_aug.integrations.mmdet3d.results import (
+    Retarget,
+    geometry,
+    scanned,
+    source_rig,
+    target_outputs,
+    target_views,
+    without_stale,
+)
 
 MEAN_STD = ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375))
 """Mean and deviation of BEVDet's ``mmlabNormalize``, in the order of the channels it leaves."""
@@ -47,7 +56,9 @@ def retarget_img_inputs(
 
     Args:
         results: As ``PrepareImageInputs`` leaves it; it is not changed. ``ann_infos``, BEVDet's boxes (those of an
-            earlier frame in its entry of ``adjacent``), are read as geometry and stay.
+            earlier frame in its entry of ``adjacent``), are read as geometry and stay. ``points`` (LiDAR frame, posed
+            by ``curr``), where they are loaded already, become those of the target's scanners, if it has any: depth
+            maps that ``PointToMultiViewDepth`` then makes of them are the target's.
         retarget: A ``RigRetarget``, or what calls one: with the sample of each frame in turn.
         names: Of the target's cameras.
         ground_z_m: Height of the road in the source's ego frame.
@@ -79,8 +90,12 @@ def retarget_img_inputs(
         grey = levels("img_inputs", images, mean_std)
         views = [image.flip(-1) if flip else image for image, flip in zip(grey, mirrored, strict=True)]
         sample = {"images": torch.stack(views), "rig": source_rig(source, views, ground_z_m)}
-        out = retarget(sample | _boxes(results if t == 0 else info))
+        lidar2key = _lidar2key(info, key2global) if t == 0 else None
+        points = {} if lidar2key is None else geometry({"points": results.get("points")}, lidar2key)
+        out = retarget(sample | points | _boxes(results if t == 0 else info))
         target = target_views(out, source, names)
+        if lidar2key is not None:
+            changed |= scanned(changed, out, lidar2key)
         outputs.append(_entries(out["images"], target, [images, *frame], mean_std))
         outs.append(out)
         if isinstance(info, Mapping) and "cams" in info:
@@ -147,6 +162,18 @@ def _boxes(info: Any) -> dict[str, torch.Tensor]:
         return {}
     boxes = np.asarray(annotated[0], np.float64).reshape(len(annotated[0]), -1)[:, :7]
     return {"boxes_3d": torch.from_numpy(boxes.reshape(-1, 7)).float()}
+
+
+def _lidar2key(info: Any, key2global: FloatArray) -> FloatArray | None:
+    """(4, 4) from the LiDAR's frame to the key ego frame; None where the frame's info does not pose it."""
+    poses = ("ego2global", "lidar2ego")
+    if not isinstance(info, Mapping) or not all(f"{name}_rotation" in info for name in poses):
+        return None
+    key2ego = np.linalg.inv(key2global)
+    ego2global, lidar2ego = (
+        poses_from(np.array([*info[f"{name}_translation"], *info[f"{name}_rotation"]], np.float64)) for name in poses
+    )
+    return np.asarray(key2ego @ ego2global @ lidar2ego)
 
 
 def _infos(target: Views, key2global: FloatArray) -> dict[str, dict[str, Any]]:

@@ -76,6 +76,9 @@ def retarget_queue(results: Mapping[str, Any], retarget_frame: Callable[[Frame],
     for key in sliced:
         if key not in (*LABELS, "timestamp") and key in outs[0]:
             kept[key] = _put_back(results[key], _together(held[key], [out[key] for out in outs]))
+    if "points" in held:
+        points = [out["points"] for out in outs] if "points" in sliced else outs[-1]["points"]
+        kept["points"] = _put_back(results["points"], points)
     if "img_metas" in held:
         written = [{key: out[key] for key in meta if key in out} for meta, out in zip(metas, outs, strict=True)]
         metas_in = held["img_metas"]

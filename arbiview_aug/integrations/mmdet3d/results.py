@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.camera import Camera
@@ -25,6 +26,7 @@ from arbiview_aug.integrations.mmdet3d.matrices import (
     read_views,
     stacked,
 )
+from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
 Retarget = Callable[[dict[str, Any]], dict[str, Any]]
 
@@ -57,7 +59,8 @@ def retarget_results(
 
     Whatever keys of ``MATRICES`` the dict has are rewritten in their container, type and shape, at the top and in
     ``images``: the form is never guessed. All target cameras stand where they are at the LiDAR's time. ``points``
-    (LiDAR frame) and ``gt_bboxes_3d`` are read as geometry, where there are any, and stay.
+    (LiDAR frame) and ``gt_bboxes_3d`` are read as geometry, where there are any. Boxes stay. Points become what the
+    target's scanners would have measured, if it has any, in the frame of the LiDAR that recorded.
 
     Args:
         results: As the loading transforms leave it; it is not changed.
@@ -99,7 +102,7 @@ def retarget_results(
         kept["img_timestamp"] = like_array(kept["img_timestamp"], [time_s] * len(views.names))
     if "num_views" in kept:
         kept["num_views"] = len(views.names)
-    return kept | target_outputs([out])
+    return kept | scanned(kept, out, source.lidar2ego) | target_outputs([out])
 
 
 # --- source -----------------------------------------------------------------------------------------------------------
@@ -181,8 +184,7 @@ def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, tor
     points = results.get("points")
     points = getattr(points, "tensor", points)
     if isinstance(points, torch.Tensor | np.ndarray) and points.ndim == 2:
-        xyz = np.asarray(points[:, :3], np.float64)
-        values["points"] = torch.from_numpy(xyz @ lidar2ego[:3, :3].T + lidar2ego[:3, 3]).float()
+        values["points"] = moved_points(points, lidar2ego)
     annotated = results.get("ann_info")
     boxes = results.get("gt_bboxes_3d", annotated.get("gt_bboxes_3d") if isinstance(annotated, Mapping) else None)
     corners, rotation = getattr(boxes, "corners", None), lidar2ego[:3, :3]
@@ -199,6 +201,13 @@ def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, tor
     along = along @ rotation.T
     columns = [*(centres @ rotation.T + lidar2ego[:3, 3]).T, *sizes, np.arctan2(along[:, 1], along[:, 0])]
     return values | {"boxes_3d": torch.from_numpy(np.stack(columns, axis=1)).float()}
+
+
+def moved_points(points: Any, pose: FloatArray) -> torch.Tensor:
+    """(P, C) float32 of points (P, C), whose first three columns are moved by a pose (4, 4)."""
+    moved = np.asarray(points, np.float64).copy()
+    moved[:, :3] = moved[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    return torch.from_numpy(moved).float()
 
 
 # --- target -----------------------------------------------------------------------------------------------------------
@@ -222,6 +231,39 @@ def target_views(out: Mapping[str, Any], source: Views, names: Sequence[str]) ->
         source.lidar2ego,
         source.ego2global,
     )
+
+
+def scanned(results: Mapping[str, Any], out: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, Any]:
+    """``points`` as the target's scanners measured them, of the given type, and ``num_lidar_pts`` of each box.
+
+    Empty where the target has none, or the sample was skipped. Numbers are written in ``ann_info`` and ``instances``,
+    where they are there for the same boxes.
+
+    Args:
+        results: With the points as they were.
+        out: The retargeted sample.
+        lidar2ego: (4, 4) to the frame of the sample's points.
+    """
+    if RINGS_KEY not in out or out.get("retarget_params", {}).get("skipped"):
+        return {}
+    given, points = results["points"], moved_points(out["points"], np.asarray(np.linalg.inv(lidar2ego)))
+    changed = {"points": given.new_point(points) if hasattr(given, "new_point") else like_array(given, points)}
+    counts = out[COUNTS_KEY].numpy() if COUNTS_KEY in out else np.zeros(0, np.int64)
+    if isinstance(annotated := results.get("ann_info"), Mapping):
+        changed["ann_info"] = with_counts(annotated, counts)
+    instances = results.get("instances")
+    if isinstance(instances, list) and len(instances) == len(counts):
+        changed["instances"] = [
+            {**one, "num_lidar_pts": n} if "num_lidar_pts" in one else one
+            for one, n in zip(instances, counts.tolist(), strict=True)
+        ]
+    return changed
+
+
+def with_counts(annotated: Mapping[str, Any], counts: npt.NDArray[np.int64]) -> dict[str, Any]:
+    """Annotations with the ``num_lidar_pts`` of their boxes, if they have such a column for as many boxes."""
+    given = annotated.get("num_lidar_pts", ())
+    return {**annotated, **({"num_lidar_pts": like_array(given, counts)} if len(given) == len(counts) > 0 else {})}
 
 
 def check_no_lenses(lenses: Sequence[str]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,8 @@ from arbiview_aug.integrations.mmdet3d.results import check_no_lenses, retarget_
 
 class RigRetargetMultiView:
     """Re-renders the images of a ``results`` dict as another vehicle's cameras, and rewrites all that describes them.
+
+    Points become those of the target's scanners, if it has any; ``keys=dict(points="source")`` keeps them.
 
     It stands right after what loads images (and points and annotations, where they are loaded: geometry), before
     resizing, cropping, flipping and whatever turns points and boxes. Several frames in one dict (BEVDet4D, collected
@@ -53,8 +54,6 @@ class RigRetargetMultiView:
         if isinstance(keys := settings.get("keys"), Mapping):
             settings["keys"] = SampleKeys(**keys)
         target = load_rig(target) if isinstance(target, str | Path) else target
-        if isinstance(target, Rig):
-            target = replace(target, lidars=())  # the results' points stay
         self.retarget = RigRetarget(target, **settings)
         held = self.retarget.target
         rig = held.base if isinstance(held, RandomRig) else held

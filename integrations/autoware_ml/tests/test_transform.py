@@ -62,10 +62,14 @@ def test_matrices_images_and_geometry(given: Recording) -> None:
         "lidar2cam",
         "lidar2img",
         "camera_names",
+        "points",
         "coverage",
         "generated",
     }
     expected = transform.step.retarget(given.sample)  # the same boxes, in the ego frame
+    xyz = merged["points"][:, :3] @ LIDAR2EGO[:3, :3].T + LIDAR2EGO[:3, 3]
+    assert merged["points"].shape == expected["points"].shape
+    assert np.isclose(xyz, expected["points"][:, :3], atol=2e-3).mean() > 0.999
     off = np.abs(merged["img"] * 255 - expected["images"].numpy())
     assert off.mean() < 0.2
 

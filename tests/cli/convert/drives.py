@@ -48,6 +48,11 @@ def write_nuscenes(root: Path, keyframes: int = 3) -> Path:
     tables = tables_of(SURROUND, scenes)
     _with_chains(tables)
     write_root(root, tables, SIZE)
+    azimuth, away_m = np.meshgrid(np.radians(np.arange(0, 360, 3)), np.arange(5.0, 20.0, 1.5))
+    z = 0.8 * (np.arange(len(azimuth)) % 2)[:, None] + 0 * azimuth  # on the road and on what stands there
+    points = np.stack([away_m * np.cos(azimuth), away_m * np.sin(azimuth), z, away_m, 0 * azimuth], axis=-1)
+    for path in (root / "samples" / "LIDAR_TOP").iterdir():
+        points.astype("<f4").tofile(path)
     (root / "maps").mkdir()
     (root / "maps" / "map.png").write_bytes(b"a map")
     tables_folder = root / "v1.0-mini"

@@ -46,9 +46,9 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
         assert torch.allclose(after["cam2ego"], out["cam2ego"]) and torch.allclose(after["K"], out["K"])
         assert after["rig"].ground_z_m == before["rig"].ground_z_m == -0.1
         assert after["rig"].names == load_rig("waymo").names and after["rig"][0].lens == "radtan"
-        cameras = replace(load_rig("waymo"), lidars=())  # conversions keep the points that were measured
-        assert after["rig"] == cameras.resized((24, 40), "crop").in_frame_of(before["rig"])
-        for key in ("points", "boxes_3d", "ego2world"):
+        assert after["rig"] == load_rig("waymo").resized((24, 40), "crop").in_frame_of(before["rig"])
+        assert after["rig"].lidars and torch.equal(after["points"], out["points"])
+        for key in ("boxes_3d", "ego2world"):
             assert torch.equal(after[key], before[key])
         assert after["time_s"] == before["time_s"]
         calib = json.loads((output / after["token"] / "calib.json").read_text())
@@ -62,8 +62,10 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
             assert np.array_equal(made_up, out["generated"][k].numpy())
 
 
-def test_points_are_the_same_file(source: Path, output: Path) -> None:
-    assert (output / "0001" / "lidar.npy").samefile(source / "0001" / "lidar.npy")
+def test_points_stay_the_same_file_on_demand(source: Path, tmp_path: Path) -> None:
+    assert main(command(source, tmp_path / "new", "--points", "source")) == 0
+    assert (tmp_path / "new" / "0001" / "lidar.npy").samefile(source / "0001" / "lidar.npy")
+    assert not FrameFolder(tmp_path / "new")[1]["rig"].lidars
 
 
 def test_provenance_names_versions_settings_and_sources(source: Path, output: Path) -> None:
@@ -238,7 +240,7 @@ def test_points_that_are_links_are_followed(source: Path, tmp_path: Path) -> Non
     for folder in sorted((tmp_path / "drive").glob("0*")):
         (folder / "lidar.npy").rename(tmp_path / "drive" / "blobs" / folder.name)
         (folder / "lidar.npy").symlink_to(Path("..", "blobs", folder.name))
-    assert main(command(tmp_path / "drive", tmp_path / "new")) == 0
+    assert main(command(tmp_path / "drive", tmp_path / "new", "--points", "source")) == 0
     linked = tmp_path / "new" / "0001" / "lidar.npy"
     assert not linked.is_symlink() and linked.samefile(tmp_path / "drive" / "blobs" / "0001")
 
@@ -335,11 +337,12 @@ def test_records_of_other_samples_and_forms(source: Path, tmp_path: Path, capsys
 def test_kept_files_come_along_as_asked(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     points = source / "0001" / "lidar.npy"
     for how in ("copy", "hard", "symlink", "hard"):
-        assert main(command(source / "0001", tmp_path / "new", "--link", how, "--report", "1")) == 0
+        asked = command(source / "0001", tmp_path / "new", "--points", "source", "--link", how)
+        assert main([*asked, "--report", "1"]) == 0
         kept = tmp_path / "new" / "0001" / "lidar.npy"
         assert kept.read_bytes() == points.read_bytes()
         assert (kept.is_symlink(), kept.samefile(points)) == (how == "symlink", how != "copy")
-        assert main(command(source / "0001", tmp_path / "new", "--link", how, "--verify")) == 0
+        assert main([*asked, "--verify"]) == 0
         if how == "symlink":
             with pytest.raises(DataError, match="links must not leave the folder"):
                 FrameFolder(tmp_path / "new")[0]
@@ -373,7 +376,7 @@ def test_what_differs_is_named(source: Path, tmp_path: Path, capsys: pytest.Capt
     changed = [tmp_path / "drive" / "0000" / "00.jpg", tmp_path / "new" / "0001" / "lidar.npy"]
     changed += [tmp_path / "new" / "0002" / "ring_front_left.jpg", tmp_path / "new" / "sequence.json"]
     for path in changed:
-        path.write_bytes(path.read_bytes()[:-1] + b"?")
+        path.write_bytes(path.read_bytes()[:-1] + b"!")
     missing = tmp_path / "new" / "0002" / "calib.json"
     missing.unlink()
     assert main([*asked, "--verify"]) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from arbiview_aug import Camera, Rig, RigRetarget, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.convert.nuscenes_rows import level, token_of, view_stem, visible_shares
 from arbiview_aug.datasets import NuScenesDataset
-from tests.cli.convert.drives import chained, command, read_tables, tree, write_nuscenes
+from tests.cli.convert.drives import SURROUND, chained, command, read_tables, tree, write_nuscenes
 
 LEFT_OUT = "goes-sample-1"
 
@@ -44,8 +45,11 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
         assert torch.allclose(after["cam2ego"], out["cam2ego"][order], atol=1e-9)
         assert torch.allclose(after["K"], out["K"][order])
         assert after["time_s"] == before["time_s"] and after["box_tokens"] == before["box_tokens"]
-        for key in ("points", "boxes_3d", "ego2world"):
+        for key in ("boxes_3d", "ego2world"):
             assert torch.equal(after[key], before[key])
+        assert len(after["points"]) > 20
+        assert torch.allclose(after["points"][:, :4], out["points"][:, :4], atol=1e-4)
+        assert torch.equal(after["points"][:, 4].int(), out["point_rings"])
 
 
 def test_the_tables_hold_together(source: Path, output: Path) -> None:
@@ -84,11 +88,50 @@ def test_new_cameras_record_when_the_lidar_did(output: Path) -> None:
     assert first["prev"] == "" and first["next"] == token_of("goes-sample-1", "ring_front_center")
 
 
-def test_other_sensors_are_linked(source: Path, output: Path) -> None:
+def test_scans_are_the_targets(source: Path, output: Path) -> None:
+    """One file for both scanners at each keyframe, in the first one's frame; no sweeps of the source's."""
+    tables, first = read_tables(output), load_rig("argoverse2").in_frame_of(SURROUND).lidars[0]
+    (sensor,) = (row["token"] for row in tables["sensor"] if row["channel"] == "LIDAR_TOP")
+    (calibrated,) = (row for row in tables["calibrated_sensor"] if row["sensor_token"] == sensor)
+    assert np.allclose(calibrated["translation"], first.center_m) and calibrated["camera_intrinsic"] == []
+    rows = [row for row in tables["sample_data"] if row["calibrated_sensor_token"] == calibrated["token"]]
+    assert len(rows) == 6 and all(row["is_key_frame"] for row in rows) and not (output / "sweeps/LIDAR_TOP").exists()
+    retarget, data = RigRetarget("argoverse2", geometry="street"), NuScenesDataset(source)
+    counts = {row["token"]: row["num_lidar_pts"] for row in tables["sample_annotation"]}
+    for sample in (data[0], data[4]):
+        expected = retarget(sample)["num_points"].tolist()
+        assert [counts[token] for token in sample["box_tokens"]] == expected
+    assert sum(counts.values()) > 0
+
+
+def test_tables_that_label_points(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = shutil.copytree(source, tmp_path / "source")
+    tables = read_tables(root)
+    (root / "labels").mkdir()
+    (root / "labels" / "one.bin").write_bytes(b"1")
+    row = {"token": "one", "filename": "labels/one.bin", "sample_data_token": tables["sample_data"][0]["token"]}
+    (root / "v1.0-mini" / "lidarseg.json").write_text(json.dumps([row]))
+    assert main(command(root, tmp_path / "new")) == 0
+    assert "label the points that were measured: tables lidarseg" in capsys.readouterr().err
+    assert "lidarseg" not in read_tables(tmp_path / "new") and not (tmp_path / "new" / "labels").exists()
+
+
+def test_other_sensors_are_linked(source: Path, output: Path, tmp_path: Path) -> None:
     rows = [row for row in read_tables(source)["sample_data"] if row["filename"].endswith(".bin")]
-    assert len(rows) > 12  # LiDAR and radar, sweeps too
-    assert all((output / row["filename"]).samefile(source / row["filename"]) for row in rows)
+    radar = [row for row in rows if "RADAR" in row["filename"]]
+    assert 6 < len(radar) < len(rows)  # LiDAR and radar, sweeps too
+    assert all((output / row["filename"]).samefile(source / row["filename"]) for row in radar)
     assert (output / "maps" / "map.png").samefile(source / "maps" / "map.png")
+    assert main(command(source, tmp_path / "new", "--points", "source")) == 0
+    assert all((tmp_path / "new" / row["filename"]).samefile(source / row["filename"]) for row in rows)
+
+
+def test_scans_without_a_return(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """No file of no bytes, which readers take for a truncated one."""
+    rig = load_rig("argoverse2")
+    replace(rig, lidars=[replace(rig.lidars[0], range_m=(0.1, 0.2))]).save(tmp_path / "blind.json")
+    assert main(command(source, tmp_path / "new", "--target", str(tmp_path / "blind.json"))) == 1
+    assert "expected returns of the target's scanners, got none; --points source" in capsys.readouterr().err
 
 
 def test_kept_files_are_verified(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -109,7 +152,8 @@ def test_visibility_is_at_most_what_people_saw(source: Path, output: Path) -> No
     levels = [(a["visibility_token"], b["visibility_token"]) for a, b in zip(old, new, strict=True)]
     assert all("1" <= b <= a for a, b in levels) and any(b < a for a, b in levels) and any(b == "4" for _, b in levels)
     stripped = [{k: v for k, v in row.items() if k != "visibility_token"} for row in old]
-    assert stripped == [{k: v for k, v in row.items() if k != "visibility_token"} for row in new]
+    changed = ("visibility_token", "num_lidar_pts")
+    assert stripped == [{k: v for k, v in row.items() if k not in changed} for row in new]
 
 
 def test_names_that_are_no_file_names() -> None:
@@ -136,7 +180,7 @@ def test_lidar_files_of_one_name(source: Path, tmp_path: Path, capsys: pytest.Ca
 def test_a_sample_that_is_left_out_leaves_no_trace(
     source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its LiDAR frame is a sweep of the next; chains and counts go on without it."""
+    """Its LiDAR frame, where they are kept, is a sweep of the next; chains and counts go on without it."""
     shutil.copytree(source, tmp_path / "source")
     (tmp_path / "source" / NuScenesDataset(source).files(1)[2].relative_to(source)).write_bytes(b"\xff\xd8 cut off")
     assert main(command(tmp_path / "source", tmp_path / "new")) == 1
@@ -155,9 +199,14 @@ def test_a_sample_that_is_left_out_leaves_no_trace(
     for row in new["instance"]:
         of = [a for a in annotations.values() if a["instance_token"] == row["token"]]
         assert len(of) == row["nbr_annotations"] and row["first_annotation_token"] in annotations
-    (sweep,) = [row for row in new["sample_data"] if row["token"] == "goes-LIDAR_TOP-1-0"]
+    assert not any(row["token"] == "goes-LIDAR_TOP-1-0" for row in new["sample_data"])
+    kept = command(tmp_path / "source", tmp_path / "kept", "--on-error", "skip", "--points", "source")
+    assert main(kept) == 0
+    rows = read_tables(tmp_path / "kept")
+    assert chained(rows["sample_data"])
+    (sweep,) = [row for row in rows["sample_data"] if row["token"] == "goes-LIDAR_TOP-1-0"]
     assert sweep["sample_token"] == "goes-sample-2" and not sweep["is_key_frame"]
-    one, two = ({row["token"] for row in rows["sample_data"] if "LIDAR_TOP" in row["token"]} for rows in (old, new))
+    one, two = ({row["token"] for row in rows["sample_data"] if "LIDAR_TOP" in row["token"]} for rows in (old, rows))
     assert one == two
     assert NuScenesDataset(tmp_path / "new")[1]["token"] == "goes-sample-2"
     provenance = json.loads((tmp_path / "new" / "conversion" / "provenance.json").read_text())

@@ -1,0 +1,248 @@
+"""A data step for OpenPCDet: the ``data_dict`` of its data sets, as another vehicle would have recorded it.
+
+Points are (N, >=3) float32 x y z ..., boxes ``gt_boxes`` (M, >=7) x y z dx dy dz heading [vx vy] with z at the centre,
+both in the LiDAR's frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from copy import copy
+from typing import Any
+
+import numpy as np
+import torch
+
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.random_rig import RandomRig
+from arbiview_aug.cameras.validation import checked_pose
+from arbiview_aug.errors import CalibrationError, SampleError
+from arbiview_aug.integrations.mmdet3d.matrices import padded
+from arbiview_aug.integrations.mmdet3d.results import geometry, moved_points
+from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
+from arbiview_aug.scene.boxes import checked_boxes, points_by_box
+from arbiview_aug.transforms.scans import retarget_points
+from arbiview_aug.transforms.settings import is_number
+
+DataDict = dict[str, Any]
+
+MATRICES = ("camera_intrinsics", "camera2ego", "camera2lidar", "lidar2camera", "lidar2image")
+"""Lists of (4, 4) that ``NuScenesDataset.load_camera_info`` writes beside ``camera_imgs``."""
+
+_TURNED = ("flip_x", "flip_y", "noise_rot", "noise_translate", "lidar_aug_matrix")
+"""What OpenPCDet notes when it augments the whole scene."""
+
+_LEAST_UP = 0.9  # z of the upward axis of a frame that boxes stand upright in
+
+
+class RigRetargetDataDict:
+    """Retargets a ``data_dict``: points, and images with their calibration where it holds them.
+
+    It stands before everything that turns, flips or scales the scene or the images: first in ``DATA_AUGMENTOR``, or
+    after ``gt_sampling``, whose pasted objects are then scanned too; or in ``__getitem__`` before ``prepare_data``.
+
+    Args:
+        target: A rig's name, file, ``Rig`` or ``RandomRig``. With ``lidars``: points are those of its scanners. With
+            images: of pinhole cameras (``Rig.undistorted()``).
+        lidar2ego: (4, 4) pose of the frame of points and boxes in the source's ego frame.
+        target_lidar2ego: (4, 4) pose of the frame of those that come out, as B's own data set has it; by default they
+            stay in the frame that they came in.
+        min_points_in_gt: Boxes with fewer points after retargeting are left out: OpenPCDet's
+            ``FILTER_MIN_POINTS_IN_GT``, which counts those before.
+        p: Probability of retargeting; a skipped dict stays as it is.
+        settings: Further ones of ``RigRetargetMultiView``: ``size``, ``ground_z_m``, ``geometry``, ``keys``.
+
+    Raises:
+        CalibrationError: A target that cannot be loaded; with lenses; a frame that is not upright.
+        ValueError: ``p`` is no probability.
+    """
+
+    def __init__(
+        self,
+        target: Any,
+        *,
+        lidar2ego: Any,
+        target_lidar2ego: Any = None,
+        min_points_in_gt: int = 0,
+        p: float = 1.0,
+        **settings: Any,
+    ) -> None:
+        self.step = RigRetargetMultiView(target, lidar2ego=lidar2ego, **settings)
+        self.lidar2ego = _upright_pose("lidar2ego", lidar2ego)
+        to = self.lidar2ego if target_lidar2ego is None else _upright_pose("target_lidar2ego", target_lidar2ego)
+        self.ego2lidar = np.asarray(np.linalg.inv(self.lidar2ego))
+        self.move = np.linalg.inv(to) @ self.lidar2ego  # to the frame of what comes out
+        if not is_number(p) or not 0 <= p <= 1:
+            raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
+        self.p, self.min_points_in_gt = float(p), int(min_points_in_gt)
+
+    def __call__(self, data_dict: Mapping[str, Any]) -> DataDict:
+        """A new ``data_dict``.
+
+        Raises:
+            SampleError: A scene that is turned already, images without matrices, nothing to retarget.
+        """
+        if self.p < 1 and torch.rand(()).item() >= self.p:
+            return dict(data_dict)
+        _check_not_turned(data_dict)
+        if data_dict.get("points") is None:
+            raise SampleError(f"points: expected (N, >=3) in the LiDAR's frame, got {', '.join(map(str, data_dict))}")
+        if "camera_imgs" in data_dict:
+            out = self._with_cameras(data_dict)
+        elif "images" in data_dict:
+            out = self._with_kitti_image(data_dict)
+        else:
+            out = {**data_dict, "points": self._points(data_dict)}
+        return self._filtered(_moved(out, self.move))
+
+    # --- points alone, nuScenes' cameras, KITTI's camera --------------------------------------------------------------
+    def _points(self, data_dict: Mapping[str, Any]) -> Any:
+        target = self.step.retarget.target
+        rig = target.rig(target.draw_for(data_dict)) if isinstance(target, RandomRig) else target
+        if not rig.lidars:
+            raise SampleError("target: expected scanners (Rig.lidars) for a data_dict without images, got none")
+        given = geometry(_labels(data_dict), self.lidar2ego)
+        boxes, ground_z_m = given.get("boxes_3d"), self.step.ground_z_m
+        scan = retarget_points(given["points"], rig, boxes_3d=boxes, ground_z_m=ground_z_m)
+        return moved_points(scan.points, self.ego2lidar).numpy().astype(data_dict["points"].dtype)
+
+    def _with_cameras(self, data_dict: Mapping[str, Any]) -> DataDict:
+        """``NuScenesDataset`` with ``CAMERA_CONFIG``: PIL images, resized and cropped by ``img_process_infos``."""
+        if missing := [key for key in MATRICES if key not in data_dict]:
+            raise SampleError(f"{', '.join(missing)}: expected beside camera_imgs, found none")
+        matrices = {key: [np.asarray(matrix) for matrix in data_dict[key]] for key in MATRICES}
+        infos = data_dict.get("img_process_infos")
+        if infos is not None:
+            crops = [_crop(*info) for info in infos]
+            matrices["camera_intrinsics"] = [
+                (crop @ K).astype(K.dtype) for crop, K in zip(crops, matrices["camera_intrinsics"], strict=True)
+            ]
+            pairs = zip(matrices["camera_intrinsics"], matrices["lidar2camera"], strict=True)
+            matrices["lidar2image"] = [K @ pose for K, pose in pairs]
+        results = self.step({"img": data_dict["camera_imgs"], **matrices, **_labels(data_dict)})
+        images = results["img"]
+        out = {**data_dict, **{key: results[key] for key in (*MATRICES, "points")}, "camera_imgs": images}
+        if "image_paths" in data_dict:
+            out["image_paths"] = list(self.step.names)
+        w, h = images[0].size
+        if infos is not None:
+            out["img_process_infos"] = [[1.0, (0, 0, w, h), False, 0] for _ in images]
+        return out | {"ori_shape": (w, h)}
+
+    def _with_kitti_image(self, data_dict: Mapping[str, Any]) -> DataDict:
+        """``KittiDataset`` with ``images`` in ``GET_ITEM_LIST``: (H, W, 3) in [0, 1], and ``calib``."""
+        calib, image = data_dict.get("calib"), np.asarray(data_dict["images"])
+        if calib is None or image.ndim != 3:
+            got = "no calib" if calib is None else f"images of shape {image.shape}"
+            raise SampleError(f"images: expected one (H, W, 3) with its calib, as KittiDataset loads it, got {got}")
+        P2, R0, V2C = (padded(np.asarray(matrix, np.float64)[None])[0] for matrix in (calib.P2, calib.R0, calib.V2C))
+        levels = np.rint(image * 255).astype(np.uint8)
+        results = self.step({"img": [levels], "cam2img": [P2], "lidar2cam": [R0 @ V2C], **_labels(data_dict)})
+        images = results["img"]
+        if len(images) != 1 or images[0].shape != image.shape:
+            got = f"{len(images)} of {images[0].shape}; pass size=(h, w)"
+            raise SampleError(f"target: expected one image of {image.shape}, as KITTI's is, got {got}")
+        new = copy(calib)
+        K, lidar2cam = (np.asarray(results[key][0])[:3] for key in ("cam2img", "lidar2cam"))
+        _write_calib(new, K.astype(calib.P2.dtype), lidar2cam.astype(calib.V2C.dtype))
+        out = {**data_dict, "images": (images[0] / 255).astype(image.dtype), "calib": new, "points": results["points"]}
+        for key in ("depth_maps", "gt_boxes2d"):
+            out.pop(key, None)  # of the source's pixels
+        matrices = {"trans_lidar_to_cam": padded(lidar2cam[None])[0], "trans_cam_to_img": K}
+        return out | {key: value.astype(out[key].dtype) for key, value in matrices.items() if key in out}
+
+    def _filtered(self, out: DataDict) -> DataDict:
+        """Leave boxes of fewer points out, by ``gt_boxes_mask`` where it is there."""
+        if self.min_points_in_gt < 1 or "gt_boxes" not in out:
+            return out
+        xyz = np.ascontiguousarray(out["points"][:, :3], np.float32)
+        _, ends = points_by_box(checked_boxes(out["gt_boxes"][:, :7]), xyz, 0.0)
+        enough: BoolArray = np.diff(ends, prepend=0) >= self.min_points_in_gt
+        if "gt_boxes_mask" in out:
+            return {**out, "gt_boxes_mask": out["gt_boxes_mask"] & enough}
+        return {**out, **{key: out[key][enough] for key in ("gt_boxes", "gt_names") if key in out}}
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.step.retarget.extra_repr()}, p={self.p:g})"
+
+
+def register(augmentor: Any) -> None:
+    """Make the step known to OpenPCDet's ``DataAugmentor`` class as ``rig_retarget``; twice is allowed.
+
+    Keys of the entry in ``AUG_CONFIG_LIST`` are the arguments in capitals.
+    """
+
+    def rig_retarget(_: Any, config: Mapping[str, Any]) -> RigRetargetDataDict:
+        return RigRetargetDataDict(**{key.lower(): value for key, value in config.items() if key != "NAME"})
+
+    augmentor.rig_retarget = rig_retarget
+
+
+def _labels(data_dict: Mapping[str, Any]) -> DataDict:
+    return {"points": data_dict["points"], "gt_bboxes_3d": data_dict.get("gt_boxes")}
+
+
+def _crop(resize: float, crop: Any, flip: bool, rotate: float) -> FloatArray:
+    """(4, 4) of a resize and a crop by PIL, whose outer edges are 0 and w: those of ``Camera`` are -0.5 and w - 0.5."""
+    if flip or rotate:
+        raise SampleError("img_process_infos: expected images that were only resized and cropped; stand before imgaug")
+    moved = np.diag([resize, resize, 1.0, 1.0])
+    moved[:2, 2] = 0.5 * resize - 0.5 - np.asarray(crop[:2], np.float64)
+    return moved
+
+
+def _write_calib(calib: Any, K: FloatArray, lidar2cam: FloatArray) -> None:
+    """Set OpenPCDet's ``Calibration`` to a camera of K (3, 4), in the place ``lidar2cam`` (3, 4), rectified."""
+    calib.P2, calib.R0, calib.V2C = K, np.eye(3, dtype=K.dtype), lidar2cam
+    calib.cu, calib.cv, calib.fu, calib.fv = K[0, 2], K[1, 2], K[0, 0], K[1, 1]
+    calib.tx = calib.ty = 0.0
+
+
+def _moved(out: DataDict, move: FloatArray) -> DataDict:
+    """A ``data_dict`` in another frame: ``move`` (4, 4) leads from the old one to it."""
+    if np.array_equal(move, np.eye(4)):
+        return out
+    back, turn = np.linalg.inv(move), np.arctan2(move[1, 0], move[0, 0])
+    changed: DataDict = {"points": moved_points(out["points"], move).numpy().astype(out["points"].dtype)}
+    if (boxes := out.get("gt_boxes")) is not None:
+        boxes = np.array(boxes)
+        boxes[:, :3] = boxes[:, :3] @ move[:3, :3].T + move[:3, 3]
+        boxes[:, 6] += turn
+        if boxes.shape[1] >= 9:
+            boxes[:, 7:9] = boxes[:, 7:9] @ move[:2, :2].T
+        changed["gt_boxes"] = boxes
+    for key in ("lidar2camera", "lidar2image", "trans_lidar_to_cam"):
+        if key in out:
+            changed[key] = _each(out[key], lambda matrix: matrix @ back)
+    if "camera2lidar" in out:
+        changed["camera2lidar"] = _each(out["camera2lidar"], lambda matrix: move @ matrix)
+    if (calib := out.get("calib")) is not None:
+        new = changed["calib"] = copy(calib)
+        new.V2C = (np.asarray(calib.V2C, np.float64) @ back).astype(calib.V2C.dtype)
+    return out | changed
+
+
+def _each(matrices: Any, change: Callable[[FloatArray], FloatArray]) -> Any:
+    """A matrix or a list of them, changed, in its type."""
+    if isinstance(matrices, list):
+        return [change(matrix).astype(matrix.dtype) for matrix in matrices]
+    return change(matrices).astype(matrices.dtype)
+
+
+def _check_not_turned(data_dict: Mapping[str, Any]) -> None:
+    for key in (*_TURNED, "noise_scale"):
+        value = data_dict.get(key)
+        still = np.eye(4) if key == "lidar_aug_matrix" else 1.0 if key == "noise_scale" else 0.0
+        if value is not None and np.abs(np.asarray(value, np.float64) - still).max() > 1e-6:
+            fix = "stand before what turns it"
+            raise SampleError(f"{key}: expected a scene as it was recorded, got a turned one; {fix}")
+
+
+def _upright_pose(name: str, value: Any) -> FloatArray:
+    try:
+        pose = checked_pose("LiDAR", value, name)
+    except CalibrationError as error:  # the checks are those of cameras
+        raise CalibrationError(str(error).removeprefix("camera 'LiDAR': ")) from None
+    if pose[2, 2] < _LEAST_UP:
+        raise CalibrationError(f"{name}: expected a frame whose z points up, got {pose[2, 2]:.2f} of it upwards")
+    return pose

@@ -1,0 +1,88 @@
+"""Pillars hold the points over their cells; a study of scanners, tiny, goes on where it was."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from integrations.cross_rig import scans
+from integrations.cross_rig.labels import VEHICLE, Grid
+from integrations.cross_rig.pillars import PillarDetector, PointFrame, PointSet
+from integrations.cross_rig.scans import CHANGES, main, point_set, rig_of, scanner, scans_of
+
+CELLS = Grid().cells
+
+
+def frame(*points) -> PointFrame:
+    boxes = np.full((3, 7), np.nan, np.float32)
+    return PointFrame(np.array(points, np.float16), np.zeros((CELLS, CELLS), np.uint8), boxes)
+
+
+@pytest.fixture
+def model() -> PillarDetector:
+    torch.manual_seed(0)
+    return PillarDetector(Grid()).eval()
+
+
+def test_a_point_is_in_the_pillar_over_its_cell(model):
+    """Row by x, column by y, as ``Grid.centres`` says; all other pillars are empty."""
+    centres = Grid().centres()
+    x, y = centres[70, 20]
+    with torch.no_grad():
+        pillars = model.pillars(PointSet.joined([frame([x, y, 1.0, 90.0]), frame([0.0, 0.0, 0.0, 0.0])]))
+    assert pillars.shape == (2, 32, CELLS, CELLS)
+    assert pillars[0].any(0).nonzero().tolist() == [[70, 20]] and pillars[1].any(0).nonzero().tolist() == [[50, 50]]
+
+
+def test_the_order_of_points_and_frames_does_not_matter(model):
+    rng = np.random.default_rng(0)
+    clouds = [rng.uniform((-24, -24, 0, 0), (24, 24, 3, 255), (n, 4)) for n in (90, 70)]
+    with torch.no_grad():
+        both = model(PointSet.joined([frame(*cloud) for cloud in clouds]))
+        alone = [model(PointSet.joined([frame(*cloud[::-1])])) for cloud in clouds]
+    for k, one in enumerate(alone):
+        torch.testing.assert_close(both.occupancy[k], one.occupancy[0], atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(both.boxes[k], one.boxes[0], atol=1e-4, rtol=1e-4)
+    assert both.occupancy.shape == (2, CELLS, CELLS) and both.boxes.shape == (2, 9, CELLS // 2, CELLS // 2)
+
+
+def test_sets_that_are_the_same_have_one_name():
+    assert scans_of("fewer", "oracle") == scans_of("more", "raw") == scans_of("up70", "dropped")
+    assert scans_of("fewer", "dropped") == (*CHANGES["fewer"], "dropped")
+
+
+def test_vehicles_count_by_their_points():
+    """Labels are of the points that a detector gets: fewer vehicles where fewer were measured."""
+    a, b = CHANGES["fewer"]
+    recorded, dropped, retargeted = (point_set(a, b, kind, "val", 2) for kind in ("raw", "dropped", "retargeted"))
+    assert len(dropped.points[0]) < len(recorded.points[0]) and dropped.points[0].dtype == np.float16
+    seen = [(one.state == VEHICLE).sum() for one in (recorded, retargeted)]
+    assert 0 < seen[1] <= seen[0] and recorded.counts.all()
+    truth = rig_of(b).lidars[0]
+    away = retargeted.points[1][:, :3].astype(float) - truth.center_m
+    elevation = np.degrees(np.arcsin(away[:, 2] / np.linalg.norm(away, axis=1)))
+    off = np.abs(elevation[:, None] - np.array(truth.elevations_deg)).min(axis=1)
+    assert np.median(off) < 0.1  # half precision
+
+
+@pytest.mark.slow
+def test_a_study_goes_on_where_it_was(tmp_path, capsys, monkeypatch):
+    asked = ["--changes", "sixteen", "--seeds", "0", "--train-frames", "2", "--val-frames", "1", "--test-frames", "2"]
+    asked += ["--steps", "2", "--output", str(tmp_path)]
+    assert main(asked) == 0
+    first = capsys.readouterr()
+    assert first.out.count("| 32 beams at 1.8 m -> 16 beams at 1.8 m |") == 5 and first.err.count("CPU s") == 5
+    assert "A's points, rings dropped" in first.out
+    results = sorted(tmp_path.iterdir())
+    assert len(results) == 5 and json.loads(results[0].read_text())["positives"]
+    results[1].unlink()
+    assert main(asked) == 0
+    again = capsys.readouterr()
+    assert again.out == first.out and again.err.count("CPU s") == 1
+    monkeypatch.setattr(scans, "train", None)
+    assert main(asked) == 0 and capsys.readouterr().out == first.out
+
+
+def test_beams_of_scanners():
+    assert scanner(16, 1.8).elevations_deg[0] == -15 and len(scanner(64, 2.1).elevations_deg) == 64
