@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from arbiview_aug.errors import SampleError as SampleError
     from arbiview_aug.errors import SampleTypeError as SampleTypeError
     from arbiview_aug.favs.config import PaperConfig as PaperConfig
+    from arbiview_aug.render.export import export_plan as export_plan
     from arbiview_aug.render.plan import RenderConfig as RenderConfig
     from arbiview_aug.sample.boxes_2d import ImageBoxes as ImageBoxes
     from arbiview_aug.sample.boxes_2d import project_boxes_3d as project_boxes_3d
@@ -50,6 +51,7 @@ else:
             "datasets.wrappers": "MixedDataset RetargetedDataset RetargetedIterable",
             "errors": "ArbiviewError CalibrationError DataError GeometryWarning SampleError SampleTypeError",
             "favs.config": "PaperConfig",
+            "render.export": "export_plan",
             "render.plan": "RenderConfig",
             "sample.boxes_2d": "ImageBoxes project_boxes_3d",
             "sample.collate": "collate",

@@ -24,7 +24,21 @@ _OPSET = 16  # the first with GridSample
 
 
 def export_plan(plan: RenderPlan, path: str | Path) -> None:
-    """Write a plan; see ``RenderPlan.export``."""
+    """Write a plan for a runtime without this package, by the ending of ``path``; see ``docs/deploy.md``.
+
+    ``.npz``: plain arrays, for ``cv2.remap``. ``.onnx`` (extra ``export``) and ``.pt``, TorchScript: N images (3, H, W)
+    uint8 in, M views (3, h, w) uint8 out. To one level they are those of ``RigRetarget`` with ``match_exposure=False``
+    and ``holes="black"``.
+
+    Args:
+        plan: Of a fixed pair of rigs, from ``RigRetarget.prepare``.
+        path: The file; its folder is created.
+
+    Raises:
+        ValueError: Another ending.
+        ImportError: ``.onnx`` without the package onnx.
+        OutputError: A file that cannot be written.
+    """
     path = Path(path)
     write = _WRITERS.get(path.suffix)
     if write is None:
@@ -111,7 +125,7 @@ def _write_onnx(plan: RenderPlan, file: BinaryIO) -> None:
     torch.onnx.export(
         module,
         module.example,
-        graph,
+        graph,  # type: ignore[arg-type]  # allowed where dynamo is False
         dynamo=False,
         opset_version=_OPSET,
         input_names=list(plan.source.names),

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from numbers import Real
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -333,19 +332,3 @@ class RenderPlan:
     def coverage(self) -> list[BoolArray]:
         """(h, w) for each target camera."""
         return [t.coverage for t in self.targets]
-
-    def export(self, path: str | Path) -> None:
-        """Write the plan for a runtime without this package, by the ending of ``path``; see ``docs/deploy.md``.
-
-        ``.npz``: plain arrays, for ``cv2.remap``. ``.onnx`` (extra ``export``) and ``.pt``, TorchScript: N images
-        (3, H, W) uint8 in, M views (3, h, w) uint8 out. To one level they are those of ``RigRetarget`` with
-        ``match_exposure=False`` and ``holes="black"``.
-
-        Raises:
-            ValueError: Another ending.
-            ImportError: ``.onnx`` without the package onnx.
-            OutputError: A file that cannot be written.
-        """
-        from arbiview_aug.render.export import export_plan
-
-        export_plan(self, path)
