@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from arbiview_aug.sample.training import visible_boxes as visible_boxes
     from arbiview_aug.transforms.camera_maps import CameraMaps as CameraMaps
     from arbiview_aug.transforms.camera_maps import CameraPriorStem as CameraPriorStem
+    from arbiview_aug.transforms.jitter import JitteredCalibration as JitteredCalibration
     from arbiview_aug.transforms.plan_cache import PlanCache as PlanCache
     from arbiview_aug.transforms.resize import CropRig as CropRig
     from arbiview_aug.transforms.resize import ResizeRig as ResizeRig
@@ -58,6 +59,7 @@ else:
             "sample.mistakes": "CheckReport Finding check",
             "sample.training": "lift_mask visible_boxes",
             "transforms.camera_maps": "CameraMaps CameraPriorStem",
+            "transforms.jitter": "JitteredCalibration",
             "transforms.plan_cache": "PlanCache",
             "transforms.resize": "CropRig ResizeRig",
             "transforms.rig_retarget": "RigRetarget",
