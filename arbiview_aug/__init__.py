@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from arbiview_aug.errors import SampleError as SampleError
     from arbiview_aug.errors import SampleTypeError as SampleTypeError
     from arbiview_aug.favs.config import PaperConfig as PaperConfig
+    from arbiview_aug.render.export import export_plan as export_plan
     from arbiview_aug.render.plan import RenderConfig as RenderConfig
     from arbiview_aug.sample.boxes_2d import ImageBoxes as ImageBoxes
     from arbiview_aug.sample.boxes_2d import project_boxes_3d as project_boxes_3d
@@ -31,6 +32,9 @@ if TYPE_CHECKING:
     from arbiview_aug.sample.mistakes import check as check
     from arbiview_aug.sample.training import lift_mask as lift_mask
     from arbiview_aug.sample.training import visible_boxes as visible_boxes
+    from arbiview_aug.transforms.camera_maps import CameraMaps as CameraMaps
+    from arbiview_aug.transforms.camera_maps import CameraPriorStem as CameraPriorStem
+    from arbiview_aug.transforms.jitter import JitteredCalibration as JitteredCalibration
     from arbiview_aug.transforms.plan_cache import PlanCache as PlanCache
     from arbiview_aug.transforms.resize import CropRig as CropRig
     from arbiview_aug.transforms.resize import ResizeRig as ResizeRig

@@ -28,6 +28,7 @@ COMMANDS = {
     ),
     "demo": Command("retarget a synthetic street or real frames, with numbers and a picture", "cli.demo"),
     "depth": Command("compute the depth of a drive's frames, from motion or by a network", "cli.depth", resumable=True),
+    "doctor": Command("check this installation, and time one frame", "cli.doctor"),
     "evaluate": Command("measure the quality of rendered views: metrics, pictures, a report", "cli.evaluate"),
     "inspect": Command("show rigs: tables, differences, a picture", "cli.rigs"),
     "train": Command(

@@ -33,10 +33,15 @@ def installed_version(name: str) -> str | None:
         return None
 
 
+def cv2_wheels() -> dict[str, str]:
+    """Installed distributions that provide ``cv2``, with their versions."""
+    return {name: version for name in _CV2_WHEELS if (version := installed_version(name)) is not None}
+
+
 @cache
 def warn_about_cv2_wheels() -> None:
     """Warn once per process if several wheels provide ``cv2``."""
-    wheels = {name: version for name in _CV2_WHEELS if (version := installed_version(name)) is not None}
+    wheels = cv2_wheels()
     if len(wheels) < 2:
         return
     versions = " and ".join(f"{name} {version}" for name, version in wheels.items())
@@ -178,11 +183,11 @@ def _kernel_cache() -> type:
         """The files of a kernel; each ends in its SHA-256, as numba runs what it reads."""
 
         def _load_index(self) -> Any:
-            return super()._load_index() if _is_intact(Path(self._index_path)) else {}
+            return super()._load_index() if is_intact(Path(self._index_path)) else {}
 
         def _load_data(self, name: str) -> Any:
             path = self._data_path(name)
-            if not _is_intact(Path(path)):
+            if not is_intact(Path(path)):
                 raise FileNotFoundError(path)  # it is compiled anew
             return super()._load_data(name)
 
@@ -208,7 +213,7 @@ def _kernel_cache() -> type:
     return KernelCache
 
 
-def _is_intact(path: Path) -> bool:
+def is_intact(path: Path) -> bool:
     """Check a file that ends in its SHA-256; delete it if it is damaged."""
     try:
         content = path.read_bytes()

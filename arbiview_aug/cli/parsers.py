@@ -136,6 +136,16 @@ def depth() -> argparse.ArgumentParser:
     return parser
 
 
+def doctor() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "doctor",
+        "Check this installation: versions, OpenCV's wheels, threads, compiled kernels, disk, extras; time one frame.",
+        "--size 256x704",
+    )
+    parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of the views (default: 256x704)")
+    return parser
+
+
 def evaluate() -> argparse.ArgumentParser:
     parser = command_parser(
         "evaluate",

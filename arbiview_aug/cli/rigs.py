@@ -15,6 +15,9 @@ from arbiview_aug.evaluate.report.pictures import draw_rigs, save_picture
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.evaluate.rig_gap import rig_gap
 
+NOISE_DEG, NOISE_M = 0.2, 0.02
+"""Errors of a calibration that is kept up. Rigs that differ by less are one rig."""
+
 
 def run(arguments: argparse.Namespace) -> None:
     """Print the rigs and the differences of the others from the first; write the picture."""
@@ -31,23 +34,27 @@ def differences(source: Rig, target: Rig) -> str:
     Heights are over each rig's own road (see ``Rig.in_frame_of``).
     """
     axes = source.cam2ego[:, :3, 2]
-    rows = []
+    rows, is_noise = [], len(source) == len(target)
     for camera in target.in_frame_of(source):
         cosine = axes @ camera.cam2ego[:3, 2]
         nearest = source[int(np.argmax(cosine))]
         turned = float(np.degrees(np.arccos(np.clip(cosine.max(), -1, 1))))
+        away_m = camera.center_m - nearest.center_m
+        is_noise &= turned < NOISE_DEG and bool(np.linalg.norm(away_m) < NOISE_M)
+        is_noise &= float(np.abs(np.subtract(camera.fov_deg, nearest.fov_deg)).max()) < NOISE_DEG
         density = [float(np.radians(c.K[0, 0])) for c in (nearest, camera)]  # on the optical axis
         rows.append(
             [
                 *(camera.name, nearest.name, f"{turned:.1f} deg"),
-                *(f"{moved:+.2f}" for moved in camera.center_m - nearest.center_m),
+                *(f"{moved:+.2f}" for moved in away_m),
                 f"{nearest.fov_deg[0]:.1f} > {camera.fov_deg[0]:.1f}",
                 f"{density[0]:.1f} > {density[1]:.1f}",
             ]
         )
     head = ["camera", "nearest", "turned", "moved x", "y", "z", "field of view", "pixels per deg"]
     title = f"From {source.name or 'the first rig'} to {target.name or 'the other rig'}:"
-    return f"{title}\n\n{markdown_table(head, rows, left=2)}"
+    note = f"\n\nAll within {NOISE_DEG:g} deg and {100 * NOISE_M:g} cm, as much as calibrations err: do not retarget."
+    return f"{title}\n\n{markdown_table(head, rows, left=2)}{note if is_noise else ''}"
 
 
 def _load(name: str) -> Rig:

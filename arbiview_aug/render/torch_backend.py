@@ -7,11 +7,11 @@ than one second source. A plan's grids are computed once for each device.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -86,22 +86,30 @@ def _blend(target: ViewPlan, atlas_size: tuple[int, int], device: torch.device) 
 
 
 def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable."""
-    batch, device = images[0].shape[0], images[0].device
-    # Gaps between slots must be finite: bilinear taps of weight 0 read them.
-    is_full = sum(math.prod(slot.size) for slot in layout.slots) == math.prod(layout.size)
-    atlas = (torch.empty if is_full else torch.zeros)((batch, 3, *layout.size), dtype=torch.float32, device=device)
-    for slot in layout.slots:
-        h, w = slot.size
-        image = images[slot.source]
-        if slot.level:
-            image = image.float()
-        for _ in range(slot.level):
-            image = torch.nn.functional.avg_pool2d(image, 2)
-            if images[0].dtype == torch.uint8:
-                image = torch.floor(image + 0.5)  # as OpenCV rounds halved uint8 images
-        atlas[:, :, slot.y : slot.y + h, slot.x : slot.x + w] = image
-    return atlas
+    """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable.
+
+    Gaps between slots are 0: bilinear taps of weight 0 read them. Pieces are joined, since an exported graph would hold
+    the index of every pixel that is written.
+    """
+    rows, columns = layout.size
+    edges = [*sorted({slot.x for slot in layout.slots}), columns]
+    parts = []
+    for left, right in pairwise(edges):
+        y, pieces = 0, []
+        for slot in sorted((slot for slot in layout.slots if slot.x == left), key=lambda slot: slot.y):
+            image = _halved(images[slot.source].float(), slot.level, images[0].dtype)
+            pieces.append(torch.nn.functional.pad(image, (0, right - left - slot.size[1], slot.y - y, 0)))
+            y = slot.y + slot.size[0]
+        parts.append(torch.nn.functional.pad(torch.cat(pieces, 2), (0, 0, 0, rows - y)))
+    return torch.cat(parts, 3)
+
+
+def _halved(image: torch.Tensor, level: int, dtype: torch.dtype) -> torch.Tensor:
+    for _ in range(level):
+        image = torch.nn.functional.avg_pool2d(image, 2)
+        if dtype == torch.uint8:
+            image = torch.floor(image + 0.5)  # as OpenCV rounds halved uint8 images
+    return image
 
 
 def _grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:

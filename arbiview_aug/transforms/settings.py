@@ -33,6 +33,7 @@ class SampleKeys:
             int8, 0 for the current frame, n + 1 for number n of the neighbours; ``confidence`` float32 in [0, 1],
             exp(-e / 10) for an expected error of e grey levels of 255 (``arbiview_aug.render.confidence``). Also
             ``sources``: the source images and calibration, for ``Inpainter.complete_batch``.
+        camera_maps: Stride of the maps of the calibration that ``CameraMaps`` adds; None for none.
         frame: Ego frame of output poses, points and boxes. ``target`` moves them, and ``ego2world``, into the target's
             and adds ``ego2ego`` (..., 4, 4).
         points: ``target``: as its scanners would have measured them, if it has any. ``source``: as they are.
@@ -45,6 +46,7 @@ class SampleKeys:
     ignore_index: float = 255
     keep: tuple[str, ...] = ()
     extra: tuple[str, ...] = ()
+    camera_maps: int | None = None
     frame: Literal["source", "target"] = "source"
     points: Literal["source", "target"] = "target"
 
@@ -56,6 +58,8 @@ class SampleKeys:
             object.__setattr__(self, name, tuple(value))
         for key in self.extra:
             choice("SampleKeys.extra", key, EXTRA_KEYS)
+        if self.camera_maps is not None and (not isinstance(self.camera_maps, int) or self.camera_maps < 1):
+            raise ValueError(f"SampleKeys.camera_maps: expected a stride in pixels from 1, got {self.camera_maps!r}")
         if not is_number(self.ignore_index):
             raise ValueError(f"SampleKeys.ignore_index: expected a number, got {self.ignore_index!r}")
         choice("SampleKeys.frame", self.frame, ("source", "target"))

@@ -301,6 +301,7 @@ HELP = {
     "evaluate": (
         "--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--target-set", "--displaced",
     ),
+    "doctor": ("--size HxW", "extras"),
     "inspect": ("RIG", "--output FILE"),
     "train": ("--data", "--output DIR", "--config", "--set KEY=VALUE"),
 }

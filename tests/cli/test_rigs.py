@@ -40,6 +40,13 @@ def test_same_rig_has_no_differences() -> None:
         assert row[:6] == [camera.name, camera.name, "0.0 deg", "+0.00", "+0.00", "+0.00"]
 
 
+def test_differences_within_the_noise_of_calibration_are_named() -> None:
+    rig = load_rig("nuscenes")
+    others = (rig.shifted(z_m=0.01), True), (rig.shifted(z_m=0.03), False), (rig.turned(yaw_deg=0.3), False)
+    for other, is_noise in others:
+        assert ("do not retarget" in differences(rig, other)) == is_noise
+
+
 def test_files_and_folders(tmp_path: Path) -> None:
     load_rig("waymo").save(tmp_path / "calib.json")
     arguments = ["--output", str(tmp_path / "rig.png")]

@@ -1,0 +1,111 @@
+"""``python -m arbiview_aug doctor``: whether this installation is sound, and how fast a frame is here."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import re
+import shutil
+import statistics
+import time
+from collections.abc import Iterator
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from timeit import timeit
+
+import cv2
+import numpy as np
+import torch
+
+from arbiview_aug.cameras.kernels import project_image
+from arbiview_aug.choices import GeometryName
+from arbiview_aug.cli.arguments import gathered_warnings
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
+from arbiview_aug.environment import cv2_wheels, installed_version, is_intact, versions, working_s
+from arbiview_aug.transforms.rig_retarget import RigRetarget
+
+_CALLS = 5
+_FRAME_MB = 0.6
+"""A converted frame of five views of 256 x 704, JPEG at quality 96, on synthetic and real streets."""
+
+_LIMITS = "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"
+
+Line = tuple[bool, str]  # whether all is well, and what was found
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print what was found, a line each; 1 if something is wrong."""
+    is_sound = True
+    for is_fine, text in _lines(arguments.size):
+        is_sound &= is_fine
+        print(text if is_fine else f"PROBLEM: {text}", flush=True)
+    return int(not is_sound)
+
+
+def _lines(size: tuple[int, int]) -> Iterator[Line]:
+    found = {**versions(), "numba": installed_version("numba") or "not installed"}
+    yield True, f"{', '.join(f'{name} {version}' for name, version in found.items())}; {platform.platform()}"
+    yield _opencv()
+    variables = [f"{name}={value}" for name in _LIMITS if (value := os.environ.get(name)) is not None]
+    threads = f"OpenCV {cv2.getNumThreads()}, torch {torch.get_num_threads()}; {', '.join(variables) or 'no limit set'}"
+    yield True, f"threads: {os.cpu_count()} cores; {threads}"
+    gpus = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
+    yield True, f"GPUs: {', '.join(gpus) or 'none that torch can use'}"
+    yield _kernels(Path(project_image._cache.cache_path))
+    free_mb = shutil.disk_usage(".").free / 1e6
+    frames = f"about {free_mb / _FRAME_MB:,.0f} converted frames of five views of 704x256"
+    yield free_mb > 1000, f"free disk here: {free_mb / 1000:.1f} GB, {frames}"
+    yield True, f"extras: {'; '.join(_extras())}"
+    yield _frame(size)
+
+
+def _opencv() -> Line:
+    wheels = [f"{name} {version}" for name, version in cv2_wheels().items()]
+    if len(wheels) == 1:
+        return True, f"OpenCV: {wheels[0]}, alone"
+    if not wheels:
+        return True, f"OpenCV: {cv2.__version__}, not from a wheel: {cv2.__file__}"
+    fix = f"pip uninstall -y {' '.join(cv2_wheels())}, then install one"
+    return False, f"OpenCV: {', '.join(wheels)} overwrite each other's files: {fix}"
+
+
+def _kernels(folder: Path) -> Line:
+    """The compiled kernels in the folder of one room and in those of the others."""
+    root = folder.parent.parent if folder.name == "__pycache__" else folder.parent
+    files = list(root.rglob("*.sha256*.nb[ic]"))
+    damaged = sum(not is_intact(path) for path in files)  # which deletes them
+    states = [path.stat() for path in files if path.exists()]
+    if not states:
+        return not damaged, f"compiled kernels: none in {root}; the first frames wait half a minute for them"
+    age_h = (time.time() - max(state.st_mtime for state in states)) / 3600
+    size_mb = sum(state.st_size for state in states) / 1e6
+    text = f"compiled kernels: {len(states)} files, {size_mb:.1f} MB in {root}, the newest {age_h:.1f} h old"
+    return not damaged, f"{text}; {damaged} damaged files are deleted, and compiled anew" if damaged else text
+
+
+def _extras() -> list[str]:
+    """Each extra, and what it lacks."""
+    lacking: dict[str, set[str]] = {}
+    for requirement in metadata.requires("arbiview_aug") or []:
+        name, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
+        if name and extra and extra[1] not in ("dev", "docs"):
+            lacking.setdefault(extra[1], set()).update({name[0]} if installed_version(name[0]) is None else ())
+    return [f"{extra} {'lacks ' + ', '.join(sorted(names)) if names else 'yes'}" for extra, names in lacking.items()]
+
+
+def _frame(size: tuple[int, int]) -> Line:
+    """Time one frame of a synthetic street, and check that something was seen."""
+    sample = SyntheticDrive(demo_source_rig(size), num_frames=1)[0]
+    geometries: tuple[GeometryName, ...] = ("street", "auto")
+    times_ms, notes = {}, list[str]()
+    with gathered_warnings(notes):
+        for geometry in geometries:
+            call = partial(RigRetarget(demo_target_rig(size), geometry=geometry), sample)
+            out = call()
+            times_ms[geometry] = 1e3 * statistics.median(timeit(call, timer=working_s, number=1) for _ in range(_CALLS))
+    images = np.stack([image.numpy() for image in out["images"]])
+    text = f"a frame, {len(sample['rig'])} cameras to {len(images)} of {size[1]}x{size[0]}: "
+    text += ", ".join(f"{name} {ms:.0f} ms" for name, ms in times_ms.items())
+    return bool(images.std() > 1 and out["coverage"].any()), text
