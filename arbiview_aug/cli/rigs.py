@@ -7,6 +7,7 @@ import os
 
 import numpy as np
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import data
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
@@ -36,7 +37,7 @@ def differences(source: Rig, target: Rig) -> str:
         cosine = axes @ camera.cam2ego[:3, 2]
         nearest = source[int(np.argmax(cosine))]
         turned = float(np.degrees(np.arccos(np.clip(cosine.max(), -1, 1))))
-        density = [float(np.radians(c.K[0, 0])) for c in (nearest, camera)]  # on the optical axis
+        density = [_pixels_per_deg(c) for c in (nearest, camera)]
         rows.append(
             [
                 *(camera.name, nearest.name, f"{turned:.1f} deg"),
@@ -48,6 +49,12 @@ def differences(source: Rig, target: Rig) -> str:
     head = ["camera", "nearest", "turned", "moved x", "y", "z", "field of view", "pixels per deg"]
     title = f"From {source.name or 'the first rig'} to {target.name or 'the other rig'}:"
     return f"{title}\n\n{markdown_table(head, rows, left=2)}"
+
+
+def _pixels_per_deg(camera: Camera) -> float:
+    """Columns a degree on the optical axis."""
+    beside, ahead = camera.project_cam(np.array([[np.radians(1e-3), 0, 1], [0, 0, 1]])).uv[:, 0]
+    return float(1e3 * (beside - ahead))
 
 
 def _load(name: str) -> Rig:
