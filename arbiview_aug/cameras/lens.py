@@ -380,7 +380,9 @@ class EUCM(_SphereLens):
         return 0.0, *self.distortion  # type: ignore[return-value]
 
 
-LENSES: dict[str, type[Lens]] = {lens.name: lens for lens in (Pinhole, RadTan, Fisheye, FTheta, FThetaBackward, DoubleSphere, EUCM)}
+LENSES: dict[str, type[Lens]] = {
+    lens.name: lens for lens in (Pinhole, RadTan, Fisheye, FTheta, FThetaBackward, DoubleSphere, EUCM)
+}
 """All lenses by name."""
 
 
