@@ -15,11 +15,11 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.rotations import poses_from, rotation_from_quaternion
 from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import area_reduced, reduced_rig, stack_or_list
-from arbiview_aug.datasets.nuscenes.tables import poses_from, rotation_from_quaternion
 from arbiview_aug.datasets.registry import log_folders
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, described
