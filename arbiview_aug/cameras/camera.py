@@ -71,7 +71,9 @@ class Camera:
         K: (3, 3) intrinsics in pixels, ``[[fx, s, cx], [0, fy, cy], [0, 0, 1]]``.
         cam2ego: (4, 4) pose, camera to ego.
         lens: ``pinhole``; ``radtan`` (OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6]]); ``fisheye`` (Kannala-Brandt,
-            OpenCV's k1..k4). ``opencv_radtan`` and ``opencv_fisheye`` are read as these two.
+            OpenCV's k1..k4); ``ftheta`` and ``ftheta_backward`` (NVIDIA's polynomial, k2..k5); ``double_sphere``
+            (xi alpha) and ``eucm`` (alpha beta), as Kalibr has them. The formulas are in docs/formats.md.
+            ``opencv_radtan``, ``opencv_fisheye`` and ``ds`` are other names.
         distortion: Coefficients of the lens.
         mask: (H, W) bool, True where the scene is seen, False on the own car's body.
 
@@ -209,7 +211,8 @@ class Camera:
         K[:2] *= scale
         K[:2, 2] += (scale - 1) / 2
         fold = min(self.lens_model.fold_limit, 1e12)
-        further = (*self.distortion, *(0.0,) * (8 - len(self.distortion)))
+        coefficients = self.lens_model.kernel_coefficients
+        further = (*coefficients, *(0.0,) * (8 - len(coefficients)))
         return np.array([K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2], fold, *further], np.float32)
 
     @cached_property

@@ -18,11 +18,15 @@ Row = Any  # float32 (n,): kernels are typed by numba
 FAR_AWAY_PX = np.float32(1e5)
 """Position of points that a camera cannot project: outside every image, and precise in float32."""
 
-LENS_CODES = {"pinhole": 0, "radtan": 1, "fisheye": 2}
+LENS_CODES = {
+    "pinhole": 0, "radtan": 1, "fisheye": 2, "ftheta": 3, "ftheta_backward": 4, "double_sphere": 5, "eucm": 5
+}  # fmt: skip
 """Lenses that kernels know. Others are projected by their class, image by image."""
 
 _FOLD, _FIRST = 5, 6  # entries of ``camera_parameters``
 _ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
+_FOUR, _FIVE = np.float32(4), np.float32(5)
+_NEWTON_STEPS, _LEAST_SLOPE = 4, np.float32(1e-2)
 _HALF = np.float32(0.5)
 _NO_CONE = np.float32(-9)
 _CONE_ROOM = np.float32(1.05)
@@ -129,9 +133,12 @@ def project_row(x: Row, y: Row, z: Row, kind: int, P: Row, a: Row, b: Row, u: Ro
     """Pixels u, v (n,) of camera-frame points; ``FAR_AWAY_PX`` where there is none. ``a`` and ``b`` are scratch."""
     n = u.shape[0]
     fx, skew, cx, fy, cy = P[0], P[1], P[2], P[3], P[4]
-    if kind == 2:
-        _fisheye_row(x, y, z, P, a, b)
-        # The angle over the radius; x and y stay in front of it.
+    if kind >= 2:
+        if kind == 5:
+            _sphere_row(x, y, z, P, a)
+        else:
+            _angular_row(x, y, z, kind, P, a, b, u)
+        # The radius over the points' own; x and y stay in front of it.
         for i in range(n):
             valid = a[i] > -_ONE
             u[i] = (fx * x[i] + skew * y[i]) * a[i] + cx if valid else FAR_AWAY_PX
@@ -183,22 +190,49 @@ def angle_row(r: Row, z: Row, out: Row) -> None:
 
 
 @inlined
-def _fisheye_row(x: Row, y: Row, z: Row, P: Row, scale: Row, r: Row) -> None:
-    """theta_d / r (n,) of a Kannala-Brandt lens, -2 past its fold and on the axis behind the camera."""
+def _angular_row(x: Row, y: Row, z: Row, kind: int, P: Row, scale: Row, r: Row, radius: Row) -> None:
+    """The radius of a fisheye or f-theta lens over r (n,), -2 past its fold and on the axis behind the camera."""
     k1, k2, k3, k4, fold = P[6], P[7], P[8], P[9], P[5]
     n = x.shape[0]
     for i in range(n):
         r[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
     angle_row(r, z, scale)
+    if kind == 2:
+        for i in range(n):
+            theta = scale[i]
+            t2 = theta * theta
+            radius[i] = theta * (_ONE + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    else:
+        first = 6 if kind == 3 else 10  # of a forward polynomial
+        s1, s2, s3, s4 = P[first], P[first + 1], P[first + 2], P[first + 3]
+        for i in range(n):
+            theta = scale[i]
+            radius[i] = theta * (_ONE + theta * (s1 + theta * (s2 + theta * (s3 + theta * s4))))
+        for _ in range(_NEWTON_STEPS if kind == 4 else 0):  # theta is a polynomial of the radius
+            for i in range(n):
+                q = radius[i]
+                off = q * (_ONE + q * (k1 + q * (k2 + q * (k3 + q * k4)))) - scale[i]
+                slope = _ONE + q * (_TWO * k1 + q * (_THREE * k2 + q * (_FOUR * k3 + q * _FIVE * k4)))
+                radius[i] = q - off / max(slope, _LEAST_SLOPE)
     for i in range(n):
-        theta = scale[i]
-        t2 = theta * theta
-        theta_d = theta * (_ONE + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
         on_axis = r[i] <= np.float32(1e-7) * abs(z[i])
         near = _ONE / max(z[i], _TINY) if z[i] > _ZERO else -_TWO
-        inside = theta <= fold
-        value = near if on_axis else theta_d / max(r[i], _TINY)
+        inside = scale[i] <= fold
+        value = near if on_axis else radius[i] / max(r[i], _TINY)
         scale[i] = value if inside else -_TWO
+
+
+@inlined
+def _sphere_row(x: Row, y: Row, z: Row, P: Row, scale: Row) -> None:
+    """Scale (n,) of x and y that a double-sphere or EUCM lens projects by, -2 past its cone."""
+    xi, alpha, beta, behind = P[6], P[7], P[8], np.cos(P[5])
+    for i in range(x.shape[0]):
+        r2 = x[i] * x[i] + y[i] * y[i]
+        length = np.sqrt(r2 + z[i] * z[i])
+        moved = z[i] + xi * length
+        divisor = alpha * np.sqrt(beta * r2 + moved * moved) + (_ONE - alpha) * moved
+        inside = (z[i] >= behind * length) & (divisor > _LEAST * length)
+        scale[i] = _ONE / divisor if inside else -_TWO
 
 
 @compiled

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -18,7 +19,7 @@ import numpy.typing as npt
 
 from arbiview_aug.errors import CalibrationError
 
-LensName = Literal["pinhole", "radtan", "fisheye"]
+LensName = Literal["pinhole", "radtan", "fisheye", "ftheta", "ftheta_backward", "double_sphere", "eucm"]
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
@@ -37,6 +38,7 @@ class Lens(ABC):
         name: The name in ``Camera.lens``, rig files and samples.
         aliases: Other names accepted on reading.
         coefficient_counts: Possible numbers of coefficients, ascending.
+        coefficient_ranges: Name, least and greatest value of each coefficient; empty if any value is possible.
         is_rectilinear: Straight lines stay straight: two views from one centre differ by a homography.
         sees_behind: The field of view may exceed 180 degrees.
         distortion: The coefficients.
@@ -45,6 +47,7 @@ class Lens(ABC):
     name: ClassVar[str]
     aliases: ClassVar[tuple[str, ...]] = ()
     coefficient_counts: ClassVar[tuple[int, ...]]
+    coefficient_ranges: ClassVar[tuple[tuple[str, float, float], ...]] = ()
     is_rectilinear: ClassVar[bool] = False
     sees_behind: ClassVar[bool] = False
     distortion: tuple[float, ...] = ()
@@ -63,12 +66,17 @@ class Lens(ABC):
     @property
     @abstractmethod
     def fold_limit(self) -> float:
-        """Limit of the radial function's rising branch: an angle (fisheye) or its tangent (other lenses)."""
+        """Limit of the radial function's rising branch: an angle (lenses that see behind) or its tangent (others)."""
 
     @property
     def fold_rad(self) -> float:
         """Angle off the optical axis of ``fold_limit``."""
-        return math.atan(self.fold_limit)
+        return self.fold_limit if self.sees_behind else math.atan(self.fold_limit)
+
+    @property
+    def kernel_coefficients(self) -> tuple[float, ...]:
+        """Coefficients as kernels read them, eight at most."""
+        return self.distortion
 
 
 class Pinhole(Lens):
@@ -167,54 +175,214 @@ class RadTan(Lens):
         )
 
 
-class Fisheye(Lens):
-    """Kannala-Brandt with OpenCV's k1..k4."""
+class _AngularLens(Lens):
+    """A lens whose distance from the principal point is a function of the angle off the optical axis alone."""
 
-    name = "fisheye"
-    aliases = ("opencv_fisheye",)
-    coefficient_counts = (4,)
     sees_behind = True
+
+    @abstractmethod
+    def _radius(self, theta: FloatArray) -> FloatArray:
+        """Distances from the principal point in the normalised image, of angles up to ``fold_limit``."""
+
+    @abstractmethod
+    def _angle(self, radius: FloatArray) -> FloatArray:
+        """The inverse of ``_radius``."""
 
     def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         r = np.hypot(x, y)
         theta = np.arctan2(r, z)
         valid = (theta <= self.fold_limit) & ((r > 0) | (z > 0))
-        theta_d = self._polynomial(theta, theta * theta)
+        theta_d = self._radius(theta)
         # theta_d / r tends to 1 / z on the axis.
         scale = np.where(r > 1e-12 * np.abs(z), theta_d / np.where(r > 0, r, 1), 1 / np.where(z > 0, z, 1))
         return x * scale, y * scale, valid
 
     def undistort(self, xd: FloatArray, yd: FloatArray) -> FloatArray:
         theta_d = np.hypot(xd, yd)
-        k1, k2, k3, k4 = self.distortion
-        theta = np.minimum(theta_d, self.fold_limit)
-        for _ in range(_NEWTON_STEPS):
-            t2 = theta * theta
-            f = self._polynomial(theta, t2) - theta_d
-            slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-            # The radial function rises up to the fold: a bounded step cannot leave that branch.
-            step = np.clip(f / np.maximum(slope, 1e-3), -0.25, 0.25)
-            theta = np.clip(theta - step, 0.0, self.fold_limit)
-            if np.abs(step).max(initial=0.0) < 1e-14:
-                break
+        theta = self._angle(theta_d)
         scale = np.sin(theta) / np.where(theta_d > 0, theta_d, 1.0)
         return np.stack([xd * scale, yd * scale, np.cos(theta)], -1)
+
+
+class Fisheye(_AngularLens):
+    """Kannala-Brandt with OpenCV's k1..k4."""
+
+    name = "fisheye"
+    aliases = ("opencv_fisheye",)
+    coefficient_counts = (4,)
 
     @cached_property
     def fold_limit(self) -> float:
         k1, k2, k3, k4 = self.distortion
         return min(math.pi, _smallest_positive_root(np.array([9 * k4, 0, 7 * k3, 0, 5 * k2, 0, 3 * k1, 0, 1.0])))
 
-    @property
-    def fold_rad(self) -> float:
-        return self.fold_limit
-
-    def _polynomial(self, theta: FloatArray, t2: FloatArray) -> FloatArray:
+    def _radius(self, theta: FloatArray) -> FloatArray:
         k1, k2, k3, k4 = self.distortion
+        t2 = theta * theta
         return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 
+    def _slope(self, theta: FloatArray) -> FloatArray:
+        k1, k2, k3, k4 = self.distortion
+        t2 = theta * theta
+        return 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
 
-LENSES: dict[str, type[Lens]] = {lens.name: lens for lens in (Pinhole, RadTan, Fisheye)}
+    def _angle(self, radius: FloatArray) -> FloatArray:
+        return _inverse(self._radius, self._slope, radius, self.fold_limit)
+
+
+class FTheta(_AngularLens):
+    """NVIDIA's f-theta with the forward polynomial: r = θ + k2 θ² + k3 θ³ + k4 θ⁴ + k5 θ⁵.
+
+    θ is the angle off the optical axis. NVIDIA's files have the polynomial in pixels, j1 θ + ... + j5 θ⁵, and linear
+    terms c and d. Here K holds what is in pixels, so that it is the focal length on the axis and follows resizing:
+    kn = jn / j1, K = [[c j1, d j1, cx], [0, j1, cy], [0, 0, 1]].
+
+    Source: ``dwFThetaCameraConfig`` of NVIDIA DriveWorks, polynomial type angle-to-pixel-distance; NCore's "FTheta
+    Camera Model", whose linear term e is 0 here.
+    """
+
+    name = "ftheta"
+    coefficient_counts = (4,)
+
+    @cached_property
+    def fold_limit(self) -> float:
+        return min(math.pi, _smallest_positive_root(self._slope_polynomial))
+
+    @property
+    def _slope_polynomial(self) -> FloatArray:
+        return np.array([n * k for n, k in zip((5, 4, 3, 2), self.distortion[::-1], strict=True)] + [1.0])
+
+    def _polynomial(self, t: FloatArray) -> FloatArray:
+        k2, k3, k4, k5 = self.distortion
+        return t * (1 + t * (k2 + t * (k3 + t * (k4 + t * k5))))
+
+    def _slope(self, t: FloatArray) -> FloatArray:
+        k2, k3, k4, k5 = self.distortion
+        return 1 + t * (2 * k2 + t * (3 * k3 + t * (4 * k4 + t * 5 * k5)))
+
+    def _radius(self, theta: FloatArray) -> FloatArray:
+        return self._polynomial(theta)
+
+    def _angle(self, radius: FloatArray) -> FloatArray:
+        return _inverse(self._polynomial, self._slope, radius, self.fold_limit)
+
+
+class FThetaBackward(FTheta):
+    """NVIDIA's f-theta with the backward polynomial: θ = r + k2 r² + k3 r³ + k4 r⁴ + k5 r⁵.
+
+    In pixels it is b1 p + ... + b5 p⁵ of the distance p: here kn = bn / b1ⁿ, and 1 / b1 stands for ``FTheta``'s j1.
+    Source: as ``FTheta``, polynomial type pixel-distance-to-angle.
+    """
+
+    name = "ftheta_backward"
+
+    @cached_property
+    def fold_limit(self) -> float:
+        return min(math.pi, float(self._polynomial(np.array(self._largest_radius))))
+
+    @cached_property
+    def _largest_radius(self) -> float:
+        """The radius at which the polynomial gives 180 degrees, or rises a tenth as fast as on the axis.
+
+        Where it stops rising, a radian is infinitely many pixels: no image reaches that far.
+        """
+        flat, behind = self._slope_polynomial, -np.array([*self.distortion[::-1], 1.0, -math.pi]) / math.pi
+        flat[-1] -= 0.1
+        return min(_smallest_positive_root(flat / flat[-1]), _smallest_positive_root(behind), 1e3)
+
+    @cached_property
+    def kernel_coefficients(self) -> tuple[float, ...]:
+        """k2..k5, and four of a forward polynomial near the inverse, from which Newton's method starts."""
+        radius = np.linspace(0, self._largest_radius, 65)[1:]
+        theta = self._polynomial(radius)
+        start = np.linalg.lstsq(np.stack([theta**n for n in range(2, 6)], -1), radius - theta, rcond=None)[0]
+        return *self.distortion, *start.tolist()
+
+    def _radius(self, theta: FloatArray) -> FloatArray:
+        return _inverse(self._polynomial, self._slope, theta, self._largest_radius)
+
+    def _angle(self, radius: FloatArray) -> FloatArray:
+        return self._polynomial(np.minimum(radius, self._largest_radius))
+
+
+class _SphereLens(Lens):
+    """Two projections onto spheres, then one onto the image: the general form of double sphere and EUCM.
+
+    A unit direction is moved by ξ along the optical axis, and (x, y, z) of it is projected to
+    (x, y) / (α sqrt(β (x² + y²) + z²) + (1 - α) z).
+    """
+
+    sees_behind = True
+
+    @property
+    @abstractmethod
+    def kernel_coefficients(self) -> tuple[float, float, float]:
+        """ξ, α, β."""
+
+    def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        xi, alpha, beta = self.kernel_coefficients
+        r2 = x * x + y * y
+        length = np.sqrt(r2 + z * z)
+        moved = z + xi * length
+        divisor = alpha * np.sqrt(beta * r2 + moved * moved) + (1 - alpha) * moved
+        valid = (z >= math.cos(self.fold_limit) * length) & (divisor > MIN_DEPTH * length)
+        divisor = np.where(valid, divisor, 1.0)
+        return np.where(valid, x, 0.0) / divisor, np.where(valid, y, 0.0) / divisor, valid
+
+    def undistort(self, xd: FloatArray, yd: FloatArray) -> FloatArray:
+        xi, alpha, beta = self.kernel_coefficients
+        r2 = np.minimum(xd * xd + yd * yd, _MAX_COORDINATE)
+        root = np.sqrt(np.maximum(1 - (2 * alpha - 1) * beta * r2, 0.0))  # below 0 there is no ray
+        z = (1 - beta * alpha**2 * r2) / np.maximum(alpha * root + 1 - alpha, 1e-12)
+        scale = (z * xi + np.sqrt(z * z + (1 - xi**2) * r2)) / (z * z + r2)
+        return np.stack([xd * scale, yd * scale, z * scale - xi], -1)
+
+    @cached_property
+    def fold_limit(self) -> float:
+        xi, alpha, beta = self.kernel_coefficients
+        w2 = (min(alpha, 1 - alpha) / max(alpha, 1 - alpha)) ** 2
+        angle = math.acos(-math.sqrt(w2 * beta / (1 - w2 + w2 * beta)))  # seen from the second sphere's centre
+        return min(math.pi, angle + math.asin(xi * math.sin(angle)))
+
+
+class DoubleSphere(_SphereLens):
+    """The double sphere model: ξ α, as Kalibr and basalt write them.
+
+    With d1 = |(x, y, z)|, d2 = sqrt(x² + y² + (ξ d1 + z)²): (x, y) / (α d2 + (1 - α) (ξ d1 + z)). K is the tools' own:
+    on the optical axis a radian is K[0, 0] / (1 + ξ) pixels. Source: Usenko, Demmel and Cremers, "The Double Sphere
+    Camera Model", 3DV 2018.
+    """
+
+    name = "double_sphere"
+    aliases = ("ds",)
+    coefficient_counts = (2,)
+    coefficient_ranges = (("xi", -0.99, 1.0), ("alpha", 0.0, 1.0))
+
+    @property
+    def kernel_coefficients(self) -> tuple[float, float, float]:
+        xi, alpha = self.distortion
+        return xi, alpha, 1.0
+
+
+class EUCM(_SphereLens):
+    """The extended unified camera model: α β, as Kalibr and basalt write them.
+
+    With d = sqrt(β (x² + y²) + z²): (x, y) / (α d + (1 - α) z). Source: Khomutenko, Garcia and Martinet, "An Enhanced
+    Unified Camera Model", RA-L 2016.
+    """
+
+    name = "eucm"
+    coefficient_counts = (2,)
+    coefficient_ranges = (("alpha", 0.0, 1.0), ("beta", 1e-3, 1e3))
+
+    @property
+    def kernel_coefficients(self) -> tuple[float, float, float]:
+        return 0.0, *self.distortion  # type: ignore[return-value]
+
+
+LENSES: dict[str, type[Lens]] = {
+    lens.name: lens for lens in (Pinhole, RadTan, Fisheye, FTheta, FThetaBackward, DoubleSphere, EUCM)
+}
 """All lenses by name."""
 
 
@@ -234,6 +402,23 @@ def _unit(a: FloatArray, b: FloatArray) -> FloatArray:
     """Unit directions (..., 3) through (a, b, 1)."""
     norm = np.sqrt(a * a + b * b + 1)
     return np.stack([a / norm, b / norm, 1 / norm], -1)
+
+
+def _inverse(
+    function: Callable[[FloatArray], FloatArray],
+    slope: Callable[[FloatArray], FloatArray],
+    values: FloatArray,
+    limit: float,
+) -> FloatArray:
+    """Arguments from 0 to ``limit`` at which a function that rises there has the values (...,): Newton's method."""
+    arguments = np.minimum(values, limit)
+    for _ in range(_NEWTON_STEPS):
+        # The function rises up to the limit: a bounded step cannot leave that branch.
+        step = np.clip((function(arguments) - values) / np.maximum(slope(arguments), 1e-3), -0.25, 0.25)
+        arguments = np.clip(arguments - step, 0.0, limit)
+        if np.abs(step).max(initial=0.0) < 1e-14:
+            break
+    return arguments
 
 
 def _smallest_positive_root(polynomial: FloatArray) -> float:

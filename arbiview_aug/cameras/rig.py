@@ -1,7 +1,7 @@
 """Rigs: the cameras of one vehicle, their files, and the vehicles that ship with the package.
 
 A rig file (YAML or JSON) holds ``name``, ``ground_z_m`` and ``cameras``, each with ``name``, ``width``, ``height``,
-``K`` (3x3), ``cam2ego`` (4x4), ``distortion`` (null or ``{model: radtan|fisheye, coeffs: [...]}``) and optionally
+``K`` (3x3), ``cam2ego`` (4x4), ``distortion`` (null or ``{model: LENS, coeffs: [...]}``) and optionally
 ``mask`` (a PNG beside the file, white = scene); optionally ``lidars``, each with the arguments of ``Lidar``.
 ``source``, ``notes``, ``ego_frame``, ``ground_source``, ``dataset``, ``kind`` and ``license`` document it.
 """
@@ -113,16 +113,16 @@ class Rig:
     def __repr__(self) -> str:
         """A table with one line per camera and scanner, as ``inspect`` prints it."""
         head = f"Rig {self.name or '(unnamed)'}: {len(self)} cameras, road at z = {self.ground_z_m:+.2f} m"
-        width = max(len(n) for n in self.names)
+        width, lens = max(map(len, self.names)), max(7, *(len(c.lens) for c in self.cameras))
         lines = [
-            f"  {'camera':<{width}}  {'size':>9}  {'lens':<7}  {'fov h x v':>13}  {'azimuth':>7}  {'elev.':>6}"
+            f"  {'camera':<{width}}  {'size':>9}  {'lens':<{lens}}  {'fov h x v':>13}  {'azimuth':>7}  {'elev.':>6}"
             f"  {'x':>6} {'y':>6} {'above road':>10}"
         ]
         for c in self.cameras:
             h_fov, v_fov = c.fov_deg
             x, y, z = c.center_m
             lines.append(
-                f"  {c.name:<{width}}  {c.width_px:>4}x{c.height_px:<4}  {c.lens:<7}  {h_fov:5.1f} x {v_fov:5.1f}"
+                f"  {c.name:<{width}}  {c.width_px:>4}x{c.height_px:<4}  {c.lens:<{lens}}  {h_fov:5.1f} x {v_fov:5.1f}"
                 f"  {c.azimuth_deg:+7.1f}  {c.elevation_deg:+6.1f}  {x:6.2f} {y:6.2f} {z - self.ground_z_m:8.2f} m"
                 + ("" if c.mask is None else f"  mask: {1 - c.mask.mean():.0%} own car")
             )

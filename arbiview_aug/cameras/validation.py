@@ -172,6 +172,10 @@ def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:
         raise _error(name, "distortion", expected, str(len(coefficients)), fix)
     if not all(abs(k) <= _MAX_COEFFICIENT for k in coefficients):  # also catches NaN
         raise _error(name, "distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", shown(coefficients))
+    ranges = LENSES[lens].coefficient_ranges
+    if any(not low <= k <= high for k, (_, low, high) in zip(coefficients, ranges, strict=False)):
+        expected = " and ".join(f"{label} from {low:g} to {high:g}" for label, low, high in ranges)
+        raise _error(name, "distortion", f"{expected} for a {lens} lens", shown(coefficients))
     return coefficients
 
 

@@ -7,6 +7,7 @@ import os
 
 import numpy as np
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import data
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
@@ -42,7 +43,7 @@ def differences(source: Rig, target: Rig) -> str:
         away_m = camera.center_m - nearest.center_m
         is_noise &= turned < NOISE_DEG and bool(np.linalg.norm(away_m) < NOISE_M)
         is_noise &= float(np.abs(np.subtract(camera.fov_deg, nearest.fov_deg)).max()) < NOISE_DEG
-        density = [float(np.radians(c.K[0, 0])) for c in (nearest, camera)]  # on the optical axis
+        density = [_pixels_per_deg(c) for c in (nearest, camera)]
         rows.append(
             [
                 *(camera.name, nearest.name, f"{turned:.1f} deg"),
@@ -55,6 +56,12 @@ def differences(source: Rig, target: Rig) -> str:
     title = f"From {source.name or 'the first rig'} to {target.name or 'the other rig'}:"
     note = f"\n\nAll within {NOISE_DEG:g} deg and {100 * NOISE_M:g} cm, as much as calibrations err: do not retarget."
     return f"{title}\n\n{markdown_table(head, rows, left=2)}{note if is_noise else ''}"
+
+
+def _pixels_per_deg(camera: Camera) -> float:
+    """Columns a degree on the optical axis."""
+    beside, ahead = camera.project_cam(np.array([[np.radians(1e-3), 0, 1], [0, 0, 1]])).uv[:, 0]
+    return float(1e3 * (beside - ahead))
 
 
 def _load(name: str) -> Rig:

@@ -15,11 +15,11 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.rotations import poses_from, rotation_from_quaternion
 from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import area_reduced, reduced_rig, stack_or_list
-from arbiview_aug.datasets.nuscenes.tables import poses_from, rotation_from_quaternion
 from arbiview_aug.datasets.registry import log_folders
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, described
@@ -39,6 +39,7 @@ NOT_SHARED = ("wod-perception", "physical-ai-av", "ncore")
 """Data sets whose licences restrict who may be given derivatives."""
 
 _MEI_HALF_FOV_RAD, _MEI_ERROR_PX = np.deg2rad(95.0), 0.5
+_FTHETA_CONSTANT_PX = 0.01
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,8 @@ class Py123dDataset(WritableRecording):
     ``neighbours`` are other iterations of the same log. A sample has the cameras that recorded in its iteration.
 
     A fisheye camera of the MEI model becomes the ``fisheye`` lens that is nearest to it, within half a pixel; its
-    tangential terms are left out, as py123d does. The road is at the bottom of the vehicle's box.
+    tangential terms are left out, as py123d does. An f-theta lens has its forward polynomial. The road is at the
+    bottom of the vehicle's box.
 
     Args:
         root: py123d's data root (with ``logs``), the folder of logs, a split, or a log.
@@ -80,7 +82,7 @@ class Py123dDataset(WritableRecording):
         ImportError: py123d is not installed.
         TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
         DataError: No log, or one that py123d cannot read.
-        CalibrationError: A camera of a lens that no lens here comes near, such as f-theta.
+        CalibrationError: A camera of a lens that no lens here comes near.
     """
 
     def __init__(
@@ -231,9 +233,12 @@ def _camera(metadata: Any, where: str) -> Camera:
         lens = "pinhole" if bent is None else "radtan"
     elif model == "fisheye_mei" and metadata.projection is not None and metadata.mirror_parameter is not None:
         lens, (K, distortion) = "fisheye", _fisheye(metadata, where)
+    elif model == "ftheta" and metadata.intrinsics is not None:
+        lens, (K, distortion) = "ftheta", _ftheta(metadata.intrinsics, where)
     else:
         raise CalibrationError(
-            f"{where}: expected a calibrated pinhole or fisheye MEI lens, got {model}; name the other cameras, cameras="
+            f"{where}: expected a calibrated pinhole, fisheye MEI or f-theta lens, got {model}; name the other "
+            f"cameras, cameras="
         )
     optics: dict[str, Any] = {"K": K, "lens": lens, "distortion": tuple(map(float, distortion))}
     optics |= {"width_px": int(metadata.width), "height_px": int(metadata.height)}
@@ -263,6 +268,16 @@ def _fisheye(metadata: Any, where: str) -> tuple[FloatArray, FloatArray]:
             f"{where}: expected a MEI lens within {_MEI_ERROR_PX} px of a fisheye lens, got {error_px:.2f} px"
         )
     return np.array([[to.gamma1 / (1 + xi), 0, to.u0], [0, to.gamma2 / (1 + xi), to.v0], [0, 0, 1]]), coefficients
+
+
+def _ftheta(intrinsics: Any, where: str) -> tuple[FloatArray, FloatArray]:
+    """K and k2..k5 of the ``ftheta`` lens with NVIDIA's forward polynomial, in pixels of radians."""
+    constant, focal, *powers = (float(c) for c in intrinsics.fw_poly)
+    if not abs(constant) <= _FTHETA_CONSTANT_PX or not focal > 0:
+        expected = "a forward polynomial without a constant term and with a positive linear one"
+        raise CalibrationError(f"{where}: expected {expected}, got {intrinsics.fw_poly}")
+    K = np.array([[focal, 0, intrinsics.cx], [0, focal, intrinsics.cy], [0, 0, 1]])
+    return K, np.array([*powers, *(0.0,) * (4 - len(powers))]) / focal
 
 
 def _boxes(detections: Any, world2ego: FloatArray) -> Any:

@@ -12,14 +12,14 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, LensName
+from arbiview_aug.cameras.lens import BoolArray, FloatArray, LensName
 from arbiview_aug.cameras.rays import (
     CELL_PX,
     MAX_INVERSE_DISTANCE,
@@ -589,12 +589,14 @@ def warm_up() -> None:
     """Compile the kernels of cameras, scenes and plans, or load them from numba's cache."""
     from arbiview_aug.render.kernels import read_ahead
 
+    # A lens without and one with an array of rays: kernels are compiled once for all lenses.
+    lenses: tuple[tuple[LensName, tuple[float, ...]], ...] = ("pinhole", ()), ("fisheye", (0.0,) * 4)
     views = [
         Camera.looking(
-            name=f"{name} {side}", azimuth_deg=20 * side, position_m=(0, 0.3 * side, 1.5), width_px=32, height_px=32,
-            horizontal_fov_deg=90, lens=cast(LensName, name), distortion=(0.0,) * lens.coefficient_counts[0],
+            name=f"{lens} {side}", azimuth_deg=20 * side, position_m=(0, 0.3 * side, 1.5), width_px=32, height_px=32,
+            horizontal_fov_deg=90, lens=lens, distortion=distortion,
         )
-        for name, lens in LENSES.items() for side in (-1, 0, 1)
+        for lens, distortion in lenses for side in (-1, 0, 1)
     ]  # fmt: skip
     wall = np.stack(np.meshgrid(8.0, np.linspace(-2, 2, 20), np.linspace(0.3, 1.5, 10)), -1).reshape(-1, 3)
     boxes = np.array([[8.5, 0, 1, 1, 4, 2, 0], [5, 3, 1, 1, 1, 2, 0]])

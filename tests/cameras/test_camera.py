@@ -60,7 +60,7 @@ BAD = {
     ),
     "zero focal": ({"K": edited(K, (1, 1), 0.0)}, r"positive focal lengths, 1e-06 px at least, got fx 500, fy 0"),
     "focal whose inverse is infinite": ({"K": edited(K, (1, 1), 5e-324)}, r"1e-06 px at least, got fx 500, fy 4.94"),
-    "unknown lens": ({"lens": "brown"}, r"lens: expected one of pinhole, radtan, fisheye, got 'brown'"),
+    "unknown lens": ({"lens": "brown"}, r"lens: expected one of pinhole, .*, eucm, got 'brown'"),
     "coefficients of a pinhole": ({"distortion": (0.1,) * 4}, r"0 coefficients for a pinhole lens.*name the lens"),
     "six coefficients": (
         {"lens": "radtan", "distortion": (0.1,) * 6},
@@ -195,6 +195,10 @@ def test_words_and_wrong_shapes_are_refused_by_name(case: str) -> None:
         ("radtan", (-0.05, 0.01, 0.0, 0.0), 70.0),
         ("fisheye", (-0.03, 0.001, 0.0, 0.0), 190.0),
         ("fisheye", (0.0, 0.0, 0.0, 0.0), 90.0),
+        ("ftheta", (-0.02, 0.05, -0.09, 0.03), 190.0),
+        ("ftheta_backward", (0.03, -0.08, 0.12, -0.04), 130.0),
+        ("double_sphere", (-0.2, 0.6), 200.0),
+        ("eucm", (0.6, 1.1), 195.0),
     ],
 )
 def test_field_of_view_round_trip(lens: str, distortion: tuple, fov: float) -> None:

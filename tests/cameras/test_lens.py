@@ -9,13 +9,16 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import strategies as st
 
 from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.cameras import lens as lens_module
 from arbiview_aug.cameras.camera import UNPROJECT_TOLERANCE_PX, Camera
+from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES
 from arbiview_aug.cameras.lens import BoolArray, FloatArray, Lens, LensName, RadTan
-from arbiview_aug.cameras.rays import CELL_PX, pixel_rays
+from arbiview_aug.cameras.rays import CELL_PX, pixel_rays, source_pixels
 from arbiview_aug.errors import CalibrationError
+from tests.helpers import examples
 
 K = np.array([[410.0, 0.0, 318.0], [0.0, 405.0, 242.0], [0.0, 0.0, 1.0]])
 
@@ -26,6 +29,12 @@ LENSES = {
     "radtan8": ("radtan", (0.9, 0.12, 0.0004, -0.0003, 0.002, 1.25, 0.35, 0.02)),
     "fisheye": ("fisheye", (-0.0703, 0.0039, -0.0033, 0.0006)),
     "fisheye_without_distortion": ("fisheye", (0.0, 0.0, 0.0, 0.0)),
+    "ftheta": ("ftheta", (-0.0202, 0.0527, -0.0894, 0.032)),
+    "ftheta_backward": ("ftheta_backward", (0.032, -0.0857, 0.125, -0.043)),
+    "double_sphere": ("double_sphere", (-0.1996, 0.5925)),
+    "double_sphere_beyond": ("double_sphere", (0.31, 0.42)),
+    "eucm": ("eucm", (0.631, 1.043)),
+    "eucm_flat": ("eucm", (0.35, 0.7)),
 }
 
 
@@ -50,12 +59,39 @@ def points_in_view(camera: Camera, count: int = 400) -> np.ndarray:
     return camera.center_m + rays.directions * rng.uniform(1, 50, (count, 1))
 
 
-def test_project_agrees_with_opencv(camera: Camera) -> None:
+def published(camera: Camera, point: np.ndarray) -> list[float]:
+    """The pixel of a camera-frame point, by the formulas of the models' papers and NVIDIA's documentation."""
+    x, y, z = map(float, point)
+    d1, r, theta = math.sqrt(x * x + y * y + z * z), math.hypot(x, y), math.atan2(math.hypot(x, y), z)
+    if camera.lens == "double_sphere":
+        xi, alpha = camera.distortion
+        d2 = math.sqrt(x * x + y * y + (xi * d1 + z) ** 2)
+        scale = 1 / (alpha * d2 + (1 - alpha) * (xi * d1 + z))
+    elif camera.lens == "eucm":
+        alpha, beta = camera.distortion
+        scale = 1 / (alpha * math.sqrt(beta * (x * x + y * y) + z * z) + (1 - alpha) * z)
+    elif camera.lens == "ftheta":
+        scale = sum(k * theta**n for n, k in enumerate((1.0, *camera.distortion), 1)) / r
+    else:
+        low, high = 0.0, 3.0
+        for _ in range(60):
+            middle = (low + high) / 2
+            if sum(k * middle**n for n, k in enumerate((1.0, *camera.distortion), 1)) < theta:
+                low = middle
+            else:
+                high = middle
+        scale = low / r
+    return [camera.K[0, 0] * x * scale + camera.K[0, 2], camera.K[1, 1] * y * scale + camera.K[1, 2]]
+
+
+def test_project_agrees_with_opencv_and_with_the_published_formulas(camera: Camera) -> None:
     points = points_in_view(camera)
     R = camera.cam2ego[:3, :3].T
     rvec, tvec = cv2.Rodrigues(R)[0], -R @ camera.center_m
     if camera.lens == "fisheye":
         want = cv2.fisheye.projectPoints(points[None], rvec, tvec, camera.K, np.array(camera.distortion))[0]
+    elif camera.lens_model.sees_behind:
+        want = np.array([published(camera, R @ (point - camera.center_m)) for point in points])
     else:
         want = cv2.projectPoints(points, rvec, tvec, camera.K, np.array(camera.distortion or (0.0,) * 4))[0]
     got = camera.project(points)
@@ -88,10 +124,9 @@ def test_points_behind_are_invalid_and_finite() -> None:
         behind = camera.center_m + np.array([[-5.0, 0, 0], [-5.0, 1.0, 0.3], [0.0, 0.0, 0.0]])
         got = camera.project(behind)
         assert np.isfinite(got.uv).all()
-        if camera.lens == "fisheye":  # a fisheye may see past 90 degrees, never straight back, nor its own centre
-            assert got.valid.tolist() == [False, True, False]
-        else:
-            assert not got.valid.any()
+        # A fisheye may see past 90 degrees, here to 168, never straight back, nor its own centre.
+        assert got.valid.tolist() == [False, camera.lens_model.fold_rad > math.radians(168), False]
+    assert camera.lens_model.fold_rad < math.radians(168) < make("ftheta").lens_model.fold_rad
 
 
 @pytest.mark.parametrize(
@@ -102,6 +137,17 @@ def test_points_behind_are_invalid_and_finite() -> None:
         ("radtan", (0.0, 0.0, 0.0, 0.0, 0.0, -0.25, 0.0, 0.0), 2.0),  # pole of 1 / (1 - r^2 / 4)
         ("fisheye", (-0.2, 0.0, 0.0, 0.0), 1 / np.sqrt(0.6)),  # 1 - 3 * 0.2 theta^2 = 0
         ("fisheye", (0.1, 0.0, 0.0, 0.0), np.pi),
+        ("ftheta", (-0.25, 0.0, 0.0, 0.0), 2.0),  # 1 - 2 * 0.25 theta = 0
+        ("ftheta", (0.0, 0.0, 0.0, 0.0), np.pi),
+        ("ftheta_backward", (-0.25, 0.0, 0.0, 0.0), 0.99),  # 1 - r / 2 = 0.1 at r = 1.8, r - r^2 / 4
+        ("ftheta_backward", (0.25, 0.0, 0.0, 0.0), np.pi),
+        ("double_sphere", (0.0, 0.0), np.pi / 2),  # a pinhole
+        ("double_sphere", (0.0, 0.5), np.pi),  # stereographic
+        ("double_sphere", (1.0, 0.0), np.pi),  # stereographic, too
+        ("double_sphere", (0.0, 0.75), np.arccos(-1 / 3)),  # w2 = w1 = 0.25 / 0.75
+        ("eucm", (0.75, 1.0), np.arccos(-1 / 3)),
+        ("eucm", (0.0, 2.0), np.pi / 2),
+        ("eucm", (0.5, 2.0), np.pi),
         ("pinhole", (), np.inf),
         ("radtan", (0.1, 0.0, 0.0, 0.0, 1e-310), np.inf),  # no overflow from a coefficient next to zero
         ("radtan", (-1e-310, 0.0, 0.0, 0.0), np.inf),
@@ -165,6 +211,73 @@ def test_impossible_coefficients_are_refused(lens: str, coefficient: float) -> N
         make("pinhole", lens=lens, distortion=(coefficient, 0.0, 0.0, 0.0))
 
 
+@pytest.mark.parametrize(
+    ("lens", "distortion", "message"),
+    [
+        ("double_sphere", (-1.2, 0.5), "expected xi from -0.99 to 1 and alpha from 0 to 1 for a double_sphere lens"),
+        ("ds", (0.1, 1.01), "alpha from 0 to 1"),
+        ("eucm", (0.5, 0.0), "expected alpha from 0 to 1 and beta from 0.001 to 1000 for a eucm lens"),
+        ("eucm", (-0.1, 1.0), "alpha from 0 to 1"),
+        ("eucm", (0.5, math.nan), "finite numbers"),
+        ("ftheta", (0.1, 0.2), "expected 4 coefficients for a ftheta lens, got 2"),
+    ],
+)
+def test_coefficients_out_of_a_lens_range_are_refused(lens: str, distortion: tuple[float, ...], message: str) -> None:
+    with pytest.raises(CalibrationError, match=f"camera 'c': distortion: .*{message}"):
+        make("pinhole", lens=lens, distortion=distortion)
+
+
+small = st.floats(-0.3, 0.3)
+drawn_lenses = st.one_of(
+    st.tuples(st.sampled_from(["fisheye", "ftheta", "ftheta_backward"]), st.tuples(small, small, small, small)),
+    st.tuples(st.just("double_sphere"), st.tuples(st.floats(-0.99, 1), st.floats(0, 1))),
+    st.tuples(st.just("eucm"), st.tuples(st.floats(0, 1), st.floats(0.1, 10))),
+)
+
+
+@examples(60, 600, lens=drawn_lenses)
+def test_directions_inside_the_cone_come_back(lens: tuple[str, tuple[float, ...]]) -> None:
+    """To 1e-6 px, up to 98 % of the way to the fold, in any image; nothing past it is seen."""
+    camera = make("pinhole", lens=lens[0], distortion=lens[1])
+    limit = camera.lens_model.fold_rad
+    angle = np.concatenate([np.linspace(0, 0.98 * limit, 60), np.linspace(1.001 * limit, np.pi, 5)[:-1]])
+    around = np.linspace(0, 9, len(angle))
+    rays = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], -1)
+    got = camera.project_cam(rays)
+    assert np.isfinite(got.uv).all() and got.valid[:60].all() and (limit > 3.13 or not got.valid[60:].any())
+    near = got.valid & (np.abs(got.uv) < 2e4).all(-1)
+    again = camera.unproject_cam(got.uv[near])
+    assert again.valid.all()  # within UNPROJECT_TOLERANCE_PX
+    np.testing.assert_allclose(again.directions, rays[near], atol=1e-7)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_kernels_project_as_classes(name: str) -> None:
+    """To 1/300 px in an image of 640 x 480; scaled parameters are those of the resized camera."""
+    camera, same = (make(name, roll_deg=0.0, azimuth_deg=a, position_m=(0, 0, 0)) for a in (25.0, -30.0))
+    rng = np.random.default_rng(3)
+    rays = rng.normal(size=(3, 60, 80)).astype(np.float32)
+    rays /= np.linalg.norm(rays, axis=0)
+    assert LENS_CODES.keys() == lens_module.LENSES.keys()
+    u, v, _ = source_pixels(same, rays, np.zeros((60, 80), np.float32), camera)
+    directions = np.moveaxis(rays, 0, -1) @ same.cam2ego[:3, :3].T
+    want = camera.project(directions)
+    inside = want.valid & camera.contains(want.uv, 500)
+    assert inside.mean() > 0.1 and np.abs(np.stack([u, v], -1) - want.uv)[inside].max() < 1 / 300
+    sure = np.abs(np.arccos(directions @ camera.cam2ego[:3, 2]) - camera.lens_model.fold_rad) > 1e-2
+    np.testing.assert_array_equal(u[sure] != FAR_AWAY_PX, want.valid[sure])
+    np.testing.assert_allclose(camera.parameters_at(0.5), camera.resize((240, 320)).parameters, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_resized_and_cropped_cameras_see_the_same(name: str) -> None:
+    """Pixels of the smaller image are the source's own, on a side with another scale, too."""
+    camera = make(name)
+    points = points_in_view(camera, 50)
+    want = (camera.project(points).uv + 0.5) * (0.5, 0.25) - 0.5 - (31, 7)
+    np.testing.assert_allclose(camera.resize((120, 320)).crop(7, 31, (90, 200)).project(points).uv, want, atol=1e-9)
+
+
 def test_cones_hold_the_rays_of_their_cells_and_are_narrow_at_the_border_of_the_image_circle() -> None:
     lens = Camera(
         name="lens", width_px=130, height_px=90, lens="fisheye", distortion=(0.0, 0.0, 0.0, 0.0),
@@ -208,7 +321,7 @@ class Stereographic(Lens):
 
 
 def test_a_lens_is_added_by_its_class_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(CalibrationError, match="lens: expected one of pinhole, radtan, fisheye, got 'stereographic'"):
+    with pytest.raises(CalibrationError, match=r"lens: expected one of pinhole, radtan, .*, eucm, got 'stereographic'"):
         make("pinhole", lens="stereographic")
     monkeypatch.setitem(lens_module.LENSES, "stereographic", Stereographic)
     camera = make("pinhole", lens="my_stereographic", K=None, horizontal_fov_deg=200.0, roll_deg=0.0)

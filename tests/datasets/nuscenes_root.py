@@ -14,7 +14,7 @@ import numpy as np
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets.nuscenes.tables import quaternion_from_rotation
+from arbiview_aug.cameras.rotations import quaternion_from_rotation
 from arbiview_aug.datasets.synthetic import Scene, make_scene
 from arbiview_aug.datasets.synthetic.render import Renderer
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
+from arbiview_aug.cameras.rotations import rotation_from_quaternion
 from arbiview_aug.datasets import FrameFolder, NuScenesDataset
 from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING
-from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion
 from arbiview_aug.errors import DataError, SampleTypeError
 
 Tables = dict[str, list[dict[str, Any]]]

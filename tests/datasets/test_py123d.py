@@ -169,14 +169,30 @@ def test_kitti_360s_fisheye_is_within_a_tenth_of_a_pixel() -> None:
     assert np.abs(camera.project(p).uv[:, 0] - theirs[0]).max() < 0.1  # 0.04 px
 
 
+def test_f_theta_is_the_forward_polynomial(tmp_path: Path) -> None:
+    """Numbers like those of a front wide camera of PhysicalAI-AV, written and read."""
+    forward, backward = np.array([0, 935.3, -9.6, 41, -32.5, 2]), np.array([0, 1.0692e-3, 1.2e-8, -4e-11, 3e-14, 0])
+    intrinsics = d.FThetaIntrinsics(956.2, 543.7, forward, backward)
+    wide = d.FThetaCameraMetadata("wide", d.CameraID.FTCAM_F0, intrinsics, 1920, 1080, pose(mounted(0, 1.6)))
+    write_log(tmp_path, more=(wide,))
+    camera = Py123dDataset(tmp_path)[0]["rig"]["wide"]
+    assert camera.lens == "ftheta" and camera.K[0, 0] == 935.3 and 110 < camera.fov_deg[0] < 125
+    angle, around = np.random.default_rng(2).uniform(0, [[1.0], [7.0]], (2, 400))
+    p = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], -1)
+    np.testing.assert_allclose(camera.project_cam(p).uv, wide.project_to_image(p)[0], atol=1e-9)
+    constant = SimpleNamespace(fw_poly=[3.0, 900.0, 0, 0, 0], cx=0.0, cy=0.0)
+    with pytest.raises(CalibrationError, match="camera 'wide': expected a forward polynomial without a constant term"):
+        logs._ftheta(constant, "camera 'wide'")
+
+
 def test_other_lenses_and_broken_logs_are_named(root: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"expected logs .folders with sync.arrow., found none"):
         Py123dDataset(tmp_path)
     with pytest.raises(DataError, match=r"expected cameras \['none'\], found none of them"):
         Py123dDataset(root, cameras=["none"])
     assert Py123dDataset(root, cameras=["front"])[0]["rig"].names == ["front"]
-    metadata = SimpleNamespace(camera_name="wide", camera_model=d.CameraModel.FTHETA)
-    with pytest.raises(CalibrationError, match=r"camera 'wide': expected a calibrated pinhole or .*, got ftheta"):
+    metadata = SimpleNamespace(camera_name="wide", camera_model=d.CameraModel.FTHETA, intrinsics=None)
+    with pytest.raises(CalibrationError, match=r"camera 'wide': expected a calibrated pinhole, .*, got ftheta"):
         logs._camera(metadata, "log")
     write_log(tmp_path)
     folder = tmp_path / "logs" / "kitti360_train" / "drive"

@@ -23,14 +23,20 @@ def small(limit: float) -> st.SearchStrategy[float]:
 @st.composite
 def cameras(draw: st.DrawFn, name: str, azimuth_deg: float | None = None, masked: bool = True) -> Camera:
     """A camera within 1.5 m of the others; one in three at the common centre, one in four with an own car in view."""
-    lens = draw(st.sampled_from(("pinhole", "pinhole", "radtan", "fisheye")))
+    lens = draw(st.sampled_from(("pinhole", "pinhole", "radtan", "wide")))
+    if lens == "wide":
+        lens = draw(st.sampled_from(("fisheye", "ftheta", "ftheta_backward", "double_sphere", "eucm")))
     h, w = draw(st.sampled_from(SIZES))
     values: dict[str, Any] = {"lens": lens, "width_px": w, "height_px": h}
     values["horizontal_fov_deg"] = draw(st.floats(*{"pinhole": (20, 150), "radtan": (20, 80)}.get(lens, (40, 200))))
     if lens == "radtan":
         values["distortion"] = tuple(draw(small(limit)) for limit in (0.2, 0.05, 0.01, 0.01, 0.02))
-    if lens == "fisheye":
+    if lens in ("fisheye", "ftheta", "ftheta_backward"):
         values["distortion"] = tuple(draw(small(0.02)) for _ in range(4))
+    elif lens == "double_sphere":
+        values["distortion"] = draw(st.floats(-0.5, 0.5)), draw(st.floats(0.3, 0.8))
+    elif lens == "eucm":
+        values["distortion"] = draw(st.floats(0.3, 0.8)), draw(st.floats(0.5, 2))
     values["position_m"] = draw(
         st.one_of(
             st.just(CENTER_M), st.just((1.0, 0.2, 2.1)), st.tuples(*(st.floats(a, a + 1.5) for a in (0, -0.75, 0.8)))

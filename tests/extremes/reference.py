@@ -35,17 +35,39 @@ class Seen(NamedTuple):
     unsure: np.ndarray
 
 
-def fisheye_radius(camera: Camera, theta: np.ndarray) -> np.ndarray:
-    """Distance from the axis in the normalised image, Kannala-Brandt."""
-    k1, k2, k3, k4 = camera.distortion
-    return theta + k1 * theta**3 + k2 * theta**5 + k3 * theta**7 + k4 * theta**9
+WIDE = ("fisheye", "ftheta", "ftheta_backward", "double_sphere", "eucm")
+"""Lenses that may see behind, whose radius is a function of the angle."""
+
+
+def wide_radius(camera: Camera, theta: np.ndarray) -> np.ndarray:
+    """Distance from the axis in the normalised image, by the angle off it; NaN past what the lens sees."""
+    if camera.lens == "fisheye":
+        k1, k2, k3, k4 = camera.distortion
+        return theta + k1 * theta**3 + k2 * theta**5 + k3 * theta**7 + k4 * theta**9
+    if camera.lens.startswith("ftheta"):
+        k2, k3, k4, k5 = camera.distortion
+
+        def polynomial(t: np.ndarray) -> np.ndarray:
+            return t + k2 * t**2 + k3 * t**3 + k4 * t**4 + k5 * t**5
+
+        if camera.lens == "ftheta":
+            return polynomial(theta)
+        scan = np.linspace(0, 20, 2_000_001)
+        angles = polynomial(scan)
+        flat = np.flatnonzero(np.diff(angles) < 0.1 * (scan[1] - scan[0]))
+        end = flat[0] if len(flat) else len(scan)
+        return np.interp(theta, angles[:end], scan[:end], right=np.nan)
+    xi, alpha, beta = (*camera.distortion, 1.0) if camera.lens == "double_sphere" else (0.0, *camera.distortion)
+    moved = xi + np.cos(theta)
+    divisor = alpha * np.sqrt(beta * np.sin(theta) ** 2 + moved**2) + (1 - alpha) * moved
+    return np.where(divisor > 0, np.sin(theta) / divisor, np.nan)
 
 
 def fold(camera: Camera) -> float:
-    """The point at which the lens's radius stops rising, scanned: an angle for fisheyes, its tangent for radtan."""
-    if camera.lens == "fisheye":
+    """The point at which the lens's radius stops rising, scanned: an angle for wide lenses, its tangent for radtan."""
+    if camera.lens in WIDE:
         scan = np.linspace(0, np.pi, 200_001)
-        radius = fisheye_radius(camera, scan)
+        radius = wide_radius(camera, scan)
     else:
         k1, k2, _, _, k3, k4, k5, k6 = (*camera.distortion, *(0.0,) * (8 - len(camera.distortion)))
         scan = np.linspace(0, 20, 200_001)
@@ -59,11 +81,11 @@ def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     """Pixels (..., 2) of camera-frame points or directions (..., 3), NaN where there is none, and where there is."""
     x, y, z = np.moveaxis(points / np.linalg.norm(points, axis=-1, keepdims=True), -1, 0)
     with np.errstate(all="ignore"):
-        if camera.lens == "fisheye":
+        if camera.lens in WIDE:
             r = np.hypot(x, y)
             theta = np.arctan2(r, z)
             valid = theta <= fold(camera)
-            scale = np.where(r > 0, fisheye_radius(camera, theta) / r, 1.0)
+            scale = np.where(r > 0, wide_radius(camera, theta) / r, 1.0)
             a, b = x * scale, y * scale
         else:
             valid = z > LEAST_DEPTH
@@ -87,12 +109,12 @@ def rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     v, u = np.mgrid[0.0 : camera.height_px, 0.0 : camera.width_px]
     pixels = np.stack([u, v, np.ones_like(u)], -1)
     a, b = np.moveaxis(np.linalg.solve(camera.K, pixels.reshape(-1, 3).T).T.reshape(pixels.shape)[..., :2], -1, 0)
-    if camera.lens == "fisheye":
+    if camera.lens in WIDE:
         radius = np.hypot(a, b)
         low, high = np.zeros(radius.shape), np.full(radius.shape, fold(camera))
         for _ in range(60):
             middle = (low + high) / 2
-            above = fisheye_radius(camera, middle) > radius
+            above = wide_radius(camera, middle) > radius
             low, high = np.where(above, low, middle), np.where(above, middle, high)
         scale = np.where(radius > 0, np.sin(low) / np.where(radius > 0, radius, 1), 1.0)
         directions = np.stack([a * scale, b * scale, np.cos(low)], -1)

@@ -98,7 +98,7 @@ def check(plan: RenderPlan, surface: str, scene: Scene, worst: Worst) -> None:
             q = inverse_distance(over, target.center_m, directions[won], float(1 / target.K[0, 0]))
             uv, valid = project_rays(source, directions[won], q, target.center_m - source.center_m)
             ahead = (directions[won] + q[:, None] * (target.center_m - source.center_m)) @ source.cam2ego[:3, 2] > 0
-            assert source.lens == "fisheye" or ahead.all(), f"{source.name} over {name}: what is read lies behind it"
+            assert source.lens in reference.WIDE or ahead.all(), f"{source.name} over {name}: read behind it"
             assert valid.all(), f"{source.name} over {name}: read behind the camera"
             outside = np.maximum(-uv, uv - (source.width_px - 1, source.height_px - 1)).max()
             assert outside <= MAP_TOLERANCE_PX, f"{source.name} over {name}: read {outside:.3g} px outside"
@@ -183,6 +183,10 @@ LENSES: dict[str, Any] = {
     "pinhole": {},
     "radtan": {"lens": "radtan", "distortion": (0.2, 0.05, 0.001, 0.001, 0.02)},
     "fisheye": {"lens": "fisheye", "distortion": (0.0,) * 4},
+    "ftheta": {"lens": "ftheta", "distortion": (-0.02, 0.05, -0.09, 0.03)},
+    "ftheta_backward": {"lens": "ftheta_backward", "distortion": (0.03, -0.08, 0.12, -0.04)},
+    "double_sphere": {"lens": "double_sphere", "distortion": (-0.2, 0.6)},
+    "eucm": {"lens": "eucm", "distortion": (0.6, 1.2)},
 }
 
 
@@ -197,11 +201,11 @@ def test_points_on_the_image_plane(lens: str) -> None:
     source = exact("s", FORWARD, 30.0, **LENSES[lens])
     beside = [[0.0, y, z] for y in (-9.0, 1e-3, 1e9) for z in (0.0, 1.5, 1e6)]
     got = source.project(beside)
-    assert np.isfinite(got.uv).all() and (got.valid == (lens == "fisheye")).all()
+    assert np.isfinite(got.uv).all() and (got.valid == (lens in reference.WIDE)).all()
     never = source.project([[0.0, 0.0, 1.5], [-5.0, 0.0, 1.5], [-1e-300, 0.0, 1.5], [-1e9, 0.0, 1.5]])
     assert np.isfinite(never.uv).all() and not never.valid.any()
     behind = source.project([[-1e-12 * y, y, 1.5] for y in (1.0, -3.0, 1e9)])
-    assert np.isfinite(behind.uv).all() and (behind.valid == (lens == "fisheye")).all()
+    assert np.isfinite(behind.uv).all() and (behind.valid == (lens in reference.WIDE)).all()
 
 
 @pytest.mark.parametrize("surface", ["infinity", "ground", "street", "lidar"])
@@ -213,7 +217,7 @@ def test_a_column_of_pixels_on_the_image_plane(lens: str, surface: str, worst: W
         plan = build_plan(Rig([source]), Rig([target]), geometry=surface, scene=SCENES[surface])
     check(plan, surface, SCENES[surface], worst)
     coverage = plan.targets[0].coverage
-    if lens == "fisheye":
+    if lens in reference.WIDE:
         assert coverage[:, 48].any() and coverage[:, :48].any(), "it sees past a right angle"
     else:
         assert not coverage[:, :49].any() and coverage[:, 49:].any()

@@ -16,6 +16,7 @@ import torch
 from hypothesis import strategies as st
 
 from arbiview_aug import Camera, Rig, RigRetarget
+from arbiview_aug.cameras.lens import LENSES
 from arbiview_aug.errors import ArbiviewError, CalibrationError
 from arbiview_aug.scene.scene import GEOMETRIES
 from tests.extremes.conftest import Worst
@@ -29,6 +30,8 @@ NUMBERS = MAGNITUDES + SPECIAL
 SIZES = ((1, 1), (1, 4000), (4000, 1), (2, 2), (3, 700), (1080, 1920))
 SIZE = (48, 64)
 
+_COEFFICIENTS = {"radtan": 5, "fisheye": 4, "ftheta": 4, "ftheta_backward": 4}  # of lenses whose coefficients may be 0
+
 Case = tuple[str, str, Any]  # the side (source or target), the field, its value
 
 
@@ -37,7 +40,7 @@ def cases() -> Iterator[Case]:
     for side in ("source", "target"):
         for field in ("fx", "fy", "f", "cx", "cy", "skew", "x", "y", "z", "xyz", "R", "R00", "ground_z_m"):
             yield from ((side, field, value) for value in NUMBERS)
-        for lens, count in (("radtan", 5), ("fisheye", 4)):
+        for lens, count in _COEFFICIENTS.items():
             yield from ((side, lens, (k, value)) for k in range(count) for value in NUMBERS)
         yield from ((side, "size", size) for size in SIZES)
         yield from ((side, "size and f", (size, f)) for size in SIZES for f in (1e-6, 1e3, 1e9))
@@ -59,8 +62,8 @@ def changed(camera: Camera, field: str, value: Any) -> Camera:
         pose[:3, :3] *= value
     elif field == "R00":  # nearly a rotation, and anything else
         pose[0, 0] += value
-    elif field in ("radtan", "fisheye"):
-        coefficients = [0.0] * (5 if field == "radtan" else 4)
+    elif field in _COEFFICIENTS:
+        coefficients = [0.0] * _COEFFICIENTS[field]
         coefficients[value[0]] = value[1]
         others = {"lens": field, "distortion": tuple(coefficients)}
     return Camera(name=camera.name, width_px=size[1], height_px=size[0], K=K, cam2ego=pose, **others)
@@ -165,8 +168,8 @@ coefficient = st.one_of(st.floats(-1.0, 1.0), st.floats(-1e-300, 1e-300), any_fl
 
 @st.composite
 def calibrations(draw: st.DrawFn) -> dict:
-    lens = draw(st.sampled_from(["pinhole", "radtan", "fisheye"]))
-    count = draw(st.sampled_from({"pinhole": [0], "radtan": [4, 5, 8], "fisheye": [4]}[lens]))
+    lens = draw(st.sampled_from(list(LENSES)))
+    count = draw(st.sampled_from(LENSES[lens].coefficient_counts))
     focal, centre = st.floats(1e-3, 1e7), st.floats(-1e5, 1e5)
     return {
         "azimuth_deg": draw(st.floats(-720, 720)),
@@ -198,9 +201,9 @@ def test_finite_or_refused(values: dict) -> None:
 
 
 @pytest.mark.parametrize("point", [[np.nan, 0, 0], [np.inf, 0, 0], [-np.inf, np.inf, 0], [1e308, 1e308, 1e308]])
-@pytest.mark.parametrize("lens", ["pinhole", "radtan", "fisheye"])
+@pytest.mark.parametrize("lens", LENSES)
 def test_points_that_are_not_finite_are_invalid(lens: str, point: list[float]) -> None:
-    distortion = () if lens == "pinhole" else (-0.01, 0.0, 0.0, 0.0)
+    distortion = {"pinhole": (), "double_sphere": (-0.2, 0.6), "eucm": (0.6, 1.2)}.get(lens, (-0.01, 0.0, 0.0, 0.0))
     view = camera("c", size=(48, 64), lens=lens, distortion=distortion)
     with np.errstate(all="ignore"):
         projection = view.project(point)

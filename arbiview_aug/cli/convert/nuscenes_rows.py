@@ -15,9 +15,10 @@ import numpy as np
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.rotations import quaternion_from_rotation
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR
-from arbiview_aug.datasets.nuscenes.tables import Row, Tables, quaternion_from_rotation
+from arbiview_aug.datasets.nuscenes.tables import Row, Tables
 from arbiview_aug.scene.boxes import draw_boxes, silhouette_sums
 
 LEVELS = ("1", "2", "3", "4")  # tokens of nuScenes' table ``visibility``: 0 to 40, 40 to 60, 60 to 80 and 80 to 100 %

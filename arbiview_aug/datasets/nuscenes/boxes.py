@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Tables, Tokens, poses_from
+from arbiview_aug.cameras.rotations import poses_from
+from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Tables, Tokens
 
 MAX_STEP_S = 1.5  # between annotations for a velocity; doubled for central differences (``NuScenes.box_velocity``)
 

@@ -14,9 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rotations import poses_from
 from arbiview_aug.datasets.drive import clock_message
 from arbiview_aug.datasets.nuscenes import tables as kinds
-from arbiview_aug.datasets.nuscenes.tables import TOKENS, Row, Tables, Tokens, poses_from
+from arbiview_aug.datasets.nuscenes.tables import TOKENS, Row, Tables, Tokens
 from arbiview_aug.errors import DataError, warn
 
 LIDAR = "LIDAR_TOP"  # sensor whose time and ego pose are the sample's

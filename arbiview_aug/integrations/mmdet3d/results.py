@@ -12,7 +12,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion
+from arbiview_aug.cameras.rotations import rotation_from_quaternion
 from arbiview_aug.errors import CalibrationError, SampleError, warn
 from arbiview_aug.integrations.mmdet3d.images import like_given as images_like
 from arbiview_aug.integrations.mmdet3d.images import norm_of, to_tensors

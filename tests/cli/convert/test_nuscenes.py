@@ -257,7 +257,7 @@ def test_names_of_other_sensors_are_refused(source: Path, tmp_path: Path, capsys
 
 
 def test_quaternions_come_back() -> None:
-    from arbiview_aug.datasets.nuscenes.tables import quaternion_from_rotation, rotation_from_quaternion
+    from arbiview_aug.cameras.rotations import quaternion_from_rotation, rotation_from_quaternion
 
     rng = np.random.default_rng(0)
     for q in [*rng.normal(size=(50, 4)), [0, 1, 0, 0], [1e-9, 0, 0, 1], [1, 0, 0, 0]]:
