@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.datasets.nuscenes.tables import poses_from
+from arbiview_aug.cameras.rotations import poses_from
 from arbiview_aug.errors import SampleError
 from arbiview_aug.integrations.mmdet3d.images import Norm, levels, normalised
 from arbiview_aug.integrations.mmdet3d.matrices import Views, padded, upper_triangular
