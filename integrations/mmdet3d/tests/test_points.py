@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from arbiview_aug import Lidar, RandomRig, RigRetarget, depth_maps, load_rig
-from arbiview_aug.datasets.nuscenes.tables import rotation_from_quaternion
+from arbiview_aug.cameras.rotations import rotation_from_quaternion
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
 from integrations.mmdet3d.fake_results import FORMS, LIDAR2EGO, QUEUES, Recording, recorded_drive, recording, source_rig
