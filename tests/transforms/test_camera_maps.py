@@ -13,7 +13,15 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import LENSES, Pinhole
 from arbiview_aug.transforms.camera_maps import CHANNELS, COVERAGE_KEY, camera_maps
 
-DISTORTION = {"pinhole": (), "radtan": (-0.1, 0.01, 1e-3, -1e-3), "fisheye": (-0.02, 0.003, 0.0, 0.0)}
+DISTORTION = {
+    "pinhole": (),
+    "radtan": (-0.1, 0.01, 1e-3, -1e-3),
+    "fisheye": (-0.02, 0.003, 0.0, 0.0),
+    "ftheta": (-0.0202, 0.0527, -0.0894, 0.032),
+    "ftheta_backward": (0.032, -0.0857, 0.125, -0.043),
+    "double_sphere": (-0.1996, 0.5925),
+    "eucm": (0.631, 1.043),
+}
 GROUND_Z_M = -0.3
 
 
