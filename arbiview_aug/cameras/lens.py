@@ -331,7 +331,9 @@ class _SphereLens(Lens):
 
     def undistort(self, xd: FloatArray, yd: FloatArray) -> FloatArray:
         xi, alpha, beta = self.kernel_coefficients
-        r2 = np.minimum(xd * xd + yd * yd, _MAX_COORDINATE)
+        shrink = np.minimum(1.0, math.sqrt(_MAX_COORDINATE) / np.maximum(np.hypot(xd, yd), 1e-300))
+        xd, yd = xd * shrink, yd * shrink  # far beyond all rays, where squares lose their digits
+        r2 = xd * xd + yd * yd
         root = np.sqrt(np.maximum(1 - (2 * alpha - 1) * beta * r2, 0.0))  # below 0 there is no ray
         z = (1 - beta * alpha**2 * r2) / np.maximum(alpha * root + 1 - alpha, 1e-12)
         scale = (z * xi + np.sqrt(z * z + (1 - xi**2) * r2)) / (z * z + r2)

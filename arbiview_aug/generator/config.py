@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
@@ -123,6 +124,7 @@ class AutoencoderConfig:
         check_fields(self, "1, or more without widths", lambda p: p == 1 or (p > 1 and not widths), "patch")
         check_fields(self, f"{pixels}, 3 patch²", lambda c: bool(widths) or c == pixels, "latent_channels")
         check_fields(self, f"a divisor of {widths}", lambda g: not any(w % g for w in widths), "norm_groups")
+        check_fields(self, "a positive number", lambda scale: 0 < scale < math.inf, "scale")
 
     @property
     def factor(self) -> int:
@@ -176,6 +178,7 @@ class GeneratorConfig:
         check_fields(self, "at least 1", lambda n: n >= 1, "steps")
         check_fields(self, "a value in (0, 1]", lambda s: 0 < s <= 1, "strength")
         check_fields(self, "a value in [0, 1]", lambda t: 0 <= t <= 1, "temperature")
+        check_fields(self, "a finite number", lambda x: -math.inf < x < math.inf, "guidance", "guidance_rescale")
 
     @property
     def unet_channels(self) -> int:
