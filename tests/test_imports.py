@@ -24,6 +24,7 @@ MOST_FOLDERS, MOST_FILES = 13, 10
 """At the top of the package."""
 
 HEAVY = (
+    "arbiview_aug.cameras.formats",
     "numba",
     "diffusers",
     "safetensors",

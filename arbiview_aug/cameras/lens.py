@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +42,7 @@ class Lens(ABC):
         is_rectilinear: Straight lines stay straight: two views from one centre differ by a homography.
         sees_behind: The field of view may exceed 180 degrees.
         distortion: The coefficients.
+        kernel_coefficients: Those that kernels read, eight at most; empty if they read ``distortion``.
     """
 
     name: ClassVar[str]
@@ -51,6 +52,7 @@ class Lens(ABC):
     is_rectilinear: ClassVar[bool] = False
     sees_behind: ClassVar[bool] = False
     distortion: tuple[float, ...] = ()
+    kernel_coefficients: ClassVar[Any] = ()
 
     @abstractmethod
     def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -72,11 +74,6 @@ class Lens(ABC):
     def fold_rad(self) -> float:
         """Angle off the optical axis of ``fold_limit``."""
         return self.fold_limit if self.sees_behind else math.atan(self.fold_limit)
-
-    @property
-    def kernel_coefficients(self) -> tuple[float, ...]:
-        """Coefficients as kernels read them, eight at most."""
-        return self.distortion
 
 
 class Pinhole(Lens):
@@ -314,10 +311,7 @@ class _SphereLens(Lens):
 
     sees_behind = True
 
-    @property
-    @abstractmethod
-    def kernel_coefficients(self) -> tuple[float, float, float]:
-        """ξ, α, β."""
+    kernel_coefficients: ClassVar[Any]  # ξ, α, β
 
     def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         xi, alpha, beta = self.kernel_coefficients

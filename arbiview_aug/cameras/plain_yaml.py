@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+from pathlib import Path
 from typing import Any
 
 import yaml
+
+from arbiview_aug.errors import CalibrationError
+
+MOST_BYTES = 1 << 20
+"""Largest calibration file: 8 KiB a camera. It is counted before it is read: YAML takes seconds a megabyte."""
 
 _MOST_VALUES = 200_000
 
@@ -24,6 +31,23 @@ _Loader.add_implicit_resolver(
     re.compile(r"^(?:[-+]?(?:[0-9]+\.[0-9]*|\.?[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf)|\.(?:nan|NaN))$"),
     list("-+.0123456789"),
 )
+
+
+def read_plain(path: Path, where: str, most_bytes: int = MOST_BYTES) -> Any:
+    """Plain data of a YAML or JSON file; CalibrationError, which begins with ``where``, if it is large or broken."""
+    refuse_large(path, where, most_bytes)
+    try:
+        text = path.read_text()
+        return parse_json(text) if path.suffix == ".json" else parse_yaml(text)
+    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
+        raise CalibrationError(f"{where}: expected plain YAML or JSON, got {' '.join(str(error).split())}") from None
+
+
+def refuse_large(path: Path, where: str, most_bytes: int = MOST_BYTES) -> None:
+    """Raise CalibrationError for a file of more bytes."""
+    size = os.path.getsize(path)
+    if size > most_bytes:
+        raise CalibrationError(f"{where}: expected at most {most_bytes >> 20} MiB, got {size / 2**20:.1f} MiB")
 
 
 def parse_json(text: str | bytes) -> Any:

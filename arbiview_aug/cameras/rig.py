@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -30,13 +30,13 @@ from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.lidar import Lidar
-from arbiview_aug.cameras.plain_yaml import parse_json, parse_yaml
+from arbiview_aug.cameras.plain_yaml import parse_yaml
 from arbiview_aug.cameras.shipped import shipped_rigs
 from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import CalibrationError, shown
 
-MOST_CAMERAS, MOST_LIDARS, MOST_BYTES = 128, 32, 1 << 20
-"""Largest rig, and largest rig file: 8 KiB a camera."""
+MOST_CAMERAS, MOST_LIDARS = 128, 32
+"""Largest rig."""
 
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
 
@@ -271,10 +271,15 @@ class Rig:
 
 
 def load_rig(name_or_path: str | Path) -> Rig:
-    """A shipped rig by name (see ``shipped_rigs``), or a rig file (YAML or JSON; read with YAML's safe loader).
+    """A shipped rig by name (see ``shipped_rigs``), a rig file (YAML or JSON), or another tool's calibration.
+
+    Recognised are files and folders of ROS (CameraInfo as camera_calibration writes it, with tf), Kalibr, COLMAP,
+    OpenCV, nuScenes, Argoverse 2 and Waymo, with a file ``mounting.yaml`` beside them that holds what they lack
+    (docs/rigs.md). Files are read by safe parsers.
 
     Raises:
-        CalibrationError: An unknown name, a missing or unreadable file, or an impossible calibration.
+        CalibrationError: An unknown name, a missing or unreadable file, or an impossible or ambiguous calibration.
+        ImportError: Argoverse 2's files without pyarrow.
     """
     if not isinstance(name_or_path, str | Path):
         got = type(name_or_path).__name__
@@ -284,19 +289,35 @@ def load_rig(name_or_path: str | Path) -> Rig:
         return Rig.from_dict(parse_yaml(text), where=f"rig {name_or_path}")
     path = Path(name_or_path)
     where = f"rig file {path}"
-    if not os.path.isfile(path):  # unlike Path.is_file, False for a name that is too long
+    if not (os.path.isfile(path) or os.path.isdir(path)):  # unlike Path.is_file, False for a name that is too long
         raise CalibrationError(
             f"{where}: expected a file or one of the shipped rigs ({', '.join(shipped_rigs())}), found neither"
         )
-    if os.path.getsize(path) > MOST_BYTES:  # counted before it is read: YAML takes seconds a megabyte
-        got = f"{os.path.getsize(path) / 2**20:.1f}"
-        raise CalibrationError(f"{where}: expected at most {MOST_CAMERAS} cameras in 1 MiB, got a file of {got} MiB")
-    try:
-        text = path.read_text()
-        data = parse_json(text) if path.suffix == ".json" else parse_yaml(text)
-    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
-        raise CalibrationError(f"{where}: expected plain YAML or JSON, got {' '.join(str(error).split())}") from None
-    return Rig.from_dict(data, folder=path.parent, where=where)
+    from arbiview_aug.cameras.formats.calibration import read_calibration
+
+    return Rig.from_dict(read_calibration(path, where), folder=path.parent, where=where)
+
+
+def save_rig(
+    rig: Rig, path: str | Path, *, format: Literal["rig", "ros", "kalibr", "colmap"] = "rig"
+) -> Path:
+    """Write a rig for another tool, or as a rig file. Returns the path.
+
+    Args:
+        rig: The cameras; their masks and the rig's scanners are in rig files alone.
+        path: A file for ``rig``, a folder for the others, which ``load_rig`` reads.
+        format: ``rig``: see ``Rig.save``. ``ros``: a CameraInfo YAML for each camera, and ``tf_static.yaml``.
+            ``kalibr``: ``camchain.yaml``, whose cameras are cam0, cam1 and so on. ``colmap``: ``cameras.txt`` and
+            ``images.txt``. ``mounting.yaml`` beside them has the road and the ego frame.
+
+    Raises:
+        CalibrationError: A lens or a skew that the format has not.
+    """
+    if format == "rig":
+        return rig.save(path)
+    from arbiview_aug.cameras.formats.calibration import write_calibration
+
+    return write_calibration(rig.to_dict(), Path(path), format)
 
 
 def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -> Camera:

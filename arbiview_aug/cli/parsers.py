@@ -181,8 +181,8 @@ def evaluate() -> argparse.ArgumentParser:
 def inspect() -> argparse.ArgumentParser:
     parser = command_parser("inspect", "Show rigs: tables, differences, a picture.", "nuscenes waymo")
     rigs = (
-        f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), or data as other commands' --data "
-        "takes it: the rig of its first frame"
+        f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), another tool's calibration "
+        "(docs/rigs.md), or data as other commands' --data takes it: the rig of its first frame"
     )
     parser.add_argument("rigs", nargs="+", metavar="RIG", help=rigs)
     parser.add_argument("--output", default="inspect.png", metavar="FILE", help="the picture")

@@ -1,0 +1,159 @@
+"""A file a camera: ROS's CameraInfo with tf, and OpenCV's FileStorage."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from arbiview_aug.cameras.formats.entries import camera_entry, lens_of, write_yaml
+from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting, pose_of
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.plain_yaml import MOST_BYTES, parse_yaml, read_plain, refuse_large
+from arbiview_aug.cameras.rotations import quaternion_from_rotation
+from arbiview_aug.errors import CalibrationError
+
+TF = "tf_static.yaml"
+_EGO_FRAMES = ("base_link", "base_footprint")  # REP 105
+_OPTICAL = ("_optical_frame", "_optical", "")  # suffixes of a camera's frame; REP 103
+
+# sensor_msgs/distortion_models.hpp; camera_calibration writes the first three
+_ROS_LENSES = {"plumb_bob": "radtan", "rational_polynomial": "radtan", "equidistant": "fisheye", "fisheye": "fisheye"}
+
+# Keys of OpenCV's samples, of its interactive tool and of its documentation.
+_MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix")
+_COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs")
+_WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
+
+
+def camera_files(folder: Path) -> list[Path]:
+    """A folder's files with a camera matrix."""
+    files = (path for path in sorted(folder.glob("*.*")) if path.suffix in (".yaml", ".yml", ".xml"))
+    return [path for path in files if path.name not in (MOUNTING, TF) and _has(path, _MATRIX)]
+
+
+def is_file_storage(path: Path) -> bool:
+    """Whether a file is OpenCV's FileStorage: XML, or YAML with its own header or tags."""
+    return path.suffix == ".xml" or _has(path, ("%YAML:", "!!opencv-"))
+
+
+def _has(path: Path, words: Iterable[str]) -> bool:
+    with path.open("rb") as file:
+        text = file.read(MOST_BYTES)
+    return any(word.encode() in text for word in words)
+
+
+def read_camera_files(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+    """Cameras of ROS's CameraInfo YAML or OpenCV's FileStorage: of one file, or of all of a folder.
+
+    Sources: camera_calibration_parsers of ROS; the sample calib3d/camera_calibration of OpenCV.
+    """
+    files, tf = (camera_files(path), path / TF) if path.is_dir() else ([path], path.parent / TF)
+    frames = _tf_poses(tf) if tf.is_file() else {}
+    return [_opencv(file, mounting) if is_file_storage(file) else _ros(file, mounting, frames) for file in files]
+
+
+def _ros(path: Path, mounting: Mounting, frames: Mapping[str, FloatArray]) -> dict[str, Any]:
+    data = read_plain(path, path.name)
+    name, model = data.get("camera_name") or path.stem, data["distortion_model"]
+    if model not in _ROS_LENSES:
+        raise CalibrationError(f"camera {name!r}: distortion_model: expected {', '.join(_ROS_LENSES)}, got {model!r}")
+    pose = next((frames[frame] for end in _OPTICAL if (frame := name.strip("/") + end) in frames), None)
+    if pose is None or name in mounting.poses:
+        there = f", or a frame {name}_optical_frame to {TF} as `ros2 topic echo /tf_static` prints it"
+        pose = mounting.pose(name, there)
+    K, coefficients = (data[key]["data"] for key in ("camera_matrix", "distortion_coefficients"))
+    size = data["image_width"], data["image_height"]
+    return camera_entry(name, size, np.reshape(K, (3, 3)), pose, _ROS_LENSES[model], coefficients)
+
+
+def _tf_poses(path: Path) -> dict[str, FloatArray]:
+    """Poses (4, 4) in the ego frame of the frames of TFMessages, as ``topic echo`` of ROS 1 and 2 prints them."""
+    refuse_large(path, path.name)
+    documents = re.split(r"^---\s*$", path.read_text(), flags=re.MULTILINE)
+    links = {}
+    for one in (one for document in documents if document.strip() for one in parse_yaml(document)["transforms"]):
+        child, parent = (frame.strip("/") for frame in (one["child_frame_id"], one["header"]["frame_id"]))
+        links[child] = parent, pose_of(child, one["transform"])
+    poses = {}
+    for frame in links:
+        pose, at = np.eye(4), frame
+        for _ in links:  # no more steps than links, which may run in a circle
+            if at in links and at not in _EGO_FRAMES:
+                at, pose = links[at][0], links[at][1] @ pose
+        if at in _EGO_FRAMES:
+            poses[frame] = pose
+    if not poses:
+        got = ", ".join(sorted({parent for parent, _ in links.values()})) or "no transforms"
+        expected = f"{' or '.join(_EGO_FRAMES)}: x forward, y left, z up"
+        raise CalibrationError(f"{TF}: which frame is the ego frame? Expected {expected}; got {got}: rename it there")
+    return poses
+
+
+def _opencv(path: Path, mounting: Mounting) -> dict[str, Any]:
+    data = _file_storage(path)
+    values = ([data[key] for key in keys if key in data] for keys in (_MATRIX, _COEFFICIENTS, _WIDTH, _HEIGHT))
+    matrices, coefficients, widths, heights = values
+    if not matrices:
+        raise CalibrationError(f"{path.name}: expected a matrix {' or '.join(_MATRIX)}, found none")
+    name = str(data.get("camera_name", path.stem)).strip('"')
+    size = (float(widths[0]), float(heights[0])) if widths and heights else mounting.size(name)
+    lens = "fisheye" if float(data.get("fisheye_model", 0)) else "radtan"
+    numbers = coefficients[0]["data"] if coefficients else ()
+    return camera_entry(name, size, np.reshape(matrices[0]["data"], (3, 3)), mounting.pose(name), lens, numbers)
+
+
+def _file_storage(path: Path) -> Mapping[str, Any]:
+    """Plain data of a FileStorage; cv2's own reader is not used, as broken files corrupt its memory (OpenCV 5.0)."""
+    refuse_large(path, path.name)
+    text = path.read_text()
+    if path.suffix != ".xml":
+        data: Mapping[str, Any] = parse_yaml(re.sub(r"\A%YAML.*|!!opencv-(nd-)?matrix", "", text))
+        return data
+    if re.search("<!(?!--)", text):  # entities could name other files, or multiply
+        raise CalibrationError(f"{path.name}: expected XML as OpenCV writes it, without declarations, got <!")
+    try:
+        nodes = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise CalibrationError(f"{path.name}: expected XML, got {error}") from None
+    matrices = {node.tag: {"data": _numbers(node.findtext("data"))} for node in nodes if len(node)}
+    return {node.tag: (node.text or "").strip() for node in nodes} | matrices
+
+
+def _numbers(text: str | None) -> list[float]:
+    return [float(number) for number in (text or "").split()]
+
+
+def write_ros(data: Mapping[str, Any], folder: Path) -> None:
+    """Write a CameraInfo YAML for each camera, as camera_calibration does, and the poses as a TFMessage."""
+    files, transforms = {}, []
+    for k, camera in enumerate(data["cameras"]):
+        name, K, pose = camera["name"], np.array(camera["K"]), np.array(camera["cam2ego"])
+        lens, coefficients = lens_of(camera, "ROS", {"radtan": 8, "fisheye": 4})
+        if lens == "radtan":
+            coefficients += [0.0] * (5 - len(coefficients))
+        model = "equidistant" if lens == "fisheye" else "plumb_bob" if len(coefficients) == 5 else "rational_polynomial"
+        file = name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", name) else f"camera {k}"
+        files[f"{file}.yaml"] = {
+            **{"image_width": camera["width"], "image_height": camera["height"], "camera_name": name},
+            "camera_matrix": _node(K),
+            **{"distortion_model": model, "distortion_coefficients": _node([coefficients])},
+            "rectification_matrix": _node(np.eye(3)),
+            "projection_matrix": _node(np.column_stack([K, np.zeros(3)])),
+        }
+        at, wxyz = pose[:3, 3].tolist(), quaternion_from_rotation(pose[:3, :3]).tolist()
+        transform = {"translation": dict(zip("xyz", at, strict=True)), "rotation": dict(zip("wxyz", wxyz, strict=True))}
+        frames = {"header": {"frame_id": _EGO_FRAMES[0]}, "child_frame_id": f"{name}_optical_frame"}
+        transforms.append({**frames, "transform": transform})
+    files |= {TF: {"transforms": transforms}, MOUNTING: {"ground_z_m": data["ground_z_m"]}}
+    for file, content in files.items():
+        write_yaml(folder / file, content)
+
+
+def _node(values: Any) -> dict[str, Any]:
+    values = np.asarray(values, float)
+    return {"rows": values.shape[0], "cols": values.shape[1], "data": values.ravel().tolist()}

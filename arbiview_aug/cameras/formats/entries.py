@@ -1,0 +1,59 @@
+"""Cameras as in a rig file: made of what readers found, and taken apart for writers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.errors import CalibrationError
+
+
+def camera_entry(
+    name: str, size: tuple[Any, Any], K: Any, cam2ego: FloatArray, lens: str = "pinhole", coefficients: Any = ()
+) -> dict[str, Any]:
+    """A camera as in a rig file, of (width, height); polynomials of zeros are no distortion."""
+    coefficients = [float(k) for k in np.ravel(coefficients)]
+    if lens == "radtan" and not any(coefficients[8:]):
+        coefficients = coefficients[:8]  # the others are OpenCV's thin prism and tilt
+    has_lens = lens != "pinhole" and (lens != "radtan" or any(coefficients))
+    return {
+        **{"name": name, "width": size[0], "height": size[1]},
+        **{"K": np.asarray(K, float).tolist(), "cam2ego": cam2ego.tolist()},
+        "distortion": {"model": lens, "coeffs": coefficients} if has_lens else None,
+    }
+
+
+def matrix(fx: float, fy: float, cx: float, cy: float) -> list[list[float]]:
+    """(3, 3) intrinsics."""
+    return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
+
+
+def focal_and_center(camera: Mapping[str, Any], tool: str) -> list[float]:
+    """fx, fy, cx and cy of a rig file's camera, for a tool that knows no skew."""
+    (fx, skew, cx), (_, fy, cy), _ = camera["K"]
+    if skew:
+        raise CalibrationError(f"camera {camera['name']!r}: expected K without skew for {tool}, got {skew}")
+    return [fx, fy, cx, cy]
+
+
+def lens_of(camera: Mapping[str, Any], tool: str, most: Mapping[str, int]) -> tuple[str, list[float]]:
+    """Lens and coefficients of a rig file's camera for a tool that has ``most`` coefficients of each of its lenses.
+
+    A pinhole is a polynomial of four zeros.
+    """
+    bent = camera["distortion"] or {"model": "radtan", "coeffs": [0.0] * 4}
+    lens, coefficients = bent["model"], list(bent["coeffs"])
+    if len(coefficients) > most.get(lens, -1):
+        known = ", ".join(f"{name} ({count} coefficients at most)" for name, count in most.items())
+        got = f"{lens} with {len(coefficients)}"
+        raise CalibrationError(f"camera {camera['name']!r}: expected a lens of {tool}: pinhole, {known}, got {got}")
+    return lens, coefficients
+
+
+def write_yaml(path: Path, data: Any) -> None:
+    path.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120))

@@ -1,0 +1,109 @@
+"""``mounting.yaml``: what other tools' calibrations lack, such as the ego frame, the road and a metric scale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.plain_yaml import read_plain
+from arbiview_aug.cameras.rotations import poses_from
+from arbiview_aug.cameras.validation import checked_numbers, checked_pose
+from arbiview_aug.errors import CalibrationError, shown
+
+MOUNTING = "mounting.yaml"
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """The file's content.
+
+    Attributes:
+        poses: cam2ego (4, 4) by camera; in the file, rows or tf's ``{translation: {x, ...}, rotation: {x, ..., w}}``.
+        ground_z_m: Height of the road in the ego frame.
+        metres_per_unit: Scale of a calibration without one (COLMAP).
+        images: Image of each camera (COLMAP).
+        sizes: ``{width, height}`` of all cameras, or by camera.
+        tokens: Rows of calibrated_sensor.json to read, all by default (nuScenes).
+    """
+
+    poses: Mapping[str, FloatArray] = field(default_factory=dict)
+    ground_z_m: float | None = None
+    metres_per_unit: float | None = None
+    images: Mapping[str, str] = field(default_factory=dict)
+    sizes: Mapping[str, Any] = field(default_factory=dict)
+    tokens: Sequence[str] = ()
+
+    @classmethod
+    def read(cls, folder: Path) -> Mounting:
+        """The file in a folder; empty without one.
+
+        Raises:
+            CalibrationError: Unknown keys or impossible values.
+        """
+        path = folder / MOUNTING
+        data = read_plain(path, MOUNTING) if path.is_file() else {}
+        keys = cls.__dataclass_fields__
+        if not isinstance(data, Mapping) or not set(data) <= set(keys):
+            raise CalibrationError(f"{MOUNTING}: expected the keys {', '.join(keys)}, got {shown(data)}")
+        for key in {"poses", "images", "sizes"} & set(data):
+            if not isinstance(data[key], Mapping):
+                raise CalibrationError(f"{MOUNTING}: {key}: expected values by camera, got {shown(data[key])}")
+        poses = {str(name): pose_of(str(name), value) for name, value in data.get("poses", {}).items()}
+        scale = data.get("metres_per_unit")
+        if scale is not None and not checked_numbers(MOUNTING, "metres_per_unit", [scale], 1, "a number")[0] > 0:
+            raise CalibrationError(f"{MOUNTING}: metres_per_unit: expected a positive number, got {scale}")
+        return cls(**{**data, "poses": poses})
+
+    def pose(self, name: str, instead: str = "") -> FloatArray:
+        """A camera's pose, or CalibrationError with the question where it is."""
+        if name not in self.poses:
+            raise CalibrationError(
+                f"camera {name!r}: where is it on the vehicle? Write its pose, camera to ego, to {MOUNTING} beside the "
+                f"calibration, poses: {{{name}: [[r, r, r, x], [r, r, r, y], [r, r, r, z], [0, 0, 0, 1]]}}{instead}"
+            )
+        return self.poses[name]
+
+    def size(self, name: str) -> tuple[Any, Any]:
+        """Width and height of a camera's images, or CalibrationError with the question how large they are."""
+        size = self.sizes if "width" in self.sizes else self.sizes.get(name)
+        if not isinstance(size, Mapping) or size.keys() != {"width", "height"}:
+            raise CalibrationError(
+                f"camera {name!r}: how large are its images? Write it to {MOUNTING} beside the calibration: "
+                f"sizes: {{{name}: {{width: 1600, height: 900}}}}, or sizes: {{width: 1600, height: 900}} for all"
+            )
+        return size["width"], size["height"]
+
+    def mounted(self, relative: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """cam2ego of cameras whose poses (4, 4) in a common frame are known, by the pose of one of them."""
+        if not relative:
+            raise CalibrationError("expected at least one camera, got none")
+        given = [name for name in relative if name in self.poses]
+        if not given:
+            self.pose(next(iter(relative)), "; one camera's is enough, the others follow")
+        if len(given) == len(relative):
+            return {name: self.poses[name] for name in relative}
+        if len(given) > 1:
+            got = ", ".join(given)
+            raise CalibrationError(f"{MOUNTING}: poses: expected those of one camera or of all, got {got}")
+        to_ego = self.poses[given[0]] @ np.linalg.inv(relative[given[0]])
+        return {name: to_ego @ pose for name, pose in relative.items()}
+
+
+def pose_of(name: str, value: Any) -> FloatArray:
+    """(4, 4) pose of a matrix, or of a translation and a quaternion as tf writes them."""
+    if isinstance(value, Mapping):
+        try:
+            numbers = [value["translation"][axis] for axis in "xyz"] + [value["rotation"][axis] for axis in "wxyz"]
+        except (LookupError, TypeError):
+            expected = "a 4x4 matrix, or {translation: {x, y, z}, rotation: {x, y, z, w}}"
+            raise CalibrationError(f"camera {name!r}: pose: expected {expected}, got {shown(value)}") from None
+        checked_numbers(name, "pose", numbers, 7, "seven finite numbers")
+        if not any(numbers[3:]):
+            raise CalibrationError(f"camera {name!r}: pose: expected a quaternion, got zeros")
+        value = poses_from(numbers)
+    return checked_pose(name, value, "pose")
