@@ -71,7 +71,7 @@ def test_the_devkit_sees_what_was_converted_as_we_retarget_it(root: Path, tmp_pa
         pytest.skip("python -m arbiview_aug has no command 'convert' yet")
     target = load_rig("waymo").undistorted().resized((64, 96))
     rig_file, output = target.save(tmp_path / "target.yaml"), tmp_path / "converted"
-    command = [sys.executable, "-m", "arbiview_aug", "convert", "--data", f"nuscenes:{root}"]
+    command = [sys.executable, "-m", "arbiview_aug", "convert", "--data", f"nuscenes:{root}", "--points", "source"]
     subprocess.run([*command, "--target", str(rig_file), "--output", str(output)], check=True, timeout=500)
     (tables,) = output.glob("v1.0-*")
     entries = devkit_boxes(python_of("nuscenes"), output, tables.name, tmp_path / "boxes.json")
