@@ -97,19 +97,27 @@ def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
     for left, right in pairwise(edges):
         y, pieces = 0, []
         for slot in sorted((slot for slot in layout.slots if slot.x == left), key=lambda slot: slot.y):
-            image = _halved(images[slot.source].float(), slot.level, images[0].dtype)
-            pieces.append(torch.nn.functional.pad(image, (0, right - left - slot.size[1], slot.y - y, 0)))
+            image = _halved(images[slot.source], slot.level)
+            pieces.append(_padded(image, right - left - slot.size[1], slot.y - y, 0))
             y = slot.y + slot.size[0]
-        parts.append(torch.nn.functional.pad(torch.cat(pieces, 2), (0, 0, 0, rows - y)))
-    return torch.cat(parts, 3)
+        parts.append(_padded(torch.cat(pieces, 2), 0, 0, rows - y))
+    return (parts[0] if len(parts) == 1 else torch.cat(parts, 3)).float()
 
 
-def _halved(image: torch.Tensor, level: int, dtype: torch.dtype) -> torch.Tensor:
+def _padded(image: torch.Tensor, right: int, above: int, below: int) -> torch.Tensor:
+    """An image with zeros beside it; itself, not a copy, without any."""
+    is_padded = right or above or below
+    return torch.nn.functional.pad(image, (0, right, above, below)) if is_padded else image
+
+
+def _halved(image: torch.Tensor, level: int) -> torch.Tensor:
+    """An image halved so many times, float32; the image itself for none."""
+    halved = image.float() if level else image
     for _ in range(level):
-        image = torch.nn.functional.avg_pool2d(image, 2)
-        if dtype == torch.uint8:
-            image = torch.floor(image + 0.5)  # as OpenCV rounds halved uint8 images
-    return image
+        halved = torch.nn.functional.avg_pool2d(halved, 2)
+        if image.dtype == torch.uint8:
+            halved = torch.floor(halved + 0.5)  # as OpenCV rounds halved uint8 images
+    return halved
 
 
 def _grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:
