@@ -83,15 +83,19 @@ def read_calibration(path: Path, where: str) -> Any:
         CalibrationError: A file that is not as its tool writes it, or that lacks what ``mounting.yaml`` could say.
         ImportError: Argoverse 2's files without pyarrow.
     """
+    data = None
     try:
-        name = recognised(path, where)
+        name = _by_files(path)
+        if name is None and not os.path.isdir(path):
+            data = read_plain(path, where)
+            name = _by_content(data)
     except OSError as error:
         raise CalibrationError(f"{where}: expected files that can be read, got {error}") from None
     if name is None and os.path.isdir(path):
         known = "; ".join(f"{form.tool} ({' or '.join(form.files)})" for form in FORMATS.values() if form.files)
         raise CalibrationError(f"{where}: expected a rig file, or a folder of {known}; ROS or OpenCV (a file a camera)")
     if name is None:
-        return read_plain(path, where)
+        return data
     form, folder = FORMATS[name], path if os.path.isdir(path) else path.parent
     try:
         mounting = Mounting.read(folder)
@@ -111,6 +115,12 @@ def read_calibration(path: Path, where: str) -> Any:
 
 def recognised(path: Path, where: str = "calibration") -> str | None:
     """Name in ``FORMATS`` of a file or folder; None for a rig file and for anything else."""
+    name = _by_files(path)
+    return name if name or os.path.isdir(path) else _by_content(read_plain(path, where))
+
+
+def _by_files(path: Path) -> str | None:
+    """Name of a folder's format by its files, or of a file's by its name and first words."""
     if os.path.isdir(path):
         for name, form in FORMATS.items():
             if any(any(path.glob(pattern)) for pattern in form.files):
@@ -120,9 +130,11 @@ def recognised(path: Path, where: str = "calibration") -> str | None:
     by_name = {".txt": "colmap", ".bin": "colmap", ".feather": "argoverse2", datasets.CALIBRATED_SENSOR: "nuscenes"}
     if path.name in by_name or path.suffix in by_name:
         return by_name.get(path.name) or by_name[path.suffix]
-    if camera_files.is_file_storage(path):
-        return "opencv"
-    data = read_plain(path, where)
+    return "opencv" if camera_files.is_file_storage(path) else None
+
+
+def _by_content(data: Any) -> str | None:
+    """Name of the format of a file's plain data."""
     if datasets.waymo_entries(data):
         return "waymo"
     if isinstance(data, Mapping) and "camera_matrix" in data:
