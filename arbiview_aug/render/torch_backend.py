@@ -111,8 +111,8 @@ def _padded(image: torch.Tensor, right: int, above: int, below: int) -> torch.Te
 
 
 def _halved(image: torch.Tensor, level: int) -> torch.Tensor:
-    """An image halved so many times, float32; the image itself for none."""
-    halved = image.float() if level else image
+    """An image halved so many times, float32; uint8 as it is for none. Autocast joins no float16."""
+    halved = image.float() if level or image.is_floating_point() else image
     for _ in range(level):
         halved = torch.nn.functional.avg_pool2d(halved, 2)
         if image.dtype == torch.uint8:
