@@ -211,7 +211,7 @@ class Camera:
         K[:2] *= scale
         K[:2, 2] += (scale - 1) / 2
         fold = min(self.lens_model.fold_limit, 1e12)
-        coefficients = self.lens_model.kernel_coefficients or self.distortion
+        coefficients = self.lens_model.kernel_coefficients
         further = (*coefficients, *(0.0,) * (8 - len(coefficients)))
         return np.array([K[0, 0], K[0, 1], K[0, 2], K[1, 1], K[1, 2], fold, *further], np.float32)
 

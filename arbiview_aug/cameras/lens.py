@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +42,6 @@ class Lens(ABC):
         is_rectilinear: Straight lines stay straight: two views from one centre differ by a homography.
         sees_behind: The field of view may exceed 180 degrees.
         distortion: The coefficients.
-        kernel_coefficients: Those that kernels read, eight at most; empty if they read ``distortion``.
     """
 
     name: ClassVar[str]
@@ -52,7 +51,6 @@ class Lens(ABC):
     is_rectilinear: ClassVar[bool] = False
     sees_behind: ClassVar[bool] = False
     distortion: tuple[float, ...] = ()
-    kernel_coefficients: ClassVar[Any] = ()
 
     @abstractmethod
     def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -69,6 +67,11 @@ class Lens(ABC):
     @abstractmethod
     def fold_limit(self) -> float:
         """Limit of the radial function's rising branch: an angle (lenses that see behind) or its tangent (others)."""
+
+    @property
+    def kernel_coefficients(self) -> tuple[float, ...]:
+        """The coefficients that kernels read, eight at most."""
+        return self.distortion
 
     @property
     def fold_rad(self) -> float:
@@ -311,7 +314,10 @@ class _SphereLens(Lens):
 
     sees_behind = True
 
-    kernel_coefficients: ClassVar[Any]  # ξ, α, β
+    @property
+    @abstractmethod
+    def kernel_coefficients(self) -> tuple[float, float, float]:
+        """ξ, α, β."""
 
     def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         xi, alpha, beta = self.kernel_coefficients
@@ -373,7 +379,8 @@ class EUCM(_SphereLens):
 
     @property
     def kernel_coefficients(self) -> tuple[float, float, float]:
-        return 0.0, *self.distortion  # type: ignore[return-value]
+        alpha, beta = self.distortion
+        return 0.0, alpha, beta
 
 
 LENSES: dict[str, type[Lens]] = {
