@@ -39,23 +39,34 @@ class Returns(NamedTuple):
     range_m: FloatArray
 
 
+class _Polar(NamedTuple):
+    elevation_deg: FloatArray
+    azimuth_deg: FloatArray
+    distance_m: FloatArray
+
+
+def _polar(lidar: Lidar, points: FloatArray) -> _Polar:
+    """Directions and distances (P,) of points as a scanner sees them."""
+    local = (points[:, :3].astype(np.float64) - lidar.center_m) @ lidar.lidar2ego[:3, :3]
+    distance = np.maximum(np.linalg.norm(local, axis=1), 1e-9)
+    elevation = np.degrees(np.arcsin(np.clip(local[:, 2] / distance, -1, 1)))
+    return _Polar(elevation, np.degrees(np.arctan2(local[:, 1], local[:, 0])), distance)
+
+
 def returns_of(lidar: Lidar, points: FloatArray) -> Returns:
     """The points of a cloud that a scanner's rays could meet.
 
     Points more than half a spacing beyond the outermost beams and columns are left out, as are those out of range.
     """
     beams, columns = lidar.shape
-    local = (points[:, :3].astype(np.float64) - lidar.center_m) @ lidar.lidar2ego[:3, :3]
-    distance = np.maximum(np.linalg.norm(local, axis=1), 1e-9)
-    azimuth = np.degrees(np.arctan2(local[:, 1], local[:, 0])) - lidar.azimuth_deg[0]
-    column = np.rint(azimuth % 360 / lidar.azimuth_step_deg).astype(int)
+    elevation, azimuth, distance = _polar(lidar, points)
+    column = np.rint((azimuth - lidar.azimuth_deg[0]) % 360 / lidar.azimuth_step_deg).astype(int)
     if columns * lidar.azimuth_step_deg > 360 - lidar.azimuth_step_deg:  # all around
         column %= columns
     order = np.argsort(lidar.elevations_deg)
     table = np.array(lidar.elevations_deg)[order]
     edges = (table[1:] + table[:-1]) / 2
     ends = (table[0] - (edges[0] - table[0]), 2 * table[-1] - edges[-1]) if beams > 1 else (table[0] - 1, table[0] + 1)
-    elevation = np.degrees(np.arcsin(np.clip(local[:, 2] / distance, -1, 1)))
     inside = (elevation >= ends[0]) & (elevation <= ends[1]) & (column < columns)
     inside &= (distance >= lidar.range_m[0]) & (distance <= lidar.range_m[1])
     return Returns(order[np.searchsorted(edges, elevation[inside])], column[inside], distance[inside])
@@ -146,8 +157,7 @@ def rings_dropped(a: Lidar, b: Lidar, points: FloatArray) -> FloatArray:
 
     It shifts heights too, so that roads coincide: in the ego frame they do.
     """
-    local = (points[:, :3].astype(float) - a.center_m) @ a.lidar2ego[:3, :3]
-    elevation = np.degrees(np.arcsin(local[:, 2] / np.linalg.norm(local, axis=1)))
+    elevation = _polar(a, points).elevation_deg
     table = np.array(a.elevations_deg)
     kept = np.unique(np.abs(np.array(b.elevations_deg)[:, None] - table).argmin(1))
     return np.asarray(points[np.isin(np.abs(elevation[:, None] - table).argmin(1), kept)])
@@ -156,15 +166,14 @@ def rings_dropped(a: Lidar, b: Lidar, points: FloatArray) -> FloatArray:
 def measured_near(a: Lidar, b: Lidar, points: FloatArray) -> BoolArray:
     """(beams, columns) rays of ``b`` within half a line and a column spacing of which ``a`` measured a point."""
     half = np.diff(np.sort(a.elevations_deg)).mean() / 2, a.azimuth_step_deg / 2 + _GRID_DEG
-    local = (points[:, :3].astype(float) - b.center_m) @ b.lidar2ego[:3, :3]
-    elevation = np.degrees(np.arcsin(local[:, 2] / np.linalg.norm(local, axis=1)))
-    row, column = np.rint((elevation + 90) / _GRID_DEG), np.rint(np.degrees(np.arctan2(*local.T[1::-1])) / _GRID_DEG)
+    elevation, azimuth, _ = _polar(b, points)
+    row, column = np.rint((elevation + 90) / _GRID_DEG), np.rint(azimuth / _GRID_DEG)
     turn = round(360 / _GRID_DEG)
     grid = np.zeros((turn // 2 + 1, turn), np.uint8)
     grid[row.astype(int), column.astype(int) % turn] = 1
     up, aside = (round(angle / _GRID_DEG) for angle in half)
     around = np.pad(grid, ((0, 0), (aside, aside)), mode="wrap")
     near = cv2.dilate(around, np.ones((2 * up + 1, 2 * aside + 1), np.uint8))[:, aside : aside + turn]
-    azimuth = b.azimuth_deg[0] + b.azimuth_step_deg * np.arange(b.shape[1])
+    columns_deg = b.azimuth_deg[0] + b.azimuth_step_deg * np.arange(b.shape[1])
     rows = np.rint((np.array(b.elevations_deg) + 90) / _GRID_DEG).astype(int)
-    return np.asarray(near[rows[:, None], np.rint(azimuth / _GRID_DEG).astype(int) % turn] > 0)
+    return np.asarray(near[rows[:, None], np.rint(columns_deg / _GRID_DEG).astype(int) % turn] > 0)
