@@ -38,18 +38,23 @@ def cv2_wheels() -> dict[str, str]:
     return {name: version for name in _CV2_WHEELS if (version := installed_version(name)) is not None}
 
 
+def cv2_conflict() -> str | None:
+    """What is wrong if several wheels provide ``cv2``, and the fix."""
+    wheels = cv2_wheels()
+    if len(wheels) < 2:
+        return None
+    versions = " and ".join(f"{name} {version}" for name, version in wheels.items())
+    return (
+        f"{versions} are installed together: they overwrite each other's files, so cv2 may break or change with the "
+        f"order of installation. Keep one: pip uninstall -y {' '.join(wheels)} && pip install {list(wheels)[-1]}"
+    )
+
+
 @cache
 def warn_about_cv2_wheels() -> None:
     """Warn once per process if several wheels provide ``cv2``."""
-    wheels = cv2_wheels()
-    if len(wheels) < 2:
-        return
-    versions = " and ".join(f"{name} {version}" for name, version in wheels.items())
-    warn(
-        f"{versions} are installed together: they overwrite each other's files, so cv2 may break or change with the "
-        f"order of installation. Keep one: pip uninstall -y {' '.join(wheels)} && pip install {list(wheels)[-1]}",
-        RuntimeWarning,
-    )
+    if (conflict := cv2_conflict()) is not None:
+        warn(conflict, RuntimeWarning)
 
 
 def imported(name: str) -> Any:

@@ -23,7 +23,7 @@ from arbiview_aug.cameras.kernels import project_image
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.arguments import gathered_warnings
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.environment import cv2_wheels, installed_version, is_intact, versions, working_s
+from arbiview_aug.environment import cv2_conflict, cv2_wheels, installed_version, is_intact, versions, working_s
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 _CALLS = 5
@@ -62,13 +62,10 @@ def _lines(size: tuple[int, int]) -> Iterator[Line]:
 
 
 def _opencv() -> Line:
-    wheels = [f"{name} {version}" for name, version in cv2_wheels().items()]
-    if len(wheels) == 1:
-        return True, f"OpenCV: {wheels[0]}, alone"
-    if not wheels:
-        return True, f"OpenCV: {cv2.__version__}, not from a wheel: {cv2.__file__}"
-    fix = f"pip uninstall -y {' '.join(cv2_wheels())}, then install one"
-    return False, f"OpenCV: {', '.join(wheels)} overwrite each other's files: {fix}"
+    if (conflict := cv2_conflict()) is not None:
+        return False, f"OpenCV: {conflict}"
+    wheels = [f"{name} {version}, alone" for name, version in cv2_wheels().items()]
+    return True, f"OpenCV: {wheels[0] if wheels else f'{cv2.__version__}, not from a wheel: {cv2.__file__}'}"
 
 
 def _kernels(folder: Path) -> Line:

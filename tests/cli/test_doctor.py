@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from arbiview_aug import environment
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli import doctor
 
@@ -33,7 +34,8 @@ def test_a_sound_installation(
 def test_wheels_of_opencv(
     wheels: dict[str, str], is_fine: bool, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(doctor, "cv2_wheels", lambda: wheels)
+    for module in (doctor, environment):
+        monkeypatch.setattr(module, "cv2_wheels", lambda: wheels)
     line = doctor._opencv()
     assert line[0] == is_fine and text in line[1]
 
