@@ -22,7 +22,7 @@ from arbiview_aug.integrations.mmdet3d.results import geometry, moved_points
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
 from arbiview_aug.scene.boxes import checked_boxes, points_by_box
 from arbiview_aug.transforms.scans import retarget_points
-from arbiview_aug.transforms.settings import is_number
+from arbiview_aug.transforms.settings import checked_probability
 
 DataDict = dict[str, Any]
 
@@ -72,9 +72,7 @@ class RigRetargetDataDict:
         to = self.lidar2ego if target_lidar2ego is None else _upright_pose("target_lidar2ego", target_lidar2ego)
         self.ego2lidar = np.asarray(np.linalg.inv(self.lidar2ego))
         self.move = np.linalg.inv(to) @ self.lidar2ego  # to the frame of what comes out
-        if not is_number(p) or not 0 <= p <= 1:
-            raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
-        self.p, self.min_points_in_gt = float(p), int(min_points_in_gt)
+        self.p, self.min_points_in_gt = checked_probability(p), int(min_points_in_gt)
 
     def __call__(self, data_dict: Mapping[str, Any]) -> DataDict:
         """A new ``data_dict``.

@@ -22,6 +22,7 @@ from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.sample.batching import gathered, stacked
 from arbiview_aug.sample.inputs import Frame, read_frames
 from arbiview_aug.sample.training import lift_mask
+from arbiview_aug.transforms.settings import checked_stride
 
 CHANNELS = {"rays": 3, "moments": 3, "road": 1, "road_gradient": 1, "pixel_angle": 1, "height": 1}
 """Channels of each map."""
@@ -64,9 +65,7 @@ class CameraMaps(torch.nn.Module):
         if isinstance(maps, str) or not maps:
             raise ValueError(f"maps: expected names among {', '.join(CHANNELS)}, got {maps!r}")
         self.maps = tuple(choice("maps", name, CHANNELS) for name in maps)
-        if not isinstance(stride, int) or stride < 1:
-            raise ValueError(f"stride: expected a number of pixels from 1, got {stride!r}")
-        self.stride = stride
+        self.stride = checked_stride("stride", stride)
         self._cache: LRUCache[Any, torch.Tensor] = LRUCache(_MAX_BYTES, lambda maps: maps.nbytes)
 
     @property

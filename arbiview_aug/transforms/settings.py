@@ -58,8 +58,8 @@ class SampleKeys:
             object.__setattr__(self, name, tuple(value))
         for key in self.extra:
             choice("SampleKeys.extra", key, EXTRA_KEYS)
-        if self.camera_maps is not None and (not isinstance(self.camera_maps, int) or self.camera_maps < 1):
-            raise ValueError(f"SampleKeys.camera_maps: expected a stride in pixels from 1, got {self.camera_maps!r}")
+        if self.camera_maps is not None:
+            checked_stride("SampleKeys.camera_maps", self.camera_maps)
         if not is_number(self.ignore_index):
             raise ValueError(f"SampleKeys.ignore_index: expected a number, got {self.ignore_index!r}")
         choice("SampleKeys.frame", self.frame, ("source", "target"))
@@ -116,13 +116,26 @@ def checked_instance(name: str, value: Any, kind: type[T]) -> T:
     return value
 
 
-def checked_p(p: Any, size: Any) -> float:
-    """A probability; ValueError for anything else, or where samples are skipped and ``size`` is None."""
+def checked_probability(p: Any) -> float:
+    """A number from 0 to 1; ValueError for anything else."""
     if not is_number(p) or not 0 <= p <= 1:
         raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
+    return float(p)
+
+
+def checked_stride(name: str, value: Any) -> int:
+    """A whole number of pixels from 1; ValueError for anything else."""
+    if not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name}: expected a number of pixels from 1, got {value!r}")
+    return value
+
+
+def checked_p(p: Any, size: Any) -> float:
+    """A probability; ValueError for anything else, or where samples are skipped and ``size`` is None."""
+    probability = checked_probability(p)
     if p < 1 and size is None:
         raise ValueError("p < 1: expected size=(h, w), so that skipped samples collate with retargeted ones")
-    return float(p)
+    return probability
 
 
 def checked_params(params: Any) -> dict[str, float]:

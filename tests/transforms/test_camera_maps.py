@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,15 +107,10 @@ def test_every_lens_has_a_case() -> None:
 
 
 def sample_of(*sizes: tuple[int, int]) -> dict[str, object]:
-    cameras = [looking_down().resize(size) for size in sizes]
-    rig = Rig([Camera(**{**vars_of(c), "name": f"camera {k}"}) for k, c in enumerate(cameras)], ground_z_m=GROUND_Z_M)
+    cameras = [replace(looking_down().resize(size), name=f"camera {k}") for k, size in enumerate(sizes)]
+    rig = Rig(cameras, ground_z_m=GROUND_Z_M)
     images = [torch.zeros(3, *size, dtype=torch.uint8) for size in sizes]
     return {"images": torch.stack(images) if len({*sizes}) == 1 else images, "rig": rig, "token": "a"}
-
-
-def vars_of(camera: Camera) -> dict[str, object]:
-    names = ("width_px", "height_px", "K", "cam2ego", "lens", "distortion", "mask")
-    return {name: getattr(camera, name) for name in names}
 
 
 def test_samples_before_and_after_retargeting() -> None:
@@ -135,8 +131,8 @@ def test_samples_before_and_after_retargeting() -> None:
 
 
 def test_sizes_that_differ_give_a_list() -> None:
-    out = CameraMaps(("rays",), stride=16)(sample_of((64, 96), (50, 96)))["camera_maps"]
-    assert [tuple(maps.shape) for maps in out] == [(3, 4, 6), (3, 4, 6)] or [m.shape[1] for m in out] == [4, 4]
+    out = CameraMaps(("rays",), stride=16)(sample_of((64, 96), (40, 96)))["camera_maps"]
+    assert isinstance(out, list) and [tuple(maps.shape) for maps in out] == [(3, 4, 6), (3, 3, 6)]
 
 
 def test_calibration_that_comes_back_is_computed_once() -> None:
