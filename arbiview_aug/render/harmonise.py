@@ -247,8 +247,8 @@ def _held_out_db(pixels: _Pixels, overlaps: Overlaps) -> float:
 
 
 _SEAM_DARK, _MIN_SEAM_PIXELS, _SEAM_PRIOR, _MAX_SEAM_LOG_GAIN = 0.12, 4, 0.1, 0.15
-"""Along seams: ``DARK``, higher because flare lifts shadows by more than what lies beside them; pixels that a group needs
-of those that are read; the weight of no change, where a group without noise has 1; the bound of what log-gains gain."""
+"""Along seams: ``DARK``, higher since flare lifts shadows by more than what is beside them; pixels that a group needs;
+the weight of no change, where a group without noise has 1; the bound of what is added to log-gains."""
 
 _SMOOTH = np.exp(-np.subtract.outer(np.arange(SEAM_ROWS), np.arange(SEAM_ROWS)) ** 2)
 """Weights between the parts of a view's height."""
