@@ -246,9 +246,9 @@ def _held_out_db(pixels: _Pixels, overlaps: Overlaps) -> float:
     return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-10))))
 
 
-_SEAM_DARK, _MIN_SEAM_PIXELS, _SEAM_PRIOR, _MAX_SEAM_LOG_GAIN = 0.12, 4, 0.1, 0.15
-"""Along seams: ``DARK``, higher since flare lifts shadows by more than what is beside them; pixels that a group needs;
-the weight of no change, where a group without noise has 1; the bound of what is added to log-gains."""
+_MIN_SEAM_PIXELS, _SEAM_PRIOR, _MAX_SEAM_LOG_GAIN = 4, 0.1, 0.15
+"""Along seams: pixels that a group needs; the weight of no change, where a group without noise has 1; the bound of what
+is added to log-gains."""
 
 _SMOOTH = np.exp(-np.subtract.outer(np.arange(SEAM_ROWS), np.arange(SEAM_ROWS)) ** 2)
 """Weights between the parts of a view's height."""
@@ -269,7 +269,7 @@ def match_seams(
     """
     samples = plan.seam_samples
     pixels = _read(images, samples.at, samples.runs)
-    number, ratio, spread = pair_ratios(pixels, samples.reads, _SEAM_DARK, BRIGHT).T
+    number, ratio, spread = pair_ratios(pixels, samples.reads, DARK, BRIGHT).T
     # Neighbouring pixels err together: four count once.
     noise = 4 * spread**2 / np.maximum(number, 1) / _PAIR_LOG_ERROR**2
     weight = (number >= _MIN_SEAM_PIXELS) / (1 + noise)
@@ -342,8 +342,8 @@ class Harmoniser:
         if not self.estimates:
             return [tone_curves(np.repeat(np.array(gains)[:, None], h, 1)) for h in heights]
         mains = [gains[view.pairs[0].source] if view.pairs else 1.0 for view in views]
-        matched = match_seams(plan, images, np.log(np.divide.outer(gains, mains)).T)
-        curves = {h: tone_curves(np.exp(_at_rows(matched, h))) for h in set(heights)}
+        matched = np.exp(match_seams(plan, images, np.log(np.divide.outer(gains, mains)).T))
+        curves = {h: tone_curves(_at_rows(matched, h)) for h in set(heights)}
         return [curves[h][view] for view, h in enumerate(heights)]
 
 

@@ -373,7 +373,7 @@ class RenderPlan:
     def seam_samples(self) -> SeamSamples:
         """What two sources show of the blended bands."""
         sources, rows = len(self.source), [np.empty((0, 6), np.int64)]
-        rank = np.full((len(self.targets), sources + 1), sources)
+        rank = np.full((len(self.targets), sources), sources)
         for number, view in enumerate(self.targets):
             rank[number, [pair.source for pair in view.pairs]] = range(len(view.pairs))
             h, w = view.source_camera.shape

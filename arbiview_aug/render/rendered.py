@@ -66,8 +66,8 @@ def render_opencv(
     for number, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
         h, w = target.source_camera.shape
         if curves is not None:
-            of_rows = curves[number].astype(np.float32).reshape(len(images), -1, 2)
-            tones = np.broadcast_to(of_rows, (len(images), h, 2)).reshape(-1, 2)
+            tones = curves[number].astype(np.float32)
+            tones = tones.reshape(-1, 2) if tones.ndim == 3 else tones.repeat(h, 0)
         change = np.zeros((h, w), np.float32) if seams is not None else None
         if seams is not None:
             seams.append(torch.from_numpy(change))
