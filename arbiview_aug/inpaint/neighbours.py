@@ -243,7 +243,8 @@ def fill_from_neighbours(
     The frame's maps, and its images where possible, are written into. Its tone curves serve the neighbours' cameras
     too: the holes overlap the current views too little to estimate others. ``images`` are its sources.
     """
-    tones = None if rendered.curves is None else rendered.curves[[hole.target for hole in fills.holes]]
+    curves = rendered.curves
+    tones = None if curves is None else [curves[hole.target][:, hole.box[0]] for hole in fills.holes]
     neighbours = []
     for fill in fills.fills:
         sources = neighbour_images(fill.neighbour, images, warn)

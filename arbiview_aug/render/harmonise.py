@@ -1,4 +1,4 @@
-"""Photometric harmonisation: one gain per source camera, so that neighbours agree where they overlap.
+"""Photometric harmonisation: gains of the source cameras, so that neighbours agree where they overlap.
 
 A view keeps the exposure of its main source, the one that gives most of its pixels; the others are brought to it.
 
@@ -6,6 +6,9 @@ The log-ratios of adjacent cameras in their half-way views, over the street surf
 joint weighted least squares with a prior towards no change. Only the overlap's *even* chessboard tiles are read, since
 evaluation scores the odd ones. Half of each tile (a finer chessboard) is fitted; the other half decides whether the
 gains are accepted.
+
+Vignetting and flare differ between the top and the bottom of an image. Both sources show the blended bands along a
+view's seams, so a sample of these says what the gain of each part of the view's height still lacks.
 """
 
 from __future__ import annotations
@@ -25,7 +28,7 @@ from arbiview_aug.cameras.rays import adjacent_pairs, ego_rays, half_way_view, o
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.plan import ViewPlan
+from arbiview_aug.render.plan import SEAM_ROWS, RenderPlan
 from arbiview_aug.scene.surface import Street
 
 _VIEW_SIZE, _TILE_PX = (225, 400), 16  # the evaluation's views and tiles at half resolution
@@ -42,6 +45,10 @@ LEVELS = np.float32(255), np.float32(0.5)
 
 SHARES = np.float32(1), np.float32(0)
 """Those for images in [0, 1]."""
+
+
+Curves = Sequence[npt.NDArray[np.float64]]
+"""Tone curves of each view for each of N sources: (N, h, 2), those of each row, or (N, 2) for all rows."""
 
 
 def tone_curves(gains: npt.ArrayLike, knee: float = KNEE) -> npt.NDArray[np.float64]:
@@ -65,7 +72,7 @@ PRIOR_LOG_GAIN = 0.5
 _PAIR_LOG_ERROR = 0.03
 """Error floor of a pair's log-ratio (lens shading, parallax); bounds the weight of a large overlap."""
 
-DARK, _BRIGHT = 0.03, 0.92
+DARK, BRIGHT = 0.03, 0.92
 """Shares of the scale: darker pixels are noise and black level, those with a brighter channel may be saturated."""
 
 _MIN_PIXELS = 200
@@ -161,8 +168,8 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
     none = (1.0,) * len(rig)
     if not overlaps.pairs.size:
         return PhotometricReport(none, False, "no two cameras overlap enough")
-    pixels = _read([images[k] for k in overlaps.order], overlaps)
-    ratios = pair_ratios(pixels, overlaps.fitted, DARK, _BRIGHT)
+    pixels = _read([images[k] for k in overlaps.order], overlaps.at, overlaps.runs)
+    ratios = pair_ratios(pixels, overlaps.fitted, DARK, BRIGHT)
     enough = _STEP_PX**2 * ratios[:, 0] >= _MIN_PIXELS
     if not enough.any():
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
@@ -183,18 +190,18 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
     return PhotometricReport(tuple(gains[np.argsort(overlaps.order)].tolist()), True, reason)
 
 
-def _read(images: Sequence[torch.Tensor], overlaps: Overlaps) -> _Pixels:
-    """All readings (K, 3) of images (3, H, W), float32 in [0, 1]."""
+def _read(images: Sequence[torch.Tensor], at: npt.NDArray[np.int64], runs: npt.NDArray[np.int64]) -> _Pixels:
+    """Readings (K, 3) of images (3, H, W), float32 in [0, 1]; arguments as in ``Overlaps``."""
     from arbiview_aug.render.photometry_kernels import read_pixels
 
     dtype, scale = (torch.uint8, 1 / 255) if images[0].dtype == torch.uint8 else (torch.float32, 1.0)
-    pixels = np.empty((len(overlaps.at), 3), np.float32)
-    for image, (first, end, _) in zip(images, overlaps.runs.tolist(), strict=True):
-        at, image = overlaps.at[first:end], image.detach()
+    pixels = np.empty((len(at), 3), np.float32)
+    for image, (first, end, _) in zip(images, runs.tolist(), strict=True):
+        places, image = at[first:end], image.detach()
         if image.device.type == "cpu":
-            read_pixels(image.to(dtype).numpy(), at, np.float32(scale), pixels[first:end])
+            read_pixels(image.to(dtype).numpy(), places, np.float32(scale), pixels[first:end])
         else:
-            rows, columns = torch.from_numpy(at).to(image.device).unbind(1)
+            rows, columns = torch.from_numpy(places).to(image.device).unbind(1)
             pixels[first:end] = (image[:, rows, columns].T.float() * scale).nan_to_num(0, 0, 0).cpu()
     return pixels
 
@@ -206,13 +213,8 @@ def pair_ratios(pixels: _Pixels, reads: npt.NDArray[np.int64], dark: float, brig
     """
     from arbiview_aug.render.photometry_kernels import log_ratios
 
-    ratios, counts = np.empty(reads.shape[1:]), np.empty(reads.shape[1], np.int64)
-    log_ratios(pixels, reads, dark, bright, ratios, counts)
-    measured = np.zeros((len(counts), 3))
-    for row, ratio, count in zip(measured, ratios, counts.tolist(), strict=True):
-        if count:
-            middle = np.median(ratio[:count])
-            row[:] = count, middle, 1.4826 * np.median(np.abs(ratio[:count] - middle))
+    measured = np.zeros((reads.shape[1], 3))
+    log_ratios(pixels, reads, dark, bright, measured)
     return measured
 
 
@@ -242,6 +244,49 @@ def _held_out_db(pixels: _Pixels, overlaps: Overlaps) -> float:
     errors = np.empty(overlaps.held_out.shape[1])
     pair_errors(pixels, overlaps.held_out, errors)
     return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-10))))
+
+
+_MIN_SEAM_PIXELS, _SEAM_PRIOR, _MAX_SEAM_LOG_GAIN = 4, 0.1, 0.15
+"""Along seams: pixels that a group needs; the weight of no change, where a group without noise has 1; the bound of what
+is added to log-gains."""
+
+_SMOOTH = np.exp(-np.subtract.outer(np.arange(SEAM_ROWS), np.arange(SEAM_ROWS)) ** 2)
+"""Weights between the parts of a view's height."""
+
+
+def match_seams(
+    plan: RenderPlan, images: Sequence[torch.Tensor], log_gains: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Add to log-gains what each part of a view's height lacks at its seams: vignetting and flare vary down an image.
+
+    Args:
+        plan: The plan for these images' rig.
+        images: N images (3, H, W): uint8, or float in [0, 1]; on any device.
+        log_gains: (M, N) of each source in each view, which bring it to the main source on the whole.
+
+    Returns:
+        (M, N, ``SEAM_ROWS``); those of a view's main source are as given.
+    """
+    samples = plan.seam_samples
+    pixels = _read(images, samples.at, samples.runs)
+    number, ratio, spread = pair_ratios(pixels, samples.reads, DARK, BRIGHT).T
+    # Neighbouring pixels err together: four count once.
+    noise = 4 * spread**2 / np.maximum(number, 1) / _PAIR_LOG_ERROR**2
+    weight = (number >= _MIN_SEAM_PIXELS) / (1 + noise)
+    matched = np.repeat(log_gains[..., None], SEAM_ROWS, 2)
+    for view, other, first, end in samples.seams:
+        part, near = samples.part[first:end], weight[first:end]
+        lack = ratio[first:end] + matched[view, samples.better[first:end], part] - log_gains[view, other]
+        change = _SMOOTH[:, part] @ (near * lack) / (_SMOOTH[:, part] @ near + _SEAM_PRIOR)
+        matched[view, other] += change.clip(-_MAX_SEAM_LOG_GAIN, _MAX_SEAM_LOG_GAIN)
+    return matched
+
+
+def _at_rows(parts: npt.NDArray[np.float64], h: int) -> npt.NDArray[np.float64]:
+    """Values (..., h) of rows from those of parts (..., ``SEAM_ROWS``), linear between their middles."""
+    place = ((np.arange(h) + 0.5) / h * SEAM_ROWS - 0.5).clip(0, SEAM_ROWS - 1)
+    above = place.astype(int).clip(max=SEAM_ROWS - 2)
+    return parts[..., above] + (place - above) * (parts[..., above + 1] - parts[..., above])
 
 
 Harmonise = bool | Sequence[float]
@@ -282,20 +327,24 @@ class Harmoniser:
         overlaps = self._overlaps.get(rig.content_key, lambda: find_overlaps(rig))
         return estimate_gains(rig, images, overlaps=overlaps)
 
-    def curves(
-        self, rig: Rig, images: Sequence[torch.Tensor], views: Sequence[ViewPlan]
-    ) -> npt.NDArray[np.float64] | None:
-        """The tone curves (M, N, 2) of each camera in each view; None if the N images (3, H, W) stay as they are.
+    def curves(self, rig: Rig, images: Sequence[torch.Tensor], plan: RenderPlan) -> Curves | None:
+        """The tone curves (N, h, 2) of the cameras in each view; None if the N images (3, H, W) stay as they are.
 
         Estimated gains leave the source that wins most pixels of a view as it is.
         """
+        views = plan.targets
         if self.estimates and all(len(view.pairs) + len(view.bands) < 2 for view in views):
             return None
         gains = self.report(rig, images).gains
         if all(gain == 1 for gain in gains):
             return None
-        mains = [gains[view.pairs[0].source] if view.pairs and self.estimates else 1.0 for view in views]
-        return tone_curves(np.divide.outer(gains, mains).T)
+        heights = [view.source_camera.shape[0] for view in views]
+        if not self.estimates:
+            return [tone_curves(np.repeat(np.array(gains)[:, None], h, 1)) for h in heights]
+        mains = [gains[view.pairs[0].source] if view.pairs else 1.0 for view in views]
+        matched = np.exp(match_seams(plan, images, np.log(np.divide.outer(gains, mains)).T))
+        curves = {h: tone_curves(_at_rows(matched, h)) for h in set(heights)}
+        return [curves[h][view] for view, h in enumerate(heights)]
 
 
 _MAX_GIVEN_GAIN = 1e3  # ten stops

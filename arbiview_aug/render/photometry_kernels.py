@@ -21,7 +21,7 @@ def read_pixels(image: Any, at: Any, scale: Any, pixels: Any) -> None:
 
 
 @compiled
-def log_ratios(pixels: Any, reads: Any, dark: float, bright: float, ratios: Any, counts: Any) -> None:
+def log_ratios(pixels: Any, reads: Any, dark: float, bright: float, measured: Any) -> None:
     """Log-ratios between the two readings of each pair's pixels, where they count.
 
     Args:
@@ -29,9 +29,10 @@ def log_ratios(pixels: Any, reads: Any, dark: float, bright: float, ratios: Any,
         reads: (2, P, L) two readings of each pixel; K after a pair's last one.
         dark: Pixels count above this mean value,
         bright: and below this value in every channel.
-        ratios: (P, L) float64, written: those of pixels that count come first.
-        counts: (P,) int64, written: how many those are.
+        measured: (P, 3) float64, written where pixels count: their number, and the median and spread of their
+            log-ratios.
     """
+    ratios = np.empty(reads.shape[2])
     for p in range(reads.shape[1]):
         n = 0
         for j in range(reads.shape[2]):
@@ -41,9 +42,12 @@ def log_ratios(pixels: Any, reads: Any, dark: float, bright: float, ratios: Any,
             light, other = one[0] + one[1] + one[2], two[0] + two[1] + two[2]
             most = max(one[0], one[1], one[2], two[0], two[1], two[2])
             if min(light, other) > 3 * dark and most < bright:
-                ratios[p, n] = np.log(np.float64(light) / np.float64(other))
+                ratios[n] = np.log(np.float64(light) / np.float64(other))
                 n += 1
-        counts[p] = n
+        if n:
+            middle = np.median(ratios[:n])
+            measured[p, 0], measured[p, 1] = n, middle
+            measured[p, 2] = 1.4826 * np.median(np.abs(ratios[:n] - middle))
 
 
 @compiled
@@ -90,7 +94,7 @@ def tone(values: Any, runs: Any, curves: Any, top: Any, rounding: Any) -> None:
 def warm_up() -> None:
     """Compile these kernels, or load them from numba's cache."""
     reads, pixels, curve = np.zeros((2, 1, 1), np.int64), np.ones((1, 3), np.float32), np.ones((1, 2), np.float32)
-    log_ratios(pixels, reads, 0.0, 2.0, np.empty((1, 1)), np.empty(1, np.int64))
+    log_ratios(pixels, reads, 0.0, 2.0, np.empty((1, 3)))
     pair_errors(pixels, reads, np.empty(1))
     for planes in (np.zeros((3, 1, 1), np.uint8), np.zeros((3, 1, 1), np.float32)):
         for image in (planes, planes.transpose(0, 2, 1)):  # channels first, and last

@@ -177,6 +177,16 @@ class AtlasLayout:
             )
         return layout
 
+    def source_pixels(self, xy: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+        """(n, 3) source, row and column in its image of atlas pixels (n, 2); -1 outside the images."""
+        pixels = np.full((len(xy), 3), -1)
+        for slot in self.slots:
+            local = xy[:, ::-1] - np.array([slot.y, slot.x])
+            inside = ((local >= 0) & (local < slot.size)).all(1)
+            pixels[inside, 0] = slot.source
+            pixels[inside, 1:] = (local[inside] << slot.level) + (1 << slot.level) // 2
+        return pixels
+
     def slot(self, source: int, level: int) -> Slot:
         """The place of one source at one level."""
         return next(s for s in self.slots if (s.source, s.level) == (source, level))
@@ -292,11 +302,21 @@ class ViewPlan:
 
     @cached_property
     def runs(self) -> npt.NDArray[np.int64]:
-        """(n, 3) runs of pixels of one source in the flattened view: first one, end and source."""
-        winner = self.source_camera.ravel()
+        """(n, 3) runs of pixels of one source in a row of h: first one in the flattened view, end, source · h + row."""
+        winner = self.source_camera
         start = np.flatnonzero(np.diff(winner, prepend=np.int8(-2)))
-        runs = np.stack([start, np.append(start[1:], winner.size), winner[start]], 1)
+        source, row = winner.ravel()[start].astype(np.int64), start // winner.shape[1]
+        runs = np.stack([start, np.append(start[1:], winner.size), source * len(winner) + row], 1)
         return runs[runs[:, 2] >= 0]
+
+    @cached_property
+    def band_runs(self) -> list[npt.NDArray[np.int64]]:
+        """(rows, 3) runs of each band, as in ``runs`` but in the flattened band."""
+        h, runs = len(self.source_camera), []
+        for band in self.bands:
+            row, width = np.arange(len(band.weight)), band.weight.shape[1]
+            runs.append(np.stack([row * width, (row + 1) * width, band.source * h + band.y + row], 1))
+        return runs
 
     @property
     def nbytes(self) -> int:
@@ -305,6 +325,27 @@ class ViewPlan:
         parts = self.certainty, self.edge, self.layers, self.paint, self.road
         further = sum(part.nbytes for part in parts if part is not None)
         return self.at.nbytes + self.source_camera.nbytes + bands + further
+
+
+SEAM_ROWS = 16
+"""Parts of a view's height in which the sources along a seam are compared."""
+
+_SEAM_SAMPLES = 90  # along a view's width
+
+
+@dataclass(frozen=True)
+class SeamSamples:
+    """A sample of pixels that two sources of a view show, in G groups: those of two sources in a part of the height.
+
+    The better source wins more of the view. A seam is all groups of another source of the view.
+    """
+
+    at: npt.NDArray[np.int64]  # (K, 2) rows and columns in source images
+    runs: npt.NDArray[np.int64]  # (N, 3) first of these, end and source
+    reads: npt.NDArray[np.int64]  # (2, G, L) which of these the better and the other source show; padded by K
+    better: npt.NDArray[np.int64]  # (G,) the better source
+    part: npt.NDArray[np.int64]  # (G,) part of the height
+    seams: list[list[int]]  # view, other source, first group and end; sources that win more come first
 
 
 @dataclass(frozen=True)
@@ -328,7 +369,50 @@ class RenderPlan:
         on_devices = list(self.on_devices.values())
         return sum(t.nbytes for t in self.targets) + sum(view.nbytes for views in on_devices for view in views)
 
+    @cached_property
+    def seam_samples(self) -> SeamSamples:
+        """What two sources show of the blended bands."""
+        sources, rows = len(self.source), [np.empty((0, 6), np.int64)]
+        rank = np.full((len(self.targets), sources), sources)
+        for number, view in enumerate(self.targets):
+            rank[number, [pair.source for pair in view.pairs]] = range(len(view.pairs))
+            h, w = view.source_camera.shape
+            step = max(1, w // _SEAM_SAMPLES)
+            for band in view.bands:
+                y, x = (step * places for places in np.nonzero(band.weight[::step, ::step]))
+                part = (y + band.y) * SEAM_ROWS // h
+                places = view.at.xy[y + band.y, x + band.x], band.at.xy[y, x]
+                rows.append(np.column_stack([np.full(len(y), number), part, *places]))
+        table = np.concatenate(rows)
+        both = self.layout.source_pixels(table[:, 2:].reshape(-1, 2)).reshape(-1, 2, 3)
+        seen = (both[..., 0] >= 0).all(1)
+        (view, part), both = table[seen, :2].T, both[seen]
+        ranks = rank[view[:, None], both[..., 0]]
+        both = np.take_along_axis(both, ranks.argsort(1)[..., None], 1)
+        return _grouped(np.column_stack([view, ranks.max(1), both[:, ::-1, 0], part]), both, sources)
+
     @property
     def coverage(self) -> list[BoolArray]:
         """(h, w) for each target camera."""
         return [t.coverage for t in self.targets]
+
+
+def _grouped(keys: npt.NDArray[np.int64], pixels: npt.NDArray[np.int64], sources: int) -> SeamSamples:
+    """Group n samples by (n, 5) view, rank and number of the other source, better source, and part of the height.
+
+    ``pixels`` (n, 2, 3) are source, row and column in the better and the other source.
+    """
+    by_group = np.lexsort(keys[:, ::-1].T)
+    keys = keys[by_group]
+    starts = np.flatnonzero(np.diff(keys, axis=0, prepend=-1).any(1))
+    groups, size = keys[starts], np.diff(starts, append=len(keys))
+    group, place = np.repeat(np.arange(len(groups)), size), np.arange(len(keys)) - np.repeat(starts, size)
+    flat = pixels[by_group].reshape(-1, 3)
+    order = flat[:, 0].argsort(kind="stable")
+    ends = np.searchsorted(flat[order, 0], np.arange(sources + 1))
+    reads = np.full((2, len(groups), size.max(initial=0)), len(flat))
+    reads[:, group, place] = order.argsort().reshape(-1, 2).T
+    first = np.flatnonzero(np.diff(groups[:, :3], axis=0, prepend=-1).any(1))
+    seams = np.column_stack([groups[first][:, [0, 2]], first, np.append(first, len(groups))[1:]]).tolist()
+    runs = np.stack([ends[:-1], ends[1:], np.arange(sources)], 1)
+    return SeamSamples(flat[order, 1:], runs, reads, groups[:, 3], groups[:, 4], seams)

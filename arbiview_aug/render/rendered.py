@@ -20,7 +20,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import Scratch, interleaved, nearest_resized, resized, write_halved
 from arbiview_aug.render.confidence import confidence
-from arbiview_aug.render.harmonise import LEVELS, SHARES
+from arbiview_aug.render.harmonise import LEVELS, SHARES, Curves
 from arbiview_aug.render.plan import AtlasLayout, BilinearFallback, Paint, RenderPlan
 from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.sample.batching import barred, covered, framed, stacked
@@ -35,7 +35,7 @@ def render_opencv(
     plan: RenderPlan,
     images: Sequence[torch.Tensor],
     scratch: Scratch | None = None,
-    curves: npt.NDArray[np.float64] | None = None,
+    curves: Curves | None = None,
     seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
     """Render the target views of one frame with ``cv2.remap``; not differentiable.
@@ -44,7 +44,7 @@ def render_opencv(
         plan: The plan for these images' rig.
         images: N images (3, H, W) on the CPU: uint8, or float in [0, 1].
         scratch: Buffers to reuse between calls.
-        curves: (M, N, 2) tone curves of each view for the pixels of each image.
+        curves: Tone curves of each view for the pixels of each image.
         seams: A list to append to, for each view, (h, w) float32: by how much blending a second source changed the
             winner's colour, mean over the channels, in the images' unit.
 
@@ -64,8 +64,10 @@ def render_opencv(
     sizes = {target.source_camera.shape for target in plan.targets}
     buffers = {size: scratch.get(f"view {size}", (*size, 3), atlas.dtype) for size in sizes}
     for number, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
-        tones = None if curves is None else curves[number].astype(np.float32)
         h, w = target.source_camera.shape
+        if curves is not None:
+            tones = curves[number].astype(np.float32)
+            tones = tones.reshape(-1, 2) if tones.ndim == 3 else tones.repeat(h, 0)
         change = np.zeros((h, w), np.float32) if seams is not None else None
         if seams is not None:
             seams.append(torch.from_numpy(change))
@@ -82,14 +84,14 @@ def render_opencv(
             if target.edge is not None:
                 _put_edge(target.edge.rows(y, y + _STRIP_ROWS, w), atlas, strip)
         # Tone the views, not the sources: these have more pixels, and would have to be copied.
-        if tones is not None:
+        if curves is not None:
             tone(buffer.reshape(-1), target.runs, tones, *scale)
-        for band in target.bands:
+        for band, runs in zip(target.bands, target.band_runs, strict=True):
             bh, bw = band.weight.shape
             part = buffer[band.y : band.y + bh, band.x : band.x + bw]
             second = _remap(atlas, band.at.xy, band.at.frac, target.seam_interpolation)
-            if tones is not None and tones[band.source, 0] != 1:
-                tone(second.reshape(-1), np.array([[0, bh * bw, band.source]]), tones, *scale)
+            if curves is not None:
+                tone(second.reshape(-1), runs, tones, *scale)
             if change is not None:
                 difference = np.abs(part.astype(np.float32) - second).mean(-1)
                 change[band.y : band.y + bh, band.x : band.x + bw] += difference * band.weight
@@ -205,7 +207,7 @@ class RenderedFrame:
         road: That of each view as in ``ViewPlan``, or None.
         certainty: (h, w) uint8 of each view as in ``ViewPlan``, for ``confidence_of``.
         seams: (h, w) float32 of each view, by how much blending changed it, for ``confidence_of``.
-        curves: (M, N, 2) tone curves of each view for each source; None if exposures are as recorded.
+        curves: Tone curves of each view for each source; None if exposures are as recorded.
         labels: Renders label maps; None if there are none.
     """
 
@@ -221,7 +223,7 @@ class RenderedFrame:
     road: Sequence[npt.NDArray[np.bool_] | None] = ()
     certainty: Sequence[npt.NDArray[np.uint8] | torch.Tensor] = ()
     seams: Sequence[torch.Tensor] = ()
-    curves: npt.NDArray[np.float64] | None = None
+    curves: Curves | None = None
     labels: LabelRenderer | None = None
 
     def with_maps(self, change: Callable[[Sequence[torch.Tensor], int], Maps]) -> RenderedFrame:
@@ -267,12 +269,12 @@ class Renderer:
         self,
         plans: Sequence[RenderPlan],
         frames: Sequence[Frame],
-        curves: Sequence[npt.NDArray[np.float64] | None],
+        curves: Sequence[Curves | None],
         outputs: Collection[str] = (),
     ) -> list[RenderedFrame]:
         """Render frames by a plan each; torch renders those that share a plan in one batch.
 
-        ``curves`` are for each frame the tone curves (M, N, 2) of each view for each source, or None; ``outputs`` the
+        ``curves`` are for each frame the tone curves of each view for each source, or None; ``outputs`` the
         requested of ``source_camera``, ``source_frame`` and ``confidence``. SampleError for ``backend="opencv"`` and an
         image on another device or with gradients.
         """
@@ -300,7 +302,7 @@ class Renderer:
         self,
         plan: RenderPlan,
         images: Sequence[torch.Tensor],
-        curves: npt.NDArray[np.float64] | None,
+        curves: Curves | None,
         like: Sequence[torch.Tensor],
     ) -> list[torch.Tensor]:
         """The views (3, h, w) of one frame alone, executed as the images ``like`` would be."""
@@ -319,7 +321,7 @@ def _rendered(
     plan: RenderPlan,
     images: list[torch.Tensor],
     seams: Sequence[torch.Tensor],
-    curves: npt.NDArray[np.float64] | None,
+    curves: Curves | None,
     outputs: Collection[str],
 ) -> RenderedFrame:
     views, on_device = plan.targets, plan.on_devices.get(images[0].device)

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from arbiview_aug.render.harmonise import Curves
 from arbiview_aug.render.plan import AtlasLayout, RenderPlan, ViewPlan
 
 
@@ -138,33 +139,33 @@ def _sample(atlas: torch.Tensor, grid: torch.Tensor, interpolation: str) -> torc
 def render_torch(
     plan: RenderPlan,
     images: Sequence[torch.Tensor],
-    curves: Sequence[npt.NDArray[np.float64] | None] | None = None,
+    curves: Sequence[Curves | None] | None = None,
     seams: list[torch.Tensor] | None = None,
 ) -> list[torch.Tensor]:
     """Render the M target views (B, 3, h, w) of a batch of frames that share a plan, with ``grid_sample``.
 
     The N images (B, 3, H, W) are uint8, or float in [0, 1], and sampled in float32. ``curves`` are for each frame None
-    or (M, N, 2), and ``seams`` a list to append (B, h, w) float32 to for each view: see ``render_opencv``.
+    or those of its views, and ``seams`` a list to append (B, h, w) float32 to for each view: see ``render_opencv``.
     """
     dtype, device = images[0].dtype, images[0].device
     top = 255 if dtype == torch.uint8 else 1
     atlas = _fill_atlas(plan.layout, images)
     tones: Callable[..., torch.Tensor] | None = None
-    curved = [] if curves is None else [of_frame for of_frame in curves if of_frame is not None]
-    if curves is not None and curved:
-        of_frames = np.stack([np.ones_like(curved[0]) if of_frame is None else of_frame for of_frame in curves])
-        of_views = torch.from_numpy(of_frames).float().to(device).unbind(1)
+    curved = next((of_frame for of_frame in curves or () if of_frame is not None), None)
     views = []
     for number, maps in enumerate(maps_on(plan, device)):
-        if curved:
-            tones = partial(_toned, curves=of_views[number], top=top)
+        if curves is not None and curved is not None:
+            as_recorded = np.ones_like(curved[number])
+            of_view = np.stack([as_recorded if of_frame is None else of_frame[number] for of_frame in curves])
+            of_rows = of_view.reshape(len(curves), len(images), -1, 2)
+            tones = partial(_toned, curves=torch.from_numpy(of_rows).float().to(device), top=top)
         view = _sample(atlas, maps.grid, maps.interpolation)
         if maps.edge is not None:
             pixel, grid = maps.edge
             at_edge = _sample(atlas, grid, "linear")[:, :, 0]
             view = view.clamp(0, top).flatten(2).index_copy(2, pixel, at_edge).view_as(view)
         if tones is not None:
-            view = tones(view, maps.source.long())
+            view = tones(view, maps.source.long(), torch.arange(len(maps.source), device=device)[:, None])
         change = view.new_zeros(view.shape[0], *view.shape[2:])
         if maps.blend is not None:
             # Never by cubics: a mean of two sources is no sharper for it.
@@ -187,16 +188,16 @@ def _blended(
     """Blend the second sources into a view (B, 3, h, w), and write by how much they changed it to (B, h, w)."""
     second = _sample(atlas, blend.grid, interpolation)[:, :, 0]  # [B, 3, n]
     if tones is not None:
-        second = tones(second, blend.source)
+        second = tones(second, blend.source, blend.pixel // view.shape[-1])
     first = view.flatten(2)[:, :, blend.pixel]
     change.flatten(1)[:, blend.pixel] = (first - second).detach().abs().mean(1) * blend.weight
     mixed = torch.lerp(first, second, blend.weight.expand_as(second))
     return view.flatten(2).index_copy(2, blend.pixel, mixed).view_as(view)
 
 
-def _toned(view: torch.Tensor, source: torch.Tensor, curves: torch.Tensor, top: int) -> torch.Tensor:
-    """Views (B, 3, ...) read from sources (...,), -1 for none, after the sources' curves (B, N, 2)."""
-    gain, slope = curves[:, source][:, None].unbind(-1)  # [B, 1, ...]
+def _toned(view: torch.Tensor, source: torch.Tensor, row: torch.Tensor, curves: torch.Tensor, top: int) -> torch.Tensor:
+    """Views (B, 3, ...) in rows (...,), read from sources (...,), -1 for none, after curves (B, N, h or 1, 2)."""
+    gain, slope = curves[:, source, row.clamp(max=curves.shape[2] - 1)][:, None].unbind(-1)  # [B, 1, ...]
     # Rounded before and after, like the OpenCV execution.
     read = torch.floor(view + 0.5) if top == 255 else view
     lower, upper = read * gain, read * slope + top * (1 - slope)

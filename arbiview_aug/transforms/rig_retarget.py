@@ -325,7 +325,7 @@ class RigRetarget(torch.nn.Module):
         planned = [self.plan_frame(frame, target) for frame in frames]
         self._warn_of_harm(planned)
         outputs = (*self.keys.extra, "confidence") if self.config.certainty else self.keys.extra
-        curves = [self.harmoniser.curves(one.frame.rig, one.frame.images, one.plan.targets) for one in planned]
+        curves = [self.harmoniser.curves(one.frame.rig, one.frame.images, one.plan) for one in planned]
         rendered = self.renderer.render([one.plan for one in planned], frames, curves, outputs)
         for k, one in enumerate(planned):
             if (fills := self.plan_fills(one)) is not None:

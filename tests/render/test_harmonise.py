@@ -232,7 +232,8 @@ def test_runs_hold_every_pixel_with_its_own_source() -> None:
         seen = np.full(one.size, -1, np.int8)
         for start, end, source in ViewPlan(FixedMap.outside(one.shape), one, (), ()).runs:
             assert (seen[start:end] == -1).all(), "no pixel gets two curves"
-            seen[start:end] = source
+            seen[start:end] = source // len(one)
+            assert start // one.shape[1] == (end - 1) // one.shape[1] == source % len(one), "every row has its own"
         assert np.array_equal(seen, one.ravel())
 
 

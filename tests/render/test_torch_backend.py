@@ -43,9 +43,9 @@ def test_curves_brighten_and_darken_up_to_the_ends_of_the_range() -> None:
     """The lower of gain·v and slope·v + top·(1 − slope) for gains above 1, else the higher; 1 changes nothing."""
     view = torch.tensor([100.0, 200.0, 100.0, 200.0, 77.0, 77.0]).expand(1, 3, 6)
     source = torch.tensor([0, 0, 1, 1, 2, -1])
-    curves = torch.tensor([[[1.5, 0.5], [0.5, 1.5], [1.0, 1.0]]])
-    assert _toned(view, source, curves, 255)[0, 0].tolist() == [150, 228, 50, 173, 77, 77]
-    toned = _toned(view / 255, source, curves, 1)[0, 0] * 255
+    curves, row = torch.tensor([[[1.5, 0.5], [0.5, 1.5], [1.0, 1.0]]])[:, :, None], torch.arange(6)
+    assert _toned(view, source, row, curves, 255)[0, 0].tolist() == [150, 228, 50, 173, 77, 77]
+    toned = _toned(view / 255, source, row, curves, 1)[0, 0] * 255
     assert toned.tolist() == pytest.approx([150, 227.5, 50, 172.5, 77, 77], abs=1e-3)
 
 
