@@ -109,7 +109,8 @@ class Jittered(FrameSet):
         with torch.random.fork_rng():
             torch.manual_seed(index)
             sample = {"images": torch.from_numpy(frame.images.copy()), "K": frame.K, "cam2ego": frame.cam2ego}
-            return replace(frame, cam2ego=JitteredCalibration(*self.jitter)(sample)["cam2ego"])
+            cam2ego = JitteredCalibration(*self.jitter)(sample)["cam2ego"]
+        return replace(frame, cam2ego=np.asarray(cam2ego, np.float32))
 
 
 def frames_of(setup: Run, detector: Trained, change: str | None, way: Way, split: Split) -> FrameSet:
