@@ -218,7 +218,7 @@ def test_presets():
     # Raw and scale/crop once for each seed, five variants for each change: 3 * (2 + 3 * 5).
     assert len(jobs(pilot())) == 51
     names = [job.name for job in jobs(full())]
-    assert len(names) == len(set(names)) == 3 * (2 + 9 * 37)
+    assert len(names) == len(set(names)) == 3 * (2 + 2 + 1 + 10 * 39)
 
 
 @pytest.mark.slow
