@@ -31,7 +31,7 @@ from integrations.cross_rig.training import FrameSet, Schedule, answers, evaluat
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.views import ViewMaker
-from integrations.cross_rig.worlds import Split
+from integrations.cross_rig.worlds import SPLITS, Split
 
 LEAST_SCORE = 0.3
 """Score of the detections that become boxes of the second pass."""
@@ -213,9 +213,9 @@ def deploy(setup: Run, titles: list[str] | None, log: Log) -> str:
     one_thread()
     setup = replace(setup, settings=replace(setup.settings, variants=("raw",)))
     setup.prepare()
-    for split, change in (("train", None), *product(("val", "test"), (None, *setup.settings.changes))):
-        for _ in make_frames(setup.source(split, change), _count(setup, split), 1):
-            pass
+    for split, change in product(SPLITS, (None, *setup.settings.changes)):
+        if split != "train" or change is None:
+            list(make_frames(setup.source(split, change), _count(setup, split), 1))
     for job in jobs(setup.settings):
         model, trained = setup.trained(job)
         detector = Trained(model, setup.training_key(job), setup.schedule(job))

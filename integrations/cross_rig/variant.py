@@ -12,7 +12,7 @@ Geometry = Literal["points", "boxes_3d", "depth_m", "learned_depth_m", "neighbou
 Noise = Literal["depth", "boxes", "missed", "late", "calibration"]
 
 
-RANDOM: dict[str, dict[str, float]] = {
+RANDOM: dict[str, dict[str, Any]] = {
     "B": {"yaw_deg": 5.0, "pitch_deg": 2.0, "height_m": 0.2, "focal_scale": 0.1},
     "A": {"yaw_deg": 15.0, "pitch_deg": 5.0, "height_m": 0.8, "lateral_m": 0.3, "focal_scale": 0.4},
 }
