@@ -162,7 +162,7 @@ class PixelRays:
         return rays
 
 
-class CameraMaps:
+class RayCache:
     """Rays and masks of cameras by their content: what is costly and does not change from frame to frame.
 
     ``memory`` is that of what does change.
@@ -172,8 +172,8 @@ class CameraMaps:
         self._cache: LRUCache[Any, Any] = LRUCache(max_bytes, lambda item: item.nbytes)
         self.memory = Memory()
 
-    def __reduce__(self) -> tuple[type[CameraMaps], tuple[int]]:
-        return CameraMaps, (self._cache.limit,)
+    def __reduce__(self) -> tuple[type[RayCache], tuple[int]]:
+        return RayCache, (self._cache.limit,)
 
     def rays(self, camera: Camera, known: PixelRays | None = None) -> PixelRays:
         """The rays of a camera; ``known`` are taken for it from now on."""

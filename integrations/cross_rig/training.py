@@ -43,6 +43,7 @@ class Schedule:
         batch: Frames a step.
         lr: The peak of a one-cycle schedule; AdamW's default decay.
         backbone: Of the model.
+        priors: Whether the model reads camera maps.
         precision: ``bf16`` runs the networks in bfloat16 (autocast): twice as fast on CPUs with AMX.
         device: Where to train.
     """
@@ -52,6 +53,7 @@ class Schedule:
     batch: int = 4
     lr: float = 3e-3
     backbone: Backbone = "small"
+    priors: bool = False
     precision: Literal["bf16", "fp32"] = "bf16"
     device: str = "cpu"
 
@@ -182,7 +184,7 @@ def untrained(schedule: Schedule) -> nn.Module:
     """A detector of a schedule's family."""
     if schedule.family == "pillars":
         return PillarDetector(Grid())
-    return Detector(Grid(), schedule.family, schedule.backbone)
+    return Detector(Grid(), schedule.family, schedule.backbone, priors=schedule.priors)
 
 
 def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[float]]:

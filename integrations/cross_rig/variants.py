@@ -97,7 +97,7 @@ VARIANTS: dict[str, Variant] = {
             reads=("neighbours", "learned_depth_m"),
             noise="depth",
         ),
-        Variant(name="random", title="RandomRig around B, auto", kind="retarget", reads=_ALL, random=True),
+        Variant(name="random", title="RandomRig around B, auto", kind="retarget", reads=_ALL, random="B"),
         *(
             _filled(name=f"auto_fill_{noise}", title=f"auto, filled holes, no mask, {title}", noise=noise)
             for noise, title in NOISES.items()
@@ -106,7 +106,22 @@ VARIANTS: dict[str, Variant] = {
         _filled(
             name="recipe", title="recipe: auto, filled, no mask, labels of the views, + raw", labels="views", mixed=True
         ),
-        _filled(name="auto_fill_random", title="RandomRig around B, auto, filled holes, no mask", random=True),
+        _filled(name="auto_fill_random", title="RandomRig around B, auto, filled holes, no mask", random="B"),
+        _filled(name="random_a", title="random rigs around A, auto, filled holes, no mask", random="A"),
+        Variant(name="raw_priors", title="raw A; camera maps", kind="raw", priors=True),
+        _filled(name="auto_fill_priors", title="auto, filled holes, no mask; camera maps", priors=True),
+        _filled(
+            name="auto_fill_random_priors",
+            title="RandomRig around B, auto, filled holes, no mask; camera maps",
+            random="B",
+            priors=True,
+        ),
+        _filled(
+            name="random_a_priors",
+            title="random rigs around A, auto, filled holes, no mask; camera maps",
+            random="A",
+            priors=True,
+        ),
         Variant(name="oracle_labels", title="B's own frames, A's labels", kind="oracle", labels="A"),
         Variant(name="oracle_mixed", title="B's own frames, + raw", kind="oracle", mixed=True),
         Variant(name="oracle_scaled", title="B's own frames, scaled and cropped", kind="oracle", augmented=True),

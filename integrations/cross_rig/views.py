@@ -38,7 +38,7 @@ class ViewMaker:
         elif variant.stays == "height":
             target = at_source_heights(source, target)
         self.variant, self.source, self.target = variant, source, target
-        self.random = RandomRig(target, **RANDOM) if variant.random else None
+        self.random = RandomRig(target, **RANDOM[variant.random]) if variant.random else None
         # Motion is asked for distances alone, so that the variant shows what these do.
         reach: Reach | None = None if variant.surface in ("motion", "fused") else "road"
         self.retarget = RigRetarget(

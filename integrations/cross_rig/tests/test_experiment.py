@@ -163,7 +163,7 @@ def test_families_have_tables_of_their_own(done):
     report = write_report(more)
     assert set(report["changes"]) == {"fov50", "fov50-depths", "fov50-queries"} and report["tests_done"] == 6
     assert "**FOV 65° → 50°, queries**, 6 samples seen, seeds 0" in markdown(report)
-    losses = [more._trained(job)[1]["losses"][-1] for job in jobs(more.settings) if job.variant.name == "raw"]
+    losses = [more.trained(job)[1]["losses"][-1] for job in jobs(more.settings) if job.variant.name == "raw"]
     assert len(set(losses)) == 3
 
 
@@ -218,7 +218,7 @@ def test_presets():
     # Raw and scale/crop once for each seed, five variants for each change: 3 * (2 + 3 * 5).
     assert len(jobs(pilot())) == 51
     names = [job.name for job in jobs(full())]
-    assert len(names) == len(set(names)) == 3 * (2 + 9 * 37)
+    assert len(names) == len(set(names)) == 3 * (2 + 2 + 1 + 10 * 39)
 
 
 @pytest.mark.slow
