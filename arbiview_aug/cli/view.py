@@ -6,7 +6,7 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.datasets.image_io import encoded_image
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, OutputError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import views_of
 from arbiview_aug.evaluate.report.pictures import BOX, HOLE, RIG_COLOURS, box_lines, left_to_right
@@ -49,27 +49,28 @@ def run(arguments: argparse.Namespace) -> int:
     path = output_file(arguments.output)
     if path.suffix != ".rrd":
         raise DataError(f"--output {arguments.output}: expected a name ending in .rrd, got {path.name!r}")
+    optional_package("rerun", "viewer")  # before work starts
     chosen = None if arguments.target is None else load_rig(arguments.target)
-    extra = () if arguments.quality == "paper" else ("confidence",)
-    recording, notes, count = SampleRecording(path), list[str](), 0
+    notes: list[str] = []
     with named_steps(notes, arguments.frames) as tick:
-        for count, sample in enumerate(_frames(arguments), 1):
-            tick(str(sample.get("token", count)), 1)
-            if count == 1:
-                (target,) = target_rigs(arguments, chosen, sample["rig"]).values()
-                retarget = RigRetarget(
-                    target,
-                    quality=arguments.quality,
-                    geometry=arguments.geometry,
-                    holes=arguments.holes,
-                    keys=SampleKeys(extra=extra),
-                )
-                recording.lay_out(sample["rig"], target, bool(extra))
-            recording.add(sample, target, retarget(sample))
-    recording.close()
+        frames = _frames(arguments)
+        first = next(frames)
+        (target,) = target_rigs(arguments, chosen, first["rig"]).values()
+        retarget = RigRetarget(
+            target,
+            quality=arguments.quality,
+            geometry=arguments.geometry,
+            holes=arguments.holes,
+            keys=SampleKeys(extra=() if arguments.quality == "paper" else ("confidence",)),
+        )
+        recording = SampleRecording(path, first["rig"], target)
+        for number, sample in enumerate(chain([first], frames)):
+            tick(str(sample.get("token", number)), 1)
+            recording.add(sample, retarget(sample))
+        recording.close()
     for note in notes:
         print(f"note: {note}\n")
-    print(f"recording: {path} ({frames_text(count)}, {path.stat().st_size / 1e6:.1f} MB)")
+    print(f"recording: {path} ({frames_text(number + 1)}, {path.stat().st_size / 1e6:.1f} MB)")
     if arguments.open:
         return subprocess.run([sys.executable, "-m", "rerun", str(path)], check=False).returncode
     print(f"open it: rerun {path}")
@@ -89,31 +90,34 @@ def _frames(arguments: argparse.Namespace) -> Iterator[Mapping[str, Any]]:
 
 
 class SampleRecording:
-    """A recording of samples and their retargeted views, written to an .rrd file frame by frame.
+    """A recording of samples and their views by a target rig, written to an .rrd file frame by frame.
 
     Everything of a frame is below ``ego``: points, boxes, and the cameras of ``source`` and ``target``. With
     ``ego2world`` in the samples, ``ego`` drives through the first one's ego frame.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, source: Rig, target: Rig) -> None:
         self._rr = optional_package("rerun", "viewer")
         self._stream = self._rr.RecordingStream("arbiview_aug")
-        self._stream.save(path)
-        self._log, self._frames = self._stream.log, 0
-        self._world2first: FloatArray | None = None
-        self._first_s: float | None = None
+        try:
+            self._stream.save(path)
+        except RuntimeError as error:
+            raise OutputError(f"--output {path}: expected a file that can be written to; {error}") from None
+        self._log, self._frames, self._target = self._stream.log, 0, target
+        self._world2first: Any = None
+        self._first_s: Any = None
         self._log("/", self._rr.ViewCoordinates.FLU, static=True)
         self._log("/", self._rr.AnnotationContext(list(_LEGEND)), static=True)
+        self._lay_out({"source": source, "target": target})
 
     def close(self) -> None:
         """Write what is not on the disk yet."""
         self._stream.disconnect()
 
-    def lay_out(self, source: Rig, target: Rig, has_confidence: bool) -> None:
+    def _lay_out(self, rigs: Mapping[str, Rig]) -> None:
         """Put the 3D scene beside the source's images, the target's views, and their confidence."""
         views = optional_package("rerun.blueprint", "viewer")
-        rigs = {"source": source, "target": target}
-        cameras = [(f"/ego/{side}/{camera.name}", camera) for side, rig in rigs.items() for camera in rig]
+        cameras = [(self._path(side, camera), camera) for side, rig in rigs.items() for camera in rig]
         flat = [f"{path}/{name}" for path, _ in cameras for name in _MAPS]
         flat += [f"{path}/image" for path, camera in cameras if not camera.is_rectilinear]
         scene = views.Spatial3DView(
@@ -129,37 +133,38 @@ class SampleRecording:
             for camera in (rig[k] for k in left_to_right(rig)):
                 contents = [f"$origin/{one}" for one in maps]
                 bounds = views.VisualBounds2D(x_range=(0, camera.width_px), y_range=(0, camera.height_px))
-                path, title = f"/ego/{side}/{camera.name}", f"{side} {camera.name}"
-                images.append(views.Spatial2DView(origin=path, contents=contents, name=title, visual_bounds=bounds))
-            return views.Grid(*images, grid_columns=3, name=name)
+                place = {"origin": self._path(side, camera), "name": camera.name}
+                images.append(views.Spatial2DView(contents=contents, visual_bounds=bounds, **place))
+            return views.Grid(*images, grid_columns=min(3, len(rig)), name=name)
 
-        seen, lit = ("image", "coverage", "boxes"), ("confidence", "boxes")
-        rows = [grid("source", seen, "source"), grid("target", seen, f"views of {target.name or 'the target'}")]
-        if has_confidence:
-            rows[1:] = [views.Tabs(rows[1], grid("target", lit, "confidence"), name="views")]
-        layout = views.Horizontal(scene, views.Vertical(*rows), column_shares=[2, 3])
+        seen = "image", "coverage", "boxes"
+        of_target = grid("target", seen, "target"), grid("target", ("confidence", "boxes"), "confidence")
+        images = views.Vertical(views.Tabs(grid("source", seen, "source")), views.Tabs(*of_target))
+        layout = views.Horizontal(scene, images, column_shares=[2, 3])
         panels = [panel(state="collapsed") for panel in (views.SelectionPanel, views.BlueprintPanel, views.TimePanel)]
         self._stream.send_blueprint(views.Blueprint(layout, *panels))
 
-    def add(self, sample: Mapping[str, Any], target: Rig, out: Mapping[str, Any]) -> None:
-        """Add a reader's sample, and what ``RigRetarget`` made of it for a target."""
+    def _path(self, side: str, camera: Camera) -> str:
+        return f"/ego/{side}/{self._rr.escape_entity_path_part(camera.name)}"
+
+    def add(self, sample: Mapping[str, Any], out: Mapping[str, Any]) -> None:
+        """Add a reader's sample, and what ``RigRetarget`` made of it."""
         self._set_time(sample)
         source: Rig = sample["rig"]
         boxes = np.zeros((0, 7)) if sample.get("boxes_3d") is None else sample["boxes_3d"].double().numpy()
         self._add_boxes(boxes, sample.get("box_names"))
-        clouds = {"source": sample.get("points"), "target": out.get("points") if target.lidars else None}
+        clouds = {"source": sample.get("points"), "target": out.get("points") if self._target.lidars else None}
         for side, points in clouds.items():
-            if points is not None:
-                positions = points[:, :3].numpy()
-                colours = height_colours(positions, source.ground_z_m)
-                self._log(f"ego/{side}_points", self._rr.Points3D(positions, colors=colours, radii=_THIN))
+            positions = np.zeros((0, 3)) if points is None else points[:, :3].numpy()
+            colours = height_colours(positions, source.ground_z_m)
+            self._log(f"/ego/{side}_points", self._rr.Points3D(positions, colors=colours, radii=_THIN))
         for camera, image in zip(source, as_arrays(sample["images"]), strict=True):
-            path = f"ego/source/{camera.name}"
+            path = self._path("source", camera)
             self._add_camera(path, camera, image, boxes, RIG_COLOURS[0])
             if camera.mask is not None:
                 self._add_classes(path, np.where(camera.mask, _SEEN, _MASKED))
-        for camera, view in zip(target.in_frame_of(source), views_of(out), strict=True):
-            path = f"ego/target/{camera.name}"
+        for camera, view in zip(self._target.in_frame_of(source), views_of(out), strict=True):
+            path = self._path("target", camera)
             self._add_camera(path, camera, view.image, boxes, RIG_COLOURS[1])
             self._add_maps(path, view)
         self._frames += 1
@@ -173,7 +178,7 @@ class SampleRecording:
             ego2world = np.asarray(sample["ego2world"], np.float64)
             if self._world2first is None:
                 self._world2first = np.linalg.inv(ego2world)
-            self._add_pose("ego", self._world2first @ ego2world)
+            self._add_pose("/ego", self._world2first @ ego2world)
 
     def _add_pose(self, path: str, pose: FloatArray) -> None:
         self._log(path, self._rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
@@ -182,7 +187,7 @@ class SampleRecording:
         turns = np.zeros((len(boxes), 4))
         turns[:, 2], turns[:, 3] = np.sin(boxes[:, 6] / 2), np.cos(boxes[:, 6] / 2)
         shape = {"centers": boxes[:, :3], "sizes": boxes[:, 3:6], "quaternions": turns, "colors": BOX}
-        self._log("ego/boxes", self._rr.Boxes3D(**shape, labels=names, show_labels=False))
+        self._log("/ego/boxes", self._rr.Boxes3D(**shape, labels=names, show_labels=False))
 
     def _add_camera(self, path: str, camera: Camera, image: Image, boxes: FloatArray, colour: str) -> None:
         """Add a camera's pose, what it sees in 3D, its image, and boxes bent as its lens bends them.
