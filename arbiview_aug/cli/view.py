@@ -72,7 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"note: {note}\n")
     print(f"recording: {path} ({frames_text(number + 1)}, {path.stat().st_size / 1e6:.1f} MB)")
     if arguments.open:
-        return subprocess.run([sys.executable, "-m", "rerun", str(path)], check=False).returncode
+        viewer = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(path)]
+        return subprocess.run(viewer, check=False).returncode
     print(f"open it: rerun {path}")
     return 0
 
