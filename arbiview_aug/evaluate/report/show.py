@@ -6,9 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from io import BytesIO
-from typing import Any
-
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.evaluate.images import Image, as_arrays
@@ -16,17 +14,11 @@ from arbiview_aug.evaluate.report.pictures import Picture, draw_labels
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.boxes import checked_boxes
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 _COLUMNS, _WIDTH_IN = 3, 12.0
 _DIMMED = 0.35  # brightness of what is no evidence
-
-
-class SampleFigure(Figure):
-    """A figure that notebooks show without pyplot and its global state."""
-
-    def _repr_png_(self) -> bytes:
-        png = BytesIO()
-        self.savefig(png, format="png")
-        return png.getvalue()
 
 
 def show(sample: Mapping[str, Any]) -> Figure:
@@ -54,7 +46,7 @@ def show(sample: Mapping[str, Any]) -> Figure:
     rows = math.ceil(len(drawn) / columns)
     aspect = max(picture.shape[0] / picture.shape[1] for _, picture in drawn)
     height_in = rows * (_WIDTH_IN / columns * aspect + 0.35)
-    figure = SampleFigure(figsize=(_WIDTH_IN, height_in), layout="constrained")
+    figure = _notebook_figure((_WIDTH_IN, height_in))
     for axes in figure.subplots(rows, columns, squeeze=False).flat:
         axes.set_axis_off()
     for axes, (title, picture) in zip(figure.axes, drawn, strict=False):
@@ -68,3 +60,16 @@ def _dimmed(camera: Camera, image: Image) -> tuple[Camera, Image]:
     if camera.mask is None:
         return camera, image
     return replace(camera, mask=None), image * (_DIMMED + (1 - _DIMMED) * camera.mask[..., None])
+
+
+def _notebook_figure(size_in: tuple[float, float]) -> Figure:
+    """An empty figure that notebooks show without pyplot and its global state."""
+    from matplotlib.figure import Figure
+
+    class NotebookFigure(Figure):
+        def _repr_png_(self) -> bytes:
+            png = BytesIO()
+            self.savefig(png, format="png")
+            return png.getvalue()
+
+    return NotebookFigure(figsize=size_in, layout="constrained")
