@@ -5,7 +5,9 @@ from __future__ import annotations
 import ast
 import json
 import re
+import runpy
 import shlex
+import warnings
 from collections.abc import Callable, Iterator
 from functools import cache
 from importlib import import_module
@@ -34,10 +36,11 @@ from tests.helpers import saved_depth_model
 
 ROOT = Path(__file__).parents[1]
 DOCS = sorted((ROOT / "docs").glob("*.md"))
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS, *sorted((ROOT / "integrations").glob("*/*.md"))]
 BENCHMARKS = (ROOT / "docs" / "benchmarks.md").read_text()
 LARGEST_PICTURE_BYTES = 300_000
-LARGEST_PICTURES_BYTES = 900_000
+LARGEST_PICTURES_BYTES = 1_100_000
 
 TINY_DEMO = ["--size", "40x104", "--width", "600"]
 TINY_BENCH = ["--quality", "draft", "--downscale", "4", "--size", "40x72", "--repeats", "1"]
@@ -74,6 +77,8 @@ TINY = {
     "depth --model ID_OR_PATH --data FOLDER --reference motion road": ["--output", "depth"],
     "evaluate --data FOLDER --target waymo --geometry learned street": ["--downscale", "4", "--geometry", "street"],
     "train --output output/tiny": ["--quiet", *SMALLER],
+    "view FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
+    "view --seed 2 --output view.rrd": ["--size", "40x104", "--frames", "1"],
 }
 """Every command of the README and the pages, and options that make it quick."""
 
@@ -82,6 +87,7 @@ SLOW = (
     "depth --model",
     "evaluate --data FOLDER --target waymo --geometry learned",
     "evaluate --data FOLDER --target-set",
+    "view",
 )
 
 
@@ -199,6 +205,8 @@ def test_the_commands_run(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     arguments = shlex.split(command)
+    if arguments[0] == "view":
+        pytest.importorskip("rerun")
     if "FOLDER" in arguments:
         root = request.getfixturevalue("kitti_root" if "--displaced" in arguments else "nuscenes_root")
         arguments[arguments.index("FOLDER")] = str(root)
@@ -210,6 +218,16 @@ def test_the_commands_run(
         run_page(ROOT / "docs" / "rigs.md", only_first=True)
     assert main([*arguments, *TINY[command]]) == 0
     assert any(path.is_file() and path.name != "truck.yaml" for path in tmp_path.rglob("*"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=name_of)
+def test_the_notebooks_run(notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        runpy.run_path(str(notebook))
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -311,7 +329,7 @@ def test_measurements_name_tests_that_are_there() -> None:
 
 
 # --- links, names, pictures -------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
+@pytest.mark.parametrize("page", [*PAGES, *NOTEBOOKS], ids=name_of)
 def test_links_resolve(page: Path) -> None:
     links = re.findall(r"\]\(([^)\s]+)\)", prose(page))
     for link in links:
@@ -346,6 +364,7 @@ def test_the_navigation_has_every_page() -> None:
     listed = list(pages(yaml.safe_load((ROOT / "mkdocs.yml").read_text().partition("\nnav:")[2])))
     assert len(listed) == len(set(listed))
     assert {f"{page.name}" for page in DOCS} <= set(listed)
+    assert {f"notebooks/{notebook.stem}.md" for notebook in NOTEBOOKS} <= set(listed)
     beside = {name_of(page) for page in PAGES if "integrations" in page.parts} | {"CHANGELOG.md"}
     assert beside <= set(listed)
 

@@ -56,25 +56,25 @@ class Way:
     jitter: tuple[float, float] = (0.0, 0.0)
 
 
-def _rendered(name: str, *, masked: bool = False) -> Way:
-    variant = replace(VARIANTS[name], holes="fill", masked=masked)
+def _rendered(variant: Variant, *, masked: bool = False) -> Way:
+    variant = replace(variant, holes="fill", masked=masked)
     return Way(shows="rendered", variant=variant, detections="boxes_3d" in variant.reads)
 
 
 _SURFACES = {
-    "infinity": "far",
-    "street": "street",
-    "LiDAR": "points",
-    "learned depth": "learned",
-    "two passes": "objects",
-    "two passes, LiDAR": "auto",
+    "infinity": Variant(name="infinity", title="infinity", kind="retarget", surface="infinity"),
+    "street": VARIANTS["street_fill"],
+    "LiDAR": Variant(name="lidar", title="LiDAR", kind="retarget", surface="lidar", reads=("points",)),
+    "learned depth": VARIANTS["learned"],
+    "two passes": VARIANTS["objects_fill"],
+    "two passes, LiDAR": VARIANTS["auto_fill"],
 }
 
 ON_B: dict[str, Way] = {
     "as is": Way(),
     "calibration not read": Way(reads_calibration=False),
-    **{title: _rendered(name) for title, name in _SURFACES.items()},
-    **{f"{title}, masked": _rendered(name, masked=True) for title, name in _SURFACES.items()},
+    **{title: _rendered(variant) for title, variant in _SURFACES.items()},
+    **{f"{title}, masked": _rendered(variant, masked=True) for title, variant in _SURFACES.items()},
     "A's true frames": Way(shows="A"),
 }
 """Ways to show B's frames, by title. The last is what a perfect rendering would reach."""

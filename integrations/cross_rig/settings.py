@@ -146,7 +146,7 @@ def pilot() -> Settings:
     """Three changes, the variants that decide, three seeds: an evening on two cores."""
     return Settings(
         changes=("fov50", "up70", "waymo"),
-        variants=("raw", "scale_crop", "row_split", "street", "objects_mixed", "auto", "oracle"),
+        variants=("raw", "scale_crop", "street_fill_mixed", "objects_fill", "auto_fill", "recipe", "oracle"),
     )
 
 
