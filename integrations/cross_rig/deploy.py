@@ -42,23 +42,20 @@ class Way:
     """One way to show frames to a detector.
 
     Attributes:
-        shows: Frames as they are, rendered to A's rig by ``variant``, or A's true ones of the same streets.
+        shows: The vehicle's own frames, or A's true ones of the same streets.
         reads_calibration: Whether the detector does; otherwise it takes every rig for A.
-        variant: A row of ``VARIANTS``, with filled holes where it has no mask.
-        detections: Boxes are what the detector finds in the frames as they are.
+        variant: How own frames are rendered to A's rig; boxes are what the detector finds in these. None: they are not.
         jitter: Degrees and metres of ``JitteredCalibration``.
     """
 
-    shows: Literal["own", "rendered", "A"] = "own"
+    shows: Literal["own", "A"] = "own"
     reads_calibration: bool = True
     variant: Variant | None = None
-    detections: bool = False
     jitter: tuple[float, float] = (0.0, 0.0)
 
 
 def _rendered(variant: Variant, *, masked: bool = False) -> Way:
-    variant = replace(variant, holes="fill", masked=masked)
-    return Way(shows="rendered", variant=variant, detections="boxes_3d" in variant.reads)
+    return Way(variant=replace(variant, holes="fill", masked=masked))
 
 
 _SURFACES = {
