@@ -26,7 +26,7 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.rays import RayCache, PixelRays
+from arbiview_aug.cameras.rays import PixelRays, RayCache
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
