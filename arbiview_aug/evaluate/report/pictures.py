@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Picture = npt.NDArray[np.uint8]
 INK, PAPER = (40, 40, 40), (255, 255, 255)
 HOLE = (255, 0, 160)  # colour of uncovered regions; rare on streets
-_BOX = (0, 230, 255)
+_BOX, _DETECTED = (0, 230, 255), (255, 220, 0)
 _FARTHEST_M = 80.0  # points there, and beyond, are blue
 
 RIG_COLOURS = ("#1f64c8", "#d65414", "#1e8c3c", "#8c3caa", "#966e14")  # of rigs, in their order
@@ -131,6 +131,15 @@ def draw_labels(camera: Camera, image: Image, points: FloatArray | None, boxes: 
             ends = np.stack([uv[:-1], uv[1:]], axis=-2)[valid[:-1] & valid[1:]]
             for one, two in np.round(ends).astype(int).tolist():
                 cv2.line(picture, one, two, colour, width_px, cv2.LINE_AA)
+    return picture
+
+
+def draw_rectangles(image: Image, labelled: FloatArray, detected: FloatArray) -> Picture:
+    """Draw labelled boxes (n, 4) x0 y0 x1 y1 in cyan, and a detector's in yellow, into an image (h, w, 3)."""
+    picture = to_bytes(image).copy()
+    for boxes, colour in ((labelled, _BOX), (detected, _DETECTED)):
+        for x0, y0, x1, y1 in np.round(boxes).astype(int).tolist():
+            cv2.rectangle(picture, (x0, y0), (x1, y1), colour, max(1, len(picture) // 200), cv2.LINE_AA)
     return picture
 
 
