@@ -19,6 +19,7 @@ from arbiview_aug.evaluate.detections import (
     average_precision,
     false_alarms,
     hits,
+    ious,
     labels_of,
     nta_ious,
 )
@@ -33,17 +34,20 @@ SOURCES, TRUTH = "sources", "truth"
 WIDE = 0.2
 """Width of an interval that says nothing."""
 
+FEWEST = 10
+"""Fewer objects or views have no interval worth the name: that of two hits is [1, 1]."""
+
 READABLE = {
-    "recall": "recall",
-    "iou": "IoU",
-    "clear_recall": "clear recall",
-    "clear_iou": "clear IoU",
-    "ap_50": "AP .5",
-    "ap_70": "AP .7",
-    "area_iou": "drivable area",
-    "lanes_iou": "lane marks",
+    "recall": ("recall", "objects"),
+    "iou": ("IoU", "objects"),
+    "clear_recall": ("clear recall", "clear_objects"),
+    "clear_iou": ("clear IoU", "clear_objects"),
+    "ap_50": ("AP .5", "true_objects"),
+    "ap_70": ("AP .7", "true_objects"),
+    "area_iou": ("drivable area IoU", "road_views"),
+    "lanes_iou": ("lane marks IoU", "road_views"),
 }
-"""Figures that have intervals, as the tables call them."""
+"""Figures that have intervals: their names in the tables, and what they count."""
 
 _DRAWS = 2000
 
@@ -62,7 +66,7 @@ class Verdict:
     size: tuple[int, int]
     detections: Detections | None = None
     labels: Labels | None = None
-    true: Detections | None = None  # confident ones in the true image, if there is one
+    true: Detections | None = None  # those in the true image, if there is one
     valid: BoolArray | None = None  # (h, w) pixels where both count
     false_alarms: int | None = None  # on generated pixels, if there are any
     road: Integers | None = None  # (2, 2) intersection and union, pixels, of drivable area and lanes with the truth's
@@ -161,9 +165,8 @@ class Panel:
         verdict = replace(verdict, detections=self.detector(image))
         there = [] if verdict.labels is None else [verdict.labels.boxes]
         if true is not None and true.detections is not None:
-            confident = true.detections.subset(true.detections.scores >= CONFIDENCE)
-            seen = valid_detections(confident, true.valid)
-            verdict, there = replace(verdict, true=seen, valid=true.valid), [*there, confident.boxes]
+            seen = valid_detections(true.detections, true.valid)
+            verdict, there = replace(verdict, true=seen, valid=true.valid), [*there, true.detections.boxes]
         if generated is None or not there:
             return verdict
         return replace(verdict, false_alarms=false_alarms(verdict.scored, np.concatenate(there), generated))
@@ -193,10 +196,13 @@ class Panel:
         """What a reader of the rows must know: figures that say nothing, labels not ``chosen``, nothing to score."""
         verdicts = {method: [v for v in self.verdicts if v.method == method] for method in methods}
         rows = {method: figures(of_method) for method, of_method in verdicts.items() if of_method}
-        wide = indistinct(rows, READABLE)
-        judging = "to tell the methods apart" if len(rows) > 1 else "to say anything"
-        notes = [f"intervals are too wide {judging} by {', '.join(wide)}; more frames narrow them"] if wide else []
+        wide, notes = ", ".join(indistinct(rows)), []
+        if wide:
+            unable = "do not tell the methods apart" if len(rows) > 1 else "say nothing"
+            notes.append(f"{wide}: too few objects or views, or intervals too wide: they {unable}; add frames")
         detections = [v.detections for v in self.verdicts if v.detections is not None]
+        if detections:
+            notes.append("judged pictures show labels in cyan, and detections of score 0.5 or more in yellow")
         if not chosen and any(label.isdecimal() for one in detections for label in one.labels):
             notes.append("--detector: its labels are numbers, and all count; --detector-classes chooses")
         if detections and not any("objects" in row or "true_objects" in row for row in rows.values()):
@@ -252,20 +258,28 @@ def _means(keys: Sequence[Any], values: FloatArray, generator: np.random.Generat
 
 
 def _precision(verdicts: Sequence[Verdict], seed: int) -> Figures:
-    """AP of all images together, at each of ``OVERLAPS``."""
-    ends = np.cumsum([0, *(len(v.true.boxes) for v in verdicts if v.true is not None)])
-    row, scores = {"true_objects": ends[-1:].astype(float)}, np.concatenate([v.scored.scores for v in verdicts])
+    """AP of all images together, at each of ``OVERLAPS``; detections of a doubtful true object do not count."""
+    confident, doubtful = zip(*(_by_confidence(v.true) for v in verdicts if v.true is not None), strict=True)
+    ends = np.cumsum([0, *map(len, confident)])
+    row: Figures = {"true_objects": ends[-1:].astype(float)}
     for overlap in OVERLAPS if ends[-1] else ():
-        generator, matched = np.random.default_rng(seed), []
-        for v, start in zip(verdicts, ends, strict=False):
-            assert v.true is not None
-            of_image = hits(v.scored, v.true.boxes, overlap)
-            matched.append(np.where(of_image < 0, -1, of_image + start))
+        generator, matched, scores = np.random.default_rng(seed), [], []
+        for v, true, unsure, start in zip(verdicts, confident, doubtful, ends[:-1], strict=True):
+            of_image = hits(v.scored, true, overlap)
+            counts = (of_image >= 0) | (ious(v.scored.boxes, unsure).max(axis=1, initial=0) < overlap)
+            matched.append(np.where(of_image < 0, -1, of_image + start)[counts])
+            scores.append(v.scored.scores[counts])
         of_all = np.concatenate(matched)
         weights = _weights(int(ends[-1]), generator)  # first: the same in all rows
         misses = _weights(int((of_all < 0).sum()), generator)
-        row[f"ap_{100 * overlap:.0f}"] = average_precision(scores, of_all, weights, misses)
+        row[f"ap_{100 * overlap:.0f}"] = average_precision(np.concatenate(scores), of_all, weights, misses)
     return row
+
+
+def _by_confidence(detections: Detections) -> tuple[FloatArray, FloatArray]:
+    """Boxes that are confident, and those that are not."""
+    is_sure = detections.scores >= CONFIDENCE
+    return detections.boxes[is_sure], detections.boxes[~is_sure]
 
 
 def _weights(count: int, generator: np.random.Generator) -> FloatArray:
@@ -291,18 +305,18 @@ def numbers(row: Figures) -> dict[str, float]:
     return values
 
 
-def indistinct(rows: Mapping[str, Figures], names: Mapping[str, str]) -> list[str]:
-    """Names, by figure, of those whose intervals are too wide to say anything about the rows.
+def indistinct(rows: Mapping[str, Figures]) -> list[str]:
+    """Names of the figures whose intervals are too wide to say anything about the rows.
 
     With several rows: the difference of the best and the worst may be 0. With one: the interval is wider than ``WIDE``.
+    Fewer objects than ``FEWEST`` say nothing either.
     """
     wide = []
-    for key, text in names.items():
-        drawn = [row[key] for row in rows.values() if key in row]
-        if len(drawn) > 1:
-            by_value = sorted(drawn, key=lambda draws: float(draws[0]))
-            says_nothing = interval(by_value[-1] - by_value[0])[0] <= 0
-        else:
-            says_nothing = any(np.subtract(*interval(draws)) < -WIDE for draws in drawn)
-        wide += [text] if says_nothing else []
+    for key, (name, unit) in READABLE.items():
+        having = sorted((row for row in rows.values() if key in row), key=lambda row: float(row[key][0]))
+        if not having:
+            continue
+        low, high = interval(having[-1][key] - having[0][key] if len(having) > 1 else having[0][key])
+        says_nothing = low <= 0 if len(having) > 1 else high - low > WIDE
+        wide += [name] if says_nothing or having[0][unit][0] < FEWEST else []
     return wide

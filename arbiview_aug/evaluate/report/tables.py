@@ -96,9 +96,9 @@ DETECTION_COLUMNS = (
 )
 DETECTION_NOTES = (
     "true objects: detections of score 0.5 or more in the true images, whatever their class. AP: of the detections in "
-    "the views against them, at these IoUs; intervals 95 %, bootstrap over objects and misses. false alarms: "
-    "detections on generated pixels that touch no label and no true object (IoU below 0.1); a dash where no pixels are "
-    "generated."
+    "the views against them, at these IoUs; less sure ones there neither count nor cost. Intervals: 95 %, bootstrap "
+    "over objects and misses. false alarms: detections on generated pixels that touch no label and no true object (IoU "
+    "below 0.1); a dash where no pixels are generated."
 )
 ROAD_COLUMNS = (
     ("views", "{road_views:.0f}"),
