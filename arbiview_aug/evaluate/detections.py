@@ -6,6 +6,7 @@ with their detections; 0 without one. It has no test of occlusion; ``Labels.clea
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -114,26 +115,58 @@ def hits(detections: Detections, boxes: FloatArray, overlap: float) -> Integers:
     return matched
 
 
-def average_precision(
-    scores: FloatArray, matched: Integers, weights: FloatArray, weights_of_misses: FloatArray
-) -> FloatArray:
-    """(R,) AP, the area under the envelope of precision over recall, for R weightings.
+class Pooled(NamedTuple):
+    """Detections of several images.
+
+    Attributes:
+        scores: (d,).
+        matched: (d,) which of all the true objects each hits, or -1 for a miss; each object at most once.
+        num_true: Number of true objects.
+    """
+
+    scores: FloatArray
+    matched: Integers
+    num_true: int
+
+    @property
+    def num_misses(self) -> int:
+        """Number of detections that hit nothing."""
+        return int((self.matched < 0).sum())
+
+
+def pooled(
+    detections: Sequence[Detections], true: Sequence[FloatArray], doubtful: Sequence[FloatArray], overlap: float
+) -> Pooled:
+    """Match the detections of images with their true boxes (t, 4); those that hit doubtful ones alone are left out."""
+    ends = np.cumsum([0, *map(len, true)])
+    scores, matched = [np.zeros(0)], [np.zeros(0, np.int64)]
+    for of_image, boxes, unsure, start in zip(detections, true, doubtful, ends[:-1], strict=True):
+        taken = hits(of_image, boxes, overlap)
+        counts = (taken >= 0) | (ious(of_image.boxes, unsure).max(axis=1, initial=0) < overlap)
+        matched.append(np.where(taken < 0, -1, taken + start)[counts])
+        scores.append(of_image.scores[counts])
+    return Pooled(np.concatenate(scores), np.concatenate(matched), int(ends[-1]))
+
+
+def average_precision(found: Pooled, weights: FloatArray | None = None, misses: FloatArray | None = None) -> FloatArray:
+    """(R,) AP, the area under the envelope of precision over recall, for R weightings; NaN without true objects.
 
     Args:
-        scores: (d,) of all detections.
-        matched: (d,) true objects that they hit, or -1 for a miss; each object at most once.
-        weights: (R, t) how often each true object counts.
-        weights_of_misses: (R, k) how often each of the k misses counts.
+        found: The detections and what they hit.
+        weights: (R, num_true) how often each true object counts; once by default.
+        misses: (R, num_misses) how often each miss counts; once by default.
     """
-    if not weights.shape[1]:
+    weights = np.ones((1, found.num_true)) if weights is None else weights
+    misses = np.ones((len(weights), found.num_misses)) if misses is None else misses
+    if not found.num_true:
         return np.full(len(weights), np.nan)
-    order = np.argsort(-scores, kind="stable")
-    hit, index = matched >= 0, matched.copy()
-    index[~hit] = np.arange((~hit).sum())
+    hit, index = found.matched >= 0, found.matched.copy()
+    index[~hit] = np.arange(found.num_misses)
+    order = np.argsort(-found.scores, kind="stable")
     hit, index = hit[order], index[order]
     true, every = np.zeros((2, len(weights), len(order)))
     true[:, hit] = every[:, hit] = weights[:, index[hit]]
-    every[:, ~hit] = weights_of_misses[:, index[~hit]]
+    every[:, ~hit] = misses[:, index[~hit]]
     true, every = true.cumsum(axis=1), every.cumsum(axis=1)
     precision = np.maximum.accumulate((true / np.maximum(every, 1))[:, ::-1], axis=1)[:, ::-1]
     gained = np.diff(true / weights.sum(axis=1, keepdims=True), axis=1, prepend=0)

@@ -18,10 +18,9 @@ from arbiview_aug.evaluate.detections import (
     Labels,
     average_precision,
     false_alarms,
-    hits,
-    ious,
     labels_of,
     nta_ious,
+    pooled,
 )
 from arbiview_aug.evaluate.frames import ScoredFrame, valid_pixels
 from arbiview_aug.evaluate.images import RenderedView, as_arrays, to_bytes
@@ -258,28 +257,16 @@ def _means(keys: Sequence[Any], values: FloatArray, generator: np.random.Generat
 
 
 def _precision(verdicts: Sequence[Verdict], seed: int) -> Figures:
-    """AP of all images together, at each of ``OVERLAPS``; detections of a doubtful true object do not count."""
-    confident, doubtful = zip(*(_by_confidence(v.true) for v in verdicts if v.true is not None), strict=True)
-    ends = np.cumsum([0, *map(len, confident)])
-    row: Figures = {"true_objects": ends[-1:].astype(float)}
-    for overlap in OVERLAPS if ends[-1] else ():
-        generator, matched, scores = np.random.default_rng(seed), [], []
-        for v, true, unsure, start in zip(verdicts, confident, doubtful, ends[:-1], strict=True):
-            of_image = hits(v.scored, true, overlap)
-            counts = (of_image >= 0) | (ious(v.scored.boxes, unsure).max(axis=1, initial=0) < overlap)
-            matched.append(np.where(of_image < 0, -1, of_image + start)[counts])
-            scores.append(v.scored.scores[counts])
-        of_all = np.concatenate(matched)
-        weights = _weights(int(ends[-1]), generator)  # first: the same in all rows
-        misses = _weights(int((of_all < 0).sum()), generator)
-        row[f"ap_{100 * overlap:.0f}"] = average_precision(np.concatenate(scores), of_all, weights, misses)
+    """AP of all images together, at each of ``OVERLAPS``."""
+    is_sure = [v.true.scores >= CONFIDENCE for v in verdicts if v.true is not None]
+    boxes = [v.true.boxes for v in verdicts if v.true is not None]
+    true, doubtful = ([one[sure == how] for one, sure in zip(boxes, is_sure, strict=True)] for how in (True, False))
+    row: Figures = {"true_objects": np.array([sum(map(len, true))], float)}
+    for overlap in OVERLAPS if row["true_objects"][0] else ():
+        generator, found = np.random.default_rng(seed), pooled([v.scored for v in verdicts], true, doubtful, overlap)
+        weights = _weights(found.num_true, generator)  # first: the same in all rows
+        row[f"ap_{100 * overlap:.0f}"] = average_precision(found, weights, _weights(found.num_misses, generator))
     return row
-
-
-def _by_confidence(detections: Detections) -> tuple[FloatArray, FloatArray]:
-    """Boxes that are confident, and those that are not."""
-    is_sure = detections.scores >= CONFIDENCE
-    return detections.boxes[is_sure], detections.boxes[~is_sure]
 
 
 def _weights(count: int, generator: np.random.Generator) -> FloatArray:
