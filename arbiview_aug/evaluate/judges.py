@@ -222,7 +222,7 @@ def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
             array = np.zeros(0)
         expected = (2, *image.shape[:2])
         if array.shape != expected or not np.isin(array, (0, 1)).all():
-            got = f"{array.dtype} {array.shape}" if array.size else type(masks).__name__
+            got = f"{array.dtype} {array.shape}" if array.shape and array.size else type(masks).__name__
             raise DataError(f"{option}: expected masks {expected} of 0 and 1: drivable area and lane marks, got {got}")
         return array.astype(bool)
 
