@@ -152,21 +152,20 @@ def segment(rgb):
 def test_judges_of_a_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "own.py").write_text(JUDGES)
     judges = ["--detector", f"{tmp_path}/own.py:detect", "--segmenter", f"{tmp_path}/own.py:segment"]
-    size = ["--size", "48x132", "--geometry", "infinity", "--holes", "black", "continue"]
+    size = ["--size", "48x132", "--geometry", "infinity", "--holes", "continue"]
     report = run([*size, *judges], tmp_path)
     rows, printed = report["judges"], capsys.readouterr().out
-    assert list(rows) == ["sources", "fast, infinity", "fast, infinity, continue", "truth"]
-    for name in list(rows)[1:3]:
-        assert rows[name]["true_objects"] == 5 and rows[name]["ap_50"] == rows[name]["ap_70"] == 1
-        assert 0 < rows[name]["area_iou"] < 1 and rows[name]["road_views"] == 5
-    assert rows["sources"]["objects"] > 0 and rows["truth"]["objects"] == rows["fast, infinity"]["objects"] > 0
-    assert {name for name, row in rows.items() if "false_alarms" in row} == {"fast, infinity, continue"}
+    assert list(rows) == ["sources", "fast, infinity, continue", "truth"]
+    row = rows["fast, infinity, continue"]
+    assert row["true_objects"] == 5 and row["ap_50"] == row["ap_70"] == 1
+    assert 0 < row["area_iou"] < 1 and row["road_views"] == row["filled"] == 5
+    assert rows["sources"]["objects"] > 0 and rows["truth"]["objects"] == row["objects"] > 0
     for title in ("Labelled objects that the detector finds", "Detections in views and", "Road in views and"):
         assert f"{title}" in printed
-    assert "note: " in printed and "do not tell the methods apart" in printed
-    assert cv2.imread(str(tmp_path / "van-fast-infinity-judged.png")).std() > 20
+    assert "note: " in printed and "they say nothing" in printed
+    assert cv2.imread(str(tmp_path / "van-fast-infinity-continue-judged.png")).std() > 20
     page = (tmp_path / "report.html").read_text()
-    assert all(f">{name}: judged<" in page for name in ("nearest source camera", "fast, infinity", "truth"))
+    assert all(f">{name}: judged<" in page for name in ("nearest source camera", "fast, infinity, continue", "truth"))
     assert "Labelled objects that the detector finds" in page
 
 
@@ -176,7 +175,7 @@ def test_judges_are_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixt
         judge = ["--detector", f"{tmp_path}/own.py:{function}", "--size", "24x66", "--geometry", "infinity"]
         assert main(["evaluate", *judge, "--output", str(tmp_path)]) == 2
         error = capsys.readouterr().err
-        assert f"--detector {tmp_path}/own.py:{function}: {message}" in error and len(error.splitlines()) == 1
+        assert f"--detector {tmp_path}/own.py:{function}: {message}" in error.splitlines()[-1]
 
 
 @pytest.mark.slow
