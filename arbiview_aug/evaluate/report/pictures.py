@@ -139,7 +139,7 @@ def draw_rectangles(image: Image, labelled: FloatArray, detected: FloatArray) ->
     picture = to_bytes(image).copy()
     for boxes, colour in ((labelled, _BOX), (detected, _DETECTED)):
         for x0, y0, x1, y1 in np.round(boxes).astype(int).tolist():
-            cv2.rectangle(picture, (x0, y0), (x1, y1), colour, max(1, len(picture) // 200))
+            cv2.rectangle(picture, (x0, y0), (x1, y1), colour, max(1, len(picture) // 128))
     return picture
 
 
