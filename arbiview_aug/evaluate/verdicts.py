@@ -277,9 +277,9 @@ def _weights(count: int, generator: np.random.Generator) -> FloatArray:
     return np.concatenate([np.ones((1, count)), drawn])
 
 
-def interval(draws: FloatArray) -> tuple[float, float]:
-    """The 95 % percentile interval of a figure, by its draws."""
-    low, high = np.percentile(draws[1:], (2.5, 97.5))
+def interval(draws: FloatArray, times: int = 1) -> tuple[float, float]:
+    """The percentile interval of a figure, by its draws: 95 %, or wider for one out of several (Bonferroni)."""
+    low, high = np.percentile(draws[1:], (2.5 / times, 100 - 2.5 / times))
     return float(low), float(high)
 
 
@@ -295,15 +295,18 @@ def numbers(row: Figures) -> dict[str, float]:
 def indistinct(rows: Mapping[str, Figures]) -> list[str]:
     """Names of the figures whose intervals are too wide to say anything about the rows.
 
-    With several rows: the difference of the best and the worst may be 0. With one: the interval is wider than ``WIDE``.
-    Fewer objects than ``FEWEST`` say nothing either.
+    With several rows: the difference of the best and the worst, one out of all pairs, may be 0. With one: the interval
+    is wider than ``WIDE``. Fewer objects than ``FEWEST`` say nothing either.
     """
     wide = []
     for key, (name, unit) in READABLE.items():
         having = sorted((row for row in rows.values() if key in row), key=lambda row: float(row[key][0]))
         if not having:
             continue
-        low, high = interval(having[-1][key] - having[0][key] if len(having) > 1 else having[0][key])
-        says_nothing = low <= 0 if len(having) > 1 else high - low > WIDE
+        if len(having) > 1:
+            pairs = len(having) * (len(having) - 1) // 2
+            says_nothing = interval(having[-1][key] - having[0][key], pairs)[0] <= 0
+        else:
+            says_nothing = np.ptp(interval(having[0][key])) > WIDE
         wide += [name] if says_nothing or having[0][unit][0] < FEWEST else []
     return wide
