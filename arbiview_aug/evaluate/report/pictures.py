@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Picture = npt.NDArray[np.uint8]
 INK, PAPER = (40, 40, 40), (255, 255, 255)
 HOLE = (255, 0, 160)  # colour of uncovered regions; rare on streets
-_BOX, _DETECTED = (0, 230, 255), (255, 220, 0)
+_BOX = (0, 230, 255)
 _FARTHEST_M = 80.0  # points there, and beyond, are blue
 
 RIG_COLOURS = ("#1f64c8", "#d65414", "#1e8c3c", "#8c3caa", "#966e14")  # of rigs, in their order
@@ -36,6 +36,8 @@ _GAP_PX = 6
 _CAPTION_PX, _CAPTION_SCALE = 20, 0.42
 _TITLE_PX = 28
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+_LABELLED, _DETECTED = (0, 230, 255), (255, 220, 0)  # colours of boxes that judges are shown, and that they see
 
 
 def put_text(picture: Picture, text: str, xy: tuple[int, int], scale: float) -> None:
@@ -134,15 +136,6 @@ def draw_labels(camera: Camera, image: Image, points: FloatArray | None, boxes: 
     return picture
 
 
-def draw_rectangles(image: Image, labelled: FloatArray, detected: FloatArray) -> Picture:
-    """Draw labelled boxes (n, 4) x0 y0 x1 y1 in cyan, and a detector's in yellow, into an image (h, w, 3)."""
-    picture = to_bytes(image).copy()
-    for boxes, colour in ((labelled, _BOX), (detected, _DETECTED)):
-        for x0, y0, x1, y1 in np.round(boxes).astype(int).tolist():
-            cv2.rectangle(picture, (x0, y0), (x1, y1), colour, max(1, len(picture) // 128))
-    return picture
-
-
 def save_picture(path: str | Path, picture: Picture) -> Path:
     """Write a picture as PNG or JPEG, by its suffix, and create its folder."""
     path = Path(path)
@@ -154,6 +147,15 @@ def save_picture(path: str | Path, picture: Picture) -> Path:
     if not written:
         raise DataError(f"picture {path}: expected a name ending in .png or .jpg, in a folder that can be written to")
     return path
+
+
+def draw_rectangles(image: Image, labelled: FloatArray, detected: FloatArray) -> Picture:
+    """Draw labelled boxes (n, 4) x0 y0 x1 y1 in cyan, and a detector's in yellow, into an image (h, w, 3)."""
+    picture = to_bytes(image).copy()
+    for boxes, colour in ((labelled, _LABELLED), (detected, _DETECTED)):
+        for x0, y0, x1, y1 in np.round(boxes).astype(int).tolist():
+            cv2.rectangle(picture, (x0, y0), (x1, y1), colour, max(1, len(picture) // 128))
+    return picture
 
 
 def _paper(height: int, width: int) -> Picture:
