@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,16 +64,10 @@ class Verdict:
     size: tuple[int, int]
     detections: Detections | None = None
     labels: Labels | None = None
-    true: Detections | None = None  # those in the true image, if there is one
-    valid: BoolArray | None = None  # (h, w) pixels where both count
+    true: Detections | None = None  # those in the true image, if there is one, on valid pixels
+    scored: Detections | None = None  # those of ``detections`` that are compared with them
     false_alarms: int | None = None  # on generated pixels, if there are any
     road: Integers | None = None  # (2, 2) intersection and union, pixels, of drivable area and lanes with the truth's
-
-    @cached_property
-    def scored(self) -> Detections:
-        """The detections whose centres are valid."""
-        assert self.detections is not None
-        return valid_detections(self.detections, self.valid)
 
     def objects(self, which: BoolArray) -> FloatArray:
         """(n,) ``nta_ious`` of those of the labels."""
@@ -83,21 +76,25 @@ class Verdict:
         return nta_ious(self.labels.boxes[which], confident, self.size)
 
 
-def valid_detections(detections: Detections, valid: BoolArray | None) -> Detections:
-    """The detections whose centres are on valid pixels (h, w); None: all."""
-    if valid is None:
-        return detections
+def valid_detections(detections: Detections, valid: BoolArray) -> Detections:
+    """The detections whose centres are on valid pixels (h, w)."""
     x, y = ((detections.boxes[:, :2] + detections.boxes[:, 2:]) / 2).astype(int).T
     return detections.subset(valid[y.clip(max=valid.shape[0] - 1), x.clip(max=valid.shape[1] - 1)])
 
 
 class TrueImage(NamedTuple):
-    """A true image, and what judges see in it."""
+    """What judges see in a true image."""
 
-    image: Picture
-    valid: BoolArray
+    valid: BoolArray  # (h, w) pixels that count
     detections: Detections | None
     road: BoolArray | None
+
+
+class Target(NamedTuple):
+    """What views for a rig are compared with: for each camera, or None."""
+
+    labels: list[Labels] | None
+    truth: list[TrueImage] | None
 
 
 @dataclass
@@ -108,41 +105,42 @@ class Panel:
     segmenter: Segmenter | None = None
     verdicts: list[Verdict] = field(default_factory=list)
     pictures: dict[tuple[str, str], list[Picture]] = field(default_factory=dict)  # of the first frame, by target, row
-    _truth: list[TrueImage] = field(default_factory=list)  # of the last frame and target
-    _labels: list[Labels] | None = None
-    _last: tuple[str, str] = ("", "")
+    _frame: str = ""
+    _targets: dict[str, Target] = field(default_factory=dict)  # of that frame
 
     def look(
         self, name: str, frame: ScoredFrame, method: str, target: str, rig: Rig, views: Sequence[RenderedView]
     ) -> None:
         """Judge a method's views for a rig; before the first ones, the sources and the true images."""
-        if name != self._last[0] and self.detector is not None:
-            self._look_at_sources(name, frame, self.detector)
-        if (name, target) != self._last:
-            self._last = name, target
-            self._look_at_truth(name, frame, target, rig)
+        if name != self._frame:
+            self._frame, self._targets = name, {}
+            if self.detector is not None:
+                self._look_at_sources(name, frame, self.detector)
+        if target not in self._targets:
+            self._targets[target] = self._look_at_truth(name, frame, target, rig)
+        labels, truth = self._targets[target]
         for k, view in enumerate(views):
-            image, true = to_bytes(view.image), self._truth[k] if self._truth else None
-            labels = None if self._labels is None else self._labels[k]
-            verdict = Verdict(name, method, target, rig[k].name, rig[k].size, labels=labels)
+            of_camera = None if labels is None else labels[k]
+            verdict = Verdict(name, method, target, rig[k].name, rig[k].size, labels=of_camera)
+            image, true = to_bytes(view.image), None if truth is None else truth[k]
             self._add(image, self._judged(verdict, image, view.generated, true))
 
-    def _look_at_truth(self, name: str, frame: ScoredFrame, target: str, rig: Rig) -> None:
+    def _look_at_truth(self, name: str, frame: ScoredFrame, target: str, rig: Rig) -> Target:
         """Judge the true images of a rig, if there are some; their masks hide labelled objects."""
-        mounted, self._truth = rig.in_frame_of(frame.sample["rig"]), []
-        if frame.truth is not None:
-            truth = frame.truth(rig)
-            for image, valid in zip(map(to_bytes, as_arrays(truth.images)), valid_pixels(truth), strict=True):
-                detections = None if self.detector is None else self.detector(image)
-                road = None if self.segmenter is None else self.segmenter(image)
-                self._truth.append(TrueImage(image, valid, detections, road))
-            mounted = mounted.with_cameras(
-                [replace(camera, mask=true.valid) for camera, true in zip(mounted, self._truth, strict=True)]
-            )
-        self._labels = None if self.detector is None else labels_of(frame, mounted)
-        for k, (camera, true) in enumerate(zip(rig, self._truth, strict=False)):
-            labels = None if self._labels is None else self._labels[k]
-            self._add(true.image, Verdict(name, TRUTH, target, camera.name, camera.size, true.detections, labels))
+        mounted = rig.in_frame_of(frame.sample["rig"])
+        if frame.truth is None:
+            return Target(None if self.detector is None else labels_of(frame, mounted), None)
+        true = frame.truth(rig)
+        images, masks = [to_bytes(image) for image in as_arrays(true.images)], valid_pixels(true)
+        masked = mounted.with_cameras([replace(camera, mask=mask) for camera, mask in zip(mounted, masks, strict=True)])
+        labels = None if self.detector is None else labels_of(frame, masked)
+        truth = []
+        for k, (camera, image) in enumerate(zip(rig, images, strict=True)):
+            detections = None if self.detector is None else self.detector(image)
+            truth.append(TrueImage(masks[k], detections, None if self.segmenter is None else self.segmenter(image)))
+            of_camera = None if labels is None else labels[k]
+            self._add(image, Verdict(name, TRUTH, target, camera.name, camera.size, detections, of_camera))
+        return Target(labels, truth)
 
     def _look_at_sources(self, name: str, frame: ScoredFrame, detector: Detector) -> None:
         rig: Rig = frame.sample["rig"]
@@ -161,14 +159,15 @@ class Panel:
             verdict = replace(verdict, road=counts.astype(np.int64))
         if self.detector is None:
             return verdict
-        verdict = replace(verdict, detections=self.detector(image))
-        there = [] if verdict.labels is None else [verdict.labels.boxes]
+        seen = self.detector(image)
+        verdict, there = replace(verdict, detections=seen), [] if verdict.labels is None else [verdict.labels.boxes]
         if true is not None and true.detections is not None:
-            seen = valid_detections(true.detections, true.valid)
-            verdict, there = replace(verdict, true=seen, valid=true.valid), [*there, true.detections.boxes]
+            seen = valid_detections(seen, true.valid)
+            there.append(true.detections.boxes)
+            verdict = replace(verdict, true=valid_detections(true.detections, true.valid), scored=seen)
         if generated is None or not there:
             return verdict
-        return replace(verdict, false_alarms=false_alarms(verdict.scored, np.concatenate(there), generated))
+        return replace(verdict, false_alarms=false_alarms(seen, np.concatenate(there), generated))
 
     def _add(self, image: Picture, verdict: Verdict) -> None:
         """Keep a verdict, and of the first frame a picture with both sets of boxes."""
@@ -221,12 +220,13 @@ def figures(verdicts: Sequence[Verdict], seed: int = 0) -> Figures:
     generated pixels), ``road_views``.
     """
     row: Figures = {}
-    labelled = [v for v in verdicts if v.labels is not None and v.detections is not None]
+    labelled = [v for v in verdicts if v.labels is not None]
     for prefix, which in (("", "whole"), ("clear_", "clear")) if labelled else ():
         keys, values = [], [np.zeros(0)]
         for v in labelled:
+            assert v.labels is not None
             chosen = getattr(v.labels, which)
-            keys += [(v.frame, row) for row in v.labels.rows[chosen].tolist()] if v.labels is not None else []
+            keys += [(v.frame, number) for number in v.labels.rows[chosen].tolist()]
             values.append(v.objects(chosen))
         row[f"{prefix}objects"] = np.array([len(keys)], float)
         if keys:
@@ -258,12 +258,16 @@ def _means(keys: Sequence[Any], values: FloatArray, generator: np.random.Generat
 
 def _precision(verdicts: Sequence[Verdict], seed: int) -> Figures:
     """AP of all images together, at each of ``OVERLAPS``."""
-    is_sure = [v.true.scores >= CONFIDENCE for v in verdicts if v.true is not None]
-    boxes = [v.true.boxes for v in verdicts if v.true is not None]
-    true, doubtful = ([one[sure == how] for one, sure in zip(boxes, is_sure, strict=True)] for how in (True, False))
+    seen = [v.scored for v in verdicts if v.scored is not None]
+    in_truth = [v.true for v in verdicts if v.true is not None]
+    true, doubtful = [], []
+    for of_image in in_truth:
+        is_sure = of_image.scores >= CONFIDENCE
+        true.append(of_image.boxes[is_sure])
+        doubtful.append(of_image.boxes[~is_sure])
     row: Figures = {"true_objects": np.array([sum(map(len, true))], float)}
     for overlap in OVERLAPS if row["true_objects"][0] else ():
-        generator, found = np.random.default_rng(seed), pooled([v.scored for v in verdicts], true, doubtful, overlap)
+        generator, found = np.random.default_rng(seed), pooled(seen, true, doubtful, overlap)
         weights = _weights(found.num_true, generator)  # first: the same in all rows
         row[f"ap_{100 * overlap:.0f}"] = average_precision(found, weights, _weights(found.num_misses, generator))
     return row

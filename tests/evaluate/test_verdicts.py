@@ -67,6 +67,28 @@ def test_rows_of_sources_views_and_truth() -> None:
     assert "ap_50" not in rows[SOURCES] and "ap_50" not in rows[TRUTH] and "false_alarms" not in rows["own"]
 
 
+def test_several_targets_and_methods_share_the_truth() -> None:
+    one, two = labelled().tolist()
+    calls: list[int] = []
+    seen = detector({SOURCE: [one, two], VIEW: [one], TRUE: [one, two]})
+
+    def detect(image: Picture) -> Detections:
+        calls.append(int(image[0, 0, 0]))
+        return seen(image)  # type: ignore[no-any-return]
+
+    panel, targets = Panel(detect), ["van", "truck"]
+    for name in ("first", "second"):
+        for method in ("own", "other"):
+            for target in targets:
+                panel.look(name, frame(), method, target, RIG, [RenderedView(plain(VIEW), ALL)])
+    assert [calls.count(colour) for colour in (SOURCE, TRUE, VIEW)] == [2, 4, 8]
+    rows = panel.rows(["own", "other"], targets)
+    assert list(rows)[:4] == [SOURCES, "own: van", "own: truck", "own: all"] and len(rows) == 10
+    counts = {name: int(row["objects"][0]) for name, row in rows.items()}
+    assert counts[SOURCES] == counts["own: van"] == counts[f"{TRUTH}: truck"] == 4
+    assert counts["own: all"] == counts[f"{TRUTH}: all"] == 8
+
+
 def test_unsure_detections() -> None:
     boxes = labelled().tolist()
     rows = looked(Panel(detector({VIEW: boxes, TRUE: boxes}, score=0.4)), frame())
