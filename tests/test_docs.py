@@ -55,6 +55,9 @@ TINY = {
     "evaluate --data FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
     "evaluate --lidar --target waymo": [],
     "evaluate --displaced --data FOLDER": ["--geometry", "street", "--downscale", "4", "--frames", "1"],
+    "evaluate --displaced --data FOLDER --detector own.py:detect --segmenter own.py:segment": [
+        *("--geometry", "street", "--downscale", "4", "--frames", "1")
+    ],
     "check FOLDER": ["--downscale", "4"],
     "check FOLDER --frames 5 --output output": ["--downscale", "4"],
     "inspect nuscenes waymo": [],
@@ -214,6 +217,11 @@ def test_the_commands_run(
         arguments[arguments.index("ID_OR_PATH")] = str(saved_depth_model(tmp_path / "model"))
     monkeypatch.setattr(train_command, "open_frames", lambda *_, **__: drawn_frames())  # streets take seconds
     monkeypatch.chdir(tmp_path)
+    if "own.py:detect" in arguments:
+        Path("own.py").write_text(
+            "def detect(rgb):\n    return [[0, 0, 9, 9]], [0.9], ['car']\n\n\n"
+            "def segment(rgb):\n    return rgb.transpose(2, 0, 1)[:2] > 100\n"
+        )
     if "truck.yaml" in arguments:
         run_page(ROOT / "docs" / "rigs.md", only_first=True)
     assert main([*arguments, *TINY[command]]) == 0

@@ -176,6 +176,20 @@ def evaluate() -> argparse.ArgumentParser:
         "synthetic streets; with --displaced, the next frame's, by the target's scanners or those in calib.json"
     )
     add("--lidar", action="store_true", help=lidar)
+    detector = (
+        "judge views by a detector: a hub id or folder of transformers' object detection, a torchvision detector's "
+        "name, or FILE.py:function (RGB (H, W, 3) uint8 to boxes (n, 4) xyxy, scores, labels). Scores labelled "
+        "objects, and true images where there are some (docs/benchmarks.md)"
+    )
+    add("--detector", metavar="MODEL", help=detector)
+    add("--detector-weights", metavar="FILE", help="weights of a torchvision detector")
+    classes = "labels that count (default: names of vehicles and people; all numbers)"
+    add("--detector-classes", nargs="+", default=[], metavar="LABEL", help=classes)
+    segmenter = (
+        "judge views by drivable area and lane marks, against true images: TorchScript of TwinLiteNet's kind, or "
+        "FILE.py:function (RGB (H, W, 3) uint8 to masks (2, H, W))"
+    )
+    add("--segmenter", metavar="MODEL", help=segmenter)
     return parser
 
 
@@ -320,5 +334,13 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
                 parser.error(f"argument --{option.replace('_', '-')}: --displaced has its own; expected none")
         if arguments.lidar and arguments.data is not None and not arguments.displaced:
             parser.error("argument --lidar: expected --displaced with --data: a drive's truth is its next scan")
+        for option in ("detector_weights", "detector_classes"):
+            if getattr(arguments, option) and not arguments.detector:
+                parser.error(f"argument --{option.replace('_', '-')}: expected --detector with it, found none")
+        for option in ("detector", "segmenter") if arguments.lidar else ():
+            if getattr(arguments, option):
+                parser.error(f"argument --{option}: it judges images; expected no --lidar")
+        if arguments.segmenter and arguments.data is not None and not arguments.displaced:
+            parser.error("argument --segmenter: expected --displaced with --data: it compares with true images")
         if arguments.displaced and arguments.data is None:
             parser.error("argument --displaced: expected --data FOLDER with it, found none")
