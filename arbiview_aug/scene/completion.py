@@ -248,18 +248,20 @@ def meet_points(
             row, column = int(np.rint(rows[y, x])), int(np.rint(columns[y, x]))
             over, under, least_over, least_under = -1, -1, np.float32(np.inf), np.float32(np.inf)
             for c in range(max(column - aside, 0), min(column + aside + 1, w)):
-                for r in range(max(row - up, 0), min(row + up + 1, h)):
+                for r in range(max(row, 0), min(row + up, h - 1) + 1):
                     i = index[r, c]
-                    if i < 0:
-                        continue
-                    away, off = seeds[0, i] - rows[y, x], seeds[1, i] - columns[y, x]
-                    if abs(off) > side or abs(away) > far:
-                        continue
-                    cost = away * away + 4 * off * off
-                    if away >= 0 and cost < least_over:
-                        over, least_over = i, cost
-                    if away < 0 and cost < least_under:
-                        under, least_under = i, cost
+                    if i >= 0 and seeds[0, i] >= rows[y, x]:
+                        cost = _cost(seeds, i, rows[y, x], columns[y, x], far, side)
+                        if cost < least_over:
+                            over, least_over = i, cost
+                        break
+                for r in range(min(row, h - 1), max(row - up, 0) - 1, -1):
+                    i = index[r, c]
+                    if i >= 0 and seeds[0, i] < rows[y, x]:
+                        cost = _cost(seeds, i, rows[y, x], columns[y, x], far, side)
+                        if cost < least_under:
+                            under, least_under = i, cost
+                        break
             if over < 0 and under < 0:
                 continue
             level = np.sqrt(max(_ONE - rays[2, y, x] * rays[2, y, x], np.float32(1e-12)))
@@ -274,6 +276,13 @@ def meet_points(
                 inverse = _going_on(seeds, is_level, one, slope)
             if inverse > _ZERO:
                 q[y, x], nearest[y, x] = inverse * level, one
+
+
+@inlined
+def _cost(seeds: Any, i: int, row: float, column: float, far: float, side: float) -> float:
+    """What tells points next to a ray apart, the nearer the less; infinite out of reach."""
+    away, off = seeds[0, i] - row, seeds[1, i] - column
+    return away * away + 4 * off * off if abs(away) <= far and abs(off) <= side else np.float32(np.inf)
 
 
 @inlined
