@@ -22,6 +22,13 @@ _CHUNK = 1024  # points worked on at once
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
 _ROW, _OWN, _NO_SEED = 1 << 7, np.int32(64 * 128 + 64), np.int32(1 << 30)
 _SIDE, _CORNER, _KNIGHT = 1024 << 14, 1434 << 14, 2250 << 14
+_LOW_M, _LOW = np.float32(0.2), np.float32(0.01)
+"""Points lie on the road up to this height over it, and this share of their distance."""
+_JOINED_STEP_M, _JOINED_SLOPE = np.float32(0.3), np.float32(0.05)
+"""Level surfaces that differ by this height, and this share of their distance, are one: kerbs, and roads that rise.
+0.1 m loses 7 % of the points on synthetic vehicles at 15 to 25 m, which stand on the road."""
+_JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
+"""... and upright ones whose distances differ by that much, and so many times by how far they are apart across."""
 _STEP, _STEP_PER_M, LEAST_WEIGHT = np.float32(panorama.STEP), np.float32(panorama.STEP_PER_M), np.float32(1e-3)
 
 
@@ -279,7 +286,7 @@ def meet_points(
 
 
 @inlined
-def _cost(seeds: Any, i: int, row: float, column: float, far: float, side: float) -> float:
+def _cost(seeds: Any, i: int, row: float, column: float, far: float, side: float) -> Any:
     """What tells points next to a ray apart, the nearer the less; infinite out of reach."""
     away, off = seeds[0, i] - row, seeds[1, i] - column
     return away * away + 4 * off * off if abs(away) <= far and abs(off) <= side else np.float32(np.inf)
@@ -299,7 +306,8 @@ def _describe(index: Any, seeds: Any, ground: float, reach: float, spoken: Any, 
             if i < 0:
                 continue
             least = 2 * reach
-            is_level[i] = abs(seeds[3, i] - ground) < np.float32(0.2) + np.float32(0.01) / seeds[2, i]
+            height = abs(seeds[3, i] - ground)
+            is_level[i] = height < _LOW_M + _LOW / seeds[2, i] and seeds[3, i] < _ZERO  # seen from above
             for step in (-1, 1):
                 for k in range(1, min(most, row if step < 0 else h - 1 - row) + 1):
                     j = index[row + step * k, column]
@@ -322,22 +330,22 @@ def _are_level(seeds: Any, i: int, j: int) -> bool:
 
 
 @inlined
-def _going_on(seeds: Any, is_level: Any, i: int, slope: float) -> float:
+def _going_on(seeds: Any, is_level: Any, i: int, slope: float) -> Any:
     """Inverse level distance at which a ray of this slope meets the surface of a point; up to 0 if it does not."""
     return slope / seeds[3, i] if is_level[i] else seeds[2, i]
 
 
 @inlined
-def _between_points(seeds: Any, is_level: Any, over: int, under: int, slope: float, apart: float) -> float:
+def _between_points(seeds: Any, is_level: Any, over: int, under: int, slope: float, apart: float) -> Any:
     """Inverse level distance at which a ray meets what two points show, ``apart`` radians; 0 if they differ."""
     a, b = seeds[2, over], seeds[2, under]
     wide = abs(_ONE / a - _ONE / b)
     if is_level[under] and not is_level[over] and a <= b:  # a floor up to the foot of something
         return max(_going_on(seeds, is_level, under, slope), a)
     if is_level[over] and is_level[under]:
-        is_same = abs(seeds[3, over] - seeds[3, under]) <= np.float32(0.3) + np.float32(0.05) * wide
+        is_same = abs(seeds[3, over] - seeds[3, under]) <= _JOINED_STEP_M + _JOINED_SLOPE * wide
     else:
-        is_same = not (is_level[over] or is_level[under]) and wide <= _TWO * apart / min(a, b) + np.float32(0.1)
+        is_same = not (is_level[over] or is_level[under]) and wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
     if not is_same:
         return _ZERO
     s, t = seeds[3, over] * a, seeds[3, under] * b

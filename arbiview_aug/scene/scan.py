@@ -114,7 +114,7 @@ def _returns(lidar: Lidar, rays: Layer, points: Points, ground_z_m: float) -> tu
     at = np.empty((2, *size), np.float32)
     cells_of(rays, upright, window.place, *at)
     lengths = ground_z_m - origin[2], SCANNED.rad, SUPPORT_RAD / SCANNED.rad, SIDE_SUPPORT_RAD / SCANNED.rad
-    meet_points(*at, rays, index, seeds, *np.float32(lengths), q, nearest)
+    meet_points(*at, rays, index, seeds, *np.array(lengths, np.float32), q, nearest)
     return q, np.where(nearest >= 0, number[row, column][nearest] if len(cell) else nearest, nearest)
 
 
