@@ -122,10 +122,9 @@ def solids(boxes: FloatArray) -> FloatArray:
 ByBox = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 
 
-def solids_among(boxes: FloatArray, points: Points, within: ByBox | None = None) -> tuple[FloatArray, BoolArray]:
+def solids_among(boxes: FloatArray, points: Points) -> tuple[FloatArray, BoolArray]:
     """Shapes in boxes (B, 7), as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs.
 
-    ``within`` are ``points_by_box`` with ``AIR_M``, if they are known.
     Of the profiles that fit a box it is the one whose faces lie nearest to its points. Points within ``AIR_M`` of it
     are its own: mirrors, and the noise of points and labels. This far over the box's floor they may be the road's.
     """
@@ -134,7 +133,7 @@ def solids_among(boxes: FloatArray, points: Points, within: ByBox | None = None)
     boxes = np.ascontiguousarray(boxes)
     planes_and_own = np.empty((len(boxes), PIECES, 6, 4)), np.zeros(len(points), bool)
     points = np.ascontiguousarray(points, np.float32)
-    within = within or points_by_box(boxes, points, AIR_M)
+    within = points_by_box(boxes, points, AIR_M)
     fit_profiles(boxes, PROFILES, OF_KIND[kinds(boxes)], points, *within, LEAST_POINTS, AIR_M, *planes_and_own)
     return planes_and_own
 

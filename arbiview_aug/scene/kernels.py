@@ -360,58 +360,6 @@ def upsampled_row(nodes: Any, step: int, y: int, x0: int, row: Any, out: Any) ->
 
 
 @compiled
-def object_returns(
-    origin: Any, rays: Any, face: Any, planes: Any, points: Any, ends: Any, first: int, most: int, air: float,
-    support: float, q: Any, nearest: Any,
-) -> None:  # fmt: skip
-    """Give rays that meet an object the nearest of its own points, and the distance that this point tells.
-
-    Of an object's points, ``most`` are looked at, evenly over the scan.
-
-    A face within ``air`` of the point is moved into it: labels and shapes are some centimetres off.
-
-    Args:
-        origin: (3,) float64 of the rays.
-        rays: (3, ny, nx) float32, ego frame.
-        face: (ny, nx) the face that each ray meets, 6 x piece + plane, -1 for none.
-        planes: (B, pieces, 6, 4).
-        points: (n, 3) points of the objects, object after object.
-        ends: (B,) where they end.
-        first: Number of the first of them.
-        most: Points of an object.
-        air: Metres.
-        support: Radians, as seen from the rays' origin, by which a point may be farther than ``air`` from the hit.
-        q: (ny, nx) inverse distances of the faces, updated.
-        nearest: (ny, nx) int32, written where a ray meets an object: the point's number, -1 without one so near.
-    """
-    hit, per_box = np.empty(3, np.float32), 6 * planes.shape[1]
-    for y in range(q.shape[0]):
-        for x in range(q.shape[1]):
-            if face[y, x] < 0:
-                continue
-            for axis in range(3):
-                hit[axis] = origin[axis] + rays[axis, y, x] / q[y, x]
-            box, best, chosen = face[y, x] // per_box, np.float32(np.inf), -1
-            start = ends[box - 1] if box else 0
-            for i in range(start, ends[box], 1 + (ends[box] - start) // most):
-                a, b, c = points[i, 0] - hit[0], points[i, 1] - hit[1], points[i, 2] - hit[2]
-                away = a * a + b * b + c * c
-                if away < best:
-                    best, chosen = away, i
-            reach = air + support / q[y, x]
-            nearest[y, x] = first + chosen if best <= reach * reach else -1
-            if nearest[y, x] >= 0:
-                n = planes[box, face[y, x] % per_box // 6, face[y, x] % 6]
-                along, over, off = 0.0, 0.0, -n[3]
-                for axis in range(3):
-                    along += n[axis] * rays[axis, y, x]
-                    over += n[axis] * (points[chosen, axis] - origin[axis])
-                    off += n[axis] * points[chosen, axis]
-                if abs(off) <= air and along * over > 0:
-                    q[y, x] = along / over
-
-
-@compiled
 def points_in(boxes: Any, points: Any, air: float) -> Any:
     """Pairs (2, n) of a box (B, 7) and a point (P, 3) in it, widened by ``air`` on all sides, in the points' order."""
     center, reach = np.empty((2, boxes.shape[0])), np.empty(boxes.shape[0])

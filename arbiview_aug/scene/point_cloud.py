@@ -173,8 +173,6 @@ class Panorama:
         layers: (4, rows, columns) residual of the nearer side of a step, or of everything where there is none, 1/m;
             that of the farther side; the nearer side's share of the neighbourhood; 1 where a point lies within
             ``SUPPORT_RAD``, else 0.
-        seeds: With ``keep_seeds``: codes of each cell's nearest point and the points' numbers, as
-            ``completion.nearest_returns`` reads them.
     """
 
     def __init__(
@@ -185,8 +183,6 @@ class Panorama:
         street: StaticSurface,
         memory: Memory = FRESH,
         mapped: int = 0,
-        *,
-        keep_seeds: bool = False,
     ) -> None:
         from arbiview_aug.scene.completion import average_sides, drop_hidden, nearest_points, nearest_residuals
 
@@ -207,8 +203,6 @@ class Panorama:
         nearest_residuals(cell, own_q, residual, cells.reach, cells.support, code, r, q_near, self.layers)
         high, low = (window_max(of, 2 * cells.smooth, 2 * cells.smooth) for of in (r, -r))
         average_sides(r, q_near, high, low, cells.smooth, self.layers)
-        if keep_seeds:  # their memory is not used again meanwhile
-            self.seeds = code, number
 
     @cached_property
     def hidden_below(self) -> Layer:

@@ -197,7 +197,7 @@ def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[
     losses = []
     model.train()
     for _ in range(schedule.steps):
-        batch = draws.batch(schedule.batch).to(device)
+        batch = _on(device, draws.batch(schedule.batch))
         with _autocast(schedule):
             answer = model(batch)
         value = loss(answer, batch)
@@ -207,6 +207,11 @@ def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[
         cycle.step()
         losses.append(float(value.detach()))
     return model.eval(), [float(np.mean(part)) for part in np.array_split(losses, min(10, len(losses)))]
+
+
+def _on(device: torch.device, batch: Batch | PointBatch) -> Batch | PointBatch:
+    """A batch on a device."""
+    return type(batch)(*(getattr(batch, name).to(device) for name in batch.__dataclass_fields__))
 
 
 def _autocast(schedule: Schedule) -> torch.autocast:
@@ -223,7 +228,7 @@ def answers(
     for start in range(0, num_frames, _EVAL_BATCH):
         indices = range(start, min(start + _EVAL_BATCH, num_frames))
         own: Any = [frames.frame(k) for k in indices]
-        batch = frames.joined(own).to(torch.device(schedule.device))
+        batch = _on(torch.device(schedule.device), frames.joined(own))
         with _autocast(schedule):
             answer = model(batch)
         cells.append(answer.occupancy.float().sigmoid().cpu().numpy().astype(np.float16))
