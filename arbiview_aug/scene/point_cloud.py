@@ -324,7 +324,7 @@ class PointCloudSurface(DenseSurface):
             # Azimuths bend near the zenith, and jump in a panorama all around.
             steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
             step = 1 if steep or view.window.columns >= view.window.cells.turn else step
-            local = rays.planes if step == 1 and rays.planes.size else nodes_of(rays, step)
+            local = rays.planes if step == 1 and rays.planes.size else rays.nodes(step)
             self._nodes[key] = view, *view.cells(local, R), step
         self._latest[camera.center_m.tobytes()] = self._nodes[key][0]
         return self._nodes[key]
@@ -356,15 +356,10 @@ def window_max(a: Layer, rows: int, columns: int) -> Layer:
     return np.asarray(cv2.dilate(a, np.ones((rows + 1, columns + 1), np.uint8), anchor=(0, 0)))
 
 
-def nodes_of(rays: PixelRays, apart: int) -> Layer:
-    """Rays (3, ny + 1, nx + 1) of pixels so far apart, the last ones on the last pixels."""
-    return rays.at(*(np.minimum(np.arange(0, n + apart, apart), n - 1) for n in rays.size))
-
-
 def directions_of(rays: PixelRays, R: FloatArray) -> tuple[FloatArray, int]:
     """Unit rays (n, 3) in the ego frame that span a view, and the pixels between nodes for its panorama."""
     step = max(1, int(min(NODES_RAD * float(rays.parameters[0]), max(rays.size))))  # two nodes span any image
-    local = nodes_of(rays, step)
+    local = rays.nodes(step)
     valid = local.any(axis=0)
     if valid.all():
         return _turned(local, R), step
