@@ -11,6 +11,7 @@ not read from that source; where no other source sees them, they are holes.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -242,7 +243,7 @@ class BoxSurface(LayeredSurface):
         is_large = self.boxes[:, 3] * self.boxes[:, 4] > ROOF_M2
         return np.asarray((self.solids[..., 2] > TOP) & is_large[:, None, None]).reshape(-1)
 
-    @property
+    @cached_property
     def face_parts(self) -> npt.NDArray[np.int32]:
         """What each face (n,) shows: ``PARTS`` times its object, and ``TOP_PART`` more for tops.
 

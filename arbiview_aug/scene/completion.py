@@ -80,13 +80,14 @@ def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, nu
         n = 0
         for i in range(start, min(start + _CHUNK, points.shape[0])):
             x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-            level2 = x * x + y * y
+            forward, level2 = x * cosine + y * sine, x * x + y * y
+            if forward < least * np.sqrt(level2):  # most points lie elsewhere
+                continue
             length = np.sqrt(level2 + z * z)
             if length >= NEAREST_M and low * length <= z <= high * length:
-                if x * cosine + y * sine >= least * np.sqrt(level2):
-                    work[0, n], work[1, n], work[2, n], work[3, n] = x / length, y / length, z / length, 1 / length
-                    index[n] = i
-                    n += 1
+                work[0, n], work[1, n], work[2, n], work[3, n] = x / length, y / length, z / length, 1 / length
+                index[n] = i
+                n += 1
         cells_row(work[0, :n], work[1, :n], work[2, :n], place, work[4, :n], work[5, :n], work[6, :n])
         for i in range(n):
             row, column = int(np.rint(work[5, i])), int(np.rint(work[6, i])) % turn

@@ -359,6 +359,9 @@ def upsampled_row(nodes: Any, step: int, y: int, x0: int, row: Any, out: Any) ->
             part[k] = first + slope * np.float32(k)
 
 
+_NEAR_M, _NEAR_CELLS = 1.0, 256  # a grid around all boxes, over which it repeats
+
+
 @compiled
 def points_in(boxes: Any, points: Any, air: float) -> Any:
     """Pairs (2, n) of a box (B, 7) and a point (P, 3) in it, widened by ``air`` on all sides, in the points' order."""
@@ -366,14 +369,19 @@ def points_in(boxes: Any, points: Any, air: float) -> Any:
     for k in range(boxes.shape[0]):
         center[0, k], center[1, k] = boxes[k, 0], boxes[k, 1]
         reach[k] = np.hypot(boxes[k, 3], boxes[k, 4]) / 2 + 2 * air
+    near = np.zeros((_NEAR_CELLS, _NEAR_CELLS, 2), np.int32)  # first and last (exclusive) box of cells, which repeat
+    for k in range(reach.shape[0]):
+        side = min(reach[k], _NEAR_M * _NEAR_CELLS / 2)
+        x, y = center[0, k], center[1, k]
+        for j in range(int(np.floor((x - side) / _NEAR_M)), int(np.floor((x + side) / _NEAR_M)) + 1):
+            for i in range(int(np.floor((y - side) / _NEAR_M)), int(np.floor((y + side) / _NEAR_M)) + 1):
+                cell = near[j & _NEAR_CELLS - 1, i & _NEAR_CELLS - 1]
+                cell[0], cell[1] = cell[0] if cell[1] else k, k + 1
     pairs, n = np.empty((2, 1024), np.int64), 0
     for i in range(points.shape[0]):
-        px, py, hits = points[i, 0], points[i, 1], 0
-        for k in range(reach.shape[0]):
-            hits |= (abs(px - center[0, k]) <= reach[k]) & (abs(py - center[1, k]) <= reach[k])
-        if not hits:
-            continue
-        for k in range(reach.shape[0]):
+        px, py = points[i, 0], points[i, 1]
+        cell = near[int(np.floor(px / _NEAR_M)) & _NEAR_CELLS - 1, int(np.floor(py / _NEAR_M)) & _NEAR_CELLS - 1]
+        for k in range(cell[0], cell[1]):
             x, y, z = px - center[0, k], py - center[1, k], points[i, 2] - boxes[k, 2]
             if abs(x) > reach[k] or abs(y) > reach[k] or abs(z) > boxes[k, 5] / 2 + air:
                 continue

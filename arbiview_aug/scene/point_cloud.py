@@ -318,7 +318,7 @@ class PointCloudSurface(DenseSurface):
             # Azimuths bend near the zenith, and jump in a panorama all around.
             steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
             step = 1 if steep or view.window.columns >= view.window.cells.turn else step
-            local = rays.planes if step == 1 and rays.planes.size else nodes_of(rays, step)
+            local = rays.planes if step == 1 and rays.planes.size else rays.nodes(step)
             self._nodes[key] = view, *view.cells(local, R), step
         self._latest[camera.center_m.tobytes()] = self._nodes[key][0]
         return self._nodes[key]
@@ -350,17 +350,19 @@ def window_max(a: Layer, rows: int, columns: int) -> Layer:
     return np.asarray(cv2.dilate(a, np.ones((rows + 1, columns + 1), np.uint8), anchor=(0, 0)))
 
 
-def nodes_of(rays: PixelRays, apart: int) -> Layer:
-    """Rays (3, ny + 1, nx + 1) of pixels so far apart, the last ones on the last pixels."""
-    return rays.at(*(np.minimum(np.arange(0, n + apart, apart), n - 1) for n in rays.size))
-
-
 def directions_of(rays: PixelRays, R: FloatArray) -> tuple[FloatArray, int]:
     """Unit rays (n, 3) in the ego frame that span a view, and the pixels between nodes for its panorama."""
     step = max(1, int(min(NODES_RAD * float(rays.parameters[0]), max(rays.size))))  # two nodes span any image
-    local = nodes_of(rays, step)
+    local = rays.nodes(step)
     valid = local.any(axis=0)
-    return local[:, valid].T @ R.T, step if valid.all() else 1  # an image circle ends between nodes
+    if valid.all():
+        return _turned(local, R), step
+    return _turned(local[:, valid], R), 1  # an image circle ends between nodes
+
+
+def _turned(rays: Layer, R: FloatArray) -> FloatArray:
+    """Rays (3, ...) turned by ``R``, as the (n, 3) view of float64 rows x, y, z: three times faster than by points."""
+    return (R @ rays.reshape(3, -1).astype(np.float64)).T
 
 
 @dataclass(frozen=True, eq=False)
