@@ -297,7 +297,7 @@ def test_the_papers_tables_are_the_commands() -> None:
 
 
 def test_the_detectors_numbers_are_the_reports() -> None:
-    """``python -m integrations.cross_rig``: the pilot's table in the benchmarks, and the README's shares of the gap."""
+    """``python -m integrations.cross_rig``: the README's shares of the gap."""
 
     def changes(name: str) -> dict[str, Any]:
         report = json.loads((ROOT / "integrations" / "cross_rig" / "results" / f"{name}.json").read_text())
@@ -306,26 +306,16 @@ def test_the_detectors_numbers_are_the_reports() -> None:
     def percent(row: dict[str, Any]) -> int:
         return round(100 * row["share"]["value"])
 
-    pilot = changes("pilot")
-    (table,) = (table for table in tables(BENCHMARKS) if table[0][1] == "closed gap")
-    for row, variants in zip(table[2:], (pilot[change] for change in ("fov50", "up70", "waymo")), strict=True):
-        ious = [f"{100 * variants[name]['iou']['value']:.1f}" for name in ("raw", "auto", "oracle")]
-        assert row[1:] == [f"{percent(variants['auto'])} %", *ious]
     readme = text_of(ROOT / "README.md")
-    assert f"| {percent(pilot['fov50']['auto'])} % |" in readme
-    families = changes("families")
-    moved = [rows["recipe"] for change, rows in families.items() if not change.startswith("fov50")]
-    shares = [[percent(row) for row in moved if row["share"]]]
-    shares += [
-        [percent(pilot[change][name]) for change in ("up70", "waymo")] for name in ("objects_mixed", "scale_crop")
-    ]
-    for of_row in shares:
-        assert f"| {min(of_row)} to {max(of_row)} % |" in readme
-    first, *others = (percent(families[f"up70{family}"]["recipe"]) for family in ("", "-depths", "-queries"))
+    voxels, depths = changes("less").values()
+    used = "auto_fill", "objects_fill", "street_fill_mixed"
+    for name in used:
+        assert percent(voxels[name]) < percent(depths[name]) and f"| {percent(voxels[name])} % |" in readme
+    first, second, third = (percent(depths[name]) for name in used)
+    assert f"which win back {first}, {second} and {third} % in rows two to four" in readme
+    assert f"| {percent(changes('fov')['fov50-depths']['auto_fill'])} % |" in readme
+    assert f"| {percent(changes('priors')['up70']['random_a'])} % |" in readme
     assert f"| {round(100 * changes('seeds')['up70']['recipe']['share_t']['value'])} % | `python -m" in readme
-    filled = percent(changes("recipe_families")["up70-depths"]["auto_fill"])
-    depths = f"lifting by depths {others[0]} % ({filled} % without untouched samples)"
-    assert f"voxels closes {first} % and more, {depths}, queries {others[1]} %" in readme
 
 
 def test_measurements_name_tests_that_are_there() -> None:
