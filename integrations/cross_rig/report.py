@@ -101,7 +101,7 @@ def markdown(report: Mapping[str, Any]) -> str:
     ]
     distances = [f"{a:g}–{b:g} m" for a, b in pairwise(DISTANCES_M)]
     heights = [f"{a:g}–{b:g} m high" for a, b in pairwise(HEIGHTS_M)]
-    scored = any("ap" in row for row in rows)
+    scored = any("ap" in row for change in report["changes"].values() for row in change["variants"].values())
     head = [
         "variant",
         "IoU",
