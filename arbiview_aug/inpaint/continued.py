@@ -57,7 +57,7 @@ _SURE_SAMPLES = 6
 """Samples of a seen top that weigh as much as its sides."""
 
 _LEAST_SAMPLES, _LEAST_SHARE = 3, 0.03
-"""Samples of a body's side that suffice for its paint, and the body's least share of those of all sides."""
+"""Samples of a side that suffice for its paint, and the body's least share of those of all sides."""
 
 _GAMMA = 2.2
 """Exponent of displayed colours in linear light, as sRGB's on average."""
@@ -176,13 +176,13 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
     for first in range(0, len(ends), PARTS):
         sides, tops = samples[first : first + TOP_PART], samples[first + TOP_PART]
         of_sides, of_body = np.concatenate(sides), np.concatenate(sides[1:])
-        if len(of_sides):
+        if len(of_sides) >= _LEAST_SAMPLES:
             cabin = sides[0] if len(sides[0]) >= _LEAST_SAMPLES else of_sides
             body = _quantile(of_body, 0.5) if len(of_body) >= _LEAST_SAMPLES else _brightest(of_sides)
             colours[first], colours[first + 1 : first + TOP_PART] = _quantile(cabin, 0.5), body
         paints = [_quantile(side, _BODY_SHARE) for side in sides[1:] if len(side) >= _LEAST_SAMPLES]
         is_seen = len(of_sides) - len(sides[0]) >= _LEAST_SHARE * len(of_sides)  # few pixels may be another object's
-        if len(of_sides) and not (paints and is_seen):
+        if len(of_sides) >= _LEAST_SAMPLES and not (paints and is_seen):
             paints = [_brightest(of_sides)]
         colours[first + TOP_PART] = _top_colour(paints, tops, white)
     return colours
