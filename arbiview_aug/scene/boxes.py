@@ -71,16 +71,19 @@ def _upright_car(waist: float, rear: float, rear_lean: float) -> tuple[Piece, Pi
 
 
 _BOX = (Piece(-0.5, 0.5),)
-_CARS = tuple(
-    make(waist, *rear)
-    for make, rears in (
-        (_car, ((-0.47, 0.12), (-0.38, 0.18), (-0.49, 0.05))),  # hatchback, saloon, estate
-        (_upright_car, ((-0.49, 0.02), (-0.33, 0.04), (-0.15, 0.02))),  # off-roader, old saloon, pick-up
-    )
-    for waist in (0.10, 0.03)
-    for rear in rears
+_WAISTS = 0.10, 0.03
+_LEANING = tuple(
+    _car(waist, *rear)
+    for waist in _WAISTS
+    for rear in ((-0.47, 0.12), (-0.38, 0.18), (-0.49, 0.05))  # hatchback, saloon, estate
 )
-_VANS = ((Piece(-0.5, 0.0, front_lean=0.02), Piece(0.0, 0.5, -0.5, 0.37, 0.5, 0.01, 0.08, 0.05)), _BOX)
+_UPRIGHT = tuple(
+    _upright_car(waist, *rear)
+    for waist in _WAISTS
+    for rear in ((-0.49, 0.02), (-0.33, 0.04), (-0.15, 0.02))  # off-roader, old saloon, pick-up
+)
+_CARS = *_LEANING, *_UPRIGHT
+_VANS = (Piece(-0.5, 0.0, front_lean=0.02), Piece(0.0, 0.5, -0.5, 0.37, 0.5, 0.01, 0.08, 0.05)), _BOX, *_UPRIGHT
 _LARGE = ((Piece(-0.5, 0.5, front_lean=0.015, rear_lean=0.005, side_lean=0.01),), _BOX)
 _PERSON = ((Piece(-0.5, 0.33, -0.35, 0.35, 0.38), Piece(0.33, 0.5, -0.25, 0.25, 0.2, 0.05, 0.05, 0.05)),)
 _LOOSE_PERSON = (
