@@ -621,7 +621,7 @@ def mark_objects(q: Any, face: Any, winner: Any, limit: Any, cell: int, layers: 
 def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table: Any) -> tuple[int, int]:
     """Find the unseen pixels of objects, and a sample of seen ones; return their numbers.
 
-    Objects without a sample give all their seen pixels.
+    Vehicles without a sample give all their seen pixels.
 
     Args:
         face: (h, w) int32 faces of objects, -1 elsewhere.
@@ -632,7 +632,10 @@ def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table:
         table: (4, h w) int32, written: the attributes of ``view_plan.Paint``.
     """
     h, w = face.shape
-    hidden, sampled, is_known = 0, 0, np.zeros(part.shape[0], np.bool_)
+    hidden, sampled, is_known = 0, 0, np.ones(part.shape[0], np.bool_)
+    for number in range(part.shape[0]):
+        if part[number] % PARTS:
+            is_known[part[number] // PARTS] = False
     for y in range(h):
         for x in range(w):
             number = face[y, x]
