@@ -473,7 +473,8 @@ def test_unseen_cabins_and_bodies_have_colours_of_their_own() -> None:
     face[10:30, 4:60], face[30:50, 4:60] = 4, 0  # the cabin, and a side of the body
     view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
     view[:, 10:30, 4:60], view[:, 30:50, 4:60] = 30, 150
-    paint = find_paint(face, np.zeros(face.shape, np.int8), FACE_PARTS)
+    right = np.tile(np.where(np.arange(64) < 56, 0, -1), (64, 1)).astype(np.int8)  # its end is hidden
+    paint = find_paint(face, right, FACE_PARTS)
     np.testing.assert_array_equal(object_colours([view.numpy()], [paint])[:5, 0], [30, 150, 150, 150, 150])
     red = torch.tensor([180, 50, 10], dtype=torch.uint8)[:, None, None]
     view[:, 10:30, 4:60], view[:, 12:20, 4:60] = torch.tensor([40, 60, 90])[:, None, None], red  # windows in red paint
