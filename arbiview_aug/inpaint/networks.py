@@ -5,6 +5,7 @@ They see windows around the holes alone (``crops``); seen pixels stay as they ar
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Sequence
@@ -227,7 +228,9 @@ class TorchScriptInpainter(NetworkInpainter):
 def load_torchscript(path: str | Path, what: str, kind: type[ArbiviewError]) -> Any:
     """Load a TorchScript file onto the CPU; an error of a ``kind`` says ``what`` it was to be."""
     try:
-        return torch.jit.load(str(path), map_location="cpu")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # advice of torch 2.14 to those who write such files
+            return torch.jit.load(str(path), map_location="cpu")
     except (RuntimeError, ValueError, OSError) as error:
         text = " ".join(str(error).split())[:300]
         raise kind(f"{what}: expected a TorchScript file: {text}") from None
