@@ -20,7 +20,7 @@ import torch
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import DataError, described, shown
+from arbiview_aug.errors import DataError, described, one_line, shown
 from arbiview_aug.evaluate.report.pictures import Picture
 from arbiview_aug.inpaint.networks import load_torchscript
 from arbiview_aug.temporal.transformers_depth import load_pretrained
@@ -171,7 +171,7 @@ def _of_torchvision(
         raise DataError(f"{file}: expected a file, found none") from None
     except Exception as error:  # pickle, zip, torch and mappings each have their own
         fix = f"expected weights of torchvision's {name} for its {len(names)} classes (others: FILE.py:function)"
-        raise DataError(f"{file}: {fix}: {_one_line(error)}") from None
+        raise DataError(f"{file}: {fix}: {one_line(error)}") from None
     model.eval().to(device)
 
     @torch.inference_mode()
@@ -290,7 +290,7 @@ def _function(option: str, name: str) -> Callable[[Picture], Any]:
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise DataError(f"{option}: importing {file} raised {type(error).__name__}: {_one_line(error)}") from error
+        raise DataError(f"{option}: importing {file} raised {type(error).__name__}: {one_line(error)}") from error
     function = getattr(module, wanted, None)
     if not callable(function):
         there = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
@@ -305,9 +305,5 @@ def _called(option: str, function: Callable[[Picture], Any], image: Picture) -> 
     except DataError:
         raise
     except Exception as error:
-        text = " ".join(described(error).split())[:300]
+        text = one_line(described(error))
         raise DataError(f"{option}: raised {text} for an image {image.shape} {image.dtype}") from error
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:300]

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import ArbiviewError, GeneratorError
+from arbiview_aug.errors import ArbiviewError, GeneratorError, one_line
 from arbiview_aug.inpaint.crops import Canvas, drawn, packed, windows
 from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, check_device, checked_settings
 from arbiview_aug.inpaint.telea import telea
@@ -176,8 +176,7 @@ class PipelineInpainter(NetworkInpainter):
         try:
             pipeline = diffusers.AutoPipelineForInpainting.from_pretrained(where, **settings)
         except (OSError, ValueError, RuntimeError, AttributeError) as error:
-            text = " ".join(str(error).split())[:300]
-            raise GeneratorError(f"{where}: expected an inpainting pipeline of diffusers: {text}") from None
+            raise GeneratorError(f"{where}: expected an inpainting pipeline of diffusers: {one_line(error)}") from None
         multiple = int(pipeline.vae_scale_factor)
         core = getattr(pipeline, "unet", None) or pipeline.transformer
         native_px = int(getattr(core.config, "sample_size", None) or 64) * multiple
@@ -232,5 +231,4 @@ def load_torchscript(path: str | Path, what: str, kind: type[ArbiviewError]) -> 
             warnings.simplefilter("ignore", FutureWarning)  # advice of torch 2.14 to those who write such files
             return torch.jit.load(str(path), map_location="cpu")
     except (RuntimeError, ValueError, OSError) as error:
-        text = " ".join(str(error).split())[:300]
-        raise kind(f"{what}: expected a TorchScript file: {text}") from None
+        raise kind(f"{what}: expected a TorchScript file: {one_line(error)}") from None

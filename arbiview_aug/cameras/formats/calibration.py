@@ -14,7 +14,7 @@ import yaml
 from arbiview_aug.cameras.formats import camera_files, colmap, datasets, kalibr
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.plain_yaml import read_plain
-from arbiview_aug.errors import ArbiviewError, CalibrationError
+from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line
 
 
 class Format(NamedTuple):
@@ -104,7 +104,7 @@ def read_calibration(path: Path, where: str) -> Any:
     except ArbiviewError as error:
         raise type(error)(f"{where}: {form.tool}: {error}") from None
     except _BROKEN as error:  # readers take files apart as their tools write them
-        got = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        got = one_line(described(error))
         raise CalibrationError(f"{where}: expected a calibration as {form.tool} writes it, got {got}") from None
     is_known = mounting.ground_z_m is not None
     ground = mounting.ground_z_m if is_known else form.ground_z_m
