@@ -16,7 +16,9 @@ from arbiview_aug.scene.panorama import NEAREST_M
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 _HALF_PI = np.float32(np.pi / 2)
-_CHUNK = 1024  # points worked on at once
+_NEAREST = np.float32(1 / NEAREST_M)
+BLOCK = 1024
+"""Points worked on at once, and left out together."""
 
 # A cell's nearest seed in one int32, so that the nearer of two is their minimum: distance in 1/1024 cell (from bit 14),
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
@@ -46,47 +48,100 @@ def cells_row(x: Any, y: Any, z: Any, place: Any, level: Any, row: Any, column: 
 
 
 @compiled
-def elevations(points: Any, origin: Any) -> Any:
-    """Sines (2,) of the lowest and highest elevation of the points (P, 3) as seen from ``origin``."""
-    low, high = 1.0, -1.0
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-        length2 = x * x + y * y + z * z
-        if length2 >= NEAREST_M * NEAREST_M:
-            sine2 = z * abs(z) / length2
-            low, high = min(low, sine2), max(high, sine2)
-    ends = np.array([low, high])
-    return np.sign(ends) * np.sqrt(np.abs(ends))
+def block_spheres(points: Any) -> Any:
+    """Spheres (n, 4) around each ``BLOCK`` of consecutive points (P, 3): centre and radius, metres."""
+    n = points.shape[0]
+    spheres = np.empty(((n + BLOCK - 1) // BLOCK, 4))
+    for block in range(spheres.shape[0]):
+        start, end, radius2 = block * BLOCK, min(block * BLOCK + BLOCK, n), 0.0
+        for axis in range(3):
+            low = high = points[start, axis]
+            for i in range(start, end):
+                low, high = min(low, points[i, axis]), max(high, points[i, axis])
+            spheres[block, axis] = (np.float64(low) + np.float64(high)) / 2
+            radius2 += ((np.float64(high) - np.float64(low)) / 2) ** 2
+        spheres[block, 3] = np.sqrt(radius2) + 1e-3
+    return spheres
+
+
+@inlined
+def _elevation_of(sphere: Any, origin: Any) -> tuple[float, float]:
+    """Elevation of a sphere's centre, and the angle by which those of its points may differ from it, radians."""
+    x, y, z = sphere[0] - origin[0], sphere[1] - origin[1], sphere[2] - origin[2]
+    length = np.sqrt(x * x + y * y + z * z)
+    return (np.arcsin(z / length), np.arcsin(sphere[3] / length)) if sphere[3] < length else (0.0, np.pi)
+
+
+@inlined
+def _may_meet(sphere: Any, origin: Any, bounds: Any) -> bool:
+    """Whether points in a sphere (4,) may lie within a window's ``bounds``."""
+    elevation, spread = _elevation_of(sphere, origin)
+    if elevation - spread > np.arcsin(bounds[1]) or elevation + spread < np.arcsin(bounds[0]):
+        return False
+    x, y = sphere[0] - origin[0], sphere[1] - origin[1]
+    level = np.sqrt(x * x + y * y)
+    if level <= sphere[3]:
+        return True
+    off = np.arccos(min(max((x * bounds[2] + y * bounds[3]) / level, -1.0), 1.0))
+    return off - np.arcsin(sphere[3] / level) <= np.arccos(bounds[4])
 
 
 @compiled
-def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, number: Any) -> None:
+def elevations(points: Any, spheres: Any, origin: Any) -> Any:
+    """Lowest and highest elevation (2,) of the points (P, 3) as seen from ``origin``, radians.
+
+    Blocks whose ``spheres`` lie between those of others are skipped.
+    """
+    low, high = np.pi / 2, -np.pi / 2
+    for block in range(spheres.shape[0]):
+        elevation, spread = _elevation_of(spheres[block], origin)
+        if low <= elevation - spread and elevation + spread <= high:
+            continue
+        least, most = 1.0, -1.0
+        for i in range(block * BLOCK, min(block * BLOCK + BLOCK, points.shape[0])):
+            x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+            length2 = x * x + y * y + z * z
+            if length2 >= NEAREST_M * NEAREST_M:
+                sine2 = z * abs(z) / length2
+                least, most = min(least, sine2), max(most, sine2)
+        if least <= most:
+            low = min(low, np.arcsin(np.sign(least) * np.sqrt(abs(least))))
+            high = max(high, np.arcsin(np.sign(most) * np.sqrt(abs(most))))
+    return np.array([low, high])
+
+
+@compiled
+def nearest_points(points: Any, spheres: Any, origin: Any, bounds: Any, place: Any, q: Any, number: Any) -> None:
     """Z-buffer the points (P, 3) around ``origin`` in a window (``Window.bounds``, ``Window.place``).
 
-    ``q`` (h, w), 0 before, becomes the largest inverse distance of points in a cell, ``number`` (h, w) int32 whose it
-    is, of equally near ones the last's.
+    ``spheres`` are those of ``block_spheres``. ``q`` (h, w), 0 before, becomes the largest inverse distance of points
+    in a cell, ``number`` (h, w) int32 whose it is, of equally near ones the last's.
     """
-    (h, w), turn = q.shape, int(place[4])
-    low, high, cosine, sine, least = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
-    work, index = np.empty((7, _CHUNK), np.float32), np.empty(_CHUNK, np.int64)
-    for start in range(0, points.shape[0], _CHUNK):
-        n = 0
-        for i in range(start, min(start + _CHUNK, points.shape[0])):
-            x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-            level2 = x * x + y * y
-            length = np.sqrt(level2 + z * z)
-            if length >= NEAREST_M and low * length <= z <= high * length:
-                if x * cosine + y * sine >= least * np.sqrt(level2):
-                    work[0, n], work[1, n], work[2, n], work[3, n] = x / length, y / length, z / length, 1 / length
-                    index[n] = i
-                    n += 1
-        cells_row(work[0, :n], work[1, :n], work[2, :n], place, work[4, :n], work[5, :n], work[6, :n])
+    (h, w), turn = q.shape, np.int32(place[4])
+    work, row, column = np.empty((7, BLOCK), np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    x, y, z, near = work[0], work[1], work[2], work[3]
+    ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
+    for block in range(spheres.shape[0]):
+        if not _may_meet(spheres[block], origin, bounds):
+            continue
+        start = block * BLOCK
+        n = min(BLOCK, points.shape[0] - start)
+        part = points[start : start + n]
         for i in range(n):
-            row, column = int(np.rint(work[5, i])), int(np.rint(work[6, i])) % turn
-            while 0 <= row < h and column < w:  # the halo of a whole turn holds some points twice
-                if work[3, i] >= q[row, column]:
-                    q[row, column], number[row, column] = work[3, i], index[i]
-                column += turn
+            x[i], y[i], z[i] = part[i, 0] - ox, part[i, 1] - oy, part[i, 2] - oz
+        for i in range(n):
+            near[i] = _ONE / np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+        cells_row(x[:n], y[:n], z[:n], place, work[4, :n], work[5, :n], work[6, :n])
+        for i in range(n):
+            row[i] = np.int32(np.rint(work[5, i])) if near[i] <= _NEAREST else np.int32(-1)
+        for i in range(n):
+            column[i] = np.int32(np.rint(work[6, i]))
+        for i in range(n):
+            at, k = row[i], column[i] if column[i] < turn else column[i] - turn
+            while 0 <= at < h and k < w:  # the halo of a whole turn holds some points twice
+                if near[i] >= q[at, k]:
+                    q[at, k], number[at, k] = near[i], start + i
+                k += turn
 
 
 @compiled

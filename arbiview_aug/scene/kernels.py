@@ -15,6 +15,8 @@ _TINY = np.float32(1e-30)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 ROW = 35
 
+_TOGETHER = 64  # consecutive points, which lie side by side in scans and depth maps
+
 GROUND, STREET = 0, 1
 
 
@@ -419,22 +421,33 @@ def points_in(boxes: Any, points: Any, air: float) -> Any:
         center[0, k], center[1, k] = boxes[k, 0], boxes[k, 1]
         reach[k] = np.hypot(boxes[k, 3], boxes[k, 4]) / 2 + 2 * air
     pairs, n = np.empty((2, 1024), np.int64), 0
-    for i in range(points.shape[0]):
-        px, py, hits = points[i, 0], points[i, 1], 0
+    beside, where = np.empty(boxes.shape[0], np.int64), np.empty((3, boxes.shape[0]))
+    for start in range(0, points.shape[0], _TOGETHER):
+        part, m = points[start : start + _TOGETHER], 0
+        x0, x1, y0, y1 = np.inf, -np.inf, np.inf, -np.inf
+        for i in range(part.shape[0]):
+            x0, x1 = min(x0, part[i, 0]), max(x1, part[i, 0])
+            y0, y1 = min(y0, part[i, 1]), max(y1, part[i, 1])
         for k in range(reach.shape[0]):
-            hits |= (abs(px - center[0, k]) <= reach[k]) & (abs(py - center[1, k]) <= reach[k])
-        if not hits:
-            continue
-        for k in range(reach.shape[0]):
-            x, y, z = px - center[0, k], py - center[1, k], points[i, 2] - boxes[k, 2]
-            if abs(x) > reach[k] or abs(y) > reach[k] or abs(z) > boxes[k, 5] / 2 + air:
-                continue
-            c, s = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
-            if abs(c * x + s * y) <= boxes[k, 3] / 2 + air and abs(c * y - s * x) <= boxes[k, 4] / 2 + air:
-                if n == pairs.shape[1]:
-                    pairs, fewer = np.empty((2, 2 * n), np.int64), pairs
-                    for j in range(n):
-                        pairs[0, j], pairs[1, j] = fewer[0, j], fewer[1, j]
-                pairs[0, n], pairs[1, n] = k, i
-                n += 1
+            x, y, r = center[0, k], center[1, k], reach[k]
+            if (x0 - r <= x) & (x <= x1 + r) & (y0 - r <= y) & (y <= y1 + r):
+                beside[m], where[0, m], where[1, m], where[2, m] = k, x, y, r
+                m += 1
+        for i in range(part.shape[0] if m else 0):
+            px, py, hits = part[i, 0], part[i, 1], 0
+            for j in range(m):
+                hits |= (abs(px - where[0, j]) <= where[2, j]) & (abs(py - where[1, j]) <= where[2, j])
+            for j in range(m if hits else 0):
+                k = beside[j]
+                x, y, z = px - center[0, k], py - center[1, k], part[i, 2] - boxes[k, 2]
+                if abs(x) > reach[k] or abs(y) > reach[k] or abs(z) > boxes[k, 5] / 2 + air:
+                    continue
+                c, s = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
+                if abs(c * x + s * y) <= boxes[k, 3] / 2 + air and abs(c * y - s * x) <= boxes[k, 4] / 2 + air:
+                    if n == pairs.shape[1]:
+                        pairs, fewer = np.empty((2, 2 * n), np.int64), pairs
+                        for old in range(n):
+                            pairs[0, old], pairs[1, old] = fewer[0, old], fewer[1, old]
+                    pairs[0, n], pairs[1, n] = k, start + i
+                    n += 1
     return pairs[:, :n]

@@ -183,6 +183,7 @@ class Panorama:
         origin: FloatArray,
         points: Points,
         street: StaticSurface,
+        spheres: FloatArray,
         memory: Memory = FRESH,
         mapped: int = 0,
         *,
@@ -193,7 +194,7 @@ class Panorama:
         self.window, self._origin, self._street, self._place = window, origin, street, window.place
         shape, cells = window.shape, window.cells
         q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
-        nearest_points(points, origin, window.bounds, self._place, q, number)
+        nearest_points(points, spheres, origin, window.bounds, self._place, q, number)
         most, sparse = window_max(q, 2 * cells.side, 2 * cells.side), len(points) - mapped
         cell, rays = drop_hidden(q, most, number, points, origin, cells.see_through, cells.side, sparse)
         own_q = q.reshape(-1)[cell]
@@ -259,7 +260,13 @@ class PointCloudSurface(DenseSurface):
     def __post_init__(self) -> None:
         kept = ~own_car(self.points)
         object.__setattr__(self, "mapped", int(np.count_nonzero(kept[len(kept) - self.mapped :])))
-        object.__setattr__(self, "points", self.points[kept])
+        object.__setattr__(self, "points", np.ascontiguousarray(self.points[kept], np.float32))
+
+    @cached_property
+    def _spheres(self) -> FloatArray:
+        from arbiview_aug.scene.completion import block_spheres
+
+        return np.asarray(block_spheres(self.points))
 
     @property
     def _cells(self) -> Cells | None:
@@ -336,7 +343,7 @@ class PointCloudSurface(DenseSurface):
         from arbiview_aug.scene.completion import elevations
 
         if origin.tobytes() not in self._panoramas:
-            low, high = np.arcsin(elevations(self.points, origin))
+            low, high = elevations(self.points, self._spheres, origin)
             self._panoramas[origin.tobytes()] = (low, high), []
         (low, high), held = self._panoramas[origin.tobytes()]
         around = lambda of: Window.around(  # noqa: E731
@@ -346,7 +353,7 @@ class PointCloudSurface(DenseSurface):
         panorama = next(suitable, None)
         if panorama is None:
             cells = cells or self._cells or FINE
-            panorama = Panorama(around(cells).roomy, origin, self.points, self.street, memory, self.mapped)
+            panorama = Panorama(around(cells).roomy, origin, self.points, self.street, self._spheres, memory, self.mapped)
             held.append(panorama)
         return panorama
 
@@ -414,10 +421,11 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
     from arbiview_aug.scene import completion
 
     points, others = (np.ascontiguousarray(part, np.float32) for part in (points[~own_car(points)], others))
-    low, high = np.arcsin(completion.elevations(points, origin)) / CELL_RAD
+    spheres = completion.block_spheres(points)
+    low, high = completion.elevations(points, spheres, origin) / CELL_RAD
     window = Window(math.floor(low), 0, max(math.ceil(high) - math.floor(low), 0), FINE.turn)
     most, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)
-    completion.nearest_points(points, origin, window.bounds, window.place, most, number)
+    completion.nearest_points(points, spheres, origin, window.bounds, window.place, most, number)
     rays = (others - origin.astype(np.float32)).T.reshape(3, 1, -1).copy()
     rows, columns = np.empty((2, 1, len(others)), np.float32)
     completion.cells_of(rays, np.eye(3, dtype=np.float32), window.place, rows, columns)
