@@ -20,7 +20,7 @@ from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.sample.inputs import LEARNED_KEY
-from arbiview_aug.scene.scene import motion_camera
+from arbiview_aug.scene.depth_map import motion_camera
 
 PACKAGE = str(Path(arbiview_aug.__file__).parent)
 BOUNDS = {

@@ -19,6 +19,9 @@ _HALF_PI = np.float32(np.pi / 2)
 _NEAREST = np.float32(1 / NEAREST_M)
 BLOCK = 1024
 """Points worked on at once, and left out together."""
+CONES_M = 1.5, 0.0, 1.5
+"""A place among a vehicle's cameras and scanners, in the ego frame: cones are seen from there."""
+_CONES, _TINY = tuple(np.float32(part) for part in CONES_M), np.float32(1e-30)
 
 # A cell's nearest seed in one int32, so that the nearer of two is their minimum: distance in 1/1024 cell (from bit 14),
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
@@ -48,81 +51,79 @@ def cells_row(x: Any, y: Any, z: Any, place: Any, level: Any, row: Any, column: 
 
 
 @compiled
-def block_spheres(points: Any) -> Any:
-    """Spheres (n, 4) around each ``BLOCK`` of consecutive points (P, 3): centre and radius, metres."""
-    n = points.shape[0]
-    spheres = np.empty(((n + BLOCK - 1) // BLOCK, 4))
-    for block in range(spheres.shape[0]):
-        start, end, radius2 = block * BLOCK, min(block * BLOCK + BLOCK, n), 0.0
-        for axis in range(3):
-            low = high = points[start, axis]
-            for i in range(start, end):
-                low, high = min(low, points[i, axis]), max(high, points[i, axis])
-            spheres[block, axis] = (np.float64(low) + np.float64(high)) / 2
-            radius2 += ((np.float64(high) - np.float64(low)) / 2) ** 2
-        spheres[block, 3] = np.sqrt(radius2) + 1e-3
-    return spheres
+def block_cones(points: Any) -> Any:
+    """Cones (n, 5) around each ``BLOCK`` of consecutive points (P, 3), as seen from ``CONES_M``.
+
+    Their axes (3), the angle that holds the points, radians, and the distance of the nearest one, metres.
+    """
+    n, work = points.shape[0], np.empty((4, BLOCK), np.float32)
+    x, y, z, length = work[0], work[1], work[2], work[3]
+    cones = np.zeros(((n + BLOCK - 1) // BLOCK, 5), np.float32)
+    for block in range(cones.shape[0]):
+        cone, part = cones[block], points[block * BLOCK : block * BLOCK + BLOCK]
+        m = part.shape[0]
+        for i in range(m):
+            x[i], y[i], z[i] = part[i, 0] - _CONES[0], part[i, 1] - _CONES[1], part[i, 2] - _CONES[2]
+        for i in range(m):
+            length[i] = np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+        nearest, least = np.float32(np.inf), _ONE
+        for i in range(m):
+            nearest = min(nearest, length[i])
+            away = max(length[i], _TINY)
+            x[i], y[i], z[i] = x[i] / away, y[i] / away, z[i] / away
+            cone[0], cone[1], cone[2] = cone[0] + x[i], cone[1] + y[i], cone[2] + z[i]
+        size = max(np.sqrt(cone[0] * cone[0] + cone[1] * cone[1] + cone[2] * cone[2]), _TINY)
+        cone[0], cone[1], cone[2] = cone[0] / size, cone[1] / size, cone[2] / size
+        for i in range(m):
+            least = min(least, x[i] * cone[0] + y[i] * cone[1] + z[i] * cone[2])
+        cone[3], cone[4] = np.arccos(max(least, -_ONE)) + np.float32(1e-3), nearest
+    return cones
 
 
 @inlined
-def _elevation_of(sphere: Any, origin: Any) -> tuple[float, float]:
-    """Elevation of a sphere's centre, and the angle by which those of its points may differ from it, radians."""
-    x, y, z = sphere[0] - origin[0], sphere[1] - origin[1], sphere[2] - origin[2]
-    length = np.sqrt(x * x + y * y + z * z)
-    return (np.arcsin(z / length), np.arcsin(sphere[3] / length)) if sphere[3] < length else (0.0, np.pi)
-
-
-@inlined
-def _may_meet(sphere: Any, origin: Any, bounds: Any) -> bool:
-    """Whether points in a sphere (4,) may lie within a window's ``bounds``."""
-    elevation, spread = _elevation_of(sphere, origin)
+def _may_meet(cone: Any, origin: Any, bounds: Any) -> bool:
+    """Whether points of a cone (5,) may lie within a window's ``bounds`` around ``origin``."""
+    x, y, z = origin[0] - _CONES[0], origin[1] - _CONES[1], origin[2] - _CONES[2]
+    sine = np.sqrt(x * x + y * y + z * z) / cone[4]  # of the angle between a point's two directions, by the sine rule
+    if not sine < 1:
+        return True
+    spread, elevation = cone[3] + np.arcsin(sine), np.arcsin(min(max(cone[2], -1.0), 1.0))
     if elevation - spread > np.arcsin(bounds[1]) or elevation + spread < np.arcsin(bounds[0]):
         return False
-    x, y = sphere[0] - origin[0], sphere[1] - origin[1]
-    level = np.sqrt(x * x + y * y)
-    if level <= sphere[3]:
+    level = np.sqrt(cone[0] * cone[0] + cone[1] * cone[1])
+    if spread + abs(elevation) >= np.pi / 2:
         return True
-    off = np.arccos(min(max((x * bounds[2] + y * bounds[3]) / level, -1.0), 1.0))
-    return off - np.arcsin(sphere[3] / level) <= np.arccos(bounds[4])
+    off = np.arccos(min(max((cone[0] * bounds[2] + cone[1] * bounds[3]) / level, -1.0), 1.0))
+    return off - np.arcsin(min(np.sin(spread) / level, 1.0)) <= np.arccos(bounds[4])
 
 
 @compiled
-def elevations(points: Any, spheres: Any, origin: Any) -> Any:
-    """Lowest and highest elevation (2,) of the points (P, 3) as seen from ``origin``, radians.
-
-    Blocks whose ``spheres`` lie between those of others are skipped.
-    """
-    low, high = np.pi / 2, -np.pi / 2
-    for block in range(spheres.shape[0]):
-        elevation, spread = _elevation_of(spheres[block], origin)
-        if low <= elevation - spread and elevation + spread <= high:
-            continue
-        least, most = 1.0, -1.0
-        for i in range(block * BLOCK, min(block * BLOCK + BLOCK, points.shape[0])):
-            x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-            length2 = x * x + y * y + z * z
-            if length2 >= NEAREST_M * NEAREST_M:
-                sine2 = z * abs(z) / length2
-                least, most = min(least, sine2), max(most, sine2)
-        if least <= most:
-            low = min(low, np.arcsin(np.sign(least) * np.sqrt(abs(least))))
-            high = max(high, np.arcsin(np.sign(most) * np.sqrt(abs(most))))
-    return np.array([low, high])
+def elevations(points: Any, origin: Any) -> Any:
+    """Lowest and highest elevation (2,) of the points (P, 3) as seen from ``origin``, radians."""
+    low, high = 1.0, -1.0
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        length2 = x * x + y * y + z * z
+        if length2 >= NEAREST_M * NEAREST_M:
+            sine2 = z * abs(z) / length2
+            low, high = min(low, sine2), max(high, sine2)
+    ends = np.array([low, high])
+    return np.arcsin(np.sign(ends) * np.sqrt(np.abs(ends)))
 
 
 @compiled
-def nearest_points(points: Any, spheres: Any, origin: Any, bounds: Any, place: Any, q: Any, number: Any) -> None:
+def nearest_points(points: Any, cones: Any, origin: Any, bounds: Any, place: Any, q: Any, number: Any) -> None:
     """Z-buffer the points (P, 3) around ``origin`` in a window (``Window.bounds``, ``Window.place``).
 
-    ``spheres`` are those of ``block_spheres``. ``q`` (h, w), 0 before, becomes the largest inverse distance of points
+    ``cones`` are those of ``block_cones``. ``q`` (h, w), 0 before, becomes the largest inverse distance of points
     in a cell, ``number`` (h, w) int32 whose it is, of equally near ones the last's.
     """
     (h, w), turn = q.shape, np.int32(place[4])
     work, row, column = np.empty((7, BLOCK), np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
     x, y, z, near = work[0], work[1], work[2], work[3]
     ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
-    for block in range(spheres.shape[0]):
-        if not _may_meet(spheres[block], origin, bounds):
+    for block in range(cones.shape[0]):
+        if not _may_meet(cones[block], origin, bounds):
             continue
         start = block * BLOCK
         n = min(BLOCK, points.shape[0] - start)
@@ -166,7 +167,7 @@ def drop_hidden(
             if number[y, x] >= sparse:
                 if 0 < y < h - 1 and 0 < x < w - 1:
                     across, above = min(q[y, x - 1], q[y, x + 1]), min(q[y - 1, x], q[y + 1, x])
-                    if q[y, x] < _hidden_below(max(across, above)):
+                    if q[y, x] < hidden_below(max(across, above)):
                         continue
             elif inside and away <= x < w - away:
                 row, left, right = most[y - side], x - away, x + 1
@@ -174,7 +175,7 @@ def drop_hidden(
                 column, up, down = x - side, y - away, y + 1
                 above = max(most[up, column], most[up + more, column])
                 below = max(most[down, column], most[down + more, column])
-                if q[y, x] < _hidden_below(max(across, min(above, below))):
+                if q[y, x] < hidden_below(max(across, min(above, below))):
                     continue
             cells[n] = y * w + x
             n += 1
@@ -203,7 +204,7 @@ def seen_through(q: Any, rows: Any, columns: Any, most: Any, up: int, side: int,
     for i in range(q.shape[0]):
         row, column = int(np.rint(rows[i])) - up, int(np.rint(columns[i])) - side
         known = most[row, column] if 0 <= row < h - height and 0 <= column < w - width else _ZERO
-        contradicted[i] = known > _ZERO and _hidden_below(q[i]) > known
+        contradicted[i] = known > _ZERO and hidden_below(q[i]) > known
 
 
 @compiled
@@ -377,7 +378,7 @@ def _slide(row: Any, oldest: Any, total: Any) -> None:
 
 
 @inlined
-def _hidden_below(known: Any) -> Any:
+def hidden_below(known: Any) -> Any:
     """The evaluation protocol's tolerance, in inverse distance: nearer by a tenth of the distance and 0.3 m."""
     known = max(known, _ZERO)
     return known / (np.float32(1.1) + np.float32(0.3) * known)
@@ -404,7 +405,7 @@ def hidden_depths(layers: Any, silent: Any, base: Any, step: int, shrink: int, o
             row[x] = _ZERO
         row = row[shrink:]
         for x in range(w - side):  # closes gaps between scan lines, but not outwards
-            row[x] = _hidden_below(inner[x]) if hidden[x] == _ZERO else _ZERO
+            row[x] = hidden_below(inner[x]) if hidden[x] == _ZERO else _ZERO
 
 
 @compiled

@@ -7,6 +7,7 @@ No sensor's place is assumed: points are z-buffered and made dense anew for each
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -22,11 +23,9 @@ from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene import panorama
 from arbiview_aug.scene.boxes import BoxSurface, solids_among
-from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, SIDE_RAD, Layer
+from arbiview_aug.scene.depth_map import DepthMap, hidden_by
+from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, OWN_CAR_M, SIDE_RAD, Layer
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
-
-OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
-"""(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
 
 _STEEP = 0.9
 """Sine of the elevation up to which azimuths are interpolated: 64 degrees."""
@@ -183,7 +182,7 @@ class Panorama:
         origin: FloatArray,
         points: Points,
         street: StaticSurface,
-        spheres: FloatArray,
+        cones: Layer,
         memory: Memory = FRESH,
         mapped: int = 0,
         *,
@@ -194,7 +193,7 @@ class Panorama:
         self.window, self._origin, self._street, self._place = window, origin, street, window.place
         shape, cells = window.shape, window.cells
         q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
-        nearest_points(points, spheres, origin, window.bounds, self._place, q, number)
+        nearest_points(points, cones, origin, window.bounds, self._place, q, number)
         most, sparse = window_max(q, 2 * cells.side, 2 * cells.side), len(points) - mapped
         cell, rays = drop_hidden(q, most, number, points, origin, cells.see_through, cells.side, sparse)
         own_q = q.reshape(-1)[cell]
@@ -244,29 +243,32 @@ class PointCloudSurface(DenseSurface):
     Attributes:
         street: What there is where nothing was measured.
         points: (P, 3) in the ego frame, finite, metres.
-        mapped: So many of the last points are of depth maps.
+        mapped: So many of the last points are of depth maps, and none of the own car.
         swept: Whether points of neighbouring frames are among them.
+        maps: These depth maps, which tell what is hidden from their own cameras.
     """
 
     street: StaticSurface
     points: Points
     mapped: int = 0
     swept: bool = False
+    maps: Sequence[DepthMap] = ()
     _panoramas: dict[bytes, tuple[tuple[float, float], list[Panorama]]] = field(default_factory=dict, repr=False)
     _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
     _latest: dict[bytes, Panorama] = field(default_factory=dict, repr=False)
     _nodes: dict[tuple[bytes, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        kept = ~own_car(self.points)
-        object.__setattr__(self, "mapped", int(np.count_nonzero(kept[len(kept) - self.mapped :])))
-        object.__setattr__(self, "points", np.ascontiguousarray(self.points[kept], np.float32))
+        measured = len(self.points) - self.mapped  # maps leave out their own
+        is_own = own_car(self.points[:measured])
+        points = np.delete(self.points, np.flatnonzero(is_own), axis=0) if is_own.any() else self.points
+        object.__setattr__(self, "points", np.ascontiguousarray(points, np.float32))
 
     @cached_property
-    def _spheres(self) -> FloatArray:
-        from arbiview_aug.scene.completion import block_spheres
+    def _cones(self) -> Layer:
+        from arbiview_aug.scene.completion import block_cones
 
-        return np.asarray(block_spheres(self.points))
+        return np.asarray(block_cones(self.points))
 
     @property
     def _cells(self) -> Cells | None:
@@ -296,9 +298,15 @@ class PointCloudSurface(DenseSurface):
         return self._shadows[key]
 
     def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, coarse: bool = True) -> Layer:
-        """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart."""
+        """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
+
+        With ``coarse`` a camera's own depth map tells, if it has one.
+        """
         from arbiview_aug.scene.completion import interpolate_layer
 
+        known = hidden_by(self.maps, camera) if coarse else None
+        if known is not None:
+            return known
         cells = self._cells or (COARSE if coarse else Cells.for_camera(camera))
         view, *nodes = self._located(camera, rays, cells, memory)
         hidden = memory.empty(camera.size, np.float32)
@@ -343,8 +351,8 @@ class PointCloudSurface(DenseSurface):
         from arbiview_aug.scene.completion import elevations
 
         if origin.tobytes() not in self._panoramas:
-            low, high = elevations(self.points, self._spheres, origin)
-            self._panoramas[origin.tobytes()] = (low, high), []
+            ends = (-math.pi, math.pi) if self.mapped else tuple(elevations(self.points, origin).tolist())
+            self._panoramas[origin.tobytes()] = ends, []
         (low, high), held = self._panoramas[origin.tobytes()]
         around = lambda of: Window.around(  # noqa: E731
             directions.reshape(-1, 3), of, (low - of.beyond, high + of.beyond)
@@ -353,7 +361,8 @@ class PointCloudSurface(DenseSurface):
         panorama = next(suitable, None)
         if panorama is None:
             cells = cells or self._cells or FINE
-            panorama = Panorama(around(cells).roomy, origin, self.points, self.street, self._spheres, memory, self.mapped)
+            points = self.points, self.street, self._cones
+            panorama = Panorama(around(cells).roomy, origin, *points, memory, self.mapped)
             held.append(panorama)
         return panorama
 
@@ -390,14 +399,10 @@ class PointCloudWithBoxes(BoxSurface):
     street: PointCloudSurface
 
     @classmethod
-    def among(
-        cls, street: StaticSurface, points: Points, boxes: FloatArray, mapped: int = 0, swept: bool = False
-    ) -> PointCloudWithBoxes:
-        """Boxes (B, 7) among points (P, 3); ``mapped`` and ``swept`` are those of ``PointCloudSurface``."""
+    def among(cls, street: StaticSurface, points: Points, boxes: FloatArray) -> PointCloudWithBoxes:
+        """Boxes (B, 7) among points (P, 3)."""
         planes, is_own = solids_among(boxes, points)
-        mapped = int(np.count_nonzero(~is_own[len(points) - mapped :]))
-        others = PointCloudSurface(street, points[~is_own], mapped, swept)
-        return cls(others, boxes, planes)
+        return cls(PointCloudSurface(street, points[~is_own]), boxes, planes)
 
     def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> Layer:
         return self.street.hidden(camera, rays, memory, coarse=coarse)
@@ -421,11 +426,11 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
     from arbiview_aug.scene import completion
 
     points, others = (np.ascontiguousarray(part, np.float32) for part in (points[~own_car(points)], others))
-    spheres = completion.block_spheres(points)
-    low, high = completion.elevations(points, spheres, origin) / CELL_RAD
+    low, high = completion.elevations(points, origin) / CELL_RAD
     window = Window(math.floor(low), 0, max(math.ceil(high) - math.floor(low), 0), FINE.turn)
     most, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)
-    completion.nearest_points(points, spheres, origin, window.bounds, window.place, most, number)
+    cones = completion.block_cones(points)
+    completion.nearest_points(points, cones, origin, window.bounds, window.place, most, number)
     rays = (others - origin.astype(np.float32)).T.reshape(3, 1, -1).copy()
     rows, columns = np.empty((2, 1, len(others)), np.float32)
     completion.cells_of(rays, np.eye(3, dtype=np.float32), window.place, rows, columns)

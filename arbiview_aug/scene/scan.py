@@ -108,16 +108,15 @@ def scan(lidars: Sequence[Lidar], points: Points, boxes: FloatArray, ground_z_m:
 
 def _static_returns(lidar: Lidar, rays: Layer, points: Points, street: Street) -> tuple[Layer, Numbers]:
     """Inverse distances of a scanner's rays (3, ny, nx), 1/m, and the points (P, 3) that support them, or -1."""
-    from arbiview_aug.scene.completion import block_spheres, elevations, nearest_returns
+    from arbiview_aug.scene.completion import block_cones, elevations, nearest_returns
 
     size, origin = rays.shape[1:], lidar.center_m
     if not len(points):
         return np.zeros(size, np.float32), np.full(size, -1, np.int32)
-    spheres = block_spheres(points)
-    low, high = elevations(points, spheres, origin)
+    low, high = elevations(points, origin)
     some = rays[..., :: max(1, int(_ROOM_DEG / lidar.azimuth_step_deg))].reshape(3, -1).T.astype(np.float64)
     window = Window.around(some, SCANNED, (low - SCANNED.beyond, high + SCANNED.beyond)).roomy
-    view = Panorama(window, origin, points, street, spheres, keep_seeds=True)
+    view = Panorama(window, origin, points, street, block_cones(points), keep_seeds=True)
     q, residual, *cells = _read(view, origin, rays, street)
     nearest: Numbers = np.empty(size, np.int32)
     up, side = (round(angle / SCANNED.rad) for angle in (SUPPORT_RAD, SIDE_SUPPORT_RAD))
