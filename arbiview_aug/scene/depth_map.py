@@ -17,7 +17,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rays import PixelRays, pixel_rays, pixels_of
 from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import SampleError
-from arbiview_aug.scene.panorama import CELL_RAD, OWN_CAR_M, Layer
+from arbiview_aug.scene.panorama import CELL_RAD, OWN_CAR_M, SHRINK_RAD, SUPPORT_RAD, Layer
 from arbiview_aug.scene.surface import Points
 
 MOTION_WIDTH_PX = 450
@@ -32,8 +32,9 @@ ANCHOR_SHARE = 0.25
 
 _UNANCHORED = 0.1  # points to the square of ``ANCHOR_RAD``, below which a map is believed more than they
 
-KNOWN_SHARE = 0.5
-"""Share of a camera's pixels with a depth, from which on its map alone tells what is hidden from it."""
+GAP_RAD = (SUPPORT_RAD - SHRINK_RAD) / 2
+"""What a map knows hides so far beyond its border, half as far as measured points: as far costs good pixels of depth
+from motion, not at all shows what is hidden."""
 
 
 class DepthMap(NamedTuple):
@@ -183,7 +184,7 @@ def points_of(maps: Sequence[DepthMap], before: Points | None = None) -> tuple[L
     from arbiview_aug.scene.map_kernels import put_points
 
     lead, most, first, car = 0 if before is None else len(before), sum(one.depth_m.size for one in maps), 0, OWN_CAR_M
-    points, pixels, count = np.empty((lead + most, 3), np.float32), np.empty(most, np.int32), 0
+    points, pixels, count = np.empty((lead + most + 1, 3), np.float32), np.empty(most + 1, np.int32), 0
     if before is not None:
         points[:lead] = before
     for camera, depth_m in maps:
@@ -212,16 +213,18 @@ def forget(maps: Sequence[DepthMap], pixels: npt.NDArray[np.int32]) -> None:
 def hidden_by(maps: Sequence[DepthMap], camera: Camera) -> Layer | None:
     """Inverse distances (h, w) along a camera's rays beyond which points are hidden by its own maps; 0 where unknown.
 
-    None if the maps know less than ``KNOWN_SHARE`` of its pixels.
+    None if they know nothing.
     """
     from arbiview_aug.scene.map_kernels import hidden_distances
 
     layers = []
     for one in maps:
-        if not one.is_of(camera) or np.mean(one.depth_m > 0) < KNOWN_SHARE:
+        if not one.is_of(camera) or not one.depth_m.any():
             continue
         rays, hidden = _rays(one.camera), np.empty(one.depth_m.shape, np.float32)
         hidden_distances(rays.planes, rays.parameters, one.depth_m, hidden)
+        side = 2 * round(GAP_RAD * float(one.camera.K[0, 0])) + 1
+        np.copyto(hidden, cv2.dilate(hidden, np.ones((side, side), np.uint8)), where=hidden == 0)
         layers.append(_warped(one.camera, hidden, camera, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE))
     return np.asarray(np.max(layers, axis=0)) if layers else None
 

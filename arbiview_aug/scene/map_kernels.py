@@ -86,28 +86,35 @@ def put_points(
         count: Points that are there.
     """
     h, w = depth.shape
-    rays, tiles = np.empty((3, _TILE), np.float32), (w + _TILE - 1) // _TILE
+    work, is_known, tiles = np.empty((4, _TILE), np.float32), np.empty(_TILE, np.bool_), (w + _TILE - 1) // _TILE
+    x0, x1, y0, y1 = np.float32(car[0]), np.float32(car[1]), np.float32(car[2]), np.float32(car[3])
     for top in range(0, h, _TILE):
         for k in range(tiles):
             left = (tiles - 1 - k if top // _TILE % 2 else k) * _TILE  # there and back
             n = min(_TILE, w - left)
+            a, b, c, far = work[0, :n], work[1, :n], work[2, :n], work[3, :n]
             for y in range(top, min(top + _TILE, h)):
-                rx, ry, rz, line = rays[0, :n], rays[1, :n], rays[2, :n], depth[y, left : left + n]
-                rays_row(planes, P, y, left, rx, ry, rz)
+                line = depth[y, left : left + n]
+                rays_row(planes, P, y, left, a, b, c)
                 for i in range(n):
-                    if not (line[i] > _ZERO and rz[i] > _LEAST_Z):
-                        continue
-                    far = line[i] / rz[i]
-                    a, b, c = far * rx[i], far * ry[i], line[i]
-                    x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + pose[0, 3]
-                    y_m = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + pose[1, 3]
-                    if car[0] < x < car[1] and car[2] < y_m < car[3]:
-                        line[i] = _ZERO
-                        continue
-                    points[count, 0], points[count, 1] = x, y_m
-                    points[count, 2] = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + pose[2, 3]
+                    is_known[i] = (line[i] > _ZERO) & (c[i] > _LEAST_Z)
+                    far[i] = line[i] / max(c[i], _LEAST_Z)
+                for i in range(n):
+                    a[i], b[i], c[i] = far[i] * a[i], far[i] * b[i], line[i]
+                for i in range(n):
+                    far[i] = pose[0, 0] * a[i] + pose[0, 1] * b[i] + pose[0, 2] * c[i] + pose[0, 3]
+                for i in range(n):
+                    y_m = pose[1, 0] * a[i] + pose[1, 1] * b[i] + pose[1, 2] * c[i] + pose[1, 3]
+                    c[i] = pose[2, 0] * a[i] + pose[2, 1] * b[i] + pose[2, 2] * c[i] + pose[2, 3]
+                    a[i], b[i] = far[i], y_m
+                for i in range(n):
+                    is_car = (x0 < a[i]) & (a[i] < x1) & (y0 < b[i]) & (b[i] < y1)
+                    line[i] = _ZERO if is_car & is_known[i] else line[i]
+                    is_known[i] &= not is_car
+                for i in range(n):
+                    points[count, 0], points[count, 1], points[count, 2] = a[i], b[i], c[i]
                     pixels[count] = first + y * w + left + i
-                    count += 1
+                    count += is_known[i]  # else written over, or left out
     return count
 
 

@@ -42,6 +42,10 @@ MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
 
 
+KNOWN_SHARE = 0.9
+"""Share of a camera's pixels with a depth, from which on its map alone tells what is hidden from it."""
+
+
 class Cells(NamedTuple):
     """The side of a panorama's cells, radians, and lengths in cells."""
 
@@ -265,6 +269,11 @@ class PointCloudSurface(DenseSurface):
         object.__setattr__(self, "points", np.ascontiguousarray(points, np.float32))
 
     @cached_property
+    def _measured(self) -> PointCloudSurface:
+        """The surface of the points alone, without those of maps."""
+        return PointCloudSurface(self.street, self.points[: len(self.points) - self.mapped], swept=self.swept)
+
+    @cached_property
     def _cones(self) -> Layer:
         from arbiview_aug.scene.completion import block_cones
 
@@ -300,12 +309,14 @@ class PointCloudSurface(DenseSurface):
     def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, coarse: bool = True) -> Layer:
         """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
 
-        With ``coarse`` a camera's own depth map tells, if it has one.
+        With ``coarse`` a camera's own depth map tells, if it has one, and measured points where that knows too little.
         """
         from arbiview_aug.scene.completion import interpolate_layer
 
         known = hidden_by(self.maps, camera) if coarse else None
         if known is not None:
+            if len(self._measured.points) and np.count_nonzero(known) < KNOWN_SHARE * known.size:
+                np.copyto(known, self._measured.hidden(camera, rays, memory), where=known == 0)
             return known
         cells = self._cells or (COARSE if coarse else Cells.for_camera(camera))
         view, *nodes = self._located(camera, rays, cells, memory)

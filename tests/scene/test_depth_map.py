@@ -14,6 +14,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.scene.depth_map import (
     ANCHOR_RAD,
     ANCHOR_SHARE,
+    GAP_RAD,
     DepthMap,
     anchored,
     anchored_maps,
@@ -151,15 +152,28 @@ def test_the_nearest_of_what_maps_know_is_joined() -> None:
 @pytest.mark.parametrize("camera", [SMALL, FISHEYE], ids=["pinhole", "fisheye"])
 def test_a_map_hides_what_is_clearly_behind_it(camera: Camera) -> None:
     one = DepthMap(camera, hilly(camera))
+    one.depth_m[30:40, 30:40] = 0
     hidden = hidden_by([one], camera)
     rays, _ = camera.unproject_cam(camera.pixel_grid())
     with np.errstate(divide="ignore"):
         distance = one.depth_m / rays[..., 2]
-        np.testing.assert_allclose(hidden, np.where(distance > 0, 1 / (1.1 * distance + 0.3), 0), rtol=1e-4)
+        expected = np.where(distance > 0, 1 / (1.1 * distance + 0.3), 0)
+    assert hidden is not None
+    np.testing.assert_allclose(hidden[distance > 0], expected[distance > 0], rtol=1e-4)
+    assert (hidden[31:39, 31:39] == 0).all()  # closed up to ``GAP_RAD``, less than a pixel
     h, w = camera.size
     flat = DepthMap(camera, np.full(camera.size, 20.0, np.float32))
     larger = hidden_by([flat], camera.resize((2 * h, 2 * w)))
     assert larger is not None and larger.shape == (2 * h, 2 * w)
     np.testing.assert_allclose(larger[::2, ::2], hidden_by([flat], camera), rtol=0.02, atol=2e-3)
     assert hidden_by([one], camera.shifted(z_m=0.1)) is None
-    assert hidden_by([flat._replace(depth_m=np.where(np.arange(w) < w // 3, flat.depth_m, 0))], camera) is None
+    assert hidden_by([flat._replace(depth_m=np.zeros_like(flat.depth_m))], camera) is None
+
+
+def test_gaps_of_a_map_are_closed_by_what_is_around_them() -> None:
+    view = helpers.camera(size=(192, 320), position_m=EYE, horizontal_fov_deg=40.0)
+    one = DepthMap(view, np.full(view.size, 20.0, np.float32))
+    one.depth_m[:, 100], one.depth_m[:, 200:220] = 0, 0
+    hidden = hidden_by([one], view)
+    assert GAP_RAD * view.K[0, 0] > 1
+    assert hidden is not None and (hidden[:, 95:105] > 0).all() and (hidden[:, 205:215] == 0).all()
