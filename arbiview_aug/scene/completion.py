@@ -168,33 +168,37 @@ def drop_hidden(
     """
     h, w = q.shape
     more = away - 1 - 2 * side  # windows are longer than wide
-    cells, n = np.empty(h * w, np.int64), 0
+    cells, n, rays = np.empty(h * w, np.int64), 0, np.empty((3, h * w), np.float32)
+    between, inner = np.zeros(w, np.float32), w - 2
     for y in range(h):
         inside = away <= y < h - away
+        if sparse < points.shape[0] and 0 < y < h - 1 and inner > 0:
+            left, right, up, down = q[y, :inner], q[y, 2:], q[y - 1, 1 : w - 1], q[y + 1, 1 : w - 1]
+            hidden = between[1 : w - 1]
+            for x in range(inner):
+                hidden[x] = hidden_below(max(min(left[x], right[x]), min(up[x], down[x])))
+        else:
+            between[:] = _ZERO
         for x in range(w):
             if q[y, x] <= _ZERO:
                 continue
             if number[y, x] >= sparse:
-                if 0 < y < h - 1 and 0 < x < w - 1:
-                    across, above = min(q[y, x - 1], q[y, x + 1]), min(q[y - 1, x], q[y + 1, x])
-                    if q[y, x] < hidden_below(max(across, above)):
-                        continue
+                if q[y, x] < between[x]:
+                    continue
             elif inside and away <= x < w - away:
-                row, left, right = most[y - side], x - away, x + 1
-                across = min(max(row[left], row[left + more]), max(row[right], row[right + more]))
-                column, up, down = x - side, y - away, y + 1
-                above = max(most[up, column], most[up + more, column])
-                below = max(most[down, column], most[down + more, column])
+                row, west, east = most[y - side], x - away, x + 1
+                across = min(max(row[west], row[west + more]), max(row[east], row[east + more]))
+                column, top, bottom = x - side, y - away, y + 1
+                above = max(most[top, column], most[top + more, column])
+                below = max(most[bottom, column], most[bottom + more, column])
                 if q[y, x] < hidden_below(max(across, min(above, below))):
                     continue
+            point, near = points[number[y, x]], q[y, x]
+            for axis in range(3):
+                rays[axis, n] = (point[axis] - origin[axis]) * near
             cells[n] = y * w + x
             n += 1
-    rays = np.empty((3, 1, n), np.float32)
-    for i in range(n):
-        y, x = cells[i] // w, cells[i] % w
-        for axis in range(3):
-            rays[axis, 0, i] = (points[number[y, x], axis] - origin[axis]) * q[y, x]
-    return cells[:n].copy(), rays
+    return cells[:n].copy(), rays[:, :n].copy().reshape(3, 1, n)
 
 
 @compiled
@@ -231,8 +235,11 @@ def nearest_residuals(
     code[:] = _NO_SEED
     seeds = layers[:2].reshape(2, size)  # until the layers are known
     seeds[:] = _ZERO
+    row, end = 0, w
     for i in range(cells.shape[0]):
-        code[cells[i] // w + 2, cells[i] % w + 2] = _OWN
+        while cells[i] >= end:  # they are in order
+            row, end = row + 1, end + w
+        code[row + 2, cells[i] - end + w + 2] = _OWN
         seeds[0, cells[i]], seeds[1, cells[i]] = residuals[i], own_q[i]
     spread(code)
     away, place, residual, nearest = np.empty(w, np.float32), np.empty(w, np.int32), seeds[0], seeds[1]

@@ -88,6 +88,9 @@ FINE, COARSE = Cells.of(CELL_RAD), Cells.of(2 * CELL_RAD)
 MAPPED = FINE._replace(smooth=1)
 """Cells where there are depth maps: their outlines are seen, not guessed between scan lines, and rounding them costs
 1 dB on the synthetic street."""
+MAPPED_COARSE = Cells.of(1.5 * CELL_RAD)._replace(smooth=1)
+"""... for coarse views: fisheye views of synthetic streets differ by -0.1 to +0.1 dB, with cells twice as wide they
+lose up to 0.3."""
 SWEPT = MAPPED._replace(see_through=round(math.radians(1.4) / CELL_RAD), side=round(SIDE_RAD / CELL_RAD / 2))
 """Cells where neighbouring frames add their scan lines: with gaps half as wide, outlines need less rounding. On DDAD a
 see-through angle of 1 degree and sides of 0.2 lose 1 dB, and gain 0.4 dB on synthetic streets."""
@@ -279,17 +282,17 @@ class PointCloudSurface(DenseSurface):
 
         return np.asarray(block_cones(self.points))
 
-    @property
-    def _cells(self) -> Cells | None:
-        """Cells that suit the points; None if they depend on the camera."""
-        return SWEPT if self.swept else MAPPED if self.mapped else None
+    def _cells(self, camera: Camera | None = None) -> Cells:
+        """Cells that suit the points, and a camera that looks at them."""
+        fits = FINE if camera is None else Cells.for_camera(camera)
+        return SWEPT if self.swept else (MAPPED if fits is FINE else MAPPED_COARSE) if self.mapped else fits
 
     def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
         """The points' dense surface at all pixels, 1/m (h, w)."""
         from arbiview_aug.scene.completion import add_residuals
 
         q = self.street.image(camera, rays, memory)
-        view, *cells = self._located(camera, rays, self._cells or Cells.for_camera(camera), memory)
+        view, *cells = self._located(camera, rays, self._cells(camera), memory)
         add_residuals(*cells, view.layers, q)
         return q
 
@@ -318,7 +321,8 @@ class PointCloudSurface(DenseSurface):
             if len(self._measured.points) and np.count_nonzero(known) < KNOWN_SHARE * known.size:
                 np.copyto(known, self._measured.hidden(camera, rays, memory), where=known == 0)
             return known
-        cells = self._cells or (COARSE if coarse else Cells.for_camera(camera))
+        measured = coarse and not self.swept and not self.mapped
+        cells = COARSE if measured else self._cells(None if coarse else camera)
         view, *nodes = self._located(camera, rays, cells, memory)
         hidden = memory.empty(camera.size, np.float32)
         interpolate_layer(*nodes, view.hidden_below, cells.apart(camera), hidden)
@@ -371,7 +375,7 @@ class PointCloudSurface(DenseSurface):
         suitable = (p for p in held if cells in (None, p.window.cells) and p.window.holds(around(p.window.cells)))
         panorama = next(suitable, None)
         if panorama is None:
-            cells = cells or self._cells or FINE
+            cells = cells or self._cells()
             points = self.points, self.street, self._cones
             panorama = Panorama(around(cells).roomy, origin, *points, memory, self.mapped)
             held.append(panorama)
