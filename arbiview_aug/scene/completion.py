@@ -131,7 +131,6 @@ def nearest_points(points: Any, cones: Any, origin: Any, bounds: Any, place: Any
     (h, w), turn = q.shape, np.int32(place[4])
     work, row, column = np.empty((7, BLOCK), np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
     x, y, z, near = work[0], work[1], work[2], work[3]
-    ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
     for block in range(cones.shape[0]):
         if not _may_meet(cones[block], origin, bounds):
             continue
@@ -139,9 +138,9 @@ def nearest_points(points: Any, cones: Any, origin: Any, bounds: Any, place: Any
         n = min(BLOCK, points.shape[0] - start)
         part = points[start : start + n]
         for i in range(n):
-            x[i], y[i], z[i] = part[i, 0] - ox, part[i, 1] - oy, part[i, 2] - oz
-        for i in range(n):
-            near[i] = _ONE / np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i])
+            a, b, c = part[i, 0] - origin[0], part[i, 1] - origin[1], part[i, 2] - origin[2]
+            length = np.sqrt(a * a + b * b + c * c)
+            x[i], y[i], z[i], near[i] = a / length, b / length, c / length, 1 / length
         cells_row(x[:n], y[:n], z[:n], place, work[4, :n], work[5, :n], work[6, :n])
         for i in range(n):
             row[i] = np.int32(np.rint(work[5, i])) if near[i] <= _NEAREST else np.int32(-1)
