@@ -27,10 +27,10 @@ BOUNDS = {
     "street, plan cached": (15, 47),
     "LiDAR + boxes": (25, 600),
     "LiDAR + boxes, points scanned": (30, 650),
-    "learned depth": (26, 600),
+    "learned depth": (27, 600),
     "generated": (27, 1500),
     "neighbours, all": (32, 2500),
-    "motion": (37, 2550),
+    "motion": (39, 2600),
     "paper": (19, 180),
 }
 """Most files and crossings that a call may have."""

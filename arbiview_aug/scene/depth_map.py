@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rays import PixelRays, pixel_rays, pixels_of
 from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import SampleError
@@ -193,13 +192,6 @@ def points_of(maps: Sequence[DepthMap], before: Points | None = None) -> tuple[L
         count = put_points(rays.planes, rays.parameters, depth_m, pose, *places)
         first += depth_m.size
     return points[: lead + count], pixels[:count]
-
-
-def without(points: Layer, left_out: BoolArray) -> Layer:
-    """The points (P, 3) without some of them (P,), in the same memory."""
-    from arbiview_aug.scene.map_kernels import close_gaps
-
-    return points[: close_gaps(points, left_out)]
 
 
 def forget(maps: Sequence[DepthMap], pixels: npt.NDArray[np.int32]) -> None:

@@ -451,3 +451,14 @@ def points_in(boxes: Any, points: Any, air: float) -> Any:
                     pairs[0, n], pairs[1, n] = k, start + i
                     n += 1
     return pairs[:, :n]
+
+
+@compiled
+def close_gaps(points: Any, left_out: Any) -> int:
+    """Move the points (P, 3) up over those that are ``left_out`` (P,); return how many stay."""
+    n = 0
+    for i in range(points.shape[0]):
+        if not left_out[i]:
+            points[n, 0], points[n, 1], points[n, 2] = points[i, 0], points[i, 1], points[i, 2]
+            n += 1
+    return n

@@ -119,17 +119,6 @@ def put_points(
 
 
 @compiled
-def close_gaps(points: Any, left_out: Any) -> int:
-    """Move the points (P, 3) up over those that are ``left_out`` (P,); return how many stay."""
-    n = 0
-    for i in range(points.shape[0]):
-        if not left_out[i]:
-            points[n, 0], points[n, 1], points[n, 2] = points[i, 0], points[i, 1], points[i, 2]
-            n += 1
-    return n
-
-
-@compiled
 def hidden_distances(planes: Any, P: Any, depth: Any, out: Any) -> None:
     """Inverse distances (h, w) along the rays of a depth map below which points are hidden by it; 0 where unknown."""
     h, w = depth.shape

@@ -316,7 +316,7 @@ class PointCloudSurface(DenseSurface):
         """
         from arbiview_aug.scene.completion import interpolate_layer
 
-        known = hidden_by(self.maps, camera) if coarse else None
+        known = hidden_by(self.maps, camera) if coarse and self.maps else None
         if known is not None:
             if len(self._measured.points) and np.count_nonzero(known) < KNOWN_SHARE * known.size:
                 np.copyto(known, self._measured.hidden(camera, rays, memory), where=known == 0)

@@ -14,7 +14,7 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.scene.boxes import BoxSurface, solids, solids_among
-from arbiview_aug.scene.depth_map import Maps, forget, joined, points_of, without
+from arbiview_aug.scene.depth_map import Maps, forget, joined, points_of
 from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes, own_car
 from arbiview_aug.scene.surface import CorrectedSurface, Correction, Far, Ground, Points, StaticSurface, Street, Surface
 
@@ -144,11 +144,16 @@ def _count(part: Geometry) -> int:
 
 def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: Geometry | None) -> Surface:
     """Points with those of neighbouring frames, and depth maps, with the scene's boxes."""
+    from arbiview_aug.scene.kernels import close_gaps
+
     boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
     sweeps = None if points is None else scene.sweeps
-    known = joined(chain.from_iterable(part for part in maps if isinstance(part, tuple)))
     parts = [np.zeros((0, 3), np.float32) if part is None else part[:, :3] for part in (points, sweeps)]
-    together, pixels = points_of(known, np.concatenate([part[~own_car(part)] for part in parts]))
+    together = np.concatenate([part[~own_car(part)] for part in parts], dtype=np.float32)
+    known, pixels = [], np.zeros(0, np.int32)
+    if of_kinds := [part for part in maps if isinstance(part, tuple) and part]:
+        known = joined(chain.from_iterable(of_kinds))
+        together, pixels = points_of(known, together)
     street = _street(scene, ground_z_m)
     if len(together) == 0:
         return scene.surface("street" if boxes is None else "boxes", ground_z_m)
@@ -157,8 +162,9 @@ def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: 
         return PointCloudSurface(street, together, len(pixels), swept, known)
     planes, is_own = solids_among(boxes, together)
     is_own_pixel = is_own[len(together) - len(pixels) :]
-    forget(known, pixels[is_own_pixel])
-    others = without(together, is_own), int(np.count_nonzero(~is_own_pixel))
+    if known:
+        forget(known, pixels[is_own_pixel])
+    others = together[: close_gaps(together, is_own)], int(np.count_nonzero(~is_own_pixel))
     return PointCloudWithBoxes(PointCloudSurface(street, *others, swept, known), boxes, planes)
 
 
