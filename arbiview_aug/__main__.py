@@ -34,6 +34,7 @@ COMMANDS = {
     "train": Command(
         "train the generator that completes what no camera saw", "generator.training.command", resumable=True
     ),
+    "view": Command("write a recording of frames and their views for Rerun's viewer", "cli.view"),
 }
 
 BENCHMARKS = {

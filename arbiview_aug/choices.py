@@ -131,6 +131,13 @@ def choice(option: str, value: object, choices: Iterable[str]) -> Any:
     raise ValueError(f"{option}: expected one of {', '.join(allowed)}, got {value!r}{hint}")
 
 
+def checked_stride(name: str, value: Any) -> int:
+    """A whole number of pixels from 1; ValueError for anything else."""
+    if not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name}: expected a number of pixels from 1, got {value!r}")
+    return value
+
+
 def removed_name(module: str, name: str) -> AttributeError:
     """The error of a module that lacks a name; old ones with their new name."""
     full = f"{module}.{name}".removeprefix("arbiview_aug.")

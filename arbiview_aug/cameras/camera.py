@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import cv2
@@ -228,10 +228,7 @@ class Camera:
     @cached_property
     def half_angle_rad(self) -> float:
         """Largest angle between the optical axis and a ray of the image; π if the lens cannot be inverted there."""
-        h, w = self.size
-        border = np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, 9), np.linspace(-0.5, h - 0.5, 9)), -1)
-        directions, valid = self.unproject_cam(border)
-        return math.acos(float(np.clip(directions[..., 2].min(), -1, 1))) if valid.all() else math.pi
+        return _half_angle_rad(self.size, self.lens, self.distortion, self.K.tobytes())
 
     @cached_property
     def cone_rad(self) -> float:
@@ -376,6 +373,18 @@ class Camera:
         pixel = np.round(uv).clip(0, [self.width_px - 1, self.height_px - 1]).astype(int)
         seen = valid & self.contains(uv)
         return replace(pinhole, mask=self.mask[pixel[..., 1], pixel[..., 0]] & seen)
+
+
+@lru_cache(256)  # from frame to frame cameras move, and their lenses stay
+def _half_angle_rad(size: tuple[int, int], lens: LensName, distortion: tuple[float, ...], K: bytes) -> float:
+    h, w = size
+    K_px = np.frombuffer(K).reshape(3, 3)
+    camera = Camera(
+        name="lens", width_px=w, height_px=h, K=K_px, cam2ego=np.eye(4), lens=lens, distortion=distortion
+    )
+    border = np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, 9), np.linspace(-0.5, h - 0.5, 9)), -1)
+    directions, valid = camera.unproject_cam(border)
+    return math.acos(float(np.clip(directions[..., 2].min(), -1, 1))) if valid.all() else math.pi
 
 
 def resize_matrix(size: tuple[int, int], new_size: tuple[int, int]) -> FloatArray:

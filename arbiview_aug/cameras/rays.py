@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -114,6 +114,7 @@ class PixelRays:
     size: tuple[int, int]  # (h, w)
     parameters: Planes  # ``Camera.parameters``
     planes: Planes  # (3, h, w) float32 unit rays, 0 where there is none; (3, 0, 0) for a pinhole
+    _nodes: dict[int, Planes] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def cones(self) -> Planes:
@@ -149,6 +150,17 @@ class PixelRays:
             planes = np.ascontiguousarray(planes[:, top : top + size[0], left : left + size[1]])
         return PixelRays(size, parameters, planes)
 
+    def nodes(self, apart: int) -> Planes:
+        """Rays (3, ny + 1, nx + 1) of pixels so far apart, the last ones on the last pixels. Read-only: they are kept,
+        but for those of all pixels.
+        """
+        nodes = self._nodes.get(apart)
+        if nodes is None:
+            nodes = self.at(*(np.minimum(np.arange(0, n + apart, apart), n - 1) for n in self.size))
+            if apart > 1:
+                self._nodes[apart] = nodes
+        return nodes
+
     def at(self, y: npt.NDArray[np.int64], x: npt.NDArray[np.int64]) -> Planes:
         """Rays (3, ny, nx) of the pixels in rows ``y`` and columns ``x``."""
         if self.planes.size:
@@ -162,7 +174,7 @@ class PixelRays:
         return rays
 
 
-class CameraMaps:
+class RayCache:
     """Rays and masks of cameras by their content: what is costly and does not change from frame to frame.
 
     ``memory`` is that of what does change.
@@ -172,8 +184,8 @@ class CameraMaps:
         self._cache: LRUCache[Any, Any] = LRUCache(max_bytes, lambda item: item.nbytes)
         self.memory = Memory()
 
-    def __reduce__(self) -> tuple[type[CameraMaps], tuple[int]]:
-        return CameraMaps, (self._cache.limit,)
+    def __reduce__(self) -> tuple[type[RayCache], tuple[int]]:
+        return RayCache, (self._cache.limit,)
 
     def rays(self, camera: Camera, known: PixelRays | None = None) -> PixelRays:
         """The rays of a camera; ``known`` are taken for it from now on."""

@@ -81,7 +81,7 @@ def add_data(parser: argparse.ArgumentParser, without: str | None = None, **opti
 
 
 def add_target(group: argparse._ActionsContainer, *, required: bool = False) -> None:
-    default = "" if required else f" (default: a higher five-camera rig; with --data, {REAL_TARGET})"
+    default = "" if required else f" (default: a higher five-camera rig; of real frames, {REAL_TARGET})"
     text = f"rig to render: a shipped one ({', '.join(shipped_rigs())}), a rig file or a calibration{default}"
     group.add_argument("--target", metavar="RIG", required=required, help=text)
 

@@ -1,8 +1,8 @@
 """``python -m arbiview_aug evaluate``: the quality of rendered views, in numbers and pictures.
 
 Real frames are scored by sparse LiDAR metrics, overlap and consistency; synthetic streets by the true views.
-``--displaced`` scores real frames by photographs that another camera took, or the next frame's cameras; ``--lidar``
-scores points instead of images.
+``--displaced`` scores real frames by photographs that another camera took, or the next frame's cameras; ``--detector``
+and ``--segmenter`` let networks judge the views; ``--lidar`` scores points instead of images.
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.arguments import REAL_TARGET, frames_text, named_steps, writable_folder
+from arbiview_aug.cli.arguments import REAL_TARGET, device_named, frames_text, named_steps, writable_folder
 from arbiview_aug.cli.scans import evaluate_scans
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
@@ -27,13 +29,15 @@ from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
-from arbiview_aug.evaluate.frames import EXPOSURES, Evaluation, ScoredFrame, evaluate, make_frame
-from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.evaluate.frames import EXPOSURES, Evaluation, Look, ScoredFrame, evaluate, make_frame
+from arbiview_aug.evaluate.images import RenderedView, as_arrays
+from arbiview_aug.evaluate.judges import load_detector, load_segmenter
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
-from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
+from arbiview_aug.evaluate.report.tables import evaluation_tables, judge_tables, text_table
 from arbiview_aug.evaluate.targets import named_targets
+from arbiview_aug.evaluate.verdicts import SOURCES, TRUTH, Panel, numbers
 from arbiview_aug.generator import load_inpainter
 from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import GEOMETRIES
@@ -47,38 +51,59 @@ def run(arguments: argparse.Namespace) -> None:
         evaluate_scans(arguments, folder)
         return
     notes: list[str] = []
+    panel = _panel(arguments)
+    look = panel.look if arguments.detector or arguments.segmenter else None
     if arguments.displaced:
-        methods, done = _displaced(arguments, notes)
+        methods, done = _displaced(arguments, notes, look)
     else:
         methods = _methods(arguments)
-        done = measured(arguments, open_frames(arguments, arguments.geometry), methods, notes)
+        data = open_frames(arguments, arguments.geometry)
+        done = measured(arguments, data, methods, notes, look=look)
     if not done.views:
         raise DataError("; ".join(done.declined.values()))
     assert done.first is not None
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
     names = [method.name for method in methods]
-    tables = evaluation_tables(done, names)
+    judged = {name: numbers(row) for name, row in panel.rows(names, list(done.targets)).items()}
+    tables = evaluation_tables(done, names) + judge_tables(judged)
+    notes.extend(panel.notes(names, arguments.detector_classes))
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
     title = f"{source}: {frames_text(len({view['frame'] for view in done.views}))}"
     settings = {key: value for key, value in vars(arguments).items() if key != "displaced"}
     report: dict[str, Any] = {"arguments": settings, "scored_on_other_points": done.first.held_out}
     report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in tables), strict=False))
-    report |= {"views": done.views, "pairs": done.pairs}
+    report |= {"views": done.views, "pairs": done.pairs} | ({"judges": judged} if judged else {})
     (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
     sample = done.first.sample
     for (target, method), views in done.pictures.items():
         rig = done.targets[target]
-        file = re.sub(r"[^\w+-]+", "-", f"{target}-{method}") + ".png"
+        file = re.sub(r"[^\w+-]+", "-", f"{target}-{method}")
         sheet = frame_sheet(sample["rig"], as_arrays(sample["images"]), rig, views, done.first.true_images(rig))
-        save_picture(folder / file, sheet)
-    (folder / "report.html").write_text(html_report(title, done, names, tables, notes), encoding="utf-8")
+        save_picture(folder / f"{file}.png", sheet)
+        if (target, method) in panel.pictures:
+            seen = [RenderedView(image, np.ones(image.shape[:2], bool)) for image in panel.pictures[target, method]]
+            sources, truth = panel.pictures[SOURCES, SOURCES], panel.pictures.get((target, TRUTH))
+            save_picture(folder / f"{file}-judged.png", frame_sheet(sample["rig"], sources, rig, seen, truth))
+    page = html_report(title, done, names, tables, notes, panel.pictures)
+    (folder / "report.html").write_text(page, encoding="utf-8")
     for note in notes:
         print(f"note: {note}\n")
     print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
     print(f"report: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}")
 
 
-def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Method], Evaluation]:
+def _panel(arguments: argparse.Namespace) -> Panel:
+    """Load the judges, before anything is rendered."""
+    device, panel = device_named(None), Panel()
+    if arguments.detector:
+        weights, classes = arguments.detector_weights, arguments.detector_classes
+        panel.detector = load_detector(arguments.detector, weights, classes, device)
+    if arguments.segmenter:
+        panel.segmenter = load_segmenter(arguments.segmenter, device)
+    return panel
+
+
+def _displaced(arguments: argparse.Namespace, notes: list[str], look: Look | None) -> tuple[list[Method], Evaluation]:
     """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
     data, displaced = open_frames(arguments, ["motion", *arguments.geometry]), arguments.displaced
     count_of = min(arguments.frames or len(data), len(data))
@@ -92,7 +117,9 @@ def _displaced(arguments: argparse.Namespace, notes: list[str]) -> tuple[list[Me
         if arguments.geometry == ["auto"]:
             arguments.geometry = surfaces_for(first[1].sample)
         methods = [COPY, *_methods(arguments, neighbours=None)]
-        return methods, evaluate(chain([first], frames), lambda _: {}, methods, tick, agreement=False)
+        return methods, evaluate(
+            chain([first], frames), lambda _: {}, methods, tick, agreement=False, look=look
+        )
 
 
 # --- frames and targets -----------------------------------------------------------------------------------------------
@@ -148,11 +175,17 @@ def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
 
 
 def measured(
-    arguments: argparse.Namespace, data: Any, methods: Sequence[Method], notes: list[str], *, agreement: bool = True
+    arguments: argparse.Namespace,
+    data: Any,
+    methods: Sequence[Method],
+    notes: list[str],
+    *,
+    agreement: bool = True,
+    look: Look | None = None,
 ) -> Evaluation:
     """Evaluate methods on the first frames, behind a progress bar; warnings go to ``notes``."""
     chosen = None if arguments.target is None else load_rig(arguments.target)
     count_of = min(arguments.frames or 1, len(data))
     frames = scored_frames(data, count_of, any(method.reads_points for method in methods))
     with named_steps(notes, count_of) as tick:
-        return evaluate(frames, partial(target_rigs, arguments, chosen), methods, tick, agreement=agreement)
+        return evaluate(frames, partial(target_rigs, arguments, chosen), methods, tick, agreement=agreement, look=look)

@@ -21,6 +21,7 @@ from arbiview_aug.cli.arguments import (
     add_target,
     command_parser,
     count,
+    data,
     kinds_text,
     positive,
     seed,
@@ -175,6 +176,20 @@ def evaluate() -> argparse.ArgumentParser:
         "synthetic streets; with --displaced, the next frame's, by the target's scanners or those in calib.json"
     )
     add("--lidar", action="store_true", help=lidar)
+    detector = (
+        "judge views by a detector: a hub id or folder of transformers' object detection, a torchvision detector's "
+        "name, or FILE.py:function (RGB (H, W, 3) uint8 to boxes (n, 4) xyxy, scores, labels). Scores labelled "
+        "objects, and true images where there are some (docs/benchmarks.md)"
+    )
+    add("--detector", metavar="MODEL", help=detector)
+    add("--detector-weights", metavar="FILE", help="weights of a torchvision detector")
+    classes = "labels that count (default: names of vehicles and people; all numbers)"
+    add("--detector-classes", nargs="+", default=[], metavar="LABEL", help=classes)
+    segmenter = (
+        "judge views by drivable area and lane marks, against true images: TorchScript of TwinLiteNet's kind, or "
+        "FILE.py:function (RGB (H, W, 3) uint8 to masks (2, H, W))"
+    )
+    add("--segmenter", metavar="MODEL", help=segmenter)
     return parser
 
 
@@ -202,8 +217,8 @@ def train() -> argparse.ArgumentParser:
     add("command", nargs="?", choices=("train", "evaluate"), default="train", help="what to do (default: %(default)s)")
     add("--config", choices=TRAINING_PRESETS, default="tiny", help="preset of all settings")
     kinds = " or ".join(f"{kind}:PATH" for kind in READERS)
-    data = f"synthetic, or real frames with their kind: {kinds} (default: synthetic; evaluate: the run's)"
-    add("--data", metavar="DATA", help=data)
+    text = f"synthetic, or real frames with their kind: {kinds} (default: synthetic; evaluate: the run's)"
+    add("--data", metavar="DATA", help=text)
     add_output(parser, "folder of the run")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
     weights = "config paper or inpaint: Stable Diffusion 1.5, or its inpainting model: a folder or hub id"
@@ -213,6 +228,26 @@ def train() -> argparse.ArgumentParser:
     add("--seeds", type=count, default=1, metavar="N", help="evaluate: targets a scene")
     add("--steps", type=count, metavar="N", help="evaluate: steps of a sample (default: the run's own)")
     add("--quiet", action="store_true", help="no progress bars")
+    return parser
+
+
+def view() -> argparse.ArgumentParser:
+    parser = command_parser(
+        "view",
+        "Write a recording for Rerun's viewer: frames along a time line, with cameras, points and boxes in 3D, and "
+        "source images beside the target's views, their coverage and confidence. Needs the extra viewer.",
+        "/data/frames --target waymo --frames 10",
+    )
+    add = parser.add_argument
+    text = f"real frames, by their path alone or with their kind. {kinds_text()} (default: a synthetic street)"
+    add("data", nargs="?", type=data, metavar="[KIND:]PATH", help=text)
+    add_target(parser)
+    add_rendering(parser)
+    add_frames(parser, 5)
+    add_reading(parser)
+    add("--output", default="output/view.rrd", metavar="FILE", help="recording to write")
+    add("--open", action="store_true", help="open it in the viewer")
+    parser.set_defaults(target_set=None)
     return parser
 
 
@@ -284,7 +319,7 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
     """Refuse options of a command that do not fit together, as argparse refuses others."""
     if name == "convert" and arguments.shard_index >= arguments.num_shards:
         parser.error(f"argument --shard-index: expected less than {arguments.num_shards}, got {arguments.shard_index}")
-    if name in ("convert", "demo", "evaluate") and "paper" in arguments.quality:
+    if name in ("convert", "demo", "evaluate", "view") and "paper" in arguments.quality:
         surfaces = arguments.geometry if isinstance(arguments.geometry, list) else [arguments.geometry]
         if {*surfaces} - {"auto", "infinity"}:
             parser.error(f"argument --geometry: quality paper knows the far surface alone, got {', '.join(surfaces)}")
@@ -299,5 +334,13 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
                 parser.error(f"argument --{option.replace('_', '-')}: --displaced has its own; expected none")
         if arguments.lidar and arguments.data is not None and not arguments.displaced:
             parser.error("argument --lidar: expected --displaced with --data: a drive's truth is its next scan")
+        for option in ("detector_weights", "detector_classes"):
+            if getattr(arguments, option) and not arguments.detector:
+                parser.error(f"argument --{option.replace('_', '-')}: expected --detector with it, found none")
+        for option in ("detector", "segmenter") if arguments.lidar else ():
+            if getattr(arguments, option):
+                parser.error(f"argument --{option}: it judges images; expected no --lidar")
+        if arguments.segmenter and arguments.data is not None and not arguments.displaced:
+            parser.error("argument --segmenter: expected --displaced with --data: it compares with true images")
         if arguments.displaced and arguments.data is None:
             parser.error("argument --displaced: expected --data FOLDER with it, found none")

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
 
 import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.formats.calibration import read_calibration, recognised
-from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.cameras.rig import Rig, load_rig, shipped_rigs
 from arbiview_aug.cli.arguments import data
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
@@ -24,8 +23,7 @@ NOISE_DEG, NOISE_M = 0.2, 0.02
 
 def run(arguments: argparse.Namespace) -> None:
     """Print the rigs and the differences of the others from the first; write the picture."""
-    rigs = [_load(name) for name in arguments.rigs]
-    notes = [_notes(name) for name in arguments.rigs]
+    rigs, notes = zip(*(_load(name) for name in arguments.rigs), strict=True)
     print("\n\n".join(f"{rig!r}{note}" for rig, note in zip(rigs, notes, strict=True)))
     for other in rigs[1:]:
         print(f"\n{differences(rigs[0], other)}\n\n{rig_gap(rigs[0], other)}")
@@ -67,20 +65,17 @@ def _pixels_per_deg(camera: Camera) -> float:
     return float(1e3 * (beside - ahead))
 
 
-def _notes(name: str) -> str:
-    """A line on what another tool's calibration was read as; empty for rigs and data sets."""
-    path = Path(name)
-    is_calibration = os.path.exists(path) and not os.path.isfile(path / CALIBRATION_FILE) and recognised(path)
-    return f"\n  {read_calibration(path, name)['notes']}" if is_calibration else ""
-
-
-def _load(name: str) -> Rig:
+def _load(name: str) -> tuple[Rig, str]:
+    """A rig, and a line on what another tool's calibration was read as."""
     kind, root = split_kind(name)
     if kind is None and os.path.isfile(root / CALIBRATION_FILE):  # its images need not be there
-        return load_rig(root / CALIBRATION_FILE)
-    if kind is None and (not os.path.isdir(root) or recognised(root)):
-        return load_rig(name)
+        return load_rig(root / CALIBRATION_FILE), ""
+    if kind is None and name not in shipped_rigs() and os.path.exists(root) and recognised(root):
+        plain = read_calibration(root, where := f"rig file {root}")
+        return Rig.from_dict(plain, folder=root.parent, where=where), f"\n  {plain['notes']}"
+    if kind is None and not os.path.isdir(root):
+        return load_rig(name), ""
     recording = open_data(data(name))
     recording.load_points = False
     rig: Rig = recording[0]["rig"]
-    return rig
+    return rig, ""

@@ -44,7 +44,8 @@ def displaced_frames(data: Any, count: int, next_frame: Mapping[str, Any] | None
             if later is None:
                 continue
             photographs, sample = later
-        yield str(sample.get("token", index)), ScoredFrame(sample, truth=photographs.of_rig, target=photographs.rig)
+        points, rig = sample.get("points"), photographs.rig
+        yield str(sample.get("token", index)), ScoredFrame(sample, truth=photographs.of_rig, target=rig, points=points)
         count -= 1
 
 

@@ -28,6 +28,9 @@ from arbiview_aug.evaluate.metrics import mean_of, truth_metrics
 
 Render = Callable[[Mapping[str, Any], Rig], list[RenderedView]]  # a view for each of the target rig
 
+Look = Callable[[str, "ScoredFrame", str, str, Rig, Sequence[RenderedView]], None]
+"""Look at a named frame's views: by a method, for a target, whose rig comes with it."""
+
 Exposure = Literal["raw", "even"]
 EXPOSURES: tuple[Exposure, ...] = ("raw", "even")  # exposures as recorded, and made even
 _CACHED_TRUTHS = 8  # one for each target would take a gigabyte
@@ -59,6 +62,7 @@ class ScoredFrame:
     held_out: bool = False  # whether ``sample`` has points, and others score
     truth: Callable[[Rig], RenderedViews | Photographs] | None = None  # the true views of a rig; None if unknown
     target: Rig | None = None  # the rig that alone has a truth, that of photographs; None for any rig
+    points: torch.Tensor | None = None  # (P, >= 3) all that the frame has, those that score too
 
     @property
     def scored_sample(self) -> dict[str, Any]:
@@ -84,12 +88,13 @@ def make_frame(
     """
     truth = None if truth is None else lru_cache(_CACHED_TRUTHS)(truth)
     inputs = {key: value for key, value in sample.items() if key != "points"}
-    if "points" not in sample or not exposures:
-        return ScoredFrame(dict(sample) if hand_over_points else inputs, truth=truth)
+    points_3d = sample.get("points")
+    if points_3d is None or not exposures:
+        return ScoredFrame(dict(sample) if hand_over_points else inputs, truth=truth, points=points_3d)
     rig, images = sample["rig"], as_arrays(sample["images"])
-    cloud = sample["points"].numpy().astype(np.float64)
+    cloud = points_3d.numpy().astype(np.float64)
     if hand_over_points:
-        inputs["points"] = sample["points"][torch.from_numpy(lidar_split(cloud)[0])]
+        inputs["points"] = points_3d[torch.from_numpy(lidar_split(cloud)[0])]
     lidar: dict[Exposure, LidarReference] = {}
     for exposure in exposures:
         exposed: list[Image] = list(equalised(rig, images, cloud)) if exposure == "even" else images
@@ -97,7 +102,7 @@ def make_frame(
         if hand_over_points:
             points = points.subset(lidar_split(points.points)[1])
         lidar[exposure] = LidarReference({**inputs, "images": as_tensors(exposed)}, points)
-    return ScoredFrame(inputs, lidar, hand_over_points, truth)
+    return ScoredFrame(inputs, lidar, hand_over_points, truth, points=points_3d)
 
 
 def scores(
@@ -116,13 +121,10 @@ def scores(
     rows = [{"seen": float(view.coverage.mean())} for view in views]
     if frame.truth is not None:
         truth = frame.truth(target)
-        for k, (row, view, true) in enumerate(zip(rows, views, as_arrays(truth.images), strict=True)):
-            if isinstance(truth, Photographs):
-                valid, parts = truth.valid[k], None
-            else:
-                classes = truth.classes[k].numpy()
-                valid, parts = classes != SceneClass.VOID, regions(classes)
-            metrics_of_view = truth_metrics(view.image, true, coverage=view.coverage, classes=parts, valid=valid)
+        shown = zip(rows, views, as_arrays(truth.images), valid_pixels(truth), strict=True)
+        for k, (row, view, true, valid) in enumerate(shown):
+            classes = None if isinstance(truth, Photographs) else regions(truth.classes[k].numpy())
+            metrics_of_view = truth_metrics(view.image, true, coverage=view.coverage, classes=classes, valid=valid)
             row |= {f"true_{name}": value for name, value in metrics_of_view.items()}
     for k, (exposure, reference) in enumerate(references):
         rendered = views if k == 0 else render(reference.sample, target)
@@ -130,6 +132,13 @@ def scores(
             metrics_of_view = sparse_metrics(view.image, camera, reference.points, coverage=view.coverage) or {}
             row |= {f"{exposure}_{name}": value for name, value in metrics_of_view.items()}
     return views, rows
+
+
+def valid_pixels(truth: RenderedViews | Photographs) -> list[BoolArray]:
+    """Pixels (h, w) of each true image that score: those that the lens sees, and what photographs do not mask."""
+    if isinstance(truth, Photographs):
+        return list(truth.valid)
+    return [classes.numpy() != SceneClass.VOID for classes in truth.classes]
 
 
 def regions(classes: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:
@@ -187,12 +196,13 @@ def evaluate(
     tick: Callable[[str, int], None] = lambda _, __: None,
     *,
     agreement: bool = True,
+    look: Look | None = None,
 ) -> Evaluation:
     """Run every method on every named frame and target.
 
     ``targets`` maps a source rig to the rigs to render, by name, unless a frame has a ``target`` of its own. ``tick``
     is called before each step with its name and the frame's number of steps. ``agreement`` measures that of neighbours
-    too.
+    too. ``look`` sees all views.
     """
     done = Evaluation()
     for name, frame in frames:
@@ -212,6 +222,8 @@ def evaluate(
                     views, metrics = scores(frame, method.render, rig)
                     if frame is done.first:
                         done.pictures[target, method.name] = views
+                    if look is not None:
+                        look(name, frame, method.name, target, rig, views)
                     row["target"] = target
                     done.views += [{**row, "camera": c.name, **m} for c, m in zip(rig, metrics, strict=True)]
                     pairs = target_consistency(rig, views) if agreement else []

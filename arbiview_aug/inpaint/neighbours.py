@@ -26,7 +26,7 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.rays import CameraMaps, PixelRays
+from arbiview_aug.cameras.rays import PixelRays, RayCache
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
@@ -152,7 +152,7 @@ def plan_fills(
     surface: str,
     config: RenderConfig,
     reach: Reach,
-    maps: CameraMaps,
+    maps: RayCache,
 ) -> Fills | None:
     """Find the holes of a frame's plan and the neighbours, nearest first, that show them; None if none does.
 
@@ -178,7 +178,7 @@ def plan_fills(
     return Fills(holes, fills) if fills else None
 
 
-def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: CameraMaps) -> Hole | None:
+def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: RayCache) -> Hole | None:
     camera, covered = plan.target[index], plan.targets[index].coverage
     empty = ~covered if camera.mask is None else ~covered & camera.mask
     height_m = camera.center_m[2] - plan.source.ground_z_m

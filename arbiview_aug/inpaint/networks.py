@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import GeneratorError
+from arbiview_aug.errors import ArbiviewError, GeneratorError
 from arbiview_aug.inpaint.crops import Canvas, drawn, packed, windows
 from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, check_device, checked_settings
 from arbiview_aug.inpaint.telea import telea
@@ -218,12 +218,16 @@ class TorchScriptInpainter(NetworkInpainter):
     def __init__(
         self, path: str | Path, *, size: int = 512, multiple: int = 8, batch: int = 4, **settings: Any
     ) -> None:
-        try:
-            network = torch.jit.load(str(path), map_location="cpu")
-        except (RuntimeError, ValueError, OSError) as error:
-            text = " ".join(str(error).split())[:300]
-            raise GeneratorError(f"{path}: expected a TorchScript file: {text}") from None
-        super().__init__(network, size, multiple, batch, **settings)
+        super().__init__(load_torchscript(path, str(path), GeneratorError), size, multiple, batch, **settings)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         return self.network(images, holes[:, None].to(images.dtype))
+
+
+def load_torchscript(path: str | Path, what: str, kind: type[ArbiviewError]) -> Any:
+    """Load a TorchScript file onto the CPU; an error of a ``kind`` says ``what`` it was to be."""
+    try:
+        return torch.jit.load(str(path), map_location="cpu")
+    except (RuntimeError, ValueError, OSError) as error:
+        text = " ".join(str(error).split())[:300]
+        raise kind(f"{what}: expected a TorchScript file: {text}") from None

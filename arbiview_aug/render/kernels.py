@@ -306,8 +306,6 @@ def _occlude_row(
     if not smooth or before_m.shape[0]:
         for i in range(n):
             place[i] = np.int32(np.rint(row[i])) * np.int32(w) + np.int32(np.rint(column[i]))
-        for i in range(n):
-            hides[i] = beyond[np.uint32(place[i])]
     if smooth:  # what was measured hides smoothly, silhouettes of solids do not
         top, left, right, down = np.float32(h - 2), np.float32(w - 2), np.uint64(1), np.uint64(w)
         for i in range(n):
@@ -319,21 +317,27 @@ def _occlude_row(
             s, t = row[i] - px[i], column[i] - py[i]
             above = beyond[k] * (_ONE - t) + beyond[k + right] * t
             below = beyond[k + down] * (_ONE - t) + beyond[k + down + right] * t
-            is_solid = before_m.shape[0] and (number_at[place[i]] >= 0 or (face.shape[0] and face[i] >= 0))
-            hides[i] = hides[i] if is_solid else above * (_ONE - s) + below * s
-    if face.shape[0] == 0 and guess:
-        pz[:] = _ZERO
-    elif face.shape[0]:
+            hides[i] = above * (_ONE - s) + below * s
+        for i in range(n if before_m.shape[0] else 0):
+            if number_at[np.uint32(place[i])] >= 0 or (face.shape[0] and face[i] >= 0):
+                hides[i] = beyond[np.uint32(place[i])]
+    else:
         for i in range(n):
-            number = face[i]
-            if number < 0:
-                pz[i] = _ZERO if guess else pz[i]
-            elif before_m[number] <= _ZERO or before_m[number] * pz[i] < LEAST_INCIDENCE:
-                pz[i] = -_ONE
-            elif number_at[place[i]] == number // 6:  # pieces are convex
-                pz[i] = _MOST
-            elif number_at[place[i]] // PIECES == number // (6 * PIECES):
-                pz[i] = pz[i] / max(_ONE - SAME_OBJECT_M * pz[i], _TINY)
+            hides[i] = beyond[np.uint32(place[i])]
+    if guess:
+        for i in range(n):
+            pz[i] = pz[i] if face.shape[0] and face[i] >= 0 else _ZERO
+    for i in range(face.shape[0]):
+        number = face[i]
+        if number < 0:
+            continue
+        me, there = np.uint32(number), number_at[np.uint32(place[i])]
+        if before_m[me] <= _ZERO or before_m[me] * pz[i] < LEAST_INCIDENCE:
+            pz[i] = -_ONE
+        elif there == number // 6:  # pieces are convex
+            pz[i] = _MOST
+        elif there // PIECES == number // (6 * PIECES):
+            pz[i] = pz[i] / max(_ONE - SAME_OBJECT_M * pz[i], _TINY)
     for i in range(n):
         seen[i] = seen[i] & (hides[i] <= pz[i])
 

@@ -23,7 +23,7 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray, LensName
 from arbiview_aug.cameras.rays import (
     CELL_PX,
     MAX_INVERSE_DISTANCE,
-    CameraMaps,
+    RayCache,
     look_apart,
     relative_pose,
     source_pixels,
@@ -127,7 +127,7 @@ class ViewPlanner:
         scene: Scene,
         config: RenderConfig,
         counters: Counter[str],
-        maps: CameraMaps,
+        maps: RayCache,
     ) -> None:
         self.sources, self.camera, self.surface, self.config = source.cameras, camera, surface, config
         self.scene, self.ground_z_m, self.counters, self.maps = scene, source.ground_z_m, counters, maps
@@ -565,7 +565,7 @@ def build_plan(
     geometry: str = "auto",
     config: RenderConfig | None = None,
     scene: Scene | None = None,
-    maps: CameraMaps | None = None,
+    maps: RayCache | None = None,
 ) -> RenderPlan:
     """Plan how ``target`` is rendered from ``source``'s images.
 
@@ -612,11 +612,11 @@ def warm_up() -> None:
 
 
 def _built(
-    source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene, maps: CameraMaps | None
+    source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene, maps: RayCache | None
 ) -> RenderPlan:
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)
-    maps = maps or CameraMaps()
+    maps = maps or RayCache()
     planners = [ViewPlanner(source, order, camera, surface, scene, config, counters, maps) for camera in target]
     used = [(region.source, region.level) for planner in planners for region in planner.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)

@@ -61,6 +61,7 @@ class Frame:
         sample: The sample it was read from; further entries are read and checked on request.
         lead: Leading dimensions of the sample's images.
         index: Place of the frame in them.
+        once: What is read once for all stages, by name: neighbours and their points.
     """
 
     images: tuple[torch.Tensor, ...]
@@ -68,6 +69,7 @@ class Frame:
     sample: Mapping[str, Any] = field(default_factory=dict, repr=False)
     lead: tuple[int, ...] = ()
     index: tuple[int, ...] = ()
+    once: dict[str, Any] = field(default_factory=dict, repr=False, init=False)
 
     @property
     def number(self) -> int:

@@ -112,8 +112,15 @@ def read_neighbours(frame: Frame, warn: Warn) -> list[Neighbour]:
     cam2ego alone keep the current lenses and masks. Without own boxes, the sample's are moved by their velocities
     (columns 7 and 8, m/s in the ego frame) if both frames have a time and all velocities are finite.
 
-    Frames at the same place are left out silently, unusable ones with a warning.
+    Frames at the same place are left out silently, unusable ones with a warning. They are read once for each frame.
     """
+    if "neighbours" not in frame.once:
+        frame.once["neighbours"] = _read(frame, warn)
+    neighbours: list[Neighbour] = frame.once["neighbours"]
+    return neighbours
+
+
+def _read(frame: Frame, warn: Warn) -> list[Neighbour]:
     value, count = frame.sample.get("neighbours"), math.prod(frame.lead)
     if value is None:
         return []
@@ -138,13 +145,24 @@ def read_neighbours(frame: Frame, warn: Warn) -> list[Neighbour]:
     return sorted(neighbours, key=lambda neighbour: neighbour.travel_m)
 
 
-def points_of_neighbours(rig: Rig, points: Points, neighbours: Sequence[Neighbour], warn: Warn) -> list[FloatArray]:
-    """Points (P, C) of other frames in the current ego frame, metres: an array for each frame that has some.
+def points_of_neighbours(frame: Frame, warn: Warn) -> list[FloatArray]:
+    """Points (P, C) of a frame's neighbours in its ego frame, metres: an array for each that has some.
 
-    Points that the frame's own (Q, 3) contradict are left out, and points that cannot be read, with a warning.
+    Points that the frame's own contradict are left out, and points that cannot be read, with a warning. They are read
+    once for each frame; without points of its own there are none.
     """
-    parts: list[FloatArray] = []
-    origin = np.mean([camera.center_m for camera in rig], axis=0)
+    if "sweeps" not in frame.once:
+        frame.once["sweeps"] = _sweeps(frame, warn)
+    sweeps: list[FloatArray] = frame.once["sweeps"]
+    return sweeps
+
+
+def _sweeps(frame: Frame, warn: Warn) -> list[FloatArray]:
+    array = frame.array("points")
+    if array is None or not (neighbours := read_neighbours(frame, warn)):
+        return []
+    points, parts = checked_points(array), list[FloatArray]()
+    origin = np.mean([camera.center_m for camera in frame.rig], axis=0)
     for neighbour in neighbours[:MAX_SWEEPS]:
         try:
             others = neighbour.points()

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.choices import checked_stride
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.boxes_2d import rig_of
 from arbiview_aug.scene.boxes import PIECES, checked_boxes, draw_solids, silhouette_sums, solids
@@ -59,10 +60,9 @@ def lift_mask(sample: Mapping[str, Any], stride: int, least: float = 0.5) -> tor
 
     Raises:
         SampleError: No ``coverage``.
-        ValueError: ``stride`` is below 1.
+        ValueError: ``stride`` is no whole number from 1.
     """
-    if stride < 1:
-        raise ValueError(f"stride: expected a number of pixels from 1, got {stride!r}")
+    checked_stride("stride", stride)
     if sample.get("coverage") is None:
         raise SampleError("lift_mask: expected an output of RigRetarget with 'coverage', got none")
     coverage, ignore = sample["coverage"], sample.get("ego_mask")

@@ -11,6 +11,7 @@ not read from that source; where no other source sees them, they are holes.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -122,10 +123,9 @@ def solids(boxes: FloatArray) -> FloatArray:
 ByBox = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 
 
-def solids_among(boxes: FloatArray, points: Points, within: ByBox | None = None) -> tuple[FloatArray, BoolArray]:
+def solids_among(boxes: FloatArray, points: Points) -> tuple[FloatArray, BoolArray]:
     """Shapes in boxes (B, 7), as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs.
 
-    ``within`` are ``points_by_box`` with ``AIR_M``, if they are known.
     Of the profiles that fit a box it is the one whose faces lie nearest to its points. Points within ``AIR_M`` of it
     are its own: mirrors, and the noise of points and labels. This far over the box's floor they may be the road's.
     """
@@ -134,7 +134,7 @@ def solids_among(boxes: FloatArray, points: Points, within: ByBox | None = None)
     boxes = np.ascontiguousarray(boxes)
     planes_and_own = np.empty((len(boxes), PIECES, 6, 4)), np.zeros(len(points), bool)
     points = np.ascontiguousarray(points, np.float32)
-    within = within or points_by_box(boxes, points, AIR_M)
+    within = points_by_box(boxes, points, AIR_M)
     fit_profiles(boxes, PROFILES, OF_KIND[kinds(boxes)], points, *within, LEAST_POINTS, AIR_M, *planes_and_own)
     return planes_and_own
 
@@ -243,7 +243,7 @@ class BoxSurface(LayeredSurface):
         is_large = self.boxes[:, 3] * self.boxes[:, 4] > ROOF_M2
         return np.asarray((self.solids[..., 2] > TOP) & is_large[:, None, None]).reshape(-1)
 
-    @property
+    @cached_property
     def face_parts(self) -> npt.NDArray[np.int32]:
         """What each face (n,) shows: ``PARTS`` times its object, and ``TOP_PART`` more for tops.
 

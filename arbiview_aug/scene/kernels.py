@@ -15,7 +15,6 @@ _TINY = np.float32(1e-30)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 ROW = 35
 
-_TOGETHER = 64  # consecutive points, which lie side by side in scans and depth maps
 
 GROUND, STREET = 0, 1
 
@@ -361,56 +360,7 @@ def upsampled_row(nodes: Any, step: int, y: int, x0: int, row: Any, out: Any) ->
             part[k] = first + slope * np.float32(k)
 
 
-@compiled
-def object_returns(
-    origin: Any, rays: Any, face: Any, planes: Any, points: Any, ends: Any, first: int, most: int, air: float,
-    support: float, q: Any, nearest: Any,
-) -> None:  # fmt: skip
-    """Give rays that meet an object the nearest of its own points, and the distance that this point tells.
-
-    Of an object's points, ``most`` are looked at, evenly over the scan.
-
-    A face within ``air`` of the point is moved into it: labels and shapes are some centimetres off.
-
-    Args:
-        origin: (3,) float64 of the rays.
-        rays: (3, ny, nx) float32, ego frame.
-        face: (ny, nx) the face that each ray meets, 6 x piece + plane, -1 for none.
-        planes: (B, pieces, 6, 4).
-        points: (n, 3) points of the objects, object after object.
-        ends: (B,) where they end.
-        first: Number of the first of them.
-        most: Points of an object.
-        air: Metres.
-        support: Radians, as seen from the rays' origin, by which a point may be farther than ``air`` from the hit.
-        q: (ny, nx) inverse distances of the faces, updated.
-        nearest: (ny, nx) int32, written where a ray meets an object: the point's number, -1 without one so near.
-    """
-    hit, per_box = np.empty(3, np.float32), 6 * planes.shape[1]
-    for y in range(q.shape[0]):
-        for x in range(q.shape[1]):
-            if face[y, x] < 0:
-                continue
-            for axis in range(3):
-                hit[axis] = origin[axis] + rays[axis, y, x] / q[y, x]
-            box, best, chosen = face[y, x] // per_box, np.float32(np.inf), -1
-            start = ends[box - 1] if box else 0
-            for i in range(start, ends[box], 1 + (ends[box] - start) // most):
-                a, b, c = points[i, 0] - hit[0], points[i, 1] - hit[1], points[i, 2] - hit[2]
-                away = a * a + b * b + c * c
-                if away < best:
-                    best, chosen = away, i
-            reach = air + support / q[y, x]
-            nearest[y, x] = first + chosen if best <= reach * reach else -1
-            if nearest[y, x] >= 0:
-                n = planes[box, face[y, x] % per_box // 6, face[y, x] % 6]
-                along, over, off = 0.0, 0.0, -n[3]
-                for axis in range(3):
-                    along += n[axis] * rays[axis, y, x]
-                    over += n[axis] * (points[chosen, axis] - origin[axis])
-                    off += n[axis] * points[chosen, axis]
-                if abs(off) <= air and along * over > 0:
-                    q[y, x] = along / over
+_NEAR_M, _NEAR_CELLS = 1.0, 256  # a grid around all boxes, over which it repeats
 
 
 @compiled
@@ -420,36 +370,30 @@ def points_in(boxes: Any, points: Any, air: float) -> Any:
     for k in range(boxes.shape[0]):
         center[0, k], center[1, k] = boxes[k, 0], boxes[k, 1]
         reach[k] = np.hypot(boxes[k, 3], boxes[k, 4]) / 2 + 2 * air
+    near = np.zeros((_NEAR_CELLS, _NEAR_CELLS, 2), np.int32)  # first and last (exclusive) box of cells, which repeat
+    for k in range(reach.shape[0]):
+        side = min(reach[k], _NEAR_M * _NEAR_CELLS / 2)
+        x, y = center[0, k], center[1, k]
+        for j in range(int(np.floor((x - side) / _NEAR_M)), int(np.floor((x + side) / _NEAR_M)) + 1):
+            for i in range(int(np.floor((y - side) / _NEAR_M)), int(np.floor((y + side) / _NEAR_M)) + 1):
+                cell = near[j & _NEAR_CELLS - 1, i & _NEAR_CELLS - 1]
+                cell[0], cell[1] = cell[0] if cell[1] else k, k + 1
     pairs, n = np.empty((2, 1024), np.int64), 0
-    beside, where = np.empty(boxes.shape[0], np.int64), np.empty((3, boxes.shape[0]))
-    for start in range(0, points.shape[0], _TOGETHER):
-        part, m = points[start : start + _TOGETHER], 0
-        x0, x1, y0, y1 = np.inf, -np.inf, np.inf, -np.inf
-        for i in range(part.shape[0]):
-            x0, x1 = min(x0, part[i, 0]), max(x1, part[i, 0])
-            y0, y1 = min(y0, part[i, 1]), max(y1, part[i, 1])
-        for k in range(reach.shape[0]):
-            x, y, r = center[0, k], center[1, k], reach[k]
-            if (x0 - r <= x) & (x <= x1 + r) & (y0 - r <= y) & (y <= y1 + r):
-                beside[m], where[0, m], where[1, m], where[2, m] = k, x, y, r
-                m += 1
-        for i in range(part.shape[0] if m else 0):
-            px, py, hits = part[i, 0], part[i, 1], 0
-            for j in range(m):
-                hits |= (abs(px - where[0, j]) <= where[2, j]) & (abs(py - where[1, j]) <= where[2, j])
-            for j in range(m if hits else 0):
-                k = beside[j]
-                x, y, z = px - center[0, k], py - center[1, k], part[i, 2] - boxes[k, 2]
-                if abs(x) > reach[k] or abs(y) > reach[k] or abs(z) > boxes[k, 5] / 2 + air:
-                    continue
-                c, s = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
-                if abs(c * x + s * y) <= boxes[k, 3] / 2 + air and abs(c * y - s * x) <= boxes[k, 4] / 2 + air:
-                    if n == pairs.shape[1]:
-                        pairs, fewer = np.empty((2, 2 * n), np.int64), pairs
-                        for old in range(n):
-                            pairs[0, old], pairs[1, old] = fewer[0, old], fewer[1, old]
-                    pairs[0, n], pairs[1, n] = k, start + i
-                    n += 1
+    for i in range(points.shape[0]):
+        px, py = points[i, 0], points[i, 1]
+        cell = near[int(np.floor(px / _NEAR_M)) & _NEAR_CELLS - 1, int(np.floor(py / _NEAR_M)) & _NEAR_CELLS - 1]
+        for k in range(cell[0], cell[1]):
+            x, y, z = px - center[0, k], py - center[1, k], points[i, 2] - boxes[k, 2]
+            if abs(x) > reach[k] or abs(y) > reach[k] or abs(z) > boxes[k, 5] / 2 + air:
+                continue
+            c, s = np.cos(boxes[k, 6]), np.sin(boxes[k, 6])
+            if abs(c * x + s * y) <= boxes[k, 3] / 2 + air and abs(c * y - s * x) <= boxes[k, 4] / 2 + air:
+                if n == pairs.shape[1]:
+                    pairs, fewer = np.empty((2, 2 * n), np.int64), pairs
+                    for j in range(n):
+                        pairs[0, j], pairs[1, j] = fewer[0, j], fewer[1, j]
+                pairs[0, n], pairs[1, n] = k, i
+                n += 1
     return pairs[:, :n]
 
 

@@ -179,8 +179,6 @@ class Panorama:
         layers: (4, rows, columns) residual of the nearer side of a step, or of everything where there is none, 1/m;
             that of the farther side; the nearer side's share of the neighbourhood; 1 where a point lies within
             ``SUPPORT_RAD``, else 0.
-        seeds: With ``keep_seeds``: codes of each cell's nearest point and the points' numbers, as
-            ``completion.nearest_returns`` reads them.
     """
 
     def __init__(
@@ -192,8 +190,6 @@ class Panorama:
         cones: Layer,
         memory: Memory = FRESH,
         mapped: int = 0,
-        *,
-        keep_seeds: bool = False,
     ) -> None:
         from arbiview_aug.scene.completion import average_sides, drop_hidden, nearest_points, nearest_residuals
 
@@ -214,8 +210,6 @@ class Panorama:
         nearest_residuals(cell, own_q, residual, cells.reach, cells.support, code, r, q_near, self.layers)
         high, low = (window_max(of, 2 * cells.smooth, 2 * cells.smooth) for of in (r, -r))
         average_sides(r, q_near, high, low, cells.smooth, self.layers)
-        if keep_seeds:  # their memory is not used again meanwhile
-            self.seeds = code, number
 
     @cached_property
     def hidden_below(self) -> Layer:
@@ -354,7 +348,7 @@ class PointCloudSurface(DenseSurface):
             # Azimuths bend near the zenith, and jump in a panorama all around.
             steep = len(directions) == 0 or float(np.abs(directions[:, 2]).max()) > _STEEP
             step = 1 if steep or view.window.columns >= view.window.cells.turn else step
-            local = rays.planes if step == 1 and rays.planes.size else nodes_of(rays, step)
+            local = rays.planes if step == 1 and rays.planes.size else rays.nodes(step)
             self._nodes[key] = view, *view.cells(local, R), step
         self._latest[camera.center_m.tobytes()] = self._nodes[key][0]
         return self._nodes[key]
@@ -387,17 +381,19 @@ def window_max(a: Layer, rows: int, columns: int) -> Layer:
     return np.asarray(cv2.dilate(a, np.ones((rows + 1, columns + 1), np.uint8), anchor=(0, 0)))
 
 
-def nodes_of(rays: PixelRays, apart: int) -> Layer:
-    """Rays (3, ny + 1, nx + 1) of pixels so far apart, the last ones on the last pixels."""
-    return rays.at(*(np.minimum(np.arange(0, n + apart, apart), n - 1) for n in rays.size))
-
-
 def directions_of(rays: PixelRays, R: FloatArray) -> tuple[FloatArray, int]:
     """Unit rays (n, 3) in the ego frame that span a view, and the pixels between nodes for its panorama."""
     step = max(1, int(min(NODES_RAD * float(rays.parameters[0]), max(rays.size))))  # two nodes span any image
-    local = nodes_of(rays, step)
+    local = rays.nodes(step)
     valid = local.any(axis=0)
-    return local[:, valid].T @ R.T, step if valid.all() else 1  # an image circle ends between nodes
+    if valid.all():
+        return _turned(local, R), step
+    return _turned(local[:, valid], R), 1  # an image circle ends between nodes
+
+
+def _turned(rays: Layer, R: FloatArray) -> FloatArray:
+    """Rays (3, ...) turned by ``R``, as the (n, 3) view of float64 rows x, y, z: three times faster than by points."""
+    return (R @ rays.reshape(3, -1).astype(np.float64)).T
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,14 +42,16 @@ class TransformersDepth:
         except ImportError as error:
             raise DataError(f"--model: {error}") from None
         folder = Path(name)
-        config = _loaded(transformers.AutoConfig, name, "a folder with config.json, or a model of the Hugging Face Hub")
+        option, known = f"--model {name}", "a folder with config.json, or a model of the Hugging Face Hub"
+        config = load_pretrained(transformers.AutoConfig, option, name, known)
         if type(config) not in transformers.MODEL_FOR_DEPTH_ESTIMATION_MAPPING:
             raise DataError(
-                f"--model {name}: expected a model that estimates depth, such as "
+                f"{option}: expected a model that estimates depth, such as "
                 f"depth-anything/Depth-Anything-V2-Metric-Outdoor-Small-hf, got {type(config).__name__}"
             )
-        self._processor = _loaded(transformers.AutoImageProcessor, name, "preprocessor_config.json beside the model")
-        model = _loaded(transformers.AutoModelForDepthEstimation, name, "weights of the model")
+        beside = "preprocessor_config.json beside the model"
+        self._processor = load_pretrained(transformers.AutoImageProcessor, option, name, beside)
+        model = load_pretrained(transformers.AutoModelForDepthEstimation, option, name, "weights of the model")
         self.model, self.device = model.float().eval().to(device), device
         commit = str(getattr(config, "_commit_hash", None) or "unknown")[:12]
         self.name, self.revision = (folder.resolve().name, _weights_of(folder)) if folder.is_dir() else (name, commit)
@@ -89,13 +91,13 @@ class TransformersDepth:
         ]
 
 
-def _loaded(kind: Any, name: str, expected: str) -> Any:
-    """Load a part of a model; transformers raises errors of many types, some of many lines."""
+def load_pretrained(kind: Any, option: str, name: str, expected: str) -> Any:
+    """Load a part of a model of transformers, a folder or hub id; DataError names the option and what was expected."""
     try:
         return kind.from_pretrained(name)
-    except Exception as error:
+    except Exception as error:  # of many types, some of many lines
         why = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        raise DataError(f"--model {name}: expected {expected}: {why.strip()[:300]}") from None
+        raise DataError(f"{option}: expected {expected}: {why.strip()[:300]}") from None
 
 
 def _weights_of(folder: Path) -> str:

@@ -16,13 +16,12 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.choices import choice
+from arbiview_aug.choices import checked_stride, choice
 from arbiview_aug.errors import SampleError
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.sample.batching import gathered, stacked
 from arbiview_aug.sample.inputs import Frame, read_frames
 from arbiview_aug.sample.training import lift_mask
-from arbiview_aug.transforms.settings import checked_stride
 
 CHANNELS = {"rays": 3, "moments": 3, "road": 1, "road_gradient": 1, "pixel_angle": 1, "height": 1}
 """Channels of each map."""

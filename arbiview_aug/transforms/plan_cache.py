@@ -10,7 +10,7 @@ from operator import attrgetter
 import numpy as np
 
 from arbiview_aug.cameras.lens import BoolArray
-from arbiview_aug.cameras.rays import CameraMaps
+from arbiview_aug.cameras.rays import RayCache
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import pose_mistake
 from arbiview_aug.choices import GeometryName
@@ -154,7 +154,7 @@ class Plans:
     ) -> None:
         self.config, self.surface, self.check_reach = config, surface, check_reach
         self.cache: LRUCache[bytes, RenderPlan] = LRUCache(max_bytes, attrgetter("nbytes"))
-        self.maps = CameraMaps()
+        self.maps = RayCache()
         self._keep_refined = keep_refined
         self._last: LRUCache[bytes, RenderPlan] = LRUCache(1)
         self._pairs: LRUCache[tuple[bytes, bytes], RigPair] = LRUCache(_MAX_RIG_PAIRS)

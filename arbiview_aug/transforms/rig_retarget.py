@@ -261,7 +261,7 @@ class RigRetarget(torch.nn.Module):
         """Points of the frames by the target's scanners, if it has any and they are wanted."""
         if not target.lidars or self.keys.points != "target":
             return []
-        return retarget_frames(frames, target, skip, self._warn if self.neighbours is not None else None)
+        return retarget_frames(frames, target, skip, self._warn, neighbours=self.neighbours is not None)
 
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
         """Check the sample's further keys, and return those that hold label maps."""
@@ -293,7 +293,7 @@ class RigRetarget(torch.nn.Module):
         if overlap is not None:
             scene = replace(scene, corrections=overlap.corrections)
         if fills and neighbours and scene.points is not None and pair.needs_geometry:
-            parts = points_of_neighbours(frame.rig, scene.points, neighbours, self._warn)
+            parts = points_of_neighbours(frame, self._warn)
             scene = replace(scene, sweeps=np.concatenate([part[:, :3] for part in parts]) if parts else None)
         if self._row.needs == "motion" and scene.motion is None:
             before = [part for part in [scene.geometry("points")] if part is not None]

@@ -14,7 +14,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.sample.batching import is_readable
 from arbiview_aug.sample.inputs import Frame, as_array
-from arbiview_aug.sample.neighbours import Warn, points_of_neighbours, read_neighbours
+from arbiview_aug.sample.neighbours import Warn, points_of_neighbours
 from arbiview_aug.scene.boxes import checked_boxes, points_by_box
 from arbiview_aug.scene.point_cloud import checked_points, finite_rows
 from arbiview_aug.scene.scan import scan
@@ -53,7 +53,7 @@ def retarget_points(
         points: (P, C >= 3) float tensor or array x y z ... in the frame's ego frame. Columns beyond z are taken from
             the nearest measured point.
         target: A rig with ``lidars``.
-        boxes_3d: (B, >= 7) labelled objects.
+        boxes_3d: (B, >= 7) labelled objects, to count the points in each; they change no point.
         ground_z_m: Height of the road in the frame's ego frame.
         skip: Leave the points as they are, and count those in boxes.
         sweeps: Points (Q, C) of other frames in this frame's ego frame, with the same columns. They fill what the
@@ -75,12 +75,11 @@ def retarget_points(
     if not skip:
         up = ground_z_m - target.ground_z_m  # scanners keep their rays where nothing moves
         lidars = [lidar.shifted(z_m=up) for lidar in target.lidars] if up else target.lidars
-        objects = np.zeros((0, 7)) if boxes is None else boxes
         if len(sweeps):
             points = _joined(points, sweeps)
             array = as_array("points", points)
             measured = checked_points(array)
-        hits, nearest, rings_of, unsupported = scan(lidars, measured, objects, ground_z_m)
+        hits, nearest, rings_of, unsupported = scan(lidars, measured, ground_z_m)
         rows = np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest
         points, measured, rings = _at(points, rows, hits), hits, torch.from_numpy(rings_of)
     counts = None
@@ -113,16 +112,14 @@ def _at(points: Any, rows: Any, hits: Any) -> Any:
 
 
 def retarget_frames(
-    frames: Sequence[Frame], target: Rig, skip: bool, warn: Warn | None = None
+    frames: Sequence[Frame], target: Rig, skip: bool, warn: Warn, *, neighbours: bool
 ) -> list[RetargetedPoints]:
     """``retarget_points`` of a sample's frames; empty if the sample has no points.
 
-    Neighbouring frames fill what one does not see, unless ``warn``, which tells why one cannot, is None.
+    With ``neighbours``, other frames of the drive fill what one does not see; ``warn`` tells why one cannot.
     """
-    sample = frames[0].sample
-    if sample.get("points") is None:
+    if frames[0].sample.get("points") is None:
         return []
-    reading = None if skip or sample.get("neighbours") is None else warn
     return [
         retarget_points(
             frame.entry("points"),
@@ -130,7 +127,7 @@ def retarget_frames(
             boxes_3d=frame.array("boxes_3d"),
             ground_z_m=frame.rig.ground_z_m,
             skip=skip,
-            sweeps=() if reading is None else _sweeps(frame, reading),
+            sweeps=_sweeps(frame, warn) if neighbours and not skip else (),
         )
         for frame in frames
     ]
@@ -138,11 +135,10 @@ def retarget_frames(
 
 def _sweeps(frame: Frame, warn: Warn) -> list[FloatArray]:
     """Points (Q, C) of a frame's neighbours with the columns of its own."""
-    neighbours, points = read_neighbours(frame, warn), frame.array("points")
-    if not neighbours or points is None:
-        return []
-    parts = points_of_neighbours(frame.rig, checked_points(points), neighbours, warn)
+    points, parts = frame.array("points"), points_of_neighbours(frame, warn)
     columns = [part.shape[1] for part in parts]
+    if points is None or not parts:
+        return []
     if any(count != points.shape[-1] for count in columns):
         warn("columns of points", f"points of neighbours: expected {points.shape[-1]} columns, got {columns}")
     return [part for part in parts if part.shape[1] == points.shape[-1]]

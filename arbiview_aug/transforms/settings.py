@@ -8,7 +8,7 @@ from numbers import Real
 from typing import Any, Literal, TypeVar
 
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
-from arbiview_aug.choices import choice
+from arbiview_aug.choices import checked_stride, choice
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.inpaint.continued import Continue, Mean
@@ -121,13 +121,6 @@ def checked_probability(p: Any) -> float:
     if not is_number(p) or not 0 <= p <= 1:
         raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
     return float(p)
-
-
-def checked_stride(name: str, value: Any) -> int:
-    """A whole number of pixels from 1; ValueError for anything else."""
-    if not isinstance(value, int) or value < 1:
-        raise ValueError(f"{name}: expected a number of pixels from 1, got {value!r}")
-    return value
 
 
 def checked_p(p: Any, size: Any) -> float:

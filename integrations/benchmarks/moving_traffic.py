@@ -10,9 +10,9 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +26,8 @@ from arbiview_aug.cli.arguments import add_output, command_parser, count, size, 
 from arbiview_aug.cli.bench.timing import benchmark, machine_line, show
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.detections import average_precision, pooled
+from arbiview_aug.evaluate.judges import Detections, load_detector, load_segmenter
 from arbiview_aug.sample.inputs import MOTION_KEY, read_frames
 from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.scene.depth_map import motion_camera
@@ -49,8 +51,6 @@ ROADWORTHY = (0, 1, 2, 3, 5, 7)
 
 TRUE_SCORE, OVERLAPS = 0.4, (0.5, 0.7)
 """Least score of a detection in a photograph that counts as an object, and IoUs of hits."""
-
-SEGMENTED = (640, 360)
 
 
 # --- synthetic drives -------------------------------------------------------------------------------------------------
@@ -125,72 +125,18 @@ def _decibels(square: float) -> float:
 
 
 # --- photographs and judges -------------------------------------------------------------------------------------------
-class Detections(NamedTuple):
-    """Boxes (n, 4) x1 y1 x2 y2 in pixels, and scores (n,)."""
-
-    boxes: Floats
-    scores: Floats
-
-
-def average_precision(found: Sequence[Detections], true: Sequence[Floats], overlap: float) -> float:
-    """AP of detections in several images, of which each has boxes (m, 4): the area under precision over recall.
-
-    Detections in the order of their scores take the free box of the largest IoU.
-    """
-    hits, scores = [], []
-    for detections, boxes in zip(found, true, strict=True):
-        free = np.ones(len(boxes), bool)
-        for k in np.argsort(-detections.scores, kind="stable"):
-            iou = np.where(free, _iou(detections.boxes[k], boxes), 0) if len(boxes) else np.zeros(1)
-            best = int(iou.argmax())
-            hits.append(bool(iou[best] >= overlap))
-            scores.append(float(detections.scores[k]))
-            if hits[-1]:
-                free[best] = False
-    total = sum(map(len, true))
-    if not hits or not total:
-        return float("nan") if not total else 0.0
-    hit = np.array(hits)[np.argsort(-np.array(scores), kind="stable")].cumsum()
-    precision = np.maximum.accumulate((hit / np.arange(1, len(hit) + 1))[::-1])[::-1]
-    return float((np.diff(hit / total, prepend=0) * precision).sum())
-
-
-def _iou(box: Floats, boxes: Floats) -> Floats:
-    low, high = np.maximum(box[:2], boxes[:, :2]), np.minimum(box[2:], boxes[:, 2:])
-    both = np.clip(high - low, 0, None).prod(-1)
-    return np.asarray(both / ((box[2:] - box[:2]).prod() + (boxes[:, 2:] - boxes[:, :2]).prod(-1) - both))
+def precision_at(found: Sequence[Detections], true: Sequence[Floats], overlap: float) -> float:
+    """AP of detections in several images, of which each has boxes (m, 4)."""
+    return float(average_precision(pooled(found, true, [np.zeros((0, 4))] * len(true), overlap))[0])
 
 
 class Judges:
     """Networks trained on photographs, in a folder: ``nanodet.py`` (needs ncnn) and ``twinlitenet.ts``."""
 
     def __init__(self, folder: Path) -> None:
-        self.detect = _function(folder / "nanodet.py", "detect")
-        self.segment = torch.jit.load(str(folder / "twinlitenet.ts")).eval()  # type: ignore[no-untyped-call]
-
-    def objects(self, image: Image) -> Detections:
-        """People and vehicles."""
-        boxes, scores, classes = self.detect(image, score=0.05)
-        kept = np.isin(classes, ROADWORTHY)
-        return Detections(boxes[kept], scores[kept])
-
-    def road(self, image: Image) -> Bools:
-        """(2, 360, 640) drivable area and lane marks of the middle 16:9 of an image."""
-        h, w = image.shape[:2]
-        wide = min(w, h * 16 // 9)
-        middle = image[:, (w - wide) // 2 :][:, :wide]
-        small = cv2.resize(middle, SEGMENTED, interpolation=cv2.INTER_AREA)
-        with torch.inference_mode():
-            logits = self.segment(torch.from_numpy(small).permute(2, 0, 1)[None].float() / 255)
-        return np.stack([one[0].argmax(0).numpy() > 0 for one in logits])
-
-
-def _function(path: Path, name: str) -> Callable[..., Any]:
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return getattr(module, name)  # type: ignore[no-any-return]
+        classes = [str(number) for number in ROADWORTHY]
+        self.objects = load_detector(f"{folder / 'nanodet.py'}:detect", classes=classes)
+        self.road = load_segmenter(str(folder / "twinlitenet.ts"))
 
 
 def load_judges(folder: str | None) -> Judges | str:
@@ -249,9 +195,9 @@ def photograph_rows(folder: str, judges: Judges | str) -> dict[str, dict[str, fl
         for method, row in table.items():
             row["objects"] = float(sum(map(len, boxes)))
             for overlap in OVERLAPS:
-                row[f"ap_{100 * overlap:.0f}"] = average_precision(objects[method], boxes, overlap)
-            one, two = np.stack(roads[method]), np.stack(roads["photograph"])
-            both, any_ = (one & two).sum((0, 2, 3)), (one | two).sum((0, 2, 3))
+                row[f"ap_{100 * overlap:.0f}"] = precision_at(objects[method], boxes, overlap)
+            pairs = list(zip(roads[method], roads["photograph"], strict=True))
+            both, any_ = (sum(how(*pair).sum((1, 2)) for pair in pairs) for how in (np.logical_and, np.logical_or))
             row |= dict(zip(("area_iou", "lanes_iou"), (both / np.maximum(any_, 1)).tolist(), strict=True))
     return table
 

@@ -8,23 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from integrations.benchmarks.moving_traffic import Detections, average_precision, load_judges, main
+from arbiview_aug.evaluate.judges import Detections
+from integrations.benchmarks.moving_traffic import load_judges, main, precision_at
 
 BOXES = np.array([[0.0, 0, 10, 10], [20, 0, 30, 10]])
 
 
 def test_average_precision() -> None:
-    right = Detections(BOXES, np.array([0.9, 0.8]))
-    assert average_precision([right], [BOXES], 0.7) == 1
-    false_first = Detections(np.concatenate([BOXES + 100, BOXES]), np.array([0.9, 0.85, 0.8, 0.7]))
-    assert average_precision([false_first], [BOXES], 0.7) == pytest.approx(0.5)
-    shifted = Detections(BOXES + np.array([2, 0, 2, 0]), np.array([0.9, 0.8]))  # IoU 2 / 3
-    assert (average_precision([shifted], [BOXES], 0.5), average_precision([shifted], [BOXES], 0.7)) == (1, 0)
-    twice = Detections(BOXES[[0, 0]], np.array([0.9, 0.8]))
-    assert average_precision([twice], [BOXES], 0.5) == pytest.approx(0.5)
-    nothing = Detections(np.zeros((0, 4)), np.zeros(0))
-    assert average_precision([nothing], [BOXES], 0.5) == 0
-    assert np.isnan(average_precision([right], [BOXES[:0]], 0.5))
+    right = Detections(BOXES, np.array([0.9, 0.8]), ["car"] * 2)
+    assert precision_at([right], [BOXES], 0.7) == 1
+    false_first = Detections(np.concatenate([BOXES + 100, BOXES]), np.array([0.9, 0.85, 0.8, 0.7]), ["car"] * 4)
+    assert precision_at([false_first], [BOXES], 0.7) == pytest.approx(0.5)
+    shifted = Detections(BOXES + np.array([2, 0, 2, 0]), np.array([0.9, 0.8]), ["car"] * 2)  # IoU 2 / 3
+    assert (precision_at([shifted], [BOXES], 0.5), precision_at([shifted], [BOXES], 0.7)) == (1, 0)
+    twice = Detections(BOXES[[0, 0]], np.array([0.9, 0.8]), ["car"] * 2)
+    assert precision_at([twice], [BOXES], 0.5) == pytest.approx(0.5)
+    nothing = Detections(np.zeros((0, 4)), np.zeros(0), [])
+    assert precision_at([nothing], [BOXES], 0.5) == 0
+    assert np.isnan(precision_at([right], [BOXES[:0]], 0.5))
 
 
 def test_without_judges_there_is_a_reason(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from typing import Any, get_args
 
 from arbiview_aug.cli.arguments import device_named
 from arbiview_aug.errors import ArbiviewError
+from integrations.cross_rig.deploy import ON_A, ON_B, deploy
 from integrations.cross_rig.experiment import Run, run
 from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.real import recorded_run
@@ -47,6 +48,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     def log(line: str) -> None:
         print(f"[{time.monotonic() - began:6.0f} s] {line}", file=sys.stderr, flush=True)
 
+    if arguments.deploy is not None:
+        text = deploy(setup, arguments.deploy or None, log)
+        (arguments.output / "deploy.md").write_text(text)
+        print(text)
+        return 0
     log(f"{len(missing)} of {len(jobs(settings))} trainings to do, in {arguments.output}")
     report: dict[str, Any] = {}
     for left in run(setup, arguments.workers, log):
@@ -71,6 +77,14 @@ def _parser() -> argparse.ArgumentParser:
         "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes of one thread (%(default)s)"
     )
     parser.add_argument("--list", action="store_true", help="only say which trainings are done")
+    parser.add_argument(
+        "--deploy",
+        nargs="*",
+        choices=[*ON_B, *ON_A],
+        metavar="ROW",
+        help="instead: raw A's detectors on B's frames rendered to A's cameras, and on A's with calibration that errs: "
+        f"all rows, or some of {', '.join(map(repr, (*ON_B, *ON_A)))}",
+    )
     parser.add_argument(
         "--real",
         nargs=2,

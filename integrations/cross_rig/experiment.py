@@ -103,7 +103,7 @@ class Run:
         """Schedule of a job's training."""
         schedule = self.settings.schedule
         steps = schedule.steps if job.length == "short" else round(LONGER * schedule.steps)
-        return replace(schedule, family=job.family, steps=steps)
+        return replace(schedule, family=job.family, steps=steps, priors=job.variant.priors)
 
     def draws(self, job: Job) -> Draws:
         """The batches of a job's training."""
@@ -182,7 +182,7 @@ class Run:
     def do(self, job: Job) -> str:
         """Train, unless the weights are there, and test; returns a line for the log."""
         one_thread()
-        model, trained = self._trained(job)
+        model, trained = self.trained(job)
         lines = []
         for change in self.tested_on(job):
             path = self.result_path(job, change)
@@ -191,12 +191,13 @@ class Run:
                 test = self.true_set("test", change, self.settings.test_frames)
                 height = test.store.stacked("height_dm", self.settings.test_frames)
                 tested = evaluate(model, val, test, height, self.schedule(job))
-                text = json.dumps(_result(job, change, trained, tested))
-                _write(path, partial(Path.write_text, data=text))
+                text = json.dumps(counts_of(job, change, trained, tested))
+                write_file(path, partial(Path.write_text, data=text))
                 lines.append(f"{change} val {100 * tested.val_iou:.1f}")
         return f"{job.name}: {trained['cpu_s']:.0f} s of training, {', '.join(lines)}"
 
-    def _trained(self, job: Job) -> tuple[nn.Module, dict[str, Any]]:
+    def trained(self, job: Job) -> tuple[nn.Module, dict[str, Any]]:
+        """A job's detector, trained unless its weights are there, and what is known of its training."""
         path = self.output / "models" / f"{self.training_key(job)}.pt"
         schedule = self.schedule(job)
         if path.is_file():
@@ -214,11 +215,12 @@ class Run:
             "losses": losses,
             "torch": str(torch.__version__),
         }
-        _write(path, lambda part: torch.save({"weights": model.state_dict(), "trained": trained}, part))
+        write_file(path, lambda part: torch.save({"weights": model.state_dict(), "trained": trained}, part))
         return model, trained
 
 
-def _result(job: Job, change: str, trained: dict[str, Any], tested: Tested) -> dict[str, Any]:
+def counts_of(job: Job, change: str, trained: dict[str, Any], tested: Tested) -> dict[str, Any]:
+    """What a result's file holds."""
     return {
         "change": change,
         "seed": job.seed,
@@ -235,7 +237,7 @@ def _result(job: Job, change: str, trained: dict[str, Any], tested: Tested) -> d
     }
 
 
-def _write(path: Path, write: Callable[[Path], object]) -> None:
+def write_file(path: Path, write: Callable[[Path], object]) -> None:
     """All of a file or nothing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{os.getpid()}-{path.name}")
@@ -303,8 +305,8 @@ def rendering_seconds(setup: Run, change: str) -> dict[str, float]:
     """CPU seconds that each variant's own rendering took for a frame: the median over the frames of a change."""
     found = {}
     for job in jobs(setup.settings):
-        source = setup.images(job)
-        if job.variant.renders and job.change == change and not source.store().missing(setup.settings.train_frames):
+        source, is_of_change = setup.images(job), job.change in (change, None)
+        if job.variant.renders and is_of_change and not source.store().missing(setup.settings.train_frames):
             seconds = source.store().stacked("cpu_s", setup.settings.train_frames)
             found[job.variant.name] = float(np.median(seconds))
     return found

@@ -55,10 +55,6 @@ class Batch:
     counts: Tensor
     boxes: Tensor
 
-    def to(self, device: torch.device) -> Batch:
-        """The same on a device."""
-        return Batch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
-
     def covered(self) -> Tensor:
         """(T, h / 4, w / 4) share of each feature's pixels that is covered."""
         return F.avg_pool2d(self.coverage[:, None].float(), STRIDE)[:, 0]

@@ -15,11 +15,9 @@ import cv2
 import numpy as np
 import torch
 
-from arbiview_aug import Camera, Rig
+from arbiview_aug import Rig
 from arbiview_aug.datasets import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
-from arbiview_aug.generator import Generator
-from arbiview_aug.generator.generator import shipped_weights
 from arbiview_aug.scene.depth_map import motion_camera
 from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
@@ -40,7 +38,6 @@ _COMPLETING = ("arbiview_aug.generator", "arbiview_aug.generator.inpainter")
 _UNUSED: dict[str, tuple[str, ...]] = {
     "black": (*_COMPLETING, "arbiview_aug.inpaint.continued"),
     "fill": _COMPLETING,
-    "generator": (),
 }
 """By ``Variant.holes``, what ``RigRetarget`` asks to fill holes and does not need for these."""
 
@@ -106,18 +103,14 @@ class Source:
             spec["two_wheelers"] = True
         if self.variant is not None:
             variant = self.variant
-            retargets = variant.kind == "retarget"
-            renderer = "arbiview_aug.transforms.rig_retarget" if retargets else "integrations.benchmarks.baselines"
             spec |= {
                 "source": source_rig(self.size).content_key.hex(),
                 "arm": variant.views_spec(),  # the key that names existing frame stores
-                "renderer": code_hash(renderer, without=_UNUSED[variant.holes]),
+                "renderer": code_hash("arbiview_aug.transforms.rig_retarget", without=_UNUSED[variant.holes]),
                 # What a variant says of its views is in ``variant``; another variant's needs may change without it.
                 "noise": code_hash("integrations.cross_rig.noise") if variant.noise else None,
                 "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.variant",)),
             }
-            if variant.holes == "generator":
-                spec["weights"] = shipped_weights()
             if "neighbours" in variant.reads:
                 spec["neighbours"] = vars(NEIGHBOURS)
         return FrameStore(self.root, spec)
@@ -127,10 +120,9 @@ class Source:
         return replace(self, change=None, variant=None)
 
     def rendered(self) -> Source:
-        """The same views as ``RigRetarget`` renders them: without the generator's pixels, or the truth's."""
+        """The same views as ``RigRetarget`` renders them, without the truth's pixels."""
         assert self.variant is not None
-        holes = "black" if self.variant.holes == "generator" else self.variant.holes
-        return replace(self, variant=replace(self.variant, holes=holes, truth=None))
+        return replace(self, variant=replace(self.variant, truth=None))
 
     def needs(self) -> list[Source]:
         """The sets that must be there before this one can be made."""
@@ -295,41 +287,19 @@ class _Later(SyntheticDrive):
 
 
 class _ChangedFrames:
-    """Rendered views with something else in their holes, or over them."""
+    """Rendered views with the truth in their holes, or over them."""
 
     def __init__(self, source: Source) -> None:
         assert source.variant is not None
-        self.variant, self.width, self.rig = source.variant, source.size[1], source.original().rig
+        self.variant, self.width = source.variant, source.size[1]
         self.store, self.truth = source.rendered().store(), source.true().store()
-        self.original = source.original().store()
-        self.generator = Generator.shipped() if self.variant.holes == "generator" else None
 
     def __call__(self, index: int) -> Arrays:
         start = time.process_time()
         arrays = {name: self.store.read(index, name) for name in ("images", "K", "cam2ego", "cpu_s")}
         covered = np.unpackbits(self.store.read(index, "coverage"), axis=-1, count=self.width).astype(bool)
-        if self.variant.truth is not None:
-            shown = covered if self.variant.truth == "covered" else ~covered
-            arrays["images"] = np.where(shown[:, None], self.truth.read(index, "images"), arrays["images"])
-            covered = covered | shown
-        if self.generator is not None:
-            arrays["images"] = self._completed(self.generator, index, arrays, covered)
-        arrays["coverage"] = np.packbits(covered, axis=-1)
+        shown = covered if self.variant.truth == "covered" else ~covered
+        arrays["images"] = np.where(shown[:, None], self.truth.read(index, "images"), arrays["images"])
+        arrays["coverage"] = np.packbits(covered | shown, axis=-1)
         arrays["cpu_s"] = (arrays["cpu_s"] + time.process_time() - start).astype(np.float32)
         return arrays
-
-    def _completed(self, generator: Generator, index: int, arrays: Arrays, covered: np.ndarray) -> np.ndarray:
-        """(M, 3, h, w) uint8 views with their holes completed by the generator."""
-        h, w = covered.shape[-2:]
-        poses = zip(arrays["K"], arrays["cam2ego"], strict=True)
-        target = Rig(
-            [
-                Camera(name=str(k), width_px=w, height_px=h, K=K.astype(np.float64), cam2ego=pose.astype(np.float64))
-                for k, (K, pose) in enumerate(poses)
-            ],
-            ground_z_m=self.rig.ground_z_m,
-        )
-        views, seen = torch.from_numpy(arrays["images"].copy()), torch.from_numpy(covered)
-        images = torch.from_numpy(self.original.read(index, "images").copy())
-        done = generator.complete_views(views, seen, target, images, self.rig, steps=1, frame=index)
-        return np.stack([view.numpy() for view in done.images])

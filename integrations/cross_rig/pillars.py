@@ -41,10 +41,6 @@ class PointBatch:
     counts: Tensor
     boxes: Tensor
 
-    def to(self, device: torch.device) -> PointBatch:
-        """The same on a device."""
-        return PointBatch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
-
 
 @dataclass(frozen=True)
 class PointFrame:

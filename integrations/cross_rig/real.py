@@ -260,5 +260,5 @@ def check_variants(variants: Sequence[Variant]) -> None:
     """ValueError for variants that need a synthetic world."""
     for variant in variants:
         reads = set(variant.reads) <= {"points", "boxes_3d"}
-        if variant.kind == "row_split" or variant.noise or variant.truth or variant.labels or not reads:
+        if variant.noise or variant.truth or variant.labels or not reads:
             raise ValueError(f"variants: {variant.name} needs the streets' truth: leave it out of --real")

@@ -87,26 +87,21 @@ def _of_change(variants: Results, rendering: Mapping[str, float], drives: Sequen
 
 
 def markdown(report: Mapping[str, Any]) -> str:
-    """The tables, one for each change.
-
-    A report whose figures have no ``low`` and ``high`` is written without intervals.
-    """
+    """The tables, one for each change."""
     s = report["settings"]
-    rows = [row for change in report["changes"].values() for row in change["variants"].values()]
-    shown = ", [95 % interval] over seeds and frames" if all("low" in row["iou"] for row in rows) else ""
     # Reports from before two-wheelers and worlds do not say.
     streets = " with two-wheelers" if s.get("two_wheelers") else ""
     streets += f" on streets of {s['world']}" if s.get("world", "drive") != "drive" else ""
     lines = [
         f"{s['train_frames']} training and {s['test_frames']} test frames{streets} at {s['size'][0]}×{s['size'][1]}, "
         f"batches of {s['schedule']['batch']}, {report['tests_done']} of {report['tests']} "
-        f"tests done. IoU of vehicle cells in %{shown}; closed gap: (variant − raw) / "
+        f"tests done. IoU of vehicle cells in %, [95 % interval] over seeds and frames; closed gap: (variant − raw) / "
         "(oracle − raw), where oracle − raw is at least 5 points; loading: CPU ms that the variant adds to a frame "
         "that is drawn.",
     ]
     distances = [f"{a:g}–{b:g} m" for a, b in pairwise(DISTANCES_M)]
     heights = [f"{a:g}–{b:g} m high" for a, b in pairwise(HEIGHTS_M)]
-    scored = any("ap" in row for row in rows)
+    scored = any("ap" in row for change in report["changes"].values() for row in change["variants"].values())
     head = [
         "variant",
         "IoU",
@@ -171,10 +166,7 @@ def _text(value: Mapping[str, float] | None, digits: int, *, sign: bool = False)
     if value is None:
         return "–"
     form = f"{'+' if sign else ''}.{digits}f"
-    text = f"{100 * value['value']:{form}}"
-    if "low" not in value:
-        return text
-    return f"{text} [{100 * value['low']:{form}}, {100 * value['high']:{form}}]"
+    return f"{100 * value['value']:{form}} [{100 * value['low']:{form}}, {100 * value['high']:{form}}]"
 
 
 def save_plot(report: Mapping[str, Any], path: Path) -> None:

@@ -1,9 +1,8 @@
 """``python -m integrations.cross_rig.scans``: does a LiDAR detector trained on retargeted scans of A work on B's?
 
 Both vehicles drive the same streets. A pillar network is trained on A's points as they are, on those of its rings next
-to B's, on A's points as B's scanner would have measured them (with the shapes of labelled boxes, and without), and on
-B's own; all are tested on B's own scans. Scans are cast anew for each run; a result is a file, so that a killed run
-goes on where it was.
+to B's, on A's points as B's scanner would have measured them, and on B's own; all are tested on B's own scans. Scans
+are cast anew for each run; a result is a file, so that a killed run goes on where it was.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ import numpy as np
 
 from arbiview_aug import Lidar, Rig, retarget_points
 from arbiview_aug.atomic_io import write_whole
-from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cli.arguments import command_parser, count
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.report.tables import markdown_table
@@ -38,13 +36,12 @@ from integrations.cross_rig.scoring import VariantScore, ap_scores, iou_scores
 from integrations.cross_rig.training import Draws, Schedule, evaluate, train
 from integrations.cross_rig.worlds import Split, street_seed
 
-Kind = Literal["raw", "dropped", "retargeted", "unlabelled", "oracle"]
+Kind = Literal["raw", "dropped", "retargeted", "oracle"]
 
 TITLES: dict[Kind, str] = {
     "raw": "A's points",
     "dropped": "A's points, rings dropped",
     "retargeted": "A's points, retargeted",
-    "unlabelled": "A's points, retargeted without boxes",
     "oracle": "B's own points",
 }
 
@@ -52,6 +49,8 @@ _LOWEST_DEG = {64: -24.8, 32: -30.67, 16: -15.0}
 _HIGHEST_DEG = {64: 10.67, 32: 10.67, 16: 15.0}
 _STEP_DEG, _RANGE_M = 0.35, (1.0, 90.0)
 _STREETS = 200
+_STREETS_CODE = "arbiview_aug.datasets.synthetic"
+_POINTS_CODE = {"dropped": "arbiview_aug.evaluate.scans", "retargeted": "arbiview_aug.transforms.scans"}
 _LEAST_POINTS = 5  # of a vehicle that counts
 _MOST_FRAMES = 1 << 20
 
@@ -108,7 +107,7 @@ def point_set(a: Lidar, b: Lidar, kind: Kind, split: Split, frames: int) -> Poin
 def _frame(drive: SyntheticDrive, a: Lidar, b: Lidar, kind: Kind, index: int) -> tuple[Any, ...]:
     scene, grid = drive.scene(index), Grid()
     boxes = scene.boxes_ego(0.0)
-    points = _points(drive.points(index).numpy(), a, b, kind, boxes)
+    points = _points(drive.points(index).numpy(), a, b, kind)
     points = points[~own_car(points)]
     _, ends = points_by_box(boxes, np.ascontiguousarray(points[:, :3]), 0.0)
     cells = box_cells(grid, boxes, scene.box_classes, np.diff(ends, prepend=0) >= _LEAST_POINTS)
@@ -116,12 +115,10 @@ def _frame(drive: SyntheticDrive, a: Lidar, b: Lidar, kind: Kind, index: int) ->
     return points[inside].astype(np.float16), cells.state, cells.height_dm, vehicle_boxes(grid, scene, 0.0)
 
 
-def _points(points: Any, a: Lidar, b: Lidar, kind: Kind, boxes: FloatArray) -> Any:
+def _points(points: Any, a: Lidar, b: Lidar, kind: Kind) -> Any:
     if kind == "dropped":
         return rings_dropped(a, b, points)
-    if kind in ("retargeted", "unlabelled"):
-        return retarget_points(points, rig_of(b), boxes_3d=boxes if kind == "retargeted" else None).points
-    return points
+    return retarget_points(points, rig_of(b)).points if kind == "retargeted" else points
 
 
 # --- trainings and tests ----------------------------------------------------------------------------------------------
@@ -148,6 +145,8 @@ def result(settings: Settings, change: str, kind: Kind, seed: int, output: Path)
             "scans": [*(lidar.content_key.hex() for lidar in (*scans[:2], b)), scans[2]],
             "settings": asdict(replace(settings, seeds=(seed,), changes=())),
             "code": code_hash("integrations.cross_rig.scans"),
+            "streets": code_hash(_STREETS_CODE, within=_STREETS_CODE),
+            "points": code_hash(_POINTS_CODE[scans[2]]) if scans[2] in _POINTS_CODE else None,
         }
     )
     path = output / f"{change}-{kind}-{seed}-{key}.json"

@@ -68,7 +68,7 @@ class Settings:
     two_wheelers: bool = False
     world: World = "drive"
     seeds: tuple[int, ...] = (0, 1, 2)
-    changes: tuple[str, ...] = tuple(CHANGES)
+    changes: tuple[str, ...] = tuple(name for name, change in CHANGES.items() if not change.has_lens)
     variants: tuple[str, ...] = tuple(VARIANTS)
     families: tuple[str, ...] = ("voxels",)
     schedules: tuple[Length, ...] = ("short",)
@@ -96,7 +96,7 @@ class Job:
 
     Attributes:
         variant: How.
-        change: For which vehicle B; None where B does not matter (raw frames): one training serves every change.
+        change: For which vehicle B; None where B does not matter: one training serves every change.
         seed: Of its initialisation and its draws, the same for every variant.
         family: Of the detector.
         length: Of its schedule.
@@ -121,9 +121,9 @@ def jobs(settings: Settings) -> list[Job]:
     variants = named_rows("variants", settings.variants, VARIANTS)
     for seed, length, family in product(settings.seeds, settings.schedules, settings.families):
         made = partial(Job, seed=seed, family=family, length=length)
-        found += [made(variant=variant, change=None) for variant in variants if variant.kind == "raw"]
+        found += [made(variant=variant, change=None) for variant in variants if not variant.knows_target]
         for change in settings.changes:
-            found += [made(variant=variant, change=change) for variant in variants if variant.kind != "raw"]
+            found += [made(variant=variant, change=change) for variant in variants if variant.knows_target]
     return found
 
 
@@ -146,7 +146,7 @@ def pilot() -> Settings:
     """Three changes, the variants that decide, three seeds: an evening on two cores."""
     return Settings(
         changes=("fov50", "up70", "waymo"),
-        variants=("raw", "scale_crop", "row_split", "street", "objects_mixed", "auto", "oracle"),
+        variants=("raw", "scale_crop", "street_fill_mixed", "objects_fill", "auto_fill", "recipe", "oracle"),
     )
 
 

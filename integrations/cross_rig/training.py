@@ -43,6 +43,7 @@ class Schedule:
         batch: Frames a step.
         lr: The peak of a one-cycle schedule; AdamW's default decay.
         backbone: Of the model.
+        priors: Whether the model reads camera maps.
         precision: ``bf16`` runs the networks in bfloat16 (autocast): twice as fast on CPUs with AMX.
         device: Where to train.
     """
@@ -52,6 +53,7 @@ class Schedule:
     batch: int = 4
     lr: float = 3e-3
     backbone: Backbone = "small"
+    priors: bool = False
     precision: Literal["bf16", "fp32"] = "bf16"
     device: str = "cpu"
 
@@ -182,7 +184,7 @@ def untrained(schedule: Schedule) -> nn.Module:
     """A detector of a schedule's family."""
     if schedule.family == "pillars":
         return PillarDetector(Grid())
-    return Detector(Grid(), schedule.family, schedule.backbone)
+    return Detector(Grid(), schedule.family, schedule.backbone, priors=schedule.priors)
 
 
 def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[float]]:
@@ -195,7 +197,7 @@ def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[
     losses = []
     model.train()
     for _ in range(schedule.steps):
-        batch = draws.batch(schedule.batch).to(device)
+        batch = _on(device, draws.batch(schedule.batch))
         with _autocast(schedule):
             answer = model(batch)
         value = loss(answer, batch)
@@ -205,6 +207,11 @@ def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[
         cycle.step()
         losses.append(float(value.detach()))
     return model.eval(), [float(np.mean(part)) for part in np.array_split(losses, min(10, len(losses)))]
+
+
+def _on(device: torch.device, batch: Batch | PointBatch) -> Batch | PointBatch:
+    """A batch on a device."""
+    return type(batch)(*(getattr(batch, name).to(device) for name in batch.__dataclass_fields__))
 
 
 def _autocast(schedule: Schedule) -> torch.autocast:
@@ -221,7 +228,7 @@ def answers(
     for start in range(0, num_frames, _EVAL_BATCH):
         indices = range(start, min(start + _EVAL_BATCH, num_frames))
         own: Any = [frames.frame(k) for k in indices]
-        batch = frames.joined(own).to(torch.device(schedule.device))
+        batch = _on(torch.device(schedule.device), frames.joined(own))
         with _autocast(schedule):
             answer = model(batch)
         cells.append(answer.occupancy.float().sigmoid().cpu().numpy().astype(np.float16))

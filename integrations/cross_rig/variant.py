@@ -7,13 +7,17 @@ from typing import Any, Literal
 
 from arbiview_aug.choices import GeometryName
 
-Kind = Literal["raw", "oracle", "row_split", "retarget"]
+Kind = Literal["raw", "oracle", "retarget"]
 Geometry = Literal["points", "boxes_3d", "depth_m", "learned_depth_m", "neighbours"]
 Noise = Literal["depth", "boxes", "missed", "late", "calibration"]
 
 
-RANDOM: dict[str, Any] = {"yaw_deg": 5.0, "pitch_deg": 2.0, "height_m": 0.2, "focal_scale": 0.1}
-"""Half-widths of the random rigs around B: a mounting tolerance well beyond real ones, less than the changes."""
+RANDOM: dict[str, dict[str, Any]] = {
+    "B": {"yaw_deg": 5.0, "pitch_deg": 2.0, "height_m": 0.2, "focal_scale": 0.1},
+    "A": {"yaw_deg": 15.0, "pitch_deg": 5.0, "height_m": 0.8, "lateral_m": 0.3, "focal_scale": 0.4},
+}
+"""Half-widths of random rigs. Around B: a mounting tolerance well beyond real ones, less than the changes. Around A, by
+those who do not know B: as wide as the changes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,14 +34,13 @@ class Variant:
             ``depth`` command's.
         mixed: Half of the frames drawn are raw ones.
         augmented: Frames are scaled and cropped at random as they are drawn.
-        holes: Pixels that no camera saw are black, filled as ``RigRetarget`` does by default, or completed by the
-            package's generator.
+        holes: Pixels that no camera saw are black, or filled as ``RigRetarget`` does by default.
         masked: The network masks them by ``coverage``. Otherwise every pixel counts as seen, as in stock detectors.
-        random: Targets are drawn around B, one for each frame.
+        random: Targets are drawn around B, or around A by those who do not know B, one for each frame.
+        priors: The network reads ``CameraMaps`` beside its features, by ``CameraPriorStem``.
         noise: What is wrong with the geometry that it is given (``noise.py``); the labels are right.
         labels: Whose rig says which vehicles are hidden: A's, which recorded, B's views as they were rendered
             (``visible_boxes``). None: A's, and for an oracle B's true ones.
-        stays: B's cameras stay in the very centres of those of A that look most alike, or at their heights.
         truth: To find out where the rest is lost: B's true pixels where something is covered, or where nothing is
             (which then counts as seen).
     """
@@ -49,18 +52,23 @@ class Variant:
     reads: tuple[Geometry, ...] = ()
     mixed: bool = False
     augmented: bool = False
-    holes: Literal["black", "fill", "generator"] = "black"
+    holes: Literal["black", "fill"] = "black"
     masked: bool = True
-    random: bool = False
+    random: Literal["A", "B"] | None = None
+    priors: bool = False
     noise: Noise | None = None
     labels: Literal["A", "views"] | None = None
-    stays: Literal["centre", "height"] | None = None
     truth: Literal["covered", "holes"] | None = None
 
     @property
     def renders(self) -> bool:
         """Whether it has a training set of its own on disk."""
-        return self.kind in ("row_split", "retarget")
+        return self.kind == "retarget"
+
+    @property
+    def knows_target(self) -> bool:
+        """Whether its training depends on B; otherwise one serves every change."""
+        return self.kind != "raw" and self.random != "A"
 
     @property
     def labels_of_a(self) -> bool:
@@ -70,6 +78,6 @@ class Variant:
     def views_spec(self) -> dict[str, Any]:
         """Settings that change its images, besides rigs and code: variants that differ in how they draw share them."""
         settings = {"kind": self.kind, "surface": self.surface, "reads": list(self.reads), "holes": self.holes}
-        extra: dict[str, Any] = {"random": RANDOM if self.random else None, "stays": self.stays, "truth": self.truth}
+        extra: dict[str, Any] = {"random": RANDOM.get(self.random or ""), "truth": self.truth}
         extra |= {"noise": self.noise, "labels": self.labels if self.renders else None}
         return settings | {name: value for name, value in extra.items() if value is not None}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+from arbiview_aug.choices import GeometryName
 from integrations.cross_rig.variant import Geometry, Noise, Variant
 
 NOISES: dict[Noise, str] = {
@@ -12,6 +13,11 @@ NOISES: dict[Noise, str] = {
     "late": "points and boxes 50 ms late",
     "calibration": "cameras turned by 0.2°",
 }
+_LESS: tuple[tuple[str, str, GeometryName, tuple[Geometry, ...]], ...] = (
+    ("street", "street", "street", ()),
+    ("objects", "objects", "boxes", ("boxes_3d",)),
+)
+"""Names, titles, surfaces and what they read, where samples have no LiDAR."""
 _ALL: tuple[Geometry, ...] = ("points", "boxes_3d")
 _filled = partial(Variant, kind="retarget", reads=_ALL, holes="fill", masked=False)
 """``auto`` for a network that lifts every pixel."""
@@ -21,24 +27,7 @@ VARIANTS: dict[str, Variant] = {
     for variant in (
         Variant(name="raw", title="raw A", kind="raw"),
         Variant(name="scale_crop", title="raw A, scaled and cropped", kind="raw", augmented=True),
-        Variant(name="row_split", title="row split", kind="row_split"),
-        Variant(name="far", title="far", kind="retarget", surface="infinity"),
-        Variant(name="street", title="street", kind="retarget", surface="street"),
-        Variant(name="objects", title="objects", kind="retarget", surface="boxes", reads=("boxes_3d",)),
-        Variant(name="points", title="lidar, no boxes", kind="retarget", surface="lidar", reads=("points",)),
         Variant(name="auto", title="auto: LiDAR, boxes", kind="retarget", surface="auto", reads=_ALL),
-        Variant(name="same_height", title="street at A's heights", kind="retarget", surface="street", stays="height"),
-        Variant(
-            name="same_height_mixed",
-            title="street at A's heights, + raw",
-            kind="retarget",
-            surface="street",
-            stays="height",
-            mixed=True,
-        ),
-        Variant(name="same_centre", title="street at A's centres", kind="retarget", surface="street", stays="centre"),
-        Variant(name="far_mixed", title="far + raw", kind="retarget", surface="infinity", mixed=True),
-        Variant(name="depth", title="true depth", kind="retarget", surface="lidar", reads=("depth_m",)),
         Variant(
             name="learned",
             title="true depth with 5 % noise",
@@ -47,26 +36,19 @@ VARIANTS: dict[str, Variant] = {
             reads=("depth_m",),
             noise="depth",
         ),
-        Variant(name="street_mixed", title="street + raw", kind="retarget", surface="street", mixed=True),
-        Variant(
-            name="objects_mixed",
-            title="objects + raw",
-            kind="retarget",
-            surface="boxes",
-            reads=("boxes_3d",),
-            mixed=True,
-        ),
-        Variant(name="auto_mixed", title="auto + raw", kind="retarget", reads=_ALL, mixed=True),
         Variant(name="auto_black", title="auto, black holes, no mask", kind="retarget", reads=_ALL, masked=False),
         _filled(name="auto_fill", title="auto, filled holes, no mask"),
         _filled(name="auto_fill_mixed", title="auto, filled holes, no mask, + raw", mixed=True),
-        Variant(
-            name="auto_generated",
-            title="auto, generator, no mask",
-            kind="retarget",
-            reads=_ALL,
-            holes="generator",
-            masked=False,
+        *(
+            _filled(
+                name=f"{name}_fill{'_mixed' * mixed}",
+                title=f"{title}, filled holes, no mask{', + raw' * mixed}",
+                surface=surface,
+                reads=reads,
+                mixed=mixed,
+            )
+            for name, title, surface, reads in _LESS
+            for mixed in (False, True)
         ),
         Variant(
             name="true_covered", title="auto's holes in B's own frames", kind="retarget", reads=_ALL, truth="covered"
@@ -82,14 +64,6 @@ VARIANTS: dict[str, Variant] = {
         ),
         Variant(name="motion", title="depth from motion", kind="retarget", surface="motion", reads=("neighbours",)),
         Variant(
-            name="motion_mixed",
-            title="depth from motion, + raw",
-            kind="retarget",
-            surface="motion",
-            reads=("neighbours",),
-            mixed=True,
-        ),
-        Variant(
             name="motion_learned",
             title="depth from motion, and true depth with 5 % noise",
             kind="retarget",
@@ -97,7 +71,6 @@ VARIANTS: dict[str, Variant] = {
             reads=("neighbours", "learned_depth_m"),
             noise="depth",
         ),
-        Variant(name="random", title="RandomRig around B, auto", kind="retarget", reads=_ALL, random=True),
         *(
             _filled(name=f"auto_fill_{noise}", title=f"auto, filled holes, no mask, {title}", noise=noise)
             for noise, title in NOISES.items()
@@ -106,7 +79,22 @@ VARIANTS: dict[str, Variant] = {
         _filled(
             name="recipe", title="recipe: auto, filled, no mask, labels of the views, + raw", labels="views", mixed=True
         ),
-        _filled(name="auto_fill_random", title="RandomRig around B, auto, filled holes, no mask", random=True),
+        _filled(name="auto_fill_random", title="RandomRig around B, auto, filled holes, no mask", random="B"),
+        _filled(name="random_a", title="random rigs around A, auto, filled holes, no mask", random="A"),
+        Variant(name="raw_priors", title="raw A; camera maps", kind="raw", priors=True),
+        _filled(name="auto_fill_priors", title="auto, filled holes, no mask; camera maps", priors=True),
+        _filled(
+            name="auto_fill_random_priors",
+            title="RandomRig around B, auto, filled holes, no mask; camera maps",
+            random="B",
+            priors=True,
+        ),
+        _filled(
+            name="random_a_priors",
+            title="random rigs around A, auto, filled holes, no mask; camera maps",
+            random="A",
+            priors=True,
+        ),
         Variant(name="oracle_labels", title="B's own frames, A's labels", kind="oracle", labels="A"),
         Variant(name="oracle_mixed", title="B's own frames, + raw", kind="oracle", mixed=True),
         Variant(name="oracle_scaled", title="B's own frames, scaled and cropped", kind="oracle", augmented=True),

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from arbiview_aug import Camera, Rig, load_rig
+from arbiview_aug.cameras.lens import LensName
 from arbiview_aug.datasets.synthetic import demo_target_rig
 
 Size = tuple[int, int]
@@ -48,14 +49,18 @@ class Change:
         name: On the command line and in files.
         title: In tables.
         target: Vehicle B at a size, in A's ego frame.
+        has_lens: Whether its cameras are no pinholes. The detectors read K alone: they are not trained on its frames.
     """
 
     name: str
     title: str
     target: Callable[[Size], Rig]
+    has_lens: bool = False
 
 
-def source_rig(size: Size, *, fov_deg: float = _FOV_DEG, height_m: float = _HEIGHT_M) -> Rig:
+def source_rig(
+    size: Size, *, fov_deg: float = _FOV_DEG, height_m: float = _HEIGHT_M, lens: LensName = "pinhole"
+) -> Rig:
     """Vehicle A: six cameras around a car's roof, all with one field of view."""
     cameras = []
     for name, azimuth in zip(_NAMES, _AZIMUTHS_DEG, strict=True):
@@ -69,6 +74,8 @@ def source_rig(size: Size, *, fov_deg: float = _FOV_DEG, height_m: float = _HEIG
                 width_px=size[1],
                 height_px=size[0],
                 horizontal_fov_deg=fov_deg,
+                lens=lens,
+                distortion=(0.0,) * 4 if lens == "fisheye" else (),
             )
         )
     return Rig(cameras, name="A")
@@ -105,6 +112,13 @@ CHANGES: dict[str, Change] = {
         Change(name="fov80", title="FOV 65° → 80°", target=_zoomed(80.0)),
         Change(name="turned", title="turned by 30°", target=lambda size: source_rig(size).turned(yaw_deg=30.0)),
         Change(name="pitched", title="5° down", target=lambda size: source_rig(size).turned(pitch_deg=-5.0)),
+        Change(name="aside60", title="0.6 m to the left", target=lambda size: source_rig(size).shifted(y_m=0.6)),
+        Change(
+            name="fisheye",
+            title="fisheye, 100° wide",
+            target=lambda size: source_rig(size, fov_deg=100.0, lens="fisheye"),
+            has_lens=True,
+        ),
     )
 }
 """By name. ``waymo``: Waymo's azimuths and height at A's field of view, so that it stays a change of the layout."""

@@ -121,9 +121,79 @@ def test_lenses_that_a_method_cannot_take(
         ["--target", "waymo", "--target-set", "paper"],
         ["--displaced"],
         ["--displaced", "--target", "waymo", "--data", "."],
+        ["--detector-weights", "weights.pth"],
+        ["--detector-classes", "car"],
+        ["--segmenter", "road.ts", "--data", "."],
+        ["--segmenter", "road.ts", "--lidar", "--target", "waymo"],
     ],
 )
 def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         main(["evaluate", *arguments])
     assert "error: argument" in capsys.readouterr().err
+
+
+# --- judges -----------------------------------------------------------------------------------------------------------
+JUDGES = """
+import numpy as np
+
+def detect(rgb):
+    h, w = rgb.shape[:2]
+    return [[0, 0, w / 2, h]], [0.6], ["car"]
+
+def wrong(rgb):
+    return [[0, 0, 1, 1]], [0.6]
+
+def segment(rgb):
+    return np.stack([rgb[..., 0] > 100, rgb[..., 0] > 200])
+"""
+
+
+def test_judges_of_a_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "own.py").write_text(JUDGES)
+    judges = ["--detector", f"{tmp_path}/own.py:detect", "--segmenter", f"{tmp_path}/own.py:segment"]
+    size = ["--size", "48x132", "--geometry", "infinity", "--holes", "continue"]
+    report = run([*size, *judges], tmp_path)
+    rows, printed = report["judges"], capsys.readouterr().out
+    assert list(rows) == ["sources", "fast, infinity, continue", "truth"]
+    row = rows["fast, infinity, continue"]
+    assert row["true_objects"] == 5 and row["ap_50"] == row["ap_70"] == 1
+    assert 0 < row["area_iou"] < 1 and row["road_views"] == row["filled"] == 5
+    assert rows["sources"]["objects"] > 0 and rows["truth"]["objects"] == row["objects"] > 0
+    for title in ("Labelled objects that the detector finds", "Detections in views and", "Road in views and"):
+        assert f"{title}" in printed
+    assert "note: " in printed and "they say nothing" in printed
+    assert cv2.imread(str(tmp_path / "van-fast-infinity-continue-judged.png")).std() > 20
+    page = (tmp_path / "report.html").read_text()
+    assert all(f">{name}: judged<" in page for name in ("nearest source camera", "fast, infinity, continue", "truth"))
+    assert "Labelled objects that the detector finds" in page
+
+
+def test_judges_are_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "own.py").write_text(JUDGES)
+    for function, message in (("none", "expected a function none"), ("wrong", "expected boxes (n, 4) x0 y0 x1 y1")):
+        judge = ["--detector", f"{tmp_path}/own.py:{function}", "--size", "24x66", "--geometry", "infinity"]
+        assert main(["evaluate", *judge, "--output", str(tmp_path)]) == 2
+        error = capsys.readouterr().err
+        assert f"--detector {tmp_path}/own.py:{function}: {message}" in error.splitlines()[-1]
+
+
+@pytest.mark.slow
+def test_real_judges_of_a_real_frame(judges_root: Path, nuscenes_root: Path, tmp_path: Path) -> None:
+    """They find as many of the clear objects in views turned by 11 degrees as in the photographs, or nearly."""
+    pytest.importorskip("ncnn", reason="pip install ncnn")
+    FrameFolder(nuscenes_root)[0]["rig"].turned(yaw_deg=11).save(tmp_path / "turned.yaml")
+    data = ["--data", f"nuscenes:{nuscenes_root}", "--target", str(tmp_path / "turned.yaml"), "--geometry", "boxes"]
+    detector = ["--detector", f"{judges_root}/nanodet.py:detect", "--detector-classes", *"012357"]
+    rows = run([*data, *detector], tmp_path)["judges"]
+    assert rows["sources"]["clear_objects"] == 14 and rows["sources"]["clear_iou"] == pytest.approx(0.35, abs=0.02)
+    assert rows["fast, boxes"]["clear_iou"] > rows["sources"]["clear_iou"] - 0.1
+
+
+@pytest.mark.slow
+def test_real_judges_of_photographs(judges_root: Path, kitti_root: Path, tmp_path: Path) -> None:
+    """Eleven frames of a suburb, 0.54 m aside: lane marks tell the surfaces apart."""
+    network = ["--segmenter", f"{judges_root}/twinlitenet.ts"]
+    rows = run(["--displaced", "--data", str(kitti_root), "--geometry", "street", *network], tmp_path)["judges"]
+    assert rows["copy"]["lanes_iou"] < 0.1 and rows["fast, street"]["lanes_iou"] == pytest.approx(0.27, abs=0.03)
+    assert rows["copy"]["area_iou"] < rows["fast, street"]["area_iou"] > 0.9

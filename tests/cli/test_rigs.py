@@ -8,7 +8,8 @@ import cv2
 import pytest
 
 from arbiview_aug.__main__ import main
-from arbiview_aug.cameras.rig import load_rig
+from arbiview_aug.cameras.rig import load_rig, save_rig
+from arbiview_aug.cli import rigs
 from arbiview_aug.cli.rigs import differences
 
 
@@ -60,3 +61,13 @@ def test_unknown_rig_and_unwritable_picture(tmp_path: Path, capsys: pytest.Captu
     assert "expected a file or one of the shipped rigs" in capsys.readouterr().err
     assert main(["inspect", "waymo", "--output", str(tmp_path / "rig.words")]) == 2
     assert "expected a name ending in .png" in capsys.readouterr().err
+
+
+def test_other_tools_calibrations_are_read_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_rig(load_rig("nuscenes"), tmp_path / "kalibr", format="kalibr")
+    reads, read = [], rigs.read_calibration
+    monkeypatch.setattr(rigs, "read_calibration", lambda *where: reads.append(where) or read(*where))
+    assert main(["inspect", str(tmp_path / "kalibr"), "--output", str(tmp_path / "rig.png")]) == 0
+    assert "read as Kalibr: " in capsys.readouterr().out and len(reads) == 1

@@ -54,7 +54,8 @@ def by_opencv(path: Path, _: RenderPlan, images: torch.Tensor) -> Views:
     """The example of ``docs/deploy.md``."""
     names: dict[str, Any] = {"path": path, "images": [image.permute(1, 2, 0).numpy() for image in images]}
     page = (Path(__file__).parents[2] / "docs" / "deploy.md").read_text()
-    exec(re.findall(r"```python\n(.*?)```", page, re.DOTALL)[1], names)
+    (code,) = (code for code in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "np.load" in code)
+    exec(code, names)
     return [view.transpose(2, 0, 1) for view in names["views"]]
 
 

@@ -60,6 +60,24 @@ def test_kinds_by_size() -> None:
     assert kinds(boxes_of(SIZES)).tolist() == list(range(len(KIND_M[0])))
 
 
+@pytest.mark.parametrize("away_m", [0.0, 5000.0])
+def test_points_in_boxes_against_the_boxes_inequalities(away_m: float) -> None:
+    """Boxes of any size beside, over and far from each other: the grid that finds them repeats."""
+    rng = np.random.default_rng(0)
+    places, sizes = rng.normal(0, (40, 40, 2), (60, 3)), rng.uniform(0.3, 12, (60, 3))
+    boxes = np.concatenate([places, sizes, rng.uniform(-4, 4, (60, 1))], 1)
+    boxes[0, 3] = 700.0
+    points = rng.normal(0, (40, 40, 2), (3000, 3)).astype(np.float32) + np.float32(away_m)
+    boxes[:, :3] += away_m
+    c, s = np.cos(boxes[:, 6, None]), np.sin(boxes[:, 6, None])
+    x, y, z = np.moveaxis(points.astype(np.float64) - boxes[:, None, :3], -1, 0)
+    along = np.abs(np.stack([c * x + s * y, c * y - s * x, z], -1))
+    expected = (along <= boxes[:, None, 3:6] / 2 + 0.1).all(-1)
+    assert expected.any(axis=1).sum() > 20
+    for row, inside in enumerate(points_in(boxes, points, 0.1)):
+        assert inside.tolist() == np.flatnonzero(expected[row]).tolist()
+
+
 def test_objects_lie_within_their_boxes() -> None:
     boxes, rng = boxes_of(SIZES), np.random.default_rng(0)
     for row, planes in enumerate(solids(boxes)):

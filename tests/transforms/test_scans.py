@@ -48,6 +48,8 @@ def test_points_are_those_of_the_target(sample: dict[str, Any]) -> None:
     away = points[:, :3].double().numpy() - POSE[:3, 3]
     elevation = np.degrees(np.arcsin(away[:, 2] / np.linalg.norm(away, axis=1)))
     np.testing.assert_allclose(elevation, np.array(TOP.elevations_deg)[rings], atol=0.01)
+    bare = retarget_points(sample["points"], target())  # labels tell what is counted, not what is measured
+    assert bare.counts is None and torch.equal(bare.points, points)
     assert set(points[:, 3].tolist()) <= set(sample["points"][:, 3].tolist())
     assert counts.shape == (len(sample["boxes_3d"]),) and counts.dtype == torch.int64 and counts.sum() > 0
     assert "top (2160 rays)" in str(RigRetarget(target()).explain(sample))
@@ -200,6 +202,24 @@ def test_neighbouring_scans_fill_what_one_does_not_see(sample: dict[str, Any]) -
     explained = [RigRetarget(target(), neighbours=n).explain(with_wall(sample)) for n in (None, "road")]
     near = [int(str(one).split("near ")[1].split("%")[0]) for one in explained]
     assert near[1] < near[0]
+
+
+class Counted(dict[str, Any]):
+    """A neighbour that counts how often its points are asked for."""
+
+    reads = 0
+
+    def get(self, key: str, default: Any = None) -> Any:
+        self.reads += key == "points"
+        return super().get(key, default)
+
+
+def test_images_and_scans_read_neighbours_once(sample: dict[str, Any]) -> None:
+    one = with_wall(sample)
+    neighbour = Counted(one["neighbours"][0])
+    moved = replace(demo_source_rig(SIZE).shifted(z_m=0.3), ground_z_m=0.0, lidars=[TOP])
+    out = RigRetarget(moved, geometry="lidar")(one | {"neighbours": [neighbour]})
+    assert neighbour.reads == 1 and (out["points"][:, 1] > 1).any()
 
 
 def test_neighbours_without_fitting_points(sample: dict[str, Any]) -> None:

@@ -8,12 +8,12 @@ outputs, with float32 maps that read a source of the view's own size at
 A time is the median over the rounds; a ratio is the median of call / floor within a round.
 
 The targets are Waymo's five cameras without and with their lenses, four fisheye cameras, and the source's own, turned
-or lowered. *Depth maps* from motion and from a network cost the same; these say at every pixel the depth of the nearest
-LiDAR point. *Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it the plan; every other call
-plans anew. Images are decoded at half size where they are then still larger than the views. They lie channels-last in
-one block, as this package's readers give them; contiguous ones are planes, torch's usual layout. Holes stay black
-unless they are *filled*. *Points by rays*: ``retarget_points`` alone. With ``--device`` the floor is a copy there of as
-many bytes as rendering must move; the clock of a GPU is its events.
+or lowered, all without scanners. *Depth maps* from motion and from a network cost the same; these say at every pixel
+the depth of the nearest LiDAR point. *Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it
+the plan; every other call plans anew. Images are decoded at half size where they are then still larger than the views.
+They lie channels-last in one block, as this package's readers give them; contiguous ones are planes, torch's usual
+layout. Holes stay black unless they are *filled*. *Points by rays*: ``retarget_points`` alone. With ``--device`` the
+floor is a copy there of as many bytes as rendering must move; the clock of a GPU is its events.
 """
 
 from __future__ import annotations
@@ -132,18 +132,23 @@ def measure(
 
 def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tuple[str, Calls]]:
     """Yield targets at (h, w), each with its floor and its calls."""
-    waymo, fisheye = (without_masks(load_rig(name)).resized(size) for name in ("waymo", "fisheye_surround"))
+    waymo, fisheye = (_cameras_of(name).resized(size) for name in ("waymo", "fisheye_surround"))
     is_small = all(2 * side <= of_camera for side, of_camera in zip(size, full["rig"].sizes[0], strict=True))
     sample = half if is_small else full
     for name, rig in {"pinhole": waymo.undistorted(), "radtan": waymo, "fisheye": fisheye}.items():
         calls = {_FLOOR: remap_floor(sample["images"][: len(rig)], size)} | _calls(sample, rig)
         if is_small and name == "radtan":
-            cropped = without_masks(load_rig("waymo")).resized(size, "crop")
+            cropped = _cameras_of("waymo").resized(size, "crop")
             calls |= _both_layouts("street, held, squashed from full size", full, waymo)
             calls |= _both_layouts("street, held, cropped from full size", full, cropped)
         yield name, calls
     if is_small:
         yield "own", {_FLOOR: remap_floor(sample["images"], size)} | _own(sample, size) | _scans(sample)
+
+
+def _cameras_of(name: str) -> Rig:
+    """A shipped rig without masks, and without scanners: scans have calls of their own."""
+    return replace(without_masks(load_rig(name)), lidars=())
 
 
 def table(report: Mapping[str, Any]) -> str:

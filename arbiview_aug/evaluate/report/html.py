@@ -21,6 +21,7 @@ from arbiview_aug.evaluate.report.pictures import (
     shrunk,
 )
 from arbiview_aug.evaluate.report.tables import Columns, Table, cell
+from arbiview_aug.evaluate.verdicts import SOURCES
 
 SOURCE_LAYER = "nearest source camera"
 TRUTH_LAYER = "truth"
@@ -30,23 +31,35 @@ _JPEG_QUALITY = 85
 
 
 def html_report(
-    title: str, done: Evaluation, methods: Sequence[str], tables: Sequence[Table], notes: Sequence[str] = ()
+    title: str,
+    done: Evaluation,
+    methods: Sequence[str],
+    tables: Sequence[Table],
+    notes: Sequence[str] = (),
+    judged: Mapping[tuple[str, str], Sequence[Picture]] | None = None,
 ) -> str:
     """Build the page: title, notes as paragraphs, tables, and the first frame's views.
 
     For each target rig it shows one picture per camera, with a slider between two layers (source, methods in their
-    order, holes, confidence, truth), and both rigs from above.
+    order, holes, confidence, truth, and those of ``judged``, as ``Panel.pictures``), and both rigs from above.
     """
     parts = [f"<h1>{escape(title)}</h1>", *(f"<p>{escape(note)}</p>" for note in notes)]
     parts += [_table(*table) for table in tables]
     for target, rig in done.targets.items():
         shown = {m: done.pictures[target, m] for m in methods if (target, m) in done.pictures}
         if shown:
-            parts.append(_target_section(target, rig, done, shown))
+            boxes = {row: pictures for (of, row), pictures in (judged or {}).items() if of in (SOURCES, target)}
+            parts.append(_target_section(target, rig, done, shown, boxes))
     return _PAGE.replace("{title}", escape(title)).replace("{body}", "\n".join(parts))
 
 
-def layers(camera: int, rig: Rig, done: Evaluation, shown: Mapping[str, Sequence[RenderedView]]) -> dict[str, Picture]:
+def layers(
+    camera: int,
+    rig: Rig,
+    done: Evaluation,
+    shown: Mapping[str, Sequence[RenderedView]],
+    judged: Mapping[str, Sequence[Picture]],
+) -> dict[str, Picture]:
     """Pictures that the slider of one target camera can show, by name."""
     assert done.first is not None
     source: Rig = done.first.sample["rig"]
@@ -63,13 +76,22 @@ def layers(camera: int, rig: Rig, done: Evaluation, shown: Mapping[str, Sequence
     true = done.first.true_images(rig)
     if true is not None:
         pictures[TRUTH_LAYER] = shrunk(true[camera], _HEIGHT_PX)
+    for row, images in judged.items():
+        name, index = (SOURCE_LAYER, nearest) if row == SOURCES else (row, camera)
+        pictures[f"{name}: judged"] = shrunk(images[index], _HEIGHT_PX)
     return pictures
 
 
-def _target_section(target: str, rig: Rig, done: Evaluation, shown: Mapping[str, Sequence[RenderedView]]) -> str:
+def _target_section(
+    target: str,
+    rig: Rig,
+    done: Evaluation,
+    shown: Mapping[str, Sequence[RenderedView]],
+    judged: Mapping[str, Sequence[Picture]],
+) -> str:
     assert done.first is not None
     source: Rig = done.first.sample["rig"]
-    by_camera = [layers(camera, rig, done, shown) for camera in range(len(rig))]
+    by_camera = [layers(camera, rig, done, shown, judged) for camera in range(len(rig))]
     # Every camera offers the same layers: a view without holes stands for its own holes.
     names = list(dict.fromkeys(name for of_camera in by_camera for name in of_camera))
     after = next(iter(shown))

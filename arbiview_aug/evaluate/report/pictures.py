@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Picture = npt.NDArray[np.uint8]
 INK, PAPER = (40, 40, 40), (255, 255, 255)
 HOLE = (255, 0, 160)  # colour of uncovered regions; rare on streets
-_BOX = (0, 230, 255)
+BOX = (0, 230, 255)
 _FARTHEST_M = 80.0  # points there, and beyond, are blue
 
 RIG_COLOURS = ("#1f64c8", "#d65414", "#1e8c3c", "#8c3caa", "#966e14")  # of rigs, in their order
@@ -36,6 +36,8 @@ _GAP_PX = 6
 _CAPTION_PX, _CAPTION_SCALE = 20, 0.42
 _TITLE_PX = 28
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+_LABELLED, _DETECTED = (0, 230, 255), (255, 220, 0)  # colours of boxes that judges are shown, and that they see
 
 
 def put_text(picture: Picture, text: str, xy: tuple[int, int], scale: float) -> None:
@@ -115,23 +117,41 @@ def draw_labels(camera: Camera, image: Image, points: FloatArray | None, boxes: 
     if points is not None and len(points):
         seen = visible_points(camera, points)
         far_first = np.argsort(-seen.depth_m)
-        depth_m = seen.depth_m[far_first].clip(1, _FARTHEST_M)
-        shade = (255 * np.log(depth_m) / np.log(_FARTHEST_M)).astype(np.uint8)
-        colours = cv2.applyColorMap(255 - shade[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
+        colours = coloured(1 - np.log(seen.depth_m[far_first].clip(1)) / np.log(_FARTHEST_M))
         column, row = np.round(seen.uv[far_first]).astype(int).T
         for dx, dy in np.ndindex(width_px + 1, width_px + 1):
             picture[np.minimum(row + dy, h - 1), np.minimum(column + dx, w - 1)] = colours
     for box in np.zeros((0, 7)) if boxes is None else boxes:
-        ahead = np.array([np.cos(box[6]), np.sin(box[6]), 0.0]) * box[3]
-        heading = box[:3] + np.linspace(0.5, 1.0, 9)[:, None, None] * ahead
-        heading = (heading - camera.center_m) @ camera.cam2ego[:3, :3]
-        for lines, colour in ((edge_points(camera, box), _BOX), (heading, HOLE)):
-            uv, depth, valid = camera.project_cam(lines)  # [steps, lines, 2]
-            valid &= (np.abs(uv) < 4 * max(h, w)).all(axis=-1) & (camera.lens_model.sees_behind | (depth > 0.1))
-            ends = np.stack([uv[:-1], uv[1:]], axis=-2)[valid[:-1] & valid[1:]]
-            for one, two in np.round(ends).astype(int).tolist():
+        for segments, colour in box_lines(camera, box):
+            for one, two in np.round(segments).astype(int).tolist():
                 cv2.line(picture, one, two, colour, width_px, cv2.LINE_AA)
     return picture
+
+
+def box_lines(camera: Camera, box: FloatArray) -> list[tuple[FloatArray, tuple[int, int, int]]]:
+    """Segments (n, 2, 2) in a camera's image of a box's edges and of its heading, each with their colour.
+
+    A lens bends them. The box is (7,) in the ego frame.
+    """
+    ahead = np.array([np.cos(box[6]), np.sin(box[6]), 0.0]) * box[3]
+    heading = box[:3] + np.linspace(0.5, 1.0, 9)[:, None, None] * ahead
+    heading = (heading - camera.center_m) @ camera.cam2ego[:3, :3]
+    return [(_segments(camera, edge_points(camera, box)), BOX), (_segments(camera, heading), HOLE)]
+
+
+def _segments(camera: Camera, lines: FloatArray) -> FloatArray:
+    """Segments (n, 2, 2) in the image along lines (steps, lines, 3) in the camera's frame."""
+    uv, depth, valid = camera.project_cam(lines)  # [steps, lines, 2]
+    valid &= (np.abs(uv) < 4 * max(camera.size)).all(axis=-1) & (camera.lens_model.sees_behind | (depth > 0.1))
+    return np.stack([uv[:-1], uv[1:]], axis=-2)[valid[:-1] & valid[1:]]
+
+
+def coloured(values: FloatArray) -> Picture:
+    """(n, 3) colours of values (n,): blue at 0 to red at 1."""
+    levels = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
+    if not len(levels):  # OpenCV gives none
+        return np.zeros((0, 3), np.uint8)
+    return np.ascontiguousarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1])
 
 
 def save_picture(path: str | Path, picture: Picture) -> Path:
@@ -145,6 +165,15 @@ def save_picture(path: str | Path, picture: Picture) -> Path:
     if not written:
         raise DataError(f"picture {path}: expected a name ending in .png or .jpg, in a folder that can be written to")
     return path
+
+
+def draw_rectangles(image: Image, labelled: FloatArray, detected: FloatArray) -> Picture:
+    """Draw labelled boxes (n, 4) x0 y0 x1 y1 in cyan, and a detector's in yellow, into an image (h, w, 3)."""
+    picture = to_bytes(image).copy()
+    for boxes, colour in ((labelled, _LABELLED), (detected, _DETECTED)):
+        for x0, y0, x1, y1 in np.round(boxes).astype(int).tolist():
+            cv2.rectangle(picture, (x0, y0), (x1, y1), colour, max(1, len(picture) // 128))
+    return picture
 
 
 def _paper(height: int, width: int) -> Picture:

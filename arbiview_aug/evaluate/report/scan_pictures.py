@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.lidar import Lidar
-from arbiview_aug.evaluate.report.pictures import PAPER, Picture, contact_sheet
+from arbiview_aug.evaluate.report.pictures import PAPER, Picture, coloured, contact_sheet
 from arbiview_aug.evaluate.scans import range_image
 
 _REACH_M = 32.0  # from above: ahead and aside
@@ -28,8 +28,7 @@ def from_above(points: FloatArray, boxes: FloatArray, ground_z_m: float) -> Pict
     lowest_first = points[np.argsort(points[:, 2])]
     row, column = _pixels(lowest_first).T
     inside = (row >= 0) & (row < _SIDE_PX) & (column >= 0) & (column < _SIDE_PX)
-    height = (lowest_first[inside, 2] - ground_z_m - _LOW_M) / (_HIGH_M - _LOW_M)
-    picture[row[inside], column[inside]] = _coloured(height)
+    picture[row[inside], column[inside]] = height_colours(lowest_first[inside], ground_z_m)
     for box in boxes:
         x, y, length, width, yaw = box[[0, 1, 3, 4, 6]].tolist()
         corners = _pixels(cv2.boxPoints(((x, y), (length, width), np.degrees(yaw))))[:, ::-1]
@@ -37,11 +36,16 @@ def from_above(points: FloatArray, boxes: FloatArray, ground_z_m: float) -> Pict
     return picture
 
 
+def height_colours(points: FloatArray, ground_z_m: float) -> Picture:
+    """(P, 3) colours of points (P, >=3): blue on the road to red."""
+    return coloured((points[:, 2] - ground_z_m - _LOW_M) / (_HIGH_M - _LOW_M))
+
+
 def range_picture(lidar: Lidar, points: FloatArray) -> Picture:
     """Range image of a scanner from left to right, the highest beam above, red near to blue far; white without."""
     ranges = range_image(lidar, points)[np.argsort(lidar.elevations_deg)[::-1], ::-1]
     shade = np.log(ranges.clip(_NEAR_M, _FAR_M) / _NEAR_M) / np.log(_FAR_M / _NEAR_M)
-    picture = np.where(ranges[..., None] > 0, _coloured(1 - shade.ravel()).reshape(*ranges.shape, 3), PAPER)
+    picture = np.where(ranges[..., None] > 0, coloured(1 - shade.ravel()).reshape(*ranges.shape, 3), PAPER)
     width_px = max(_LEAST_PX, ranges.shape[1])
     size = width_px, max(len(ranges), width_px // _ASPECT)
     return np.asarray(cv2.resize(picture.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
@@ -70,10 +74,3 @@ def _pixels(points: Any) -> npt.NDArray[np.int64]:
     """(n, 2) int rows and columns of points (n, >=2)."""
     return np.floor((1 - points[:, :2] / _REACH_M) * _SIDE_PX / 2).astype(int)
 
-
-def _coloured(values: FloatArray) -> Picture:
-    """(n, 3) colours of values (n,): blue at 0 to red at 1."""
-    levels = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
-    if not len(levels):  # OpenCV gives none
-        return np.zeros((0, 3), np.uint8)
-    return np.ascontiguousarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1])

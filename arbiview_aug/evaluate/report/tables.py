@@ -74,6 +74,41 @@ OVERLAP_NOTES = (
     "to their half-way view over the street's surface. Compare methods of one surface: views rendered over the street "
     "agree there even where the street is wrong."
 )
+LABEL_COLUMNS = (
+    ("labelled", "{objects:.0f}"),
+    ("recall", "{recall:.2f} [{recall_low:.2f}, {recall_high:.2f}]"),
+    ("IoU", "{iou:.2f} [{iou_low:.2f}, {iou_high:.2f}]"),
+    ("clear", "{clear_objects:.0f}"),
+    ("clear recall", "{clear_recall:.2f} [{clear_recall_low:.2f}, {clear_recall_high:.2f}]"),
+    ("clear IoU", "{clear_iou:.2f} [{clear_iou_low:.2f}, {clear_iou_high:.2f}]"),
+)
+LABEL_NOTES = (
+    "labelled: vehicles and people within the images, by their labels. recall: share with a detection of score above "
+    "0.5 whose centre is nearest to theirs, within 10 pixels of 480 x 320. IoU: mean with their labels, 0 without one "
+    "(NTA-IoU). clear: those that other labelled objects hide by no more than half, with 4 LiDAR points or more where "
+    "the data has points. Intervals: 95 %, bootstrap over objects."
+)
+DETECTION_COLUMNS = (
+    ("true objects", "{true_objects:.0f}"),
+    ("AP .5", "{ap_50:.2f} [{ap_50_low:.2f}, {ap_50_high:.2f}]"),
+    ("AP .7", "{ap_70:.2f} [{ap_70_low:.2f}, {ap_70_high:.2f}]"),
+    ("false alarms", "{false_alarms:.0f} in {filled:.0f} views"),
+)
+DETECTION_NOTES = (
+    "true objects: detections of score 0.5 or more in the true images, whatever their class. AP: of the detections in "
+    "the views against them, at these IoUs; less sure ones there neither count nor cost. Intervals: 95 %, bootstrap "
+    "over objects and misses. false alarms: detections on generated pixels that touch no label and no true object (IoU "
+    "below 0.1); a dash where no pixels are generated."
+)
+ROAD_COLUMNS = (
+    ("views", "{road_views:.0f}"),
+    ("drivable area IoU", "{area_iou:.2f} [{area_iou_low:.2f}, {area_iou_high:.2f}]"),
+    ("lane marks IoU", "{lanes_iou:.2f} [{lanes_iou_low:.2f}, {lanes_iou_high:.2f}]"),
+)
+ROAD_NOTES = (
+    "IoU of the segmenter's masks in the views with those in the true images, over all pixels; intervals 95 %, "
+    "bootstrap over views."
+)
 SCAN_COLUMNS = (
     ("recall", "{recall:.1%}"),
     ("precision", "{precision:.1%}"),
@@ -119,6 +154,20 @@ def evaluation_tables(done: Evaluation, methods: Sequence[str]) -> list[Table]:
         table = (title, rows, SPARSE_COLUMNS, notes)
     agreement = {name: done.agreement(name) for name in names}
     return [table, ("Agreement of neighbours", agreement, OVERLAP_COLUMNS, OVERLAP_NOTES)]
+
+
+def judge_tables(rows: Mapping[str, Mapping[str, float]]) -> list[Table]:
+    """Tabulate judges' figures, by row: labelled objects, detections and road, for the rows that have them."""
+    tables: list[tuple[set[str], str, Columns, str]] = [
+        ({"objects"}, "Labelled objects that the detector finds", LABEL_COLUMNS, LABEL_NOTES),
+        ({"true_objects", "false_alarms"}, "Detections in views and true images", DETECTION_COLUMNS, DETECTION_NOTES),
+        ({"road_views"}, "Road in views and true images", ROAD_COLUMNS, ROAD_NOTES),
+    ]
+    shown: list[Table] = []
+    for keys, title, columns, notes in tables:
+        having = {name: row for name, row in rows.items() if keys & row.keys()}
+        shown += [(title, having, columns, notes)] if having else []
+    return shown
 
 
 def text_table(title: str, rows: Mapping[str, Mapping[str, float]], columns: Columns, notes: str = "") -> str:

@@ -39,17 +39,6 @@ def test_the_short_tables_of_the_benchmarks_are_the_reports(name):
     assert SHORT[name] == summary(json.loads((FOLDER / "results" / f"{name}.json").read_text()))
 
 
-def test_reports_without_intervals_are_written_as_points():
-    report = json.loads((FOLDER / "results" / "rest.json").read_text())
-    assert "[95 % interval]" in markdown(report)
-    for change in report["changes"].values():
-        for row in change["variants"].values():
-            for figure in filter(None, (row["iou"], row["over_raw"], row["share"])):
-                del figure["low"], figure["high"]
-    text = markdown(report)
-    assert "[" not in text and "interval" not in text
-
-
 def test_a_short_table_of_one_change_has_a_row_for_each_variant():
     table = summary(json.loads((FOLDER / "results" / "recipe.json").read_text())).splitlines()
     assert table[0].startswith("| trained on | samples seen | IoU ")

@@ -124,7 +124,7 @@ def test_what_cannot_be_run_is_refused(roots, tmp_path, capsys):
         assert command.main(["--quick", "--output", str(tmp_path), *given]) == 2
         return capsys.readouterr().err
 
-    assert "row_split needs the streets' truth" in said("--real", *roots, "--variants", "raw", "row_split")
+    assert "learned needs the streets' truth" in said("--real", *roots, "--variants", "raw", "learned")
     assert "expected 3 drives or more to split, found 2" in said("--real", roots[1], roots[0])
     assert "expected a folder, found none" in said("--real", roots[0], str(tmp_path / "nothing"))
     sample = {"token": "t", "boxes_3d": torch.zeros(0, 7)}

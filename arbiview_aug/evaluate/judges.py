@@ -1,0 +1,301 @@
+"""Networks that judge views: detectors and segmenters that were trained on photographs, by the names of the options.
+
+Detectors take an RGB image (H, W, 3) uint8 and return ``Detections``; segmenters return two masks of the image's size.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from collections.abc import Callable, Collection, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import DataError, described, shown
+from arbiview_aug.evaluate.report.pictures import Picture
+from arbiview_aug.inpaint.networks import load_torchscript
+from arbiview_aug.temporal.transformers_depth import load_pretrained
+
+
+class Detections(NamedTuple):
+    """Objects that a detector sees in an image.
+
+    Attributes:
+        boxes: (n, 4) float64 x0 y0 x1 y1 in pixels, within the image.
+        scores: (n,) float64 in [0, 1].
+        labels: n names or class numbers, as text.
+    """
+
+    boxes: FloatArray
+    scores: FloatArray
+    labels: Sequence[str]
+
+    def subset(self, chosen: BoolArray) -> Detections:
+        """The detections that a mask (n,) chooses."""
+        labels = [label for label, keep in zip(self.labels, chosen, strict=True) if keep]
+        return Detections(self.boxes[chosen], self.scores[chosen], labels)
+
+
+Detector = Callable[[Picture], Detections]
+Segmenter = Callable[[Picture], BoolArray]
+
+SEGMENTED = (360, 640)
+"""(h, w) of the 16:9 crop that a TorchScript segmenter sees: TwinLiteNet's."""
+
+LEAST_SCORE = 0.05
+"""Detections below it are left out: torchvision's default of Faster R-CNN."""
+
+_WORDS = (
+    *("person", "people", "pedestrian", "human", "rider", "cyclist", "bicyclist", "motorcyclist"),
+    *("bicycle", "bike", "motorcycle", "motorbike", "vehicle", "car", "van", "truck", "lorry", "bus", "trailer"),
+)
+
+
+def is_road_user(name: str) -> bool:
+    """Whether a class name is of vehicles or people: COCO's ``car``, nuScenes' ``vehicle.car``, ``BOX_TRUCK``."""
+    words = re.split(r"[^a-z]+", name.lower())
+    return "static" not in words and not {*words}.isdisjoint(_WORDS)  # static_object.bicycle_rack
+
+
+# --- detectors --------------------------------------------------------------------------------------------------------
+def load_detector(
+    name: str, weights: str | None = None, classes: Collection[str] = (), device: torch.device | str = "cpu"
+) -> Detector:
+    """Load the detector that ``--detector`` names; it returns the detections that count.
+
+    Args:
+        name: ``FILE.py:function``, the name of a torchvision detector, or a folder or hub id of transformers.
+        weights: File of a torchvision detector's weights.
+        classes: Labels that count, names or numbers as text. By default names of vehicles and people, and all numbers.
+        device: Where a network of transformers or torchvision runs.
+
+    Raises:
+        DataError: No such detector, or one that does not fit; its calls raise it for outputs of other shapes.
+    """
+    option = f"--detector {name}"
+    if names_a_function(name):
+        if weights is not None:
+            raise DataError(f"--detector-weights: expected it with a torchvision detector alone, got {option}")
+        detect, names = _function(option, name), None
+    elif weights is not None or name in _torchvision_detectors():
+        detect, names = _of_torchvision(option, name, weights, device)
+    else:
+        detect, names = _of_transformers(option, name, device)
+    if names is not None and (unknown := {*classes} - {*names}):
+        raise DataError(f"--detector-classes: expected names that {name} has, {shown(names)}, got {sorted(unknown)}")
+    if names is not None and not classes and not any(map(is_road_user, names)):
+        raise DataError(f"{option}: no class is a vehicle or person: {shown(names)}; choose by --detector-classes")
+
+    def detector(image: Picture) -> Detections:
+        found = checked_detections(option, _called(option, detect, image), image)
+        counts = [label in classes if classes else label.isdecimal() or is_road_user(label) for label in found.labels]
+        return found.subset(np.array(counts, bool))
+
+    return detector
+
+
+def checked_detections(option: str, output: Any, image: Picture) -> Detections:
+    """What a detector returned for an image, as ``Detections`` cut at the image's border.
+
+    Raises:
+        DataError: Not boxes (n, 4), scores (n,) and n labels; or boxes that are not finite and ordered.
+    """
+    expected = f"{option}: expected boxes (n, 4) x0 y0 x1 y1, scores (n,) and n labels for an image {image.shape}"
+    if not isinstance(output, tuple | list) or len(output) != 3:
+        got = f"{len(output)} values" if isinstance(output, tuple | list) else type(output).__name__
+        raise DataError(f"{expected}, got {got}")
+    try:
+        boxes, scores = (np.asarray(_host(part), np.float64) for part in output[:2])
+        labels = np.asarray(_host(output[2])).reshape(-1)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{expected}, got other values: {error}") from None
+    boxes = boxes.reshape(0, 4) if boxes.size == 0 else boxes
+    if boxes.ndim != 2 or boxes.shape[1] != 4 or scores.shape != (len(boxes),) or len(labels) != len(boxes):
+        raise DataError(f"{expected}, got {boxes.shape}, {scores.shape} and {len(labels)}")
+    if not np.isfinite(boxes).all() or (boxes[:, :2] > boxes[:, 2:]).any():
+        bad = boxes[~np.isfinite(boxes).all(axis=1) | (boxes[:, :2] > boxes[:, 2:]).any(axis=1)][0]
+        raise DataError(f"{expected}: finite, with x0 <= x1 and y0 <= y1, got {bad.tolist()}")
+    if not ((scores >= 0) & (scores <= 1)).all():
+        raise DataError(f"{expected}: scores from 0 to 1, got {shown(scores.tolist())}")
+    h, w = image.shape[:2]
+    texts = [str(int(one)) if np.issubdtype(labels.dtype, np.number) else str(one) for one in labels]
+    return Detections(boxes.clip(0, (w, h, w, h)), scores, texts)
+
+
+def _host(part: Any) -> Any:
+    return part.detach().cpu() if isinstance(part, torch.Tensor) else part
+
+
+def _torchvision_detectors() -> list[str]:
+    from torchvision import models
+
+    return list(models.list_models(module=models.detection))
+
+
+def _of_torchvision(
+    option: str, name: str, weights: str | None, device: torch.device | str
+) -> tuple[Callable[[Picture], Any], list[str]]:
+    from torchvision import models
+
+    if name not in _torchvision_detectors():
+        known = ", ".join(_torchvision_detectors())
+        raise DataError(f"{option}: expected a torchvision detector with --detector-weights: {known}")
+    if weights is None:
+        raise DataError(f"{option}: expected --detector-weights FILE with a torchvision detector, found none")
+    names = list(models.get_model_weights(name).DEFAULT.meta["categories"])
+    model = models.get_model(name, weights=None, weights_backbone=None)
+    file = f"--detector-weights {weights}"
+    try:
+        state = torch.load(weights, map_location="cpu", weights_only=True)
+        model.load_state_dict(state["model"] if "model" in state else state)  # torchvision's references save more
+    except FileNotFoundError:
+        raise DataError(f"{file}: expected a file, found none") from None
+    except Exception as error:  # pickle, zip, torch and mappings each have their own
+        fix = f"expected weights of torchvision's {name} for its {len(names)} classes (others: FILE.py:function)"
+        raise DataError(f"{file}: {fix}: {_one_line(error)}") from None
+    model.eval().to(device)
+
+    @torch.inference_mode()
+    def detect(image: Picture) -> Any:
+        pixels = torch.from_numpy(image).to(device).permute(2, 0, 1).float() / 255
+        (out,) = model([pixels])
+        return out["boxes"], out["scores"], [names[label] for label in out["labels"].tolist()]
+
+    return detect, names
+
+
+def _of_transformers(
+    option: str, name: str, device: torch.device | str
+) -> tuple[Callable[[Picture], Any], list[str]]:
+    try:
+        transformers = optional_package("transformers", "depth")
+    except ImportError as error:
+        raise DataError(f"{option}: {error}") from None
+    expected = "FILE.py:function, a torchvision detector's name, or a folder with config.json or a model of the Hub"
+    config = load_pretrained(transformers.AutoConfig, option, name, expected)
+    if type(config) not in transformers.MODEL_FOR_OBJECT_DETECTION_MAPPING:
+        kind = type(config).__name__
+        raise DataError(f"{option}: expected a model that detects objects, such as facebook/detr-resnet-50, got {kind}")
+    beside = "preprocessor_config.json beside the model"
+    processor = load_pretrained(transformers.AutoImageProcessor, option, name, beside)
+    loaded = load_pretrained(transformers.AutoModelForObjectDetection, option, name, "weights of the model")
+    model, names = loaded.float().eval().to(device), [str(one) for one in config.id2label.values()]
+
+    @torch.inference_mode()
+    def detect(image: Picture) -> Any:
+        inputs = processor(images=image, return_tensors="pt").to(device)
+        sizes = [image.shape[:2]]
+        (out,) = processor.post_process_object_detection(model(**inputs), threshold=LEAST_SCORE, target_sizes=sizes)
+        return out["boxes"], out["scores"], [str(config.id2label[label]) for label in out["labels"].tolist()]
+
+    return detect, names
+
+
+# --- segmenters -------------------------------------------------------------------------------------------------------
+def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
+    """Load the segmenter that ``--segmenter`` names; it returns (2, H, W) bool: drivable area, lane marks.
+
+    Args:
+        name: ``FILE.py:function``, which returns the same masks; or a TorchScript file of TwinLiteNet's kind: of images
+            (1, 3, 360, 640), RGB in [0, 1], it returns two (1, 2, 360, 640) logits: area and lanes, against others. It
+            sees the 16:9 part of an image that is left when the top or the sides are cut; the rest has no masks.
+        device: Where TorchScript runs.
+
+    Raises:
+        DataError: No such file or function; its calls raise it for outputs of other shapes.
+    """
+    option = f"--segmenter {name}"
+    segment = _function(option, name) if names_a_function(name) else _of_torchscript(option, name, device)
+
+    def segmenter(image: Picture) -> BoolArray:
+        masks = _called(option, segment, image)
+        try:
+            array = np.asarray(_host(masks))
+        except (TypeError, ValueError):
+            array = np.zeros(0)
+        expected = (2, *image.shape[:2])
+        if array.shape != expected or not np.isin(array, (0, 1)).all():
+            got = f"{array.dtype} {array.shape}" if array.shape and array.size else type(masks).__name__
+            raise DataError(f"{option}: expected masks {expected} of 0 and 1: drivable area and lane marks, got {got}")
+        return array.astype(bool)
+
+    return segmenter
+
+
+def _of_torchscript(option: str, name: str, device: torch.device | str) -> Callable[[Picture], BoolArray]:
+    network = load_torchscript(name, option, DataError).to(device).eval()
+    logits = (1, 2, *SEGMENTED)
+
+    @torch.inference_mode()
+    def segment(image: Picture) -> BoolArray:
+        part = _wide_part(*image.shape[:2])
+        small = cv2.resize(image[part], SEGMENTED[::-1], interpolation=cv2.INTER_AREA)
+        pixels = torch.from_numpy(small).to(device).permute(2, 0, 1)[None].float() / 255
+        out = network(pixels)
+        shapes = [tuple(one.shape) for one in out if isinstance(one, torch.Tensor)]
+        if not isinstance(out, tuple | list) or shapes != [logits, logits]:
+            got = shapes if isinstance(out, tuple | list) else type(out).__name__
+            raise DataError(f"{option}: expected two outputs {logits} for {tuple(pixels.shape)}, got {got}")
+        masks = np.zeros((2, *image.shape[:2]), bool)
+        for mask, one in zip(masks, out, strict=True):
+            h, w = mask[part].shape
+            mask[part] = cv2.resize(one[0].argmax(0).byte().cpu().numpy(), (w, h), interpolation=cv2.INTER_NEAREST) > 0
+        return masks
+
+    return segment
+
+
+def _wide_part(h: int, w: int) -> tuple[slice, slice]:
+    """Rows and columns of an image's 16:9 part, cut at the top or on both sides."""
+    wide, high = min(w, h * 16 // 9), min(h, max(1, w * 9 // 16))
+    return slice(h - high, h), slice((w - wide) // 2, (w - wide) // 2 + wide)
+
+
+# --- functions in files -----------------------------------------------------------------------------------------------
+def names_a_function(name: str) -> bool:
+    """Whether an option's value is ``FILE.py:function`` or, by mistake, ``FILE.py`` alone."""
+    return name.endswith(".py") or ".py:" in name
+
+
+def _function(option: str, name: str) -> Callable[[Picture], Any]:
+    """Import the function that ``FILE.py:function`` names."""
+    file, _, wanted = (name, "", "") if name.endswith(".py") else name.rpartition(":")
+    if not wanted:
+        raise DataError(f"{option}: expected FILE.py:function, got no function; add its name, such as {file}:detect")
+    path = Path(file)
+    if not path.is_file():
+        raise DataError(f"{option}: expected a file {file}, found none")
+    spec = importlib.util.spec_from_file_location(f"arbiview_aug_judge_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except (Exception, SystemExit) as error:
+        raise DataError(f"{option}: importing {file} raised {type(error).__name__}: {_one_line(error)}") from error
+    function = getattr(module, wanted, None)
+    if not callable(function):
+        there = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
+        raise DataError(f"{option}: expected a function {wanted} in {file}, found {shown(there)}")
+    return function  # type: ignore[no-any-return]
+
+
+def _called(option: str, function: Callable[[Picture], Any], image: Picture) -> Any:
+    """Call a judge; it may raise anything."""
+    try:
+        return function(image)
+    except DataError:
+        raise
+    except Exception as error:
+        text = " ".join(described(error).split())[:300]
+        raise DataError(f"{option}: raised {text} for an image {image.shape} {image.dtype}") from error
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:300]

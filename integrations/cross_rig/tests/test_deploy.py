@@ -1,0 +1,91 @@
+"""A's detectors on B's frames: what is shown, and a whole run at toy size that goes on where it was."""
+
+import numpy as np
+import pytest
+
+from integrations.cross_rig import __main__ as command
+from integrations.cross_rig import cache, deploy
+from integrations.cross_rig.deploy import ON_A, ON_B, Jittered, Trained, frames_of, rows_of
+from integrations.cross_rig.experiment import Run
+from integrations.cross_rig.settings import Settings, jobs
+from integrations.cross_rig.training import Schedule, untrained
+
+TINY = Settings(
+    size=(24, 64),
+    train_frames=2,
+    val_frames=1,
+    test_frames=2,
+    seeds=(0,),
+    changes=("fisheye", "up70", "waymo"),
+    variants=("raw",),
+    schedule=Schedule(steps=2, batch=2, precision="fp32"),
+)
+
+
+def test_rows_are_those_that_say_something(tmp_path):
+    setup = Run(settings=TINY, output=tmp_path)
+    in_place = ["as is", "calibration not read", "infinity", "infinity, masked", "A's true frames"]
+    assert list(rows_of(setup, "fisheye")) == in_place
+    assert rows_of(setup, "up70") == ON_B
+    assert set(ON_B) - set(rows_of(setup, "waymo")) == {"calibration not read"}  # it has other cameras
+    assert rows_of(setup, None) == ON_A
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "CHUNK_FRAMES", 1)
+        setup, lines = Run(settings=TINY, output=tmp_path_factory.mktemp("deploy")), []
+        yield setup, deploy.deploy(setup, None, lines.append), lines
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_what_is_done_is_not_done_again(done, monkeypatch):
+    setup, text, lines = done
+    assert len(lines) == sum(len(rows_of(setup, change)) for change in (None, *TINY.changes))
+    monkeypatch.setattr(deploy, "evaluate", None)
+    assert deploy.deploy(setup, None, lines.append) == text
+    for title in ("fisheye, 100° wide", "+0.7 m", "Waymo-like", "A, calibration that errs", *ON_A, *ON_B):
+        assert f"| {title}" in text
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_frames_are_shown_as_their_rows_say(done):
+    setup, _, _ = done
+    schedule = setup.schedule(jobs(setup.settings)[0])
+    detector = Trained(untrained(schedule).eval(), "untrained", schedule)
+    a, b = setup.source("test").rig, setup.source("test", "up70").rig
+    shown = {title: frames_of(setup, detector, "up70", way, "test") for title, way in ON_B.items()}
+    frames = {title: of_row.frame(1) for title, of_row in shown.items()}
+    for title, frame in frames.items():
+        rig = b if title == "as is" else a
+        np.testing.assert_allclose(frame.cam2ego, rig.cam2ego, atol=1e-6)
+        np.testing.assert_array_equal(frame.state, frames["as is"].state)
+        has_holes = title.endswith("masked") and title != "infinity, masked"  # turned and zoomed alike
+        assert frame.coverage.all() == (not has_holes)
+    np.testing.assert_array_equal(frames["as is"].images, frames["calibration not read"].images)
+    assert len({frame.images.tobytes() for frame in frames.values()}) > 5
+
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_calibration_errs_the_same_each_time(done):
+    setup, _, _ = done
+    schedule, a = setup.schedule(jobs(setup.settings)[0]), setup.source("test").rig
+    detector = Trained(untrained(schedule), "untrained", schedule)
+    own = frames_of(setup, detector, None, ON_A["1°"], "test")
+    assert isinstance(own, Jittered)
+    poses = own.frame(0).cam2ego
+    np.testing.assert_array_equal(poses, own.frame(0).cam2ego)
+    cosines = np.einsum("nij,nij->n", a.cam2ego[:, :3, :3], poses[:, :3, :3]) / 2 - 0.5
+    assert 0.2 < np.degrees(np.arccos(cosines)).mean() < 5
+    np.testing.assert_allclose(poses[:, :3, 3], a.cam2ego[:, :3, 3], atol=1e-6)
+
+
+def test_command_takes_rows(capsys, tmp_path):
+    with pytest.raises(SystemExit):
+        command.main(["--small", "--output", str(tmp_path), "--deploy", "nothing"])
+    assert "learned depth" in capsys.readouterr().err

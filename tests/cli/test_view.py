@@ -1,0 +1,66 @@
+"""The view command: a recording that Rerun reads, and errors that name what is missing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from arbiview_aug import load_rig
+from arbiview_aug.__main__ import main
+from arbiview_aug.cli.view import _field_of_view
+from tests.helpers import camera
+
+TINY = ["--size", "24x64", "--frames", "2"]
+
+
+def rerun(*arguments: str | Path) -> str:
+    """What Rerun's own command prints."""
+    command = [sys.executable, "-m", "rerun", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=100).stdout
+
+
+@pytest.mark.slow
+def test_rerun_reads_the_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A drive whose target has lenses and scanners."""
+    pytest.importorskip("rerun")
+    path = tmp_path / "new" / "drive.rrd"
+    assert main(["view", *TINY, "--target", "waymo", "--output", str(path)]) == 0
+    assert f"recording: {path} (2 frames, " in capsys.readouterr().out
+    rerun("rrd", "verify", path)
+    printed = rerun("rrd", "print", path)
+    cameras = {"source": "front", "target": "FRONT"}
+    paths = [f"/ego/{side}/{name}/{layer}" for side, name in cameras.items() for layer in ("image", "boxes")]
+    paths += [f"/ego/target/FRONT/{layer}" for layer in ("coverage", "confidence", "sees")]
+    for entity in (*paths, "/ego/boxes", "/ego/source_points", "/ego/target_points", "/ego/source/front"):
+        assert f"{entity} " in printed, entity
+    assert "/ego/source/front/sees" not in printed  # it has no lens
+
+
+def test_without_rerun_one_line_says_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main(["view", *TINY, "--output", str(tmp_path / "drive.rrd")]) == 2
+    expected = "python -m arbiview_aug view: rerun is not installed: pip install 'arbiview_aug[viewer]'\n"
+    assert capsys.readouterr().err == expected
+
+
+def test_a_recording_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rerun")
+    (tmp_path / "drive.rrd").symlink_to(tmp_path / "none" / "drive.rrd")
+    assert main(["view", "--size", "8x22", "--frames", "1", "--output", str(tmp_path / "drive.rrd")]) == 2
+    assert "expected a file that can be written to" in capsys.readouterr().err
+
+
+def test_a_lens_sees_what_its_lines_enclose() -> None:
+    pinhole = camera()
+    ring, *spokes = _field_of_view(pinhole)
+    uv = pinhole.project_cam(ring).uv
+    on_border = np.isclose(uv, 0, atol=1e-6) | np.isclose(uv, np.array(pinhole.size[::-1]) - 1, atol=1e-6)
+    assert on_border.any(axis=-1).all() and all((spoke[0] == 0).all() for spoke in spokes)
+    for fisheye in load_rig("fisheye_surround"):
+        assert np.isfinite(_field_of_view(fisheye)[0]).all()

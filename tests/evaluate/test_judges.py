@@ -1,0 +1,199 @@
+"""Judges by the names of their options: stubs in files, tiny networks, and refusals that name option, file and fix."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.judges import SEGMENTED, is_road_user, load_detector, load_segmenter
+
+IMAGE = np.random.default_rng(0).integers(0, 256, (90, 160, 3), np.uint8)
+ONE = "[[10, 20, 30, 40]], [0.9]"
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Callable[[str], str]:
+    """Write a file with a function ``judge`` that returns an expression, and name it as the options do."""
+
+    def write(expression: str, head: str = "import numpy as np, torch") -> str:
+        (tmp_path / "own.py").write_text(f"{head}\ndef judge(rgb):\n    return {expression}\nnumber = 3\n")
+        return f"{tmp_path / 'own.py'}:judge"
+
+    return write
+
+
+def test_road_users() -> None:
+    yes = ("car", "vehicle.car", "human.pedestrian.adult", "BOX_TRUCK", "TYPE_CYCLIST", "Person_sitting", "Van")
+    no = ("static_object.bicycle_rack", "movable_object.trafficcone", "traffic light", "cat", "carpet", "LABEL_0")
+    assert all(map(is_road_user, yes)) and not any(map(is_road_user, no))
+
+
+# --- functions --------------------------------------------------------------------------------------------------------
+def test_a_function_of_a_file(file: Callable[[str], str]) -> None:
+    boxes = "[[-5.0, 2, 200, 50], [1, 2, 3, 4], [1, 2, 3, 4]]"
+    found = load_detector(file(f"torch.tensor({boxes}), np.array([0.9, 0.8, 0.7]), ['car', 'cat', 'person']"))(IMAGE)
+    assert found.boxes.tolist() == [[0, 2, 160, 50], [1, 2, 3, 4]], "cut at the border; a cat is no road user"
+    assert found.labels == ["car", "person"] and found.scores.tolist() == [0.9, 0.7]
+    nothing = load_detector(file("[], [], []"))(IMAGE)
+    assert nothing.boxes.shape == (0, 4) and nothing.scores.shape == (0,)
+
+
+def test_classes_that_count(file: Callable[[str], str]) -> None:
+    numbers = file("[[0, 0, 9, 9]] * 3, [0.5] * 3, torch.tensor([2, 7, 9])")
+    assert load_detector(numbers)(IMAGE).labels == ["2", "7", "9"], "numbers say nothing, so all count"
+    assert load_detector(numbers, classes=["2", "9"])(IMAGE).labels == ["2", "9"]
+    assert load_detector(file(f"{ONE}, ['cat']"), classes=["cat"])(IMAGE).labels == ["cat"]
+
+
+@pytest.mark.parametrize(
+    ("expression", "message"),
+    [
+        ("np.zeros((2, 4))", "expected boxes (n, 4) x0 y0 x1 y1, scores (n,) and n labels for an image (90, 160, 3), "),
+        ("[[1, 2, 3]], [0.5], [0]", "got (1, 3), (1,) and 1"),
+        ("[[1, 2, 3, 4]], [0.5, 0.4], [0]", "got (1, 4), (2,) and 1"),
+        ("[[1, 2, 3, 4]], [0.5], []", "got (1, 4), (1,) and 0"),
+        ("[[1, 2, float('nan'), 4]], [0.5], [0]", "finite, with x0 <= x1 and y0 <= y1, got [1.0, 2.0, nan, 4.0]"),
+        ("[[9, 2, 3, 4]], [0.5], [0]", "finite, with x0 <= x1 and y0 <= y1, got [9.0, 2.0, 3.0, 4.0]"),
+        ("[[1, 2, 3, 4]], [50], [0]", "scores from 0 to 1, got [50.0]"),
+        ("'abc', [0.5], [0]", "got other values"),
+        ("rgb.missing", "raised AttributeError: 'numpy.ndarray' object has no attribute 'missing' for an image"),
+    ],
+)
+def test_detections_of_other_shapes(file: Callable[[str], str], expression: str, message: str) -> None:
+    name = file(expression)
+    with pytest.raises(DataError, match=re.escape(f"--detector {name}: ") + ".*" + re.escape(message)):
+        load_detector(name)(IMAGE)
+
+
+@pytest.mark.parametrize("load", [load_detector, load_segmenter])
+def test_files_without_a_function(load: Callable[[str], object], file: Callable[..., str], tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"expected a file .*none\.py, found none"):
+        load(f"{tmp_path}/none.py:judge")
+    name = file("1")
+    with pytest.raises(DataError, match=r"expected FILE.py:function, got no function; add its name"):
+        load(name.removesuffix(":judge"))
+    for missing in ("missing", "number"):
+        with pytest.raises(DataError, match=rf"expected a function {missing} in .*own\.py, found \['judge'\]"):
+            load(name.replace(":judge", f":{missing}"))
+    with pytest.raises(DataError, match=r"importing .*own\.py raised ModuleNotFoundError: No module named 'nowhere'"):
+        load(file("1", "import nowhere"))
+    with pytest.raises(DataError, match=r"importing .*own\.py raised SystemExit: 3"):
+        load(file("1", "raise SystemExit(3)"))
+
+
+def test_a_segmenter_of_a_file(file: Callable[[str], str]) -> None:
+    masks = load_segmenter(file("np.stack([rgb[..., 0] > 9, rgb[..., 1] > 9])"))(IMAGE)
+    assert masks.dtype == np.bool_ and np.array_equal(masks, IMAGE.transpose(2, 0, 1)[:2] > 9)
+    wrong_ones = {"rgb[..., 0] > 9": "bool (90, 160)", "rgb.transpose(2, 0, 1)[:2]": "uint8", "None": "NoneType"}
+    for wrong, got in wrong_ones.items():
+        with pytest.raises(DataError, match=r"--segmenter .*expected masks \(2, 90, 160\).*got " + re.escape(got)):
+            load_segmenter(file(wrong))(IMAGE)
+
+
+# --- networks ---------------------------------------------------------------------------------------------------------
+class Half(torch.nn.Module):
+    """Drivable: the lower half; lanes: the left half."""
+
+    def forward(self, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        logits = torch.zeros(2, 1, 2, pixels.size(2), pixels.size(3))
+        logits[0, :, 1, pixels.size(2) // 2 :] = pixels.max()
+        logits[1, :, 1, :, : pixels.size(3) // 2] = 1
+        return logits[0], logits[1]
+
+
+class Wrong(torch.nn.Module):
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        return pixels
+
+
+@pytest.mark.parametrize(
+    ("shape", "rows", "columns"),
+    [((90, 160), (0, 90), (0, 160)), ((90, 400), (0, 90), (120, 280)), ((200, 160), (110, 200), (0, 160))],
+)
+def test_torchscript_sees_the_wide_part(
+    shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int], tmp_path: Path
+) -> None:
+    torch.jit.save(torch.jit.script(Half()), str(tmp_path / "half.ts"))
+    area, lanes = load_segmenter(str(tmp_path / "half.ts"))(np.full((*shape, 3), 255, np.uint8))
+    for mask, (top, bottom, left, right) in (
+        (area, (sum(rows) // 2, rows[1], *columns)),
+        (lanes, (*rows, columns[0], sum(columns) // 2)),
+    ):
+        expected = np.zeros(shape, bool)
+        expected[top:bottom, left:right] = True
+        np.testing.assert_array_equal(mask, expected)
+
+
+def test_torchscript_of_another_kind(tmp_path: Path) -> None:
+    torch.jit.save(torch.jit.script(Wrong()), str(tmp_path / "wrong.ts"))
+    h, w = SEGMENTED
+    message = rf"wrong\.ts: expected two outputs \(1, 2, {h}, {w}\) for \(1, 3, {h}, {w}\), got Tensor"
+    with pytest.raises(DataError, match=message):
+        load_segmenter(str(tmp_path / "wrong.ts"))(IMAGE)
+    (tmp_path / "text.ts").write_text("none")
+    for name in ("text.ts", "missing.ts"):
+        with pytest.raises(DataError, match=rf"--segmenter .*{name}: expected a TorchScript file"):
+            load_segmenter(str(tmp_path / name))
+
+
+@pytest.mark.slow
+def test_torchvisions_detectors(tmp_path: Path, file: Callable[[str], str]) -> None:
+    from torchvision.models.detection import ssdlite320_mobilenet_v3_large as ssdlite
+
+    name, weights = "ssdlite320_mobilenet_v3_large", tmp_path / "weights.pth"
+    torch.manual_seed(0)
+    state = ssdlite(weights=None, weights_backbone=None).state_dict()
+    torch.save({"model": state}, weights)
+    found = load_detector(name, str(weights), classes=["car", "person", "bus"])(IMAGE)
+    assert found.boxes.shape == (len(found.labels), 4) and {*found.labels} <= {"car", "person", "bus"}
+    with pytest.raises(DataError, match=r"--detector-classes: expected names that .* has, .*got \['horse-cart'\]"):
+        load_detector(name, str(weights), classes=["horse-cart"])
+    with pytest.raises(DataError, match="expected --detector-weights FILE with a torchvision detector, found none"):
+        load_detector(name)
+    with pytest.raises(DataError, match=r"--detector resnet: expected a torchvision detector .*: .*retinanet"):
+        load_detector("resnet", str(weights))
+    with pytest.raises(DataError, match=r"--detector-weights .*none\.pth: expected a file, found none"):
+        load_detector(name, str(tmp_path / "none.pth"))
+    torch.save(dict(list(state.items())[:5]), weights)
+    with pytest.raises(DataError, match=r"expected weights of torchvision's ssdlite.* its 91 classes .*Missing key"):
+        load_detector(name, str(weights))
+    weights.write_text("none")
+    with pytest.raises(DataError, match=r"weights\.pth: expected weights of torchvision's ssdlite"):
+        load_detector(name, str(weights))
+    with pytest.raises(DataError, match="--detector-weights: expected it with a torchvision detector alone"):
+        load_detector(file("1"), str(weights))
+
+
+@pytest.mark.slow
+def test_detectors_of_transformers(tmp_path: Path) -> None:
+    transformers = pytest.importorskip("transformers", reason="pip install 'arbiview_aug[depth]'")
+    settings = {
+        **{"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16},
+        **{"image_size": [64, 96], "num_detection_tokens": 5},
+    }
+    torch.manual_seed(0)
+    for labels in (["cat", "car"], ["cat", "dog"]):
+        config = transformers.YolosConfig(**settings, id2label=dict(enumerate(labels)))
+        transformers.YolosForObjectDetection(config).save_pretrained(tmp_path / labels[1])
+        size = {"height": 64, "width": 96}
+        transformers.YolosImageProcessor(size=size, do_pad=False).save_pretrained(tmp_path / labels[1])
+    found = load_detector(str(tmp_path / "car"), classes=["cat", "car"])(IMAGE)
+    assert len(found.boxes) == 5 and {*found.labels} <= {"cat", "car"} and (found.scores >= 0.05).all()
+    assert {*load_detector(str(tmp_path / "car"))(IMAGE).labels} <= {"car"}
+    with pytest.raises(DataError, match=r"no class is a vehicle or person: \['cat', 'dog'\]; choose by"):
+        load_detector(str(tmp_path / "dog"))
+    transformers.ViTConfig().save_pretrained(tmp_path / "other")
+    with pytest.raises(DataError, match=r"expected a model that detects objects, such as .*, got ViTConfig"):
+        load_detector(str(tmp_path / "other"))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match=r"--detector .*empty: expected FILE.py:function, a torchvision"):
+        load_detector(str(tmp_path / "empty"))
+    (tmp_path / "car" / "model.safetensors").unlink()
+    with pytest.raises(DataError, match=r"--detector .*car: expected weights of the model"):
+        load_detector(str(tmp_path / "car"))
