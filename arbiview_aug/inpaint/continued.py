@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -228,7 +227,6 @@ def _fill(
     put_cells(sums, cell, (~seen).view(np.uint8), 0.5 if view.dtype == np.uint8 else 0.0, view)
 
 
-@lru_cache(64)  # of a fixed target they are the same for every frame
 def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
     """Directions (2, 2, n, n) in the image, x and y, of lines along the heading and vertical ones, as kernels read."""
     if camera is None:

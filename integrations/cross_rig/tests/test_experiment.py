@@ -81,14 +81,15 @@ def test_what_is_done_is_not_done_again(done, monkeypatch):
 
 @pytest.mark.slow
 def test_variants_with_the_same_frames_are_one_training(done):
-    """Every surface is the same when the centres stay: only the far one is trained."""
-    more = replace(done, settings=replace(TINY, variants=("raw", "far", "street", "oracle")))
+    """Every surface is the same when the centres stay: only the first one is trained."""
+    more = replace(done, settings=replace(TINY, variants=("raw", "street_fill", "objects_fill", "oracle")))
     assert list(run(more, 1, lambda line: None)) == [1, 0]
     results = load_results(more, "voxels")["fov50"]
-    assert set(results) == {"raw", "far", "street", "oracle"} and results["far"] == results["street"]
+    assert set(results) == {"raw", "street_fill", "objects_fill", "oracle"}
+    assert results["street_fill"] == results["objects_fill"]
     report = write_report(more)
-    assert report["changes"]["fov50"]["same_frames"] == {"street": "far"}
-    assert "| street (the frames of far) |" in markdown(report)
+    assert report["changes"]["fov50"]["same_frames"] == {"objects_fill": "street_fill"}
+    assert "| objects, filled holes, no mask (the frames of street, filled holes, no mask) |" in markdown(report)
 
 
 @pytest.mark.slow
@@ -139,7 +140,7 @@ def test_report(done):
         assert (row["loading_cpu_s"] > 0) == (name in ("scale_crop", "objects_fill_mixed"))
         assert 0 <= row["iou"]["low"] <= row["iou"]["value"] <= row["iou"]["high"] <= 1
         assert 0 <= row["ap"]["value"]["value"] <= 1
-    assert "| objects + raw |" in markdown(report)
+    assert "| objects, filled holes, no mask, + raw |" in markdown(report)
 
 
 @pytest.mark.slow
