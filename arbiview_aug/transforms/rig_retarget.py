@@ -296,8 +296,8 @@ class RigRetarget(torch.nn.Module):
             parts = points_of_neighbours(frame, self._warn)
             scene = replace(scene, sweeps=np.concatenate([part[:, :3] for part in parts]) if parts else None)
         if self._row.needs == "motion" and scene.motion is None:
-            points = motion.points(frame.rig, scene.geometry("points")) if motion else np.zeros((0, 3))
-            scene = replace(scene, motion=points)
+            before = [part for part in [scene.geometry("points")] if part is not None]
+            scene = replace(scene, motion=motion.maps(frame.rig, before) if motion else ())
         surface = scene.best if self.geometry == "auto" else self.geometry
         plan = self._plans.plan(pair, scene)
         return FramePlan(frame, pair, scene, surface, plan, neighbours if fills else (), overlap, motion)

@@ -18,7 +18,7 @@ import torch
 from arbiview_aug import Rig
 from arbiview_aug.datasets import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
-from arbiview_aug.scene.scene import motion_camera
+from arbiview_aug.scene.depth_map import motion_camera
 from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.cuboids import CuboidDrive
