@@ -61,7 +61,7 @@ class Frame:
         sample: The sample it was read from; further entries are read and checked on request.
         lead: Leading dimensions of the sample's images.
         index: Place of the frame in them.
-        once: What is read once for all stages, by name: neighbours and their points.
+        once: Parts read once for all stages, by name: neighbours and their points.
     """
 
     images: tuple[torch.Tensor, ...]

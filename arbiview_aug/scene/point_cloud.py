@@ -242,9 +242,9 @@ class PointCloudSurface(DenseSurface):
     """Points made dense over the street. Points of the own car are left out.
 
     Attributes:
-        street: What there is where nothing was measured.
+        street: Surface where nothing was measured.
         points: (P, 3) in the ego frame, finite, metres.
-        mapped: So many of the last points are of depth maps, and none of the own car.
+        mapped: Number of the last points that are of depth maps; none of these is of the own car.
         swept: Whether points of neighbouring frames are among them.
         maps: These depth maps, which tell what is hidden from their own cameras.
     """
