@@ -25,7 +25,7 @@ from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.sample.inputs import MOTION_KEY, read_frames
 from arbiview_aug.sample.neighbours import read_neighbours
-from arbiview_aug.scene.scene import motion_camera
+from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.temporal.motion_depth import motion_depth
 
 Bools = npt.NDArray[np.bool_]
