@@ -31,7 +31,7 @@ from integrations.cross_rig.training import FrameSet, Schedule, answers, evaluat
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.views import ViewMaker
-from integrations.cross_rig.worlds import OF_TESTS, SPLITS, Split
+from integrations.cross_rig.worlds import OF_TESTS, Split
 
 LEAST_SCORE = 0.3
 """Score of the detections that become boxes of the second pass."""
@@ -206,9 +206,8 @@ def deploy(setup: Run, titles: list[str] | None, log: Log) -> str:
     one_thread()
     setup = replace(setup, settings=replace(setup.settings, variants=("raw",)))
     setup.prepare()
-    for split, change in product(SPLITS, (None, *setup.settings.changes)):
-        if split != "train" or change is None:
-            list(make_frames(setup.source(split, change), setup.settings.count(split), 1))
+    for source, count in [*setup.sources(), *setup.tests(None)]:
+        list(make_frames(source, count, 1))
     for job in jobs(setup.settings):
         model, trained = setup.trained(job)
         detector = Trained(model, setup.training_key(job), setup.schedule(job))

@@ -60,8 +60,8 @@ class Run:
             needed += [(source, s.train_frames) for source in (*images.needs(), images)]
         return list({source.store().key: (source, count) for source, count in needed}.values())
 
-    def tests(self, change: str) -> list[tuple[Source, int]]:
-        """Vehicle B's true frames for the threshold and the test, and their numbers."""
+    def tests(self, change: str | None) -> list[tuple[Source, int]]:
+        """A vehicle's true frames for the threshold and the test, and their numbers."""
         return [(self.source(split, change), self.settings.count(split)) for split in OF_TESTS]
 
     def images(self, job: Job) -> Source:

@@ -23,6 +23,7 @@ World = Literal["drive", "cuboids"]
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 OF_TESTS = SPLITS[1:]
+"""Streets of vehicle B: for thresholds, and for tests."""
 
 STREETS = 100
 """The world that constants of the renderer were chosen on; another hundred is another world."""
