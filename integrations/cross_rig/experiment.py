@@ -152,8 +152,9 @@ class Run:
 
     def result_path(self, job: Job, change: str) -> Path:
         """File of a test's counts; the frames must be there."""
-        sets = {source.split: [self._content(source, count), count] for source, count in self.tests(change)}
-        key = content_hash({"training": self.training_key(job), **sets})
+        spec: dict[str, Any] = {"training": self.training_key(job)}
+        spec |= {source.split: [self._content(source, count), count] for source, count in self.tests(change)}
+        key = content_hash(spec)
         return self.output / "results" / f"{change}-{job.seed}-{key}.json"
 
     def result_paths(self, job: Job) -> dict[str, Path]:
