@@ -160,11 +160,11 @@ class PipelineInpainter(NetworkInpainter):
             where: A folder or hub id in diffusers' layout.
             size: Longest side of an image that it sees; None: the pipeline's own.
             batch: Images that it sees at once.
-            prompt: What fills the holes.
+            prompt: Words for what fills the holes.
             steps: Steps of the pipeline; None: its own.
             guidance: Guidance of the pipeline; None: its own.
             min_confidence: As for every ``Inpainter``, like ``seed``.
-            settings: Of diffusers' ``from_pretrained``, such as ``torch_dtype`` or ``revision``.
+            settings: Arguments of diffusers' ``from_pretrained``, such as ``torch_dtype`` or ``revision``.
 
         Raises:
             ImportError: diffusers or transformers are missing.
@@ -207,7 +207,7 @@ class TorchScriptInpainter(NetworkInpainter):
     Args:
         path: The file. TorchScript runs code: load files that you trust.
         size: Longest side of an image that it sees.
-        multiple: Of which sides are multiples.
+        multiple: Number that divides both sides.
         batch: Images that it sees at once.
         settings: ``min_confidence`` and ``seed``, as for every ``Inpainter``.
 

@@ -89,17 +89,24 @@ def scan(lidars: Sequence[Lidar], points: Points, ground_z_m: float) -> Scan:
 
 def _returns(lidar: Lidar, rays: Layer, points: Points, ground_z_m: float) -> tuple[Layer, Numbers]:
     """Inverse distances of a scanner's rays (3, ny, nx), 1/m, and the points (P, 3) next to them, or -1."""
-    from arbiview_aug.scene.completion import cells_of, drop_hidden, elevations, meet_points, nearest_points
+    from arbiview_aug.scene.completion import (
+        block_cones,
+        cells_of,
+        drop_hidden,
+        elevations,
+        meet_points,
+        nearest_points,
+    )
 
     size, origin = rays.shape[1:], lidar.center_m.copy()
     q, nearest = np.zeros(size, np.float32), np.full(size, -1, np.int32)
     if not len(points):
         return q, nearest
-    low, high = np.arcsin(elevations(points, origin))
+    low, high = elevations(points, origin)
     some = rays[..., :: max(1, int(_ROOM_DEG / lidar.azimuth_step_deg))].reshape(3, -1).T.astype(np.float64)
     window = Window.around(some, SCANNED, (low - SUPPORT_RAD, high + SUPPORT_RAD)).roomy
     closest, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)
-    nearest_points(points, origin, window.bounds, window.place, closest, number)
+    nearest_points(points, block_cones(points), origin, window.bounds, window.place, closest, number)
     most = window_max(closest, 2 * SCANNED.side, 2 * SCANNED.side)
     visible = SCANNED.see_through, SCANNED.side, len(points)
     cell, directions = drop_hidden(closest, most, number, points, origin, *visible)

@@ -8,7 +8,7 @@ Labelled objects are masked in both frames. Unlabelled traffic is put upright wh
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -27,9 +27,9 @@ from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, Frame
 from arbiview_aug.sample.neighbours import BOX_MARGIN_M, Neighbour, neighbour_images
 from arbiview_aug.scene.boxes import draw_boxes
+from arbiview_aug.scene.depth_map import DepthMap, Maps, anchored_maps, motion_camera
 from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.scene.scene import GEOMETRIES, Scene, motion_camera, points_of_depth
-from arbiview_aug.scene.surface import Points
+from arbiview_aug.scene.scene import GEOMETRIES, Geometry, Scene
 from arbiview_aug.temporal.moving import stand_on_road
 from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, reduced_grey
 
@@ -67,10 +67,9 @@ class MotionDepth:
         """Share of all pixels with a depth; 0 if declined."""
         return float(np.mean([np.mean(depth > 0) for depth in self.depth_m]))
 
-    def points(self, rig: Rig, anchors: Points | None = None) -> FloatArray:
-        """(P, 3) points in the ego frame, metres, seen by the frame's rig; fused with ``anchors`` (P, 3) if given."""
-        pairs = zip(map(motion_camera, rig), self.depth_m, strict=True)
-        return np.concatenate([points_of_depth(c, z.astype(np.float64), anchors=anchors) for c, z in pairs])
+    def maps(self, rig: Rig, before: Iterable[Geometry] = ()) -> Maps:
+        """The maps of the frame's rig, fused with the points and maps ``before`` them."""
+        return anchored_maps(map(DepthMap.of, map(motion_camera, rig), self.depth_m), before)
 
     def __str__(self) -> str:
         if self.density == 0:

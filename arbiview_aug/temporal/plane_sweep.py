@@ -19,8 +19,8 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import ego_rays, relative_pose, source_pixels
 from arbiview_aug.render.overlap_depth import reduced
+from arbiview_aug.scene.depth_map import halvings
 from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.scene.scene import halvings
 from arbiview_aug.scene.surface import plane_inverse_distance
 
 NEAREST_M = 2.0

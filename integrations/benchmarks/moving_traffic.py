@@ -30,7 +30,7 @@ from arbiview_aug.evaluate.detections import average_precision, pooled
 from arbiview_aug.evaluate.judges import Detections, load_detector, load_segmenter
 from arbiview_aug.sample.inputs import MOTION_KEY, read_frames
 from arbiview_aug.sample.neighbours import read_neighbours
-from arbiview_aug.scene.scene import motion_camera
+from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.temporal.motion_depth import motion_depth
 from integrations.benchmarks.baselines import own_index
 

@@ -9,7 +9,7 @@ import torch
 
 from arbiview_aug import Camera
 from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.scene.scene import motion_camera
+from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.temporal.kernels import (
     INVALID,
     JUMP,
