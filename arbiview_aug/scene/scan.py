@@ -1,7 +1,7 @@
 """Scans of a measured scene by other scanners: their rays meet the surfaces between measured points.
 
 Points that nearer ones hide from a scanner are left out. A ray lies between two others above and below it, and returns
-where they are of one surface or it is near enough to one of them: ``completion.meet_points``.
+where they are of one surface or it is near enough to one of them: ``scan_kernels.meet_points``.
 """
 
 from __future__ import annotations
@@ -94,9 +94,9 @@ def _returns(lidar: Lidar, rays: Layer, points: Points, ground_z_m: float) -> tu
         cells_of,
         drop_hidden,
         elevations,
-        meet_points,
         nearest_points,
     )
+    from arbiview_aug.scene.scan_kernels import meet_points
 
     size, origin = rays.shape[1:], lidar.center_m.copy()
     q, nearest = np.zeros(size, np.float32), np.full(size, -1, np.int32)
