@@ -20,8 +20,8 @@ _JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
 
 @compiled
 def meet_points(
-    rows: Any, columns: Any, rays: Any, index: Any, seeds: Any, ground: float, rad: float, reach: float, side: float,
-    q: Any, nearest: Any,
+    rows: Any, columns: Any, rays: Any, index: Any, seeds: Any, numbers: Any, ground: float, rad: float, reach: float,
+    side: float, q: Any, nearest: Any,
 ) -> None:  # fmt: skip
     """Find where rays meet the surfaces between points: the next point above each ray, and the next one below.
 
@@ -35,12 +35,13 @@ def meet_points(
         index: (h, w) int32 the point in each cell, -1 without one.
         seeds: (4, n) float32 rows and columns of points, their inverse level distances, 1/m, and their heights over
             the rays' origin.
+        numbers: (n,) int32 what ``nearest`` calls them.
         ground: Height of the road over the rays' origin.
         rad: Side of a cell.
         reach: Cells by which a point may lie above or below a ray.
         side: Cells by which it may lie aside.
-        q: (ny, nx) inverse distances, written, 1/m.
-        nearest: (ny, nx) int32, written: the point that is nearer to the ray, -1 where the ray meets nothing.
+        q: (ny, nx) inverse distances, 1/m, written where rays meet something.
+        nearest: (ny, nx) int32: the point that is nearer to the ray. Rays of -1 are those to meet something.
     """
     h, w = index.shape
     far = 2 * reach
@@ -49,7 +50,8 @@ def meet_points(
     _describe(index, seeds, ground, reach, spoken, is_level)
     for y in range(rows.shape[0]):
         for x in range(rows.shape[1]):
-            q[y, x], nearest[y, x] = _ZERO, -1
+            if nearest[y, x] >= 0:
+                continue
             row, column = int(np.rint(rows[y, x])), int(np.rint(columns[y, x]))
             over, under, least_over, least_under = -1, -1, np.float32(np.inf), np.float32(np.inf)
             for c in range(max(column - aside, 0), min(column + aside + 1, w)):
@@ -80,7 +82,7 @@ def meet_points(
             if inverse <= _ZERO and min(to_over, to_under) <= spoken[one]:
                 inverse = _going_on(seeds, is_level, one, slope)
             if inverse > _ZERO:
-                q[y, x], nearest[y, x] = inverse * level, one
+                q[y, x], nearest[y, x] = inverse * level, numbers[one]
 
 
 @inlined

@@ -56,8 +56,8 @@ def retarget_points(
         boxes_3d: (B, >= 7) labelled objects, to count the points in each; they change no point.
         ground_z_m: Height of the road in the frame's ego frame.
         skip: Leave the points as they are, and count those in boxes.
-        sweeps: Points (Q, C) of other frames in this frame's ego frame, with the same columns. They fill what the
-            frame's own do not see.
+        sweeps: Points (Q, C) of other frames in this frame's ego frame, with the same columns. They fill
+            rays that the frame's own do not support.
 
     Raises:
         SampleError: Points or boxes of another shape.
@@ -75,11 +75,12 @@ def retarget_points(
     if not skip:
         up = ground_z_m - target.ground_z_m  # scanners keep their rays where nothing moves
         lidars = [lidar.shifted(z_m=up) for lidar in target.lidars] if up else target.lidars
+        own = len(measured)
         if len(sweeps):
             points = _joined(points, sweeps)
             array = as_array("points", points)
             measured = checked_points(array)
-        hits, nearest, rings_of, unsupported = scan(lidars, measured, ground_z_m)
+        hits, nearest, rings_of, unsupported = scan(lidars, measured, ground_z_m, len(measured) - own)
         rows = np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest
         points, measured, rings = _at(points, rows, hits), hits, torch.from_numpy(rings_of)
     counts = None
