@@ -142,6 +142,9 @@ def _between_points(seeds: Any, is_level: Any, over: int, under: int, slope: flo
     wide = abs(_ONE / a - _ONE / b)
     if is_level[under] and not is_level[over] and a <= b:  # a floor up to the foot of something
         return max(_going_on(seeds, is_level, under, slope), a)
+    is_edge = is_level[over] and not is_level[under] and a <= b and seeds[3, over] >= seeds[3, under]
+    if is_edge:  # of the top of something, over its face
+        return min(_going_on(seeds, is_level, over, slope), b)
     if is_level[over] and is_level[under]:
         is_same = abs(seeds[3, over] - seeds[3, under]) <= _JOINED_STEP_M + _JOINED_SLOPE * wide
     else:
