@@ -41,7 +41,7 @@ def meet_points(
         reach: Cells by which a point may lie above or below a ray.
         side: Cells by which it may lie aside.
         q: (ny, nx) inverse distances, 1/m, written where rays meet something.
-        nearest: (ny, nx) int32: the point that is nearer to the ray. Rays of -1 are those to meet something.
+        nearest: (ny, nx) int32: the point whose surface the ray meets. Rays of -1 are those to meet something.
     """
     h, w = index.shape
     far = 2 * reach
@@ -76,13 +76,13 @@ def meet_points(
             to_over = seeds[0, over] - rows[y, x] if over >= 0 else np.float32(np.inf)
             to_under = rows[y, x] - seeds[0, under] if under >= 0 else np.float32(np.inf)
             one = over if to_over <= to_under else under
-            inverse = _ZERO
+            inverse, met = _ZERO, one
             if over >= 0 and under >= 0 and to_over + to_under <= far:
-                inverse = _between_points(seeds, is_level, over, under, slope, (to_over + to_under) * rad)
+                inverse, met = _between_points(seeds, is_level, over, under, slope, (to_over + to_under) * rad)
             if inverse <= _ZERO and min(to_over, to_under) <= spoken[one]:
-                inverse = _going_on(seeds, is_level, one, slope)
+                inverse, met = _going_on(seeds, is_level, one, slope), one
             if inverse > _ZERO:
-                q[y, x], nearest[y, x] = inverse * level, numbers[one]
+                q[y, x], nearest[y, x] = inverse * level, numbers[met]
 
 
 @inlined
@@ -136,21 +136,24 @@ def _going_on(seeds: Any, is_level: Any, i: int, slope: float) -> Any:
 
 
 @inlined
-def _between_points(seeds: Any, is_level: Any, over: int, under: int, slope: float, apart: float) -> Any:
-    """Inverse level distance at which a ray meets what two points show, ``apart`` radians; 0 if they differ."""
+def _between_points(seeds: Any, is_level: Any, over: int, under: int, slope: float, apart: float) -> tuple[Any, int]:
+    """Inverse level distance at which a ray meets what two points show, ``apart`` radians, and the one whose surface
+    that is; 0 if they differ."""
     a, b = seeds[2, over], seeds[2, under]
     wide = abs(_ONE / a - _ONE / b)
     if is_level[under] and not is_level[over] and a <= b:  # a floor up to the foot of something
-        return max(_going_on(seeds, is_level, under, slope), a)
+        floor = _going_on(seeds, is_level, under, slope)
+        return (floor, under) if floor > a else (a, over)
     is_edge = is_level[over] and not is_level[under] and a <= b and seeds[3, over] >= seeds[3, under]
     if is_edge:  # of the top of something, over its face
-        return min(_going_on(seeds, is_level, over, slope), b)
+        top = _going_on(seeds, is_level, over, slope)
+        return (top, over) if top < b else (b, under)
     if is_level[over] and is_level[under]:
         is_same = abs(seeds[3, over] - seeds[3, under]) <= _JOINED_STEP_M + _JOINED_SLOPE * wide
     else:
         is_same = not (is_level[over] or is_level[under]) and wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
     if not is_same:
-        return _ZERO
-    s, t = seeds[3, over] * a, seeds[3, under] * b
+        return _ZERO, over
+    s, t = seeds[3, over] * a, seeds[3, under] * b  # slopes to both
     part = min(max((slope - t) / max(s - t, np.float32(1e-6)), _ZERO), _ONE)
-    return b + (a - b) * part
+    return b + (a - b) * part, over if part > _HALF else under
