@@ -96,7 +96,7 @@ def _returns(lidar: Lidar, rays: Layer, scenes: Sequence[Points], ground_z_m: fl
     Each of ``scenes`` (P, 3) begins with the points of the one before it, and fills rays that this did not.
     """
     from arbiview_aug.scene.completion import cells_of, elevations
-    from arbiview_aug.scene.scan_kernels import meet_points
+    from arbiview_aug.scene.scan_kernels import continue_road, meet_points
 
     size, origin = rays.shape[1:], lidar.center_m.copy()
     q, nearest = np.zeros(size, np.float32), np.full(size, -1, np.int32)
@@ -108,9 +108,11 @@ def _returns(lidar: Lidar, rays: Layer, scenes: Sequence[Points], ground_z_m: fl
     at = np.empty((2, *size), np.float32)
     cells_of(rays, np.eye(3, dtype=np.float32), window.place, *at)
     lengths = ground_z_m - origin[2], SCANNED.rad, SUPPORT_RAD / SCANNED.rad, SIDE_SUPPORT_RAD / SCANNED.rad
+    ground, rad, reach, side = np.array(lengths, np.float32)
     for points in scenes:
-        index, seeds, numbers = _visible(window, origin, points)
-        meet_points(*at, rays, index, seeds, numbers, *np.array(lengths, np.float32), q, nearest)
+        seen = _visible(window, origin, points)
+        meet_points(*at, rays, *seen, ground, rad, reach, side, q, nearest)
+    continue_road(*at, rays, *seen, ground, side, q, nearest)
     return q, nearest
 
 
