@@ -73,17 +73,19 @@ def scan(lidars: Sequence[Lidar], points: Points, ground_z_m: float, swept: int 
             where = f"a place over the road at z = {ground_z_m:g} m, got z = {lidar.center_m[2]:g} m"
             raise CalibrationError(f"lidar {lidar.name!r}: expected {where}")
         upwards = np.argsort(lidar.elevations_deg, kind="stable")  # cells of rays need beams in order
-        rays = np.ascontiguousarray(lidar.rays[:, upwards])
-        q, nearest = _returns(lidar, rays, scenes, ground_z_m)
-        silent += int(np.count_nonzero(nearest < 0))
-        with np.errstate(divide="ignore"):
-            distance = np.float32(1) / q
-        returns = (nearest >= 0) & (distance >= lidar.range_m[0]) & (distance <= lidar.range_m[1])
-        hits = lidar.center_m.astype(np.float32) + (rays[:, returns] * distance[returns]).T
+        rays = np.take(lidar.rays, upwards, axis=1)
+        q, nearest = (array.ravel() for array in _returns(lidar, rays, scenes, ground_z_m))
+        returns = np.flatnonzero(nearest >= 0)
+        silent += nearest.size - len(returns)
+        distance = 1 / q[returns]
+        in_range = (distance >= lidar.range_m[0]) & (distance <= lidar.range_m[1])
+        returns, distance = returns[in_range], distance[in_range]
+        hits = np.take(rays.reshape(3, -1), returns, axis=1).T * distance[:, None]
+        hits += lidar.center_m.astype(np.float32)
         outside = ~own_car(hits)
-        beam, _ = np.nonzero(returns)
-        rings = (first + upwards[beam]).astype(np.int32)
-        parts.append((hits[outside], numbers[nearest[returns][outside]], rings[outside]))
+        returns = returns[outside]
+        rings = (first + upwards[returns // lidar.shape[1]]).astype(np.int32)
+        parts.append((hits[outside], numbers[nearest[returns]], rings))
         first += len(upwards)
     total = sum(math.prod(lidar.shape) for lidar in lidars)
     hits, nearest, rings = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
@@ -119,21 +121,17 @@ def _returns(lidar: Lidar, rays: Layer, scenes: Sequence[Points], ground_z_m: fl
 def _visible(window: Window, origin: FloatArray, points: Points) -> tuple[Numbers, Layer, Numbers]:
     """The visible points of (P, 3): the one in each cell, or -1, their ``seeds`` (4, n) of ``meet_points``, numbers."""
     from arbiview_aug.scene.completion import block_cones, cells_of, drop_hidden, nearest_points
+    from arbiview_aug.scene.scan_kernels import place_points
 
     closest, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)
     nearest_points(points, block_cones(points), origin, window.bounds, window.place, closest, number)
     most = window_max(closest, 2 * SCANNED.side, 2 * SCANNED.side)
     visible = SCANNED.see_through, SCANNED.side, len(points)
     cell, directions = drop_hidden(closest, most, number, points, origin, *visible)
-    row, column = np.divmod(cell, window.shape[1])
     at = np.empty((2, 1, len(cell)), np.float32)
     cells_of(directions, np.eye(3, dtype=np.float32), window.place, *at)
-    aside = (at[1, 0] - column + SCANNED.turn / 2) % SCANNED.turn - SCANNED.turn / 2  # a halo holds some twice
-    x, y, z = directions[:, 0] / closest[row, column]
-    seeds = np.stack([at[0, 0], column + aside, 1 / np.hypot(x, y), z]).astype(np.float32)
     index = np.full(window.shape, -1, np.int32)
-    index[row, column] = np.arange(len(cell))
-    return index, seeds, number[row, column]
+    return index, *place_points(cell, directions[:, 0], closest, number, *at[:, 0], np.float32(SCANNED.turn), index)
 
 
 def warm_up() -> None:

@@ -21,6 +21,34 @@ _JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
 
 
 @compiled
+def place_points(
+    cells: Any, rays: Any, q: Any, number: Any, rows: Any, columns: Any, turn: Any, index: Any
+) -> tuple[Any, Any]:
+    """``seeds`` (4, n) and ``numbers`` (n,) of ``meet_points``, of points in flat cells (n,); writes ``index`` (h, w).
+
+    Args:
+        cells: (n,) those of ``drop_hidden``.
+        rays: (3, n) float32 to the points.
+        q: (h, w) inverse distances of cells.
+        number: (h, w) int32 the points' own numbers.
+        rows: (n,) of the points.
+        columns: (n,) of the points, up to whole turns.
+        turn: Columns of a turn.
+        index: (h, w) int32, -1.
+    """
+    n, w = cells.shape[0], q.shape[1]
+    seeds, numbers = np.empty((4, n), np.float32), np.empty(n, np.int32)
+    for i in range(n):
+        y, x = cells[i] // w, cells[i] % w
+        index[y, x], numbers[i] = i, number[y, x]
+        aside = columns[i] - np.float32(x)  # a halo holds some twice
+        seeds[0, i], seeds[1, i] = rows[i], columns[i] - turn * np.rint(aside / turn)
+        seeds[2, i] = q[y, x] / np.sqrt(max(rays[0, i] * rays[0, i] + rays[1, i] * rays[1, i], np.float32(1e-12)))
+        seeds[3, i] = rays[2, i] / q[y, x]
+    return seeds, numbers
+
+
+@compiled
 def meet_points(
     rows: Any, columns: Any, rays: Any, index: Any, seeds: Any, numbers: Any, ground: float, rad: float, reach: float,
     side: float, q: Any, nearest: Any,
@@ -47,30 +75,29 @@ def meet_points(
     """
     h, w = index.shape
     far = 2 * reach
-    up, aside = int(far) + 1, int(side) + 1
+    aside = int(side) + 1
+    above, below = _next_points(index)
     spoken, is_level = np.empty(seeds.shape[1], np.float32), np.zeros(seeds.shape[1], np.bool_)
-    _describe(index, seeds, ground, reach, spoken, is_level)
+    _describe(above, below, index, seeds, ground, reach, spoken, is_level)
     for y in range(rows.shape[0]):
         for x in range(rows.shape[1]):
             if nearest[y, x] >= 0:
                 continue
-            row, column = int(np.rint(rows[y, x])), int(np.rint(columns[y, x]))
+            row, column = min(max(int(np.rint(rows[y, x])), 0), h - 1), int(np.rint(columns[y, x]))
             over, under, least_over, least_under = -1, -1, np.float32(np.inf), np.float32(np.inf)
             for c in range(max(column - aside, 0), min(column + aside + 1, w)):
-                for r in range(max(row, 0), min(row + up, h - 1) + 1):
-                    i = index[r, c]
-                    if i >= 0 and seeds[0, i] >= rows[y, x]:
-                        cost = _cost(seeds, i, rows[y, x], columns[y, x], far, side)
-                        if cost < least_over:
-                            over, least_over = i, cost
-                        break
-                for r in range(min(row, h - 1), max(row - up, 0) - 1, -1):
-                    i = index[r, c]
-                    if i >= 0 and seeds[0, i] < rows[y, x]:
-                        cost = _cost(seeds, i, rows[y, x], columns[y, x], far, side)
-                        if cost < least_under:
-                            under, least_under = i, cost
-                        break
+                i = above[row, c]
+                if i >= 0 and seeds[0, i] < rows[y, x]:
+                    i = above[row + 1, c]
+                cost = _cost(seeds, i, rows[y, x], columns[y, x], far, side)
+                if cost < least_over:
+                    over, least_over = i, cost
+                i = below[row, c]
+                if i >= 0 and seeds[0, i] >= rows[y, x]:
+                    i = below[row - 1, c]
+                cost = _cost(seeds, i, rows[y, x], columns[y, x], far, side)
+                if cost < least_under:
+                    under, least_under = i, cost
             if over < 0 and under < 0:
                 continue
             level = np.sqrt(max(_ONE - rays[2, y, x] * rays[2, y, x], np.float32(1e-12)))
@@ -97,42 +124,57 @@ def continue_road(
     Whatever stands on it and reaches up to the lowest scan line would have been measured. Only roads within
     ``_LOWEST_LINE_M`` go on: farther ones are not of the lowest line. Arguments are those of ``meet_points``.
     """
-    h, w = index.shape
-    lowest = np.full(w, -1, np.int32)
-    for row in range(h - 1, -1, -1):
-        for column in range(w):
-            if index[row, column] >= 0:
-                lowest[column] = index[row, column]
+    w, aside = index.shape[1], int(side)
+    lowest = _next_points(index)[0][0]
     for y in range(rows.shape[0]):
         for x in range(rows.shape[1]):
             if nearest[y, x] >= 0 or rays[2, y, x] >= _ZERO:
                 continue
-            column, one = int(np.rint(columns[y, x])), -1
-            for c in range(max(column - int(side), 0), min(column + int(side) + 1, w)):
-                i = lowest[c]
-                if i >= 0 and (one < 0 or abs(seeds[1, i] - columns[y, x]) < abs(seeds[1, one] - columns[y, x])):
-                    one = i
-            if one < 0 or seeds[0, one] <= rows[y, x] or seeds[2, one] * _LOWEST_LINE_M < _ONE:
-                continue
-            if _is_road(seeds, one, ground):
+            column, one, least = int(np.rint(columns[y, x])), -1, np.float32(np.inf)
+            for c in range(max(column - aside, 0), min(column + aside + 1, w)):
+                off = abs(seeds[1, lowest[c]] - columns[y, x]) if lowest[c] >= 0 else np.float32(np.inf)
+                if off < least:
+                    one, least = lowest[c], off
+            is_below = one >= 0 and rows[y, x] < seeds[0, one]
+            if is_below and seeds[2, one] * _LOWEST_LINE_M >= _ONE and _is_road(seeds, one, ground):
                 q[y, x], nearest[y, x] = rays[2, y, x] / seeds[3, one], numbers[one]
+
+
+@inlined
+def _next_points(index: Any) -> tuple[Any, Any]:
+    """The point in each cell of (h, w), or else the next one above it in its column; likewise below; -1 without.
+
+    Both have a row more, of -1: index h, and -1.
+    """
+    h, w = index.shape
+    above, below = np.full((h + 1, w), -1, np.int32), np.full((h + 1, w), -1, np.int32)
+    for row in range(h):
+        up = h - 1 - row
+        for column in range(w):
+            above[up, column] = index[up, column] if index[up, column] >= 0 else above[up + 1, column]
+        for column in range(w):
+            below[row, column] = index[row, column] if index[row, column] >= 0 else below[row - 1, column]
+    return above, below
 
 
 @inlined
 def _cost(seeds: Any, i: int, row: float, column: float, far: float, side: float) -> Any:
     """What tells points next to a ray apart, the nearer the less; infinite out of reach."""
+    if i < 0:
+        return np.float32(np.inf)
     away, off = seeds[0, i] - row, seeds[1, i] - column
     return away * away + 4 * off * off if abs(away) <= far and abs(off) <= side else np.float32(np.inf)
 
 
 @inlined
-def _describe(index: Any, seeds: Any, ground: float, reach: float, spoken: Any, is_level: Any) -> None:
+def _describe(
+    above: Any, below: Any, index: Any, seeds: Any, ground: float, reach: float, spoken: Any, is_level: Any
+) -> None:
     """Write for how many cells above and below points (n,) speak, and which lie on level surfaces.
 
     A point speaks for half the spacing of points there, at most ``reach``.
     """
     h, w = index.shape
-    most = int(2 * reach)
     for row in range(h):
         for column in range(w):
             i = index[row, column]
@@ -140,13 +182,10 @@ def _describe(index: Any, seeds: Any, ground: float, reach: float, spoken: Any, 
                 continue
             least = 2 * reach
             is_level[i] = _is_road(seeds, i, ground)
-            for step in (-1, 1):
-                for k in range(1, min(most, row if step < 0 else h - 1 - row) + 1):
-                    j = index[row + step * k, column]
-                    if j >= 0:
-                        least = min(least, abs(seeds[0, j] - seeds[0, i]))
-                        is_level[i] |= _are_level(seeds, i, j)
-                        break
+            for j in (above[row + 1, column], below[row - 1, column]):
+                if j >= 0 and abs(seeds[0, j] - seeds[0, i]) <= 2 * reach:
+                    least = min(least, abs(seeds[0, j] - seeds[0, i]))
+                    is_level[i] |= _are_level(seeds, i, j)
             spoken[i] = least / _TWO
 
 
