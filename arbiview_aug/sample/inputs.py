@@ -71,7 +71,7 @@ class Frame:
     lead: tuple[int, ...] = ()
     index: tuple[int, ...] = ()
     neighbours: list[Any] | None = field(default=None, repr=False, init=False)
-    sweeps: list[Points] | None = field(default=None, repr=False, init=False)
+    sweeps: list[FloatArray] | None = field(default=None, repr=False, init=False)
 
     @property
     def number(self) -> int:

@@ -74,18 +74,17 @@ def scan(lidars: Sequence[Lidar], points: Points, ground_z_m: float, swept: int 
             raise CalibrationError(f"lidar {lidar.name!r}: expected {where}")
         upwards = np.argsort(lidar.elevations_deg, kind="stable")  # cells of rays need beams in order
         rays = np.take(lidar.rays, upwards, axis=1)
-        q, nearest = (array.ravel() for array in _returns(lidar, rays, scenes, ground_z_m))
-        returns = np.flatnonzero(nearest >= 0)
-        silent += nearest.size - len(returns)
-        distance = 1 / q[returns]
+        q, met = _returns(lidar, rays, scenes, ground_z_m)
+        returns = np.flatnonzero(met >= 0)
+        silent += met.size - len(returns)
+        distance = (1 / q.ravel()[returns]).astype(np.float32)
         in_range = (distance >= lidar.range_m[0]) & (distance <= lidar.range_m[1])
         returns, distance = returns[in_range], distance[in_range]
-        hits = np.take(rays.reshape(3, -1), returns, axis=1).T * distance[:, None]
-        hits += lidar.center_m.astype(np.float32)
+        hits: Layer = lidar.center_m.astype(np.float32) + (np.take(rays.reshape(3, -1), returns, axis=1) * distance).T
         outside = ~own_car(hits)
         returns = returns[outside]
         rings = (first + upwards[returns // lidar.shape[1]]).astype(np.int32)
-        parts.append((hits[outside], numbers[nearest[returns]], rings))
+        parts.append((hits[outside], numbers[met.ravel()[returns]], rings))
         first += len(upwards)
     total = sum(math.prod(lidar.shape) for lidar in lidars)
     hits, nearest, rings = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
