@@ -130,11 +130,10 @@ def continue_road(
         for x in range(rows.shape[1]):
             if nearest[y, x] >= 0 or rays[2, y, x] >= _ZERO:
                 continue
-            column, one, least = int(np.rint(columns[y, x])), -1, np.float32(np.inf)
+            column, one = int(np.rint(columns[y, x])), -1
             for c in range(max(column - aside, 0), min(column + aside + 1, w)):
-                off = abs(seeds[1, lowest[c]] - columns[y, x]) if lowest[c] >= 0 else np.float32(np.inf)
-                if off < least:
-                    one, least = lowest[c], off
+                if lowest[c] >= 0 and (one < 0 or seeds[0, lowest[c]] < seeds[0, one]):
+                    one = lowest[c]
             is_below = one >= 0 and rows[y, x] < seeds[0, one]
             if is_below and seeds[2, one] * _LOWEST_LINE_M >= _ONE and _is_road(seeds, one, ground):
                 q[y, x], nearest[y, x] = rays[2, y, x] / seeds[3, one], numbers[one]
