@@ -16,6 +16,8 @@ _LOWEST_LINE_M = np.float32(10.0)
 _JOINED_STEP_M, _JOINED_SLOPE = np.float32(0.3), np.float32(0.05)
 """Level surfaces that differ by this height, and this share of their distance, are one: kerbs, and roads that rise.
 0.1 m loses 7 % of the points on synthetic vehicles at 15 to 25 m, which stand on the road."""
+_TOP_M = np.float32(2.0)
+"""Tops of things go on from point to point up to this distance."""
 _JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
 """... and upright ones whose distances differ by that much, and so many times by how far they are apart across."""
 
@@ -107,7 +109,8 @@ def meet_points(
             one = over if to_over <= to_under else under
             inverse, met = _ZERO, one
             if over >= 0 and under >= 0 and to_over + to_under <= far:
-                inverse, met = _between_points(seeds, is_level, over, under, slope, (to_over + to_under) * rad)
+                apart = (to_over + to_under) * rad
+                inverse, met = _between_points(seeds, is_level, over, under, slope, apart, ground)
             if inverse <= _ZERO and min(to_over, to_under) <= spoken[one]:
                 inverse, met = _going_on(seeds, is_level, one, slope), one
             if inverse > _ZERO:
@@ -184,7 +187,7 @@ def _describe(
             for j in (above[row + 1, column], below[row - 1, column]):
                 if j >= 0 and abs(seeds[0, j] - seeds[0, i]) <= 2 * reach:
                     least = min(least, abs(seeds[0, j] - seeds[0, i]))
-                    is_level[i] |= _are_level(seeds, i, j)
+                    is_level[i] |= _are_level(seeds, i, j, ground)
             spoken[i] = least / _TWO
 
 
@@ -195,14 +198,21 @@ def _is_road(seeds: Any, i: int, ground: float) -> bool:
 
 
 @inlined
-def _are_level(seeds: Any, i: int, j: int) -> bool:
+def _are_level(seeds: Any, i: int, j: int, ground: float) -> bool:
     """Whether a line between two points under the origin is nearer to a level one than to an upright one."""
     a, b, slope = seeds[2, i], seeds[2, j], seeds[3, i] * seeds[2, i]
-    if max(seeds[3, i], seeds[3, j]) >= _ZERO or a == b:
+    if max(seeds[3, i], seeds[3, j]) >= _ZERO or a == b or _are_apart(seeds, i, j, ground):
         return False
     # Inverse distances of a level surface are proportional to slopes.
     part = (seeds[3, j] * b / slope - _ONE) / (b / a - _ONE)
     return _HALF < part < _TWO
+
+
+@inlined
+def _are_apart(seeds: Any, i: int, j: int, ground: float) -> bool:
+    """Whether two points are tops of different things: nearer to the rays' height than to the road's, and far apart."""
+    is_high = _TWO * max(seeds[3, i], seeds[3, j]) > ground
+    return is_high and abs(_ONE / seeds[2, i] - _ONE / seeds[2, j]) > _TOP_M
 
 
 @inlined
@@ -212,7 +222,9 @@ def _going_on(seeds: Any, is_level: Any, i: int, slope: float) -> Any:
 
 
 @inlined
-def _between_points(seeds: Any, is_level: Any, over: int, under: int, slope: float, apart: float) -> tuple[Any, int]:
+def _between_points(
+    seeds: Any, is_level: Any, over: int, under: int, slope: float, apart: float, ground: float
+) -> tuple[Any, int]:
     """Inverse level distance at which a ray meets what two points show, ``apart`` radians, and the one whose surface
     that is; 0 if they differ."""
     a, b = seeds[2, over], seeds[2, under]
@@ -226,6 +238,7 @@ def _between_points(seeds: Any, is_level: Any, over: int, under: int, slope: flo
         return (top, over) if top < b else (b, under)
     if is_level[over] and is_level[under]:
         is_same = abs(seeds[3, over] - seeds[3, under]) <= _JOINED_STEP_M + _JOINED_SLOPE * wide
+        is_same &= not _are_apart(seeds, over, under, ground)
     else:
         is_same = not (is_level[over] or is_level[under]) and wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
     if not is_same:
