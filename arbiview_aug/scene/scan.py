@@ -1,7 +1,8 @@
 """Scans of a measured scene by other scanners: their rays meet the surfaces between measured points.
 
 Points that nearer ones hide from a scanner are left out. A ray lies between two others above and below it, and returns
-where they are of one surface or it is near enough to one of them: ``scan_kernels.meet_points``.
+where they are of one surface or it is near enough to one of them: ``scan_kernels.meet_points``. Below all points it
+returns from the road that the lowest scan line measured: ``scan_kernels.continue_road``.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ class Scan(NamedTuple):
 
     Attributes:
         points: (n, 3) float32, ego frame, metres.
-        nearest: (n,) numbers of the measured points that support them.
+        nearest: (n,) numbers of the measured points whose surfaces they are of.
         rings: (n,) beams, counted on from scanner to scanner.
-        unsupported: Share of all rays near which nothing was measured; the sky's are among them.
+        unsupported: Share of all rays that meet nothing measured; the sky's are among them.
     """
 
     points: Layer

@@ -29,7 +29,7 @@ class RetargetedPoints(NamedTuple):
         points: (n, C) of the type, dtype and device of the measured ones, in their ego frame.
         rings: (n,) int32 beam, counted on from scanner to scanner; -1 where they are as measured.
         counts: (B,) int64 points in each box; None without boxes.
-        unsupported: Share of rays near which nothing was measured; the sky's are among them.
+        unsupported: Share of rays that meet nothing measured; the sky's are among them.
     """
 
     points: Any
@@ -50,8 +50,8 @@ def retarget_points(
     """Measure a frame's scene by a target's scanners, as ``RigRetarget`` does; no images are needed.
 
     Args:
-        points: (P, C >= 3) float tensor or array x y z ... in the frame's ego frame. Columns beyond z are taken from
-            the nearest measured point.
+        points: (P, C >= 3) float tensor or array x y z ... in the frame's ego frame. Columns beyond z are those of
+            the measured point whose surface a ray meets.
         target: A rig with ``lidars``.
         boxes_3d: (B, >= 7) labelled objects, to count the points in each; they change no point.
         ground_z_m: Height of the road in the frame's ego frame.
