@@ -50,7 +50,7 @@ def match_walls(
     rays: Any, road: Any, horizontal: Any, nodes: Any, windows: Any, walls: Any, offset: Any, lens: Any, quads: Any,
     costs: Any,
 ) -> None:  # fmt: skip
-    """Costs (K, h, w) of surfaces by the normalised cross-correlation of windows.
+    """Costs (h, K, w) of surfaces by the normalised cross-correlation of windows.
 
     ``rays`` (3, h, w) are in the neighbour's frame, where they start at ``offset`` (3,); for a pinhole both are times
     its intrinsics. ``nodes`` are every ``NODE_PX``-th of them, of ``road`` and of ``horizontal``, which are those of a
@@ -76,14 +76,14 @@ def match_walls(
         top, bottom, left, right = box[0], min(box[1], rows), box[2], box[3]
         for y in range(rows):
             for x in range(w):
-                costs[k, y, x] = _UNSEEN
+                costs[y, k, x] = _UNSEEN
         if top < bottom:
             reach = max(top - RADIUS_PX, 0), min(bottom + RADIUS_PX, h), max(left - RADIUS_PX, 0), min(right + RADIUS_PX, w)
             _read(surface, walls[k], offset, lens, k, quads, reach, lines, read, seen)
-            _correlate(read, seen, windows, sums, (top, bottom, left, right), costs[k])
+            _correlate(read, seen, windows, sums, (top, bottom, left, right), k, costs)
         for y in range(rows, h):
             for x in range(w):
-                costs[k, y, x] = costs[k - 1, y, x]
+                costs[y, k, x] = costs[y, k - 1, x]
 
 
 @inlined
@@ -191,8 +191,8 @@ def _read(
 
 
 @called
-def _correlate(read: Any, seen: Any, windows: Any, sums: Any, box: Any, costs: Any) -> None:
-    """Costs of a box of an image as it was read (h + 1, w + 6), the last row 0; ``sums`` (7, w + 6) is scratch."""
+def _correlate(read: Any, seen: Any, windows: Any, sums: Any, box: Any, k: Any, costs: Any) -> None:
+    """Costs of wall ``k`` in a box of an image as it was read (h + 1, w + 6), the last row 0; ``sums`` (7, w + 6) is scratch."""
     levels, mean, weight = windows
     values, squares, products, s1, s2, s12, pairs = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6]
     h, top, columns = levels.shape[0], box[0], (np.uint64(box[2]), np.uint64(box[3]))
@@ -220,7 +220,7 @@ def _correlate(read: Any, seen: Any, windows: Any, sums: Any, box: Any, costs: A
             covariance = np.float32(s12[x]) * _SQUARE - average * mean[y, x]
             cost = (_ONE - covariance * weight[y, x] / np.sqrt(variance)) * _PER_CORRELATION
             cost = min(max(cost, _ZERO), _INVALID - _ONE) if seen[y, x] else _INVALID
-            costs[y, x] = np.uint16(np.int32(cost))
+            costs[y, k, x] = np.uint16(np.int32(cost))
 
 
 @compiled
@@ -269,11 +269,22 @@ def _follow(path: Any, least: Any, cost: Any, out: Any) -> Any:
 
 @compiled
 def merge_costs(one: Any, two: Any, out: Any) -> None:
-    """Costs (n,) of a neighbour before and one after: three quarters of the better, as the other may be hidden."""
-    for x in range(out.shape[0]):
-        better, worse = min(one[x], two[x]), max(one[x], two[x])
-        worse = better if worse == _UNSEEN else worse
-        out[x] = np.uint16(better + np.uint16(np.uint16(worse - better) >> np.uint16(2)))
+    """Merge costs (h, K, w) of a neighbour before and one after into ``out`` (h, w, K).
+
+    Three quarters are of the better, as the other may be hidden.
+    """
+    h, K, w = one.shape
+    rows = np.empty((K, w), np.uint16)
+    merged = rows.ravel()
+    for y in range(h):
+        a, b = one[y].ravel(), two[y].ravel()
+        for x in range(K * w):
+            better, worse = min(a[x], b[x]), max(a[x], b[x])
+            worse = better if worse == _UNSEEN else worse
+            merged[x] = np.uint16(better + np.uint16(np.uint16(worse - better) >> np.uint16(2)))
+        for x in range(w):  # writes in order, four times as fast as reading in order
+            for k in range(K):
+                out[y, x, k] = rows[k, x]
 
 
 @compiled
@@ -312,7 +323,7 @@ def find_least(total: Any, spacing: float, road: Any) -> Any:
 @inlined
 def _gain(costs: Any, wall: Any, y: Any, x: Any, label: Any, thing: Any) -> Any:
     """Correlation with the road above that with a wall; 0 where neither matches or another thing hides the road."""
-    own, road = costs[wall, y, x], costs[0, y, x]
+    own, road = costs[y, x, wall], costs[y, x, 0]
     if min(own, road) > _MATCHING or (own > road and label != thing and label != 0):
         return 0.0
     return (np.float64(own) - np.float64(road)) / PER_CORRELATION
@@ -343,7 +354,7 @@ def find_feet(
                     total += q[y, x] / horizontal[y, x]
                     count += 1
                     tops[x] = y
-            walls[x] = min(max(round(total / count / spacing), 1), costs.shape[0] - 1) * spacing
+            walls[x] = min(max(round(total / count / spacing), 1), costs.shape[2] - 1) * spacing
             for y in range(y0, h):
                 scale = road[y, x] / (horizontal[y, x] * walls[x])
                 if _FARTHEST_SCALE < scale < 1:

@@ -87,12 +87,8 @@ class SweptImage:
         return np.maximum(self.road, wall * self.horizontal)
 
     def positions(self, other: Camera, inverse_distance: Layer) -> Layer:
-        """(h, w, 2) pixels of another camera for points on the rays."""
-        return np.stack(source_pixels(self.camera, self.rays, inverse_distance, other)[:2], -1)
-
-    def shift(self, other: Camera, inverse_distance: Layer) -> Layer:
-        """(h, w, 2) motion of these pixels along the epipolar lines when inverse distances grow by a tenth."""
-        return self.positions(other, inverse_distance * np.float32(1.1)) - self.positions(other, inverse_distance)
+        """(2, h, w) pixels of another camera, u and v, for points on the rays."""
+        return np.stack(source_pixels(self.camera, self.rays, inverse_distance, other)[:2])
 
     @cached_property
     def unmasked(self) -> npt.NDArray[np.uint8]:
@@ -128,7 +124,7 @@ class SweptImage:
         return np.pad(levels.astype(np.int32), ((0, 0), (RADIUS_PX, RADIUS_PX)), mode="edge"), mean, weight
 
     def costs(self, other: SweptImage, walls: Layer) -> npt.NDArray[np.uint16]:
-        """Costs (K, h, w) of walls, (K,) ascending 1/radius in 1/m, by the correlation with another image over them.
+        """Costs (h, K, w) of walls, (K,) ascending 1/radius in 1/m, by the correlation with another image over them.
 
         The other image is in the same ego frame.
         """
@@ -139,7 +135,6 @@ class SweptImage:
         kind, positions = LENS_CODES.get(other.camera.lens, -1), np.zeros((0, 2, h, w), np.float32)
         if kind < 0:
             positions = np.stack([self.positions(other.camera, self.inverse_distance(wall)) for wall in walls])
-            positions = positions.transpose(0, 3, 1, 2)
         (A, offset), lens = relative_pose(self.camera, other.camera), (kind, other.camera.parameters, positions)
         if kind == 0:
             K = other.camera.K.astype(np.float32)
@@ -147,7 +142,7 @@ class SweptImage:
         rays = (A @ self.rays.reshape(3, -1)).reshape(3, h, w)
         surfaces = rays, self.road, self.horizontal
         nodes = tuple(np.ascontiguousarray(one[..., ::NODE_PX, ::NODE_PX]) for one in surfaces)
-        costs = np.empty((len(walls), h, w), np.uint16)
+        costs = np.empty((h, len(walls), w), np.uint16)
         walls = np.ascontiguousarray(walls)  # another layout would be compiled, too
         match_walls(*surfaces, nodes, self.windows, walls, offset, lens, other.quads, costs)
         return costs
