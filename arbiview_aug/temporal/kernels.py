@@ -42,7 +42,7 @@ NODE_PX = 8
 _LEVEL, _RIGHT, _MASK_BIT, _NONE = np.int32(0x7FFF), np.int32(16), np.int32(15), np.int32(0)  # of ``SweptImage.quads``
 _WIDER, _INFINITY = 2 * RADIUS_PX, np.float32(np.inf)
 # Unsigned, so that no index is tested for being negative, and loops become vector instructions.
-_U1, _U2, _U4, _U5, _U6, _RADIUS = (np.uint64(n) for n in (1, 2, 4, 5, 6, RADIUS_PX))
+_U1, _U2, _U3, _U4, _U5, _U6, _RADIUS = (np.uint64(n) for n in (1, 2, 3, 4, 5, 6, RADIUS_PX))
 
 
 @compiled
@@ -58,8 +58,8 @@ def match_walls(
     ``Camera.parameters``, and positions (K, 2, h, w) for a negative code; ``quads`` (H, W) are those of its image.
     """
     h, w = road.shape
-    surface, lines, sums = (rays, road, horizontal), np.empty((7, w), np.float32), np.empty((7, w + _WIDER), np.int32)
-    seen, read = np.empty((h, w), np.int32), np.zeros((h + 1, w + _WIDER), np.int32)  # whose last row stays 0
+    surface, lines, sums = (rays, road, horizontal), np.empty((7, w), np.float32), np.empty((3, w + _WIDER), np.int32)
+    seen, read = np.empty((h, w), np.int32), np.zeros((h + 1, w + _WIDER), np.int32)  # the last row stays 0
     touching = np.empty(h, np.float32)  # 1/radius of the farthest wall before a row's road
     for y in range(h):
         touching[y] = np.inf
@@ -78,19 +78,19 @@ def match_walls(
             for x in range(w):
                 costs[y, k, x] = _UNSEEN
         if top < bottom:
-            reach = max(top - RADIUS_PX, 0), min(bottom + RADIUS_PX, h), max(left - RADIUS_PX, 0), min(right + RADIUS_PX, w)
-            _read(surface, walls[k], offset, lens, k, quads, reach, lines, read, seen)
-            _correlate(read, seen, windows, sums, (top, bottom, left, right), k, costs)
+            box = top, bottom, left, right
+            _read(surface, walls[k], offset, lens, k, quads, box, lines, read, seen)
+            _correlate(read, seen, windows, sums, box, k, costs)
         for y in range(rows, h):
             for x in range(w):
                 costs[y, k, x] = costs[y, k - 1, x]
 
 
 @inlined
-def _project_row(surface: Any, y: Any, columns: Any, wall: Any, offset: Any, lens: Any, points: Any, parts: Any) -> None:
-    """Project row ``y`` of a surface between two columns; ``parts`` of the lines ``points`` are the same columns."""
+def _project_row(surface: Any, y: Any, columns: Any, wall: Any, offset: Any, lens: Any, lines: Any, parts: Any) -> None:
+    """Project row ``y`` of a surface between two columns; ``parts`` of ``lines`` are the same columns."""
     rays, road, horizontal = surface
-    u, v, q, px, py, pz, _ = points
+    u, v, q, px, py, pz, _ = lines
     for x in range(columns[0], columns[1]):
         q[x] = max(road[y, x], wall * horizontal[y, x])
     for x in range(columns[0], columns[1]):
@@ -111,12 +111,11 @@ def _project_row(surface: Any, y: Any, columns: Any, wall: Any, offset: Any, len
 
 
 @inlined
-def _seven(line: Any, pairs: Any, out: Any, columns: Any) -> None:
-    """Sums of seven columns."""
-    for x in range(columns[0], columns[1] + _U5):
-        pairs[x] = np.int32(line[x] + line[x + _U1])
-    for x in range(columns[0], columns[1]):
-        out[x] = np.int32(np.int32(np.int32(pairs[x] + pairs[x + _U2]) + pairs[x + _U4]) + line[x + _U6])
+def _seven(line: Any, x: Any) -> Any:
+    """Sum of seven columns from ``x`` on."""
+    a, b = np.int32(line[x] + line[x + _U1]), np.int32(line[x + _U2] + line[x + _U3])
+    c = np.int32(np.int32(line[x + _U4] + line[x + _U5]) + line[x + _U6])
+    return np.float32(np.int32(np.int32(a + b) + c))
 
 
 @inlined
@@ -133,52 +132,56 @@ def _seen_box(nodes: Any, wall: Any, offset: Any, lens: Any, other_size: Any, si
     ny, nx = nodes[1].shape
     top, bottom, left, right = ny, -1, nx, -1
     last_y, last_x = np.float32(other_size[0] - 1), np.float32(other_size[1] - 1)
-    points, columns = _columns(lines, 0, nx), (np.uint64(0), np.uint64(nx))
-    u, v = points[0], points[1]
+    parts, columns = _columns(lines, 0, nx), (np.uint64(0), np.uint64(nx))
+    u, v = parts[0], parts[1]
     for y in range(ny):
-        _project_row(nodes, y, columns, wall, offset, lens, points, points)
+        _project_row(nodes, y, columns, wall, offset, lens, parts, parts)
         for x in range(nx):
             if (u[x] >= _ZERO) & (u[x] <= last_x) & (v[x] >= _ZERO) & (v[x] <= last_y):
                 top, bottom, left, right = min(top, y), y, min(left, x), max(right, x)
+    if bottom < 0:
+        return 0, 0, 0, 0
     top, left = max(top - 1, 0) * NODE_PX, max(left - 1, 0) * NODE_PX
-    return (top, min((bottom + 1) * NODE_PX, size[0]), left, min((right + 1) * NODE_PX, size[1])) if bottom >= 0 else (0, 0, 0, 0)
+    return top, min((bottom + 1) * NODE_PX, size[0]), left, min((right + 1) * NODE_PX, size[1])
 
 
 @called
 def _read(
     surface: Any, wall: Any, offset: Any, lens: Any, k: Any, quads: Any, box: Any, lines: Any, read: Any, seen: Any
 ) -> None:
-    """Read a box of the neighbour's image as over a surface: bilinear levels, the border's beyond it, and the mask."""
-    first, last, w = np.uint64(box[2]), np.uint64(box[3]), seen.shape[1]
-    points, parts = _columns(lines, 0, w), _columns(lines, box[2], box[3])
-    u, v, s, t = points[0], points[1], points[4], points[5]
+    """Read a box and a window around it of a neighbour's image as over a surface.
+
+    Levels are bilinear, those of the image's border beyond it; ``seen`` is the mask at the nearest pixel.
+    """
+    (h, w), left, right = seen.shape, max(box[2] - RADIUS_PX, 0), min(box[3] + RADIUS_PX, seen.shape[1])
+    whole, parts, first, last = _columns(lines, 0, w), _columns(lines, left, right), np.uint64(left), np.uint64(right)
+    u, v, s, t = whole[0], whole[1], whole[4], whole[5]
     image, width = quads.ravel(), np.int32(quads.shape[1])
     last_x, last_y = np.float32(quads.shape[1] - 2), np.float32(quads.shape[0] - 2)
     at, words = np.empty(w, np.int32), np.empty(w, np.int64)
     halves = words.view(np.int32)
-    for y in range(box[0], box[1]):
+    for y in range(max(box[0] - RADIUS_PX, 0), min(box[1] + RADIUS_PX, h)):
         if lens[0] < 0:
             for x in range(first, last):
                 u[x], v[x] = lens[2][k, 0, y, x], lens[2][k, 1, y, x]
         else:
-            _project_row(surface, y, (first, last), wall, offset, lens, points, parts)
+            _project_row(surface, y, (first, last), wall, offset, lens, whole, parts)
         for x in range(first, last):
-            t[x] = min(u[x] if u[x] > _ZERO else _ZERO, last_x + _ONE)  # NaN becomes 0
+            column, row = min(u[x] if u[x] > _ZERO else _ZERO, last_x), min(v[x] if v[x] > _ZERO else _ZERO, last_y)
+            at[x] = np.int32(np.int32(np.int32(row) * width) + np.int32(column))
         for x in range(first, last):
-            s[x] = min(v[x] if v[x] > _ZERO else _ZERO, last_y + _ONE)
+            column = min(u[x] if u[x] > _ZERO else _ZERO, last_x + _ONE)
+            t[x] = column - np.float32(np.int32(min(column, last_x)))
         for x in range(first, last):
-            seen[y, x] = np.int32(1) if (t[x] == u[x]) & (s[x] == v[x]) else _NONE
-        for x in range(first, last):
-            at[x] = np.int32(np.int32(np.int32(min(s[x], last_y)) * width) + np.int32(min(t[x], last_x)))
-        for x in range(first, last):
-            t[x] -= np.float32(np.int32(min(t[x], last_x)))
-        for x in range(first, last):
-            s[x] -= np.float32(np.int32(min(s[x], last_y)))
+            row = min(v[x] if v[x] > _ZERO else _ZERO, last_y + _ONE)
+            s[x] = row - np.float32(np.int32(min(row, last_y)))
         for x in range(first, last):  # no vector instruction: alone for that
             words[x] = image[np.uint64(at[x])]
         for x in range(first, last):
+            inside = (u[x] >= _ZERO) & (u[x] <= last_x + _ONE) & (v[x] >= _ZERO) & (v[x] <= last_y + _ONE)
             right, below = np.int32(16) if t[x] >= _HALF else _NONE, np.int32(32) if s[x] >= _HALF else _NONE
-            seen[y, x] = np.int32(seen[y, x] & np.int32(words[x] >> np.int32(_MASK_BIT + right + below)))
+            bit = np.int32(words[x] >> np.int32(_MASK_BIT + right + below))
+            seen[y, x] = np.int32(bit & np.int32(1)) if inside else _NONE
         for x in range(first, last):
             a, b = halves[_U2 * x], halves[_U2 * x + _U1]
             a0, a1 = np.float32(a & _LEVEL), np.float32(np.int32(a >> _RIGHT) & _LEVEL)
@@ -192,32 +195,29 @@ def _read(
 
 @called
 def _correlate(read: Any, seen: Any, windows: Any, sums: Any, box: Any, k: Any, costs: Any) -> None:
-    """Costs of wall ``k`` in a box of an image as it was read (h + 1, w + 6), the last row 0; ``sums`` (7, w + 6) is scratch."""
+    """Costs of wall ``k`` in a box of an image as it was read (h + 1, w + 6); ``sums`` (3, w + 6) is scratch."""
     levels, mean, weight = windows
-    values, squares, products, s1, s2, s12, pairs = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6]
-    h, top, columns = levels.shape[0], box[0], (np.uint64(box[2]), np.uint64(box[3]))
-    end = columns[1] + np.uint64(_WIDER)
-    sums[:3] = 0
+    values, squares, products = sums[0], sums[1], sums[2]  # of columns
+    h, top, left, right = levels.shape[0], box[0], np.uint64(box[2]), np.uint64(box[3])
+    end = right + np.uint64(_WIDER)
+    sums[:] = 0
     for y in range(top - 2 * RADIUS_PX, box[1]):
         new, old = min(max(y + RADIUS_PX, 0), h - 1), max(y - RADIUS_PX - 1, 0)
         row = old if y > top else h
-        for x in range(columns[0], end):
+        for x in range(left, end):
             values[x] = np.int32(values[x] + np.int32(read[new, x] - read[row, x]))
-        for x in range(columns[0], end):
+        for x in range(left, end):
             a, c = read[new, x], read[row, x]
             squares[x] = np.int32(squares[x] + np.int32(np.int32(a + c) * np.int32(a - c)))
-        for x in range(columns[0], end):
+        for x in range(left, end):
             a, c = read[new, x], read[row, x]
             products[x] = np.int32(products[x] + np.int32(np.int32(a * levels[new, x]) - np.int32(c * levels[old, x])))
         if y < top:
             continue
-        _seven(values, pairs, s1, columns)
-        _seven(squares, pairs, s2, columns)
-        _seven(products, pairs, s12, columns)
-        for x in range(columns[0], columns[1]):
-            average = np.float32(s1[x]) * _MEAN
-            variance = max(np.float32(s2[x]) * _SQUARE - average * average, _ZERO) + _NOISE
-            covariance = np.float32(s12[x]) * _SQUARE - average * mean[y, x]
+        for x in range(left, right):
+            average = _seven(values, x) * _MEAN
+            variance = max(_seven(squares, x) * _SQUARE - average * average, _ZERO) + _NOISE
+            covariance = _seven(products, x) * _SQUARE - average * mean[y, x]
             cost = (_ONE - covariance * weight[y, x] / np.sqrt(variance)) * _PER_CORRELATION
             cost = min(max(cost, _ZERO), _INVALID - _ONE) if seen[y, x] else _INVALID
             costs[y, k, x] = np.uint16(np.int32(cost))

@@ -282,7 +282,7 @@ _ACROSS = 0.3
 
 _CONTRAST_LEVELS = 2.0  # per pixel; fainter gradients are noise
 
-_MIN_PIXELS = 500  # for the five parameters
+_MIN_PIXELS, _MANY_PIXELS = 500, 4000  # for the five parameters; of more of a camera, every so many are taken
 
 _TURN_DEG, _SHIFT_M = 0.1, 0.02  # steps of the derivatives
 
@@ -337,8 +337,9 @@ def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray]
     x holds turns about the ego's axes in degrees and shifts along its y and z in metres. Images are compared at their
     local mean and contrast, as in the sweep's correlation.
     """
-    at, nearer = (sample.image.positions(sample.other.camera, np.float32(k) * sample.inverse_distance) for k in (1, 1.1))
-    warped: Any = cv2.remap(sample.other.grey, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    other, q = sample.other, sample.inverse_distance
+    at, nearer = (sample.image.positions(other.camera, np.float32(factor) * q) for factor in (1, 1.1))
+    warped: Any = cv2.remap(other.grey, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     one, two = _normalised(sample.image.grey), _normalised(warped)
     mean = (sample.image.grey + warped) / 2
     # Gradients of the warped image stand for those of the neighbour's: the warp is close to the identity.
@@ -347,15 +348,17 @@ def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray]
     ex, ey = nearer - at
     length = cv2.magnitude(ex, ey)
     across = np.abs(gx * ex + gy * ey) <= _ACROSS * length * cv2.magnitude(gx, gy)
-    use = sample.valid & (length >= LEAST_SHIFT_PX) & (contrast > _CONTRAST_LEVELS) & across
-    if not use.any():
+    use = np.flatnonzero(sample.valid & (length >= LEAST_SHIFT_PX) & (contrast > _CONTRAST_LEVELS) & across)
+    if not len(use):
         return None
-    motion = _motion(sample, use, at[:, use])
-    normal = np.stack([-ey[use], ex[use]], -1) / length[use][:, None]
+    use = use[:: max(1, len(use) // _MANY_PIXELS)]
+    ex, ey, length, gx, gy, difference = (one.ravel()[use] for one in (ex, ey, length, gx, gy, one - two))
+    motion = _motion(sample, use, at.reshape(2, -1)[:, use])
+    normal = np.stack([-ey, ex], -1) / length[:, None]
     off_line = np.einsum("nk,nkp->np", normal, motion)  # [n, 5] px per unit
-    gradient = gx[use] * normal[:, 0] + gy[use] * normal[:, 1]
+    gradient = gx * normal[:, 0] + gy * normal[:, 1]
     # Pixels read by the erroneous pose are displaced by its error: two(x) = one(x - off_line).
-    return gradient[:, None] * off_line, (one - two)[use], motion
+    return gradient[:, None] * off_line, difference, motion
 
 
 def _normalised(image: Layer) -> Layer:
@@ -364,10 +367,10 @@ def _normalised(image: Layer) -> Layer:
     return np.asarray((image - mean) / spread)
 
 
-def _motion(sample: PoseSamples, use: BoolArray, at: Layer) -> FloatArray:
+def _motion(sample: PoseSamples, use: npt.NDArray[np.int64], at: Layer) -> FloatArray:
     """(n, 2, 5) motion of the corresponding pixels per unit of turn and shift of the neighbour."""
     image, source = sample.image, sample.other.camera
-    rays, q = image.rays[:, None, use], sample.inverse_distance[None, use]
+    rays, q = image.rays.reshape(3, 1, -1)[..., use], sample.inverse_distance.reshape(1, -1)[:, use]
     columns = []
     for step in np.diag([_TURN_DEG] * 3 + [_SHIFT_M] * 2):
         to_source = np.linalg.inv(_pose(step) @ source.cam2ego) @ image.camera.cam2ego
