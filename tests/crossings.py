@@ -20,17 +20,17 @@ from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.sample.inputs import LEARNED_KEY
-from arbiview_aug.scene.scene import motion_camera
+from arbiview_aug.scene.depth_map import motion_camera
 
 PACKAGE = str(Path(arbiview_aug.__file__).parent)
 BOUNDS = {
     "street, plan cached": (15, 47),
     "LiDAR + boxes": (25, 600),
-    "LiDAR + boxes, points scanned": (30, 650),
-    "learned depth": (26, 600),
+    "LiDAR + boxes, points scanned": (31, 650),
+    "learned depth": (27, 600),
     "generated": (27, 1500),
     "neighbours, all": (32, 2500),
-    "motion": (37, 2550),
+    "motion": (39, 2600),
     "paper": (19, 180),
 }
 """Most files and crossings that a call may have."""

@@ -242,9 +242,14 @@ def source_pixels(
     ``rays`` are (3, h, w) unit rays in the target's frame, ``inverse_distance`` (h, w) is along them, 1/m. Returns u
     and v (h, w), ``kernels.FAR_AWAY_PX`` where there is no pixel, and inverse distances from the source (h, w), 1/m.
     """
+    return pixels_of(rays, inverse_distance, *relative_pose(target, source), source)
+
+
+def pixels_of(rays: Planes, inverse_distance: Planes, A: Any, o: Any, source: Camera) -> tuple[Planes, Planes, Planes]:
+    """As ``source_pixels``, by the rotation (3, 3) to the source's frame, and the rays' start (3,) there."""
     from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, project_image
 
-    A, o = relative_pose(target, source)
+    A, o = (np.ascontiguousarray(part, np.float32) for part in (A, o))
     u, v, nearness = (np.empty(inverse_distance.shape, np.float32) for _ in range(3))
     kind = LENS_CODES.get(source.lens, 0)
     project_image(rays, inverse_distance, A, o, kind, source.parameters, u, v, nearness)

@@ -29,6 +29,7 @@ from arbiview_aug.environment import compilation_announced
 from arbiview_aug.errors import WarnOnce, described
 from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.sample.neighbours import Neighbour, neighbour_images, read_neighbours
+from arbiview_aug.scene.depth_map import points_of
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, learned_depth
 from arbiview_aug.temporal.motion_depth import motion_depth, warm_up
@@ -107,7 +108,9 @@ def _for_network(
     """
     (frame,) = read_frames(sample, None)
     scene = read_scene(frame, "auto") or Scene()
-    measured = [one for one in (scene.points, scene.further.get("depth_m")) if one is not None]
+    measured = [] if scene.points is None else [scene.points[:, :3]]
+    if isinstance(maps := scene.further.get("depth_m"), tuple):
+        measured.append(points_of(maps)[0])
     points = np.concatenate(measured).astype(float) if measured and "LiDAR" in wanted else None
     is_there = "motion" in wanted and motion.path(token).is_file()
     from_motion = motion.read(token, sample["rig"]) if is_there else None

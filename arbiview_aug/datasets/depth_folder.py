@@ -17,8 +17,8 @@ from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.datasets.image_io import stack_or_list
 from arbiview_aug.errors import DataError, SampleError
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY
+from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.scene.scene import motion_camera
 from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import BEST_TRAVEL_M, MotionDepth
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,12 +15,13 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
 from arbiview_aug.sample.masks import CLEANING, dark_rims
 from arbiview_aug.scene.boxes import checked_boxes
+from arbiview_aug.scene.depth_map import DepthMap, Maps, anchored_maps, believed, motion_camera
 from arbiview_aug.scene.point_cloud import checked_points
-from arbiview_aug.scene.scene import GEOMETRIES, Scene, believed, motion_camera, points_of_depth
+from arbiview_aug.scene.scene import GEOMETRIES, Geometry, Scene
 from arbiview_aug.scene.surface import Points
 
 MOTION_KEY, LEARNED_KEY = "motion_depth_m", "learned_depth_m"
@@ -60,7 +61,8 @@ class Frame:
         sample: The sample it was read from; further entries are read and checked on request.
         lead: Leading dimensions of the sample's images.
         index: Place of the frame in them.
-        once: What is read once for all stages, by name: neighbours and their points.
+        neighbours: Checked neighbouring frames, once ``sample.neighbours`` has read them.
+        sweeps: Their points, likewise.
     """
 
     images: tuple[torch.Tensor, ...]
@@ -68,7 +70,8 @@ class Frame:
     sample: Mapping[str, Any] = field(default_factory=dict, repr=False)
     lead: tuple[int, ...] = ()
     index: tuple[int, ...] = ()
-    once: dict[str, Any] = field(default_factory=dict, repr=False, init=False)
+    neighbours: list[Any] | None = field(default=None, repr=False, init=False)
+    sweeps: list[FloatArray] | None = field(default=None, repr=False, init=False)
 
     @property
     def number(self) -> int:
@@ -151,7 +154,7 @@ def read_scene(frame: Frame, surface: str) -> Scene | None:
         SampleError: The sample lacks what the surface needs, or it is impossible.
     """
     row, sample = GEOMETRIES[surface], frame.sample
-    arrays: dict[str, Points] = {}
+    arrays: dict[str, Geometry] = {}
     for name in row.reads:
         array = _geometry(name, frame, arrays, name == "motion" and LEARNED_KEY in row.reads)
         if array is not None:
@@ -179,46 +182,42 @@ _EXPECTED = {
 _CHECKS: dict[str, Callable[[Points], Points]] = {"boxes_3d": checked_boxes, "points": checked_points}
 
 
-def _geometry(name: str, frame: Frame, arrays: Mapping[str, Points], is_doubted: bool) -> Points | None:
-    """The array of a name in ``GeometryRow.reads``, beside the ``arrays`` read before; None without any.
+def _geometry(name: str, frame: Frame, arrays: Mapping[str, Geometry], is_doubted: bool) -> Geometry | None:
+    """The arrays or maps of a name in ``GeometryRow.reads``, beside the ``arrays`` read before; None without any.
 
     Depth from motion that ``is_doubted`` is left out where a network's maps, if there are any, contradict it.
     """
-    parts: list[Points] = []
-    for key in _SAMPLE_KEYS.get(name, (name,)):
-        if frame.sample.get(key) is None:
-            continue
-        if key in DEPTH_KEYS:
-            anchors = [arrays[one] for one in ("points", "depth_m", "motion") if one in arrays and key != "depth_m"]
-            parts.append(_points_of_maps(key, frame, np.concatenate([np.zeros((0, 3)), *anchors]), is_doubted))
-            continue
-        array = frame.array(key)
-        assert array is not None
-        parts.append(_CHECKS[key](array) if key in _CHECKS else array)
-    return (parts[0] if len(parts) == 1 else cast(Points, np.concatenate(parts))) if parts else None
+    (key,) = _SAMPLE_KEYS.get(name, (name,))
+    if frame.sample.get(key) is None:
+        return None
+    if key in DEPTH_KEYS:
+        before = [arrays[one] for one in ("points", "depth_m", "motion") if one in arrays and key != "depth_m"]
+        return _maps(key, frame, before, is_doubted)
+    array = frame.array(key)
+    assert array is not None
+    return _CHECKS[key](array) if key in _CHECKS else array
 
 
-def _points_of_maps(key: str, frame: Frame, anchors: Points, is_doubted: bool) -> Points:
-    """(P, 3) points of a frame's depth maps, brought to ``anchors`` (P, 3) if there are any."""
+def _maps(key: str, frame: Frame, before: Sequence[Geometry], is_doubted: bool) -> Maps:
+    """A frame's depth maps, fused with the points and maps ``before`` them; none if nothing is known."""
     maps = _depth_maps(key, frame)
     if is_doubted and frame.sample.get(LEARNED_KEY) is not None:
         maps = list(map(believed, maps, _depth_maps(LEARNED_KEY, frame)))
-    cameras = [camera if key == "depth_m" else motion_camera(camera) for camera in frame.rig]
-    pairs = zip(cameras, maps, strict=True)
-    return np.concatenate([points_of_depth(camera, depth_m, key, anchors) for camera, depth_m in pairs])
+    return anchored_maps(maps, before)
 
 
-def _depth_maps(key: str, frame: Frame) -> list[FloatArray]:
-    """The depth maps (H, W) of a frame's cameras."""
+def _depth_maps(key: str, frame: Frame) -> list[DepthMap]:
+    """The depth maps of a frame's cameras."""
     try:
         maps = entry(frame.sample[key], frame.lead, frame.index)
     except (AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise SampleError(f"{key}: expected one map (H, W) for each image ({error})") from None
     if isinstance(maps, torch.Tensor | np.ndarray):
-        maps = list(numbers(key, maps)) if maps.ndim else ()
+        maps = list(as_array(key, maps)) if maps.ndim else ()
     if not isinstance(maps, list | tuple) or len(maps) != len(frame.rig):
         raise SampleError(f"{key}: expected {len(frame.rig)} maps (H, W), one for each image")
-    return [numbers(key, depth_m) for depth_m in maps]
+    cameras = frame.rig if key == "depth_m" else map(motion_camera, frame.rig)
+    return [DepthMap.of(camera, as_array(key, one), key) for camera, one in zip(cameras, maps, strict=True)]
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
@@ -372,8 +371,8 @@ def as_array(key: str, value: Any) -> Points:
         array = np.asarray(value)
         return array if array.dtype == np.float32 else np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: quantised and meta tensors
-        why = " ".join(str(error).split())[:120]
-        raise SampleTypeError(f"{key}: expected a tensor of numbers, got {type(value).__name__} ({why})") from None
+        got = f"{type(value).__name__} ({one_line(error, 120)})"
+        raise SampleTypeError(f"{key}: expected a tensor of numbers, got {got}") from None
 
 
 PIXEL_BOUND_KEYS = (

@@ -16,19 +16,17 @@ from arbiview_aug.scene.panorama import NEAREST_M
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 _HALF_PI = np.float32(np.pi / 2)
-_CHUNK = 1024  # points worked on at once
+_NEAREST = np.float32(1 / NEAREST_M)
+BLOCK, _LANES = 1024, 64
+"""Points worked on at once, and left out together."""
+CONES_M = 1.5, 0.0, 1.5
+"""A place among a vehicle's cameras and scanners, in the ego frame: cones are seen from there."""
+_CONES, _TINY = tuple(np.float32(part) for part in CONES_M), np.float32(1e-30)
 
 # A cell's nearest seed in one int32, so that the nearer of two is their minimum: distance in 1/1024 cell (from bit 14),
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
 _ROW, _OWN, _NO_SEED = 1 << 7, np.int32(64 * 128 + 64), np.int32(1 << 30)
 _SIDE, _CORNER, _KNIGHT = 1024 << 14, 1434 << 14, 2250 << 14
-_LOW_M, _LOW = np.float32(0.2), np.float32(0.01)
-"""Points lie on the road up to this height over it, and this share of their distance."""
-_JOINED_STEP_M, _JOINED_SLOPE = np.float32(0.3), np.float32(0.05)
-"""Level surfaces that differ by this height, and this share of their distance, are one: kerbs, and roads that rise.
-0.1 m loses 7 % of the points on synthetic vehicles at 15 to 25 m, which stand on the road."""
-_JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
-"""... and upright ones whose distances differ by that much, and so many times by how far they are apart across."""
 _STEP, _STEP_PER_M, LEAST_WEIGHT = np.float32(panorama.STEP), np.float32(panorama.STEP_PER_M), np.float32(1e-3)
 
 
@@ -53,8 +51,65 @@ def cells_row(x: Any, y: Any, z: Any, place: Any, level: Any, row: Any, column: 
 
 
 @compiled
+def block_cones(points: Any) -> Any:
+    """Cones (n, 5) around each ``BLOCK`` of consecutive points (P, 3), as seen from ``CONES_M``.
+
+    Their axes (3), the angle that holds the points, radians, and the distance of the nearest one, metres.
+    """
+    n, work, lanes = points.shape[0], np.empty((4, BLOCK), np.float32), np.empty((5, _LANES), np.float32)
+    x, y, z, length = work[0], work[1], work[2], work[3]
+    cones = np.zeros(((n + BLOCK - 1) // BLOCK, 5), np.float32)
+    for block in range(cones.shape[0]):
+        cone, part = cones[block], points[block * BLOCK : block * BLOCK + BLOCK]
+        for i in range(BLOCK):
+            k = min(i, part.shape[0] - 1)
+            x[i], y[i], z[i] = part[k, 0] - _CONES[0], part[k, 1] - _CONES[1], part[k, 2] - _CONES[2]
+        for i in range(BLOCK):
+            length[i] = max(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i]), _TINY)
+        for i in range(BLOCK):
+            x[i], y[i], z[i] = x[i] / length[i], y[i] / length[i], z[i] / length[i]
+        lanes[:3], lanes[3], lanes[4] = _ZERO, np.float32(np.inf), _ONE
+        for start in range(0, BLOCK, _LANES):  # side by side, as vector instructions do
+            for i in range(_LANES):
+                lanes[0, i] += x[start + i]
+            for i in range(_LANES):
+                lanes[1, i] += y[start + i]
+            for i in range(_LANES):
+                lanes[2, i] += z[start + i]
+            for i in range(_LANES):
+                lanes[3, i] = min(lanes[3, i], length[start + i])
+        for i in range(_LANES):
+            cone[0], cone[1], cone[2] = cone[0] + lanes[0, i], cone[1] + lanes[1, i], cone[2] + lanes[2, i]
+        size = max(np.sqrt(cone[0] * cone[0] + cone[1] * cone[1] + cone[2] * cone[2]), _TINY)
+        cone[0], cone[1], cone[2] = cone[0] / size, cone[1] / size, cone[2] / size
+        for start in range(0, BLOCK, _LANES):
+            for i in range(_LANES):
+                k = start + i
+                lanes[4, i] = min(lanes[4, i], x[k] * cone[0] + y[k] * cone[1] + z[k] * cone[2])
+        cone[3], cone[4] = np.arccos(max(lanes[4].min(), -_ONE)) + np.float32(1e-3), lanes[3].min()
+    return cones
+
+
+@inlined
+def _may_meet(cone: Any, origin: Any, bounds: Any) -> bool:
+    """Whether points of a cone (5,) may lie within a window's ``bounds`` around ``origin``."""
+    x, y, z = origin[0] - _CONES[0], origin[1] - _CONES[1], origin[2] - _CONES[2]
+    sine = np.sqrt(x * x + y * y + z * z) / cone[4]  # of the angle between a point's two directions, by the sine rule
+    if not sine < 1:
+        return True
+    spread, elevation = cone[3] + np.arcsin(sine), np.arcsin(min(max(cone[2], -1.0), 1.0))
+    if elevation - spread > np.arcsin(bounds[1]) or elevation + spread < np.arcsin(bounds[0]):
+        return False
+    level = np.sqrt(cone[0] * cone[0] + cone[1] * cone[1])
+    if spread + abs(elevation) >= np.pi / 2:
+        return True
+    off = np.arccos(min(max((cone[0] * bounds[2] + cone[1] * bounds[3]) / level, -1.0), 1.0))
+    return off - np.arcsin(min(np.sin(spread) / level, 1.0)) <= np.arccos(bounds[4])
+
+
+@compiled
 def elevations(points: Any, origin: Any) -> Any:
-    """Sines (2,) of the lowest and highest elevation of the points (P, 3) as seen from ``origin``."""
+    """Lowest and highest elevation (2,) of the points (P, 3) as seen from ``origin``, radians."""
     low, high = 1.0, -1.0
     for i in range(points.shape[0]):
         x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
@@ -63,38 +118,40 @@ def elevations(points: Any, origin: Any) -> Any:
             sine2 = z * abs(z) / length2
             low, high = min(low, sine2), max(high, sine2)
     ends = np.array([low, high])
-    return np.sign(ends) * np.sqrt(np.abs(ends))
+    return np.arcsin(np.sign(ends) * np.sqrt(np.abs(ends)))
 
 
 @compiled
-def nearest_points(points: Any, origin: Any, bounds: Any, place: Any, q: Any, number: Any) -> None:
+def nearest_points(points: Any, cones: Any, origin: Any, bounds: Any, place: Any, q: Any, number: Any) -> None:
     """Z-buffer the points (P, 3) around ``origin`` in a window (``Window.bounds``, ``Window.place``).
 
-    ``q`` (h, w), 0 before, becomes the largest inverse distance of points in a cell, ``number`` (h, w) int32 whose it
-    is, of equally near ones the last's.
+    ``cones`` are those of ``block_cones``. ``q`` (h, w), 0 before, becomes the largest inverse distance of points
+    in a cell, ``number`` (h, w) int32 whose it is, of equally near ones the last's.
     """
-    (h, w), turn = q.shape, int(place[4])
-    low, high, cosine, sine, least = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
-    work, index = np.empty((7, _CHUNK), np.float32), np.empty(_CHUNK, np.int64)
-    for start in range(0, points.shape[0], _CHUNK):
-        n = 0
-        for i in range(start, min(start + _CHUNK, points.shape[0])):
-            x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-            forward, level2 = x * cosine + y * sine, x * x + y * y
-            if forward < least * np.sqrt(level2):  # most points lie elsewhere
-                continue
-            length = np.sqrt(level2 + z * z)
-            if length >= NEAREST_M and low * length <= z <= high * length:
-                work[0, n], work[1, n], work[2, n], work[3, n] = x / length, y / length, z / length, 1 / length
-                index[n] = i
-                n += 1
-        cells_row(work[0, :n], work[1, :n], work[2, :n], place, work[4, :n], work[5, :n], work[6, :n])
+    (h, w), turn = q.shape, np.int32(place[4])
+    work, row, column = np.empty((7, BLOCK), np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    x, y, z, near = work[0], work[1], work[2], work[3]
+    for block in range(cones.shape[0]):
+        if not _may_meet(cones[block], origin, bounds):
+            continue
+        start = block * BLOCK
+        n = min(BLOCK, points.shape[0] - start)
+        part = points[start : start + n]
         for i in range(n):
-            row, column = int(np.rint(work[5, i])), int(np.rint(work[6, i])) % turn
-            while 0 <= row < h and column < w:  # the halo of a whole turn holds some points twice
-                if work[3, i] >= q[row, column]:
-                    q[row, column], number[row, column] = work[3, i], index[i]
-                column += turn
+            a, b, c = part[i, 0] - origin[0], part[i, 1] - origin[1], part[i, 2] - origin[2]
+            length = np.sqrt(a * a + b * b + c * c)
+            x[i], y[i], z[i], near[i] = a / length, b / length, c / length, 1 / length
+        cells_row(x[:n], y[:n], z[:n], place, work[4, :n], work[5, :n], work[6, :n])
+        for i in range(n):
+            row[i] = np.int32(np.rint(work[5, i])) if near[i] <= _NEAREST else np.int32(-1)
+        for i in range(n):
+            column[i] = np.int32(np.rint(work[6, i]))
+        for i in range(n):
+            at, k = row[i], column[i] if column[i] < turn else column[i] - turn
+            while 0 <= at < h and k < w:  # the halo of a whole turn holds some points twice
+                if near[i] >= q[at, k]:
+                    q[at, k], number[at, k] = near[i], start + i
+                k += turn
 
 
 @compiled
@@ -110,33 +167,37 @@ def drop_hidden(
     """
     h, w = q.shape
     more = away - 1 - 2 * side  # windows are longer than wide
-    cells, n = np.empty(h * w, np.int64), 0
+    cells, n, rays = np.empty(h * w, np.int64), 0, np.empty((3, h * w), np.float32)
+    between, inner = np.zeros(w, np.float32), w - 2
     for y in range(h):
         inside = away <= y < h - away
+        if sparse < points.shape[0] and 0 < y < h - 1 and inner > 0:
+            left, right, up, down = q[y, :inner], q[y, 2:], q[y - 1, 1 : w - 1], q[y + 1, 1 : w - 1]
+            hidden = between[1 : w - 1]
+            for x in range(inner):
+                hidden[x] = hidden_below(max(min(left[x], right[x]), min(up[x], down[x])))
+        else:
+            between[:] = _ZERO
         for x in range(w):
             if q[y, x] <= _ZERO:
                 continue
             if number[y, x] >= sparse:
-                if 0 < y < h - 1 and 0 < x < w - 1:
-                    across, above = min(q[y, x - 1], q[y, x + 1]), min(q[y - 1, x], q[y + 1, x])
-                    if q[y, x] < _hidden_below(max(across, above)):
-                        continue
-            elif inside and away <= x < w - away:
-                row, left, right = most[y - side], x - away, x + 1
-                across = min(max(row[left], row[left + more]), max(row[right], row[right + more]))
-                column, up, down = x - side, y - away, y + 1
-                above = max(most[up, column], most[up + more, column])
-                below = max(most[down, column], most[down + more, column])
-                if q[y, x] < _hidden_below(max(across, min(above, below))):
+                if q[y, x] < between[x]:
                     continue
+            elif inside and away <= x < w - away:
+                row, west, east = most[y - side], x - away, x + 1
+                across = min(max(row[west], row[west + more]), max(row[east], row[east + more]))
+                column, top, bottom = x - side, y - away, y + 1
+                above = max(most[top, column], most[top + more, column])
+                below = max(most[bottom, column], most[bottom + more, column])
+                if q[y, x] < hidden_below(max(across, min(above, below))):
+                    continue
+            point, near = points[number[y, x]], q[y, x]
+            for axis in range(3):
+                rays[axis, n] = (point[axis] - origin[axis]) * near
             cells[n] = y * w + x
             n += 1
-    rays = np.empty((3, 1, n), np.float32)
-    for i in range(n):
-        y, x = cells[i] // w, cells[i] % w
-        for axis in range(3):
-            rays[axis, 0, i] = (points[number[y, x], axis] - origin[axis]) * q[y, x]
-    return cells[:n].copy(), rays
+    return cells[:n].copy(), rays[:, :n].copy().reshape(3, 1, n)
 
 
 @compiled
@@ -156,7 +217,7 @@ def seen_through(q: Any, rows: Any, columns: Any, most: Any, up: int, side: int,
     for i in range(q.shape[0]):
         row, column = int(np.rint(rows[i])) - up, int(np.rint(columns[i])) - side
         known = most[row, column] if 0 <= row < h - height and 0 <= column < w - width else _ZERO
-        contradicted[i] = known > _ZERO and _hidden_below(q[i]) > known
+        contradicted[i] = known > _ZERO and hidden_below(q[i]) > known
 
 
 @compiled
@@ -173,8 +234,11 @@ def nearest_residuals(
     code[:] = _NO_SEED
     seeds = layers[:2].reshape(2, size)  # until the layers are known
     seeds[:] = _ZERO
+    row, end = 0, w
     for i in range(cells.shape[0]):
-        code[cells[i] // w + 2, cells[i] % w + 2] = _OWN
+        while cells[i] >= end:  # they are in order
+            row, end = row + 1, end + w
+        code[row + 2, cells[i] - end + w + 2] = _OWN
         seeds[0, cells[i]], seeds[1, cells[i]] = residuals[i], own_q[i]
     spread(code)
     away, place, residual, nearest = np.empty(w, np.float32), np.empty(w, np.int32), seeds[0], seeds[1]
@@ -219,139 +283,6 @@ def spread(code: Any) -> None:
                 x = i if s == 1 else w - 5 - i
                 last = min(row[x], np.int32(last + beside))
                 row[x] = last
-
-
-@compiled
-def meet_points(
-    rows: Any, columns: Any, rays: Any, index: Any, seeds: Any, ground: float, rad: float, reach: float, side: float,
-    q: Any, nearest: Any,
-) -> None:  # fmt: skip
-    """Find where rays meet the surfaces between points: the next point above each ray, and the next one below.
-
-    Points of one surface are joined by a line. Elsewhere a ray meets the surface of the nearer point, which goes on
-    level or upright for half the spacing of the scan lines around that point.
-
-    Args:
-        rows: (ny, nx) rows of the rays in a panorama.
-        columns: (ny, nx) their columns.
-        rays: (3, ny, nx) unit rays.
-        index: (h, w) int32 the point in each cell, -1 without one.
-        seeds: (4, n) float32 rows and columns of points, their inverse level distances, 1/m, and their heights over
-            the rays' origin.
-        ground: Height of the road over the rays' origin.
-        rad: Side of a cell.
-        reach: Cells by which a point may lie above or below a ray.
-        side: Cells by which it may lie aside.
-        q: (ny, nx) inverse distances, written, 1/m.
-        nearest: (ny, nx) int32, written: the point that is nearer to the ray, -1 where the ray meets nothing.
-    """
-    h, w = index.shape
-    far = 2 * reach
-    up, aside = int(far) + 1, int(side) + 1
-    spoken, is_level = np.empty(seeds.shape[1], np.float32), np.zeros(seeds.shape[1], np.bool_)
-    _describe(index, seeds, ground, reach, spoken, is_level)
-    for y in range(rows.shape[0]):
-        for x in range(rows.shape[1]):
-            q[y, x], nearest[y, x] = _ZERO, -1
-            row, column = int(np.rint(rows[y, x])), int(np.rint(columns[y, x]))
-            over, under, least_over, least_under = -1, -1, np.float32(np.inf), np.float32(np.inf)
-            for c in range(max(column - aside, 0), min(column + aside + 1, w)):
-                for r in range(max(row, 0), min(row + up, h - 1) + 1):
-                    i = index[r, c]
-                    if i >= 0 and seeds[0, i] >= rows[y, x]:
-                        cost = _cost(seeds, i, rows[y, x], columns[y, x], far, side)
-                        if cost < least_over:
-                            over, least_over = i, cost
-                        break
-                for r in range(min(row, h - 1), max(row - up, 0) - 1, -1):
-                    i = index[r, c]
-                    if i >= 0 and seeds[0, i] < rows[y, x]:
-                        cost = _cost(seeds, i, rows[y, x], columns[y, x], far, side)
-                        if cost < least_under:
-                            under, least_under = i, cost
-                        break
-            if over < 0 and under < 0:
-                continue
-            level = np.sqrt(max(_ONE - rays[2, y, x] * rays[2, y, x], np.float32(1e-12)))
-            slope = rays[2, y, x] / level
-            to_over = seeds[0, over] - rows[y, x] if over >= 0 else np.float32(np.inf)
-            to_under = rows[y, x] - seeds[0, under] if under >= 0 else np.float32(np.inf)
-            one = over if to_over <= to_under else under
-            inverse = _ZERO
-            if over >= 0 and under >= 0 and to_over + to_under <= far:
-                inverse = _between_points(seeds, is_level, over, under, slope, (to_over + to_under) * rad)
-            if inverse <= _ZERO and min(to_over, to_under) <= spoken[one]:
-                inverse = _going_on(seeds, is_level, one, slope)
-            if inverse > _ZERO:
-                q[y, x], nearest[y, x] = inverse * level, one
-
-
-@inlined
-def _cost(seeds: Any, i: int, row: float, column: float, far: float, side: float) -> Any:
-    """What tells points next to a ray apart, the nearer the less; infinite out of reach."""
-    away, off = seeds[0, i] - row, seeds[1, i] - column
-    return away * away + 4 * off * off if abs(away) <= far and abs(off) <= side else np.float32(np.inf)
-
-
-@inlined
-def _describe(index: Any, seeds: Any, ground: float, reach: float, spoken: Any, is_level: Any) -> None:
-    """Write for how many cells above and below points (n,) speak, and which lie on level surfaces.
-
-    A point speaks for half the spacing of points there, at most ``reach``.
-    """
-    h, w = index.shape
-    most = int(2 * reach)
-    for row in range(h):
-        for column in range(w):
-            i = index[row, column]
-            if i < 0:
-                continue
-            least = 2 * reach
-            height = abs(seeds[3, i] - ground)
-            is_level[i] = height < _LOW_M + _LOW / seeds[2, i] and seeds[3, i] < _ZERO  # seen from above
-            for step in (-1, 1):
-                for k in range(1, min(most, row if step < 0 else h - 1 - row) + 1):
-                    j = index[row + step * k, column]
-                    if j >= 0:
-                        least = min(least, abs(seeds[0, j] - seeds[0, i]))
-                        is_level[i] |= _are_level(seeds, i, j)
-                        break
-            spoken[i] = least / _TWO
-
-
-@inlined
-def _are_level(seeds: Any, i: int, j: int) -> bool:
-    """Whether a line between two points under the origin is nearer to a level one than to an upright one."""
-    a, b, slope = seeds[2, i], seeds[2, j], seeds[3, i] * seeds[2, i]
-    if max(seeds[3, i], seeds[3, j]) >= _ZERO or a == b:
-        return False
-    # Inverse distances of a level surface are proportional to slopes.
-    part = (seeds[3, j] * b / slope - _ONE) / (b / a - _ONE)
-    return _HALF < part < _TWO
-
-
-@inlined
-def _going_on(seeds: Any, is_level: Any, i: int, slope: float) -> Any:
-    """Inverse level distance at which a ray of this slope meets the surface of a point; up to 0 if it does not."""
-    return slope / seeds[3, i] if is_level[i] else seeds[2, i]
-
-
-@inlined
-def _between_points(seeds: Any, is_level: Any, over: int, under: int, slope: float, apart: float) -> Any:
-    """Inverse level distance at which a ray meets what two points show, ``apart`` radians; 0 if they differ."""
-    a, b = seeds[2, over], seeds[2, under]
-    wide = abs(_ONE / a - _ONE / b)
-    if is_level[under] and not is_level[over] and a <= b:  # a floor up to the foot of something
-        return max(_going_on(seeds, is_level, under, slope), a)
-    if is_level[over] and is_level[under]:
-        is_same = abs(seeds[3, over] - seeds[3, under]) <= _JOINED_STEP_M + _JOINED_SLOPE * wide
-    else:
-        is_same = not (is_level[over] or is_level[under]) and wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
-    if not is_same:
-        return _ZERO
-    s, t = seeds[3, over] * a, seeds[3, under] * b
-    part = min(max((slope - t) / max(s - t, np.float32(1e-6)), _ZERO), _ONE)
-    return b + (a - b) * part
 
 
 @inlined
@@ -438,7 +369,7 @@ def _slide(row: Any, oldest: Any, total: Any) -> None:
 
 
 @inlined
-def _hidden_below(known: Any) -> Any:
+def hidden_below(known: Any) -> Any:
     """The evaluation protocol's tolerance, in inverse distance: nearer by a tenth of the distance and 0.3 m."""
     known = max(known, _ZERO)
     return known / (np.float32(1.1) + np.float32(0.3) * known)
@@ -465,7 +396,7 @@ def hidden_depths(layers: Any, silent: Any, base: Any, step: int, shrink: int, o
             row[x] = _ZERO
         row = row[shrink:]
         for x in range(w - side):  # closes gaps between scan lines, but not outwards
-            row[x] = _hidden_below(inner[x]) if hidden[x] == _ZERO else _ZERO
+            row[x] = hidden_below(inner[x]) if hidden[x] == _ZERO else _ZERO
 
 
 @compiled

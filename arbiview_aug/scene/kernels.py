@@ -15,6 +15,7 @@ _TINY = np.float32(1e-30)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 ROW = 35
 
+
 GROUND, STREET = 0, 1
 
 
@@ -320,7 +321,7 @@ def fit_profiles(
         points: (P, 3).
         within: (n,) numbers of points in boxes, box after box.
         ends: (B,) where they end.
-        least: So many points choose.
+        least: Fewest points that may choose.
         air: Points so near are the object's own unless they lie as near to the box's floor.
         planes: (B, pieces, 6, 4), written.
         is_own: (P,) set for the points of objects.
@@ -394,3 +395,14 @@ def points_in(boxes: Any, points: Any, air: float) -> Any:
                 pairs[0, n], pairs[1, n] = k, i
                 n += 1
     return pairs[:, :n]
+
+
+@compiled
+def close_gaps(points: Any, left_out: Any) -> int:
+    """Move the points (P, 3) up over those that are ``left_out`` (P,); return how many stay."""
+    n = 0
+    for i in range(points.shape[0]):
+        if not left_out[i]:
+            points[n, 0], points[n, 1], points[n, 2] = points[i, 0], points[i, 1], points[i, 2]
+            n += 1
+    return n

@@ -55,3 +55,6 @@ NEAREST_M = 0.5
 BASE_STEP = 4  # cells, 0.8 or 1.6 degrees: a static surface is smooth
 HALO_RAD = math.radians(4.0)
 """Room around a window that its filters need."""
+
+OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
+"""(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""

@@ -7,6 +7,7 @@ No sensor's place is assumed: points are z-buffered and made dense anew for each
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -21,12 +22,10 @@ from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene import panorama
-from arbiview_aug.scene.boxes import BoxSurface, solids_among
-from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, SIDE_RAD, Layer
+from arbiview_aug.scene.boxes import BoxSurface
+from arbiview_aug.scene.depth_map import DepthMap, hidden_by
+from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, OWN_CAR_M, SIDE_RAD, Layer
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
-
-OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
-"""(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
 
 _STEEP = 0.9
 """Sine of the elevation up to which azimuths are interpolated: 64 degrees."""
@@ -41,6 +40,10 @@ _MOST_FEATURES = 16  # of a point: 3 or 4 rows that are longer are points turned
 
 MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
+
+
+KNOWN_SHARE = 0.9
+"""Share of a camera's pixels with a depth, from which on its map alone tells what is hidden from it."""
 
 
 class Cells(NamedTuple):
@@ -85,6 +88,9 @@ FINE, COARSE = Cells.of(CELL_RAD), Cells.of(2 * CELL_RAD)
 MAPPED = FINE._replace(smooth=1)
 """Cells where there are depth maps: their outlines are seen, not guessed between scan lines, and rounding them costs
 1 dB on the synthetic street."""
+MAPPED_COARSE = Cells.of(1.5 * CELL_RAD)._replace(smooth=1)
+"""... for coarse views: fisheye views of synthetic streets differ by -0.1 to +0.1 dB, with cells twice as wide they
+lose up to 0.3."""
 SWEPT = MAPPED._replace(see_through=round(math.radians(1.4) / CELL_RAD), side=round(SIDE_RAD / CELL_RAD / 2))
 """Cells where neighbouring frames add their scan lines: with gaps half as wide, outlines need less rounding. On DDAD a
 see-through angle of 1 degree and sides of 0.2 lose 1 dB, and gain 0.4 dB on synthetic streets."""
@@ -181,6 +187,7 @@ class Panorama:
         origin: FloatArray,
         points: Points,
         street: StaticSurface,
+        cones: Layer,
         memory: Memory = FRESH,
         mapped: int = 0,
     ) -> None:
@@ -189,7 +196,7 @@ class Panorama:
         self.window, self._origin, self._street, self._place = window, origin, street, window.place
         shape, cells = window.shape, window.cells
         q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
-        nearest_points(points, origin, window.bounds, self._place, q, number)
+        nearest_points(points, cones, origin, window.bounds, self._place, q, number)
         most, sparse = window_max(q, 2 * cells.side, 2 * cells.side), len(points) - mapped
         cell, rays = drop_hidden(q, most, number, points, origin, cells.see_through, cells.side, sparse)
         own_q = q.reshape(-1)[cell]
@@ -235,37 +242,51 @@ class PointCloudSurface(DenseSurface):
     """Points made dense over the street. Points of the own car are left out.
 
     Attributes:
-        street: What there is where nothing was measured.
+        street: Surface where nothing was measured.
         points: (P, 3) in the ego frame, finite, metres.
-        mapped: So many of the last points are of depth maps.
+        mapped: Number of the last points that are of depth maps; none of these is of the own car.
         swept: Whether points of neighbouring frames are among them.
+        maps: These depth maps, which tell what is hidden from their own cameras.
     """
 
     street: StaticSurface
     points: Points
     mapped: int = 0
     swept: bool = False
+    maps: Sequence[DepthMap] = ()
     _panoramas: dict[bytes, tuple[tuple[float, float], list[Panorama]]] = field(default_factory=dict, repr=False)
     _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
     _latest: dict[bytes, Panorama] = field(default_factory=dict, repr=False)
     _nodes: dict[tuple[bytes, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        kept = ~own_car(self.points)
-        object.__setattr__(self, "mapped", int(np.count_nonzero(kept[len(kept) - self.mapped :])))
-        object.__setattr__(self, "points", self.points[kept])
+        measured = len(self.points) - self.mapped  # maps leave out their own
+        is_own = own_car(self.points[:measured])
+        points = np.delete(self.points, np.flatnonzero(is_own), axis=0) if is_own.any() else self.points
+        object.__setattr__(self, "points", np.ascontiguousarray(points, np.float32))
 
-    @property
-    def _cells(self) -> Cells | None:
-        """Cells that suit the points; None if they depend on the camera."""
-        return SWEPT if self.swept else MAPPED if self.mapped else None
+    @cached_property
+    def _measured(self) -> PointCloudSurface:
+        """The surface of the points alone, without those of maps."""
+        return PointCloudSurface(self.street, self.points[: len(self.points) - self.mapped], swept=self.swept)
+
+    @cached_property
+    def _cones(self) -> Layer:
+        from arbiview_aug.scene.completion import block_cones
+
+        return np.asarray(block_cones(self.points))
+
+    def _cells(self, camera: Camera | None = None) -> Cells:
+        """Cells that suit the points, and a camera that looks at them."""
+        fits = FINE if camera is None else Cells.for_camera(camera)
+        return SWEPT if self.swept else (MAPPED if fits is FINE else MAPPED_COARSE) if self.mapped else fits
 
     def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
         """The points' dense surface at all pixels, 1/m (h, w)."""
         from arbiview_aug.scene.completion import add_residuals
 
         q = self.street.image(camera, rays, memory)
-        view, *cells = self._located(camera, rays, self._cells or Cells.for_camera(camera), memory)
+        view, *cells = self._located(camera, rays, self._cells(camera), memory)
         add_residuals(*cells, view.layers, q)
         return q
 
@@ -283,10 +304,19 @@ class PointCloudSurface(DenseSurface):
         return self._shadows[key]
 
     def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, coarse: bool = True) -> Layer:
-        """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart."""
+        """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
+
+        With ``coarse`` a camera's own depth map tells, if it has one, and measured points where that knows too little.
+        """
         from arbiview_aug.scene.completion import interpolate_layer
 
-        cells = self._cells or (COARSE if coarse else Cells.for_camera(camera))
+        known = hidden_by(self.maps, camera) if coarse and self.maps else None
+        if known is not None:
+            if len(self._measured.points) and np.count_nonzero(known) < KNOWN_SHARE * known.size:
+                np.copyto(known, self._measured.hidden(camera, rays, memory), where=known == 0)
+            return known
+        measured = coarse and not self.swept and not self.mapped
+        cells = COARSE if measured else self._cells(None if coarse else camera)
         view, *nodes = self._located(camera, rays, cells, memory)
         hidden = memory.empty(camera.size, np.float32)
         interpolate_layer(*nodes, view.hidden_below, cells.apart(camera), hidden)
@@ -330,8 +360,8 @@ class PointCloudSurface(DenseSurface):
         from arbiview_aug.scene.completion import elevations
 
         if origin.tobytes() not in self._panoramas:
-            low, high = np.arcsin(elevations(self.points, origin))
-            self._panoramas[origin.tobytes()] = (low, high), []
+            ends = (-math.pi, math.pi) if self.mapped else tuple(elevations(self.points, origin).tolist())
+            self._panoramas[origin.tobytes()] = ends, []
         (low, high), held = self._panoramas[origin.tobytes()]
         around = lambda of: Window.around(  # noqa: E731
             directions.reshape(-1, 3), of, (low - of.beyond, high + of.beyond)
@@ -339,8 +369,9 @@ class PointCloudSurface(DenseSurface):
         suitable = (p for p in held if cells in (None, p.window.cells) and p.window.holds(around(p.window.cells)))
         panorama = next(suitable, None)
         if panorama is None:
-            cells = cells or self._cells or FINE
-            panorama = Panorama(around(cells).roomy, origin, self.points, self.street, memory, self.mapped)
+            cells = cells or self._cells()
+            points = self.points, self.street, self._cones
+            panorama = Panorama(around(cells).roomy, origin, *points, memory, self.mapped)
             held.append(panorama)
         return panorama
 
@@ -372,21 +403,11 @@ class PointCloudWithBoxes(BoxSurface):
     An object's points choose its shape and are left out of the panoramas, where they would blur over its outline.
 
     Attributes:
-        street: The points' surface; ``among`` leaves out those of objects.
+        street: The surface of the points that are of no object.
         boxes: (B, 7), as in ``BoxSurface``.
     """
 
     street: PointCloudSurface
-
-    @classmethod
-    def among(
-        cls, street: StaticSurface, points: Points, boxes: FloatArray, mapped: int = 0, swept: bool = False
-    ) -> PointCloudWithBoxes:
-        """Boxes (B, 7) among points (P, 3); ``mapped`` and ``swept`` are those of ``PointCloudSurface``."""
-        planes, is_own = solids_among(boxes, points)
-        mapped = int(np.count_nonzero(~is_own[len(points) - mapped :]))
-        others = PointCloudSurface(street, points[~is_own], mapped, swept)
-        return cls(others, boxes, planes)
 
     def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> Layer:
         return self.street.hidden(camera, rays, memory, coarse=coarse)
@@ -410,10 +431,11 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
     from arbiview_aug.scene import completion
 
     points, others = (np.ascontiguousarray(part, np.float32) for part in (points[~own_car(points)], others))
-    low, high = np.arcsin(completion.elevations(points, origin)) / CELL_RAD
+    low, high = completion.elevations(points, origin) / CELL_RAD
     window = Window(math.floor(low), 0, max(math.ceil(high) - math.floor(low), 0), FINE.turn)
     most, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)
-    completion.nearest_points(points, origin, window.bounds, window.place, most, number)
+    cones = completion.block_cones(points)
+    completion.nearest_points(points, cones, origin, window.bounds, window.place, most, number)
     rays = (others - origin.astype(np.float32)).T.reshape(3, 1, -1).copy()
     rows, columns = np.empty((2, 1, len(others)), np.float32)
     completion.cells_of(rays, np.eye(3, dtype=np.float32), window.place, rows, columns)

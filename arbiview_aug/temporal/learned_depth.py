@@ -20,8 +20,8 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reference
 from arbiview_aug.scene.boxes import draw_boxes
+from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.scene.scene import motion_camera
 from arbiview_aug.temporal.motion_depth import FARTHEST_M, MotionDepth
 
 LEAST_POINTS = 50

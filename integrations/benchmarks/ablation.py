@@ -36,7 +36,7 @@ from arbiview_aug.evaluate.targets import UP_M, named_targets, without_masks
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
-from arbiview_aug.scene.scene import motion_camera
+from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget

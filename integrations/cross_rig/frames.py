@@ -20,7 +20,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.datasets import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
 from arbiview_aug.datasets.synthetic.scene import SceneClass
-from arbiview_aug.scene.scene import motion_camera
+from arbiview_aug.scene.depth_map import motion_camera
 from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.cuboids import CuboidDrive
@@ -82,7 +82,7 @@ class Source:
         return make(rig, num_frames=_MAX_FRAMES, seed=self.street_seed, lidar=False)
 
     def world_spec(self) -> dict[str, Any]:
-        """What names the streets: their seed and the code that builds and renders them."""
+        """Name of the streets: their seed and the code that builds and renders them."""
         # Not the cameras' code: theirs is pinned by tests, and a change there must not cost hours of rendering.
         spec = {"streets": self.street_seed, "world": code_hash(_WORLD, within=_WORLD)}
         return spec | ({"cuboids": code_hash("integrations.cross_rig.cuboids")} if self.world == "cuboids" else {})

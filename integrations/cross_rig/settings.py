@@ -12,7 +12,7 @@ from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.training import Schedule
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.variants import VARIANTS
-from integrations.cross_rig.worlds import CHANGES, STREETS, Size, World
+from integrations.cross_rig.worlds import CHANGES, STREETS, Size, Split, World
 
 T = TypeVar("T")
 
@@ -45,11 +45,11 @@ class Settings:
 
     Attributes:
         size: (h, w) of every image.
-        train_frames, val_frames, test_frames: Of the three sets of streets.
+        train_frames, val_frames, test_frames: Sizes of the three sets of streets.
         streets: The world that all three come from, a whole hundred: ``worlds.street_seed``.
         two_wheelers: Whether bicycles and motorcycles are in its streets.
-        world: What makes the streets.
-        seeds: Of the trainings; each variant is trained once with each.
+        world: Maker of the streets.
+        seeds: Seeds of the trainings; each variant is trained once with each.
         changes: Names of ``worlds.CHANGES``, or ``REAL`` alone.
         variants: Names of ``variants.VARIANTS``.
         families: Names of ``families.FAMILIES``.
@@ -89,6 +89,10 @@ class Settings:
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a whole number above 0, got {getattr(self, name)}")
 
+    def count(self, split: Split) -> int:
+        """Number of frames of a set of streets."""
+        return int(getattr(self, f"{split}_frames"))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
@@ -97,9 +101,9 @@ class Job:
     Attributes:
         variant: How.
         change: For which vehicle B; None where B does not matter: one training serves every change.
-        seed: Of its initialisation and its draws, the same for every variant.
-        family: Of the detector.
-        length: Of its schedule.
+        seed: Seed of its initialisation and its draws, the same for every variant.
+        family: Family of the detector.
+        length: Length of its schedule.
     """
 
     variant: Variant

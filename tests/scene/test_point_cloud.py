@@ -11,12 +11,19 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.render.view_planner import build_plan
+from arbiview_aug.scene.completion import block_cones
 from arbiview_aug.scene.panorama import REACH_RAD
-from arbiview_aug.scene.point_cloud import Cells, PointCloudSurface, PointCloudWithBoxes, checked_points
-from arbiview_aug.scene.scene import Scene, points_of_depth
+from arbiview_aug.scene.point_cloud import (
+    Cells,
+    Panorama,
+    PointCloudSurface,
+    Window,
+    checked_points,
+)
+from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Street
 from tests import helpers
-from tests.scene.single_rays import inverse_distance, occludes, occlusion_depth
+from tests.scene.single_rays import inverse_distance, occludes, occlusion_depth, points_and_boxes
 
 EYE = np.array([2.0, 0.0, 1.5])
 PIXEL_RAD = 0.002
@@ -96,16 +103,9 @@ def test_depth_maps_show_gaps_as_they_are() -> None:
     assert np.allclose(inverse_distance(maps, EYE, gap), q, rtol=0.02)
     # Points before those of maps are scan lines, and stay so where the own car's are left out.
     bonnet = np.array([[3.0, y, 1.0] for y in np.arange(-0.8, 0.8, 0.05)])
-    mixed = PointCloudSurface(Street(), np.concatenate([bonnet, FAR, bonnet, posts]), len(bonnet) + len(posts))
-    assert mixed.mapped == len(posts)
+    mixed = PointCloudSurface(Street(), np.concatenate([bonnet, FAR, posts]), len(posts))
+    assert len(mixed.points) == len(FAR) + len(posts)
     assert np.allclose(inverse_distance(mixed, EYE, gap), 3 * q, rtol=0.02)
-
-
-def test_maps_among_boxes_are_counted_without_those_of_objects() -> None:
-    box = np.array([[13.0, 0.0, 1.0, 2.0, 3.0, 2.0, 0.0]])  # its back is x = 12, y within 1.5
-    of_box = wall(12.0, (-1.4, 1.4), (0.4, 1.8))
-    surface = PointCloudWithBoxes.among(Street(), np.concatenate([FAR, of_box, NEAR + 5]), box, len(of_box) + len(NEAR))
-    assert len(surface.street.points) == len(FAR) + len(NEAR) and surface.street.mapped == len(NEAR)
 
 
 def test_silence_is_the_street() -> None:
@@ -147,7 +147,7 @@ def test_a_box_decides_within_its_silhouette_and_its_points_not_beyond() -> None
     mirror = wall(12.1, (1.5, 1.65), (1.0, 1.2))
     of_box = wall(12.0, (-1.5, 1.5), (0.0, 2.0))
     of_box = of_box[:: len(of_box) // 30]  # too few to show a shape
-    surface = PointCloudWithBoxes.among(Street(), np.concatenate([of_box, mirror, FAR]), box)
+    surface = points_and_boxes(np.concatenate([of_box, mirror, FAR]), box)
     assert len(surface.boxes) == 1
     inside, q = towards(np.array([[12.0, y, z] for y in (-1.49, 1.49) for z in (0.3, 1.99)]))
     assert np.allclose(inverse_distance(surface, EYE, inside), q, rtol=1e-6)
@@ -211,6 +211,20 @@ def test_only_the_nearest_point_of_a_direction_counts() -> None:
         assert np.array_equal(inverse_distance(many, EYE, part), once)
 
 
+def test_blocks_that_a_window_cannot_show_change_nothing() -> None:
+    """Windows see the same, whether or not blocks of points beside them are left out."""
+    rng = np.random.default_rng(0)
+    azimuth, elevation = np.sort(rng.uniform(-np.pi, np.pi, 60_000)), rng.uniform(-0.6, 0.6, 60_000)
+    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1)
+    points = (EYE + rays * rng.uniform(1, 40, (len(rays), 1))).astype(np.float32)
+    cones, left_out = block_cones(points), block_cones(points)
+    cones[:, 4] = 0.0  # so near that any window may show them
+    for place in (*rng.uniform(-3, 3, (4, 3)), EYE):
+        window = Window(-40, int(rng.integers(-900, 900)), 90, 200)
+        every, some = (Panorama(window, place, points, Street(), of).layers for of in (cones, left_out))
+        assert np.array_equal(every, some)
+
+
 def test_points_are_taken_as_they_were_recorded() -> None:
     """float32 is neither copied nor rounded again."""
     points = np.concatenate([NEAR, FAR]).astype(np.float32)
@@ -238,18 +252,8 @@ def test_points_are_checked() -> None:
             checked_points(np.zeros((rows, 500)))
 
 
-# --- depth maps and samples -------------------------------------------------------------------------------------------
+# --- views and samples -----------------------------------------------------------------------------------------------
 camera = partial(helpers.camera, size=(192, 320), position_m=tuple(EYE), horizontal_fov_deg=70.0)
-
-
-def test_depth_is_along_the_axis() -> None:
-    view = camera()
-    depth = np.full(view.size, 10.0)
-    depth[:20], depth[20:40], depth[40:60] = 0.0, np.nan, np.inf
-    points = points_of_depth(view, depth)
-    assert np.allclose(points[:, 0], EYE[0] + 10) and len(points) == 320 * 132
-    with pytest.raises(SampleError, match=r"depth_m: camera 'front': expected a map of \(192, 320\), got \(3, 4\)"):
-        points_of_depth(view, np.zeros((3, 4)))
 
 
 VIEWS = {

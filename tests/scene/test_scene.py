@@ -13,7 +13,8 @@ from arbiview_aug import Camera, Rig, RigRetarget
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.errors import SampleError
-from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene, anchored
+from arbiview_aug.scene.depth_map import DepthMap, anchored
+from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
 from arbiview_aug.scene.surface import StaticSurface
 
 
@@ -47,7 +48,7 @@ def test_points_and_depth_from_motion_are_fused(surface: GeometryName) -> None:
     measured = [abs(away_px[30, x] - near_px) < 0.5 for x in (32, 70)]
     assert measured == [surface != "motion", surface != "lidar"]
     assert f"geometry: {len(points)} points" in str(explained) or surface == "motion"
-    assert "points of depth from motion; the street elsewhere" in str(explained) or surface == "lidar"
+    assert "pixels of depth from motion; the street elsewhere" in str(explained) or surface == "lidar"
     lacking = {key: value for key, value in sample.items() if key != "motion_depth_m"}
     with pytest.raises(SampleError, match="geometry='fused': expected 'neighbours' in the sample, or 'motion_depth_m'"):
         RigRetarget(target, geometry="fused")(lacking)
@@ -61,12 +62,12 @@ def test_learned_depth_follows_what_was_measured() -> None:
     y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-3, 3, 300), np.arange(0.2, 3, 0.18)))
     points = np.stack([np.full_like(y, 8.0), y, z], -1)
     points = np.concatenate([points, 2 * points - camera.center_m])  # some of another wall behind it
-    fixed = anchored(camera, depth.numpy().astype(float), points)
+    fixed = anchored(DepthMap(camera, depth.numpy()), points).depth_m
     assert np.allclose(fixed[22:44, 26:70], 8.0, rtol=0.01)
     assert np.array_equal(fixed[:, :8], depth[:, :8]) and (fixed[16:52, 19] != fixed[16:52, 20]).all()
-    wrong = depth.numpy().astype(float)
+    wrong = depth.numpy().copy()
     wrong[24:40, 30:60] = 5.0  # against all points
-    assert (anchored(camera, wrong, points)[26:38, 32:58] == 0).all()
+    assert (anchored(DepthMap(camera, wrong), points).depth_m[26:38, 32:58] == 0).all()
     rig, target = Rig([camera]), Rig([camera.shifted(z_m=0.5)])
     sample = {"images": torch.rand(1, 3, 64, 96), "rig": rig, "points": torch.from_numpy(points)}
     sample["learned_depth_m"] = depth[None]

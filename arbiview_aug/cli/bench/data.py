@@ -25,8 +25,8 @@ from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import LidarReference, ScoredFrame, make_frame
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.sample.inputs import DEPTH_KEYS
+from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.scene.scene import motion_camera
 from arbiview_aug.temporal.learned_depth import LearnedDepth, dense_depth
 from arbiview_aug.temporal.motion_depth import MotionDepth
 

@@ -10,7 +10,7 @@ from arbiview_aug import RigRetarget
 from arbiview_aug.cli.bench.data import as_of_another_frame, recorded
 from arbiview_aug.datasets import WithDepth, open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.scene.scene import motion_camera
+from arbiview_aug.scene.depth_map import motion_camera
 
 
 def test_another_frame() -> None:

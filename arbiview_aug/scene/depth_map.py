@@ -1,0 +1,231 @@
+"""Depth maps of cameras: their fusion with points and with each other, their points, and what they hide."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rays import PixelRays, pixel_rays, pixels_of
+from arbiview_aug.cameras.validation import MOST_M
+from arbiview_aug.errors import SampleError
+from arbiview_aug.scene.panorama import CELL_RAD, OWN_CAR_M, SHRINK_RAD, SUPPORT_RAD, Layer
+from arbiview_aug.scene.surface import Points
+
+MOTION_WIDTH_PX = 450
+"""Images are halved until their width is nearest to this, by ratio: to 318 to 636 px."""
+
+ANCHOR_RAD = math.radians(1.0)
+"""Distance over which a depth map follows points, as a Gaussian's sigma: with 32 scan lines 0.5 to 1 degree are as
+good, 2 lose 1 dB."""
+
+ANCHOR_SHARE = 0.25
+"""Points and a map that differ by more than this share show different things: one is hidden, moved, or wrong."""
+
+_UNANCHORED = 0.1  # points to the square of ``ANCHOR_RAD``, below which a map is believed more than they
+
+GAP_RAD = (SUPPORT_RAD - SHRINK_RAD) / 2
+"""Angle by which a map's pixels hide beyond their border: half that of measured points. The whole angle costs good
+pixels of depth from motion; without any, hidden things show."""
+
+
+class DepthMap(NamedTuple):
+    """The known depths of a camera's pixels.
+
+    Attributes:
+        camera: The camera, at the size of the map.
+        depth_m: (h, w) float32 z-depth in metres, 0 where it is unknown.
+    """
+
+    camera: Camera
+    depth_m: Layer
+
+    @classmethod
+    def of(cls, camera: Camera, depth_m: Any, key: str = "depth_m") -> DepthMap:
+        """The map (H, W) of a camera: z along the optical axis, metres; 0, NaN and inf are unknown.
+
+        Pixels closer together than a panorama's cells are skipped; masked ones are unknown.
+
+        Raises:
+            SampleError: A map of another size.
+        """
+        if depth_m.shape != camera.size:
+            raise SampleError(f"{key}: camera {camera.name!r}: expected a map of {camera.size}, got {depth_m.shape}")
+        step = max(1, int(CELL_RAD * float(camera.K[0, 0])))
+        camera, depth_m = sparser(camera, step), depth_m[::step, ::step]
+        known = (depth_m > 0) & (depth_m <= MOST_M)
+        if camera.mask is not None:
+            known &= camera.mask
+        return cls(camera, np.where(known, depth_m, 0).astype(np.float32))
+
+    def is_of(self, camera: Camera) -> bool:
+        """Whether it is of a camera, of whatever size."""
+        one = self.camera
+        same_lens = one.lens == camera.lens and one.distortion == camera.distortion
+        return same_lens and np.array_equal(one.cam2ego, camera.cam2ego)
+
+    def at(self, camera: Camera) -> Layer:
+        """Its depth (h, w) at the pixels of the camera that it ``is_of``, the nearest pixel's; 0 beyond it."""
+        return _warped(self.camera, self.depth_m, camera, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
+
+
+Maps = tuple[DepthMap, ...]
+
+
+@lru_cache(32)  # of a rig, frame by frame
+def sparser(camera: Camera, step: int) -> Camera:
+    """The camera that has every ``step``-th pixel of each row and column, from the first on."""
+    if step == 1:
+        return camera
+    h, w = (-(-n // step) for n in camera.size)
+    mask = None if camera.mask is None else np.ascontiguousarray(camera.mask[::step, ::step])
+    return replace(camera, width_px=w, height_px=h, K=np.diag([1 / step, 1 / step, 1]) @ camera.K, mask=mask)
+
+
+@lru_cache(32)
+def motion_camera(camera: Camera) -> Camera:
+    """The camera of an image halved to ``MOTION_WIDTH_PX``, without odd rows and columns."""
+    level = halvings(camera)
+    if level == 0:
+        return camera
+    h, w = (side >> level for side in camera.size)
+    return camera.crop(0, 0, (h << level, w << level)).resize((h, w))
+
+
+def halvings(camera: Camera) -> int:
+    """Number of halvings of a camera's images."""
+    return max(0, round(math.log2(camera.width_px / MOTION_WIDTH_PX)))
+
+
+@lru_cache(16)
+def _rays(camera: Camera) -> PixelRays:
+    return pixel_rays(camera)
+
+
+# --- fusion -----------------------------------------------------------------------------------------------------------
+def anchored(one: DepthMap, points: Points, others: Sequence[DepthMap] = ()) -> DepthMap:
+    """A camera's depth map, fused with points (P, 3) in the ego frame and with its other maps; its outlines stay.
+
+    The logarithm of what the map says over what the points say is averaged around each pixel, on cells as wide as
+    the average's sigma. A pixel is unknown where the map contradicts most of the points around it.
+    """
+    from arbiview_aug.scene.map_kernels import compare_maps, compare_points
+
+    camera, depth_m = one
+    h, w = depth_m.shape
+    sigma = min(ANCHOR_RAD * float(camera.K[0, 0]), max(h, w))
+    side = max(1, int(sigma))
+    sums = np.zeros((-(-h // side), -(-w // side), 3), np.float32)  # logarithms, points that agree, others
+    if len(points):
+        R, shift = camera.cam2ego[:3, :3].T, -camera.cam2ego[:3, :3].T @ camera.center_m
+        rows = np.ascontiguousarray(points.T, np.float32)[:, None]
+        u, v, _ = pixels_of(rows, np.ones((1, len(points)), np.float32), R, shift, camera)
+        z = R[2].astype(np.float32) @ rows[:, 0] + np.float32(shift[2])
+        compare_points(u[0], v[0], z, depth_m, side, ANCHOR_SHARE, sums)
+    for other in others:
+        compare_maps(depth_m, other.at(camera), side, ANCHOR_SHARE, sums)
+    if not sums.any():
+        return one
+    total, agreeing, contradicting = cv2.split(cv2.GaussianBlur(sums, (0, 0), sigma / side))
+    weight = agreeing + np.float32(_UNANCHORED * side**2 / (2 * math.pi * sigma**2))
+    factor, doubt = (
+        cv2.resize(cells, None, fx=side, fy=side, interpolation=cv2.INTER_LINEAR)[:h, :w]
+        for cells in (np.exp(-total / weight), contradicting - agreeing)
+    )
+    return DepthMap(camera, np.where(doubt > 0, np.float32(0), depth_m * factor))
+
+
+def anchored_maps(maps: Iterable[DepthMap], before: Iterable[Points | Maps]) -> Maps:
+    """The maps of a rig, fused with its points (P, 3) and other maps, camera by camera; none if nothing is known."""
+    before = list(before)
+    others = [one for part in before if isinstance(part, tuple) for one in part]
+    arrays = [part[:, :3] for part in before if not isinstance(part, tuple)]
+    points = np.concatenate([np.zeros((0, 3), np.float32), *arrays])
+    fused = tuple(anchored(one, points, [other for other in others if other.is_of(one.camera)]) for one in maps)
+    return fused if any(one.depth_m.any() for one in fused) else ()
+
+
+def believed(one: DepthMap, network: DepthMap) -> DepthMap:
+    """Depth from motion, unknown where a network's depth contradicts it: moving things have wrong distances."""
+    depth_m, network_m = one.depth_m, network.depth_m
+    if depth_m.shape != network_m.shape:
+        return one
+    least = np.float32(1 - ANCHOR_SHARE)
+    wrong = (network_m > 0) & ((depth_m < least * network_m) | (least * depth_m > network_m))
+    return one._replace(depth_m=np.where(wrong, np.float32(0), depth_m))
+
+
+def joined(maps: Iterable[DepthMap]) -> list[DepthMap]:
+    """One map of each camera and size: the nearest of what its maps know."""
+    by_camera: dict[Camera, Layer] = {}
+    for camera, depth_m in maps:
+        known = by_camera.get(camera)
+        if known is None:
+            by_camera[camera] = depth_m.copy()  # pixels are left out of it
+        else:
+            np.copyto(known, depth_m, where=(depth_m > 0) & ((known == 0) | (depth_m < known)))
+    return list(map(DepthMap._make, by_camera.items()))
+
+
+# --- as points, and as what hides -------------------------------------------------------------------------------------
+def points_of(maps: Sequence[DepthMap], before: Points | None = None) -> tuple[Layer, npt.NDArray[np.int32]]:
+    """(P, 3) ego-frame points of the maps behind others (Q, 3), and their pixels (P - Q,), counted on from map to map.
+
+    Points that lie side by side follow one another. Pixels within ``OWN_CAR_M`` become unknown.
+    """
+    from arbiview_aug.scene.map_kernels import put_points
+
+    lead, most, first, car = 0 if before is None else len(before), sum(one.depth_m.size for one in maps), 0, OWN_CAR_M
+    points, pixels, count = np.empty((lead + most + 1, 3), np.float32), np.empty(most + 1, np.int32), 0
+    if before is not None:
+        points[:lead] = before
+    for camera, depth_m in maps:
+        rays, pose = _rays(camera), camera.cam2ego.astype(np.float32)
+        places = (*car[0], *car[1]), first, points[lead:], pixels, count
+        count = put_points(rays.planes, rays.parameters, depth_m, pose, *places)
+        first += depth_m.size
+    return points[: lead + count], pixels[:count]
+
+
+def forget(maps: Sequence[DepthMap], pixels: npt.NDArray[np.int32]) -> None:
+    """Make pixels (n,), as ``points_of`` counts them, unknown."""
+    first = 0
+    for _, depth_m in maps:
+        depth_m.reshape(-1)[pixels[(pixels >= first) & (pixels < first + depth_m.size)] - first] = 0
+        first += depth_m.size
+
+
+def hidden_by(maps: Sequence[DepthMap], camera: Camera) -> Layer | None:
+    """Inverse distances (h, w) along a camera's rays beyond which points are hidden by its own maps; 0 where unknown.
+
+    None if they know nothing.
+    """
+    from arbiview_aug.scene.map_kernels import hidden_distances
+
+    layers = []
+    for one in maps:
+        if not one.is_of(camera) or not one.depth_m.any():
+            continue
+        rays, hidden = _rays(one.camera), np.empty(one.depth_m.shape, np.float32)
+        hidden_distances(rays.planes, rays.parameters, one.depth_m, hidden)
+        side = 2 * round(GAP_RAD * float(one.camera.K[0, 0])) + 1
+        np.copyto(hidden, cv2.dilate(hidden, np.ones((side, side), np.uint8)), where=hidden == 0)
+        layers.append(_warped(one.camera, hidden, camera, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE))
+    return np.asarray(np.max(layers, axis=0)) if layers else None
+
+
+def _warped(one: Camera, layer: Layer, two: Camera, interpolation: int, border: int) -> Layer:
+    """A layer of a camera at the size of another one with the same rays."""
+    if one.size == two.size and np.array_equal(one.K, two.K):
+        return layer
+    scale = one.K[[0, 1], [0, 1]] / two.K[[0, 1], [0, 1]]
+    to_one = np.column_stack([np.diag(scale), one.K[:2, 2] - scale * two.K[:2, 2]])
+    flags = interpolation | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(layer, to_one, two.size[::-1], flags=flags, borderMode=border))
