@@ -61,6 +61,7 @@ VARIANTS: dict[str, Variant] = {
         Variant(
             name="true_holes", title="auto, holes filled with the truth", kind="retarget", reads=_ALL, truth="holes"
         ),
+        _filled(name="true_vehicles", title="auto, filled holes, no mask, true vehicles", truth="vehicles"),
         Variant(
             name="auto_neighbours",
             title="auto, near road from other frames",
