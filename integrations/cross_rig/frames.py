@@ -315,5 +315,5 @@ class _ChangedFrames:
         """(M, h, w) bool: B's true outlines of vehicles, widened."""
         classes = self.drive.render(index).classes
         window = np.ones((_OUTLINE_PX, _OUTLINE_PX), np.uint8)
-        shown = [cv2.dilate(np.uint8(view.numpy() == SceneClass.VEHICLE), window) for view in classes]
+        shown = [cv2.dilate((view.numpy() == SceneClass.VEHICLE).astype(np.uint8), window) for view in classes]
         return np.stack(shown).astype(bool)
