@@ -316,4 +316,4 @@ class _ChangedFrames:
         classes = self.drive.render(index).classes
         window = np.ones((_OUTLINE_PX, _OUTLINE_PX), np.uint8)
         shown = [cv2.dilate((view.numpy() == SceneClass.VEHICLE).astype(np.uint8), window) for view in classes]
-        return np.asarray(shown, bool)
+        return np.stack(shown).astype(bool)
