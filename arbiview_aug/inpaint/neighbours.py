@@ -14,7 +14,7 @@ of at most two contradicts; and the current frame shows no newly arrived object 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 from typing import Any, Literal, NamedTuple
@@ -28,7 +28,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import PixelRays, RayCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.image_ops import FRESH, Memory
+from arbiview_aug.image_ops import FRESH, Memory, some_of_cells
 from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
 from arbiview_aug.render.view_planner import build_plan
@@ -72,6 +72,12 @@ class Hole:
         y, x = (np.minimum(np.arange(0, n + _CELL_PX, _CELL_PX), n - 1) for n in self.camera.size)
         directions = np.moveaxis(np.tensordot(self.camera.cam2ego[:3, :3], self.rays.at(y, x), 1), 0, -1)
         return directions, np.maximum(self.inverse_distance[np.ix_(y, x)].astype(np.float64), 1e-6)
+
+    @property
+    def points(self) -> FloatArray:
+        """What lies there, in the ego frame (n, 3)."""
+        directions, q = self.nodes
+        return np.reshape(self.camera.center_m + directions / q[..., None], (-1, 3))
 
 
 class Fill(NamedTuple):
@@ -119,6 +125,7 @@ class _HoleSurface(DenseSurface):
     holes: Sequence[Hole]
     full: Surface  # the frame's surface
     objects: BoxSurface | None  # labelled objects of both frames
+    _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
 
     @property
     def is_dense(self) -> bool:  # type: ignore[override]
@@ -132,13 +139,16 @@ class _HoleSurface(DenseSurface):
         return hole.inverse_distance[top : top + camera.height_px, left : left + camera.width_px]
 
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """Labelled objects hide everything; what was measured hides what lies behind."""
-        before, full = memory.full(camera.size, 0, np.float32), self.full.background
-        if isinstance(full, DenseSurface):
-            before = full.occlusion_map(camera, rays, memory).beyond
-        if self.objects is not None:
-            before = np.where(self.objects.occlusion_map(camera, rays, memory).beyond > 0, np.float32(np.inf), before)
-        return OcclusionMap(before, np.zeros(before.shape, np.int32))
+        """Labelled objects hide everything; what was measured hides what lies behind. Kept for the next hole."""
+        key, full = camera.content_key, self.full.background
+        if key not in self._shadows:
+            before = np.zeros(camera.size, np.float32)
+            if isinstance(full, DenseSurface):
+                before = full.occlusion_map(camera, rays, memory).beyond.copy()
+            if self.objects is not None:
+                before[self.objects.occlusion_map(camera, rays, memory).solid >= 0] = np.inf
+            self._shadows[key] = OcclusionMap(before, np.zeros(before.shape, np.int32))
+        return self._shadows[key]
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """The full surface's."""
@@ -166,13 +176,18 @@ def plan_fills(
     # A neighbour's cameras are not blended: one of them may see a moved object.
     config = replace(config, seam_width=0.0)
     rig = Rig([hole.camera for hole in holes], ground_z_m=plan.source.ground_z_m)
-    fills = []
+    wanted, points = [hole.free | hole.seam for hole in holes], [hole.points for hole in holes]
+    ends, fills = np.cumsum([len(of_hole) for of_hole in points]), []
     for neighbour in neighbours:
         boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
         objects = BoxSurface(Street(), boxes, whole(boxes)) if len(boxes) else None
         known = Scene(known=_HoleSurface(holes, full, objects))
-        views = build_plan(neighbour.rig, rig, geometry=surface, config=config, scene=known, maps=maps)
-        shown = [_shown(hole, view, neighbour) for hole, view in zip(holes, views.targets, strict=True)]
+        settings: dict[str, Any] = {"geometry": surface, "config": config, "scene": known, "maps": maps}
+        views = build_plan(neighbour.rig, rig, wanted=wanted, **settings)
+        risks: Sequence[Any] = [None] * len(holes)
+        if neighbour.moved is not None:
+            risks = np.split(change_risks(neighbour.moved, np.concatenate(points)), ends[:-1])
+        shown = [_shown(*one, neighbour) for one in zip(holes, views.targets, risks, strict=True)]
         if any((hole.free & one.shows).any() for hole, one in zip(holes, shown, strict=True)):
             fills.append(Fill(neighbour, views, shown))
     return Fills(holes, fills) if fills else None
@@ -184,35 +199,42 @@ def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: Ra
     height_m = camera.center_m[2] - plan.source.ground_z_m
     if not empty.any() or (reach == "road" and height_m <= 0):
         return None
-    rays = maps.rays(camera)
-    local = rays.at(*map(np.arange, camera.size))
+    margin_px = max(2, round(_SEAM_WIDTH * camera.width_px))
+    rays, part = maps.rays(camera), _box(empty, margin_px)
+    local = rays.at(*(np.arange(side.start, side.stop) for side in part))
     up = np.tensordot(camera.cam2ego[2, :3].astype(np.float32), local, 1)
     allowed = np.asarray(up < -1 / np.hypot(1, NEAR_M / height_m) if reach == "road" else local.any(axis=0))
-    free = empty & allowed
+    free = empty[part] & allowed
     if not free.any():
         return None
-    margin_px = max(2, round(_SEAM_WIDTH * camera.width_px))
-    rows, columns = (_with_margin(np.asarray(free.any(axis=1 - axis)), margin_px) for axis in (0, 1))
-    box, size = (rows, columns), (rows.stop - rows.start, columns.stop - columns.start)
-    camera = camera.crop(rows.start, columns.start, size)
-    rays = maps.rays(camera, rays.crop(rows.start, columns.start, size))
-    q, allowed = surface.image(camera, rays), allowed[box]
+    inner = _box(free, margin_px)
+    up, allowed, free = up[inner], allowed[inner], free[inner]
+    rows, columns = box = _within(part[0], inner[0]), _within(part[1], inner[1])
+    camera = camera.crop(rows.start, columns.start, free.shape)
+    rays = maps.rays(camera, rays.crop(rows.start, columns.start, free.shape))
+    q = surface.image(camera, rays)
     if reach == "road":
-        allowed &= (q > 0) & (np.abs(height_m + up[box] / np.maximum(q, np.float32(1e-9))) < _ROAD_TOLERANCE_M)
-    free = free[box] & allowed
+        allowed &= (q > 0) & (np.abs(height_m + up / np.maximum(q, np.float32(1e-9))) < _ROAD_TOLERANCE_M)
+    free &= allowed
     if not free.any():
         return None
     around = cv2.dilate(empty[box].view(np.uint8), np.ones((2 * margin_px + 1,) * 2, np.uint8)) > 0
     return Hole(index, box, camera, rays, free, around & allowed & covered[box], q, margin_px)
 
 
-def _with_margin(flags: BoolArray, margin: int) -> slice:
-    """From the first to the last True, with a margin."""
-    first, last = np.flatnonzero(flags)[[0, -1]].tolist()
-    return slice(max(first - margin, 0), min(last + 1 + margin, len(flags)))
+def _box(flags: BoolArray, margin: int) -> tuple[slice, slice]:
+    """Rows and columns from the first to the last True of (h, w), with a margin."""
+    ends = [np.flatnonzero(flags.any(axis=1 - axis))[[0, -1]].tolist() for axis in (0, 1)]
+    top, left = (slice(max(a - margin, 0), min(b + 1 + margin, n)) for (a, b), n in zip(ends, flags.shape, strict=True))
+    return top, left
 
 
-def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
+def _within(outer: slice, inner: slice) -> slice:
+    """A slice of a slice."""
+    return slice(outer.start + inner.start, outer.start + inner.stop)
+
+
+def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neighbour: Neighbour) -> Candidate:
     from arbiview_aug.render.kernels import upsample_where
 
     usable = view.coverage & (hole.free | hole.seam)
@@ -226,12 +248,16 @@ def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
         other, own_z = (np.maximum(np.abs(rays[..., 2]), 1e-9) for rays in (from_source, directions))
         halves = np.clip(2 * np.log2(hole.camera.K[0, 0] * own_z * relative / (source.K[0, 0] * other)), 0, 255)
         upsample_where(halves.astype(np.float32), _CELL_PX, view.source_camera, pair.source, blur)
-    if neighbour.moved is not None:
-        points = hole.camera.center_m + directions / q[..., None]
-        corners = change_risks(neighbour.moved, points.reshape(-1, 3)).reshape(q.shape)
+    if risks is not None:
+        corners = risks.reshape(q.shape)
         cells = np.maximum.reduce([corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:], corners[1:, 1:]])
-        risk = cells.repeat(_CELL_PX, axis=0).repeat(_CELL_PX, axis=1)[: usable.shape[0], : usable.shape[1]]
+        risk = _of_cells(cells, _CELL_PX, usable.shape)
     return Candidate(usable, blur, risk, neighbour.is_later)
+
+
+def _of_cells(values: Any, cell: int, size: tuple[int, ...]) -> Any:
+    """The pixels (h, w) of cells (ny, nx)."""
+    return values.repeat(cell, axis=0).repeat(cell, axis=1)[: size[0], : size[1]]
 
 
 # --- filling ----------------------------------------------------------------------------------------------------------
@@ -287,6 +313,9 @@ _CONTRADICTION_LEVELS = 24.0
 _CONTRADICTION_REACH = 1.25
 """A contradiction on the seam reaches to where agreement is nearer by this factor (``docs/drives.md``, Constants)."""
 
+_CELLS_PER_SEAM = 4
+"""Cells along a seam's width in which the distances of contradictions and agreement are compared."""
+
 _FEW_CANDIDATES = 2
 """With at most this many candidates, accept one without a confirming vote."""
 
@@ -335,11 +364,24 @@ def merged(
     Returns:
         (3, h, w) filled view, and (h, w) int16 index of the candidate taken, -1 for none.
     """
+    pixels, chosen = view.clone(), np.full(free.shape, -1, np.int16)
+    shows = np.logical_or.reduce([one.shows for one in candidates])
+    if (shows & free).any():
+        box = _box(shows, margin_px)
+        parts = [Candidate(*(a[box] for a in one[:3]), one.later, one.image[:, *box]) for one in candidates]
+        pixels[:, *box], chosen[box] = _merged(view[:, *box], free[box], seam[box], parts, margin_px)
+    return pixels, chosen
+
+
+def _merged(
+    view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
+) -> tuple[torch.Tensor, npt.NDArray[np.int16]]:
+    """As ``merged``, where any candidate shows something."""
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
     current, images = _levels(view, levels), [_levels(one.image, levels) for one in candidates]
     _tone(current, images, free, seam, candidates, margin_px)
     shown = np.stack([one.shows & free for one in candidates])
-    accepted = shown & _accepted(current, images, shown, seam, candidates)
+    accepted = shown & _accepted(current, images, shown, seam, candidates, max(1, margin_px // _CELLS_PER_SEAM))
     # The order breaks ties.
     rank, chosen = np.full(free.shape, 256 * len(candidates), np.uint16), np.full(free.shape, -1, np.int16)
     for k, one in enumerate(candidates):
@@ -355,12 +397,17 @@ def merged(
 
 def _levels(image: torch.Tensor, levels: float) -> Levels:
     grey = image.detach().cpu().to(torch.float32, memory_format=torch.contiguous_format, copy=True)
-    return np.asarray(grey.mul_(levels).numpy())
+    return np.asarray((grey.mul_(levels) if levels != 1 else grey).numpy())
 
 
 # --- votes ------------------------------------------------------------------------------------------------------------
 def _accepted(
-    current: Levels, toned: Sequence[Levels], shown: BoolArray, seam: BoolArray, candidates: Sequence[Candidate]
+    current: Levels,
+    toned: Sequence[Levels],
+    shown: BoolArray,
+    seam: BoolArray,
+    candidates: Sequence[Candidate],
+    cell: int,
 ) -> BoolArray:
     """(n, h, w) whether each candidate shows what stands there now."""
     votes, nearest = np.zeros(shown.shape, np.uint8), np.full((2, *seam.shape), -1, np.int16)
@@ -384,13 +431,15 @@ def _accepted(
         on_both_sides = (nearest[0] >= 0) & (nearest[1] >= 0)
         static = (static & on_both_sides) | (unanimous & (votes >= (0 if few else 2)) & ~on_both_sides)
         if len(candidates) > 1:  # a single candidate may itself show the moving object
-            static &= ~_arrived(current, toned, seam, candidates)
+            static &= ~_arrived(current, toned, seam, candidates, cell)
         accepted = (static & unlabelled) | (accepted & ~unlabelled)
     return np.asarray(accepted)
 
 
-def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate]) -> BoolArray:
-    """(h, w) where a hole continues what the current frame alone shows on the seam."""
+def _arrived(
+    current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate], cell: int
+) -> BoolArray:
+    """(h, w) where a hole continues what the current frame alone shows on the seam, by cells of ``cell`` pixels."""
     known, agree = np.zeros_like(seam), np.zeros_like(seam)
     for image, one in zip(toned, candidates, strict=True):
         both = seam & one.shows
@@ -400,9 +449,10 @@ def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidat
     if not contradicts.any():
         return contradicts
     away, near = (
-        np.asarray(cv2.distanceTransform((~places).view(np.uint8), cv2.DIST_L2, 5)) for places in (contradicts, agree)
+        np.asarray(cv2.distanceTransform((~some_of_cells(places, cell)).view(np.uint8), cv2.DIST_L2, 5))
+        for places in (contradicts, agree)
     )
-    return np.asarray(away / _CONTRADICTION_REACH < near)
+    return _of_cells(away / _CONTRADICTION_REACH < near, cell, seam.shape)
 
 
 def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float) -> BoolArray:
