@@ -28,7 +28,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import PixelRays, RayCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.image_ops import FRESH, Memory, some_of_cells
+from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
 from arbiview_aug.render.view_planner import build_plan
@@ -313,8 +313,8 @@ _CONTRADICTION_LEVELS = 24.0
 _CONTRADICTION_REACH = 1.25
 """A contradiction on the seam reaches to where agreement is nearer by this factor (``docs/drives.md``, Constants)."""
 
-_CELLS_PER_SEAM = 4
-"""Cells along a seam's width in which the distances of contradictions and agreement are compared."""
+_SAMPLES_PER_SEAM = 7
+"""Rows or columns across a seam in which frames are compared; all of narrower seams."""
 
 _FEW_CANDIDATES = 2
 """With at most this many candidates, accept one without a confirming vote."""
@@ -376,23 +376,41 @@ def merged(
 def _merged(
     view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
 ) -> tuple[torch.Tensor, npt.NDArray[np.int16]]:
-    """As ``merged``, where any candidate shows something."""
+    """As ``merged``, where any candidate shows something; exposures and votes are those of a sample of pixels."""
+    step, n = max(1, margin_px // _SAMPLES_PER_SEAM), len(candidates)
+    every = slice(None, None, step), slice(None, None, step)
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
-    current, images = _levels(view, levels), [_levels(one.image, levels) for one in candidates]
-    _tone(current, images, free, seam, candidates, margin_px)
-    shown = np.stack([one.shows & free for one in candidates])
-    accepted = shown & _accepted(current, images, shown, seam, candidates, max(1, margin_px // _CELLS_PER_SEAM))
+    samples = [Candidate(*(a[every] for a in one[:3]), one.later, one.image[:, *every]) for one in candidates]
+    current, images = (_levels(view[:, *every], levels), [_levels(one.image, levels) for one in samples])
+    recorded = [image.copy() for image in images]
+    gains = _tone(current, images, free[every], seam[every], samples, max(1, margin_px // 2 // step))
+    shown = np.stack([one.shows & free[every] for one in samples])
+    accepted = shown & _accepted(current, images, shown, seam[every], samples)
     # The order breaks ties.
-    rank, chosen = np.full(free.shape, 256 * len(candidates), np.uint16), np.full(free.shape, -1, np.int16)
+    rank, chosen = np.full(free.shape, 256 * n, np.uint16), np.full(free.shape, -1, np.int16)
     for k, one in enumerate(candidates):
-        key = one.blur * np.uint16(len(candidates)) + np.uint16(k)
-        better = accepted[k] & (key < rank)
+        # Samples may miss a border.
+        accepts, rejects = (_beside(flags) for flags in (accepted[k], shown[k] & ~accepted[k]))
+        usable = _of_cells(accepted[k] | (accepts & ~rejects & ~shown[k]), step, free.shape) & one.shows & free
+        key = one.blur * np.uint16(n) + np.uint16(k)
+        better = usable & (key < rank)
         np.copyto(rank, key, where=better)
         np.copyto(chosen, np.int16(k), where=better)
-        np.copyto(current, images[k], where=better)
-    filled = np.clip(np.rint(current) if levels == 1 else current / np.float32(levels), 0, 255 / levels)
-    where = torch.from_numpy(chosen >= 0).to(view.device)
-    return torch.where(where, torch.from_numpy(filled).to(view), view), chosen
+    pixels = view.clone(memory_format=torch.contiguous_format)
+    for k, one in enumerate(candidates):
+        taken = np.flatnonzero(chosen == k)
+        y, x = np.divmod(taken, free.shape[1])
+        at = y // step * current.shape[2] + x // step
+        colours = gains[k] * _levels(one.image.reshape(3, -1)[:, taken], levels)
+        colours += (images[k] - gains[k][..., None] * recorded[k]).reshape(3, -1).take(at, 1)
+        colours = np.clip(np.rint(colours) if levels == 1 else colours / np.float32(levels), 0, 255 / levels)
+        pixels.view(3, -1)[:, taken] = torch.from_numpy(colours).to(pixels)
+    return pixels, chosen
+
+
+def _beside(flags: BoolArray) -> BoolArray:
+    """(h, w) True on True pixels and those next to them."""
+    return np.asarray(cv2.dilate(flags.view(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
 def _levels(image: torch.Tensor, levels: float) -> Levels:
@@ -402,12 +420,7 @@ def _levels(image: torch.Tensor, levels: float) -> Levels:
 
 # --- votes ------------------------------------------------------------------------------------------------------------
 def _accepted(
-    current: Levels,
-    toned: Sequence[Levels],
-    shown: BoolArray,
-    seam: BoolArray,
-    candidates: Sequence[Candidate],
-    cell: int,
+    current: Levels, toned: Sequence[Levels], shown: BoolArray, seam: BoolArray, candidates: Sequence[Candidate]
 ) -> BoolArray:
     """(n, h, w) whether each candidate shows what stands there now."""
     votes, nearest = np.zeros(shown.shape, np.uint8), np.full((2, *seam.shape), -1, np.int16)
@@ -431,15 +444,13 @@ def _accepted(
         on_both_sides = (nearest[0] >= 0) & (nearest[1] >= 0)
         static = (static & on_both_sides) | (unanimous & (votes >= (0 if few else 2)) & ~on_both_sides)
         if len(candidates) > 1:  # a single candidate may itself show the moving object
-            static &= ~_arrived(current, toned, seam, candidates, cell)
+            static &= ~_arrived(current, toned, seam, candidates)
         accepted = (static & unlabelled) | (accepted & ~unlabelled)
     return np.asarray(accepted)
 
 
-def _arrived(
-    current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate], cell: int
-) -> BoolArray:
-    """(h, w) where a hole continues what the current frame alone shows on the seam, by cells of ``cell`` pixels."""
+def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate]) -> BoolArray:
+    """(h, w) where a hole continues what the current frame alone shows on the seam."""
     known, agree = np.zeros_like(seam), np.zeros_like(seam)
     for image, one in zip(toned, candidates, strict=True):
         both = seam & one.shows
@@ -449,10 +460,9 @@ def _arrived(
     if not contradicts.any():
         return contradicts
     away, near = (
-        np.asarray(cv2.distanceTransform((~some_of_cells(places, cell)).view(np.uint8), cv2.DIST_L2, 5))
-        for places in (contradicts, agree)
+        np.asarray(cv2.distanceTransform((~places).view(np.uint8), cv2.DIST_L2, 5)) for places in (contradicts, agree)
     )
-    return _of_cells(away / _CONTRADICTION_REACH < near, cell, seam.shape)
+    return np.asarray(away / _CONTRADICTION_REACH < near)
 
 
 def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float) -> BoolArray:
@@ -460,7 +470,7 @@ def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float) -> BoolA
     apart = np.asarray(cv2.absdiff(one.reshape(-1, one.shape[2]), two.reshape(-1, one.shape[2]))).reshape(one.shape)
     valid = where.astype(np.float32)
     total, count = (
-        np.asarray(cv2.boxFilter(part, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT))
+        np.asarray(cv2.boxFilter(part, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
         for part in ((apart[0] + apart[1] + apart[2]) * valid, valid)
     )
     return np.asarray(where & (total < 3 * limit * count))
@@ -473,37 +483,42 @@ def _tone(
     free: BoolArray,
     seam: BoolArray,
     candidates: Sequence[Candidate],
-    margin_px: int,
-) -> None:
-    """Bring the candidates to the view's exposure, in place.
+    cell: int,
+) -> list[Levels]:
+    """Bring the candidates to the view's exposure, in place; return their gains (3, 1).
 
-    Candidates with too little of the seam are matched to those with enough.
+    Candidates with too little of the seam are matched to those with enough. Their offsets are of cells of pixels.
     """
-    unmatched = []
+    unmatched, gains = [], [np.ones((3, 1), np.float32)] * len(candidates)
     for k, one in enumerate(candidates):
-        agreement = _expose(images[k], view, seam & one.shows, _SEAM_INLIERS)
-        if agreement is None:
+        match = _expose(images[k], view, seam & one.shows, _SEAM_INLIERS)
+        if match is None:
             unmatched.append(k)
         else:
-            images[k] += _offset(*agreement, seam.shape, max(1, margin_px // 2))
+            gains[k] = match[0]
+            images[k] += _offset(*match[1:], seam.shape, cell)
     if not unmatched:
-        return
+        return gains
     reference, known = view.copy(), seam.copy()
     for k in sorted(range(len(candidates)), key=unmatched.__contains__):
         shows = free & candidates[k].shows
-        if k in unmatched and _expose(images[k], reference, shows & known, _OVERLAP_INLIERS) is None:
-            continue
+        if k in unmatched:
+            match = _expose(images[k], reference, shows & known, _OVERLAP_INLIERS)
+            if match is None:
+                continue
+            gains[k] = match[0]
         np.copyto(reference, images[k], where=shows & ~known)
         known |= shows
+    return gains
 
 
 def _expose(
     image: Levels, reference: Levels, where: BoolArray, min_inliers: float
-) -> tuple[npt.NDArray[np.int64], Levels] | None:
+) -> tuple[Levels, npt.NDArray[np.int64], Levels] | None:
     """Give an image the gain of a reference, in place; None if it is implausible.
 
     Returns:
-        Pixels (n,) that then agree, and what they lack (3, n).
+        The gain (3, 1), pixels (n,) that then agree, and what they lack (3, n).
     """
     pixel = np.flatnonzero(where)
     if len(pixel) < _MIN_SEAM_PX:
@@ -520,7 +535,7 @@ def _expose(
         return None
     image *= gain[:, :, None]
     image += np.float32(_DARK_LEVELS) * (gain[:, :, None] - 1)
-    return pixel[agree], error.take(agree, 1)
+    return gain, pixel[agree], error.take(agree, 1)
 
 
 def _offset(pixel: npt.NDArray[np.int64], error: Levels, size: tuple[int, ...], cell: int) -> Levels:
