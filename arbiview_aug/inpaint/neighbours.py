@@ -28,7 +28,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import PixelRays, RayCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.image_ops import FRESH, Memory
+from arbiview_aug.image_ops import FRESH, Memory, some_of_cells
 from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
 from arbiview_aug.render.view_planner import build_plan
@@ -73,11 +73,22 @@ class Hole:
         directions = np.moveaxis(np.tensordot(self.camera.cam2ego[:3, :3], self.rays.at(y, x), 1), 0, -1)
         return directions, np.maximum(self.inverse_distance[np.ix_(y, x)].astype(np.float64), 1e-6)
 
+    @cached_property
+    def wanted(self) -> BoolArray:
+        """(h, w) pixels that neighbours are asked for."""
+        return self.free | self.seam
+
+    @cached_property
+    def near(self) -> BoolArray:
+        """(ny + 1, nx + 1) corners of the cells that hold such pixels."""
+        cells = np.pad(some_of_cells(self.wanted, _CELL_PX), 1)
+        return np.asarray(cells[1:, 1:] | cells[1:, :-1] | cells[:-1, 1:] | cells[:-1, :-1])
+
     @property
     def points(self) -> FloatArray:
-        """What lies there, in the ego frame (n, 3)."""
-        directions, q = self.nodes
-        return np.reshape(self.camera.center_m + directions / q[..., None], (-1, 3))
+        """What lies at these corners, in the ego frame (n, 3)."""
+        directions, q = (of[self.near] for of in self.nodes)
+        return np.asarray(self.camera.center_m + directions / q[:, None])
 
 
 class Fill(NamedTuple):
@@ -170,13 +181,16 @@ def plan_fills(
     the area that may be filled.
     """
     full = scene.surface(surface, plan.source.ground_z_m)
-    holes = [hole for k in range(len(plan.targets)) if (hole := _hole(plan, k, full, reach, maps)) is not None]
+    shown_q = [scene.images.get((surface, camera.content_key)) for camera in plan.target]
+    holes = [
+        hole for k, q in enumerate(shown_q) if (hole := _hole(plan, k, full, q, reach, maps)) is not None
+    ]
     if not holes:
         return None
     # A neighbour's cameras are not blended: one of them may see a moved object.
     config = replace(config, seam_width=0.0)
     rig = Rig([hole.camera for hole in holes], ground_z_m=plan.source.ground_z_m)
-    wanted, points = [hole.free | hole.seam for hole in holes], [hole.points for hole in holes]
+    wanted, points = [hole.wanted for hole in holes], [hole.points for hole in holes]
     ends, fills = np.cumsum([len(of_hole) for of_hole in points]), []
     for neighbour in neighbours:
         boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
@@ -193,7 +207,9 @@ def plan_fills(
     return Fills(holes, fills) if fills else None
 
 
-def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: RayCache) -> Hole | None:
+def _hole(
+    plan: RenderPlan, index: int, surface: Surface, q: Any, reach: Reach, maps: RayCache
+) -> Hole | None:
     camera, covered = plan.target[index], plan.targets[index].coverage
     empty = ~covered if camera.mask is None else ~covered & camera.mask
     height_m = camera.center_m[2] - plan.source.ground_z_m
@@ -212,7 +228,7 @@ def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: Ra
     rows, columns = box = _within(part[0], inner[0]), _within(part[1], inner[1])
     camera = camera.crop(rows.start, columns.start, free.shape)
     rays = maps.rays(camera, rays.crop(rows.start, columns.start, free.shape))
-    q = surface.image(camera, rays)
+    q = surface.image(camera, rays) if q is None else q[box]
     if reach == "road":
         allowed &= (q > 0) & (np.abs(height_m + up / np.maximum(q, np.float32(1e-9))) < _ROAD_TOLERANCE_M)
     free &= allowed
@@ -237,7 +253,7 @@ def _within(outer: slice, inner: slice) -> slice:
 def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neighbour: Neighbour) -> Candidate:
     from arbiview_aug.render.kernels import upsample_where
 
-    usable = view.coverage & (hole.free | hole.seam)
+    usable = view.coverage & hole.wanted
     blur, risk = np.zeros(usable.shape, np.uint8), np.full(usable.shape, ChangeRisk.UNLABELLED, np.uint8)
     directions, q = hole.nodes
     for pair in view.pairs:
@@ -249,7 +265,8 @@ def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neig
         halves = np.clip(2 * np.log2(hole.camera.K[0, 0] * own_z * relative / (source.K[0, 0] * other)), 0, 255)
         upsample_where(halves.astype(np.float32), _CELL_PX, view.source_camera, pair.source, blur)
     if risks is not None:
-        corners = risks.reshape(q.shape)
+        corners = np.zeros(q.shape, np.uint8)
+        corners[hole.near] = risks
         cells = np.maximum.reduce([corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:], corners[1:, 1:]])
         risk = _of_cells(cells, _CELL_PX, usable.shape)
     return Candidate(usable, blur, risk, neighbour.is_later)
@@ -349,6 +366,10 @@ class Candidate(NamedTuple):
     later: bool  # whether it was recorded after the current frame
     image: torch.Tensor = torch.empty(0)  # (3, h, w) of the view's type, once it is rendered
 
+    def part(self, place: tuple[slice, slice]) -> Candidate:
+        """Some of its rows and columns."""
+        return Candidate(*(of[place] for of in self[:3]), self.later, self.image[(..., *place)])
+
 
 def merged(
     view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
@@ -368,8 +389,8 @@ def merged(
     shows = np.logical_or.reduce([one.shows for one in candidates])
     if (shows & free).any():
         box = _box(shows, margin_px)
-        parts = [Candidate(*(a[box] for a in one[:3]), one.later, one.image[:, *box]) for one in candidates]
-        pixels[:, *box], chosen[box] = _merged(view[:, *box], free[box], seam[box], parts, margin_px)
+        parts = view[(..., *box)], free[box], seam[box], [one.part(box) for one in candidates]
+        pixels[(..., *box)], chosen[box] = _merged(*parts, margin_px)
     return pixels, chosen
 
 
@@ -380,8 +401,8 @@ def _merged(
     step, n = max(1, margin_px // _SAMPLES_PER_SEAM), len(candidates)
     every = slice(None, None, step), slice(None, None, step)
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
-    samples = [Candidate(*(a[every] for a in one[:3]), one.later, one.image[:, *every]) for one in candidates]
-    current, images = (_levels(view[:, *every], levels), [_levels(one.image, levels) for one in samples])
+    samples = [one.part(every) for one in candidates]
+    current, images = _levels(view[(..., *every)], levels), [_levels(one.image, levels) for one in samples]
     recorded = [image.copy() for image in images]
     gains = _tone(current, images, free[every], seam[every], samples, max(1, margin_px // 2 // step))
     shown = np.stack([one.shows & free[every] for one in samples])
@@ -401,10 +422,10 @@ def _merged(
         taken = np.flatnonzero(chosen == k)
         y, x = np.divmod(taken, free.shape[1])
         at = y // step * current.shape[2] + x // step
-        colours = gains[k] * _levels(one.image.reshape(3, -1)[:, taken], levels)
+        colours = gains[k] * _levels(one.image, levels).reshape(3, -1).take(taken, 1)
         colours += (images[k] - gains[k][..., None] * recorded[k]).reshape(3, -1).take(at, 1)
         colours = np.clip(np.rint(colours) if levels == 1 else colours / np.float32(levels), 0, 255 / levels)
-        pixels.view(3, -1)[:, taken] = torch.from_numpy(colours).to(pixels)
+        pixels.view(3, -1).index_copy_(1, torch.from_numpy(taken).to(view.device), torch.from_numpy(colours).to(view))
     return pixels, chosen
 
 

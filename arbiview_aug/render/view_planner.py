@@ -238,6 +238,8 @@ class ViewPlanner:
         nearest, farthest = np.empty((2, *self._open.shape), np.float32)
         depth_range(q, self.step, nearest, farthest)
         apart = look_apart(self.camera, self.sources, float(nearest.max()))
+        if is_whole and (surface.is_layered or surface.is_dense):
+            self.scene.images[name, self.camera.content_key] = q
         measured = q, face, *at_nodes, behind, nearest, farthest, uncertainty
         self._geometries[name] = _Geometry(surface, *measured, apart, background.is_guess)
         return self._geometries[name]
