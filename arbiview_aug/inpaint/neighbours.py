@@ -188,7 +188,7 @@ def plan_fills(
     if not holes:
         return None
     # A neighbour's cameras are not blended: one of them may see a moved object.
-    config = replace(config, seam_width=0.0)
+    config = replace(config, seam_width=0.0, layers=False)
     rig = Rig([hole.camera for hole in holes], ground_z_m=plan.source.ground_z_m)
     wanted, points = [hole.wanted for hole in holes], [hole.points for hole in holes]
     ends, fills = np.cumsum([len(of_hole) for of_hole in points]), []

@@ -382,7 +382,7 @@ class ViewPlanner:
             fixed = fixed.rounded()
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
-        if self._wanted is not None:
+        if not self.config.layers:
             return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
         holes = winner < 0
         layers = (holes & (in_image > 0)).view(np.uint8)
@@ -585,7 +585,7 @@ def build_plan(
         config: Settings; the ``fast`` preset by default.
         scene: Known geometry, in the source's ego frame.
         maps: Rays and masks of cameras, to be reused by later plans.
-        wanted: (h, w) pixels of each target that must be planned, in place of all; then there are no ``layers``.
+        wanted: (h, w) pixels of each target that must be planned, in place of all.
 
     Returns:
         The plan. Targets that no source sees have zero coverage.
