@@ -182,9 +182,7 @@ def plan_fills(
     """
     full = scene.surface(surface, plan.source.ground_z_m)
     shown_q = [scene.images.get((surface, camera.content_key)) for camera in plan.target]
-    holes = [
-        hole for k, q in enumerate(shown_q) if (hole := _hole(plan, k, full, q, reach, maps)) is not None
-    ]
+    holes = [hole for k, q in enumerate(shown_q) if (hole := _hole(plan, k, full, q, reach, maps)) is not None]
     if not holes:
         return None
     # A neighbour's cameras are not blended: one of them may see a moved object.
@@ -207,9 +205,7 @@ def plan_fills(
     return Fills(holes, fills) if fills else None
 
 
-def _hole(
-    plan: RenderPlan, index: int, surface: Surface, q: Any, reach: Reach, maps: RayCache
-) -> Hole | None:
+def _hole(plan: RenderPlan, index: int, surface: Surface, q: Any, reach: Reach, maps: RayCache) -> Hole | None:
     camera, covered = plan.target[index], plan.targets[index].coverage
     empty = ~covered if camera.mask is None else ~covered & camera.mask
     height_m = camera.center_m[2] - plan.source.ground_z_m
@@ -368,7 +364,8 @@ class Candidate(NamedTuple):
 
     def part(self, place: tuple[slice, slice]) -> Candidate:
         """Some of its rows and columns."""
-        return Candidate(*(of[place] for of in self[:3]), self.later, self.image[(..., *place)])
+        maps = self.shows[place], self.blur[place], self.risk[place]
+        return Candidate(*maps, self.later, self.image[(..., *place)])
 
 
 def merged(

@@ -42,7 +42,7 @@ class RenderConfig:
             off. Wider bands show double images of near objects, narrower ones the exposure step.
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
         certainty: Store the geometry's accuracy in plans, one byte a pixel; ``outputs=("confidence",)`` needs it.
-        layers: Store what holes lie behind (``ViewPlan.layers``, ``paint`` and ``road``); ``holes="continue"`` needs it.
+        layers: Store what holes show (``ViewPlan.layers``, ``paint`` and ``road``); ``holes="continue"`` needs it.
     """
 
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"

@@ -591,8 +591,9 @@ def build_plan(
         The plan. Targets that no source sees have zero coverage.
     """
     with compilation_announced():
-        rigs, settings = (source, target.in_frame_of(source)), (geometry, config or RenderConfig(), scene or Scene())
-        return _built(*rigs, *settings, maps or RayCache(), wanted or [None] * len(target))
+        config, scene, maps = config or RenderConfig(), scene or Scene(), maps or RayCache()
+        target = target.in_frame_of(source)
+        return _built(source, target, geometry, config, scene, maps, wanted or [None] * len(target))
 
 
 def warm_up() -> None:
