@@ -318,10 +318,13 @@ def _write(maps: Maps | None, hole: Hole, where: BoolArray, value: Any) -> None:
 
 
 _AGREEMENT_LEVELS = 16.0
-"""Largest difference of two frames that agree, in grey levels over 5 x 5 pixels."""
+"""Largest difference of two frames that agree, in grey levels over a window."""
 
 _CONTRADICTION_LEVELS = 24.0
 """The same between a frame and the current one, on a seam (``docs/drives.md``, Constants)."""
+
+_WINDOW_PX = 5
+"""Side of the window in which two frames are compared, at least 3 samples."""
 
 _CONTRADICTION_REACH = 1.25
 """A contradiction on the seam reaches to where agreement is nearer by this factor (``docs/drives.md``, Constants)."""
@@ -403,7 +406,7 @@ def _merged(
     recorded = [image.copy() for image in images]
     gains = _tone(current, images, free[every], seam[every], samples, max(1, margin_px // 2 // step))
     shown = np.stack([one.shows & free[every] for one in samples])
-    accepted = shown & _accepted(current, images, shown, seam[every], samples)
+    accepted = shown & _accepted(current, images, shown, seam[every], samples, max(3, _WINDOW_PX // step | 1))
     # The order breaks ties.
     rank, chosen = np.full(free.shape, 256 * n, np.uint16), np.full(free.shape, -1, np.int16)
     for k, one in enumerate(candidates):
@@ -438,7 +441,12 @@ def _levels(image: torch.Tensor, levels: float) -> Levels:
 
 # --- votes ------------------------------------------------------------------------------------------------------------
 def _accepted(
-    current: Levels, toned: Sequence[Levels], shown: BoolArray, seam: BoolArray, candidates: Sequence[Candidate]
+    current: Levels,
+    toned: Sequence[Levels],
+    shown: BoolArray,
+    seam: BoolArray,
+    candidates: Sequence[Candidate],
+    window: int,
 ) -> BoolArray:
     """(n, h, w) whether each candidate shows what stands there now."""
     votes, nearest = np.zeros(shown.shape, np.uint8), np.full((2, *seam.shape), -1, np.int16)
@@ -448,7 +456,7 @@ def _accepted(
     static = shown.copy()  # as far as the nearest frames before and after the current one agree
     for pair in combinations(range(len(candidates)), 2):
         both = shown[pair[0]] & shown[pair[1]]
-        agree = _agreeing(toned[pair[0]], toned[pair[1]], both, _AGREEMENT_LEVELS)
+        agree = _agreeing(toned[pair[0]], toned[pair[1]], both, _AGREEMENT_LEVELS, window)
         for i, j in (pair, pair[::-1]):
             votes[i] += agree
             static[i] &= ~both | agree | (nearest[int(candidates[j].later)] != j)
@@ -462,18 +470,20 @@ def _accepted(
         on_both_sides = (nearest[0] >= 0) & (nearest[1] >= 0)
         static = (static & on_both_sides) | (unanimous & (votes >= (0 if few else 2)) & ~on_both_sides)
         if len(candidates) > 1:  # a single candidate may itself show the moving object
-            static &= ~_arrived(current, toned, seam, candidates)
+            static &= ~_arrived(current, toned, seam, candidates, window)
         accepted = (static & unlabelled) | (accepted & ~unlabelled)
     return np.asarray(accepted)
 
 
-def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate]) -> BoolArray:
+def _arrived(
+    current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate], window: int
+) -> BoolArray:
     """(h, w) where a hole continues what the current frame alone shows on the seam."""
     known, agree = np.zeros_like(seam), np.zeros_like(seam)
     for image, one in zip(toned, candidates, strict=True):
         both = seam & one.shows
         known |= both
-        agree |= _agreeing(image, current, both, _CONTRADICTION_LEVELS)
+        agree |= _agreeing(image, current, both, _CONTRADICTION_LEVELS, window)
     contradicts = known & ~agree
     if not contradicts.any():
         return contradicts
@@ -483,12 +493,12 @@ def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidat
     return np.asarray(away / _CONTRADICTION_REACH < near)
 
 
-def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float) -> BoolArray:
+def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float, window: int) -> BoolArray:
     """(h, w) where two images differ by less than a limit: means over the channels and a window's valid pixels."""
     apart = np.asarray(cv2.absdiff(one.reshape(-1, one.shape[2]), two.reshape(-1, one.shape[2]))).reshape(one.shape)
     valid = where.astype(np.float32)
     total, count = (
-        np.asarray(cv2.boxFilter(part, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
+        np.asarray(cv2.boxFilter(part, -1, (window, window), normalize=False, borderType=cv2.BORDER_CONSTANT))
         for part in ((apart[0] + apart[1] + apart[2]) * valid, valid)
     )
     return np.asarray(where & (total < 3 * limit * count))
