@@ -39,7 +39,7 @@ def cv2_wheels() -> dict[str, str]:
 
 
 def cv2_conflict() -> str | None:
-    """What is wrong if several wheels provide ``cv2``, and the fix."""
+    """Warning that several wheels provide ``cv2``, and the fix."""
     wheels = cv2_wheels()
     if len(wheels) < 2:
         return None

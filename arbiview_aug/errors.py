@@ -24,6 +24,11 @@ def shown(value: object) -> str:
     return _SHORT.repr(value)
 
 
+def one_line(text: object, most: int = 300) -> str:
+    """A text or an error for a message: on one line, cut where it is long."""
+    return " ".join(str(text).split())[:most]
+
+
 class ArbiviewError(Exception):
     """Base of this package's errors; messages name the camera or file, the expected and the given value."""
 

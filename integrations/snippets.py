@@ -11,11 +11,11 @@ def snippets(folder: str, replaced: Mapping[str, str] | None = None) -> list[str
     """The Python blocks of an integration's README.
 
     Args:
-        folder: Of the integration.
-        replaced: What a reader would put in place of what stands there: paths, mostly.
+        folder: Folder of the integration.
+        replaced: New text by the text that stands there: paths, mostly.
 
     Raises:
-        ValueError: What is to be replaced does not stand there.
+        ValueError: A text to replace does not stand there.
     """
     text = (Path(__file__).parent / folder / "README.md").read_text()
     for old, new in (replaced or {}).items():

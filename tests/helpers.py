@@ -57,7 +57,7 @@ def ring(
         radius_m: Distance of their centres from the ego origin.
         z_m: Height of their centres.
         yaw_deg: Turn of every camera about its own centre.
-        name: What their names begin with.
+        name: Start of their names.
     """
     cameras = []
     for k in range(count):
@@ -194,7 +194,7 @@ def examples(
         many: Examples of the slow one.
         most: Examples of the release check, if there is one.
         share: Range of the share of examples for which the property returns True.
-        strategies: What to draw, by the property's parameters; others are fixtures.
+        strategies: Strategies to draw from, by the property's parameters; others are fixtures.
     """
     drawing = settings(suppress_health_check=list(HealthCheck), phases=[Phase.generate])
 

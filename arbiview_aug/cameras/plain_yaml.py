@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.errors import CalibrationError, one_line
 
 MOST_BYTES = 1 << 20
 """Largest calibration file: 8 KiB a camera. It is counted before it is read: YAML takes seconds a megabyte."""
@@ -40,7 +40,7 @@ def read_plain(path: Path, where: str, most_bytes: int = MOST_BYTES) -> Any:
         text = path.read_text()
         return parse_json(text) if path.suffix == ".json" else parse_yaml(text)
     except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
-        raise CalibrationError(f"{where}: expected plain YAML or JSON, got {' '.join(str(error).split())}") from None
+        raise CalibrationError(f"{where}: expected plain YAML or JSON, got {one_line(error)}") from None
 
 
 def refuse_large(path: Path, where: str, most_bytes: int = MOST_BYTES) -> None:

@@ -168,7 +168,7 @@ def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:
     if len(coefficients) not in counts:
         expected = " or ".join(map(str, counts)) + f" coefficients for a {lens} lens"
         others = " or ".join(f"lens={other!r}" for other in LENSES if LENSES[other].coefficient_counts != (0,))
-        fix = f"name the lens: {others}" if counts == (0,) else ""
+        fix = f"name the lens: {others}" if counts == (0,) else "docs/formats.md, Lenses, has them"
         raise _error(name, "distortion", expected, str(len(coefficients)), fix)
     if not all(abs(k) <= _MAX_COEFFICIENT for k in coefficients):  # also catches NaN
         raise _error(name, "distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", shown(coefficients))

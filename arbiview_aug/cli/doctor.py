@@ -9,21 +9,29 @@ import re
 import shutil
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 from timeit import timeit
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
 from arbiview_aug.cameras.kernels import project_image
-from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.arguments import gathered_warnings
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.environment import cv2_conflict, cv2_wheels, installed_version, is_intact, versions, working_s
+from arbiview_aug.environment import (
+    cv2_conflict,
+    cv2_wheels,
+    installed_version,
+    is_intact,
+    one_thread,
+    versions,
+    working_s,
+)
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 _CALLS = 5
@@ -95,14 +103,22 @@ def _extras() -> list[str]:
 def _frame(size: tuple[int, int]) -> Line:
     """Time one frame of a synthetic street, and check that something was seen."""
     sample = SyntheticDrive(demo_source_rig(size), num_frames=1)[0]
-    geometries: tuple[GeometryName, ...] = ("street", "auto")
-    times_ms, notes = {}, list[str]()
-    with gathered_warnings(notes):
-        for geometry in geometries:
-            call = partial(RigRetarget(demo_target_rig(size), geometry=geometry), sample)
-            out = call()
-            times_ms[geometry] = 1e3 * statistics.median(timeit(call, timer=working_s, number=1) for _ in range(_CALLS))
+    target = demo_target_rig(size)
+    calls = {
+        "street": partial(RigRetarget(target, geometry="street"), sample),
+        "auto": partial(RigRetarget(target), sample),
+    }
+    with gathered_warnings([]):
+        out = [call() for call in calls.values()][-1]
+        times = _times(calls)
+        with one_thread():
+            times += f"; on one thread {_times(calls)}"
     images = np.stack([image.numpy() for image in out["images"]])
-    text = f"a frame, {len(sample['rig'])} cameras to {len(images)} of {size[1]}x{size[0]}: "
-    text += ", ".join(f"{name} {ms:.0f} ms" for name, ms in times_ms.items())
+    text = f"a frame, {len(sample['rig'])} cameras to {len(images)} of {size[1]}x{size[0]}: {times}"
     return bool(images.std() > 1 and out["coverage"].any()), text
+
+
+def _times(calls: Mapping[str, Callable[[], Any]]) -> str:
+    """Median times of calls."""
+    ms = {name: [1e3 * timeit(call, timer=working_s, number=1) for _ in range(_CALLS)] for name, call in calls.items()}
+    return ", ".join(f"{name} {statistics.median(times):.0f} ms" for name, times in ms.items())

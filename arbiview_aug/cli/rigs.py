@@ -13,6 +13,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig, shipped_rigs
 from arbiview_aug.cli.arguments import data
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.pictures import draw_rigs, save_picture
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.evaluate.rig_gap import rig_gap
@@ -70,12 +71,16 @@ def _load(name: str) -> tuple[Rig, str]:
     kind, root = split_kind(name)
     if kind is None and os.path.isfile(root / CALIBRATION_FILE):  # its images need not be there
         return load_rig(root / CALIBRATION_FILE), ""
-    if kind is None and name not in shipped_rigs() and os.path.exists(root) and recognised(root):
+    is_rig = os.path.isfile(root) or (os.path.isdir(root) and recognised(root))
+    if kind is None and name not in shipped_rigs() and is_rig:
         plain = read_calibration(root, where := f"rig file {root}")
-        return Rig.from_dict(plain, folder=root.parent, where=where), f"\n  {plain['notes']}"
+        rig = Rig.from_dict(plain, folder=root.parent, where=where)
+        return rig, f"\n  {plain['notes']}" if "notes" in plain else ""
     if kind is None and not os.path.isdir(root):
         return load_rig(name), ""
-    recording = open_data(data(name))
+    try:
+        recording = open_data(data(name))
+    except DataError as error:
+        raise DataError(f"{error}; nor is it a folder of another tool's calibration (docs/rigs.md)") from None
     recording.load_points = False
-    rig: Rig = recording[0]["rig"]
-    return rig, ""
+    return recording[0]["rig"], ""

@@ -75,7 +75,7 @@ def evaluate_scans(arguments: argparse.Namespace, folder: Path) -> None:
 
 
 def clouds_of(scan: TrueScan, lidar: Lidar) -> dict[str, FloatArray]:
-    """What a detector for B may be trained on: points as they are, rings dropped, and as B's scanner measures them."""
+    """Scans to train a detector for B on: points as they are, rings dropped, and as B's scanner measures them."""
     measured, rig = scan.points[~own_car(scan.points)], replace(scan.rig, lidars=[lidar])
     boxes, ground_z_m = scan.boxes, scan.rig.ground_z_m
     clouds = {"as they are": measured}

@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.open:
         viewer = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(path)]
         return subprocess.run(viewer, check=False).returncode
-    print(f"open it: rerun {path}")
+    print(f"open it: python -m rerun {path}")
     return 0
 
 

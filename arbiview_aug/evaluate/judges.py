@@ -6,9 +6,11 @@ Detectors take an RGB image (H, W, 3) uint8 and return ``Detections``; segmenter
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import re
 import sys
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +20,7 @@ import torch
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import DataError, described, shown
+from arbiview_aug.errors import DataError, described, one_line, shown
 from arbiview_aug.evaluate.report.pictures import Picture
 from arbiview_aug.inpaint.networks import load_torchscript
 from arbiview_aug.temporal.transformers_depth import load_pretrained
@@ -71,7 +73,8 @@ def load_detector(
     """Load the detector that ``--detector`` names; it returns the detections that count.
 
     Args:
-        name: ``FILE.py:function``, the name of a torchvision detector, or a folder or hub id of transformers.
+        name: ``FILE.py:function``, the name of a torchvision detector, or a folder or hub id of transformers. All are
+            asked for detections from ``LEAST_SCORE`` on, a function by its parameter ``score`` if it has one.
         weights: File of a torchvision detector's weights.
         classes: Labels that count, names or numbers as text. By default names of vehicles and people, and all numbers.
         device: Where a network of transformers or torchvision runs.
@@ -83,7 +86,7 @@ def load_detector(
     if names_a_function(name):
         if weights is not None:
             raise DataError(f"--detector-weights: expected it with a torchvision detector alone, got {option}")
-        detect, names = _function(option, name), None
+        detect, names = _asked_for_all(_function(option, name)), None
     elif weights is not None or name in _torchvision_detectors():
         detect, names = _of_torchvision(option, name, weights, device)
     else:
@@ -99,6 +102,15 @@ def load_detector(
         return found.subset(np.array(counts, bool))
 
     return detector
+
+
+def _asked_for_all(detect: Callable[..., Any]) -> Callable[[Picture], Any]:
+    """A function that returns detections from ``LEAST_SCORE`` on, where it has a parameter for it: AP counts them."""
+    try:
+        asks = "score" in inspect.signature(detect).parameters
+    except (TypeError, ValueError):  # of a compiled function
+        asks = False
+    return partial(detect, score=LEAST_SCORE) if asks else detect
 
 
 def checked_detections(option: str, output: Any, image: Picture) -> Detections:
@@ -159,7 +171,7 @@ def _of_torchvision(
         raise DataError(f"{file}: expected a file, found none") from None
     except Exception as error:  # pickle, zip, torch and mappings each have their own
         fix = f"expected weights of torchvision's {name} for its {len(names)} classes (others: FILE.py:function)"
-        raise DataError(f"{file}: {fix}: {_one_line(error)}") from None
+        raise DataError(f"{file}: {fix}: {one_line(error)}") from None
     model.eval().to(device)
 
     @torch.inference_mode()
@@ -278,7 +290,7 @@ def _function(option: str, name: str) -> Callable[[Picture], Any]:
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
-        raise DataError(f"{option}: importing {file} raised {type(error).__name__}: {_one_line(error)}") from error
+        raise DataError(f"{option}: importing {file} raised {type(error).__name__}: {one_line(error)}") from error
     function = getattr(module, wanted, None)
     if not callable(function):
         there = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
@@ -293,9 +305,5 @@ def _called(option: str, function: Callable[[Picture], Any], image: Picture) -> 
     except DataError:
         raise
     except Exception as error:
-        text = " ".join(described(error).split())[:300]
+        text = one_line(described(error))
         raise DataError(f"{option}: raised {text} for an image {image.shape} {image.dtype}") from error
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:300]

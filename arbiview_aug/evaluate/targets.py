@@ -60,13 +60,15 @@ def vehicle_targets(rig: Rig) -> dict[str, Rig]:
 
 def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:
     """Targets of a set, by name: ``paper`` (six), ``yaw`` (``YAWS_DEG``), ``vehicles`` or ``truck``."""
-    if kind == "paper":
-        return {f"paper {share:+g}": paper_target(rig, share) for share in PAPER_SHARES}
-    if kind == "yaw":
-        return {f"yaw {yaw:+g}": without_masks(rig.turned(yaw_deg=yaw)) for yaw in YAWS_DEG}
     if kind == "vehicles":
         return vehicle_targets(rig)
-    return {"truck": without_masks(rig.shifted(z_m=TRUCK_UP_M))}
+    if kind == "paper":
+        targets = {f"paper {share:+g}": paper_target(rig, share) for share in PAPER_SHARES}
+    elif kind == "yaw":
+        targets = {f"yaw {yaw:+g}": without_masks(rig.turned(yaw_deg=yaw)) for yaw in YAWS_DEG}
+    else:
+        targets = {"truck": without_masks(rig.shifted(z_m=TRUCK_UP_M))}
+    return {name: replace(target, name=f"{rig.name}, {name}".lstrip(", ")) for name, target in targets.items()}
 
 
 def without_masks(rig: Rig) -> Rig:

@@ -18,7 +18,7 @@ from torch import nn
 
 from arbiview_aug.atomic_io import checksum, remove_parts, write_whole
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import GeneratorError, shown
+from arbiview_aug.errors import GeneratorError, one_line, shown
 
 FORMAT = 1
 CONFIG_FILE = "config.json"
@@ -88,5 +88,5 @@ def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder:
     try:
         module.load_state_dict(tensors, assign=assign)
     except RuntimeError as error:
-        text = " ".join(str(error).split())[:_MAX_MESSAGE]
+        text = one_line(error, _MAX_MESSAGE)
         raise GeneratorError(f"{folder}: expected the weights of this configuration: {text}") from None

@@ -108,7 +108,7 @@ class Denoiser(nn.Module):
             noisy: (B, N, C, h, w) x_t; the pre-filled latent at t = ``REGRESSION``.
             t: (B,) int64 in [0, ``REGRESSION``].
             targets: Their conditions.
-            windows: Of the targets in [sources, targets], one for each token grid, the finest first.
+            windows: Windows of the targets in [sources, targets], one for each token grid, the finest first.
             sources: From ``read_sources``.
             rows: A list to append L_geo's rows to, one entry per block.
 

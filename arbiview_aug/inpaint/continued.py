@@ -111,8 +111,8 @@ def fill_holes(
             are modified.
         coverage: (h, w) bool of each.
         layers: (h, w) uint8 of each as in ``ViewPlan``, or None: all uncovered pixels lie outside the images.
-        paint: Of each as in ``ViewPlan``, or None.
-        road: Of each as in ``ViewPlan``, or None: the road reaches to the horizon.
+        paint: Colours of each as in ``ViewPlan``, or None.
+        road: The road of each as in ``ViewPlan``, or None: the road reaches to the horizon.
         cameras: That of each view; None if unknown: verticals are columns, and there is no road.
         only_mean: Set all to the mean colour of the frame's covered pixels. Else continue background from background,
             sides of objects from objects, and paint tops in their objects' colours.

@@ -28,7 +28,7 @@ class Inpainter(ABC):
     Attributes:
         min_confidence: Pixels that sources show with less confidence are filled too, 0 to 1.
         seed: Seed of random pixels, combined with the frame (its ``token``, else its images) and the camera.
-        outcome: What becomes of holes, for warnings: "The rest is ...".
+        outcome: The holes' fate, for warnings: "The rest is ...".
         is_random: Whether ``inpaint`` reads its seeds.
         needs_confidence: Whether frames must bring their confidence.
         needs_layers: Whether they must bring what holes lie behind (``RenderedFrame.layers``).

@@ -125,7 +125,7 @@ def complete_cells(sums: Any, mean: Any, wide: int, sweeps: int, cells: Any, aro
         sums: (4, ny, nx) of ``sum_cells``.
         mean: (3,) float32 colour where nothing is known.
         wide: The first so many steps to larger cells keep their height.
-        sweeps: Of smoothing, at each size.
+        sweeps: Sweeps of smoothing at each size.
         cells: (4, ceil(ny / 2), ceil(nx / 2)) float32, written.
         around: (4, ceil(ny / 4), ceil(nx / 4)) float32, written: ``sums`` added up, not completed.
     """

@@ -5,6 +5,7 @@ They see windows around the holes alone (``crops``); seen pixels stay as they ar
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import ArbiviewError, GeneratorError
+from arbiview_aug.errors import ArbiviewError, GeneratorError, one_line
 from arbiview_aug.inpaint.crops import Canvas, drawn, packed, windows
 from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, check_device, checked_settings
 from arbiview_aug.inpaint.telea import telea
@@ -160,11 +161,11 @@ class PipelineInpainter(NetworkInpainter):
             where: A folder or hub id in diffusers' layout.
             size: Longest side of an image that it sees; None: the pipeline's own.
             batch: Images that it sees at once.
-            prompt: What fills the holes.
+            prompt: Words for what fills the holes.
             steps: Steps of the pipeline; None: its own.
             guidance: Guidance of the pipeline; None: its own.
             min_confidence: As for every ``Inpainter``, like ``seed``.
-            settings: Of diffusers' ``from_pretrained``, such as ``torch_dtype`` or ``revision``.
+            settings: Arguments of diffusers' ``from_pretrained``, such as ``torch_dtype`` or ``revision``.
 
         Raises:
             ImportError: diffusers or transformers are missing.
@@ -175,8 +176,7 @@ class PipelineInpainter(NetworkInpainter):
         try:
             pipeline = diffusers.AutoPipelineForInpainting.from_pretrained(where, **settings)
         except (OSError, ValueError, RuntimeError, AttributeError) as error:
-            text = " ".join(str(error).split())[:300]
-            raise GeneratorError(f"{where}: expected an inpainting pipeline of diffusers: {text}") from None
+            raise GeneratorError(f"{where}: expected an inpainting pipeline of diffusers: {one_line(error)}") from None
         multiple = int(pipeline.vae_scale_factor)
         core = getattr(pipeline, "unet", None) or pipeline.transformer
         native_px = int(getattr(core.config, "sample_size", None) or 64) * multiple
@@ -207,7 +207,7 @@ class TorchScriptInpainter(NetworkInpainter):
     Args:
         path: The file. TorchScript runs code: load files that you trust.
         size: Longest side of an image that it sees.
-        multiple: Of which sides are multiples.
+        multiple: Number that divides both sides.
         batch: Images that it sees at once.
         settings: ``min_confidence`` and ``seed``, as for every ``Inpainter``.
 
@@ -227,7 +227,8 @@ class TorchScriptInpainter(NetworkInpainter):
 def load_torchscript(path: str | Path, what: str, kind: type[ArbiviewError]) -> Any:
     """Load a TorchScript file onto the CPU; an error of a ``kind`` says ``what`` it was to be."""
     try:
-        return torch.jit.load(str(path), map_location="cpu")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # advice of torch 2.14 to those who write such files
+            return torch.jit.load(str(path), map_location="cpu")
     except (RuntimeError, ValueError, OSError) as error:
-        text = " ".join(str(error).split())[:300]
-        raise kind(f"{what}: expected a TorchScript file: {text}") from None
+        raise kind(f"{what}: expected a TorchScript file: {one_line(error)}") from None

@@ -30,7 +30,7 @@ MATRICES = ("camera_intrinsics", "camera2ego", "camera2lidar", "lidar2camera", "
 """Lists of (4, 4) that ``NuScenesDataset.load_camera_info`` writes beside ``camera_imgs``."""
 
 _TURNED = ("flip_x", "flip_y", "noise_rot", "noise_translate", "lidar_aug_matrix")
-"""What OpenPCDet notes when it augments the whole scene."""
+"""Keys that OpenPCDet sets when it augments the whole scene."""
 
 _LEAST_UP = 0.9  # z of the upward axis of a frame that boxes stand upright in
 

@@ -31,7 +31,7 @@ def export_plan(plan: RenderPlan, path: str | Path) -> None:
     and ``holes="black"``.
 
     Args:
-        plan: Of a fixed pair of rigs, from ``RigRetarget.prepare``.
+        plan: Plan of a fixed pair of rigs, from ``RigRetarget.prepare``.
         path: The file; its folder is created.
 
     Raises:

@@ -189,9 +189,9 @@ def keep_objects_whole(
 ) -> None:  # fmt: skip
     """Give the nodes of each labelled object that a seam would cross to one source, where that sees it.
 
-    A seam repeats or cuts what it crosses. Of the sources that see the object whole, the one of the least parallax is
-    read. Nearer objects decide last. Objects that a source shows exactly, from the target's own centre, stay as they
-    are.
+    A seam repeats or cuts what it crosses. Among the sources that see the object whole, the one of the least parallax
+    is read. Nearer objects decide last. Objects that a source shows exactly, from the target's own centre, stay as
+    they are.
 
     Args:
         scores: (K, ny, nx) weight of each source, 0 where it sees nothing.

@@ -373,7 +373,7 @@ class RenderPlan:
 
     @cached_property
     def seam_samples(self) -> SeamSamples:
-        """What two sources show of the blended bands."""
+        """The blended bands as two sources show them."""
         sources, rows = len(self.source), [np.empty((0, 6), np.int64)]
         rank = np.full((len(self.targets), sources), sources)
         for number, view in enumerate(self.targets):

@@ -15,7 +15,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
 from arbiview_aug.sample.masks import CLEANING, dark_rims
 from arbiview_aug.scene.boxes import checked_boxes
@@ -61,7 +61,7 @@ class Frame:
         sample: The sample it was read from; further entries are read and checked on request.
         lead: Leading dimensions of the sample's images.
         index: Place of the frame in them.
-        once: What is read once for all stages, by name: neighbours and their points.
+        once: Parts read once for all stages, by name: neighbours and their points.
     """
 
     images: tuple[torch.Tensor, ...]
@@ -369,8 +369,8 @@ def as_array(key: str, value: Any) -> Points:
         array = np.asarray(value)
         return array if array.dtype == np.float32 else np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: quantised and meta tensors
-        why = " ".join(str(error).split())[:120]
-        raise SampleTypeError(f"{key}: expected a tensor of numbers, got {type(value).__name__} ({why})") from None
+        got = f"{type(value).__name__} ({one_line(error, 120)})"
+        raise SampleTypeError(f"{key}: expected a tensor of numbers, got {got}") from None
 
 
 PIXEL_BOUND_KEYS = (

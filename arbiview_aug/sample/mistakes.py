@@ -52,9 +52,9 @@ class Finding:
 
     Attributes:
         where: The camera or key.
-        expected: What is right.
-        found: What the sample says instead.
-        fix: What to do.
+        expected: The right value.
+        found: The sample's value.
+        fix: The step that mends it.
     """
 
     where: str
@@ -92,7 +92,7 @@ def check(sample: Mapping[str, Any], source: Rig | None = None, **unknown: Any) 
         source: The rig of samples that carry none.
 
     Raises:
-        ArbiviewError: What ``RigRetarget`` would refuse too.
+        ArbiviewError: ``RigRetarget`` would refuse the sample too.
     """
     refuse_old_options("check", unknown)
     frames = read_frames(sample, source)

@@ -32,12 +32,12 @@ ANCHOR_SHARE = 0.25
 _UNANCHORED = 0.1  # points to the square of ``ANCHOR_RAD``, below which a map is believed more than they
 
 GAP_RAD = (SUPPORT_RAD - SHRINK_RAD) / 2
-"""What a map knows hides so far beyond its border, half as far as measured points: as far costs good pixels of depth
-from motion, not at all shows what is hidden."""
+"""Angle by which a map's pixels hide beyond their border: half that of measured points. The whole angle costs good
+pixels of depth from motion; without any, hidden things show."""
 
 
 class DepthMap(NamedTuple):
-    """What is known of the depth of a camera's pixels.
+    """The known depths of a camera's pixels.
 
     Attributes:
         camera: The camera, at the size of the map.

@@ -321,7 +321,7 @@ def fit_profiles(
         points: (P, 3).
         within: (n,) numbers of points in boxes, box after box.
         ends: (B,) where they end.
-        least: So many points choose.
+        least: Fewest points that may choose.
         air: Points so near are the object's own unless they lie as near to the box's floor.
         planes: (B, pieces, 6, 4), written.
         is_own: (P,) set for the points of objects.

@@ -22,7 +22,7 @@ from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene import panorama
-from arbiview_aug.scene.boxes import BoxSurface, solids_among
+from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.depth_map import DepthMap, hidden_by
 from arbiview_aug.scene.panorama import BASE_STEP, CELL_RAD, NEAREST_M, OWN_CAR_M, SIDE_RAD, Layer
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
@@ -242,9 +242,9 @@ class PointCloudSurface(DenseSurface):
     """Points made dense over the street. Points of the own car are left out.
 
     Attributes:
-        street: What there is where nothing was measured.
+        street: Surface where nothing was measured.
         points: (P, 3) in the ego frame, finite, metres.
-        mapped: So many of the last points are of depth maps, and none of the own car.
+        mapped: Number of the last points that are of depth maps; none of these is of the own car.
         swept: Whether points of neighbouring frames are among them.
         maps: These depth maps, which tell what is hidden from their own cameras.
     """
@@ -403,17 +403,11 @@ class PointCloudWithBoxes(BoxSurface):
     An object's points choose its shape and are left out of the panoramas, where they would blur over its outline.
 
     Attributes:
-        street: The points' surface; ``among`` leaves out those of objects.
+        street: The surface of the points that are of no object.
         boxes: (B, 7), as in ``BoxSurface``.
     """
 
     street: PointCloudSurface
-
-    @classmethod
-    def among(cls, street: StaticSurface, points: Points, boxes: FloatArray) -> PointCloudWithBoxes:
-        """Boxes (B, 7) among points (P, 3)."""
-        planes, is_own = solids_among(boxes, points)
-        return cls(PointCloudSurface(street, points[~is_own]), boxes, planes)
 
     def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> Layer:
         return self.street.hidden(camera, rays, memory, coarse=coarse)

@@ -30,7 +30,7 @@ class TransformersDepth:
 
     Args:
         name: A folder, or a name on the Hugging Face Hub.
-        device: Where it runs.
+        device: Device that it runs on.
 
     Raises:
         DataError: transformers is not installed, there is no such model, or it does not estimate depth.

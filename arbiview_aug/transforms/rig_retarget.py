@@ -73,24 +73,24 @@ class RigRetarget(torch.nn.Module):
     A sample is a dict with ``images``, (..., N, 3, H, W) or a list of (..., 3, Hi, Wi), uint8 or float in [0, 1], and
     its calibration: ``rig``, or ``K`` (..., N, 3, 3) and ``cam2ego`` (..., N, 4, 4). The output has M images of the
     target, their ``K`` and ``cam2ego`` in the source's ego frame, and ``coverage`` (..., M, h, w) bool, True where a
-    camera saw the pixel. Boxes are in the ego frame and stay. So do points, unless the target has scanners
+    camera saw the pixel. Boxes are in the ego frame and stay. Points stay too, unless the target has scanners
     (``Rig.lidars``): then they are what these would have measured. Label maps are rendered too; what depends on the
     source's pixels is dropped. ``docs/formats.md`` lists all keys.
 
     Args:
         target: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
         source: The rig of samples that carry none.
-        geometry: What is known of the scene where cameras move. ``auto`` takes the best that the sample offers.
+        geometry: Source of distances where cameras move. ``auto`` takes the best that the sample offers.
             ``infinity``: nothing, right where centres coincide. ``ground``, ``street``: a flat road, with walls.
             ``boxes``: ``boxes_3d`` on the street. ``lidar``: ``points`` or ``depth_m``, with boxes. ``motion``: depth
             from ``neighbours``. ``learned``: ``learned_depth_m``. ``fused``: all of these. See ``docs/surfaces.md``.
-        holes: What fills pixels that no camera saw, marked in ``generated``: ``continue``, the background continued
+        holes: Filler of pixels that no camera saw, marked in ``generated``: ``continue``, the background continued
             behind objects; ``telea``; ``mean``; ``diffusion``, the shipped generator; or an ``Inpainter``. ``black``
             leaves them. See ``docs/holes.md``.
         quality: ``draft``, ``fast``, ``accurate`` or a ``RenderConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4
             as published.
-        neighbours: What other frames of the drive (``neighbours`` in the sample) may fill: ``road``, the road nearby;
-            ``all``; None, nothing.
+        neighbours: Holes that other frames of the drive (``neighbours`` in the sample) may fill: ``road``, those of the
+            road nearby; ``all``; or None.
         match_exposure: Bring each view's sources to the exposure of its main one. True estimates gains where held-out
             pixels agree better; False; or a gain for each camera. Never with ``paper``.
         size: (h, w) of every view.
@@ -99,7 +99,7 @@ class RigRetarget(torch.nn.Module):
         p: Probability of retargeting. A skipped sample keeps its own cameras at ``size``, with full coverage, so
             ``p < 1`` needs ``size`` and equal camera counts (else see ``MixedDataset``).
         keys: Label maps, further outputs and frames: ``SampleKeys``.
-        cache: What is kept from call to call: ``PlanCache``.
+        cache: Limits of the plans kept from call to call.
         backend: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
 

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Choosing the geometry
 #
-# Where a camera only turns or zooms, no geometry is needed. Where it moves, each pixel needs a distance, and
+# A camera that only turns or zooms needs no geometry. If it moves, each pixel needs a distance, and
 # `geometry=` says where that comes from. This notebook renders one street over several of them, and compares with the
 # truth, which a synthetic street knows.
 

@@ -41,7 +41,7 @@ YAW_DEG, FOCAL = 20.0, 0.7
 
 MOVES_M = {"0.7 m up": (0.0, 0.0, 0.7), "1 m aside": (0.0, 1.0, 0.0)}
 KNOWN = {"LiDAR and boxes": {}, "boxes": {"points": None}}
-"""What takes away from a sample what is not known."""
+"""Function that takes away from a sample what is not known."""
 
 BEHIND = {
     "road": GROUND_CLASSES,

@@ -1,14 +1,12 @@
 """``python -m integrations.benchmarks.moving_traffic``: what depth from motion does to moving traffic without labels.
 
-Synthetic drives know the truth: distances on moving objects, and views from aside and from higher. Photographs of a
-displaced camera know the pixels, and networks that were trained on photographs say whether they see in a view what they
-see in the photograph: a detector (AP) and a segmenter of drivable area and lane marks (IoU).
+Synthetic drives know the truth: distances on moving objects, and views from aside and from higher. What networks see in
+views and in photographs of displaced cameras is ``evaluate --displaced --detector --segmenter``.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,36 +19,25 @@ import torch
 from tqdm import tqdm
 
 from arbiview_aug import RigRetarget
-from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import add_output, command_parser, count, size, writable_folder
 from arbiview_aug.cli.bench.timing import benchmark, machine_line, show
-from arbiview_aug.datasets import FrameFolder, Neighbours
+from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.detections import average_precision, pooled
-from arbiview_aug.evaluate.judges import Detections, load_detector, load_segmenter
 from arbiview_aug.sample.inputs import MOTION_KEY, read_frames
 from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.temporal.motion_depth import motion_depth
-from integrations.benchmarks.baselines import own_index
 
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.floating]
-Image = npt.NDArray[np.uint8]
 
 MOVES = {"1 m aside": {"y_m": 1.0}, "0.6 m higher": {"z_m": 0.6}}
-METHODS = ("copy", "street", "motion")
+METHODS = ("street", "motion")
 FAR_M, MOVING_MPS, LEAST_PX = 60.0, 0.5, 60
 """Moving objects that count: greatest median distance, least speed, least number of pixels."""
 
 AROUND_PX, RIGHT = 8, 0.15
 """Pixels around them that score, and the relative error of a right distance."""
-
-ROADWORTHY = (0, 1, 2, 3, 5, 7)
-"""COCO's classes of people and vehicles: person, bicycle, car, motorcycle, bus, truck."""
-
-TRUE_SCORE, OVERLAPS = 0.4, (0.5, 0.7)
-"""Least score of a detection in a photograph that counts as an object, and IoUs of hits."""
 
 
 # --- synthetic drives -------------------------------------------------------------------------------------------------
@@ -84,7 +71,7 @@ def objects_seen(instances: npt.NDArray[Any], depth_m: Floats, rows: npt.NDArray
 def synthetic_rows(drive: SyntheticDrive) -> dict[str, dict[str, float]]:
     """A row for each move and method, and one for the distances; every object weighs the same, whatever its size."""
     distances: dict[str, list[list[float]]] = {"moving": [], "still": []}
-    levels: dict[str, list[list[float]]] = {f"{move}, {method}": [] for move in MOVES for method in METHODS[1:]}
+    levels: dict[str, list[list[float]]] = {f"{move}, {method}": [] for move in MOVES for method in METHODS}
     still: dict[str, list[float]] = {name: [] for name in levels}
     matched = drive.rig.with_cameras(list(map(motion_camera, drive.rig)))
     for index in tqdm(range(len(drive)), desc="streets", leave=False):
@@ -100,7 +87,7 @@ def synthetic_rows(drive: SyntheticDrive) -> dict[str, dict[str, float]]:
         for move, shift in MOVES.items():
             target = drive.rig.shifted(**shift)
             view = drive.render(index, target)
-            for method in METHODS[1:]:
+            for method in METHODS:
                 out, name = RigRetarget(target, geometry=method, neighbours=None)(given), f"{move}, {method}"
                 square = ((out["images"].float() - view.images.float()) ** 2).mean(1).numpy()
                 elsewhere = np.ones(square.shape, bool)
@@ -124,98 +111,18 @@ def _decibels(square: float) -> float:
     return float(10 * np.log10(255**2 / square))
 
 
-# --- photographs and judges -------------------------------------------------------------------------------------------
-def precision_at(found: Sequence[Detections], true: Sequence[Floats], overlap: float) -> float:
-    """AP of detections in several images, of which each has boxes (m, 4)."""
-    return float(average_precision(pooled(found, true, [np.zeros((0, 4))] * len(true), overlap))[0])
-
-
-class Judges:
-    """Networks trained on photographs, in a folder: ``nanodet.py`` (needs ncnn) and ``twinlitenet.ts``."""
-
-    def __init__(self, folder: Path) -> None:
-        classes = [str(number) for number in ROADWORTHY]
-        self.objects = load_detector(f"{folder / 'nanodet.py'}:detect", classes=classes)
-        self.road = load_segmenter(str(folder / "twinlitenet.ts"))
-
-
-def load_judges(folder: str | None) -> Judges | str:
-    """The judges in a folder, or why there are none."""
-    if folder is None:
-        return "no judges: name their folder by --judges"
-    if missing := [name for name in ("nanodet.py", "twinlitenet.ts") if not (Path(folder) / name).is_file()]:
-        return f"no judges: {folder} has no {' and no '.join(missing)}"
-    if importlib.util.find_spec("ncnn") is None:
-        return "no judges: pip install ncnn"
-    return Judges(Path(folder))
-
-
-def photographed_views(folder: str) -> Iterator[dict[str, tuple[Image, Bools]]]:
-    """The photograph of each frame's displaced camera, and what the methods make of the frame, with coverage."""
-    data = FrameFolder(folder, neighbours=Neighbours())
-    for index in range(len(data)):
-        truth = data.truth(index)
-        if truth is None:
-            continue
-        sample, rig = data[index], truth["rig"]
-        views = {"photograph": _arrays(truth["images"]), "copy": _copied(sample, rig)}
-        for method in METHODS[1:]:
-            out = RigRetarget(rig, geometry=method)(sample)
-            views[method] = _arrays(out["images"], out["coverage"])
-        for k in range(len(rig)):
-            yield {name: of_cameras[k] for name, of_cameras in views.items()}
-
-
-def _arrays(images: Any, coverage: Any = None) -> list[tuple[Image, Bools]]:
-    pixels = [np.ascontiguousarray(one.numpy().transpose(1, 2, 0)) for one in images]
-    masks = [np.ones(one.shape[:2], bool) for one in pixels] if coverage is None else [one.numpy() for one in coverage]
-    return list(zip(pixels, masks, strict=True))
-
-
-def _copied(sample: Mapping[str, Any], rig: Rig) -> list[tuple[Image, Bools]]:
-    return _arrays([sample["images"][own_index(sample["rig"], camera)] for camera in rig])
-
-
-def photograph_rows(folder: str, judges: Judges | str) -> dict[str, dict[str, float]]:
-    """A row for each method: PSNR of covered pixels, and what judges say if there are any."""
-    squares: dict[str, list[float]] = {method: [] for method in METHODS}
-    objects: dict[str, list[Detections]] = {method: [] for method in (*METHODS, "photograph")}
-    roads: dict[str, list[Bools]] = {method: [] for method in objects}
-    for views in tqdm(photographed_views(folder), desc="photographs", leave=False):
-        true = views["photograph"][0].astype(np.float32)
-        for method, (image, covered) in views.items():
-            if method in squares:
-                squares[method].append(_decibels(float(((image - true) ** 2)[covered].mean())))
-            if isinstance(judges, Judges):
-                objects[method].append(judges.objects(image))
-                roads[method].append(judges.road(image))
-    table: dict[str, dict[str, float]] = {name: {"psnr_db": float(np.mean(rows))} for name, rows in squares.items()}
-    if isinstance(judges, Judges):
-        boxes = [one.boxes[one.scores >= TRUE_SCORE] for one in objects["photograph"]]
-        for method, row in table.items():
-            row["objects"] = float(sum(map(len, boxes)))
-            for overlap in OVERLAPS:
-                row[f"ap_{100 * overlap:.0f}"] = precision_at(objects[method], boxes, overlap)
-            pairs = list(zip(roads[method], roads["photograph"], strict=True))
-            both, any_ = (sum(how(*pair).sum((1, 2)) for pair in pairs) for how in (np.logical_and, np.logical_or))
-            row |= dict(zip(("area_iou", "lanes_iou"), (both / np.maximum(any_, 1)).tolist(), strict=True))
-    return table
-
-
 # --- the command ------------------------------------------------------------------------------------------------------
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the tables, write the JSON."""
     parser = command_parser(
         "",
         "What depth from motion does to moving traffic without labels.",
-        "--data kitti-stereo --judges judges",
+        "--streets 6 --seed 91",
         program="python -m integrations.benchmarks.moving_traffic",
     )
     parser.add_argument("--size", type=size, default=(256, 704), metavar="HxW", help="of synthetic views")
     parser.add_argument("--streets", type=count, default=8, metavar="N", help="synthetic streets")
     parser.add_argument("--seed", type=int, default=70, metavar="N", help="of the streets")
-    parser.add_argument("--data", nargs="+", default=[], metavar="DIR", help="frame folders with photographs")
-    parser.add_argument("--judges", metavar="DIR", help="folder of nanodet.py and twinlitenet.ts (default: none)")
     add_output(parser)
     arguments = parser.parse_args(argv)
     folder = writable_folder(Path(arguments.output), arguments.output)
@@ -227,19 +134,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 @benchmark
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """All rows."""
-    judges = load_judges(arguments.judges)
-    if isinstance(judges, str):
-        print(judges, file=sys.stderr)
-    rig = demo_source_rig(arguments.size)
     streets = {"num_frames": arguments.streets, "seed": arguments.seed}
-    drive = SyntheticDrive(rig, **streets, lidar=False, neighbours=Neighbours())
-    rows = {name: photograph_rows(name, judges) for name in arguments.data}
-    return {
-        **streets,
-        "size": list(arguments.size),
-        "judges": judges if isinstance(judges, str) else arguments.judges,
-        "rows": {"synthetic": synthetic_rows(drive)} | rows,
-    }
+    drive = SyntheticDrive(demo_source_rig(arguments.size), **streets, lidar=False, neighbours=Neighbours())
+    return {**streets, "size": list(arguments.size), "rows": synthetic_rows(drive)}
 
 
 def table(report: dict[str, Any]) -> str:
@@ -247,14 +144,13 @@ def table(report: dict[str, Any]) -> str:
 
     def lines() -> Iterator[str]:
         yield machine_line(report)
-        for source, rows in report["rows"].items():
-            for columns in dict.fromkeys(tuple(row) for row in rows.values()):
-                yield ""
-                yield f"| {source} | " + " | ".join(columns) + " |"
-                yield "| --- |" + " ---: |" * len(columns)
-                for name, row in rows.items():
-                    if tuple(row) == columns:
-                        yield f"| {name} | " + " | ".join(f"{value:.3f}" for value in row.values()) + " |"
+        rows = report["rows"]
+        for columns in dict.fromkeys(tuple(row) for row in rows.values()):
+            yield f"\n| synthetic | {' | '.join(columns)} |"
+            yield "| --- |" + " ---: |" * len(columns)
+            for name, row in rows.items():
+                if tuple(row) == columns:
+                    yield f"| {name} | " + " | ".join(f"{value:.3f}" for value in row.values()) + " |"
 
     return "\n".join(lines())
 

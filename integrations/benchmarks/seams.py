@@ -97,7 +97,7 @@ def _winners(view: ViewPlan) -> ViewPlan:
 
 
 def _seconds(view: ViewPlan) -> ViewPlan:
-    """What the second sources show of the bands."""
+    """Layers of the bands as the second sources show them."""
     at, source = FixedMap.outside(view.source_camera.shape), np.full_like(view.source_camera, -1)
     for band in view.bands:
         (h, w), second = band.weight.shape, band.weight > 0

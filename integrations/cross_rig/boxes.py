@@ -49,7 +49,7 @@ def box_loss(answer: Tensor, boxes: Tensor, state: Tensor, counts: Tensor, grid:
         boxes: (B, n, 7), padded with NaN.
         state: (B, cells, cells) of ``labels``.
         counts: (B, cells, cells) cells that count.
-        grid: Of ``state``.
+        grid: Grid of ``state``.
     """
     side = answer.shape[-1]
     coarse, known = Grid(grid.side_m, side), counts & (state != HIDDEN)
@@ -98,7 +98,7 @@ def decode(answer: Tensor, grid: Grid, *, apart: bool) -> Tensor:
 
     Args:
         answer: (B, BOX_CHANNELS, side, side).
-        grid: Of the labels.
+        grid: Grid of the labels.
         apart: Whether a centre must be the strongest of its 3×3 cells.
     """
     answer = answer.float()

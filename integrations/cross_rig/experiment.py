@@ -66,7 +66,7 @@ class Run:
         return self.source("train", job.change, job.variant if job.variant.renders else None)
 
     def training_set(self, job: Job) -> FrameSet:
-        """A job's frames. What counts: objects that the rig of the recording sees, in the cells that B covers."""
+        """A job's frames. Objects count that the rig of the recording sees, in the cells that B covers."""
         images = self.images(job)
         labels = self.source("train") if job.variant.labels_of_a else images
         own = job.variant.renders
@@ -220,7 +220,7 @@ class Run:
 
 
 def counts_of(job: Job, change: str, trained: dict[str, Any], tested: Tested) -> dict[str, Any]:
-    """What a result's file holds."""
+    """Contents of a result's file."""
     return {
         "change": change,
         "seed": job.seed,

@@ -147,9 +147,9 @@ class Voxels(nn.Module):
     """Voxel sampling (SimpleBEV, Harley et al., ICRA 2023): no depth distribution, one average for each voxel.
 
     Args:
-        grid: Of the labels; cells of the map are twice as wide.
-        channels: Of the features.
-        width: Of the map.
+        grid: Grid of the labels; cells of the map are twice as wide.
+        channels: Channels of the features.
+        width: Width of the map.
     """
 
     voxels: Tensor

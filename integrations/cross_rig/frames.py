@@ -80,7 +80,7 @@ class Source:
         return make(rig, num_frames=_MAX_FRAMES, seed=self.street_seed, lidar=False)
 
     def world_spec(self) -> dict[str, Any]:
-        """What names the streets: their seed and the code that builds and renders them."""
+        """Name of the streets: their seed and the code that builds and renders them."""
         # Not the cameras' code: theirs is pinned by tests, and a change there must not cost hours of rendering.
         spec = {"streets": self.street_seed, "world": code_hash(_WORLD, within=_WORLD)}
         return spec | ({"cuboids": code_hash("integrations.cross_rig.cuboids")} if self.world == "cuboids" else {})

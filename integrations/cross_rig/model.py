@@ -40,7 +40,7 @@ class Heads(nn.Module):
     """Occupancy of cells and boxes, of a map.
 
     Args:
-        width: Of the map.
+        width: Width of the map.
         queries: Cells of the map are queries, which answer for their 16 cells; else for four.
     """
 
@@ -64,7 +64,7 @@ class Detector(nn.Module):
     """An encoder, a family's map, and two heads.
 
     Args:
-        grid: Of the labels.
+        grid: Grid of the labels.
         family: One of ``FAMILIES``.
         backbone: ``small``, or ``resnet34`` for a GPU.
         priors: Whether camera maps are added to the features.

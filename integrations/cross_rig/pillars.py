@@ -56,7 +56,7 @@ class PointSet:
     """Scans with labels, in memory.
 
     Attributes:
-        points: Of each frame (P, 4), within the grid.
+        points: Points of each frame (P, 4), within the grid.
         state: (F, cells, cells) of ``labels``.
         height_dm: (F, cells, cells).
         boxes: (F, n, 7), padded with NaN.
@@ -100,7 +100,7 @@ class PillarDetector(nn.Module):
     """Features of points, their maximum in each pillar, a map, and the heads.
 
     Args:
-        grid: Of the labels, a pillar a cell; cells of the map are twice as wide.
+        grid: Grid of the labels, a pillar a cell; cells of the map are twice as wide.
     """
 
     def __init__(self, grid: Grid) -> None:

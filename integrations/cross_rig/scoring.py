@@ -100,7 +100,7 @@ class VariantScore:
         value: IoU of all seeds' frames together, or mean AP of the seeds.
         over_raw: Value minus raw's.
         over_raw_t: The mean of the seeds' differences from raw and its t-interval; None of fewer than three seeds.
-        share: Of the gap, (variant - raw) / (oracle - raw); None where the gap is below ``MIN_GAP`` or no oracle was
+        share: Closed gap, (variant - raw) / (oracle - raw); None where the gap is below ``MIN_GAP`` or no oracle was
             trained.
         share_t: The mean of the seeds' shares and its t-interval; None of fewer than three seeds.
         seeds: Value of each seed.

@@ -45,11 +45,11 @@ class Settings:
 
     Attributes:
         size: (h, w) of every image.
-        train_frames, val_frames, test_frames: Of the three sets of streets.
+        train_frames, val_frames, test_frames: Sizes of the three sets of streets.
         streets: The world that all three come from, a whole hundred: ``worlds.street_seed``.
         two_wheelers: Whether bicycles and motorcycles are in its streets.
-        world: What makes the streets.
-        seeds: Of the trainings; each variant is trained once with each.
+        world: Maker of the streets.
+        seeds: Seeds of the trainings; each variant is trained once with each.
         changes: Names of ``worlds.CHANGES``, or ``REAL`` alone.
         variants: Names of ``variants.VARIANTS``.
         families: Names of ``families.FAMILIES``.
@@ -97,9 +97,9 @@ class Job:
     Attributes:
         variant: How.
         change: For which vehicle B; None where B does not matter: one training serves every change.
-        seed: Of its initialisation and its draws, the same for every variant.
-        family: Of the detector.
-        length: Of its schedule.
+        seed: Seed of its initialisation and its draws, the same for every variant.
+        family: Family of the detector.
+        length: Length of its schedule.
     """
 
     variant: Variant

@@ -38,14 +38,14 @@ class Schedule:
     """The same for every variant.
 
     Attributes:
-        family: Of the model.
-        steps: Of the optimiser.
+        family: Family of the model.
+        steps: Steps of the optimiser.
         batch: Frames a step.
         lr: The peak of a one-cycle schedule; AdamW's default decay.
-        backbone: Of the model.
+        backbone: Backbone of the model.
         priors: Whether the model reads camera maps.
         precision: ``bf16`` runs the networks in bfloat16 (autocast): twice as fast on CPUs with AMX.
-        device: Where to train.
+        device: Device to train on.
     """
 
     steps: int
@@ -137,8 +137,8 @@ class Draws:
     Args:
         own: The variant's frames, images or scans.
         raw: A's frames, half of which are drawn instead; None: none.
-        num_frames: Of each.
-        seed: Of the training.
+        num_frames: Frames of each.
+        seed: Seed of the training.
         augmented: Frames are scaled and cropped.
 
     Attributes:
@@ -251,8 +251,8 @@ class Tested:
     """Scores that a model reached on vehicle B.
 
     Attributes:
-        threshold, val_iou: Of validation.
-        tally: Of cells, at that threshold.
+        threshold, val_iou: Best threshold on validation streets, and the IoU there.
+        tally: Counts of cells, at that threshold.
         fixed: (F, 3) counts at ``FIXED_THRESHOLD``.
         matched: (F, k, 5) of ``boxes.match``.
         positives: (F,) boxes that count.

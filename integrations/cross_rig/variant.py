@@ -27,8 +27,8 @@ class Variant:
     Attributes:
         name: On the command line and in files.
         title: In tables.
-        kind: Where its images come from: A's as they are, B's own, or A's re-rendered.
-        surface: Of ``RigRetarget``.
+        kind: Source of its images: A's as they are, B's own, or A's re-rendered.
+        surface: Surface of ``RigRetarget``.
         reads: Which of the frame's geometry it is given, besides the images; ``neighbours``: the frames 1.2 m before
             and after it, with boxes where it reads boxes; ``learned_depth_m``: the true depth, at the size of the
             ``depth`` command's.
@@ -38,7 +38,7 @@ class Variant:
         masked: The network masks them by ``coverage``. Otherwise every pixel counts as seen, as in stock detectors.
         random: Targets are drawn around B, or around A by those who do not know B, one for each frame.
         priors: The network reads ``CameraMaps`` beside its features, by ``CameraPriorStem``.
-        noise: What is wrong with the geometry that it is given (``noise.py``); the labels are right.
+        noise: Error of the geometry that it is given (``noise.py``); the labels are right.
         labels: Whose rig says which vehicles are hidden: A's, which recorded, B's views as they were rendered
             (``visible_boxes``). None: A's, and for an oracle B's true ones.
         truth: To find out where the rest is lost: B's true pixels where something is covered, or where nothing is

@@ -47,7 +47,7 @@ class ViewMaker:
         """The arrays of a retargeted frame.
 
         Args:
-            index: Of the frame: its draw depends on it alone.
+            index: Index of the frame: its draw depends on it alone.
             frame: ``images`` (N, 3, h, w) uint8, the geometry that the variant reads, and perhaps ``rig``.
 
         Returns:

@@ -52,7 +52,7 @@ def worst_error_px(results: Mapping[str, Any], rig: Rig, lidar2ego: FloatArray =
         results: A dict of one of the forms.
         rig: Its cameras, in the ego frame of ``lidar2ego``.
         lidar2ego: (4, 4).
-        seed: Of the points: 20,000, up to 60 m around the vehicle, of which those count that are in an image.
+        seed: Seed of the points: 20,000, up to 60 m around the vehicle, of which those count that are in an image.
     """
     rng = np.random.default_rng(seed)
     points = rng.uniform((-60, -60, -3, 1), (60, 60, 6, 1), (20_000, 4))

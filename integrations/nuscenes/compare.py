@@ -62,7 +62,7 @@ def agreement(
     """Compare the devkit's boxes with those of samples.
 
     Args:
-        entries: Of ``devkit_boxes``.
+        entries: Entries of ``devkit_boxes``.
         sample_of: The sample of a token, with ``boxes_3d`` and ``box_tokens``.
         rig_of: Its cameras, by the devkit's channels.
     """

@@ -124,6 +124,48 @@ def test_ros_camera_info_with_tf(tmp_path: Path) -> None:
     assert load_rig(tmp_path / "front.yaml")[0] == front
 
 
+CAMERA_INFO_MESSAGE = """\
+header:
+  stamp:
+    sec: 1700000000
+    nanosec: 84372815
+  frame_id: front_optical_frame
+height: 480
+width: 640
+distortion_model: plumb_bob
+d:
+- -0.271482
+- 0.107643
+- -0.000164
+- -0.005099
+- 0.0
+k: [536.57137, 0.0, 315.05552, 0.0, 537.71384, 241.03827, 0.0, 0.0, 1.0]
+r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+p: [487.19293, 0.0, 312.29617, 0.0, 0.0, 515.41675, 240.47823, 0.0, 0.0, 0.0, 1.0, 0.0]
+binning_x: 0
+binning_y: 0
+roi:
+  x_offset: 0
+  y_offset: 0
+  height: 0
+  width: 0
+  do_rectify: false
+---
+"""
+
+
+def test_ros_camera_info_as_topic_echo_prints_it(tmp_path: Path) -> None:
+    expected = load_rig(written(tmp_path, front__yaml=CAMERA_INFO, tf_static__yaml=TF_STATIC))
+    written(tmp_path, front__yaml=CAMERA_INFO_MESSAGE)
+    assert load_rig(tmp_path) == expected == load_rig(tmp_path / "front.yaml").with_cameras(expected)
+    of_ros_1 = CAMERA_INFO_MESSAGE.replace("\nd:", "\nD:").replace("\nk:", "\nK:")
+    assert load_rig(written(tmp_path, front__yaml=of_ros_1)) == expected
+    for part in (("binning_y: 0", "binning_y: 2"), ("  width: 0", "  width: 320")):
+        written(tmp_path, front__yaml=CAMERA_INFO_MESSAGE.replace(*part))
+        with pytest.raises(CalibrationError, match="camera 'front': expected full images, got binning or a region"):
+            load_rig(tmp_path)
+
+
 def test_ros_questions(tmp_path: Path) -> None:
     written(tmp_path, front__yaml=CAMERA_INFO)
     question = r"ROS: camera 'front': where is it on the vehicle\? Write its pose.*mounting.yaml.*tf_static.yaml"
@@ -225,6 +267,12 @@ def test_opencv_file_storage(tmp_path: Path) -> None:
     written(tmp_path, mounting__yaml=f"{mounting}\nsizes: {{back: {{width: 1920, height: 1080}}}}")
     again = load_rig(tmp_path)["back"]
     assert again.distortion == (*back.distortion, 0.0, 0.0, 0.0) and np.array_equal(again.K, back.K)
+    storage = cv2.FileStorage(str(tmp_path / "back.json"), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", back.K)
+    storage.write("distortion_coefficients", np.array(back.distortion))
+    storage.release()
+    (tmp_path / "back.yml").unlink()
+    assert load_rig(tmp_path)["back"] == back
     for text, message in {
         "<opencv_storage><Camera_Matrix>": "wide.xml: expected XML, got no element found",
         '<!DOCTYPE a [<!ENTITY b SYSTEM "/etc/passwd">]><a>&b;</a>': "without declarations, got <!",

@@ -18,7 +18,7 @@ TINY = ["--size", "24x64", "--frames", "2"]
 
 
 def rerun(*arguments: str | Path) -> str:
-    """What Rerun's own command prints."""
+    """Output of Rerun's own command."""
     command = [sys.executable, "-m", "rerun", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=100).stdout
 

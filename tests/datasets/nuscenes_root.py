@@ -34,7 +34,7 @@ class Street:
     """A scene of the data set.
 
     Attributes:
-        name: Of the scene.
+        name: Name of the scene.
         scene: At time 0.
         travel_m: How far the vehicle has come by a time in seconds.
         keyframes: How many.

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.judges import SEGMENTED, is_road_user, load_detector, load_segmenter
+from arbiview_aug.evaluate.judges import LEAST_SCORE, SEGMENTED, is_road_user, load_detector, load_segmenter
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (90, 160, 3), np.uint8)
 ONE = "[[10, 20, 30, 40]], [0.9]"
@@ -42,6 +42,13 @@ def test_a_function_of_a_file(file: Callable[[str], str]) -> None:
     assert found.labels == ["car", "person"] and found.scores.tolist() == [0.9, 0.7]
     nothing = load_detector(file("[], [], []"))(IMAGE)
     assert nothing.boxes.shape == (0, 4) and nothing.scores.shape == (0,)
+
+
+def test_a_function_is_asked_for_all_detections_that_ap_counts(file: Callable[[str], str]) -> None:
+    name = file("[[1, 2, 3, 4]], [score], [0]")
+    path = Path(name.removesuffix(":judge"))
+    path.write_text(path.read_text().replace("judge(rgb)", "judge(rgb, score=0.3)"))
+    assert load_detector(name)(IMAGE).scores.tolist() == [LEAST_SCORE]
 
 
 def test_classes_that_count(file: Callable[[str], str]) -> None:

@@ -64,8 +64,8 @@ def test_targets_carry_no_masks() -> None:
         name="a", azimuth_deg=0, width_px=8, height_px=8, horizontal_fov_deg=50.0, mask=np.zeros((8, 8), bool)
     )
     rig = Rig([camera], ground_z_m=0.1, name="masked")
-    for target in (paper_target(rig, 0.2), named_targets("truck", rig)["truck"]):
-        assert target[0].mask is None and target.name == "masked"
+    for target, name in ((paper_target(rig, 0.2), "masked"), (named_targets("truck", rig)["truck"], "masked, truck")):
+        assert target[0].mask is None and target.name == name
 
 
 def test_named_sets() -> None:

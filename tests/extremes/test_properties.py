@@ -134,7 +134,7 @@ def test_unproject_is_the_inverse_of_project(worst: Worst, camera: Camera, seed:
     back = camera.unproject(seen.uv[inside])
     assert back.valid.all()
     angle = np.linalg.norm(np.cross(back.directions, directions[inside]), axis=-1)
-    # Where a lens is nearly flat, close to its fold, a pixel's tolerance is a wide angle.
+    # At a lens that is nearly flat, close to its fold, a pixel's tolerance is a wide angle.
     error_px = (angle * camera.K[0, 0]).max(initial=0)
     worst("px in the middle of the image, unproject(project(point))", error_px)
     assert error_px <= 1e-3

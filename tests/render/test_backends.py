@@ -52,7 +52,7 @@ def test_target_equal_to_source_gives_the_source_back(name: str, surface: str) -
     plan = build_plan(rig, rig, geometry=surface)
     views = [by(execution, plan, images) for execution in ("opencv", "torch")]
     for camera, image, target, *both in zip(rig, images, plan.targets, *views, strict=True):
-        # Where the lens can be inverted: past its fold a pixel has no ray.
+        # Only pixels that the lens can invert: past its fold a pixel has no ray.
         seen = camera.unproject(camera.pixel_grid()).valid
         assert (target.coverage == seen)[1:-1, 1:-1].all()
         for view in both:
@@ -189,7 +189,7 @@ def test_half_precision_images_keep_float32_positions(dtype: torch.dtype, autoca
     assert all(torch.equal(view, other.to(dtype)) for view, other in zip(views, exact, strict=True))
     maps = maps_on(plan, torch.device("cpu"))[0]
     assert maps.grid.dtype == torch.float32 and (maps.blend is None or maps.blend.grid.dtype == torch.float32)
-    # What half precision would have done: pixels elsewhere.
+    # Half precision would have read other pixels.
     seen = maps.source >= 0
     rows = (maps.grid.bfloat16().float() - maps.grid)[seen][:, 1].abs() * plan.layout.size[0] / 2
     assert rows.max() > 0.5

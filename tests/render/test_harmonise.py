@@ -132,7 +132,7 @@ def test_harmful_gains_are_declined(street, monkeypatch: pytest.MonkeyPatch) -> 
     before, after = told_db(report.reason)
     assert after > before  # what it would have been
     assert torch.equal(declined, retargeted(rig, spoiled, match_exposure=False))
-    # Where fitted pixels lie, the first camera reads a brighter image: a lie that the others uncover.
+    # At the fitted pixels the first camera reads a brighter image: a lie that the others uncover.
     told = np.zeros(len(overlaps.at) + 1, np.uint8)
     told[overlaps.fitted[0]], told[overlaps.fitted[1]] = 120, 60
     lies = [image.clone() for image in images]

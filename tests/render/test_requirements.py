@@ -158,7 +158,7 @@ def test_geometry_is_needed_where_a_pixel_can_move() -> None:
     }
     for (source, target), expected in needed.items():
         assert needs_geometry(source, target, "auto", FAST) == expected, (source.names, target.names)
-    # What is asked for by name is left out only where it cannot matter.
+    # An option asked for by name is left out only where it cannot matter.
     assert not needs_geometry(rig, cut, "lidar", FAST)
     assert needs_geometry(front_and_back, front_and_back.turned(yaw_deg=10), "lidar", FAST)
     nearly = rig.shifted(x_m=1e-5)

@@ -7,7 +7,15 @@ import numpy as np
 from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.point_cloud import COARSE, Panorama, PointCloudSurface, PointCloudWithBoxes
+from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import StaticSurface, Surface
+
+
+def points_and_boxes(points: np.ndarray, boxes: np.ndarray) -> PointCloudWithBoxes:
+    """Boxes (B, 7) among points (P, 3) on a street at 0 m."""
+    surface = Scene(boxes, points).surface("lidar", 0.0)
+    assert isinstance(surface, PointCloudWithBoxes)
+    return surface
 
 
 def inverse_distance(

@@ -94,7 +94,7 @@ def test_drawn_boxes_equal_cast_rays(lens: dict) -> None:
     both = shown & (q > 0)
     assert np.quantile(np.abs(drawn[both] / q[both] - 1), 0.999) < 1e-5
     assert (drawn_face == face)[both].mean() > 0.998  # corners belong to two
-    # What a source's image shows of objects, a pixel above the road, is what they hide from it.
+    # Objects hide from a source what its image shows of them, a pixel above the road.
     shadow = scene.occlusion_map(camera, pixel_rays(camera)).beyond.ravel() > 0
     rays = camera.unproject(camera.pixel_grid()).directions.reshape(-1, 3)
     hidden = occludes(scene, camera.center_m, rays, np.zeros(len(rays)), float(1 / camera.K[0, 0]))

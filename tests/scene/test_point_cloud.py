@@ -17,14 +17,13 @@ from arbiview_aug.scene.point_cloud import (
     Cells,
     Panorama,
     PointCloudSurface,
-    PointCloudWithBoxes,
     Window,
     checked_points,
 )
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Street
 from tests import helpers
-from tests.scene.single_rays import inverse_distance, occludes, occlusion_depth
+from tests.scene.single_rays import inverse_distance, occludes, occlusion_depth, points_and_boxes
 
 EYE = np.array([2.0, 0.0, 1.5])
 PIXEL_RAD = 0.002
@@ -148,7 +147,7 @@ def test_a_box_decides_within_its_silhouette_and_its_points_not_beyond() -> None
     mirror = wall(12.1, (1.5, 1.65), (1.0, 1.2))
     of_box = wall(12.0, (-1.5, 1.5), (0.0, 2.0))
     of_box = of_box[:: len(of_box) // 30]  # too few to show a shape
-    surface = PointCloudWithBoxes.among(Street(), np.concatenate([of_box, mirror, FAR]), box)
+    surface = points_and_boxes(np.concatenate([of_box, mirror, FAR]), box)
     assert len(surface.boxes) == 1
     inside, q = towards(np.array([[12.0, y, z] for y in (-1.49, 1.49) for z in (0.3, 1.99)]))
     assert np.allclose(inverse_distance(surface, EYE, inside), q, rtol=1e-6)

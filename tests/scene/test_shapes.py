@@ -10,10 +10,9 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.boxes import KIND_M, OF_KIND, PROFILES, BoxSurface, kinds, points_in, solids, solids_among
 from arbiview_aug.scene.kernels import planes_of
-from arbiview_aug.scene.point_cloud import PointCloudWithBoxes
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Street
-from tests.scene.single_rays import inverse_distance, occlusion_depth, solids_ahead
+from tests.scene.single_rays import inverse_distance, occlusion_depth, points_and_boxes, solids_ahead
 
 SIZES = {
     "car": (4.5, 1.8, 1.45),
@@ -127,7 +126,7 @@ def test_points_beside_an_object_are_the_background_s() -> None:
     """Over a bonnet, and on the road below."""
     points = np.array([[9.9, 0.5, 1.4], [9.9, 0.5, 0.05], [9.8, 0.5, 0.6]], np.float32)
     assert solids_among(CAR, points)[1].tolist() == [False, False, True]
-    among = PointCloudWithBoxes.among(Street(), points, CAR)
+    among = points_and_boxes(points, CAR)
     assert len(among.street.points) == 2
 
 
@@ -158,9 +157,11 @@ def test_a_roof_that_no_source_saw_is_a_hole(surface: str) -> None:
     points = surface_points(planes, CAR[0])
     points = points[points[:, 2] < 1.3] if surface == "lidar" else np.zeros((0, 3))
     rig = Rig([low])
-    plan = build_plan(rig, rig.shifted(z_m=1.2), geometry=surface, scene=Scene(CAR, points))
-    target, among = plan.target[0], PointCloudWithBoxes.among(Street(), points, CAR)
-    faces = solids_ahead(CAR, among.solids, target.center_m, target.unproject(target.pixel_grid()).directions)[1]
+    scene = Scene(CAR, points)
+    plan = build_plan(rig, rig.shifted(z_m=1.2), geometry=surface, scene=scene)
+    target, boxes = plan.target[0], scene.surface(surface, 0.0)
+    assert isinstance(boxes, BoxSurface)
+    faces = solids_ahead(CAR, boxes.solids, target.center_m, target.unproject(target.pixel_grid()).directions)[1]
     inner = cv2.erode(np.isin(faces, [5, 11]).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     assert inner.sum() > 50 and not plan.coverage[0][inner & (faces == 11)].any()
     rear = cv2.erode((faces == 1).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -174,7 +175,7 @@ def test_images_say_what_single_rays_say() -> None:
     wall = np.stack(np.meshgrid(32.0, np.arange(-20, 20, 0.12), np.arange(-1.0, 9.0, 0.12)), -1).reshape(-1, 3)
     boxes = np.concatenate([CAR, [[18.0, 3.0, 1.0, 4.0, 2.0, 2.0, 0.7]]])
     near = surface_points(solids(CAR)[0], CAR[0])
-    surface = PointCloudWithBoxes.among(Street(), np.concatenate([near, wall]), boxes)
+    surface = points_and_boxes(np.concatenate([near, wall]), boxes)
     rays, valid = view.unproject(view.pixel_grid())
     rays, street = rays[valid], surface.street
     off = np.abs(street.image(view, pixel_rays(view))[valid] - inverse_distance(street, view.center_m, rays))

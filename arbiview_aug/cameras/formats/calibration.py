@@ -14,7 +14,7 @@ import yaml
 from arbiview_aug.cameras.formats import camera_files, colmap, datasets, kalibr
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.plain_yaml import read_plain
-from arbiview_aug.errors import ArbiviewError, CalibrationError
+from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line
 
 
 class Format(NamedTuple):
@@ -85,7 +85,7 @@ def read_calibration(path: Path, where: str) -> Any:
     """
     data = None
     try:
-        name = _by_files(path)
+        name = recognised(path)
         if name is None and not os.path.isdir(path):
             data = read_plain(path, where)
             name = _by_content(data)
@@ -104,7 +104,7 @@ def read_calibration(path: Path, where: str) -> Any:
     except ArbiviewError as error:
         raise type(error)(f"{where}: {form.tool}: {error}") from None
     except _BROKEN as error:  # readers take files apart as their tools write them
-        got = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        got = one_line(described(error))
         raise CalibrationError(f"{where}: expected a calibration as {form.tool} writes it, got {got}") from None
     is_known = mounting.ground_z_m is not None
     ground = mounting.ground_z_m if is_known else form.ground_z_m
@@ -113,14 +113,8 @@ def read_calibration(path: Path, where: str) -> Any:
     return {"name": stem, "ground_z_m": ground, "notes": notes, "cameras": cameras}
 
 
-def recognised(path: Path, where: str = "calibration") -> str | None:
-    """Name in ``FORMATS`` of a file or folder; None for a rig file and for anything else."""
-    name = _by_files(path)
-    return name if name or os.path.isdir(path) else _by_content(read_plain(path, where))
-
-
-def _by_files(path: Path) -> str | None:
-    """Name of a folder's format by its files, or of a file's by its name and first words."""
+def recognised(path: Path) -> str | None:
+    """Name in ``FORMATS`` of a folder by its files, or of a file by its name and first words."""
     if os.path.isdir(path):
         for name, form in FORMATS.items():
             if any(any(path.glob(pattern)) for pattern in form.files):
@@ -130,7 +124,7 @@ def _by_files(path: Path) -> str | None:
     by_name = {".txt": "colmap", ".bin": "colmap", ".feather": "argoverse2", datasets.CALIBRATED_SENSOR: "nuscenes"}
     if path.name in by_name or path.suffix in by_name:
         return by_name.get(path.name) or by_name[path.suffix]
-    return "opencv" if camera_files.is_file_storage(path) else None
+    return "opencv" if camera_files.is_file_storage(path) else "ros" if camera_files.is_camera_info(path) else None
 
 
 def _by_content(data: Any) -> str | None:

@@ -13,7 +13,7 @@ import numpy as np
 from arbiview_aug.cameras.formats.entries import camera_entry, lens_of, write_yaml
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting, pose_of
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.plain_yaml import MOST_BYTES, parse_yaml, read_plain, refuse_large
+from arbiview_aug.cameras.plain_yaml import MOST_BYTES, parse_yaml, refuse_large
 from arbiview_aug.cameras.rotations import quaternion_from_rotation
 from arbiview_aug.errors import CalibrationError
 
@@ -29,16 +29,23 @@ _MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix")
 _COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs")
 _WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
 
+_MESSAGE = "binning_x"  # of CameraInfo messages; camera_calibration's files have none
+
 
 def camera_files(folder: Path) -> list[Path]:
     """A folder's files with a camera matrix."""
-    files = (path for path in sorted(folder.glob("*.*")) if path.suffix in (".yaml", ".yml", ".xml"))
-    return [path for path in files if path.name not in (MOUNTING, TF) and _has(path, _MATRIX)]
+    files = (path for path in sorted(folder.glob("*.*")) if path.suffix in (".yaml", ".yml", ".xml", ".json"))
+    return [path for path in files if path.name not in (MOUNTING, TF) and _has(path, (*_MATRIX, _MESSAGE))]
 
 
 def is_file_storage(path: Path) -> bool:
-    """Whether a file is OpenCV's FileStorage: XML, or YAML with its own header or tags."""
-    return path.suffix == ".xml" or _has(path, ("%YAML:", "!!opencv-"))
+    """Whether a file is OpenCV's FileStorage: XML, or YAML or JSON with its own header or types."""
+    return path.suffix == ".xml" or _has(path, ("%YAML:", "!!opencv-", '"opencv-'))
+
+
+def is_camera_info(path: Path) -> bool:
+    """Whether a file is a CameraInfo message."""
+    return _has(path, (_MESSAGE,))
 
 
 def _has(path: Path, words: Iterable[str]) -> bool:
@@ -58,25 +65,38 @@ def read_camera_files(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
 
 
 def _ros(path: Path, mounting: Mounting, frames: Mapping[str, FloatArray]) -> dict[str, Any]:
-    data = read_plain(path, path.name)
+    data = _messages(path)[0]
     name, model = data.get("camera_name") or path.stem, data["distortion_model"]
     if model not in _ROS_LENSES:
         raise CalibrationError(f"camera {name!r}: distortion_model: expected {', '.join(_ROS_LENSES)}, got {model!r}")
-    pose = next((frames[frame] for end in _OPTICAL if (frame := name.strip("/") + end) in frames), None)
+    optical = [name.strip("/") + end for end in _OPTICAL]
+    if _MESSAGE in data:
+        data = {key.lower(): value for key, value in data.items()}  # ROS 1 has K and D
+        optical, K, coefficients = [data["header"]["frame_id"].strip("/")], data["k"], data["d"]
+        size = data["width"], data["height"]
+        if data["binning_x"] > 1 or data["binning_y"] > 1 or data["roi"]["width"] not in (0, size[0]):
+            raise CalibrationError(f"camera {name!r}: expected full images, got binning or a region of interest")
+    else:
+        K, coefficients = (data[key]["data"] for key in ("camera_matrix", "distortion_coefficients"))
+        size = data["image_width"], data["image_height"]
+    pose = next((frames[frame] for frame in optical if frame in frames), None)
     if pose is None or name in mounting.poses:
-        there = f", or a frame {name}_optical_frame to {TF} as `ros2 topic echo /tf_static` prints it"
+        there = f", or a frame {optical[0]} to {TF} as `ros2 topic echo /tf_static` prints it"
         pose = mounting.pose(name, there)
-    K, coefficients = (data[key]["data"] for key in ("camera_matrix", "distortion_coefficients"))
-    size = data["image_width"], data["image_height"]
     return camera_entry(name, size, np.reshape(K, (3, 3)), pose, _ROS_LENSES[model], coefficients)
 
 
-def _tf_poses(path: Path) -> dict[str, FloatArray]:
-    """Poses (4, 4) in the ego frame of the frames of TFMessages, as ``topic echo`` of ROS 1 and 2 prints them."""
+def _messages(path: Path) -> list[Any]:
+    """Documents of a file that ``topic echo`` of ROS 1 or 2 printed."""
     refuse_large(path, path.name)
     documents = re.split(r"^---\s*$", path.read_text(), flags=re.MULTILINE)
+    return [parse_yaml(document) for document in documents if document.strip()]
+
+
+def _tf_poses(path: Path) -> dict[str, FloatArray]:
+    """Poses (4, 4) in the ego frame of the frames of TFMessages."""
     links = {}
-    for one in (one for document in documents if document.strip() for one in parse_yaml(document)["transforms"]):
+    for one in (one for message in _messages(path) for one in message["transforms"]):
         child, parent = (frame.strip("/") for frame in (one["child_frame_id"], one["header"]["frame_id"]))
         links[child] = parent, pose_of(child, one["transform"])
     poses = {}

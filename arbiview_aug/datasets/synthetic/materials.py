@@ -3,7 +3,7 @@
 Each takes hits on one material and returns (n, 3) display RGB before light and haze, filtered over the footprint.
 
 The *footprint* is the size in metres of a pixel on the surface. Interval and pulse functions return the exact covered
-share of the footprint; noise loses each octave as the footprint reaches its wavelength. So nothing aliases.
+share of the footprint; noise loses each octave as the footprint reaches its wavelength. Nothing aliases.
 """
 
 from __future__ import annotations

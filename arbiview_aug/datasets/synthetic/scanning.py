@@ -71,7 +71,7 @@ def scan_scene(
         position: (3,) of the scanner; z is over the road.
         rays: (columns, beams, 3) unit rays in the ego frame.
         range_m: Least and largest distance of returns.
-        errors: What the scanner does wrong.
+        errors: The scanner's errors.
         seed: Seed of its noise.
 
     Returns:

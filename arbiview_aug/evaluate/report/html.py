@@ -113,7 +113,7 @@ def _target_section(
                 f'<img class="layer{side}" data-layer="{escape(name)}" alt="{escape(name)}" src="{_data_url(picture)}">'
             )
         h, w = rig[k].size
-        seen = ", ".join(f"{m} {views[k].coverage.mean():.1%}" for m, views in shown.items())
+        seen = "; ".join(f"{m} {views[k].coverage.mean():.1%}" for m, views in shown.items())
         cells.append(
             f'<figure><div class="slider" style="aspect-ratio:{w}/{h}">{"".join(pictures)}<i></i></div>'
             f'<input type="range" min="0" max="100" value="50" aria-label="{escape(rig[k].name)}">'

@@ -27,7 +27,7 @@ def show(sample: Mapping[str, Any]) -> Figure:
     What ``coverage`` or a mask leaves out is dimmed: no source camera saw it, or it is the own car.
 
     Args:
-        sample: What ``RigRetarget`` takes or returns; of a batch, each frame.
+        sample: A sample that ``RigRetarget`` takes or returns; of a batch, each frame.
 
     Returns:
         A matplotlib figure; ``savefig(path)`` writes it.

@@ -92,14 +92,14 @@ DETECTION_COLUMNS = (
     ("true objects", "{true_objects:.0f}"),
     ("AP .5", "{ap_50:.2f} [{ap_50_low:.2f}, {ap_50_high:.2f}]"),
     ("AP .7", "{ap_70:.2f} [{ap_70_low:.2f}, {ap_70_high:.2f}]"),
-    ("false alarms", "{false_alarms:.0f} in {filled:.0f} views"),
 )
 DETECTION_NOTES = (
     "true objects: detections of score 0.5 or more in the true images, whatever their class. AP: of the detections in "
     "the views against them, at these IoUs; less sure ones there neither count nor cost. Intervals: 95 %, bootstrap "
-    "over objects and misses. false alarms: detections on generated pixels that touch no label and no true object (IoU "
-    "below 0.1); a dash where no pixels are generated."
+    "over objects and misses."
 )
+ALARM_COLUMNS = (("false alarms", "{false_alarms:.0f}"), ("views", "{filled:.0f}"))
+ALARM_NOTES = "Detections on generated pixels that touch no label and no true object (IoU below 0.1)."
 ROAD_COLUMNS = (
     ("views", "{road_views:.0f}"),
     ("drivable area IoU", "{area_iou:.2f} [{area_iou_low:.2f}, {area_iou_high:.2f}]"),
@@ -157,17 +157,15 @@ def evaluation_tables(done: Evaluation, methods: Sequence[str]) -> list[Table]:
 
 
 def judge_tables(rows: Mapping[str, Mapping[str, float]]) -> list[Table]:
-    """Tabulate judges' figures, by row: labelled objects, detections and road, for the rows that have them."""
-    tables: list[tuple[set[str], str, Columns, str]] = [
-        ({"objects"}, "Labelled objects that the detector finds", LABEL_COLUMNS, LABEL_NOTES),
-        ({"true_objects", "false_alarms"}, "Detections in views and true images", DETECTION_COLUMNS, DETECTION_NOTES),
-        ({"road_views"}, "Road in views and true images", ROAD_COLUMNS, ROAD_NOTES),
+    """Tabulate judges' figures, by row, for the rows that have them."""
+    tables: list[tuple[str, str, Columns, str]] = [
+        ("objects", "Labelled objects that the detector finds", LABEL_COLUMNS, LABEL_NOTES),
+        ("true_objects", "Detections in views and true images", DETECTION_COLUMNS, DETECTION_NOTES),
+        ("false_alarms", "Detections of what was filled", ALARM_COLUMNS, ALARM_NOTES),
+        ("road_views", "Road in views and true images", ROAD_COLUMNS, ROAD_NOTES),
     ]
-    shown: list[Table] = []
-    for keys, title, columns, notes in tables:
-        having = {name: row for name, row in rows.items() if keys & row.keys()}
-        shown += [(title, having, columns, notes)] if having else []
-    return shown
+    having = {key: {name: row for name, row in rows.items() if key in row} for key, *_ in tables}
+    return [(title, having[key], columns, notes) for key, title, columns, notes in tables if having[key]]
 
 
 def text_table(title: str, rows: Mapping[str, Mapping[str, float]], columns: Columns, notes: str = "") -> str:

@@ -60,7 +60,7 @@ def retarget_img_inputs(
             by ``curr``), where they are loaded already, become those of the target's scanners, if it has any: depth
             maps that ``PointToMultiViewDepth`` then makes of them are the target's.
         retarget: A ``RigRetarget``, or what calls one: with the sample of each frame in turn.
-        names: Of the target's cameras.
+        names: Names of the target's cameras.
         ground_z_m: Height of the road in the source's ego frame.
         mean_std: Three numbers each, by which the images are normalised: (grey level − mean) / std.
 

@@ -70,7 +70,7 @@ def read_views(matrices: Mapping[str, Any], count: int, names: Sequence[str], li
     Args:
         matrices: Values of the keys of ``MATRICES``, each for all cameras.
         count: How many images there are.
-        names: Of the cameras.
+        names: Names of the cameras.
         lidar2ego: (4, 4).
 
     Raises:

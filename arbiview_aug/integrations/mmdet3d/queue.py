@@ -52,7 +52,7 @@ def retarget_queue(results: Mapping[str, Any], retarget_frame: Callable[[Frame],
 
     Args:
         results: The collected queue; it is not changed.
-        retarget_frame: What retargets the dict of a frame.
+        retarget_frame: Function that retargets the dict of a frame.
 
     Raises:
         SampleError: Matrices or ``img_metas`` of another number of frames; what ``retarget_frame`` refuses.

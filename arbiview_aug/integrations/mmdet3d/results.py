@@ -65,7 +65,7 @@ def retarget_results(
     Args:
         results: As the loading transforms leave it; it is not changed.
         retarget: A ``RigRetarget``, or what calls one.
-        names: Of the target's cameras.
+        names: Names of the target's cameras.
         lidar2ego: (4, 4), where the dict does not tell it.
         ground_z_m: Height of the road in the source's ego frame.
 

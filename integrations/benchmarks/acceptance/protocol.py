@@ -1,4 +1,4 @@
-"""What several of these checks share: the evaluation protocol's frames, and the moves of synthetic streets."""
+"""Shared parts of these checks: the evaluation protocol's frames, and the moves of synthetic streets."""
 
 from __future__ import annotations
 

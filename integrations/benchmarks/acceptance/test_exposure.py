@@ -1,4 +1,4 @@
-"""What harmonising gives back of the PSNR that one camera's exposure costs, by truth."""
+"""The part that harmonising gives back of the PSNR that one camera's exposure costs, by truth."""
 
 from __future__ import annotations
 

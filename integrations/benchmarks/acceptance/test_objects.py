@@ -3,7 +3,7 @@
 The target is the front camera on even streets and the front-left one on odd ones: three sources serve them.
 
 Each street is rendered twice: with its vehicles and people as they are (``shapes``), and with each replaced by a block
-that fills its label (``blocks``), and planned so. What a profile cannot know shows in the difference.
+that fills its label (``blocks``), and planned so. The difference shows what a profile cannot know.
 
 Truth is read off the ray caster's depth images. A target pixel's scene point is *seen* by a source where it projects
 into its image and no pixel within one of it is nearer; *hidden* where all pixels within one of it are nearer, in every

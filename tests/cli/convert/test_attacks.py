@@ -47,7 +47,7 @@ class Home:
     Attributes:
         root: The folder: ``in`` is what an archive may bring, ``new`` the output of conversions.
         source: A copy of the data set, in ``in``.
-        said: What the last command printed on standard error.
+        said: Text that the last command printed on standard error.
     """
 
     def __init__(self, root: Path, original: Path, capsys: pytest.CaptureFixture[str] | None = None) -> None:

@@ -34,7 +34,7 @@ class Conversion:
 
     Attributes:
         root: The folder.
-        said, printed: What the last command printed on standard error and output.
+        said, printed: Texts that the last command printed on standard error and output.
     """
 
     def __init__(self, root: Path, sources: dict[str, Path], whole: Any, capsys: Any) -> None:
