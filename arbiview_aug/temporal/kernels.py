@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.kernels import project_row, turn_row
+from arbiview_aug.cameras.kernels import project_row
 from arbiview_aug.environment import called, compiled, inlined
 
 RADIUS_PX = 3  # of windows of 7 x 7 pixels
@@ -36,22 +36,30 @@ _SQUARE = np.float32(1 / (2 * RADIUS_PX + 1) ** 2 / LEVELS**2)
 _PER_CORRELATION, _INVALID = np.float32(PER_CORRELATION), np.float32(INVALID)
 _OUTSIDE = np.uint16(60000)
 
+NODE_PX = 8
+"""Distance of the pixels that are projected to find which part of a surface a neighbour sees."""
+
+_LEVEL, _RIGHT, _MASK_BIT, _NONE = np.int32(0x7FFF), np.int32(16), np.int32(15), np.int32(0)  # of ``SweptImage.quads``
+_WIDER, _INFINITY = 2 * RADIUS_PX, np.float32(np.inf)
+# Unsigned, so that no index is tested for being negative, and loops become vector instructions.
+_U1, _U2, _U3, _U4, _U5, _U6, _RADIUS = (np.uint64(n) for n in (1, 2, 3, 4, 5, 6, RADIUS_PX))
+
 
 @compiled
 def match_walls(
-    rays: Any, road: Any, horizontal: Any, windows: Any, walls: Any, pose: Any, lens: Any, other: Any, unmasked: Any,
+    rays: Any, road: Any, horizontal: Any, nodes: Any, windows: Any, walls: Any, offset: Any, lens: Any, quads: Any,
     costs: Any,
 ) -> None:  # fmt: skip
-    """Costs (K, h, w) of surfaces by the normalised cross-correlation of windows.
+    """Costs (h, K, w) of surfaces by the normalised cross-correlation of windows.
 
-    Arguments up to ``windows`` are those of a ``SweptImage``. ``walls`` (K,) are 1/radius, ascending; ``pose`` is the
-    rotation (3, 3) and shift (3,) into the neighbour's frame; ``lens`` the neighbour's code, its ``Camera.parameters``,
-    and positions (K, 2, h, w) for a negative code; ``other`` and ``unmasked`` (H, W) are its image and mask.
+    ``rays`` (3, h, w) are in the neighbour's frame, where they start at ``offset`` (3,); for a pinhole both are times
+    its intrinsics. ``nodes`` are every ``NODE_PX``-th of them, of ``road`` and of ``horizontal``, which are those of a
+    ``SweptImage``, as ``windows`` are. ``walls`` (K,) are 1/radius, ascending; ``lens`` is the neighbour's code, its
+    ``Camera.parameters``, and positions (K, 2, h, w) for a negative code; ``quads`` (H, W) are those of its image.
     """
     h, w = road.shape
-    work, at, seen = np.empty((7, w), np.float32), np.empty(w, np.int32), np.empty((h, w), np.uint8)
-    u, v, q, x1, y1, z1, scratch = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
-    read, sums = np.empty((h, w + 2 * RADIUS_PX), np.int32), np.empty((8, w + 2 * RADIUS_PX), np.int32)
+    surface, lines, sums = (rays, road, horizontal), np.empty((7, w), np.float32), np.empty((3, w + _WIDER), np.int32)
+    seen, read = np.empty((h, w), np.int32), np.zeros((h + 1, w + _WIDER), np.int32)  # the last row stays 0
     touching = np.empty(h, np.float32)  # 1/radius of the farthest wall before a row's road
     for y in range(h):
         touching[y] = np.inf
@@ -59,94 +67,160 @@ def match_walls(
             one = road[y, x] / horizontal[y, x]
             touching[y] = one if one < touching[y] or one != one else touching[y]  # NaN once, NaN for ever
     for k in range(walls.shape[0]):
-        wall = walls[k]
-        rows = h
-        while k and rows and wall < touching[rows - 1]:  # as over the wall before
+        rows, box = h, (0, h, 0, w)
+        while k and rows and walls[k] < touching[rows - 1]:  # as over the wall before
             rows -= 1
         rows = min(rows + RADIUS_PX, h)
-        for y in range(min(rows + RADIUS_PX, h)):
-            if lens[0] < 0:
-                for x in range(w):
-                    u[x], v[x] = lens[2][k, 0, y, x], lens[2][k, 1, y, x]
-            else:
-                a, b = road[y], horizontal[y]
-                for x in range(w):
-                    q[x] = max(a[x], wall * b[x])
-                turn_row(rays[0, y], rays[1, y], rays[2, y], q, pose[0], pose[1], x1, y1, z1)
-                project_row(x1, y1, z1, lens[0], lens[1], q, scratch, u, v)
-            line = read[y]
-            _read_row(u, v, other, unmasked, q, scratch, at, line[RADIUS_PX:], seen[y])
-            line[:RADIUS_PX], line[w + RADIUS_PX :] = line[RADIUS_PX], line[w + RADIUS_PX - 1]
-        _correlate(read, seen, windows, sums, costs[k, :rows])
+        if lens[0] >= 0:
+            box = _seen_box(nodes, walls[k], offset, lens, quads.shape, (h, w), lines)
+        top, bottom, left, right = box[0], min(box[1], rows), box[2], box[3]
+        for y in range(rows):
+            for x in range(w):
+                costs[y, k, x] = _UNSEEN
+        if top < bottom:
+            box = top, bottom, left, right
+            _read(surface, walls[k], offset, lens, k, quads, box, lines, read, seen)
+            _correlate(read, seen, windows, sums, box, k, costs)
         for y in range(rows, h):
             for x in range(w):
-                costs[k, y, x] = costs[k - 1, y, x]
+                costs[y, k, x] = costs[y, k - 1, x]
+
+
+@inlined
+def _project_row(surface: Any, y: Any, columns: Any, wall: Any, offset: Any, lens: Any, lines: Any, parts: Any) -> None:
+    """Project row ``y`` of a surface between two columns; ``parts`` of ``lines`` are the same columns."""
+    rays, road, horizontal = surface
+    u, v, q, px, py, pz, _ = lines
+    for x in range(columns[0], columns[1]):
+        q[x] = max(road[y, x], wall * horizontal[y, x])
+    for x in range(columns[0], columns[1]):
+        px[x] = rays[0, y, x] + offset[0] * q[x]
+    for x in range(columns[0], columns[1]):
+        py[x] = rays[1, y, x] + offset[1] * q[x]
+    for x in range(columns[0], columns[1]):
+        pz[x] = rays[2, y, x] + offset[2] * q[x]
+    if lens[0] == 0:
+        for x in range(columns[0], columns[1]):
+            pz[x] = _ONE / pz[x] if pz[x] > _ZERO else _INFINITY  # outside the image, or NaN
+        for x in range(columns[0], columns[1]):
+            u[x] = px[x] * pz[x]
+        for x in range(columns[0], columns[1]):
+            v[x] = py[x] * pz[x]
+    else:
+        project_row(parts[3], parts[4], parts[5], lens[0], lens[1], parts[2], parts[6], parts[0], parts[1])
+
+
+@inlined
+def _seven(line: Any, x: Any) -> Any:
+    """Sum of seven columns from ``x`` on."""
+    a, b = np.int32(line[x] + line[x + _U1]), np.int32(line[x + _U2] + line[x + _U3])
+    c = np.int32(np.int32(line[x + _U4] + line[x + _U5]) + line[x + _U6])
+    return np.float32(np.int32(np.int32(a + b) + c))
+
+
+@inlined
+def _columns(lines: Any, first: Any, last: Any) -> Any:
+    return (
+        lines[0][first:last], lines[1][first:last], lines[2][first:last], lines[3][first:last], lines[4][first:last],
+        lines[5][first:last], lines[6][first:last],
+    )  # fmt: skip
 
 
 @called
-def _correlate(read: Any, seen: Any, windows: Any, sums: Any, costs: Any) -> None:
-    """Costs of the first rows (n, w) of an image as it was read (h, w + 6); ``sums`` (8, w + 6) is scratch."""
+def _seen_box(nodes: Any, wall: Any, offset: Any, lens: Any, other_size: Any, size: Any, lines: Any) -> Any:
+    """Rows and columns (top, bottom, left, right) outside which a neighbour sees no point of a surface."""
+    ny, nx = nodes[1].shape
+    top, bottom, left, right = ny, -1, nx, -1
+    last_y, last_x = np.float32(other_size[0] - 1), np.float32(other_size[1] - 1)
+    parts, columns = _columns(lines, 0, nx), (np.uint64(0), np.uint64(nx))
+    u, v = parts[0], parts[1]
+    for y in range(ny):
+        _project_row(nodes, y, columns, wall, offset, lens, parts, parts)
+        for x in range(nx):
+            if (u[x] >= _ZERO) & (u[x] <= last_x) & (v[x] >= _ZERO) & (v[x] <= last_y):
+                top, bottom, left, right = min(top, y), y, min(left, x), max(right, x)
+    if bottom < 0:
+        return 0, 0, 0, 0
+    top, left = max(top - 1, 0) * NODE_PX, max(left - 1, 0) * NODE_PX
+    return top, min((bottom + 1) * NODE_PX, size[0]), left, min((right + 1) * NODE_PX, size[1])
+
+
+@called
+def _read(
+    surface: Any, wall: Any, offset: Any, lens: Any, k: Any, quads: Any, box: Any, lines: Any, read: Any, seen: Any
+) -> None:
+    """Read a box and a window around it of a neighbour's image as over a surface.
+
+    Levels are bilinear, those of the image's border beyond it; ``seen`` is the mask at the nearest pixel.
+    """
+    (h, w), left, right = seen.shape, max(box[2] - RADIUS_PX, 0), min(box[3] + RADIUS_PX, seen.shape[1])
+    whole, parts, first, last = _columns(lines, 0, w), _columns(lines, left, right), np.uint64(left), np.uint64(right)
+    u, v, s, t = whole[0], whole[1], whole[4], whole[5]
+    image, width = quads.ravel(), np.int32(quads.shape[1])
+    last_x, last_y = np.float32(quads.shape[1] - 2), np.float32(quads.shape[0] - 2)
+    at, words = np.empty(w, np.int32), np.empty(w, np.int64)
+    halves = words.view(np.int32)
+    for y in range(max(box[0] - RADIUS_PX, 0), min(box[1] + RADIUS_PX, h)):
+        if lens[0] < 0:
+            for x in range(first, last):
+                u[x], v[x] = lens[2][k, 0, y, x], lens[2][k, 1, y, x]
+        else:
+            _project_row(surface, y, (first, last), wall, offset, lens, whole, parts)
+        for x in range(first, last):
+            column, row = min(u[x] if u[x] > _ZERO else _ZERO, last_x), min(v[x] if v[x] > _ZERO else _ZERO, last_y)
+            at[x] = np.int32(np.int32(np.int32(row) * width) + np.int32(column))
+        for x in range(first, last):
+            column = min(u[x] if u[x] > _ZERO else _ZERO, last_x + _ONE)
+            t[x] = column - np.float32(np.int32(min(column, last_x)))
+        for x in range(first, last):
+            row = min(v[x] if v[x] > _ZERO else _ZERO, last_y + _ONE)
+            s[x] = row - np.float32(np.int32(min(row, last_y)))
+        for x in range(first, last):  # no vector instruction: alone for that
+            words[x] = image[np.uint64(at[x])]
+        for x in range(first, last):
+            inside = (u[x] >= _ZERO) & (u[x] <= last_x + _ONE) & (v[x] >= _ZERO) & (v[x] <= last_y + _ONE)
+            right, below = np.int32(16) if t[x] >= _HALF else _NONE, np.int32(32) if s[x] >= _HALF else _NONE
+            bit = np.int32(words[x] >> np.int32(_MASK_BIT + right + below))
+            seen[y, x] = np.int32(bit & np.int32(1)) if inside else _NONE
+        for x in range(first, last):
+            a, b = halves[_U2 * x], halves[_U2 * x + _U1]
+            a0, a1 = np.float32(a & _LEVEL), np.float32(np.int32(a >> _RIGHT) & _LEVEL)
+            b0, b1 = np.float32(b & _LEVEL), np.float32(np.int32(b >> _RIGHT) & _LEVEL)
+            above = a0 + (a1 - a0) * t[x]
+            below = b0 + (b1 - b0) * t[x]
+            read[y, x + _RADIUS] = np.int32(above + (below - above) * s[x] + _HALF)
+        for x in range(RADIUS_PX):
+            read[y, x], read[y, w + RADIUS_PX + x] = read[y, RADIUS_PX], read[y, w + RADIUS_PX - 1]
+
+
+@called
+def _correlate(read: Any, seen: Any, windows: Any, sums: Any, box: Any, k: Any, costs: Any) -> None:
+    """Costs of wall ``k`` in a box of an image as it was read (h + 1, w + 6); ``sums`` (3, w + 6) is scratch."""
     levels, mean, weight = windows
-    h, wide = read.shape
-    n, w = costs.shape
-    values, squares, products, nothing = sums[0], sums[1], sums[2], sums[3]  # of columns
-    s1, s2, s12, pairs = sums[4], sums[5], sums[6], sums[7]
-    sums[:4] = 0
-    for y in range(-2 * RADIUS_PX, n):
+    values, squares, products = sums[0], sums[1], sums[2]  # of columns
+    h, top, left, right = levels.shape[0], box[0], np.uint64(box[2]), np.uint64(box[3])
+    end = right + np.uint64(_WIDER)
+    sums[:] = 0
+    for y in range(top - 2 * RADIUS_PX, box[1]):
         new, old = min(max(y + RADIUS_PX, 0), h - 1), max(y - RADIUS_PX - 1, 0)
-        a, b, c, d = read[new], levels[new], read[old], levels[old]
-        if y <= 0:
-            c = d = nothing
-        for x in range(wide):
-            values[x] = np.int32(values[x] + np.int32(a[x] - c[x]))
-        for x in range(wide):
-            squares[x] = np.int32(squares[x] + np.int32(np.int32(a[x] * a[x]) - np.int32(c[x] * c[x])))
-        for x in range(wide):
-            products[x] = np.int32(products[x] + np.int32(np.int32(a[x] * b[x]) - np.int32(c[x] * d[x])))
-        if y < 0:
+        row = old if y > top else h
+        for x in range(left, end):
+            values[x] = np.int32(values[x] + np.int32(read[new, x] - read[row, x]))
+        for x in range(left, end):
+            a, c = read[new, x], read[row, x]
+            squares[x] = np.int32(squares[x] + np.int32(np.int32(a + c) * np.int32(a - c)))
+        for x in range(left, end):
+            a, c = read[new, x], read[row, x]
+            products[x] = np.int32(products[x] + np.int32(np.int32(a * levels[new, x]) - np.int32(c * levels[old, x])))
+        if y < top:
             continue
-        for k in range(3):  # sums of seven columns
-            line, out = sums[k], sums[4 + k]
-            for x in range(wide - 1):
-                pairs[x] = np.int32(line[x] + line[x + 1])
-            for x in range(w):
-                out[x] = np.int32(np.int32(np.int32(pairs[x] + pairs[x + 2]) + pairs[x + 4]) + line[x + 6])
-        m, f, visible, out = mean[y], weight[y], seen[y], costs[y]
-        for x in range(w):
-            average = np.float32(s1[x]) * _MEAN
-            variance = max(np.float32(s2[x]) * _SQUARE - average * average, _ZERO) + _NOISE
-            covariance = np.float32(s12[x]) * _SQUARE - average * m[x]
-            cost = (_ONE - covariance * f[x] / np.sqrt(variance)) * _PER_CORRELATION
-            cost = min(max(cost, _ZERO), _INVALID - _ONE) if visible[x] else _INVALID
-            out[x] = np.uint16(np.int32(cost))
-
-
-@called
-def _read_row(u: Any, v: Any, image: Any, mask: Any, s: Any, t: Any, at: Any, row: Any, seen: Any) -> None:
-    """Levels at positions (w,), bilinearly, the border's beyond it; and the mask at the nearest pixel."""
-    values, unmasked, width, n = image.ravel(), mask.ravel(), np.int32(image.shape[1]), u.shape[0]
-    last_x, last_y = np.float32(image.shape[1] - 2), np.float32(image.shape[0] - 2)
-    for x in range(n):
-        t[x] = min(u[x] if u[x] > _ZERO else _ZERO, last_x + _ONE)  # NaN becomes 0
-    for x in range(n):
-        s[x] = min(v[x] if v[x] > _ZERO else _ZERO, last_y + _ONE)
-    for x in range(n):
-        nearest = np.int32(np.int32(np.int32(s[x] + _HALF) * width) + np.int32(t[x] + _HALF))
-        at[x] = nearest if (t[x] == u[x]) & (s[x] == v[x]) else 0  # the first pixel is masked
-    for x in range(n):
-        seen[x] = unmasked[np.uint64(at[x])]  # unsigned: no test for negative indices
-    for x in range(n):
-        at[x] = np.int32(np.int32(np.int32(min(s[x], last_y)) * width) + np.int32(min(t[x], last_x)))
-    for x in range(n):
-        t[x] -= np.float32(np.int32(min(t[x], last_x)))
-    for x in range(n):
-        s[x] -= np.float32(np.int32(min(s[x], last_y)))
-    one, down = np.uint64(1), np.uint64(width)
-    for x in range(n):
-        k = np.uint64(at[x])
-        above = values[k] + (values[k + one] - values[k]) * t[x]
-        below = values[k + down] + (values[k + down + one] - values[k + down]) * t[x]
-        row[x] = np.int32((above + (below - above) * s[x]) * np.float32(LEVELS) + _HALF)
+        for x in range(left, right):
+            average = _seven(values, x) * _MEAN
+            variance = max(_seven(squares, x) * _SQUARE - average * average, _ZERO) + _NOISE
+            covariance = _seven(products, x) * _SQUARE - average * mean[y, x]
+            cost = (_ONE - covariance * weight[y, x] / np.sqrt(variance)) * _PER_CORRELATION
+            cost = min(max(cost, _ZERO), _INVALID - _ONE) if seen[y, x] else _INVALID
+            costs[y, k, x] = np.uint16(np.int32(cost))
 
 
 @compiled
@@ -195,11 +269,22 @@ def _follow(path: Any, least: Any, cost: Any, out: Any) -> Any:
 
 @compiled
 def merge_costs(one: Any, two: Any, out: Any) -> None:
-    """Costs (n,) of a neighbour before and one after: three quarters of the better, as the other may be hidden."""
-    for x in range(out.shape[0]):
-        better, worse = min(one[x], two[x]), max(one[x], two[x])
-        worse = better if worse == _UNSEEN else worse
-        out[x] = np.uint16(better + np.uint16(np.uint16(worse - better) >> np.uint16(2)))
+    """Merge costs (h, K, w) of a neighbour before and one after into ``out`` (h, w, K).
+
+    Three quarters are of the better, as the other may be hidden.
+    """
+    h, K, w = one.shape
+    rows = np.empty((K, w), np.uint16)
+    merged = rows.ravel()
+    for y in range(h):
+        a, b = one[y].ravel(), two[y].ravel()
+        for x in range(K * w):
+            better, worse = min(a[x], b[x]), max(a[x], b[x])
+            worse = better if worse == _UNSEEN else worse
+            merged[x] = np.uint16(better + np.uint16(np.uint16(worse - better) >> np.uint16(2)))
+        for x in range(w):  # writes in order, four times as fast as reading in order
+            for k in range(K):
+                out[y, x, k] = rows[k, x]
 
 
 @compiled
@@ -238,7 +323,7 @@ def find_least(total: Any, spacing: float, road: Any) -> Any:
 @inlined
 def _gain(costs: Any, wall: Any, y: Any, x: Any, label: Any, thing: Any) -> Any:
     """Correlation with the road above that with a wall; 0 where neither matches or another thing hides the road."""
-    own, road = costs[wall, y, x], costs[0, y, x]
+    own, road = costs[y, x, wall], costs[y, x, 0]
     if min(own, road) > _MATCHING or (own > road and label != thing and label != 0):
         return 0.0
     return (np.float64(own) - np.float64(road)) / PER_CORRELATION
@@ -269,7 +354,7 @@ def find_feet(
                     total += q[y, x] / horizontal[y, x]
                     count += 1
                     tops[x] = y
-            walls[x] = min(max(round(total / count / spacing), 1), costs.shape[0] - 1) * spacing
+            walls[x] = min(max(round(total / count / spacing), 1), costs.shape[2] - 1) * spacing
             for y in range(y0, h):
                 scale = road[y, x] / (horizontal[y, x] * walls[x])
                 if _FARTHEST_SCALE < scale < 1:

@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.rays import project_rays
+from arbiview_aug.cameras.rays import pixels_of
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.environment import compilation_announced
@@ -174,20 +175,27 @@ def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands
     Valid are clear matches away from the outlines of objects, which windows blur. With ``stands``, things that hang
     above the road are put upon it.
     """
-    from arbiview_aug.temporal.kernels import aggregate, find_least, merge_costs
+    from arbiview_aug.temporal.kernels import aggregate, find_least
 
-    costs = [image.costs(other, walls) for other in others]
-    if len(costs) == 2:
-        merge_costs(costs[0].ravel(), costs[1].ravel(), costs[0].ravel())
-    total = aggregate(cv2.transpose(costs[0].reshape(len(walls), -1)).reshape(*image.camera.size, -1))
-    wall, clear = find_least(total, walls[1], image.road / np.maximum(image.horizontal, np.float32(1e-6)))
+    costs = _costs(image, others, walls)
+    wall, clear = find_least(aggregate(costs), walls[1], image.road / np.maximum(image.horizontal, np.float32(1e-6)))
     q = image.inverse_distance(wall)
     step = cv2.dilate(q, _AROUND) - cv2.erode(q, _AROUND)
-    visible = [cv2.remap(o.unmasked, image.positions(o.camera, q), None, cv2.INTER_NEAREST) for o in others]  # type: ignore[call-overload]
+    visible = [cv2.remap(o.unmasked, *image.positions(o.camera, q), cv2.INTER_NEAREST) for o in others]
     valid = clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0)
     if stands:
-        q, valid = stand_on_road(image, others, costs[0], float(walls[1]), q, valid)
+        q, valid = stand_on_road(image, others, costs, float(walls[1]), q, valid)
     return _Estimate(q, valid)
+
+
+def _costs(image: SweptImage, others: Sequence[SweptImage], walls: Layer) -> npt.NDArray[np.uint16]:
+    """Merge the costs of walls over all sides, (h, w, K)."""
+    from arbiview_aug.temporal.kernels import merge_costs
+
+    costs = [image.costs(other, walls) for other in others]
+    merged = np.empty((*image.camera.size, len(walls)), np.uint16)
+    merge_costs(costs[0], costs[-1], merged)
+    return merged
 
 
 def warm_up() -> None:
@@ -214,10 +222,8 @@ def _walls(image: SweptImage, coarse: _Estimate) -> Layer:
 
 
 def _pose_samples(images: Sequence[SweptImage], estimates: Sequence[_Estimate], side: _Side) -> list[PoseSamples]:
-    return [
-        PoseSamples(image, other, q, valid & (np.linalg.norm(image.shift(other.camera, q), axis=-1) >= LEAST_SHIFT_PX))
-        for image, other, (q, valid) in zip(images, side.images, estimates, strict=True)
-    ]
+    parts = zip(images, side.images, estimates, strict=True)
+    return [PoseSamples(image, other, estimate.inverse_distance, estimate.valid) for image, other, estimate in parts]
 
 
 def _depth_m(image: SweptImage, estimate: _Estimate) -> Layer:
@@ -276,7 +282,7 @@ _ACROSS = 0.3
 
 _CONTRAST_LEVELS = 2.0  # per pixel; fainter gradients are noise
 
-_MIN_PIXELS = 500  # for the five parameters
+_MIN_PIXELS, _MANY_PIXELS = 500, 4000  # for the five parameters; of more of a camera, every so many are taken
 
 _TURN_DEG, _SHIFT_M = 0.1, 0.02  # steps of the derivatives
 
@@ -331,26 +337,28 @@ def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray]
     x holds turns about the ego's axes in degrees and shifts along its y and z in metres. Images are compared at their
     local mean and contrast, as in the sweep's correlation.
     """
-    at = sample.image.positions(sample.other.camera, sample.inverse_distance)
-    warped: Any = cv2.remap(sample.other.grey, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+    other, q = sample.other, sample.inverse_distance
+    at, nearer = (sample.image.positions(other.camera, np.float32(factor) * q) for factor in (1, 1.1))
+    warped: Any = cv2.remap(other.grey, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     one, two = _normalised(sample.image.grey), _normalised(warped)
     mean = (sample.image.grey + warped) / 2
     # Gradients of the warped image stand for those of the neighbour's: the warp is close to the identity.
     gx, gy = (cv2.Sobel((one + two) / 2, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))
-    contrast = np.hypot(*(cv2.Sobel(mean, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1))))
-    shift = sample.image.shift(sample.other.camera, sample.inverse_distance)
-    length = np.maximum(np.hypot(shift[..., 0], shift[..., 1]), 1e-9)
-    ex, ey = shift[..., 0] / length, shift[..., 1] / length
-    across = np.abs(gx * ex + gy * ey) <= _ACROSS * np.hypot(gx, gy)
-    use = sample.valid & (contrast > _CONTRAST_LEVELS) & across
-    if not use.any():
+    contrast = cv2.magnitude(*(cv2.Sobel(mean, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1))))
+    ex, ey = nearer - at
+    length = cv2.magnitude(ex, ey)
+    across = np.abs(gx * ex + gy * ey) <= _ACROSS * length * cv2.magnitude(gx, gy)
+    use = np.flatnonzero(sample.valid & (length >= LEAST_SHIFT_PX) & (contrast > _CONTRAST_LEVELS) & across)
+    if not len(use):
         return None
-    motion = _motion(sample, use, at[use])
-    normal = np.stack([-ey[use], ex[use]], -1)
+    use = use[:: max(1, len(use) // _MANY_PIXELS)]
+    ex, ey, length, gx, gy, difference = (one.ravel()[use] for one in (ex, ey, length, gx, gy, one - two))
+    motion = _motion(sample, use, at.reshape(2, -1)[:, use])
+    normal = np.stack([-ey, ex], -1) / length[:, None]
     off_line = np.einsum("nk,nkp->np", normal, motion)  # [n, 5] px per unit
-    gradient = gx[use] * normal[:, 0] + gy[use] * normal[:, 1]
+    gradient = gx * normal[:, 0] + gy * normal[:, 1]
     # Pixels read by the erroneous pose are displaced by its error: two(x) = one(x - off_line).
-    return gradient[:, None] * off_line, (one - two)[use], motion
+    return gradient[:, None] * off_line, difference, motion
 
 
 def _normalised(image: Layer) -> Layer:
@@ -359,16 +367,15 @@ def _normalised(image: Layer) -> Layer:
     return np.asarray((image - mean) / spread)
 
 
-def _motion(sample: PoseSamples, use: BoolArray, at: Layer) -> FloatArray:
+def _motion(sample: PoseSamples, use: npt.NDArray[np.int64], at: Layer) -> FloatArray:
     """(n, 2, 5) motion of the corresponding pixels per unit of turn and shift of the neighbour."""
     image, source = sample.image, sample.other.camera
-    directions, q = image.directions[use], sample.inverse_distance[use].astype(np.float64)
+    rays, q = image.rays.reshape(3, 1, -1)[..., use], sample.inverse_distance.reshape(1, -1)[:, use]
     columns = []
-    for axis in range(5):
-        step = _TURN_DEG if axis < 3 else _SHIFT_M
-        moved = source.moved(_pose(step * np.eye(5)[axis]))
-        uv, _ = project_rays(moved, directions, q, image.camera.center_m - moved.center_m)
-        columns.append((uv - at) / step)
+    for step in np.diag([_TURN_DEG] * 3 + [_SHIFT_M] * 2):
+        to_source = np.linalg.inv(_pose(step) @ source.cam2ego) @ image.camera.cam2ego
+        uv = pixels_of(rays, q, to_source[:3, :3], to_source[:3, 3], source)[:2]
+        columns.append((np.concatenate(uv) - at).T / step.sum())
     return np.stack(columns, -1)
 
 

@@ -62,22 +62,22 @@ def stand_on_road(
 ) -> tuple[Layer, BoolArray]:
     """Move what hangs above the road, lies below it or crosses it to the distance at which its foot is on it.
 
-    ``others`` are the neighbours' images. ``costs`` (K, h, w) are those of walls at multiples of ``spacing``, 1/radius
+    ``others`` are the neighbours' images. ``costs`` (h, w, K) are those of walls at multiples of ``spacing``, 1/radius
     in 1/m; the first is the road alone. Returns inverse distances ``q`` (h, w), 1/m, and whether they are valid, with
     the moved things filled.
     """
     from arbiview_aug.temporal.kernels import RADIUS_PX, find_feet
 
     walls = np.where(q > image.road, q / np.maximum(image.horizontal, 1e-6) / spacing, 0)
-    chosen = np.rint(walls).astype(np.int64).clip(0, len(costs) - 1)
-    chosen_costs = np.take_along_axis(costs, chosen[None], 0)[0]
+    chosen = np.rint(walls).astype(np.int64).clip(0, costs.shape[2] - 1)
+    chosen_costs = np.take_along_axis(costs, chosen[..., None], 2)[..., 0]
     q, valid = q.copy(), valid.copy()
     upright = (valid & (q > UPRIGHT * image.road)).astype(np.uint8)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(upright, connectivity=4)
     least_gap_px = RADIUS_PX + math.tan(math.radians(SLOPE_DEG)) * float(image.camera.K[1, 1])
     limits = LEAST_SCALE, EVIDENCE, STANDING, least_gap_px, image.height_m, TALLEST_M
     find_feet(labels, boxes[:count], (image.horizontal, image.road, image.slope), costs, spacing, limits, q, valid)
-    _stand_off_road(image, others, chosen_costs, costs[0], q, valid)
+    _stand_off_road(image, others, chosen_costs, costs[..., 0], q, valid)
     return q, valid
 
 
@@ -85,9 +85,9 @@ class _RoadFlow(NamedTuple):
     """Optical flow to a neighbour beyond that of the road."""
 
     other: SweptImage  # the neighbour's image
-    flow: Layer  # (h, w, 2) px, along the epipolar line towards nearer places and across it
+    flow: Layer  # (2, h, w) px, along the epipolar line towards nearer places and across it
     seen: BoolArray  # (h, w) whether the neighbour sees the road there
-    at: Layer  # (h, w, 2) pixels of the neighbour that match
+    at: Layer  # (2, h, w) pixels of the neighbour that match
 
 
 def _road_flow(image: SweptImage, other: SweptImage, road: Layer) -> _RoadFlow:
@@ -98,20 +98,20 @@ def _road_flow(image: SweptImage, other: SweptImage, road: Layer) -> _RoadFlow:
     seen[:first] = False
     warped = np.where(seen, _read(other.grey, at), image.grey)
     grey, warped = (np.rint(one[first:]).astype(np.uint8) for one in (image.grey, warped))
-    moved = np.zeros_like(at)
+    moved = np.zeros((*road.shape, 2), np.float32)
     cv: Any = cv2  # whose stubs lack DIS flow
     dis = cv.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     moved[first:] = dis.calc(grey, warped, None) if min(grey.shape) >= _LEAST_DIS_PX else 0
-    matching = _read(at, image.camera.pixel_grid().astype(np.float32) + moved)
-    moved, line = matching - at, image.positions(other.camera, np.float32(1.1) * road + np.float32(1e-4)) - at
-    (x, y), (ex, ey) = (np.ascontiguousarray(np.moveaxis(one, -1, 0)) for one in (moved, line))
-    length = np.maximum(np.sqrt(ex * ex + ey * ey), np.float32(1e-9))
-    flow = np.stack([(x * ex + y * ey) / length, (y * ex - x * ey) / length], -1)
+    towards = cv2.split(image.camera.pixel_grid().astype(np.float32) + moved)
+    matching = np.stack([_read(one, towards) for one in at])
+    (x, y), (ex, ey) = matching - at, image.positions(other.camera, np.float32(1.1) * road + np.float32(1e-4)) - at
+    length = np.maximum(cv2.magnitude(ex, ey), np.float32(1e-9))
+    flow = np.stack([(x * ex + y * ey) / length, (y * ex - x * ey) / length])
     return _RoadFlow(other, flow, seen, matching)
 
 
-def _read(image: Any, at: Layer, interpolation: int = cv2.INTER_LINEAR) -> Any:
-    return cv2.remap(image, at, None, interpolation, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+def _read(image: Any, at: Sequence[Any] | Layer, interpolation: int = cv2.INTER_LINEAR) -> Any:
+    return cv2.remap(image, at[0], at[1], interpolation, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _stand_off_road(
@@ -158,15 +158,15 @@ def _off_road(flows: Sequence[_RoadFlow], free: BoolArray) -> Iterator[BoolArray
     """Masks (h, w) of patches in which the flow is off the road, in the same way in all neighbours that see it."""
     from arbiview_aug.temporal.kernels import RADIUS_PX
 
-    ways = [(-2 * one.flow[..., 0], one.flow[..., 1], -one.flow[..., 1]) for one in flows]
-    sizes = [np.where(one.seen, np.hypot(one.flow[..., 0], one.flow[..., 1]), np.inf) for one in flows]
+    ways = [(-2 * one.flow[0], one.flow[1], -one.flow[1]) for one in flows]
+    sizes = [np.where(one.seen, cv2.magnitude(*one.flow), np.inf) for one in flows]
     unseen = [~one.seen for one in flows]
     alike = [((ways[0][k] > FLOW_PX) | unseen[0]) & ((ways[-1][k] > FLOW_PX) | unseen[-1]) for k in range(3)]
     size = np.minimum(sizes[0], sizes[-1])
     difference = flows[0].flow - flows[-1].flow
     both = flows[0].seen & flows[-1].seen
     off = np.any(alike, 0) & (flows[0].seen | flows[-1].seen)
-    off &= (np.hypot(difference[..., 0], difference[..., 1]) < FLOW_PX + _FLOW_SHARE * size) | ~both
+    off &= (cv2.magnitude(*difference) < FLOW_PX + _FLOW_SHARE * size) | ~both
     count, labels, boxes, _ = cv2.connectedComponentsWithStats((off & free).astype(np.uint8), connectivity=4)
     for k in range(1, count):
         if boxes[k, 4] >= (2 * RADIUS_PX + 1) ** 2:
@@ -185,8 +185,8 @@ def _correlations(image: SweptImage, flows: Sequence[_RoadFlow], rows: Any, colu
     for flow in flows:
         if not flow.seen[rows, columns].any():
             continue
-        affine = np.linalg.lstsq(pixels.astype(np.float64), flow.at[rows, columns], rcond=None)[0]
-        two = _read(flow.other.grey, (grid @ affine).astype(np.float32))
+        affine = np.linalg.lstsq(pixels.astype(np.float64), flow.at[:, rows, columns].T, rcond=None)[0]
+        two = _read(flow.other.grey, cv2.split((grid @ affine).astype(np.float32)))
         products = one, two, one * one, two * two, one * two
         means = [cv2.blur(product, side, borderType=cv2.BORDER_REPLICATE) for product in products]
         variances = [np.maximum(means[k + 2] - means[k] ** 2, 0) + NOISE_LEVELS**2 for k in range(2)]

@@ -87,12 +87,8 @@ class SweptImage:
         return np.maximum(self.road, wall * self.horizontal)
 
     def positions(self, other: Camera, inverse_distance: Layer) -> Layer:
-        """(h, w, 2) pixels of another camera for points on the rays."""
-        return np.stack(source_pixels(self.camera, self.rays, inverse_distance, other)[:2], -1)
-
-    def shift(self, other: Camera, inverse_distance: Layer) -> Layer:
-        """(h, w, 2) motion of these pixels along the epipolar lines when inverse distances grow by a tenth."""
-        return self.positions(other, inverse_distance * np.float32(1.1)) - self.positions(other, inverse_distance)
+        """(2, h, w) pixels of another camera, u and v, for points on the rays."""
+        return np.stack(source_pixels(self.camera, self.rays, inverse_distance, other)[:2])
 
     @cached_property
     def unmasked(self) -> npt.NDArray[np.uint8]:
@@ -102,6 +98,18 @@ class SweptImage:
         unmasked[[0, -1]] = 0
         unmasked[:, [0, -1]] = 0
         return unmasked
+
+    @cached_property
+    def quads(self) -> npt.NDArray[np.int64]:
+        """(h, w) four words of 16 bits, from the lowest: this pixel, its right neighbour, and the two below them.
+
+        Each is a grey level's integer sixteenths, and ``unmasked`` in its highest bit.
+        """
+        from arbiview_aug.temporal.kernels import LEVELS
+
+        one = np.rint(LEVELS * self.grey).astype(np.int64) | self.unmasked.astype(np.int64) << 15
+        two = one | np.roll(one, -1, 1) << 16
+        return two | np.roll(two, -1, 0) << 32
 
     @cached_property
     def windows(self) -> tuple[npt.NDArray[np.int32], Any, Any]:
@@ -116,24 +124,27 @@ class SweptImage:
         return np.pad(levels.astype(np.int32), ((0, 0), (RADIUS_PX, RADIUS_PX)), mode="edge"), mean, weight
 
     def costs(self, other: SweptImage, walls: Layer) -> npt.NDArray[np.uint16]:
-        """Costs (K, h, w) of walls, (K,) ascending 1/radius in 1/m, by the correlation with another image over them.
+        """Costs (h, K, w) of walls, (K,) ascending 1/radius in 1/m, by the correlation with another image over them.
 
         The other image is in the same ego frame.
         """
         from arbiview_aug.cameras.kernels import LENS_CODES
-        from arbiview_aug.temporal.kernels import match_walls
+        from arbiview_aug.temporal.kernels import NODE_PX, match_walls
 
         h, w = self.camera.size
         kind, positions = LENS_CODES.get(other.camera.lens, -1), np.zeros((0, 2, h, w), np.float32)
         if kind < 0:
             positions = np.stack([self.positions(other.camera, self.inverse_distance(wall)) for wall in walls])
-            positions = positions.transpose(0, 3, 1, 2)
-        pose, lens = relative_pose(self.camera, other.camera), (kind, other.camera.parameters, positions)
-        costs = np.empty((len(walls), h, w), np.uint16)
+        (A, offset), lens = relative_pose(self.camera, other.camera), (kind, other.camera.parameters, positions)
+        if kind == 0:
+            K = other.camera.K.astype(np.float32)
+            A, offset = K @ A, K @ offset
+        rays = (A @ self.rays.reshape(3, -1)).reshape(3, h, w)
+        surfaces = rays, self.road, self.horizontal
+        nodes = tuple(np.ascontiguousarray(one[..., ::NODE_PX, ::NODE_PX]) for one in surfaces)
+        costs = np.empty((h, len(walls), w), np.uint16)
         walls = np.ascontiguousarray(walls)  # another layout would be compiled, too
-        match_walls(
-            self.rays, self.road, self.horizontal, self.windows, walls, pose, lens, other.grey, other.unmasked, costs
-        )
+        match_walls(*surfaces, nodes, self.windows, walls, offset, lens, other.quads, costs)
         return costs
 
 
