@@ -181,7 +181,8 @@ def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands
     wall, clear = find_least(aggregate(costs), walls[1], image.road / np.maximum(image.horizontal, np.float32(1e-6)))
     q = image.inverse_distance(wall)
     step = cv2.dilate(q, _AROUND) - cv2.erode(q, _AROUND)
-    visible = [cv2.remap(o.unmasked, *image.positions(o.camera, q), cv2.INTER_NEAREST) for o in others]
+    at = [image.positions(o.camera, q) for o in others]
+    visible = [cv2.remap(o.unmasked, u, v, cv2.INTER_NEAREST) for o, (u, v) in zip(others, at, strict=True)]
     valid = clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0)
     if stands:
         q, valid = stand_on_road(image, others, costs, float(walls[1]), q, valid)
@@ -339,7 +340,7 @@ def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray]
     """
     other, q = sample.other, sample.inverse_distance
     at, nearer = (sample.image.positions(other.camera, np.float32(factor) * q) for factor in (1, 1.1))
-    warped: Any = cv2.remap(other.grey, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    warped: Any = cv2.remap(other.grey, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     one, two = _normalised(sample.image.grey), _normalised(warped)
     mean = (sample.image.grey + warped) / 2
     # Gradients of the warped image stand for those of the neighbour's: the warp is close to the identity.
@@ -358,7 +359,7 @@ def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray]
     off_line = np.einsum("nk,nkp->np", normal, motion)  # [n, 5] px per unit
     gradient = gx * normal[:, 0] + gy * normal[:, 1]
     # Pixels read by the erroneous pose are displaced by its error: two(x) = one(x - off_line).
-    return gradient[:, None] * off_line, difference, motion
+    return np.asarray(gradient[:, None] * off_line), np.asarray(difference), motion
 
 
 def _normalised(image: Layer) -> Layer:
