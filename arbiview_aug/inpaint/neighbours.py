@@ -330,7 +330,7 @@ _CONTRADICTION_REACH = 1.25
 """A contradiction on the seam reaches to where agreement is nearer by this factor (``docs/drives.md``, Constants)."""
 
 _SAMPLES_PER_SEAM = 7
-"""Rows or columns across a seam in which frames are compared; all of narrower seams."""
+"""Rows or columns across a seam in which labelled frames are compared; all of narrower seams."""
 
 _FEW_CANDIDATES = 2
 """With at most this many candidates, accept one without a confirming vote."""
@@ -398,12 +398,14 @@ def _merged(
     view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
 ) -> tuple[torch.Tensor, npt.NDArray[np.int16]]:
     """As ``merged``, where any candidate shows something; exposures and votes are those of a sample of pixels."""
-    step, n = max(1, margin_px // _SAMPLES_PER_SEAM), len(candidates)
+    # Without labels the borders of what moved must be found.
+    unlabelled = any((one.risk == ChangeRisk.UNLABELLED).any() for one in candidates)
+    step, n = 1 if unlabelled else max(1, margin_px // _SAMPLES_PER_SEAM), len(candidates)
     every = slice(None, None, step), slice(None, None, step)
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
     samples = [one.part(every) for one in candidates]
     current, images = _levels(view[(..., *every)], levels), [_levels(one.image, levels) for one in samples]
-    recorded = [image.copy() for image in images]
+    recorded = [image.copy() if step > 1 else image for image in images]
     gains = _tone(current, images, free[every], seam[every], samples, max(1, margin_px // 2 // step))
     shown = np.stack([one.shows & free[every] for one in samples])
     accepted = shown & _accepted(current, images, shown, seam[every], samples, max(3, _WINDOW_PX // step | 1))
@@ -422,8 +424,10 @@ def _merged(
         taken = np.flatnonzero(chosen == k)
         y, x = np.divmod(taken, free.shape[1])
         at = y // step * current.shape[2] + x // step
-        colours = gains[k] * _levels(one.image, levels).reshape(3, -1).take(taken, 1)
-        colours += (images[k] - gains[k][..., None] * recorded[k]).reshape(3, -1).take(at, 1)
+        colours = images[k].reshape(3, -1).take(at, 1)
+        if step > 1:  # what a pixel has more than its sample
+            detail = _levels(one.image, levels).reshape(3, -1).take(taken, 1) - recorded[k].reshape(3, -1).take(at, 1)
+            colours += gains[k] * detail
         colours = np.clip(np.rint(colours) if levels == 1 else colours / np.float32(levels), 0, 255 / levels)
         pixels.view(3, -1).index_copy_(1, torch.from_numpy(taken).to(view.device), torch.from_numpy(colours).to(view))
     return pixels, chosen
