@@ -83,6 +83,12 @@ def nearest_resized(label: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     return label[..., y[:, None], x]
 
 
+def some_of_cells(flags: npt.NDArray[np.bool_], step: int) -> npt.NDArray[np.bool_]:
+    """Cells (ny, nx) of ``step`` pixels that hold a True of an image (h, w)."""
+    largest = cv2.dilate(flags.view(np.uint8), np.ones((step, step), np.uint8), anchor=(0, 0))
+    return np.asarray(largest[::step, ::step] > 0)
+
+
 _PAGES = 1 << 16  # smaller arrays come from memory that the process has
 
 

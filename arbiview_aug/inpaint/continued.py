@@ -74,6 +74,7 @@ class Continue(Inpainter):
     """
 
     outcome: ClassVar[str] = "filled in from its surroundings"
+    needs_layers: ClassVar[bool] = True
     only_mean: ClassVar[bool] = False
 
     def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:

@@ -31,6 +31,7 @@ class Inpainter(ABC):
         outcome: The holes' fate, for warnings: "The rest is ...".
         is_random: Whether ``inpaint`` reads its seeds.
         needs_confidence: Whether frames must bring their confidence.
+        needs_layers: Whether they must bring what holes lie behind (``RenderedFrame.layers``).
         fills_own_car: Whether ``inpaint`` gets the own car, which is black, as a hole too, so that it does not bleed.
     """
 
@@ -38,6 +39,7 @@ class Inpainter(ABC):
     seed: int = 0
     outcome: ClassVar[str] = "inpainted"
     is_random: ClassVar[bool] = False
+    needs_layers: ClassVar[bool] = False
     fills_own_car: ClassVar[bool] = False
 
     @property

@@ -14,7 +14,7 @@ of at most two contradicts; and the current frame shows no newly arrived object 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 from typing import Any, Literal, NamedTuple
@@ -28,7 +28,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import PixelRays, RayCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.image_ops import FRESH, Memory
+from arbiview_aug.image_ops import FRESH, Memory, some_of_cells
 from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
 from arbiview_aug.render.view_planner import build_plan
@@ -72,6 +72,23 @@ class Hole:
         y, x = (np.minimum(np.arange(0, n + _CELL_PX, _CELL_PX), n - 1) for n in self.camera.size)
         directions = np.moveaxis(np.tensordot(self.camera.cam2ego[:3, :3], self.rays.at(y, x), 1), 0, -1)
         return directions, np.maximum(self.inverse_distance[np.ix_(y, x)].astype(np.float64), 1e-6)
+
+    @cached_property
+    def wanted(self) -> BoolArray:
+        """(h, w) pixels that neighbours are asked for."""
+        return self.free | self.seam
+
+    @cached_property
+    def near(self) -> BoolArray:
+        """(ny + 1, nx + 1) corners of the cells that hold such pixels."""
+        cells = np.pad(some_of_cells(self.wanted, _CELL_PX), 1)
+        return np.asarray(cells[1:, 1:] | cells[1:, :-1] | cells[:-1, 1:] | cells[:-1, :-1])
+
+    @property
+    def points(self) -> FloatArray:
+        """What lies at these corners, in the ego frame (n, 3)."""
+        directions, q = (of[self.near] for of in self.nodes)
+        return np.asarray(self.camera.center_m + directions / q[:, None])
 
 
 class Fill(NamedTuple):
@@ -119,6 +136,7 @@ class _HoleSurface(DenseSurface):
     holes: Sequence[Hole]
     full: Surface  # the frame's surface
     objects: BoxSurface | None  # labelled objects of both frames
+    _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
 
     @property
     def is_dense(self) -> bool:  # type: ignore[override]
@@ -132,13 +150,16 @@ class _HoleSurface(DenseSurface):
         return hole.inverse_distance[top : top + camera.height_px, left : left + camera.width_px]
 
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """Labelled objects hide everything; what was measured hides what lies behind."""
-        before, full = memory.full(camera.size, 0, np.float32), self.full.background
-        if isinstance(full, DenseSurface):
-            before = full.occlusion_map(camera, rays, memory).beyond
-        if self.objects is not None:
-            before = np.where(self.objects.occlusion_map(camera, rays, memory).beyond > 0, np.float32(np.inf), before)
-        return OcclusionMap(before, np.zeros(before.shape, np.int32))
+        """Labelled objects hide everything; what was measured hides what lies behind. Kept for the next hole."""
+        key, full = camera.content_key, self.full.background
+        if key not in self._shadows:
+            before = np.zeros(camera.size, np.float32)
+            if isinstance(full, DenseSurface):
+                before = full.occlusion_map(camera, rays, memory).beyond.copy()
+            if self.objects is not None:
+                before[self.objects.occlusion_map(camera, rays, memory).solid >= 0] = np.inf
+            self._shadows[key] = OcclusionMap(before, np.zeros(before.shape, np.int32))
+        return self._shadows[key]
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """The full surface's."""
@@ -160,62 +181,75 @@ def plan_fills(
     the area that may be filled.
     """
     full = scene.surface(surface, plan.source.ground_z_m)
-    holes = [hole for k in range(len(plan.targets)) if (hole := _hole(plan, k, full, reach, maps)) is not None]
+    shown_q = [scene.images.get((surface, camera.content_key)) for camera in plan.target]
+    holes = [hole for k, q in enumerate(shown_q) if (hole := _hole(plan, k, full, q, reach, maps)) is not None]
     if not holes:
         return None
     # A neighbour's cameras are not blended: one of them may see a moved object.
-    config = replace(config, seam_width=0.0)
+    config = replace(config, seam_width=0.0, layers=False)
     rig = Rig([hole.camera for hole in holes], ground_z_m=plan.source.ground_z_m)
-    fills = []
+    wanted, points = [hole.wanted for hole in holes], [hole.points for hole in holes]
+    ends, fills = np.cumsum([len(of_hole) for of_hole in points]), []
     for neighbour in neighbours:
         boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
         objects = BoxSurface(Street(), boxes, whole(boxes)) if len(boxes) else None
         known = Scene(known=_HoleSurface(holes, full, objects))
-        views = build_plan(neighbour.rig, rig, geometry=surface, config=config, scene=known, maps=maps)
-        shown = [_shown(hole, view, neighbour) for hole, view in zip(holes, views.targets, strict=True)]
+        settings: dict[str, Any] = {"geometry": surface, "config": config, "scene": known, "maps": maps}
+        views = build_plan(neighbour.rig, rig, wanted=wanted, **settings)
+        risks: Sequence[Any] = [None] * len(holes)
+        if neighbour.moved is not None:
+            risks = np.split(change_risks(neighbour.moved, np.concatenate(points)), ends[:-1])
+        shown = [_shown(*one, neighbour) for one in zip(holes, views.targets, risks, strict=True)]
         if any((hole.free & one.shows).any() for hole, one in zip(holes, shown, strict=True)):
             fills.append(Fill(neighbour, views, shown))
     return Fills(holes, fills) if fills else None
 
 
-def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: RayCache) -> Hole | None:
+def _hole(plan: RenderPlan, index: int, surface: Surface, q: Any, reach: Reach, maps: RayCache) -> Hole | None:
     camera, covered = plan.target[index], plan.targets[index].coverage
     empty = ~covered if camera.mask is None else ~covered & camera.mask
     height_m = camera.center_m[2] - plan.source.ground_z_m
     if not empty.any() or (reach == "road" and height_m <= 0):
         return None
-    rays = maps.rays(camera)
-    local = rays.at(*map(np.arange, camera.size))
+    margin_px = max(2, round(_SEAM_WIDTH * camera.width_px))
+    rays, part = maps.rays(camera), _box(empty, margin_px)
+    local = rays.at(*(np.arange(side.start, side.stop) for side in part))
     up = np.tensordot(camera.cam2ego[2, :3].astype(np.float32), local, 1)
     allowed = np.asarray(up < -1 / np.hypot(1, NEAR_M / height_m) if reach == "road" else local.any(axis=0))
-    free = empty & allowed
+    free = empty[part] & allowed
     if not free.any():
         return None
-    margin_px = max(2, round(_SEAM_WIDTH * camera.width_px))
-    rows, columns = (_with_margin(np.asarray(free.any(axis=1 - axis)), margin_px) for axis in (0, 1))
-    box, size = (rows, columns), (rows.stop - rows.start, columns.stop - columns.start)
-    camera = camera.crop(rows.start, columns.start, size)
-    rays = maps.rays(camera, rays.crop(rows.start, columns.start, size))
-    q, allowed = surface.image(camera, rays), allowed[box]
+    inner = _box(free, margin_px)
+    up, allowed, free = up[inner], allowed[inner], free[inner]
+    rows, columns = box = _within(part[0], inner[0]), _within(part[1], inner[1])
+    camera = camera.crop(rows.start, columns.start, free.shape)
+    rays = maps.rays(camera, rays.crop(rows.start, columns.start, free.shape))
+    q = surface.image(camera, rays) if q is None else q[box]
     if reach == "road":
-        allowed &= (q > 0) & (np.abs(height_m + up[box] / np.maximum(q, np.float32(1e-9))) < _ROAD_TOLERANCE_M)
-    free = free[box] & allowed
+        allowed &= (q > 0) & (np.abs(height_m + up / np.maximum(q, np.float32(1e-9))) < _ROAD_TOLERANCE_M)
+    free &= allowed
     if not free.any():
         return None
     around = cv2.dilate(empty[box].view(np.uint8), np.ones((2 * margin_px + 1,) * 2, np.uint8)) > 0
     return Hole(index, box, camera, rays, free, around & allowed & covered[box], q, margin_px)
 
 
-def _with_margin(flags: BoolArray, margin: int) -> slice:
-    """From the first to the last True, with a margin."""
-    first, last = np.flatnonzero(flags)[[0, -1]].tolist()
-    return slice(max(first - margin, 0), min(last + 1 + margin, len(flags)))
+def _box(flags: BoolArray, margin: int) -> tuple[slice, slice]:
+    """Rows and columns from the first to the last True of (h, w), with a margin."""
+    ends = [np.flatnonzero(flags.any(axis=1 - axis))[[0, -1]].tolist() for axis in (0, 1)]
+    top, left = (slice(max(a - margin, 0), min(b + 1 + margin, n)) for (a, b), n in zip(ends, flags.shape, strict=True))
+    return top, left
 
 
-def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
+def _within(outer: slice, inner: slice) -> slice:
+    """A slice of a slice."""
+    return slice(outer.start + inner.start, outer.start + inner.stop)
+
+
+def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neighbour: Neighbour) -> Candidate:
     from arbiview_aug.render.kernels import upsample_where
 
-    usable = view.coverage & (hole.free | hole.seam)
+    usable = view.coverage & hole.wanted
     blur, risk = np.zeros(usable.shape, np.uint8), np.full(usable.shape, ChangeRisk.UNLABELLED, np.uint8)
     directions, q = hole.nodes
     for pair in view.pairs:
@@ -226,12 +260,17 @@ def _shown(hole: Hole, view: ViewPlan, neighbour: Neighbour) -> Candidate:
         other, own_z = (np.maximum(np.abs(rays[..., 2]), 1e-9) for rays in (from_source, directions))
         halves = np.clip(2 * np.log2(hole.camera.K[0, 0] * own_z * relative / (source.K[0, 0] * other)), 0, 255)
         upsample_where(halves.astype(np.float32), _CELL_PX, view.source_camera, pair.source, blur)
-    if neighbour.moved is not None:
-        points = hole.camera.center_m + directions / q[..., None]
-        corners = change_risks(neighbour.moved, points.reshape(-1, 3)).reshape(q.shape)
+    if risks is not None:
+        corners = np.zeros(q.shape, np.uint8)
+        corners[hole.near] = risks
         cells = np.maximum.reduce([corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:], corners[1:, 1:]])
-        risk = cells.repeat(_CELL_PX, axis=0).repeat(_CELL_PX, axis=1)[: usable.shape[0], : usable.shape[1]]
+        risk = _of_cells(cells, _CELL_PX, usable.shape)
     return Candidate(usable, blur, risk, neighbour.is_later)
+
+
+def _of_cells(values: Any, cell: int, size: tuple[int, ...]) -> Any:
+    """The pixels (h, w) of cells (ny, nx)."""
+    return values.repeat(cell, axis=0).repeat(cell, axis=1)[: size[0], : size[1]]
 
 
 # --- filling ----------------------------------------------------------------------------------------------------------
@@ -279,13 +318,19 @@ def _write(maps: Maps | None, hole: Hole, where: BoolArray, value: Any) -> None:
 
 
 _AGREEMENT_LEVELS = 16.0
-"""Largest difference of two frames that agree, in grey levels over 5 x 5 pixels."""
+"""Largest difference of two frames that agree, in grey levels over a window."""
 
 _CONTRADICTION_LEVELS = 24.0
 """The same between a frame and the current one, on a seam (``docs/drives.md``, Constants)."""
 
+_WINDOW_PX = 5
+"""Side of the window in which two frames are compared, at least 3 samples."""
+
 _CONTRADICTION_REACH = 1.25
 """A contradiction on the seam reaches to where agreement is nearer by this factor (``docs/drives.md``, Constants)."""
+
+_SAMPLES_PER_SEAM = 7
+"""Rows or columns across a seam in which labelled frames are compared; all of narrower seams."""
 
 _FEW_CANDIDATES = 2
 """With at most this many candidates, accept one without a confirming vote."""
@@ -320,6 +365,11 @@ class Candidate(NamedTuple):
     later: bool  # whether it was recorded after the current frame
     image: torch.Tensor = torch.empty(0)  # (3, h, w) of the view's type, once it is rendered
 
+    def part(self, place: tuple[slice, slice]) -> Candidate:
+        """Some of its rows and columns."""
+        maps = self.shows[place], self.blur[place], self.risk[place]
+        return Candidate(*maps, self.later, self.image[(..., *place)])
+
 
 def merged(
     view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
@@ -335,32 +385,72 @@ def merged(
     Returns:
         (3, h, w) filled view, and (h, w) int16 index of the candidate taken, -1 for none.
     """
+    pixels, chosen = view.clone(), np.full(free.shape, -1, np.int16)
+    shows = np.logical_or.reduce([one.shows for one in candidates])
+    if (shows & free).any():
+        box = _box(shows, margin_px)
+        parts = view[(..., *box)], free[box], seam[box], [one.part(box) for one in candidates]
+        pixels[(..., *box)], chosen[box] = _merged(*parts, margin_px)
+    return pixels, chosen
+
+
+def _merged(
+    view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
+) -> tuple[torch.Tensor, npt.NDArray[np.int16]]:
+    """As ``merged``, where any candidate shows something; exposures and votes are those of a sample of pixels."""
+    # Without labels the borders of what moved must be found.
+    unlabelled = any((one.risk == ChangeRisk.UNLABELLED).any() for one in candidates)
+    step, n = 1 if unlabelled else max(1, margin_px // _SAMPLES_PER_SEAM), len(candidates)
+    every = slice(None, None, step), slice(None, None, step)
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
-    current, images = _levels(view, levels), [_levels(one.image, levels) for one in candidates]
-    _tone(current, images, free, seam, candidates, margin_px)
-    shown = np.stack([one.shows & free for one in candidates])
-    accepted = shown & _accepted(current, images, shown, seam, candidates)
+    samples = [one.part(every) for one in candidates]
+    current, images = _levels(view[(..., *every)], levels), [_levels(one.image, levels) for one in samples]
+    recorded = [image.copy() if step > 1 else image for image in images]
+    gains = _tone(current, images, free[every], seam[every], samples, max(1, margin_px // 2 // step))
+    shown = np.stack([one.shows & free[every] for one in samples])
+    accepted = shown & _accepted(current, images, shown, seam[every], samples, max(3, _WINDOW_PX // step | 1))
     # The order breaks ties.
-    rank, chosen = np.full(free.shape, 256 * len(candidates), np.uint16), np.full(free.shape, -1, np.int16)
+    rank, chosen = np.full(free.shape, 256 * n, np.uint16), np.full(free.shape, -1, np.int16)
     for k, one in enumerate(candidates):
-        key = one.blur * np.uint16(len(candidates)) + np.uint16(k)
-        better = accepted[k] & (key < rank)
+        # Samples may miss a border.
+        accepts, rejects = (_beside(flags) for flags in (accepted[k], shown[k] & ~accepted[k]))
+        usable = _of_cells(accepted[k] | (accepts & ~rejects & ~shown[k]), step, free.shape) & one.shows & free
+        key = one.blur * np.uint16(n) + np.uint16(k)
+        better = usable & (key < rank)
         np.copyto(rank, key, where=better)
         np.copyto(chosen, np.int16(k), where=better)
-        np.copyto(current, images[k], where=better)
-    filled = np.clip(np.rint(current) if levels == 1 else current / np.float32(levels), 0, 255 / levels)
-    where = torch.from_numpy(chosen >= 0).to(view.device)
-    return torch.where(where, torch.from_numpy(filled).to(view), view), chosen
+    pixels = view.clone(memory_format=torch.contiguous_format)
+    for k, one in enumerate(candidates):
+        taken = np.flatnonzero(chosen == k)
+        y, x = np.divmod(taken, free.shape[1])
+        at = y // step * current.shape[2] + x // step
+        colours = images[k].reshape(3, -1).take(at, 1)
+        if step > 1:  # what a pixel has more than its sample
+            detail = _levels(one.image, levels).reshape(3, -1).take(taken, 1) - recorded[k].reshape(3, -1).take(at, 1)
+            colours += gains[k] * detail
+        colours = np.clip(np.rint(colours) if levels == 1 else colours / np.float32(levels), 0, 255 / levels)
+        pixels.view(3, -1).index_copy_(1, torch.from_numpy(taken).to(view.device), torch.from_numpy(colours).to(view))
+    return pixels, chosen
+
+
+def _beside(flags: BoolArray) -> BoolArray:
+    """(h, w) True on True pixels and those next to them."""
+    return np.asarray(cv2.dilate(flags.view(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
 def _levels(image: torch.Tensor, levels: float) -> Levels:
     grey = image.detach().cpu().to(torch.float32, memory_format=torch.contiguous_format, copy=True)
-    return np.asarray(grey.mul_(levels).numpy())
+    return np.asarray((grey.mul_(levels) if levels != 1 else grey).numpy())
 
 
 # --- votes ------------------------------------------------------------------------------------------------------------
 def _accepted(
-    current: Levels, toned: Sequence[Levels], shown: BoolArray, seam: BoolArray, candidates: Sequence[Candidate]
+    current: Levels,
+    toned: Sequence[Levels],
+    shown: BoolArray,
+    seam: BoolArray,
+    candidates: Sequence[Candidate],
+    window: int,
 ) -> BoolArray:
     """(n, h, w) whether each candidate shows what stands there now."""
     votes, nearest = np.zeros(shown.shape, np.uint8), np.full((2, *seam.shape), -1, np.int16)
@@ -370,7 +460,7 @@ def _accepted(
     static = shown.copy()  # as far as the nearest frames before and after the current one agree
     for pair in combinations(range(len(candidates)), 2):
         both = shown[pair[0]] & shown[pair[1]]
-        agree = _agreeing(toned[pair[0]], toned[pair[1]], both, _AGREEMENT_LEVELS)
+        agree = _agreeing(toned[pair[0]], toned[pair[1]], both, _AGREEMENT_LEVELS, window)
         for i, j in (pair, pair[::-1]):
             votes[i] += agree
             static[i] &= ~both | agree | (nearest[int(candidates[j].later)] != j)
@@ -384,18 +474,20 @@ def _accepted(
         on_both_sides = (nearest[0] >= 0) & (nearest[1] >= 0)
         static = (static & on_both_sides) | (unanimous & (votes >= (0 if few else 2)) & ~on_both_sides)
         if len(candidates) > 1:  # a single candidate may itself show the moving object
-            static &= ~_arrived(current, toned, seam, candidates)
+            static &= ~_arrived(current, toned, seam, candidates, window)
         accepted = (static & unlabelled) | (accepted & ~unlabelled)
     return np.asarray(accepted)
 
 
-def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate]) -> BoolArray:
+def _arrived(
+    current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate], window: int
+) -> BoolArray:
     """(h, w) where a hole continues what the current frame alone shows on the seam."""
     known, agree = np.zeros_like(seam), np.zeros_like(seam)
     for image, one in zip(toned, candidates, strict=True):
         both = seam & one.shows
         known |= both
-        agree |= _agreeing(image, current, both, _CONTRADICTION_LEVELS)
+        agree |= _agreeing(image, current, both, _CONTRADICTION_LEVELS, window)
     contradicts = known & ~agree
     if not contradicts.any():
         return contradicts
@@ -405,12 +497,12 @@ def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidat
     return np.asarray(away / _CONTRADICTION_REACH < near)
 
 
-def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float) -> BoolArray:
+def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float, window: int) -> BoolArray:
     """(h, w) where two images differ by less than a limit: means over the channels and a window's valid pixels."""
     apart = np.asarray(cv2.absdiff(one.reshape(-1, one.shape[2]), two.reshape(-1, one.shape[2]))).reshape(one.shape)
     valid = where.astype(np.float32)
     total, count = (
-        np.asarray(cv2.boxFilter(part, -1, (5, 5), normalize=False, borderType=cv2.BORDER_CONSTANT))
+        np.asarray(cv2.boxFilter(part, -1, (window, window), normalize=False, borderType=cv2.BORDER_CONSTANT))
         for part in ((apart[0] + apart[1] + apart[2]) * valid, valid)
     )
     return np.asarray(where & (total < 3 * limit * count))
@@ -423,37 +515,42 @@ def _tone(
     free: BoolArray,
     seam: BoolArray,
     candidates: Sequence[Candidate],
-    margin_px: int,
-) -> None:
-    """Bring the candidates to the view's exposure, in place.
+    cell: int,
+) -> list[Levels]:
+    """Bring the candidates to the view's exposure, in place; return their gains (3, 1).
 
-    Candidates with too little of the seam are matched to those with enough.
+    Candidates with too little of the seam are matched to those with enough. Their offsets are of cells of pixels.
     """
-    unmatched = []
+    unmatched, gains = [], [np.ones((3, 1), np.float32)] * len(candidates)
     for k, one in enumerate(candidates):
-        agreement = _expose(images[k], view, seam & one.shows, _SEAM_INLIERS)
-        if agreement is None:
+        match = _expose(images[k], view, seam & one.shows, _SEAM_INLIERS)
+        if match is None:
             unmatched.append(k)
         else:
-            images[k] += _offset(*agreement, seam.shape, max(1, margin_px // 2))
+            gains[k] = match[0]
+            images[k] += _offset(*match[1:], seam.shape, cell)
     if not unmatched:
-        return
+        return gains
     reference, known = view.copy(), seam.copy()
     for k in sorted(range(len(candidates)), key=unmatched.__contains__):
         shows = free & candidates[k].shows
-        if k in unmatched and _expose(images[k], reference, shows & known, _OVERLAP_INLIERS) is None:
-            continue
+        if k in unmatched:
+            match = _expose(images[k], reference, shows & known, _OVERLAP_INLIERS)
+            if match is None:
+                continue
+            gains[k] = match[0]
         np.copyto(reference, images[k], where=shows & ~known)
         known |= shows
+    return gains
 
 
 def _expose(
     image: Levels, reference: Levels, where: BoolArray, min_inliers: float
-) -> tuple[npt.NDArray[np.int64], Levels] | None:
+) -> tuple[Levels, npt.NDArray[np.int64], Levels] | None:
     """Give an image the gain of a reference, in place; None if it is implausible.
 
     Returns:
-        Pixels (n,) that then agree, and what they lack (3, n).
+        The gain (3, 1), pixels (n,) that then agree, and what they lack (3, n).
     """
     pixel = np.flatnonzero(where)
     if len(pixel) < _MIN_SEAM_PX:
@@ -470,7 +567,7 @@ def _expose(
         return None
     image *= gain[:, :, None]
     image += np.float32(_DARK_LEVELS) * (gain[:, :, None] - 1)
-    return pixel[agree], error.take(agree, 1)
+    return gain, pixel[agree], error.take(agree, 1)
 
 
 def _offset(pixel: npt.NDArray[np.int64], error: Levels, size: tuple[int, ...], cell: int) -> Levels:

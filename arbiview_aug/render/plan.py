@@ -42,6 +42,7 @@ class RenderConfig:
             off. Wider bands show double images of near objects, narrower ones the exposure step.
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
         certainty: Store the geometry's accuracy in plans, one byte a pixel; ``outputs=("confidence",)`` needs it.
+        layers: Store what holes show (``ViewPlan.layers``, ``paint`` and ``road``); ``holes="continue"`` needs it.
     """
 
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
@@ -49,6 +50,7 @@ class RenderConfig:
     seam_width: float = 0.03
     overlap_depth: bool = False
     certainty: bool = False
+    layers: bool = True
 
     def __post_init__(self) -> None:
         check_ranges(self, {"seam_width": (0.0, 0.5)})

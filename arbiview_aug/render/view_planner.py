@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -30,7 +30,7 @@ from arbiview_aug.cameras.rays import (
 )
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import compilation_announced
-from arbiview_aug.image_ops import at_level, level_size
+from arbiview_aug.image_ops import at_level, level_size, some_of_cells
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.plan import (
     GRID_STEP_PX,
@@ -128,6 +128,7 @@ class ViewPlanner:
         config: RenderConfig,
         counters: Counter[str],
         maps: RayCache,
+        wanted: BoolArray | None = None,
     ) -> None:
         self.sources, self.camera, self.surface, self.config = source.cameras, camera, surface, config
         self.scene, self.ground_z_m, self.counters, self.maps = scene, source.ground_z_m, counters, maps
@@ -149,6 +150,7 @@ class ViewPlanner:
         self._geometries: dict[str, _Geometry] = {}
         # Cells that sources elsewhere may change: none without a ray.
         self._open = _whole_cells(self.corner_rays.any(axis=0))
+        self._wanted = None if wanted is None else some_of_cells(wanted, self.step)
         exact = {k: self._region(k) for k in order if self.baselines_m[k] < SAME_CENTER_M}
         for one in filter(None, exact.values()):
             self._open = self._open & self._around_unseen(one)
@@ -236,6 +238,8 @@ class ViewPlanner:
         nearest, farthest = np.empty((2, *self._open.shape), np.float32)
         depth_range(q, self.step, nearest, farthest)
         apart = look_apart(self.camera, self.sources, float(nearest.max()))
+        if is_whole and (surface.is_layered or surface.is_dense):
+            self.scene.images[name, self.camera.content_key] = q
         measured = q, face, *at_nodes, behind, nearest, farthest, uncertainty
         self._geometries[name] = _Geometry(surface, *measured, apart, background.is_guess)
         return self._geometries[name]
@@ -253,7 +257,8 @@ class ViewPlanner:
         from arbiview_aug.render.kernels import cells_in_view
 
         size, columns = np.array(source.size, np.float32), np.empty((len(self._open), 2), np.int64)
-        cells_in_view(self.corner_rays, nearest, farthest, *projection, size, source.cone_rad, self._open, columns)
+        cells = self._open if self._wanted is None else self._open & self._wanted
+        cells_in_view(self.corner_rays, nearest, farthest, *projection, size, source.cone_rad, cells, columns)
         return columns
 
     def _region(self, index: int) -> _Region | None:
@@ -377,6 +382,8 @@ class ViewPlanner:
             fixed = fixed.rounded()
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
+        if not self.config.layers:
+            return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
         holes = winner < 0
         layers = (holes & (in_image > 0)).view(np.uint8)
         road = self._road() if holes.any() else None
@@ -566,6 +573,7 @@ def build_plan(
     config: RenderConfig | None = None,
     scene: Scene | None = None,
     maps: RayCache | None = None,
+    wanted: Sequence[BoolArray | None] | None = None,
 ) -> RenderPlan:
     """Plan how ``target`` is rendered from ``source``'s images.
 
@@ -577,12 +585,15 @@ def build_plan(
         config: Settings; the ``fast`` preset by default.
         scene: Known geometry, in the source's ego frame.
         maps: Rays and masks of cameras, to be reused by later plans.
+        wanted: (h, w) pixels of each target that must be planned, in place of all.
 
     Returns:
         The plan. Targets that no source sees have zero coverage.
     """
     with compilation_announced():
-        return _built(source, target.in_frame_of(source), geometry, config or RenderConfig(), scene or Scene(), maps)
+        config, scene, maps = config or RenderConfig(), scene or Scene(), maps or RayCache()
+        target = target.in_frame_of(source)
+        return _built(source, target, geometry, config, scene, maps, wanted or [None] * len(target))
 
 
 def warm_up() -> None:
@@ -612,12 +623,20 @@ def warm_up() -> None:
 
 
 def _built(
-    source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene, maps: RayCache | None
+    source: Rig,
+    target: Rig,
+    surface: str,
+    config: RenderConfig,
+    scene: Scene,
+    maps: RayCache,
+    wanted: Sequence[BoolArray | None],
 ) -> RenderPlan:
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)
-    maps = maps or RayCache()
-    planners = [ViewPlanner(source, order, camera, surface, scene, config, counters, maps) for camera in target]
+    planners = [
+        ViewPlanner(source, order, camera, surface, scene, config, counters, maps, pixels)
+        for camera, pixels in zip(target, wanted, strict=True)
+    ]
     used = [(region.source, region.level) for planner in planners for region in planner.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)
     targets = tuple(planner.finish(layout) for planner in planners)

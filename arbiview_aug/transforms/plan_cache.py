@@ -46,7 +46,7 @@ def check_reach(source: Rig, target: Rig, coverages: Coverages, unseen: str, war
     if is_empty:
         cause = _likely_cause(source, target)
         raise UnreachableError(f"{lost}: expected some pixels to be covered, got none. {cause}")
-    shares = [float(np.mean(coverage)) for coverage in coverages]
+    shares = [float(np.count_nonzero(c) / c.size if isinstance(c, np.ndarray) else c) for c in coverages]
     poor = [f"{c.name} {share:.0%}" for c, share in zip(target, shares, strict=True) if share < _UNREACHABLE]
     if poor:
         cause = f"{_likely_cause(source, target)}. " if np.mean(shares) < _SUSPICIOUS else ""

@@ -170,7 +170,8 @@ class RigRetarget(torch.nn.Module):
     def _checked_config(self, config: Any) -> Any:
         needs_confidence = "confidence" in self.keys.extra or self.inpainter.needs_confidence
         if isinstance(config, RenderConfig):
-            return replace(config, certainty=True) if needs_confidence else config
+            certainty = config.certainty or needs_confidence
+            return replace(config, certainty=certainty, layers=self.inpainter.needs_layers)
         if "confidence" in self.keys.extra:
             raise ValueError(
                 "SampleKeys.extra: quality='paper' has no 'confidence': it moves pixels by what it matches"
