@@ -26,7 +26,7 @@ PACKAGE = str(Path(arbiview_aug.__file__).parent)
 BOUNDS = {
     "street, plan cached": (15, 47),
     "LiDAR + boxes": (25, 600),
-    "LiDAR + boxes, points scanned": (30, 650),
+    "LiDAR + boxes, points scanned": (31, 650),
     "learned depth": (27, 600),
     "generated": (27, 1500),
     "neighbours, all": (32, 2500),

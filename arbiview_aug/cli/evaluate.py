@@ -74,6 +74,18 @@ def run(arguments: argparse.Namespace) -> None:
     report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in tables), strict=False))
     report |= {"views": done.views, "pairs": done.pairs} | ({"judges": judged} if judged else {})
     (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
+    _save_pictures(folder, done, panel)
+    page = html_report(title, done, names, tables, notes, panel.pictures)
+    (folder / "report.html").write_text(page, encoding="utf-8")
+    for note in notes:
+        print(f"note: {note}\n")
+    print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
+    print(f"report: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}")
+
+
+def _save_pictures(folder: Path, done: Evaluation, panel: Panel) -> None:
+    """Save the first frame's views of each method and target, and what a detector sees in them."""
+    assert done.first is not None
     sample = done.first.sample
     for (target, method), views in done.pictures.items():
         rig = done.targets[target]
@@ -84,12 +96,6 @@ def run(arguments: argparse.Namespace) -> None:
             seen = [RenderedView(image, np.ones(image.shape[:2], bool)) for image in panel.pictures[target, method]]
             sources, truth = panel.pictures[SOURCES, SOURCES], panel.pictures.get((target, TRUTH))
             save_picture(folder / f"{file}-judged.png", frame_sheet(sample["rig"], sources, rig, seen, truth))
-    page = html_report(title, done, names, tables, notes, panel.pictures)
-    (folder / "report.html").write_text(page, encoding="utf-8")
-    for note in notes:
-        print(f"note: {note}\n")
-    print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
-    print(f"report: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}")
 
 
 def _panel(arguments: argparse.Namespace) -> Panel:

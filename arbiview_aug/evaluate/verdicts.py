@@ -91,10 +91,10 @@ class TrueImage(NamedTuple):
 
 
 class Target(NamedTuple):
-    """What views for a rig are compared with: for each camera, or None."""
+    """What views for a rig are compared with, by camera; None where there is nothing."""
 
-    labels: list[Labels] | None
-    truth: list[TrueImage] | None
+    labels: Sequence[Labels | None]
+    truth: Sequence[TrueImage | None]
 
 
 @dataclass
@@ -120,34 +120,35 @@ class Panel:
             self._targets[target] = self._look_at_truth(name, frame, target, rig)
         labels, truth = self._targets[target]
         for k, view in enumerate(views):
-            of_camera = None if labels is None else labels[k]
-            verdict = Verdict(name, method, target, rig[k].name, rig[k].size, labels=of_camera)
-            image, true = to_bytes(view.image), None if truth is None else truth[k]
-            self._add(image, self._judged(verdict, image, view.generated, true))
+            image = to_bytes(view.image)
+            verdict = Verdict(name, method, target, rig[k].name, rig[k].size, labels=labels[k])
+            self._add(image, self._judged(verdict, image, view.generated, truth[k]))
 
     def _look_at_truth(self, name: str, frame: ScoredFrame, target: str, rig: Rig) -> Target:
         """Judge the true images of a rig, if there are some; their masks hide labelled objects."""
         mounted = rig.in_frame_of(frame.sample["rig"])
         if frame.truth is None:
-            return Target(None if self.detector is None else labels_of(frame, mounted), None)
+            return Target(self._labels(frame, mounted), [None] * len(rig))
         true = frame.truth(rig)
         images, masks = [to_bytes(image) for image in as_arrays(true.images)], valid_pixels(true)
         masked = mounted.with_cameras([replace(camera, mask=mask) for camera, mask in zip(mounted, masks, strict=True)])
-        labels = None if self.detector is None else labels_of(frame, masked)
-        truth = []
-        for k, (camera, image) in enumerate(zip(rig, images, strict=True)):
+        labels, truth = self._labels(frame, masked), []
+        for camera, image, mask, of_camera in zip(rig, images, masks, labels, strict=True):
             detections = None if self.detector is None else self.detector(image)
-            truth.append(TrueImage(masks[k], detections, None if self.segmenter is None else self.segmenter(image)))
-            of_camera = None if labels is None else labels[k]
+            truth.append(TrueImage(mask, detections, None if self.segmenter is None else self.segmenter(image)))
             self._add(image, Verdict(name, TRUTH, target, camera.name, camera.size, detections, of_camera))
         return Target(labels, truth)
 
+    def _labels(self, frame: ScoredFrame, rig: Rig) -> Sequence[Labels | None]:
+        """Labels that a detector is compared with, by camera."""
+        labels = None if self.detector is None else labels_of(frame, rig)
+        return [None] * len(rig) if labels is None else labels
+
     def _look_at_sources(self, name: str, frame: ScoredFrame, detector: Detector) -> None:
         rig: Rig = frame.sample["rig"]
-        labels = labels_of(frame, rig)
-        for k, (camera, image) in enumerate(zip(rig, map(to_bytes, as_arrays(frame.sample["images"])), strict=True)):
-            of_camera = None if labels is None else labels[k]
-            self._add(image, Verdict(name, SOURCES, SOURCES, camera.name, camera.size, detector(image), of_camera))
+        images = map(to_bytes, as_arrays(frame.sample["images"]))
+        for camera, image, labels in zip(rig, images, self._labels(frame, rig), strict=True):
+            self._add(image, Verdict(name, SOURCES, SOURCES, camera.name, camera.size, detector(image), labels))
 
     def _judged(
         self, verdict: Verdict, image: Picture, generated: BoolArray | None, true: TrueImage | None

@@ -46,6 +46,9 @@ _TOP_SHARE, _BODY_SHARE = 0.9, 0.6
 """Quantiles of what sources see of tops and of a body's side that are nearest to their paint: tops are seen at grazing
 angles, sides have wheels and sills. No lamps, plates and windows: these are less than the rest, or on other pieces."""
 
+_PAINT_SHARE = 0.8
+"""Quantile of windows and the paint around them, by their largest channel, from which on all is paint."""
+
 _TOP_LIGHT, _TOP_SHINE = 1.8, 0.05
 """Light on tops over that on the brightest side in view, and reflected sky, as a share of white; in linear light. An
 evenly bright sky gives 1.7; clear coat reflects 4 to 5 %. From ``integrations.benchmarks.tops``, seeds 7000, 7100."""
@@ -54,7 +57,7 @@ _SURE_SAMPLES = 6
 """Samples of a seen top that weigh as much as its sides."""
 
 _LEAST_SAMPLES, _LEAST_SHARE = 3, 0.03
-"""Samples of a body's side that suffice for its paint, and the body's least share of those of all sides."""
+"""Samples of a side that suffice for its paint, and the body's least share of those of all sides."""
 
 _GAMMA = 2.2
 """Exponent of displayed colours in linear light, as sRGB's on average."""
@@ -156,7 +159,8 @@ def mean_colour(views: Sequence[npt.NDArray[Any]], coverage: Sequence[npt.NDArra
 def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | None]) -> Colour:
     """Colours (P, 3) of the parts of objects by their numbers in ``Paint``; -1 where unknown.
 
-    Sides take the median of what sources see of all sides. Tops take the paint of the body's brightest side in the
+    Sides take the median of what sources see of the body, or of the cabin. A body of which nothing is seen takes the
+    paint around the windows. Tops take the paint of the body's brightest side in the
     light that falls on tops, and what sources see of them, the more the larger the part that they see.
     """
     painted = [(view.reshape(3, -1), p) for view, p in zip(views, paint, strict=True) if p is not None]
@@ -171,13 +175,15 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
     white = 255 if views[0].dtype == np.uint8 else 1
     for first in range(0, len(ends), PARTS):
         sides, tops = samples[first : first + TOP_PART], samples[first + TOP_PART]
-        of_sides = np.concatenate(sides)
-        if len(of_sides):
-            colours[first : first + TOP_PART] = _quantile(of_sides, 0.5)
+        of_sides, of_body = np.concatenate(sides), np.concatenate(sides[1:])
+        if len(of_sides) >= _LEAST_SAMPLES:
+            cabin = sides[0] if len(sides[0]) >= _LEAST_SAMPLES else of_sides
+            body = _quantile(of_body, 0.5) if len(of_body) >= _LEAST_SAMPLES else _brightest(of_sides)
+            colours[first], colours[first + 1 : first + TOP_PART] = _quantile(cabin, 0.5), body
         paints = [_quantile(side, _BODY_SHARE) for side in sides[1:] if len(side) >= _LEAST_SAMPLES]
         is_seen = len(of_sides) - len(sides[0]) >= _LEAST_SHARE * len(of_sides)  # few pixels may be another object's
-        if len(of_sides) and not (paints and is_seen):
-            paints = [_quantile(of_sides, _TOP_SHARE)]  # windows are darker than the paint around them
+        if len(of_sides) >= _LEAST_SAMPLES and not (paints and is_seen):
+            paints = [_brightest(of_sides)]
         colours[first + TOP_PART] = _top_colour(paints, tops, white)
     return colours
 
@@ -194,6 +200,12 @@ def _top_colour(paints: Sequence[Colour], tops: Colour, white: float) -> Colour:
     if len(tops):
         light += sure * (_quantile(tops, _TOP_SHARE) / white) ** _GAMMA
     return np.asarray(white * np.minimum(light, 1) ** (1 / _GAMMA), np.float32)
+
+
+def _brightest(values: Colour) -> Colour:
+    """Colour (3,) of the brightest samples (n, 3): windows are darker than the paint around them."""
+    level = values.max(1)  # saturated paint has little luminance
+    return np.asarray(np.median(values[level >= np.quantile(level, _PAINT_SHARE)], 0), np.float32)
 
 
 def _quantile(values: Colour, share: float) -> Colour:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_row, turn_row
 from arbiview_aug.environment import called, compiled, inlined
 from arbiview_aug.render.plan import OUTSIDE
-from arbiview_aug.scene.boxes import PIECES
+from arbiview_aug.scene.boxes import PARTS, PIECES
 from arbiview_aug.scene.kernels import upsampled_row
 
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
@@ -621,6 +621,8 @@ def mark_objects(q: Any, face: Any, winner: Any, limit: Any, cell: int, layers: 
 def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table: Any) -> tuple[int, int]:
     """Find the unseen pixels of objects, and a sample of seen ones; return their numbers.
 
+    Vehicles without a sample give all their seen pixels.
+
     Args:
         face: (h, w) int32 faces of objects, -1 elsewhere.
         part: (F,) int32 ``scene.boxes.BoxSurface.face_parts``.
@@ -630,7 +632,10 @@ def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table:
         table: (4, h w) int32, written: the attributes of ``view_plan.Paint``.
     """
     h, w = face.shape
-    hidden, sampled = 0, 0
+    hidden, sampled, is_known = 0, 0, np.ones(part.shape[0], np.bool_)
+    for number in range(part.shape[0]):
+        if part[number] % PARTS:
+            is_known[part[number] // PARTS] = False
     for y in range(h):
         for x in range(w):
             number = face[y, x]
@@ -647,7 +652,14 @@ def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table:
                     and face[y, x + margin] == number
                 ):
                     table[2, sampled], table[3, sampled] = y * w + x, part[number]
+                    is_known[part[number] // PARTS] = True
                     sampled += 1
+    for y in range(h):
+        for x in range(w):
+            number = face[y, x]
+            if number >= 0 and winner[y, x] >= 0 and not is_known[part[number] // PARTS]:
+                table[2, sampled], table[3, sampled] = y * w + x, part[number]
+                sampled += 1
     return hidden, sampled
 
 

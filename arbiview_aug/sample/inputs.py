@@ -61,7 +61,8 @@ class Frame:
         sample: The sample it was read from; further entries are read and checked on request.
         lead: Leading dimensions of the sample's images.
         index: Place of the frame in them.
-        once: Parts read once for all stages, by name: neighbours and their points.
+        neighbours: Checked neighbouring frames, once ``sample.neighbours`` has read them.
+        sweeps: Their points, likewise.
     """
 
     images: tuple[torch.Tensor, ...]
@@ -69,7 +70,8 @@ class Frame:
     sample: Mapping[str, Any] = field(default_factory=dict, repr=False)
     lead: tuple[int, ...] = ()
     index: tuple[int, ...] = ()
-    once: dict[str, Any] = field(default_factory=dict, repr=False, init=False)
+    neighbours: list[Any] | None = field(default=None, repr=False, init=False)
+    sweeps: list[FloatArray] | None = field(default=None, repr=False, init=False)
 
     @property
     def number(self) -> int:

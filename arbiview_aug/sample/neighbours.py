@@ -114,10 +114,9 @@ def read_neighbours(frame: Frame, warn: Warn) -> list[Neighbour]:
 
     Frames at the same place are left out silently, unusable ones with a warning. They are read once for each frame.
     """
-    if "neighbours" not in frame.once:
-        frame.once["neighbours"] = _read(frame, warn)
-    neighbours: list[Neighbour] = frame.once["neighbours"]
-    return neighbours
+    if frame.neighbours is None:
+        object.__setattr__(frame, "neighbours", _read(frame, warn))
+    return frame.neighbours or []
 
 
 def _read(frame: Frame, warn: Warn) -> list[Neighbour]:
@@ -151,10 +150,9 @@ def points_of_neighbours(frame: Frame, warn: Warn) -> list[FloatArray]:
     Points that the frame's own contradict are left out, and points that cannot be read, with a warning. They are read
     once for each frame; without points of its own there are none.
     """
-    if "sweeps" not in frame.once:
-        frame.once["sweeps"] = _sweeps(frame, warn)
-    sweeps: list[FloatArray] = frame.once["sweeps"]
-    return sweeps
+    if frame.sweeps is None:
+        object.__setattr__(frame, "sweeps", _sweeps(frame, warn))
+    return frame.sweeps or []
 
 
 def _sweeps(frame: Frame, warn: Warn) -> list[FloatArray]:

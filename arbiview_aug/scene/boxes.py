@@ -64,13 +64,26 @@ def _car(waist: float, rear: float, rear_lean: float) -> tuple[Piece, Piece]:
     return body, Piece(waist, 0.5, rear, 0.25, 0.47, rear_lean, 0.18, 0.09)
 
 
+def _upright_car(waist: float, rear: float, rear_lean: float) -> tuple[Piece, Piece]:
+    """A car whose cabin hardly leans."""
+    body = Piece(-0.5, waist, rear_lean=0.01, front_lean=0.01, side_lean=0.01)
+    return body, Piece(waist, 0.5, rear, 0.2, 0.48, rear_lean, 0.04, 0.03)
+
+
 _BOX = (Piece(-0.5, 0.5),)
-_CARS = tuple(
+_WAISTS = 0.10, 0.03
+_LEANING = tuple(
     _car(waist, *rear)
-    for waist in (0.10, 0.03)
+    for waist in _WAISTS
     for rear in ((-0.47, 0.12), (-0.38, 0.18), (-0.49, 0.05))  # hatchback, saloon, estate
 )
-_VANS = ((Piece(-0.5, 0.0, front_lean=0.02), Piece(0.0, 0.5, -0.5, 0.37, 0.5, 0.01, 0.08, 0.05)), _BOX)
+_UPRIGHT = tuple(
+    _upright_car(waist, *rear)
+    for waist in _WAISTS
+    for rear in ((-0.49, 0.02), (-0.33, 0.04), (-0.15, 0.02))  # off-roader, old saloon, pick-up
+)
+_CARS = *_LEANING, *_UPRIGHT
+_VANS = (Piece(-0.5, 0.0, front_lean=0.02), Piece(0.0, 0.5, -0.5, 0.37, 0.5, 0.01, 0.08, 0.05)), _BOX, *_UPRIGHT
 _LARGE = ((Piece(-0.5, 0.5, front_lean=0.015, rear_lean=0.005, side_lean=0.01),), _BOX)
 _PERSON = ((Piece(-0.5, 0.33, -0.35, 0.35, 0.38), Piece(0.33, 0.5, -0.25, 0.25, 0.2, 0.05, 0.05, 0.05)),)
 _LOOSE_PERSON = (

@@ -1,7 +1,8 @@
 """Scans of a measured scene by other scanners: their rays meet the surfaces between measured points.
 
 Points that nearer ones hide from a scanner are left out. A ray lies between two others above and below it, and returns
-where they are of one surface or it is near enough to one of them: ``completion.meet_points``.
+where they are of one surface or it is near enough to one of them: ``scan_kernels.meet_points``. Below all points it
+returns from the road that the lowest scan line measured: ``scan_kernels.continue_road``.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.scene.panorama import SUPPORT_RAD, Layer
@@ -38,9 +40,9 @@ class Scan(NamedTuple):
 
     Attributes:
         points: (n, 3) float32, ego frame, metres.
-        nearest: (n,) numbers of the measured points that support them.
+        nearest: (n,) numbers of the measured points whose surfaces they are of.
         rings: (n,) beams, counted on from scanner to scanner.
-        unsupported: Share of all rays near which nothing was measured; the sky's are among them.
+        unsupported: Share of all rays that meet nothing measured; the sky's are among them.
     """
 
     points: Layer
@@ -49,20 +51,22 @@ class Scan(NamedTuple):
     unsupported: float
 
 
-def scan(lidars: Sequence[Lidar], points: Points, ground_z_m: float) -> Scan:
+def scan(lidars: Sequence[Lidar], points: Points, ground_z_m: float, swept: int = 0) -> Scan:
     """Scan what one frame measured by scanners at other places.
 
     Args:
         lidars: The scanners, in the frame's ego frame.
         points: (P, 3) finite measured points; those within ``OWN_CAR_M`` are the own car's and are left out.
         ground_z_m: Height of the road.
+        swept: So many of the last points are of other frames. They fill rays that the frame's own do not support.
 
     Raises:
         CalibrationError: A scanner on or under the road.
     """
     points = np.ascontiguousarray(points, np.float32)
     numbers, first = np.flatnonzero(~own_car(points)).astype(np.int32), 0
-    scene = points[numbers]
+    scene, own = points[numbers], int(np.searchsorted(numbers, len(points) - swept))
+    scenes = [scene[:own], scene] if own < len(scene) else [scene]
     parts: list[tuple[Layer, Numbers, Numbers]] = []
     silent = 0
     for lidar in lidars:
@@ -70,59 +74,64 @@ def scan(lidars: Sequence[Lidar], points: Points, ground_z_m: float) -> Scan:
             where = f"a place over the road at z = {ground_z_m:g} m, got z = {lidar.center_m[2]:g} m"
             raise CalibrationError(f"lidar {lidar.name!r}: expected {where}")
         upwards = np.argsort(lidar.elevations_deg, kind="stable")  # cells of rays need beams in order
-        rays = np.ascontiguousarray(lidar.rays[:, upwards])
-        q, nearest = _returns(lidar, rays, scene, ground_z_m)
-        silent += int(np.count_nonzero(nearest < 0))
-        with np.errstate(divide="ignore"):
-            distance = np.float32(1) / q
-        returns = (nearest >= 0) & (distance >= lidar.range_m[0]) & (distance <= lidar.range_m[1])
-        hits = lidar.center_m.astype(np.float32) + (rays[:, returns] * distance[returns]).T
+        rays = np.take(lidar.rays, upwards, axis=1)
+        q, met = _returns(lidar, rays, scenes, ground_z_m)
+        returns = np.flatnonzero(met >= 0)
+        silent += met.size - len(returns)
+        distance = (1 / q.ravel()[returns]).astype(np.float32)
+        in_range = (distance >= lidar.range_m[0]) & (distance <= lidar.range_m[1])
+        returns, distance = returns[in_range], distance[in_range]
+        hits: Layer = lidar.center_m.astype(np.float32) + (np.take(rays.reshape(3, -1), returns, axis=1) * distance).T
         outside = ~own_car(hits)
-        beam, _ = np.nonzero(returns)
-        rings = (first + upwards[beam]).astype(np.int32)
-        parts.append((hits[outside], numbers[nearest[returns][outside]], rings[outside]))
+        returns = returns[outside]
+        rings = (first + upwards[returns // lidar.shape[1]]).astype(np.int32)
+        parts.append((hits[outside], numbers[met.ravel()[returns]], rings))
         first += len(upwards)
     total = sum(math.prod(lidar.shape) for lidar in lidars)
     hits, nearest, rings = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return Scan(hits, nearest, rings, silent / total)
 
 
-def _returns(lidar: Lidar, rays: Layer, points: Points, ground_z_m: float) -> tuple[Layer, Numbers]:
-    """Inverse distances of a scanner's rays (3, ny, nx), 1/m, and the points (P, 3) next to them, or -1."""
-    from arbiview_aug.scene.completion import (
-        block_cones,
-        cells_of,
-        drop_hidden,
-        elevations,
-        meet_points,
-        nearest_points,
-    )
+def _returns(lidar: Lidar, rays: Layer, scenes: Sequence[Points], ground_z_m: float) -> tuple[Layer, Numbers]:
+    """Inverse distances of a scanner's rays (3, ny, nx), 1/m, and the number of the point next to each, or -1.
+
+    Each of ``scenes`` (P, 3) begins with the points of the one before it, and fills rays that this did not.
+    """
+    from arbiview_aug.scene.completion import cells_of, elevations
+    from arbiview_aug.scene.scan_kernels import continue_road, meet_points
 
     size, origin = rays.shape[1:], lidar.center_m.copy()
     q, nearest = np.zeros(size, np.float32), np.full(size, -1, np.int32)
-    if not len(points):
+    if not len(scenes[-1]):
         return q, nearest
-    low, high = elevations(points, origin)
+    low, high = elevations(scenes[-1], origin)
     some = rays[..., :: max(1, int(_ROOM_DEG / lidar.azimuth_step_deg))].reshape(3, -1).T.astype(np.float64)
     window = Window.around(some, SCANNED, (low - SUPPORT_RAD, high + SUPPORT_RAD)).roomy
+    at = np.empty((2, *size), np.float32)
+    cells_of(rays, np.eye(3, dtype=np.float32), window.place, *at)
+    lengths = ground_z_m - origin[2], SCANNED.rad, SUPPORT_RAD / SCANNED.rad, SIDE_SUPPORT_RAD / SCANNED.rad
+    ground, rad, reach, side = np.array(lengths, np.float32)
+    for points in scenes:
+        seen = _visible(window, origin, points)
+        meet_points(*at, rays, *seen, ground, rad, reach, side, q, nearest)
+    continue_road(*at, rays, *seen, ground, side, q, nearest)
+    return q, nearest
+
+
+def _visible(window: Window, origin: FloatArray, points: Points) -> tuple[Numbers, Layer, Numbers]:
+    """The visible points of (P, 3): the one in each cell, or -1, their ``seeds`` (4, n) of ``meet_points``, numbers."""
+    from arbiview_aug.scene.completion import block_cones, cells_of, drop_hidden, nearest_points
+    from arbiview_aug.scene.scan_kernels import place_points
+
     closest, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)
     nearest_points(points, block_cones(points), origin, window.bounds, window.place, closest, number)
     most = window_max(closest, 2 * SCANNED.side, 2 * SCANNED.side)
     visible = SCANNED.see_through, SCANNED.side, len(points)
     cell, directions = drop_hidden(closest, most, number, points, origin, *visible)
-    (row, column), upright = np.divmod(cell, window.shape[1]), np.eye(3, dtype=np.float32)
     at = np.empty((2, 1, len(cell)), np.float32)
-    cells_of(directions, upright, window.place, *at)
-    aside = (at[1, 0] - column + SCANNED.turn / 2) % SCANNED.turn - SCANNED.turn / 2  # a halo holds some twice
-    x, y, z = directions[:, 0] / closest[row, column]
-    seeds = np.stack([at[0, 0], column + aside, 1 / np.hypot(x, y), z]).astype(np.float32)
+    cells_of(directions, np.eye(3, dtype=np.float32), window.place, *at)
     index = np.full(window.shape, -1, np.int32)
-    index[row, column] = np.arange(len(cell))
-    at = np.empty((2, *size), np.float32)
-    cells_of(rays, upright, window.place, *at)
-    lengths = ground_z_m - origin[2], SCANNED.rad, SUPPORT_RAD / SCANNED.rad, SIDE_SUPPORT_RAD / SCANNED.rad
-    meet_points(*at, rays, index, seeds, *np.array(lengths, np.float32), q, nearest)
-    return q, np.where(nearest >= 0, number[row, column][nearest] if len(cell) else nearest, nearest)
+    return index, *place_points(cell, directions[:, 0], closest, number, *at[:, 0], np.float32(SCANNED.turn), index)
 
 
 def warm_up() -> None:

@@ -29,7 +29,7 @@ class RetargetedPoints(NamedTuple):
         points: (n, C) of the type, dtype and device of the measured ones, in their ego frame.
         rings: (n,) int32 beam, counted on from scanner to scanner; -1 where they are as measured.
         counts: (B,) int64 points in each box; None without boxes.
-        unsupported: Share of rays near which nothing was measured; the sky's are among them.
+        unsupported: Share of rays that meet nothing measured; the sky's are among them.
     """
 
     points: Any
@@ -50,14 +50,14 @@ def retarget_points(
     """Measure a frame's scene by a target's scanners, as ``RigRetarget`` does; no images are needed.
 
     Args:
-        points: (P, C >= 3) float tensor or array x y z ... in the frame's ego frame. Columns beyond z are taken from
-            the nearest measured point.
+        points: (P, C >= 3) float tensor or array x y z ... in the frame's ego frame. Columns beyond z are those of
+            the measured point whose surface a ray meets.
         target: A rig with ``lidars``.
         boxes_3d: (B, >= 7) labelled objects, to count the points in each; they change no point.
         ground_z_m: Height of the road in the frame's ego frame.
         skip: Leave the points as they are, and count those in boxes.
-        sweeps: Points (Q, C) of other frames in this frame's ego frame, with the same columns. They fill what the
-            frame's own do not see.
+        sweeps: Points (Q, C) of other frames in this frame's ego frame, with the same columns. They fill
+            rays that the frame's own do not support.
 
     Raises:
         SampleError: Points or boxes of another shape.
@@ -75,11 +75,12 @@ def retarget_points(
     if not skip:
         up = ground_z_m - target.ground_z_m  # scanners keep their rays where nothing moves
         lidars = [lidar.shifted(z_m=up) for lidar in target.lidars] if up else target.lidars
+        own = len(measured)
         if len(sweeps):
             points = _joined(points, sweeps)
             array = as_array("points", points)
             measured = checked_points(array)
-        hits, nearest, rings_of, unsupported = scan(lidars, measured, ground_z_m)
+        hits, nearest, rings_of, unsupported = scan(lidars, measured, ground_z_m, len(measured) - own)
         rows = np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest
         points, measured, rings = _at(points, rows, hits), hits, torch.from_numpy(rings_of)
     counts = None

@@ -31,7 +31,7 @@ from integrations.cross_rig.training import FrameSet, Schedule, answers, evaluat
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.views import ViewMaker
-from integrations.cross_rig.worlds import SPLITS, Split
+from integrations.cross_rig.worlds import OF_TESTS, Split
 
 LEAST_SCORE = 0.3
 """Score of the detections that become boxes of the second pass."""
@@ -112,7 +112,7 @@ class Jittered(FrameSet):
 
 def frames_of(setup: Run, detector: Trained, change: str | None, way: Way, split: Split) -> FrameSet:
     """Frames of a split as a way shows them, with the labels and cells of a vehicle's own; of A for no change."""
-    frames, of_a = setup.true_set(split, change, _count(setup, split)), setup.source(split)
+    frames, of_a = setup.true_set(split, change), setup.source(split)
     if any(way.jitter):
         return Jittered(**vars(frames), jitter=way.jitter)
     if way.variant is not None and change is not None:
@@ -121,10 +121,6 @@ def frames_of(setup: Run, detector: Trained, change: str | None, way: Way, split
     if way.shows == "A":
         return replace(frames, store=of_a.store(), rig=of_a.rig)
     return frames if way.reads_calibration else replace(frames, rig=of_a.rig)
-
-
-def _count(setup: Run, split: Split) -> int:
-    return int(getattr(setup.settings, f"{split}_frames"))
 
 
 def _views(setup: Run, detector: Trained, change: str, variant: Variant, split: Split) -> FrameStore:
@@ -152,7 +148,7 @@ def _views(setup: Run, detector: Trained, change: str, variant: Variant, split: 
         "renderer": code_hash("arbiview_aug.transforms.rig_retarget"),
     }
     rendered = FrameStore(store.folder.parent, spec)
-    for chunk in rendered.missing(_count(setup, split)):
+    for chunk in rendered.missing(setup.settings.count(split)):
         fill(rendered, make, chunk)
     return rendered
 
@@ -160,8 +156,8 @@ def _views(setup: Run, detector: Trained, change: str, variant: Variant, split: 
 @lru_cache(maxsize=2)
 def _detections(setup: Run, detector: Trained, change: str, split: Split) -> list[torch.Tensor]:
     """Boxes (k, 7) that a detector finds in each of B's frames as they are."""
-    frames = setup.true_set(split, change, _count(setup, split))
-    _, found = answers(detector.model, frames, _count(setup, split), detector.schedule)
+    frames = setup.true_set(split, change)
+    _, found = answers(detector.model, frames, setup.settings.count(split), detector.schedule)
     return [torch.from_numpy(boxes[boxes[:, 0] >= LEAST_SCORE, 1:]) for boxes in found]
 
 
@@ -210,17 +206,16 @@ def deploy(setup: Run, titles: list[str] | None, log: Log) -> str:
     one_thread()
     setup = replace(setup, settings=replace(setup.settings, variants=("raw",)))
     setup.prepare()
-    for split, change in product(SPLITS, (None, *setup.settings.changes)):
-        if split != "train" or change is None:
-            list(make_frames(setup.source(split, change), _count(setup, split), 1))
+    for source, count in [*setup.sources(), *setup.tests(None)]:
+        list(make_frames(source, count, 1))
     for job in jobs(setup.settings):
         model, trained = setup.trained(job)
         detector = Trained(model, setup.training_key(job), setup.schedule(job))
         for change, title, way, path in _tests(setup, job):
             if path.is_file() or (titles is not None and title not in titles):
                 continue
-            val, test = (frames_of(setup, detector, change, way, split) for split in ("val", "test"))
-            height = setup.source("test", change).store().stacked("height_dm", _count(setup, "test"))
+            val, test = (frames_of(setup, detector, change, way, split) for split in OF_TESTS)
+            height = setup.source("test", change).store().stacked("height_dm", setup.settings.test_frames)
             tested = evaluate(model, val, test, height, detector.schedule)
             text = json.dumps(counts_of(job, change or "A", trained, tested))
             write_file(path, partial(Path.write_text, data=text))

@@ -23,7 +23,7 @@ from integrations.cross_rig.labels import Grid, covered_cells
 from integrations.cross_rig.settings import LONGER, Job, Length, Settings, jobs
 from integrations.cross_rig.training import Draws, FrameSet, Schedule, Tested, evaluate, train, untrained
 from integrations.cross_rig.variant import Variant
-from integrations.cross_rig.worlds import CHANGES, SPLITS, Split
+from integrations.cross_rig.worlds import CHANGES, OF_TESTS, SPLITS, Split
 
 Log = Callable[[str], None]
 
@@ -54,12 +54,15 @@ class Run:
         """Every set that the run needs and its length, in the order in which they can be made."""
         s = self.settings
         needed = [(self.source("train"), s.train_frames)]
-        for change in s.changes:
-            needed += [(self.source("val", change), s.val_frames), (self.source("test", change), s.test_frames)]
+        needed += [true for change in s.changes for true in self.tests(change)]
         for job in jobs(s):
             images = self.images(job)
             needed += [(source, s.train_frames) for source in (*images.needs(), images)]
         return list({source.store().key: (source, count) for source, count in needed}.values())
+
+    def tests(self, change: str | None) -> list[tuple[Source, int]]:
+        """A vehicle's true frames for the threshold and the test, and their numbers."""
+        return [(self.source(split, change), self.settings.count(split)) for split in OF_TESTS]
 
     def images(self, job: Job) -> Source:
         """Frames that a job is trained on."""
@@ -72,10 +75,10 @@ class Run:
         own = job.variant.renders
         return self._frames(images, labels, self.settings.train_frames, own=own, masked=job.variant.masked)
 
-    def true_set(self, split: Split, change: str | None, num_frames: int) -> FrameSet:
+    def true_set(self, split: Split, change: str | None = None) -> FrameSet:
         """Frames as a rig really sees them."""
         source = self.source(split, change)
-        return self._frames(source, source, num_frames, own=False, masked=True)
+        return self._frames(source, source, self.settings.count(split), own=False, masked=True)
 
     def _frames(self, images: Source, labels: Source, count: int, *, own: bool, masked: bool) -> FrameSet:
         state, boxes = labels.store().stacked("state", count), self.box_store(labels).stacked("boxes", count)
@@ -89,7 +92,7 @@ class Run:
     def prepare(self) -> None:
         """Make what all frames need."""
         for split in SPLITS:
-            make_boxes(self.source(split), getattr(self.settings, f"{split}_frames"))
+            make_boxes(self.source(split), self.settings.count(split))
 
     def title(self, change: str) -> str:
         """Title of a change in tables."""
@@ -107,8 +110,8 @@ class Run:
 
     def draws(self, job: Job) -> Draws:
         """The batches of a job's training."""
+        raw = self.true_set("train") if job.variant.mixed else None
         count = self.settings.train_frames
-        raw = self.true_set("train", None, count) if job.variant.mixed else None
         return Draws(self.training_set(job), raw, count, job.seed, augmented=job.variant.augmented)
 
     # --- trainings and tests ----------------------------------------------------------------------------------------
@@ -149,14 +152,9 @@ class Run:
 
     def result_path(self, job: Job, change: str) -> Path:
         """File of a test's counts; the frames must be there."""
-        s = self.settings
-        key = content_hash(
-            {
-                "training": self.training_key(job),
-                "val": [self._content(self.source("val", change), s.val_frames), s.val_frames],
-                "test": [self._content(self.source("test", change), s.test_frames), s.test_frames],
-            }
-        )
+        spec: dict[str, Any] = {"training": self.training_key(job)}
+        spec |= {source.split: [self._content(source, count), count] for source, count in self.tests(change)}
+        key = content_hash(spec)
         return self.output / "results" / f"{change}-{job.seed}-{key}.json"
 
     def result_paths(self, job: Job) -> dict[str, Path]:
@@ -165,8 +163,7 @@ class Run:
         own = [(self.images(job), s.train_frames), (self.source("train"), s.train_frames)]
         found = {}
         for change in self.tested_on(job):
-            needed = [*own, (self.source("val", change), s.val_frames), (self.source("test", change), s.test_frames)]
-            if not any(source.store().missing(count) for source, count in needed):
+            if not any(source.store().missing(count) for source, count in [*own, *self.tests(change)]):
                 found[change] = self.result_path(job, change)
         return found
 
@@ -187,8 +184,7 @@ class Run:
         for change in self.tested_on(job):
             path = self.result_path(job, change)
             if not path.is_file():
-                val = self.true_set("val", change, self.settings.val_frames)
-                test = self.true_set("test", change, self.settings.test_frames)
+                val, test = (self.true_set(split, change) for split in OF_TESTS)
                 height = test.store.stacked("height_dm", self.settings.test_frames)
                 tested = evaluate(model, val, test, height, self.schedule(job))
                 text = json.dumps(counts_of(job, change, trained, tested))

@@ -16,8 +16,10 @@ import numpy as np
 import torch
 
 from arbiview_aug import Rig
+from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.datasets import LazyFrame, Neighbours
 from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
+from arbiview_aug.datasets.synthetic.scene import SceneClass
 from arbiview_aug.scene.depth_map import motion_camera
 from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
@@ -286,20 +288,32 @@ class _Later(SyntheticDrive):
         return self.drive.scene(index).after(self.seconds)
 
 
+_OUTLINE_PX = 5
+"""Side of the window by which outlines are widened."""
+
+
 class _ChangedFrames:
-    """Rendered views with the truth in their holes, or over them."""
+    """Rendered views with the truth in their holes, over them, or in the outlines of vehicles."""
 
     def __init__(self, source: Source) -> None:
         assert source.variant is not None
         self.variant, self.width = source.variant, source.size[1]
-        self.store, self.truth = source.rendered().store(), source.true().store()
+        self.store, self.truth, self.drive = source.rendered().store(), source.true().store(), source.drive(source.rig)
 
     def __call__(self, index: int) -> Arrays:
         start = time.process_time()
         arrays = {name: self.store.read(index, name) for name in ("images", "K", "cam2ego", "cpu_s")}
         covered = np.unpackbits(self.store.read(index, "coverage"), axis=-1, count=self.width).astype(bool)
-        shown = covered if self.variant.truth == "covered" else ~covered
+        of_vehicles = self.variant.truth == "vehicles"
+        shown = self._vehicles(index) if of_vehicles else covered == (self.variant.truth == "covered")
         arrays["images"] = np.where(shown[:, None], self.truth.read(index, "images"), arrays["images"])
         arrays["coverage"] = np.packbits(covered | shown, axis=-1)
         arrays["cpu_s"] = (arrays["cpu_s"] + time.process_time() - start).astype(np.float32)
         return arrays
+
+    def _vehicles(self, index: int) -> BoolArray:
+        """(M, h, w) bool: B's true outlines of vehicles, widened."""
+        classes = self.drive.render(index).classes
+        window = np.ones((_OUTLINE_PX, _OUTLINE_PX), np.uint8)
+        shown = [cv2.dilate((view.numpy() == SceneClass.VEHICLE).astype(np.uint8), window) for view in classes]
+        return np.stack(shown).astype(bool)

@@ -33,7 +33,7 @@ from integrations.cross_rig.training import FrameSet
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.views import ViewMaker
-from integrations.cross_rig.worlds import SPLITS, Split
+from integrations.cross_rig.worlds import OF_TESTS, SPLITS, Split
 
 _VEHICLES = {"vehicle", "car", "van", "truck", "bus", "trailer"}
 _NO_VEHICLES = {"bicycle", "motorcycle", "cyclist", "human", "pedestrian", "static", "movable"}
@@ -250,7 +250,7 @@ def recorded_run(a: str, b: str, settings: Settings, output: Path) -> RecordedRu
     """
     check_variants(named_rows("variants", settings.variants, VARIANTS))
     train = min(len(frames_of(a, None)), len(frames_of(b, "train")), settings.train_frames)
-    counts = {f"{s}_frames": min(len(frames_of(b, s)), getattr(settings, f"{s}_frames")) for s in ("val", "test")}
+    counts: dict[str, Any] = {f"{s}_frames": min(len(frames_of(b, s)), settings.count(s)) for s in OF_TESTS}
     for data in (a, b):
         vehicles_of(recording(data)[0], data)
     return RecordedRun(a=a, b=b, settings=replace(settings, train_frames=train, **counts), output=output)

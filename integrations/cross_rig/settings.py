@@ -12,7 +12,7 @@ from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.training import Schedule
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.variants import VARIANTS
-from integrations.cross_rig.worlds import CHANGES, STREETS, Size, World
+from integrations.cross_rig.worlds import CHANGES, STREETS, Size, Split, World
 
 T = TypeVar("T")
 
@@ -88,6 +88,10 @@ class Settings:
         for name in ("train_frames", "val_frames", "test_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a whole number above 0, got {getattr(self, name)}")
+
+    def count(self, split: Split) -> int:
+        """Number of frames of a set of streets."""
+        return int(getattr(self, f"{split}_frames"))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -41,8 +41,8 @@ class Variant:
         noise: Error of the geometry that it is given (``noise.py``); the labels are right.
         labels: Whose rig says which vehicles are hidden: A's, which recorded, B's views as they were rendered
             (``visible_boxes``). None: A's, and for an oracle B's true ones.
-        truth: To find out where the rest is lost: B's true pixels where something is covered, or where nothing is
-            (which then counts as seen).
+        truth: To find out where the rest is lost: B's true pixels where something is covered, where nothing is, or
+            in and beside the outlines of vehicles (which then count as seen).
     """
 
     name: str
@@ -58,7 +58,7 @@ class Variant:
     priors: bool = False
     noise: Noise | None = None
     labels: Literal["A", "views"] | None = None
-    truth: Literal["covered", "holes"] | None = None
+    truth: Literal["covered", "holes", "vehicles"] | None = None
 
     @property
     def renders(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 from arbiview_aug.choices import GeometryName
@@ -21,11 +22,15 @@ _LESS: tuple[tuple[str, str, GeometryName, tuple[Geometry, ...]], ...] = (
 _ALL: tuple[Geometry, ...] = ("points", "boxes_3d")
 _filled = partial(Variant, kind="retarget", reads=_ALL, holes="fill", masked=False)
 """``auto`` for a network that lifts every pixel."""
+_RAW = Variant(name="raw", title="raw A", kind="raw")
+_AUTO = _filled(name="auto_fill", title="auto, filled holes, no mask")
+_AROUND_B = _filled(name="auto_fill_random", title="RandomRig around B, auto, filled holes, no mask", random="B")
+_AROUND_A = _filled(name="random_a", title="random rigs around A, auto, filled holes, no mask", random="A")
 
 VARIANTS: dict[str, Variant] = {
     variant.name: variant
     for variant in (
-        Variant(name="raw", title="raw A", kind="raw"),
+        _RAW,
         Variant(name="scale_crop", title="raw A, scaled and cropped", kind="raw", augmented=True),
         Variant(name="auto", title="auto: LiDAR, boxes", kind="retarget", surface="auto", reads=_ALL),
         Variant(
@@ -37,7 +42,7 @@ VARIANTS: dict[str, Variant] = {
             noise="depth",
         ),
         Variant(name="auto_black", title="auto, black holes, no mask", kind="retarget", reads=_ALL, masked=False),
-        _filled(name="auto_fill", title="auto, filled holes, no mask"),
+        _AUTO,
         _filled(name="auto_fill_mixed", title="auto, filled holes, no mask, + raw", mixed=True),
         *(
             _filled(
@@ -56,6 +61,7 @@ VARIANTS: dict[str, Variant] = {
         Variant(
             name="true_holes", title="auto, holes filled with the truth", kind="retarget", reads=_ALL, truth="holes"
         ),
+        _filled(name="true_vehicles", title="auto, filled holes, no mask, true vehicles", truth="vehicles"),
         Variant(
             name="auto_neighbours",
             title="auto, near road from other frames",
@@ -79,21 +85,11 @@ VARIANTS: dict[str, Variant] = {
         _filled(
             name="recipe", title="recipe: auto, filled, no mask, labels of the views, + raw", labels="views", mixed=True
         ),
-        _filled(name="auto_fill_random", title="RandomRig around B, auto, filled holes, no mask", random="B"),
-        _filled(name="random_a", title="random rigs around A, auto, filled holes, no mask", random="A"),
-        Variant(name="raw_priors", title="raw A; camera maps", kind="raw", priors=True),
-        _filled(name="auto_fill_priors", title="auto, filled holes, no mask; camera maps", priors=True),
-        _filled(
-            name="auto_fill_random_priors",
-            title="RandomRig around B, auto, filled holes, no mask; camera maps",
-            random="B",
-            priors=True,
-        ),
-        _filled(
-            name="random_a_priors",
-            title="random rigs around A, auto, filled holes, no mask; camera maps",
-            random="A",
-            priors=True,
+        _AROUND_B,
+        _AROUND_A,
+        *(
+            replace(variant, name=f"{variant.name}_priors", title=f"{variant.title}; camera maps", priors=True)
+            for variant in (_RAW, _AUTO, _AROUND_B, _AROUND_A)
         ),
         Variant(name="oracle_labels", title="B's own frames, A's labels", kind="oracle", labels="A"),
         Variant(name="oracle_mixed", title="B's own frames, + raw", kind="oracle", mixed=True),

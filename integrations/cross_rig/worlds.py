@@ -22,6 +22,8 @@ World = Literal["drive", "cuboids"]
 """Generators of streets: ``SyntheticDrive``, and the one of ``cuboids`` with other shapes, textures and light."""
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
+OF_TESTS = SPLITS[1:]
+"""Streets of vehicle B: for thresholds, and for tests."""
 
 STREETS = 100
 """The world that constants of the renderer were chosen on; another hundred is another world."""

@@ -468,6 +468,33 @@ def test_sides_take_the_seen_pixels_in_their_row_and_column() -> None:
     assert abs(int(out[0, 42, 35]) - (median + 120 * reach / far) / (1 + reach / far)) <= 1
 
 
+def test_unseen_cabins_and_bodies_have_colours_of_their_own() -> None:
+    face = np.full((64, 64), -1, np.int32)
+    face[10:30, 4:60], face[30:50, 4:60] = 4, 0  # the cabin, and a side of the body
+    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
+    view[:, 10:30, 4:60], view[:, 30:50, 4:60] = 30, 150
+    right = np.tile(np.where(np.arange(64) < 56, 0, -1), (64, 1)).astype(np.int8)  # its end is hidden
+    paint = find_paint(face, right, FACE_PARTS)
+    np.testing.assert_array_equal(object_colours([view.numpy()], [paint])[:5, 0], [30, 150, 150, 150, 150])
+    red = torch.tensor([180, 50, 10], dtype=torch.uint8)[:, None, None]
+    view[:, 10:30, 4:60], view[:, 12:20, 4:60] = torch.tensor([40, 60, 90])[:, None, None], red  # windows in red paint
+    paint = find_paint(face, np.where((face == 4) | (face < 0), 0, -1).astype(np.int8), FACE_PARTS)
+    np.testing.assert_array_equal(object_colours([view.numpy()], [paint])[1], red[:, 0, 0])  # no mixture of the two
+
+
+def test_vehicles_of_which_only_an_edge_is_seen_are_painted() -> None:
+    face = np.full((64, 64), -1, np.int32)
+    face[20:50, 10:54] = 0
+    seen = np.ones(face.shape, bool)
+    seen[21:50, 10:54] = False  # one row remains
+    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
+    view[:, 20, 10:54] = 60
+    paint = find_paint(face, np.where(seen, 0, -1).astype(np.int8), FACE_PARTS)
+    assert len(paint.sample) == 44 and object_colours([view.numpy()], [paint])[1, 0] == 60
+    small = find_paint(face, np.where(seen, 0, -1).astype(np.int8), np.zeros(1, np.int32))
+    assert len(small.sample) == 0  # of a barrier or a head, an edge may be anything
+
+
 def test_objects_that_nobody_sees_are_background() -> None:
     face = np.full((64, 64), -1, np.int32)
     face[20:50, 10:30], face[20:50, 30:44] = 0, 6  # the second one stands behind the first

@@ -45,7 +45,7 @@ def test_of_a_near_box_few_pixels_suffice() -> None:
     near["boxes_3d"] = torch.tensor([[10.0, 0, 1, 4, 2, 2, 0]])
     left, top, right, bottom = (int(end) for end in project_boxes_3d(near["boxes_3d"], near)[0].boxes[0])
     assert (right - left) * (bottom - top) > 10 * 80  # a tenth of it is more
-    for seen_px, expected in ((80, True), (40, False)):
+    for seen_px, expected in ((40, True), (20, False)):
         coverage = torch.zeros((1, 640, 960), dtype=torch.bool)
         coverage[0, (top + bottom) // 2 :, (left + right) // 2] = True
         coverage[0, (top + bottom) // 2 + seen_px :] = False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -90,6 +91,48 @@ def test_a_road_goes_on_up_to_an_object() -> None:
     x, y, z = b.center_m[:, None, None] + b.rays * true
     before = (true > 0) & (np.abs(z) < 0.01) & (np.abs(y) < 0.9) & (x > 4.4) & (x < 4.97)
     assert before.any() and (np.abs(got - true)[before] < 0.05).mean() > 0.95
+
+
+def test_a_road_goes_on_under_the_lowest_line() -> None:
+    """Not under an object that this line meets, nor under farther lines."""
+    b = replace(scanner(48, at(z=2.0)), elevations_deg=tuple(np.linspace(-40, 0, 48)))
+    below, aside = np.array(b.elevations_deg) < -22, np.abs(np.arange(480) - 240) > 140  # beyond the own car
+
+    def scanned(lowest_deg: float, with_box: bool = False) -> np.ndarray:
+        a = replace(scanner(32, at()), elevations_deg=tuple(np.linspace(lowest_deg, 10, 32)))
+        return ranges(b, scan([b], measured(a, with_box=with_box), 0.0))[below]
+
+    got, true = scanned(-15.0), true_ranges(b)[below]
+    np.testing.assert_allclose(got[:, aside], true[:, aside], atol=0.02)
+    assert (scanned(-15.0, with_box=True)[:, 210:270] == 0).all()
+    assert not scanned(-8.0).any()
+
+
+def test_a_top_ends_at_its_face() -> None:
+    """Rays between a point on a box and one on its front meet what is farther: the front under the edge, or the top."""
+    top, face = [[5.2, 0.0, 1.0], [5.9, 0.0, 1.0], [6.6, 0.0, 1.0]], [[5.0, 0.0, 0.9], [5.0, 0.0, 0.8]]
+    points, edge_deg = np.array(face + top, np.float32), float(np.degrees(np.arctan2(-0.9, 5.0)))
+    for deg in (edge_deg - 0.3, edge_deg + 0.1):
+        ray = replace(scanner(1, at()), elevations_deg=(deg,), azimuth_step_deg=0.25)
+        expected_m = 5.0 if deg < edge_deg else -0.9 / np.tan(np.radians(deg))
+        np.testing.assert_allclose(scan([ray], points, 0.0).points[:, 0], expected_m, atol=0.02)
+
+
+def test_other_frames_fill_what_the_own_scan_does_not_support() -> None:
+    a, b = scanner(32, at()), scanner(64, at())
+    points, nearer = measured(a), measured(scanner(64, at()), with_box=True)
+    own = points[points[:, 1] < 2]
+    alone = ranges(b, scan([b], own, 0.0))
+    filled = ranges(b, scan([b], np.concatenate([own, nearer]), 0.0, swept=len(nearer)))
+    np.testing.assert_array_equal(filled[alone > 0], alone[alone > 0])
+    assert (filled > 0).sum() > 1.2 * (alone > 0).sum()
+
+
+def test_columns_are_those_of_the_surface() -> None:
+    """A ray that is nearer to a point on the road may pass it and meet the foot of an object."""
+    points = np.array([[20.0, 0.0, 0.0], [20.2, 0.0, 0.45], [20.2, 0.0, 0.75]], np.float32)
+    lidar = replace(scanner(1, at()), elevations_deg=(-5.2,), azimuth_step_deg=0.1)
+    assert set(scan([lidar], points, 0.0).nearest) == {1}
 
 
 def test_an_object_hides_the_wall() -> None:

@@ -115,10 +115,12 @@ def test_people_in_loose_boxes_barriers_and_two_wheelers_leave_room() -> None:
 
 
 def test_points_choose_among_profiles() -> None:
-    for number in OF_KIND[0]:
-        planes = profile_planes(CAR[0], number)
-        chosen, is_own = solids_among(CAR, surface_points(planes, CAR[0]))
-        assert np.allclose(chosen[0], planes) and is_own.mean() > 0.9
+    pick_up = np.array([[12.0, 0.5, 0.98, 5.3, 1.93, 1.96, np.pi]])  # as high as a van
+    for box in (CAR, pick_up):
+        for number in OF_KIND[kinds(box)[0]]:
+            planes = profile_planes(box[0], number)
+            chosen, is_own = solids_among(box, surface_points(planes, box[0]))
+            assert np.allclose(chosen[0], planes) and is_own.mean() > 0.9
     assert len(PROFILES) > len(OF_KIND[0])
 
 

@@ -28,7 +28,7 @@ TRUTH_COLUMNS = (
 TRUTH_NOTES = (
     "seen: share of the target's pixels. ground, objects, sky: PSNR there. MAE in grey levels of 255. holes, hole MAE: "
     "pixels that no source saw. texture: distance of the radial power spectrum there to the truth's; 0 is the truth's. "
-    "whole view: PSNR of all pixels; holes are black unless a path fills them."
+    "whole view: PSNR of all pixels; holes are black unless they are filled."
 )
 PHOTOGRAPH_COLUMNS = (
     SEEN,

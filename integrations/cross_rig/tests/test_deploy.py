@@ -1,5 +1,7 @@
 """A's detectors on B's frames: what is shown, and a whole run at toy size that goes on where it was."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,19 +9,11 @@ from integrations.cross_rig import __main__ as command
 from integrations.cross_rig import cache, deploy
 from integrations.cross_rig.deploy import ON_A, ON_B, Jittered, Trained, frames_of, rows_of
 from integrations.cross_rig.experiment import Run
-from integrations.cross_rig.settings import Settings, jobs
-from integrations.cross_rig.training import Schedule, untrained
+from integrations.cross_rig.settings import jobs
+from integrations.cross_rig.tests import test_experiment
+from integrations.cross_rig.training import untrained
 
-TINY = Settings(
-    size=(24, 64),
-    train_frames=2,
-    val_frames=1,
-    test_frames=2,
-    seeds=(0,),
-    changes=("fisheye", "up70", "waymo"),
-    variants=("raw",),
-    schedule=Schedule(steps=2, batch=2, precision="fp32"),
-)
+TINY = replace(test_experiment.TINY, changes=("fisheye", "up70", "waymo"), variants=("raw",))
 
 
 def test_rows_are_those_that_say_something(tmp_path):
@@ -67,7 +61,6 @@ def test_frames_are_shown_as_their_rows_say(done):
         assert frame.coverage.all() == (not has_holes)
     np.testing.assert_array_equal(frames["as is"].images, frames["calibration not read"].images)
     assert len({frame.images.tobytes() for frame in frames.values()}) > 5
-
 
 
 @pytest.mark.slow

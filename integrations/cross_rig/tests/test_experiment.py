@@ -94,12 +94,11 @@ def test_variants_with_the_same_frames_are_one_training(done):
 
 @pytest.mark.slow
 def test_true_pixels_replace_what_was_rendered(done):
-    """The two variants of the diagnosis: the truth where something was seen, or where nothing was."""
-    more = replace(
-        done, settings=replace(TINY, changes=("up70",), variants=("auto", "true_covered", "true_holes", "oracle"))
-    )
+    """The variants of the diagnosis: the truth where something was seen, where nothing was, or at vehicles."""
+    variants = "auto", "true_covered", "true_holes", "true_vehicles", "oracle"
+    more = replace(done, settings=replace(TINY, changes=("up70",), variants=variants))
     assert list(run(more, 1, lambda line: None))[-1] == 0
-    auto, covered, holes, oracle = (more.training_set(job).frame(1) for job in jobs(more.settings))
+    auto, covered, holes, vehicles, oracle = (more.training_set(job).frame(1) for job in jobs(more.settings))
     seen = np.broadcast_to(auto.coverage[:, None], auto.images.shape)
     assert 0.05 < 1 - seen.mean() < 0.95
     np.testing.assert_array_equal(covered.coverage, auto.coverage)
@@ -108,6 +107,8 @@ def test_true_pixels_replace_what_was_rendered(done):
     assert holes.coverage.all()
     np.testing.assert_array_equal(holes.images[seen], auto.images[seen])
     np.testing.assert_array_equal(holes.images[~seen], oracle.images[~seen])
+    true = (vehicles.images == oracle.images).all(axis=1)
+    assert vehicles.coverage.all() and 0.02 < true.mean() < 0.95
 
 
 @pytest.mark.slow
