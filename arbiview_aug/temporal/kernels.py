@@ -53,9 +53,9 @@ def match_walls(
     """Costs (h, K, w) of surfaces by the normalised cross-correlation of windows.
 
     ``rays`` (3, h, w) are in the neighbour's frame, where they start at ``offset`` (3,); for a pinhole both are times
-    its intrinsics. ``nodes`` are every ``NODE_PX``-th of them, of ``road`` and of ``horizontal``, which are those of a
-    ``SweptImage``, as ``windows`` are. ``walls`` (K,) are 1/radius, ascending; ``lens`` is the neighbour's code, its
-    ``Camera.parameters``, and positions (K, 2, h, w) for a negative code; ``quads`` (H, W) are those of its image.
+    its intrinsics. ``nodes`` are every ``NODE_PX``-th and the last of them, of ``road`` and of ``horizontal``. Those,
+    and ``windows``, are of a ``SweptImage``. ``walls`` (K,) are 1/radius, ascending; ``lens`` is the neighbour's code,
+    its ``Camera.parameters``, and positions (K, 2, h, w) for a negative code; ``quads`` (H, W) are those of its image.
     """
     h, w = road.shape
     surface, lines, sums = (rays, road, horizontal), np.empty((7, w), np.float32), np.empty((3, w + _WIDER), np.int32)

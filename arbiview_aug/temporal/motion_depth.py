@@ -32,7 +32,7 @@ from arbiview_aug.scene.depth_map import DepthMap, Maps, anchored_maps, motion_c
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.scene.scene import GEOMETRIES, Geometry, Scene
 from arbiview_aug.temporal.moving import stand_on_road
-from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, reduced_grey
+from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, read_at, reduced_grey
 
 BEST_TRAVEL_M, TRAVEL_M = 1.2, (0.4, 3.0)
 """Best travel to a neighbour, and the range allowed: shorter baselines measure nothing, longer ones hide too much."""
@@ -181,8 +181,7 @@ def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands
     wall, clear = find_least(aggregate(costs), walls[1], image.road / np.maximum(image.horizontal, np.float32(1e-6)))
     q = image.inverse_distance(wall)
     step = cv2.dilate(q, _AROUND) - cv2.erode(q, _AROUND)
-    at = [image.positions(o.camera, q) for o in others]
-    visible = [cv2.remap(o.unmasked, u, v, cv2.INTER_NEAREST) for o, (u, v) in zip(others, at, strict=True)]
+    visible = [read_at(o.unmasked, image.positions(o.camera, q), cv2.INTER_NEAREST) for o in others]
     valid = clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0)
     if stands:
         q, valid = stand_on_road(image, others, costs, float(walls[1]), q, valid)
@@ -340,7 +339,7 @@ def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray]
     """
     other, q = sample.other, sample.inverse_distance
     at, nearer = (sample.image.positions(other.camera, np.float32(factor) * q) for factor in (1, 1.1))
-    warped: Any = cv2.remap(other.grey, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    warped = read_at(other.grey, at)
     one, two = _normalised(sample.image.grey), _normalised(warped)
     mean = (sample.image.grey + warped) / 2
     # Gradients of the warped image stand for those of the neighbour's: the warp is close to the identity.
@@ -353,13 +352,13 @@ def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray]
     if not len(use):
         return None
     use = use[:: max(1, len(use) // _MANY_PIXELS)]
-    ex, ey, length, gx, gy, difference = (one.ravel()[use] for one in (ex, ey, length, gx, gy, one - two))
+    ex, ey, length, gx, gy, difference = (np.ravel(part)[use] for part in (ex, ey, length, gx, gy, one - two))
     motion = _motion(sample, use, at.reshape(2, -1)[:, use])
     normal = np.stack([-ey, ex], -1) / length[:, None]
     off_line = np.einsum("nk,nkp->np", normal, motion)  # [n, 5] px per unit
     gradient = gx * normal[:, 0] + gy * normal[:, 1]
     # Pixels read by the erroneous pose are displaced by its error: two(x) = one(x - off_line).
-    return np.asarray(gradient[:, None] * off_line), np.asarray(difference), motion
+    return gradient[:, None] * off_line, difference, motion
 
 
 def _normalised(image: Layer) -> Layer:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.temporal.plane_sweep import SweptImage
+from arbiview_aug.temporal.plane_sweep import SweptImage, read_at
 
 SLOPE_DEG = 1.0
 """Pitch of the vehicle against its road, and of the road against a plane: feet that are so far off may be right."""
@@ -94,24 +94,20 @@ def _road_flow(image: SweptImage, other: SweptImage, road: Layer) -> _RoadFlow:
     """The flow in the rows that show some road; above them, nothing is seen."""
     first = max(0, int((road > 0).any(1).argmax()) - 2 * _PATCH_PX)
     at = image.positions(other.camera, road)
-    seen = _read(other.unmasked, at, cv2.INTER_NEAREST) > 0
+    seen = read_at(other.unmasked, at, cv2.INTER_NEAREST) > 0
     seen[:first] = False
-    warped = np.where(seen, _read(other.grey, at), image.grey)
+    warped = np.where(seen, read_at(other.grey, at), image.grey)
     grey, warped = (np.rint(one[first:]).astype(np.uint8) for one in (image.grey, warped))
     moved = np.zeros((*road.shape, 2), np.float32)
     cv: Any = cv2  # whose stubs lack DIS flow
     dis = cv.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     moved[first:] = dis.calc(grey, warped, None) if min(grey.shape) >= _LEAST_DIS_PX else 0
     towards = cv2.split(image.camera.pixel_grid().astype(np.float32) + moved)
-    matching = np.stack([_read(one, towards) for one in at])
+    matching = np.stack([read_at(one, towards) for one in at])
     (x, y), (ex, ey) = matching - at, image.positions(other.camera, np.float32(1.1) * road + np.float32(1e-4)) - at
     length = np.maximum(cv2.magnitude(ex, ey), np.float32(1e-9))
     flow = np.stack([(x * ex + y * ey) / length, (y * ex - x * ey) / length])
     return _RoadFlow(other, flow, seen, matching)
-
-
-def _read(image: Any, at: Sequence[Any] | Layer, interpolation: int = cv2.INTER_LINEAR) -> Any:
-    return cv2.remap(image, at[0], at[1], interpolation, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _stand_off_road(
@@ -186,7 +182,7 @@ def _correlations(image: SweptImage, flows: Sequence[_RoadFlow], rows: Any, colu
         if not flow.seen[rows, columns].any():
             continue
         affine = np.linalg.lstsq(pixels.astype(np.float64), flow.at[:, rows, columns].T, rcond=None)[0]
-        two = _read(flow.other.grey, cv2.split((grid @ affine).astype(np.float32)))
+        two = read_at(flow.other.grey, cv2.split((grid @ affine).astype(np.float32)))
         products = one, two, one * one, two * two, one * two
         means = [cv2.blur(product, side, borderType=cv2.BORDER_REPLICATE) for product in products]
         variances = [np.maximum(means[k + 2] - means[k] ** 2, 0) + NOISE_LEVELS**2 for k in range(2)]

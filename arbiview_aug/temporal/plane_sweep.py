@@ -7,6 +7,7 @@ zero-mean normalised cross-correlation of small windows.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -141,11 +142,17 @@ class SweptImage:
             A, offset = K @ A, K @ offset
         rays = (A @ self.rays.reshape(3, -1)).reshape(3, h, w)
         surfaces = rays, self.road, self.horizontal
-        nodes = tuple(np.ascontiguousarray(one[..., ::NODE_PX, ::NODE_PX]) for one in surfaces)
+        y, x = (np.minimum(np.arange(0, n + NODE_PX - 1, NODE_PX), n - 1) for n in (h, w))
+        nodes = tuple(np.ascontiguousarray(one[..., y[:, None], x]) for one in surfaces)
         costs = np.empty((h, len(walls), w), np.uint16)
         walls = np.ascontiguousarray(walls)  # another layout would be compiled, too
         match_walls(*surfaces, nodes, self.windows, walls, offset, lens, other.quads, costs)
         return costs
+
+
+def read_at(image: Any, at: Sequence[Any] | Layer, interpolation: int = cv2.INTER_LINEAR) -> Any:
+    """Read an image at pixels, u and v (h, w); the border's beyond it."""
+    return cv2.remap(image, at[0], at[1], interpolation, borderMode=cv2.BORDER_REPLICATE)
 
 
 def reduced_grey(camera: Camera, image: torch.Tensor) -> Layer:

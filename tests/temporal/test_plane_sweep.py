@@ -102,6 +102,22 @@ def test_costs_are_correlations(lens: str) -> None:
         assert error.max() < 0.02 and error.mean() < 1e-3
 
 
+def test_a_neighbour_that_looks_away_sees_nothing() -> None:
+    image, other = swept(camera()), swept(camera(position_m=(0.5, 0, 1.5)).turned(yaw_deg=180))
+    assert (image.costs(other, WALLS) == INVALID).all()
+
+
+@pytest.mark.parametrize("yaw_deg", [-25.0, 25.0])
+def test_all_that_a_turned_neighbour_sees_is_matched(yaw_deg: float) -> None:
+    """On the border of what it sees, and nowhere else, single precision may differ."""
+    image, other = swept(camera()), swept(camera(position_m=(1.5, 0.3, 1.5)).turned(yaw_deg=yaw_deg))
+    costs = image.costs(other, WALLS)
+    for k in range(0, len(WALLS), 5):
+        u, v = image.positions(other.camera, image.inverse_distance(WALLS[k]))
+        inside = (u >= 0.5) & (v >= 0.5) & (u < SIZE[1] - 1.5) & (v < SIZE[0] - 1.5)
+        assert ((costs[:, k] != INVALID) != inside).mean() < 2e-3
+
+
 def test_exposure_does_not_matter() -> None:
     image, there = swept(camera()), camera(position_m=(0.5, 0, 1.5))
     one = image.costs(SweptImage(there, image.grey, 0.0), WALLS).astype(float)
