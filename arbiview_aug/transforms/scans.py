@@ -158,6 +158,6 @@ def words_of(part: RetargetedPoints, frame: Frame, target: Rig) -> str:
     rays = sum(math.prod(lidar.shape) for lidar in target.lidars)
     return (
         f"points: {len(frame.entry('points'))} measured, {len(part.points)} by the target's "
-        f"{', '.join(lidar.name for lidar in target.lidars)} ({rays} rays); nothing was measured near "
-        f"{part.unsupported:.0%} of the rays, the sky's among them"
+        f"{', '.join(lidar.name for lidar in target.lidars)} ({rays} rays); "
+        f"{part.unsupported:.0%} of the rays, the sky's among them, meet nothing that was measured"
     )
