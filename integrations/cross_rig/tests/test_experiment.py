@@ -220,7 +220,7 @@ def test_presets():
     # Raw and scale/crop once for each seed, five variants for each change.
     assert len(jobs(pilot())) == 3 * (2 + 3 * 5)
     names = [job.name for job in jobs(full())]
-    assert len(names) == len(set(names)) == 3 * (5 + 10 * 27)
+    assert len(names) == len(set(names)) == 3 * (5 + 10 * 28)
 
 
 @pytest.mark.slow
