@@ -200,8 +200,8 @@ def test_neighbouring_scans_fill_what_one_does_not_see(sample: dict[str, Any]) -
     assert (filled[left, 0] - 15).abs().median() < 0.01
     assert (filled[left, 3] == 35).all() and set(filled[:, 3].tolist()) == {30.0, 35.0}  # the nearest point's columns
     explained = [RigRetarget(target(), neighbours=n).explain(with_wall(sample)) for n in (None, "road")]
-    near = [int(str(one).split("near ")[1].split("%")[0]) for one in explained]
-    assert near[1] < near[0]
+    unsupported = [int(str(one).split("rays); ")[1].split("%")[0]) for one in explained]
+    assert unsupported[1] < unsupported[0]
 
 
 class Counted(dict[str, Any]):
