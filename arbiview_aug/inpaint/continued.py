@@ -161,8 +161,8 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
     """Colours (P, 3) of the parts of objects by their numbers in ``Paint``; -1 where unknown.
 
     Sides take the median of what sources see of the body, or of the cabin. A body of which nothing is seen takes the
-    paint around the windows. Tops take the paint of the body's brightest side in the
-    light that falls on tops, and what sources see of them, the more the larger the part that they see.
+    paint around the windows. Tops take the paint of the body's brightest side in the light that falls on tops, and what
+    sources see of them, the more the larger the part that they see.
     """
     painted = [(view.reshape(3, -1), p) for view, p in zip(views, paint, strict=True) if p is not None]
     if not any(len(p.pixel) for _, p in painted):

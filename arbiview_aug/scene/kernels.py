@@ -15,7 +15,6 @@ _TINY = np.float32(1e-30)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 ROW = 35
 
-
 GROUND, STREET = 0, 1
 
 
