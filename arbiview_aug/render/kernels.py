@@ -184,12 +184,12 @@ def measure_nodes(
 
 
 @compiled
-def keep_objects_whole(
+def win_nodes(
     scores: Any, parallax: Any, boxes: Any, center: Any, R: Any, rays: Any, axis: Any, node_rad: float, winner: Any
 ) -> None:  # fmt: skip
-    """Give the nodes of each labelled object that a seam would cross to one source, where that sees it.
+    """Let the source of the largest weight win each node, but one source all that it sees of a labelled object.
 
-    A seam repeats or cuts what it crosses. Among the sources that see the object whole, the one of the least parallax
+    A seam repeats or cuts what it crosses. Of an object that one would cross, among the sources that see the object whole, the one of the least parallax
     is read. Nearer objects decide last. Objects that a source shows exactly, from the target's own centre, stay as
     they are.
 
@@ -202,7 +202,7 @@ def keep_objects_whole(
         rays: (3, ny, nx) of the nodes.
         axis: (4,) middle of a cone around the target's rays, camera frame, and its half angle.
         node_rad: Angle between nodes: objects are wider by it.
-        winner: (ny, nx) int8 the source of the largest weight, -1 for none; updated.
+        winner: (ny, nx) int8, written; -1 for none.
     """
     K, ny, nx = scores.shape
     n = ny * nx
@@ -212,7 +212,13 @@ def keep_objects_whole(
     along, vectors, count, total = np.empty(n, np.float32), np.empty((7, 3)), np.empty(K), np.empty(K)
     axes, to_box, across, away, half = vectors[:3], vectors[3], vectors[4], vectors[5], vectors[6]
     for i in range(n):
-        first[i] = chosen[i]
+        first[i] = 0 if score[0, i] > _ZERO else -1
+    for k in range(1, K):
+        for i in range(n):
+            better = score[k, i] > (score[first[i], i] if first[i] >= 0 else _ZERO)
+            first[i] = k if better else first[i]
+    for i in range(n):
+        chosen[i] = first[i]
     for b in range(boxes.shape[0]):
         c, s = np.cos(boxes[b, 6]), np.sin(boxes[b, 6])
         for i in range(3):
@@ -269,6 +275,39 @@ def keep_objects_whole(
         for j in range(around if one >= 0 else 0):
             if score[one, near[j]] > _ZERO:
                 chosen[near[j]] = one
+
+
+@compiled
+def soften(winner: Any, border_px: Any, radius: int, width_px: float, weights: Any) -> None:
+    """Write ``weights.seam_weights`` (K, ny, nx) float32, by the borders (K, ny, nx) of what the sources see."""
+    K, ny, nx = border_px.shape
+    side, width = 2 * radius + 1, np.float32(width_px)
+    row, across, total = np.empty(nx + 2 * radius, np.float32), np.empty((ny, nx)), np.empty(nx)
+    for k in range(K):
+        soft = weights[k]
+        for j in range(ny):
+            for i in range(nx):
+                soft[j, i] = _ONE if winner[j, i] == k else _ZERO
+        for _ in range(2):  # two passes of a box make a smooth ramp
+            for j in range(ny):
+                for i in range(row.shape[0]):
+                    row[i] = soft[j, min(max(i - radius, 0), nx - 1)]
+                across[j] = 0.0
+                for shift in range(side):
+                    part = row[shift : shift + nx]
+                    for i in range(nx):
+                        across[j, i] += part[i]
+            for j in range(ny):
+                total[:] = 0.0
+                for shift in range(side):
+                    part = across[min(max(j + shift - radius, 0), ny - 1)]
+                    for i in range(nx):
+                        total[i] += part[i]
+                for i in range(nx):
+                    soft[j, i] = total[i] * (1.0 / (side * side))
+        for j in range(ny):
+            for i in range(nx):
+                soft[j, i] *= min(max(border_px[k, j, i] / width, _ZERO), _ONE)
 
 
 @inlined
@@ -404,12 +443,13 @@ def put_source(
         q: (h, w) inverse distances along its rays.
         face: (h, w) int32 faces of solids, -1 elsewhere; (0, 0) without any.
         source: As ``view_planner.ViewPlanner._kernel`` makes it.
-        slot: The source's index; column and row of its first pixel in the atlas.
+        slot: The source's index; column and row of its first pixel in the atlas; 1 for the first source of a target, else
+            0: it fills the images that follow ``shared`` with nothing before they are updated.
         weight: (ny + 1, nx + 1) its weight on the nodes.
         step: Side of a cell, pixels.
         columns: (ny, 2) first and last (exclusive) cell of each row of cells that it may see.
         shared: (ny, nx) bool, cells in which the second-best source is kept.
-        best: (h, w) float32 largest weight so far, below 0 where there is none; updated, as are all that follow.
+        best: (h, w) float32 largest weight so far, -1 where there is none; updated, as are all that follow.
             If it is (0, 0), ``in_image`` becomes 255 where the source sees a pixel, and nothing else is written.
         winner: (h, w) int8.
         xy: (h, w) int32, two int16: whole pixels in the source.
@@ -428,6 +468,10 @@ def put_source(
     me, left, top = np.int8(slot[0]), np.int32(slot[1]), np.int32(slot[2])
     for y in range(h):
         j = y // step
+        if slot[3]:
+            best[y], winner[y], xy[y], frac[y], in_image[y] = -_ONE, -1, _OUTSIDE, 0, 0
+            if next_best.shape[0]:
+                next_best[y], second[y] = _ZERO, -1
         x0, x1 = columns[j, 0] * step, min(columns[j, 1] * step, w)
         n = x1 - x0
         if n <= 0:
@@ -484,7 +528,7 @@ def seen_image(planes: Any, target: Any, q: Any, face: Any, source: Any) -> npt.
     no_weight, no_name, no_place, no_fraction = (np.zeros((0, 0), t) for t in ("f4", "i1", "i4", "u2"))
     columns, seen = np.array([[0, 1]]), np.zeros(q.shape, np.uint8)
     put_source(
-        planes, target, q, face, source, (0, 0, 0), no_weight, max(q.shape), columns,
+        planes, target, q, face, source, (0, 0, 0, 0), no_weight, max(q.shape), columns,
         no_weight > 0, no_weight, no_name, no_place, no_fraction, seen, no_weight, no_name, no_place, no_fraction,
     )  # fmt: skip
     return seen > 0

@@ -356,19 +356,23 @@ class ViewPlanner:
         from arbiview_aug.render.kernels import put_source, upsample_where
 
         size, memory = self.camera.size, self.maps.memory
-        fixed = FixedMap.outside(size, memory)
-        packed = fixed.packed
-        winner, in_image = memory.full(size, -1, np.int8), memory.full(size, 0, np.uint8)
-        best = memory.full(size, -1, np.float32)  # a source that sees a pixel beats none, even with a weight of 0
+        if not self.regions:
+            at, winner = FixedMap.outside(size), np.full(size, -1, np.int8)
+            certain = np.zeros(size, np.uint8) if self.config.certainty else None
+            return ViewPlan(at, winner, (), (), self._interpolation(Counter()), certain)
+        packed, frac, winner = memory.images(size, np.int32, np.uint16, np.int8)
+        # A source that sees a pixel beats none, even with a weight of 0.
+        best, in_image = memory.images(size, np.float32, np.uint8)
+        fixed = FixedMap(packed.view(np.int16).reshape(*size, 2), frac)
         weights = self._weights()
-        seconds = SecondBest(weights if self.config.seam_width else (), self.step, size, memory)
-        for region, weight in zip(self.regions, weights, strict=True):
+        seconds = SecondBest(weights if self.config.seam_width else weights[:0], self.step, size, memory)
+        for number, (region, weight) in enumerate(zip(self.regions, weights, strict=True)):
             slot = layout.slot(region.source, region.level)
             self.counters["cells"] += int((region.columns[:, 1] - region.columns[:, 0]).sum())
-            place = region.source, slot.x, slot.y
+            place = region.source, slot.x, slot.y, int(number == 0)
             put_source(
                 *self._target(region), region.kernel, place, weight, self.step, region.columns,
-                seconds.shared, best, winner, packed, fixed.frac, in_image, *seconds.images,
+                seconds.shared, best, winner, packed, frac, in_image, *seconds.images,
             )  # fmt: skip
         won_px = Counter({r.source: int(np.count_nonzero(winner == r.source)) for r in self.regions})
         bands = tuple(seconds.blend_regions([region.source for region in self.regions], best))
@@ -420,24 +424,24 @@ class ViewPlanner:
         mark_objects(geometry.q, geometry.face, winner, limit, self.step, layers)
         return find_paint(geometry.face, winner, geometry.surface.face_parts) if geometry.face.size else None
 
-    def _weights(self) -> list[npt.NDArray[np.float32]]:
-        """Weights of the sources on the nodes: their scores, for one source or hard seams."""
-        from arbiview_aug.render.kernels import keep_objects_whole
+    def _weights(self) -> npt.NDArray[np.float32]:
+        """Weights (K, ny + 1, nx + 1) of the sources: their scores, for one source or hard seams."""
+        from arbiview_aug.render.kernels import win_nodes
 
-        scores, width_px = [region.score for region in self.regions], self.config.seam_width * self.camera.width_px
+        width_px = self.config.seam_width * self.camera.width_px
+        scores = np.array([region.score for region in self.regions])
         if width_px == 0 or len(scores) < 2:
             return scores
-        stacked = np.stack(scores)
-        winner = np.where(stacked.any(axis=0), stacked.argmax(axis=0), -1).astype(np.int8)
+        parallax, border_px = (
+            np.array([getattr(region, name) for region in self.regions]) for name in ("parallax", "border_px")
+        )
         labelled = self.scene.boxes if "boxes" in GEOMETRIES[self.surface].reads else None
-        if labelled is not None and len(labelled):
-            near_last = np.argsort(-np.linalg.norm(labelled[:, :3] - self.camera.center_m, axis=-1), kind="stable")
-            parallax = np.stack([region.parallax for region in self.regions])
-            pose = np.ascontiguousarray(self.camera.center_m), np.ascontiguousarray(self.camera.cam2ego[:3, :3])
-            node_rad = self.step / float(self.camera.K[0, 0])
-            boxes = labelled[near_last, :7]
-            keep_objects_whole(stacked, parallax, boxes, *pose, self.node_rays, self.rays.cone, node_rad, winner)
-        return seam_weights(winner, [region.border_px for region in self.regions], self._seam_radius, width_px)
+        boxes = np.zeros((0, 7)) if labelled is None else labelled[:, :7]
+        near_last = np.argsort(-np.linalg.norm(boxes[:, :3] - self.camera.center_m, axis=-1), kind="stable")
+        pose = np.ascontiguousarray(self.camera.center_m), np.ascontiguousarray(self.camera.cam2ego[:3, :3])
+        node_rad, winner = self.step / float(self.camera.K[0, 0]), np.empty(scores.shape[1:], np.int8)
+        win_nodes(scores, parallax, boxes[near_last], *pose, self.node_rays, self.rays.cone, node_rad, winner)
+        return seam_weights(winner, border_px, self._seam_radius, width_px)
 
     def _target(self, region: _Region) -> tuple[Any, Any, Any, Any]:
         return self.rays.planes, self.rays.parameters, region.geometry.q, region.geometry.face
