@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 import weakref
-from itertools import accumulate
 from typing import Any
 
 import cv2
@@ -143,13 +142,6 @@ class Memory:
         array = self.empty(shape, dtype)
         array.fill(value)
         return array
-
-    def images(self, size: tuple[int, int], *dtypes: npt.DTypeLike) -> list[Any]:
-        """Images (h, w) of arbitrary content and these types, the widest first, in one block."""
-        n, widths = math.prod(size), [np.dtype(dtype).itemsize for dtype in dtypes]
-        block, ends = self.empty((n * sum(widths),), np.uint8), [0, *accumulate(n * width for width in widths)]
-        parts = zip(dtypes, ends[:-1], ends[1:], strict=True)
-        return [block[first:end].view(dtype).reshape(size) for dtype, first, end in parts]
 
     def _take_back(self, block: np.ndarray) -> None:
         with self._lock:

@@ -130,7 +130,7 @@ def cells_in_view(
 @compiled
 def measure_nodes(
     rays: Any, q: Any, A: Any, o: Any, kind: int, P: Any, y: Any, x: Any, size: Any, to_mask: Any, cell_px: int,
-    offset_m: Any, uncertainty: Any, u: Any, v: Any, resolution: Any, edge_px: Any, parallax_rad: Any,
+    offset_m: Any, uncertainty: Any, focal_px: float, u: Any, v: Any, measured: Any, rounded: Any,
 ) -> None:  # fmt: skip
     """Compute what weights depend on, at the nodes of a target.
 
@@ -148,15 +148,16 @@ def measure_nodes(
         cell_px: Side of those cells.
         offset_m: (3,) float64 the target's centre minus the source's, target's frame.
         uncertainty: (ny, nx) expected error of the inverse distance, 1/m.
+        focal_px: The target's focal length.
         u: (ny, nx) float32 columns in the source: given for lenses that kernels do not know, else written.
         v: (ny, nx) its rows.
-        resolution: (ny, nx) float64, written: source pixels per target pixel along the worse axis, which is the smaller
-            singular value of the Jacobian.
-        edge_px: (ny, nx) float64, written: ``rays.edge_distance``.
-        parallax_rad: (ny, nx) float64, written: displacement that unknown depth may cause, offset across the ray times
-            uncertainty.
+        measured: (3, ny, nx) float64, written: source pixels per target pixel along the worse axis, which is the
+            smaller singular value of the Jacobian; ``rays.edge_distance``; displacement that unknown depth may cause,
+            target pixels: offset across the ray times uncertainty.
+        rounded: (2, ny, nx) float32, written: that displacement; the edge's distance in target pixels.
     """
     ny, nx = u.shape
+    resolution, edge_px, parallax_px = measured[0], measured[1], measured[2]
     if kind >= 0:
         work = np.empty((5, nx), np.float32)
         for j in range(ny):
@@ -165,6 +166,7 @@ def measure_nodes(
     # The last nodes may coincide: their difference says nothing.
     last_y = max(ny - 2 - (ny > 2 and y[ny - 1] == y[ny - 2]), 0)
     last_x = max(nx - 2 - (nx > 2 and x[nx - 1] == x[nx - 2]), 0)
+    is_line = y[ny - 1] == y[0] or x[nx - 1] == x[0]
     length2 = offset_m[0] ** 2 + offset_m[1] ** 2 + offset_m[2] ** 2
     for j in range(ny):
         jj = min(j, last_y)
@@ -176,11 +178,15 @@ def measure_nodes(
             b, d = (u[jj + 1, i] - u[jj, i]) * per_y, (v[jj + 1, i] - v[jj, i]) * per_y
             half_sum, determinant = (a * a + b * b + c * c + d * d) / 2, a * d - b * c
             root = np.sqrt(max(half_sum * half_sum - determinant * determinant, 0.0))
-            resolution[j, i] = np.sqrt(max(half_sum - root, 0.0))
+            resolution[j, i] = 1.0 if is_line else np.sqrt(max(half_sum - root, 0.0))
         edge_distance_row(u[j], v[j], size, to_mask, cell_px, edge_px[j])
         for i in range(nx):
             along = rays[0, j, i] * offset_m[0] + rays[1, j, i] * offset_m[1] + rays[2, j, i] * offset_m[2]
-            parallax_rad[j, i] = np.sqrt(max(length2 - along * along, 0.0)) * uncertainty[j, i]
+            parallax_px[j, i] = focal_px * (np.sqrt(max(length2 - along * along, 0.0)) * uncertainty[j, i])
+        for i in range(nx):
+            rounded[0, j, i] = parallax_px[j, i]
+        for i in range(nx):
+            rounded[1, j, i] = edge_px[j, i] / max(resolution[j, i], 1e-3)
 
 
 @compiled
@@ -189,9 +195,9 @@ def win_nodes(
 ) -> None:  # fmt: skip
     """Let the source of the largest weight win each node, but one source all that it sees of a labelled object.
 
-    A seam repeats or cuts what it crosses. Of an object that one would cross, among the sources that see the object whole, the one of the least parallax
-    is read. Nearer objects decide last. Objects that a source shows exactly, from the target's own centre, stay as
-    they are.
+    A seam repeats or cuts what it crosses. An object that one would cross is read from the source of the least parallax
+    among those that see it whole. Nearer objects decide last. Objects that a source shows exactly, from the target's
+    own centre, stay as they are.
 
     Args:
         scores: (K, ny, nx) weight of each source, 0 where it sees nothing.
@@ -435,7 +441,7 @@ def put_source(
     shared: Any, best: Any, winner: Any, xy: Any, frac: Any, in_image: Any,
     next_best: Any, second: Any, next_xy: Any, next_frac: Any,
 ) -> None:  # fmt: skip
-    """Let a source win the pixels that it sees with more weight than the best so far; see also ``seen_image``.
+    """Let a source win the pixels that it sees with more weight than the best so far; see also ``clear_unseen``.
 
     Args:
         planes: (3, h, w) the target's rays; (3, 0, 0) for a pinhole.
@@ -443,14 +449,13 @@ def put_source(
         q: (h, w) inverse distances along its rays.
         face: (h, w) int32 faces of solids, -1 elsewhere; (0, 0) without any.
         source: As ``view_planner.ViewPlanner._kernel`` makes it.
-        slot: The source's index; column and row of its first pixel in the atlas; 1 for the first source of a target, else
-            0: it fills the images that follow ``shared`` with nothing before they are updated.
+        slot: The source's index; column and row of its first pixel in the atlas.
         weight: (ny + 1, nx + 1) its weight on the nodes.
         step: Side of a cell, pixels.
         columns: (ny, 2) first and last (exclusive) cell of each row of cells that it may see.
         shared: (ny, nx) bool, cells in which the second-best source is kept.
-        best: (h, w) float32 largest weight so far, -1 where there is none; updated, as are all that follow.
-            If it is (0, 0), ``in_image`` becomes 255 where the source sees a pixel, and nothing else is written.
+        best: (h, w) float32 largest weight so far, below 0 where there is none; updated, as are all that follow.
+            If it is (0, 0), ``weight`` (h, w) becomes 0 where the source does not see a pixel, and nothing is written.
         winner: (h, w) int8.
         xy: (h, w) int32, two int16: whole pixels in the source.
         frac: (h, w) uint16, 32nds of a pixel.
@@ -460,7 +465,7 @@ def put_source(
         next_xy: (h, w) int32 where it is read.
         next_frac: (h, w) uint16.
     """
-    h, w = in_image.shape
+    h, w = q.shape
     work, share = np.empty((_WORK_ROWS, w), np.float32), np.empty(w, np.float32)
     inside, seen = np.empty(w, np.int32), np.empty(w, np.int32)
     fu, fv = np.empty(w, np.int32), np.empty(w, np.int32)
@@ -468,18 +473,15 @@ def put_source(
     me, left, top = np.int8(slot[0]), np.int32(slot[1]), np.int32(slot[2])
     for y in range(h):
         j = y // step
-        if slot[3]:
-            best[y], winner[y], xy[y], frac[y], in_image[y] = -_ONE, -1, _OUTSIDE, 0, 0
-            if next_best.shape[0]:
-                next_best[y], second[y] = _ZERO, -1
         x0, x1 = columns[j, 0] * step, min(columns[j, 1] * step, w)
         n = x1 - x0
         if n <= 0:
             continue
         _evaluate_row(planes, target, q, face, source, y, x0, n, work, inside[:n], seen[:n], fu[:n])
         if not best.shape[0]:
+            of_pixels = weight[y]
             for i in range(n):
-                in_image[y, x0 + i] = np.uint8(255) if seen[i] else in_image[y, x0 + i]
+                of_pixels[i] = of_pixels[i] if seen[i] else _ZERO
             continue
         u, v = work[0, :n], work[1, :n]
         upsampled_row(weight, step, y, x0, row, share[:n])
@@ -523,15 +525,13 @@ def put_source(
             held[i] = max(share[i], held[i])
 
 
-def seen_image(planes: Any, target: Any, q: Any, face: Any, source: Any) -> npt.NDArray[np.bool_]:
-    """Find the pixels (h, w) that a source sees; arguments as in ``put_source``, whose compiled code it runs."""
-    no_weight, no_name, no_place, no_fraction = (np.zeros((0, 0), t) for t in ("f4", "i1", "i4", "u2"))
-    columns, seen = np.array([[0, 1]]), np.zeros(q.shape, np.uint8)
-    put_source(
-        planes, target, q, face, source, (0, 0, 0, 0), no_weight, max(q.shape), columns,
-        no_weight > 0, no_weight, no_name, no_place, no_fraction, seen, no_weight, no_name, no_place, no_fraction,
-    )  # fmt: skip
-    return seen > 0
+_NOTHING = tuple(np.zeros((0, 0), dtype) for dtype in ("?", "f4", "i1", "i4", "u2", "u1", "f4", "i1", "i4", "u2"))
+_ONE_CELL = np.array([[0, 1]])
+
+
+def clear_unseen(planes: Any, target: Any, q: Any, face: Any, source: Any, weight: npt.NDArray[np.float32]) -> None:
+    """Clear the weights (h, w) of pixels that a source does not see, by ``put_source``; arguments as there."""
+    put_source(planes, target, q, face, source, (0, 0, 0), weight, max(q.shape), _ONE_CELL, *_NOTHING)
 
 
 @compiled

@@ -24,7 +24,7 @@ def distance_weight(distance_px: FloatArray, d_max_px: float) -> FloatArray:
 
     d (...,) is the distance to the border, negative outside; d_max > 0.
     """
-    return np.clip(distance_px / d_max_px, 0.0, 1.0)
+    return np.minimum(np.maximum(distance_px / d_max_px, 0.0), 1.0)  # of nodes, np.clip takes three times as long
 
 
 def quality_weight(parallax_px: FloatArray, resolution: FloatArray) -> FloatArray:
@@ -33,7 +33,7 @@ def quality_weight(parallax_px: FloatArray, resolution: FloatArray) -> FloatArra
     ``parallax_px`` is the displacement in target pixels that unknown depth may cause, ``resolution`` source pixels per
     target pixel along the worse axis.
     """
-    return np.clip(resolution, 0.05, 1.0) / (1.0 + parallax_px)
+    return np.minimum(np.maximum(resolution, 0.05), 1.0) / (1.0 + parallax_px)
 
 
 def source_weight(
@@ -83,8 +83,8 @@ class SecondBest:
         cells = some[:, 1:, 1:] | some[:, 1:, :-1] | some[:, :-1, 1:] | some[:, :-1, :-1]
         self.shared, self._step = np.add.reduce(cells, 0, np.uint8) > 1, step
         size = size if self.shared.any() else (0, 0)
-        weight, xy, frac, second = memory.images(size, np.float32, np.int32, np.uint16, np.int8)
-        self.images = weight, second, xy, frac
+        weight, second = memory.full(size, 0, np.float32), memory.full(size, -1, np.int8)
+        self.images = weight, second, memory.empty(size, np.int32), memory.empty(size, np.uint16)
 
     def blend_regions(self, sources: Sequence[int], best: npt.NDArray[np.float32]) -> list[BlendRegion]:
         """Rectangles around the pixels that a second source adds to; ``best`` (h, w) is the winning source's weight.
