@@ -363,9 +363,12 @@ def _occlude_row(
             above = beyond[k] * (_ONE - t) + beyond[k + right] * t
             below = beyond[k + down] * (_ONE - t) + beyond[k + down + right] * t
             hides[i] = above * (_ONE - s) + below * s
-        for i in range(n if before_m.shape[0] else 0):
-            if number_at[np.uint32(place[i])] >= 0 or (face.shape[0] and face[i] >= 0):
-                hides[i] = beyond[np.uint32(place[i])]
+        for i in range(n if before_m.shape[0] else 0):  # whose it is decides few pixels, and costs a cache miss to read
+            nearest = beyond[np.uint32(place[i])]
+            if face.shape[0] and face[i] >= 0:
+                hides[i] = nearest
+            elif (nearest <= pz[i]) != (hides[i] <= pz[i]) and number_at[np.uint32(place[i])] >= 0:
+                hides[i] = nearest
     else:
         for i in range(n):
             hides[i] = beyond[np.uint32(place[i])]
@@ -376,13 +379,15 @@ def _occlude_row(
         number = face[i]
         if number < 0:
             continue
-        me, there = np.uint32(number), number_at[np.uint32(place[i])]
+        me = np.uint32(number)
         if before_m[me] <= _ZERO or before_m[me] * pz[i] < LEAST_INCIDENCE:
             pz[i] = -_ONE
-        elif there == number // 6:  # pieces are convex
-            pz[i] = _MOST
-        elif there // PIECES == number // (6 * PIECES):
-            pz[i] = pz[i] / max(_ONE - SAME_OBJECT_M * pz[i], _TINY)
+        elif hides[i] > pz[i]:
+            there = number_at[np.uint32(place[i])]
+            if there == number // 6:  # pieces are convex
+                pz[i] = _MOST
+            elif there // PIECES == number // (6 * PIECES):
+                pz[i] = pz[i] / max(_ONE - SAME_OBJECT_M * pz[i], _TINY)
     for i in range(n):
         seen[i] = seen[i] & (hides[i] <= pz[i])
 
