@@ -423,7 +423,7 @@ class ViewPlanner:
         from arbiview_aug.render.kernels import win_nodes
 
         width_px = self.config.seam_width * self.camera.width_px
-        scores = np.array([region.score for region in self.regions])
+        scores = np.array([region.score for region in self.regions], np.float32).reshape(-1, *self.node_rays.shape[1:])
         if width_px == 0 or len(scores) < 2:
             return scores
         parallax, border_px = (
