@@ -464,7 +464,7 @@ def put_source(
         winner: (h, w) int8.
         xy: (h, w) int32, two int16: whole pixels in the source.
         frac: (h, w) uint16, 32nds of a pixel.
-        in_image: (h, w) uint8, 255 where some source's image contains the pixel.
+        in_image: (h, w) uint8, 255 where some source's image contains the pixel; (0, 0) where that is not asked.
         next_best: (h, w) float32 weight of the second-best source in these cells, 0 for none.
         second: (h, w) int8 whose that is, -1 for none.
         next_xy: (h, w) int32 where it is read.
@@ -514,7 +514,7 @@ def put_source(
             xy[y, x0:x1],
             frac[y, x0:x1],
             winner[y, x0:x1],
-            in_image[y, x0:x1],
+            in_image[y, x0:x1] if in_image.shape[0] else in_image[:, 0],
         )
         for i in range(n):
             place = (((fv[i] >> 5) + top) << 16) | (((fu[i] >> 5) + left) & 0xFFFF)
@@ -524,7 +524,7 @@ def put_source(
             part[i] = fraction if share[i] > held[i] else part[i]
         for i in range(n):
             mine[i] = me if share[i] > held[i] else mine[i]
-        for i in range(n):
+        for i in range(image.shape[0]):
             image[i] = np.uint8(255) if inside[i] else image[i]
         for i in range(n):
             held[i] = max(share[i], held[i])
@@ -556,7 +556,7 @@ def find_bands(
         sources: (S,) sources in content order.
         bands: (n, 5) int64, written: source, first and last (exclusive) row, first and last (exclusive) column.
     """
-    (h, w), nx = second.shape, shared.shape[1]
+    (h, w), nx, low = second.shape, shared.shape[1], np.float32(least)
     rows = np.empty((128, (h + strip - 1) // strip, nx, 2), np.int32)  # first and last of each column of cells
     for k in sources:
         rows[k, ..., 0] = h
@@ -565,12 +565,15 @@ def find_bands(
         for i in range(nx):
             if not shared[y // step, i]:
                 continue
-            for x in range(i * step, min(i * step + step, w)):
-                k = second[y, x]
-                part = share[y, x] / max(best[y, x] + share[y, x], _TINY)
-                share[y, x] = part if k >= 0 and part >= least else _ZERO
-                if share[y, x] > _ZERO:
-                    ends = rows[k, y // strip, i]
+            x0, x1 = i * step, min(i * step + step, w)
+            part, whole, who, last = share[y, x0:x1], best[y, x0:x1], second[y, x0:x1], np.int8(-1)
+            for x in range(x1 - x0):
+                value = part[x] / max(whole[x] + part[x], _TINY)
+                part[x] = value if (who[x] >= 0) & (value >= low) else _ZERO
+            for x in range(x1 - x0):
+                if part[x] > _ZERO and who[x] != last:
+                    last = who[x]
+                    ends = rows[last, y // strip, i]
                     ends[0], ends[1] = min(ends[0], y), max(ends[1], y + 1)
     count = 0
     for k in sources:
@@ -591,8 +594,7 @@ def find_bands(
 
 @compiled
 def cut_bands(
-    bands: Any, shared: Any, step: int, share: Any, second: Any, xy: Any, frac: Any,
-    band_xy: Any, band_frac: Any, weight: Any,
+    bands: Any, share: Any, second: Any, xy: Any, frac: Any, band_xy: Any, band_frac: Any, weight: Any
 ) -> None:  # fmt: skip
     """Copy the positions and shares in rectangles (n, 5), one after the other; others than its source's read nothing.
 
@@ -600,13 +602,21 @@ def cut_bands(
     """
     at = 0
     for k in range(bands.shape[0]):
+        source, x0, x1 = np.int8(bands[k, 0]), bands[k, 3], bands[k, 4]
         for y in range(bands[k, 1], bands[k, 2]):
-            for x in range(bands[k, 3], bands[k, 4]):
-                adds = shared[y // step, x // step] and second[y, x] == bands[k, 0] and share[y, x] > _ZERO
-                band_xy[at] = xy[y, x] if adds else _OUTSIDE
-                band_frac[at] = frac[y, x] if adds else 0
-                weight[at] = share[y, x] if adds else _ZERO
-                at += 1
+            out, out_xy, out_frac = (
+                weight[at : at + x1 - x0],
+                band_xy[at : at + x1 - x0],
+                band_frac[at : at + x1 - x0],
+            )
+            part, who, where, fraction = share[y, x0:x1], second[y, x0:x1], xy[y, x0:x1], frac[y, x0:x1]
+            for x in range(out.shape[0]):
+                out[x] = part[x] if who[x] == source else _ZERO
+            for x in range(out.shape[0]):
+                out_xy[x] = where[x] if out[x] > _ZERO else _OUTSIDE
+            for x in range(out.shape[0]):
+                out_frac[x] = fraction[x] if out[x] > _ZERO else np.uint16(0)
+            at += x1 - x0
 
 
 @compiled

@@ -110,6 +110,12 @@ class _Region:
     fineness: float  # median of the pixels, as they are read, per target pixel
     certainty: npt.NDArray[np.float32] | None  # in 255ths, if asked for
 
+    @property
+    def hides(self) -> bool:
+        """Whether occluders or a mask may hide what lies in the source's image."""
+        _, _, _, _, _, clean, _, shadow, *_ = self.kernel
+        return bool(clean.size or shadow.size)
+
 
 class ViewPlanner:
     """Builds one target's plan in two steps: what each source sees, then who wins and where ``seams`` are blended.
@@ -355,7 +361,9 @@ class ViewPlanner:
         size, memory = self.camera.size, self.maps.memory
         fixed = FixedMap.outside(size, memory)
         packed = fixed.packed
-        winner, in_image = memory.full(size, -1, np.int8), memory.full(size, 0, np.uint8)
+        winner = memory.full(size, -1, np.int8)
+        hides = any(region.hides for region in self.regions)
+        in_image = memory.full(size if hides else (0, 0), 0, np.uint8)
         best = memory.full(size, -1, np.float32)  # a source that sees a pixel beats none, even with a weight of 0
         weights = self._weights()
         seconds = SecondBest(weights if self.config.seam_width else weights[:0], self.step, size, memory)
@@ -380,12 +388,10 @@ class ViewPlanner:
         reports = tuple(self._reports(winner, won_px))
         if not self.config.layers:
             return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
-        if sum(won_px.values()) == winner.size:
-            return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
-        holes = winner < 0
-        layers = (holes & (in_image > 0)).view(np.uint8)
-        road = self._road()
-        if not layers.any():
+        is_whole = sum(won_px.values()) == winner.size
+        road = None if is_whole else self._road()
+        layers = None if is_whole or not hides else ((winner < 0) & (in_image > 0)).view(np.uint8)
+        if layers is None or not layers.any():
             return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, road=road)
         paint = self._mark_objects(winner, layers)
         return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, layers, paint, road)

@@ -103,7 +103,7 @@ class SecondBest:
         size = np.stack([bands[:, 2] - bands[:, 1], bands[:, 4] - bands[:, 3]], -1)
         ends = [0, *np.cumsum(size.prod(axis=1)).tolist()]
         xy, frac, weight = (np.empty(ends[-1], kind) for kind in (np.int32, np.uint16, np.float32))
-        cut_bands(bands, *cells, share, second, *where, xy, frac, weight)
+        cut_bands(bands, share, second, *where, xy, frac, weight)
         regions = []
         for (source, y0, _, x0, _), (h, w), a, b in zip(bands.tolist(), size.tolist(), ends, ends[1:], strict=False):
             at = FixedMap(xy[a:b].view(np.int16).reshape(h, w, 2), frac[a:b].reshape(h, w))
