@@ -219,7 +219,7 @@ class _PolynomialLens(_AngularLens):
         """The slope's coefficients from the highest power down."""
         polynomial = np.zeros(2 + self.step * len(self.distortion))
         polynomial[:-1: self.step] = [*self.distortion[::-1], 1.0]
-        return np.polyder(polynomial)
+        return np.asarray(np.polyder(polynomial), np.float64)
 
     def _polynomial(self, t: FloatArray) -> FloatArray:
         return t * np.polyval([*self.distortion[::-1], 1.0], t**self.step)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.lidar_fit import checked_scans, fitted_fields
 from arbiview_aug.cameras.validation import checked_numbers, checked_pose
 from arbiview_aug.errors import CalibrationError, shown
 
@@ -158,8 +159,6 @@ class Lidar:
         Raises:
             CalibrationError: Too few points, or no distinct beams.
         """
-        from arbiview_aug.cameras.lidar_fit import checked_scans, fitted_fields
-
         pose = checked_pose(name, lidar2ego, "lidar2ego")
         scans, numbers = checked_scans(name, points, rings)
         local = [(scan - pose[:3, 3]) @ pose[:3, :3] for scan in scans]

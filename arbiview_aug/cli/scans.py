@@ -64,7 +64,7 @@ def evaluate_scans(arguments: argparse.Namespace, folder: Path) -> None:
     if picture is None:
         expected = "a later frame of the drive with points (sequence.json and ego2world)"
         raise DataError(f"--displaced: {arguments.data}: expected {expected}, found none; see docs/formats.md")
-    means = {name: mean_of([_numbers(row) for row in rows if row["points"] == name]) for name in clouds}
+    means = {name: mean_of(row for row in rows if row["points"] == name) for name in clouds}
     (folder / "evaluate.json").write_text(json.dumps({"arguments": vars(arguments), "scans": means, "rows": rows}))
     for note in notes:
         print(f"note: {note}\n")
@@ -93,10 +93,6 @@ def scored(scan: TrueScan, lidar: Lidar, clouds: Mapping[str, FloatArray]) -> It
         metrics = scan_metrics(lidar, cloud, truth, where, scan.boxes)
         known = {key: value for key, value in metrics.items() if np.isfinite(value)}
         yield {"frame": scan.name, "lidar": lidar.name, "points": name, **known}
-
-
-def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
-    return {key: value for key, value in row.items() if not isinstance(value, str)}
 
 
 def _synthetic(arguments: argparse.Namespace) -> Iterator[TrueScan]:
@@ -152,9 +148,5 @@ def _with_scanners(rig: Rig, chosen: Rig | None, where: str) -> Rig:
 
 def _next_frame(sample: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """The nearest neighbour recorded later."""
-    if not sample.get("neighbours"):
-        return None
     (frame,) = read_frames(sample, None)
-    numbers = (one.number for one in read_neighbours(frame, lambda *_: None) if one.is_later)
-    number = next(numbers, None)
-    return None if number is None else sample["neighbours"][number]
+    return next((one.given for one in read_neighbours(frame, lambda *_: None) if one.is_later), None)

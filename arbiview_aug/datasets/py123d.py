@@ -19,10 +19,11 @@ from arbiview_aug.cameras.rotations import poses_from, rotation_from_quaternion
 from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
 from arbiview_aug.datasets.frame_folder import checked_points
-from arbiview_aug.datasets.image_io import area_reduced, reduced_rig, stack_or_list
+from arbiview_aug.datasets.image_io import area_reduced, reduced_rig
 from arbiview_aug.datasets.registry import log_folders
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, described
+from arbiview_aug.sample.batching import stacked
 
 LICENCES = {
     "av2-sensor": "CC BY-NC-SA 4.0",
@@ -125,10 +126,15 @@ class Py123dDataset(WritableRecording):
     def time_s(self, index: int) -> float:
         return 1e-6 * self._frames[index][2]
 
+    def _at(self, index: int) -> tuple[_Log, int]:
+        """A sample's log, and its iteration there."""
+        number, iteration, _ = self._frames[index]
+        return self._logs[number], iteration
+
     def files(self, index: int) -> list[Path]:
         """Files of the log; images and points that a log names elsewhere are not among them."""
-        folder = self._logs[self._frames[index][0]].folder
-        return sorted(path for path in folder.iterdir() if path.suffix in (".arrow", ".mp4"))
+        log, _ = self._at(index)
+        return sorted(path for path in log.folder.iterdir() if path.suffix in (".arrow", ".mp4"))
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         index = range(len(self))[index]  # IndexError, and negative indices
@@ -143,8 +149,7 @@ class Py123dDataset(WritableRecording):
 
     def _fields(self, index: int) -> dict[str, Any]:
         """Everything but the images and points."""
-        number, iteration, _ = self._frames[index]
-        log = self._logs[number]
+        log, iteration = self._at(index)
         ego2world = self._ego2world(index)
         world2ego = np.linalg.inv(ego2world).astype(np.float64, copy=False)
         rig = []
@@ -154,7 +159,7 @@ class Py123dDataset(WritableRecording):
                 rig.append(replace(camera, cam2ego=world2ego @ cam2world))
         if not rig:
             raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected a camera's image, got none")
-        name = self.datasets[number]
+        name = self.datasets[self._frames[index][0]]
         fields = {"token": self.tokens[index], "time_s": self.time_s(index), "ego2world": torch.from_numpy(ego2world)}
         fields["rig"] = reduced_rig(Rig(rig, ground_z_m=log.ground_z_m, name=name), self.reduce)
         detections = log.scene.get_box_detections_se3_at_iteration(iteration)
@@ -164,8 +169,7 @@ class Py123dDataset(WritableRecording):
         return fields
 
     def _images(self, index: int, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
-        number, iteration, _ = self._frames[index]
-        log, images = self._logs[number], []
+        (log, iteration), images = self._at(index), []
         for identity, camera in log.cameras.items():
             if camera.name in rig.names:
                 with _reading(log.folder):
@@ -174,19 +178,17 @@ class Py123dDataset(WritableRecording):
                     if image.shape != (*camera.size, 3) or image.dtype != np.uint8:
                         raise DataError(f"{where}: expected {(*camera.size, 3)} uint8, got {image.shape} {image.dtype}")
                     images.append(torch.from_numpy(area_reduced(image, self.reduce)).permute(2, 0, 1).contiguous())
-        return stack_or_list(images)
+        return stacked(images)
 
     def _points(self, index: int) -> torch.Tensor | None:
-        number, iteration, _ = self._frames[index]
-        log = self._logs[number]
+        log, iteration = self._at(index)
         with _reading(log.folder):
             scans = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
             clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in scans if one is not None]
         return checked_points(np.concatenate(clouds), f"of {self.tokens[index]}") if clouds else None
 
     def _ego2world(self, index: int) -> FloatArray:
-        number, iteration, _ = self._frames[index]
-        log = self._logs[number]
+        log, iteration = self._at(index)
         pose = log.pose(iteration, "imu_se3", "ego_state_se3")
         if pose is None:
             raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected the ego's pose, got none")

@@ -90,11 +90,8 @@ class TrueImage(NamedTuple):
     road: BoolArray | None
 
 
-class Target(NamedTuple):
-    """What views for a rig are compared with, by camera; None where there is nothing."""
-
-    labels: Sequence[Labels | None]
-    truth: Sequence[TrueImage | None]
+Target = tuple[Sequence[Labels | None], Sequence[TrueImage | None]]
+"""Labels and true images that views for a rig are compared with, by camera; None where there is nothing."""
 
 
 @dataclass
@@ -128,16 +125,16 @@ class Panel:
         """Judge the true images of a rig, if there are some; their masks hide labelled objects."""
         mounted = rig.in_frame_of(frame.sample["rig"])
         if frame.truth is None:
-            return Target(self._labels(frame, mounted), [None] * len(rig))
+            return self._labels(frame, mounted), [None] * len(rig)
         true = frame.truth(rig)
         images, masks = [to_bytes(image) for image in as_arrays(true.images)], valid_pixels(true)
         masked = mounted.with_cameras([replace(camera, mask=mask) for camera, mask in zip(mounted, masks, strict=True)])
-        labels, truth = self._labels(frame, masked), []
+        labels, truth = self._labels(frame, masked), list[TrueImage | None]()
         for camera, image, mask, of_camera in zip(rig, images, masks, labels, strict=True):
             detections = None if self.detector is None else self.detector(image)
             truth.append(TrueImage(mask, detections, None if self.segmenter is None else self.segmenter(image)))
             self._add(image, Verdict(name, TRUTH, target, camera.name, camera.size, detections, of_camera))
-        return Target(labels, truth)
+        return labels, truth
 
     def _labels(self, frame: ScoredFrame, rig: Rig) -> Sequence[Labels | None]:
         """Labels that a detector is compared with, by camera."""
