@@ -60,7 +60,6 @@ class Verdict:
     frame: str
     method: str  # or ``SOURCES``, ``TRUTH``
     target: str
-    camera: str
     size: tuple[int, int]
     detections: Detections | None = None
     labels: Labels | None = None
@@ -118,7 +117,7 @@ class Panel:
         labels, truth = self._targets[target]
         for k, view in enumerate(views):
             image = to_bytes(view.image)
-            verdict = Verdict(name, method, target, rig[k].name, rig[k].size, labels=labels[k])
+            verdict = Verdict(name, method, target, rig[k].size, labels=labels[k])
             self._add(image, self._judged(verdict, image, view.generated, truth[k]))
 
     def _look_at_truth(self, name: str, frame: ScoredFrame, target: str, rig: Rig) -> Target:
@@ -133,7 +132,7 @@ class Panel:
         for camera, image, mask, of_camera in zip(rig, images, masks, labels, strict=True):
             detections = None if self.detector is None else self.detector(image)
             truth.append(TrueImage(mask, detections, None if self.segmenter is None else self.segmenter(image)))
-            self._add(image, Verdict(name, TRUTH, target, camera.name, camera.size, detections, of_camera))
+            self._add(image, Verdict(name, TRUTH, target, camera.size, detections, of_camera))
         return labels, truth
 
     def _labels(self, frame: ScoredFrame, rig: Rig) -> Sequence[Labels | None]:
@@ -145,7 +144,7 @@ class Panel:
         rig: Rig = frame.sample["rig"]
         images = map(to_bytes, as_arrays(frame.sample["images"]))
         for camera, image, labels in zip(rig, images, self._labels(frame, rig), strict=True):
-            self._add(image, Verdict(name, SOURCES, SOURCES, camera.name, camera.size, detector(image), labels))
+            self._add(image, Verdict(name, SOURCES, SOURCES, camera.size, detector(image), labels))
 
     def _judged(
         self, verdict: Verdict, image: Picture, generated: BoolArray | None, true: TrueImage | None

@@ -22,9 +22,15 @@ def leading_shape(images: Any) -> tuple[int, ...]:
     return ()
 
 
-def split(value: Any, lead: tuple[int, ...]) -> list[Any]:
-    """The entries of each frame, from a (*lead, ...) tensor or a list of (*lead, ...) tensors, one per camera."""
-    return [entry(value, lead, index) for index in np.ndindex(*lead)]
+def split(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
+    """The entries of each frame, from a (*lead, ...) tensor or a list of (*lead, ...) tensors, one per camera.
+
+    SampleError, which begins with ``key``, for other leading dimensions.
+    """
+    try:
+        return [entry(value, lead, index) for index in np.ndindex(*lead)]
+    except ValueError as error:
+        raise SampleError(f"{key}: {error}") from None
 
 
 def entry(value: Any, lead: tuple[int, ...], index: tuple[int, ...]) -> Any:

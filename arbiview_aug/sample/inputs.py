@@ -137,13 +137,9 @@ def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
     lead = leading_shape(images)
     if 0 in lead:
         raise SampleError(f"images: expected at least one frame, got the leading dimensions {lead}")
-    try:
-        frames = split(images, lead)
-    except ValueError as error:
-        raise SampleError(f"images: {error}") from None
     return [
         frame_from(checked_images(frame), sample, source, lead, index)
-        for frame, index in zip(frames, np.ndindex(*lead), strict=True)
+        for frame, index in zip(split("images", images, lead), np.ndindex(*lead), strict=True)
     ]
 
 
