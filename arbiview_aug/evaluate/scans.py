@@ -79,7 +79,7 @@ def scan_metrics(
     lidar: Lidar,
     points: FloatArray,
     truth: FloatArray,
-    where: BoolArray | None = None,
+    where: BoolArray | bool = True,
     boxes: FloatArray | None = None,
 ) -> dict[str, float]:
     """Compare a cloud with a scanner's true one.
@@ -99,9 +99,7 @@ def scan_metrics(
         another ring, or among ``RANGES_M``, for the true densities. ``in_boxes``: sum over the boxes of how far the
         numbers of points are apart, over the sum of the true ones. NaN where undefined.
     """
-    ours, true = range_image(lidar, points), range_image(lidar, truth)
-    if where is not None:
-        ours, true = np.where(where, ours, 0), np.where(where, true, 0)
+    ours, true = (np.where(where, range_image(lidar, cloud), 0) for cloud in (points, truth))
     both = (ours > 0) & (true > 0)
     error = np.abs(ours - true)
     right = np.count_nonzero(both & (error <= np.maximum(TOLERANCE_M, TOLERANCE * true)))

@@ -257,11 +257,8 @@ def _precision(verdicts: Sequence[Verdict], seed: int) -> Figures:
     """AP of all images together, at each of ``OVERLAPS``."""
     seen = [v.scored for v in verdicts if v.scored is not None]
     in_truth = [v.true for v in verdicts if v.true is not None]
-    true, doubtful = [], []
-    for of_image in in_truth:
-        is_sure = of_image.scores >= CONFIDENCE
-        true.append(of_image.boxes[is_sure])
-        doubtful.append(of_image.boxes[~is_sure])
+    true = [of_image.boxes[of_image.scores >= CONFIDENCE] for of_image in in_truth]
+    doubtful = [of_image.boxes[of_image.scores < CONFIDENCE] for of_image in in_truth]
     row: Figures = {"true_objects": np.array([sum(map(len, true))], float)}
     for overlap in OVERLAPS if row["true_objects"][0] else ():
         generator, found = np.random.default_rng(seed), pooled(seen, true, doubtful, overlap)
