@@ -161,7 +161,7 @@ def _next_points(index: Any) -> tuple[Any, Any]:
 
 @inlined
 def _cost(seeds: Any, i: int, row: float, column: float, far: float, side: float) -> Any:
-    """What tells points next to a ray apart, the nearer the less; infinite out of reach."""
+    """Cost of a point for a ray: its squared distance in cells, aside counted double; infinite out of reach."""
     if i < 0:
         return np.float32(np.inf)
     away, off = seeds[0, i] - row, seeds[1, i] - column
