@@ -236,11 +236,10 @@ def _between_points(
     if is_edge:  # of the top of something, over its face
         top = _going_on(seeds, is_level, over, slope)
         return (top, over) if top < b else (b, under)
-    if is_level[over] and is_level[under]:
+    is_same = wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
+    if is_level[over] and is_level[under] and not is_same:
         is_same = abs(seeds[3, over] - seeds[3, under]) <= _JOINED_STEP_M + _JOINED_SLOPE * wide
         is_same &= not _are_apart(seeds, over, under, ground)
-    else:
-        is_same = not (is_level[over] or is_level[under]) and wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
     if not is_same:
         return _ZERO, over
     s, t = seeds[3, over] * a, seeds[3, under] * b  # slopes to both
