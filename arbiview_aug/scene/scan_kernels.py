@@ -79,7 +79,7 @@ def meet_points(
     far = 2 * reach
     aside = int(side) + 1
     above, below = _next_points(index)
-    spoken, is_level = np.empty(seeds.shape[1], np.float32), np.zeros(seeds.shape[1], np.bool_)
+    spoken, is_level = np.empty(seeds.shape[1], np.float32), np.zeros((2, seeds.shape[1]), np.bool_)
     _describe(above, below, index, seeds, ground, reach, spoken, is_level)
     for y in range(rows.shape[0]):
         for x in range(rows.shape[1]):
@@ -112,7 +112,7 @@ def meet_points(
                 apart = (to_over + to_under) * rad
                 inverse, met = _between_points(seeds, is_level, over, under, slope, apart, ground)
             if inverse <= _ZERO and min(to_over, to_under) <= spoken[one]:
-                inverse, met = _going_on(seeds, is_level, one, slope), one
+                inverse, met = _going_on(seeds, is_level[0 if one == over else 1, one], one, slope), one
             if inverse > _ZERO:
                 q[y, x], nearest[y, x] = inverse * level, numbers[met]
 
@@ -182,12 +182,13 @@ def _describe(
             i = index[row, column]
             if i < 0:
                 continue
-            least = 2 * reach
-            is_level[i] = _is_road(seeds, i, ground)
-            for j in (above[row + 1, column], below[row - 1, column]):
-                if j >= 0 and abs(seeds[0, j] - seeds[0, i]) <= 2 * reach:
+            least, is_road = 2 * reach, _is_road(seeds, i, ground)
+            for side, j in enumerate((above[row + 1, column], below[row - 1, column])):
+                is_next = j >= 0 and abs(seeds[0, j] - seeds[0, i]) <= 2 * reach
+                is_level[side, i] = is_road and not (is_next and _are_upright(seeds, i, j))
+                if is_next:
                     least = min(least, abs(seeds[0, j] - seeds[0, i]))
-                    is_level[i] |= _are_level(seeds, i, j, ground)
+                    is_level[side, i] |= _are_level(seeds, i, j, ground)
             spoken[i] = least / _TWO
 
 
@@ -209,6 +210,12 @@ def _are_level(seeds: Any, i: int, j: int, ground: float) -> bool:
 
 
 @inlined
+def _are_upright(seeds: Any, i: int, j: int) -> bool:
+    """Whether a line between two points is nearer to an upright one than to a level one."""
+    return abs(seeds[3, i] - seeds[3, j]) >= abs(_ONE / seeds[2, i] - _ONE / seeds[2, j])
+
+
+@inlined
 def _are_apart(seeds: Any, i: int, j: int, ground: float) -> bool:
     """Whether two points are tops of different things: nearer to the rays' height than to the road's, and far apart."""
     is_high = _TWO * max(seeds[3, i], seeds[3, j]) > ground
@@ -216,9 +223,9 @@ def _are_apart(seeds: Any, i: int, j: int, ground: float) -> bool:
 
 
 @inlined
-def _going_on(seeds: Any, is_level: Any, i: int, slope: float) -> Any:
+def _going_on(seeds: Any, is_level: bool, i: int, slope: float) -> Any:
     """Inverse level distance at which a ray of this slope meets the surface of a point; up to 0 if it does not."""
-    return slope / seeds[3, i] if is_level[i] else seeds[2, i]
+    return slope / seeds[3, i] if is_level else seeds[2, i]
 
 
 @inlined
@@ -229,15 +236,15 @@ def _between_points(
     that is; 0 if they differ."""
     a, b = seeds[2, over], seeds[2, under]
     wide = abs(_ONE / a - _ONE / b)
-    if is_level[under] and not is_level[over] and a <= b:  # a floor up to the foot of something
-        floor = _going_on(seeds, is_level, under, slope)
+    is_top, is_floor = is_level[0, over], is_level[1, under]
+    if is_floor and not is_top and a <= b:  # a floor up to the foot of something
+        floor = _going_on(seeds, True, under, slope)
         return (floor, under) if floor > a else (a, over)
-    is_edge = is_level[over] and not is_level[under] and a <= b and seeds[3, over] >= seeds[3, under]
-    if is_edge:  # of the top of something, over its face
-        top = _going_on(seeds, is_level, over, slope)
+    if is_top and not is_floor and a <= b and seeds[3, over] >= seeds[3, under]:  # the top of something, over its face
+        top = _going_on(seeds, True, over, slope)
         return (top, over) if top < b else (b, under)
     is_same = wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
-    if is_level[over] and is_level[under] and not is_same:
+    if is_top and is_floor and not is_same:
         is_same = abs(seeds[3, over] - seeds[3, under]) <= _JOINED_STEP_M + _JOINED_SLOPE * wide
         is_same &= not _are_apart(seeds, over, under, ground)
     if not is_same:
