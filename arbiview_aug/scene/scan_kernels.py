@@ -243,6 +243,9 @@ def _between_points(
     if is_top and not is_floor and a <= b and seeds[3, over] >= seeds[3, under]:  # the top of something, over its face
         top = _going_on(seeds, True, over, slope)
         return (top, over) if top < b else (b, under)
+    if is_floor and a > b and _JOINED_M < wide <= _TOP_M:  # a floor under what hangs over it, down to its clearance
+        is_under = slope / a - seeds[3, under] < _LOW_M
+        return (_going_on(seeds, True, under, slope), under) if is_under else (a, over)
     is_same = wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
     if is_top and is_floor and not is_same:
         is_same = abs(seeds[3, over] - seeds[3, under]) <= _JOINED_STEP_M + _JOINED_SLOPE * wide
