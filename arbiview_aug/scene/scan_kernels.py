@@ -112,7 +112,7 @@ def meet_points(
                 apart = (to_over + to_under) * rad
                 inverse, met = _between_points(seeds, is_level, over, under, slope, apart, ground)
             if inverse <= _ZERO and min(to_over, to_under) <= spoken[one]:
-                inverse, met = _going_on(seeds, is_level[0 if one == over else 1, one], one, slope), one
+                inverse, met = _going_on(seeds, is_level[int(one == under), one], one, slope), one
             if inverse > _ZERO:
                 q[y, x], nearest[y, x] = inverse * level, numbers[met]
 
@@ -172,9 +172,10 @@ def _cost(seeds: Any, i: int, row: float, column: float, far: float, side: float
 def _describe(
     above: Any, below: Any, index: Any, seeds: Any, ground: float, reach: float, spoken: Any, is_level: Any
 ) -> None:
-    """Write for how many cells above and below points (n,) speak, and which lie on level surfaces.
+    """Write for how many cells above and below points (n,) speak, and which lie on level surfaces (2, n).
 
-    A point speaks for half the spacing of points there, at most ``reach``.
+    A point speaks for half the spacing of points there, at most ``reach``. Rows say how its surface goes on below and
+    above it: as it lies on its other side where it stands upright on this one, so that a top ends in a level edge.
     """
     h, w = index.shape
     for row in range(h):
@@ -182,14 +183,14 @@ def _describe(
             i = index[row, column]
             if i < 0:
                 continue
-            least, is_road = 2 * reach, _is_road(seeds, i, ground)
-            for side, j in enumerate((above[row + 1, column], below[row - 1, column])):
-                is_next = j >= 0 and abs(seeds[0, j] - seeds[0, i]) <= 2 * reach
-                is_level[side, i] = is_road and not (is_next and _are_upright(seeds, i, j))
-                if is_next:
+            least, is_flat = 2 * reach, _is_road(seeds, i, ground)
+            for j in (above[row + 1, column], below[row - 1, column]):
+                if j >= 0 and abs(seeds[0, j] - seeds[0, i]) <= 2 * reach:
                     least = min(least, abs(seeds[0, j] - seeds[0, i]))
-                    is_level[side, i] |= _are_level(seeds, i, j, ground)
+                    is_flat |= _are_level(seeds, i, j, ground)
             spoken[i] = least / _TWO
+            is_level[0, i] = is_flat and not _are_upright(seeds, i, above[row + 1, column], reach)
+            is_level[1, i] = is_flat and not _are_upright(seeds, i, below[row - 1, column], reach)
 
 
 @inlined
@@ -210,9 +211,10 @@ def _are_level(seeds: Any, i: int, j: int, ground: float) -> bool:
 
 
 @inlined
-def _are_upright(seeds: Any, i: int, j: int) -> bool:
-    """Whether a line between two points is nearer to an upright one than to a level one."""
-    return abs(seeds[3, i] - seeds[3, j]) >= abs(_ONE / seeds[2, i] - _ONE / seeds[2, j])
+def _are_upright(seeds: Any, i: int, j: int, reach: float) -> bool:
+    """Whether a line between two points next to each other is nearer to an upright one, and no noise; j may be -1."""
+    up, wide = abs(seeds[3, i] - seeds[3, j]), abs(_ONE / seeds[2, i] - _ONE / seeds[2, j])
+    return j >= 0 and abs(seeds[0, i] - seeds[0, j]) <= _TWO * reach and up >= max(wide, _JOINED_M)
 
 
 @inlined
