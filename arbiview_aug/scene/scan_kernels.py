@@ -10,14 +10,14 @@ from arbiview_aug.environment import compiled, inlined
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _LOW_M, _LOW = np.float32(0.2), np.float32(0.01)
-"""Points lie on the road up to this height over it, and this share of their distance."""
+"""Points lie on the road up to this height over it, and this share of their distance. Cars stand that high over it."""
 _LOWEST_LINE_M = np.float32(10.0)
 """The lowest beams of scanners on roofs, -12 to -31 degrees, meet the road within this distance."""
 _JOINED_STEP_M, _JOINED_SLOPE = np.float32(0.3), np.float32(0.05)
 """Level surfaces that differ by this height, and this share of their distance, are one: kerbs, and roads that rise.
 0.1 m loses 7 % of the points on synthetic vehicles at 15 to 25 m, which stand on the road."""
 _TOP_M = np.float32(2.0)
-"""Tops of things go on from point to point up to this distance."""
+"""Tops of things go on from point to point up to this distance, and floors under what hangs over them."""
 _JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
 """... and upright ones whose distances differ by that much, and so many times by how far they are apart across."""
 
@@ -112,7 +112,8 @@ def meet_points(
                 apart = (to_over + to_under) * rad
                 inverse, met = _between_points(seeds, is_level, over, under, slope, apart, ground)
             if inverse <= _ZERO and min(to_over, to_under) <= spoken[one]:
-                inverse, met = _going_on(seeds, is_level[int(one == under), one], one, slope), one
+                is_flat = is_level[0, one] if one == over else is_level[1, one]
+                inverse, met = slope / seeds[3, one] if is_flat else seeds[2, one], one
             if inverse > _ZERO:
                 q[y, x], nearest[y, x] = inverse * level, numbers[met]
 
@@ -212,7 +213,7 @@ def _are_level(seeds: Any, i: int, j: int, ground: float) -> bool:
 
 @inlined
 def _are_upright(seeds: Any, i: int, j: int, reach: float) -> bool:
-    """Whether a line between two points next to each other is nearer to an upright one, and no noise; j may be -1."""
+    """Whether two points next to each other, of which the second may be -1, lie one over the other beyond noise."""
     up, wide = abs(seeds[3, i] - seeds[3, j]), abs(_ONE / seeds[2, i] - _ONE / seeds[2, j])
     return j >= 0 and abs(seeds[0, i] - seeds[0, j]) <= _TWO * reach and up >= max(wide, _JOINED_M)
 
@@ -225,12 +226,6 @@ def _are_apart(seeds: Any, i: int, j: int, ground: float) -> bool:
 
 
 @inlined
-def _going_on(seeds: Any, is_level: bool, i: int, slope: float) -> Any:
-    """Inverse level distance at which a ray of this slope meets the surface of a point; up to 0 if it does not."""
-    return slope / seeds[3, i] if is_level else seeds[2, i]
-
-
-@inlined
 def _between_points(
     seeds: Any, is_level: Any, over: int, under: int, slope: float, apart: float, ground: float
 ) -> tuple[Any, int]:
@@ -240,14 +235,13 @@ def _between_points(
     wide = abs(_ONE / a - _ONE / b)
     is_top, is_floor = is_level[0, over], is_level[1, under]
     if is_floor and not is_top and a <= b:  # a floor up to the foot of something
-        floor = _going_on(seeds, True, under, slope)
+        floor = slope / seeds[3, under]
         return (floor, under) if floor > a else (a, over)
     if is_top and not is_floor and a <= b and seeds[3, over] >= seeds[3, under]:  # the top of something, over its face
-        top = _going_on(seeds, True, over, slope)
+        top = slope / seeds[3, over]
         return (top, over) if top < b else (b, under)
     if is_floor and a > b and _JOINED_M < wide <= _TOP_M:  # a floor under what hangs over it, down to its clearance
-        is_under = slope / a - seeds[3, under] < _LOW_M
-        return (_going_on(seeds, True, under, slope), under) if is_under else (a, over)
+        return (a, over) if slope / a - seeds[3, under] >= _LOW_M else (slope / seeds[3, under], under)
     is_same = wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
     if is_top and is_floor and not is_same:
         is_same = abs(seeds[3, over] - seeds[3, under]) <= _JOINED_STEP_M + _JOINED_SLOPE * wide
