@@ -416,7 +416,8 @@ def _series(x: FloatArray, coefficients: Sequence[float]) -> FloatArray:
     for c in coefficients[-2::-1]:
         value += c
         value *= x
-    return value + 1
+    value += 1
+    return value
 
 
 def _smallest_positive_root(polynomial: FloatArray) -> float:
