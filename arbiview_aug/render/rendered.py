@@ -23,7 +23,7 @@ from arbiview_aug.render.confidence import confidence
 from arbiview_aug.render.harmonise import LEVELS, SHARES, Curves
 from arbiview_aug.render.plan import AtlasLayout, BilinearFallback, Paint, RenderPlan
 from arbiview_aug.render.torch_backend import render_torch
-from arbiview_aug.sample.batching import barred, covered, framed, stacked
+from arbiview_aug.sample.batching import barred, covered, empty_views, framed, stacked
 from arbiview_aug.sample.inputs import Frame
 
 _REMAP_COLUMNS = 32000  # cv2.remap needs sizes below 32767
@@ -52,14 +52,14 @@ def render_opencv(
         M views (3, h, w) of the images' type, black where no source sees; slices of one block where sizes agree.
     """
     from arbiview_aug.render.kernels import read_ahead
-    from arbiview_aug.render.photometry_kernels import tone
+    from arbiview_aug.render.photometry_kernels import blend, tone
 
     scratch = scratch or Scratch()
     dtype = images[0].dtype
     work = torch.uint8 if dtype == torch.uint8 else torch.float32
     atlas = _fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
     rows_of_bytes = atlas.view(np.uint8).reshape(len(atlas), -1)
-    views = _empty_views(plan, work)
+    views = empty_views([(3, *target.source_camera.shape) for target in plan.targets], work)
     scale = LEVELS if work == torch.uint8 else SHARES
     sizes = {target.source_camera.shape for target in plan.targets}
     buffers = {size: scratch.get(f"view {size}", (*size, 3), atlas.dtype) for size in sizes}
@@ -74,13 +74,12 @@ def render_opencv(
         if not target.pairs:
             view.zero_()
             continue
-        buffer = buffers[h, w]
+        buffer, at, packed, winner = buffers[h, w], target.at, target.at.packed, target.source_camera
         for y in range(0, h, _STRIP_ROWS):
             rows = slice(y, y + _STRIP_ROWS)
             strip = buffer[rows]
-            xy = target.at.xy[rows]
-            read_ahead(rows_of_bytes, 3 * atlas.itemsize, xy.view(np.int32)[..., 0], target.source_camera[rows])
-            _remap(atlas, xy, target.at.frac[rows], target.interpolation, dst=strip)
+            read_ahead(rows_of_bytes, 3 * atlas.itemsize, packed[rows], winner[rows])
+            _remap(atlas, at.xy[rows], at.frac[rows], target.interpolation, dst=strip)
             if target.edge is not None:
                 _put_edge(target.edge.rows(y, y + _STRIP_ROWS, w), atlas, strip)
         # Tone the views, not the sources: these have more pixels, and would have to be copied.
@@ -88,14 +87,15 @@ def render_opencv(
             tone(buffer.reshape(-1), target.runs, tones, *scale)
         for band, runs in zip(target.bands, target.band_runs, strict=True):
             bh, bw = band.weight.shape
-            part = buffer[band.y : band.y + bh, band.x : band.x + bw]
+            rows, columns = slice(band.y, band.y + bh), slice(band.x, band.x + bw)
             second = _remap(atlas, band.at.xy, band.at.frac, target.seam_interpolation)
             if curves is not None:
                 tone(second.reshape(-1), runs, tones, *scale)
             if change is not None:
-                difference = np.abs(part.astype(np.float32) - second).mean(-1)
-                change[band.y : band.y + bh, band.x : band.x + bw] += difference * band.weight
-            part[...] = cv2.blendLinear(part, second, 1 - band.weight, band.weight)
+                difference = np.abs(buffer[rows, columns].astype(np.float32) - second).mean(-1)
+                change[rows, columns] += difference * band.weight
+            part = buffer.reshape(h, -1)[rows, 3 * columns.start : 3 * columns.stop]
+            blend(part, second.reshape(bh, -1), band.weight, scale[1])
         cv2.split(buffer, list(view.numpy()))
     return [view.to(dtype) for view in views]
 
@@ -108,13 +108,6 @@ def _put_edge(edge: BilinearFallback, atlas: np.ndarray, strip: np.ndarray) -> N
     for first in range(0, len(edge.pixel), _REMAP_COLUMNS):
         some = slice(first, first + _REMAP_COLUMNS)
         flat[edge.pixel[some]] = _remap(atlas, edge.at.xy[:, some], edge.at.frac[:, some], "linear")[0]
-
-
-def _empty_views(plan: RenderPlan, dtype: torch.dtype) -> list[torch.Tensor]:
-    sizes = [target.source_camera.shape for target in plan.targets]
-    if len(set(sizes)) == 1:
-        return list(torch.empty((len(sizes), 3, *sizes[0]), dtype=dtype))
-    return [torch.empty((3, *size), dtype=dtype) for size in sizes]
 
 
 def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch) -> np.ndarray:
