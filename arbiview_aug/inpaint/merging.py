@@ -19,7 +19,7 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray
-from arbiview_aug.image_ops import bounding_box
+from arbiview_aug.image_ops import bounding_box, of_cells
 from arbiview_aug.sample.neighbours import ChangeRisk
 
 _AGREEMENT_LEVELS = 16.0
@@ -29,10 +29,13 @@ _CONTRADICTION_LEVELS = 24.0
 """The same between a frame and the current one, on a seam (``docs/drives.md``, Constants)."""
 
 _WINDOW_PX = 5
-"""Side of the window in which two frames are compared."""
+"""Side of the window in which two frames are compared, at least 3 samples."""
 
 _CONTRADICTION_REACH = 1.25
 """A contradiction on the seam reaches to where agreement is nearer by this factor (``docs/drives.md``, Constants)."""
+
+_SAMPLES_PER_SEAM = 7
+"""Rows or columns across a seam in which labelled frames are compared; all of narrower seams."""
 
 _FEW_CANDIDATES = 2
 """With at most this many candidates, accept one without a confirming vote."""
@@ -99,26 +102,45 @@ def merged(
 def _merged(
     view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
 ) -> tuple[torch.Tensor, npt.NDArray[np.int16]]:
-    """As ``merged``, where any candidate shows something."""
-    levels, n = 1.0 if view.dtype == torch.uint8 else 255.0, len(candidates)
-    current, images = _levels(view, levels), [_levels(one.image, levels) for one in candidates]
-    _tone(current, images, free, seam, candidates, max(1, margin_px // 2))
-    shown = np.stack([one.shows & free for one in candidates])
-    accepted = shown & _accepted(current, images, shown, seam, candidates)
+    """As ``merged``, where any candidate shows something; exposures and votes are those of a sample of pixels."""
+    # Without labels the borders of what moved must be found.
+    unlabelled = any((one.risk == ChangeRisk.UNLABELLED).any() for one in candidates)
+    step, n = 1 if unlabelled else max(1, margin_px // _SAMPLES_PER_SEAM), len(candidates)
+    every = slice(None, None, step), slice(None, None, step)
+    levels = 1.0 if view.dtype == torch.uint8 else 255.0
+    samples = [one.part(every) for one in candidates]
+    current, images = _levels(view[(..., *every)], levels), [_levels(one.image, levels) for one in samples]
+    recorded = [image.copy() if step > 1 else image for image in images]
+    gains = _tone(current, images, free[every], seam[every], samples, max(1, margin_px // 2 // step))
+    shown = np.stack([one.shows & free[every] for one in samples])
+    accepted = shown & _accepted(current, images, shown, seam[every], samples, max(3, _WINDOW_PX // step | 1))
     # The order breaks ties.
     rank, chosen = np.full(free.shape, 256 * n, np.uint16), np.full(free.shape, -1, np.int16)
     for k, one in enumerate(candidates):
+        # Samples may miss a border.
+        accepts, rejects = (_beside(flags) for flags in (accepted[k], shown[k] & ~accepted[k]))
+        usable = of_cells(accepted[k] | (accepts & ~rejects & ~shown[k]), step, free.shape) & one.shows & free
         key = one.blur * np.uint16(n) + np.uint16(k)
-        better = accepted[k] & (key < rank)
+        better = usable & (key < rank)
         np.copyto(rank, key, where=better)
         np.copyto(chosen, np.int16(k), where=better)
     pixels = view.clone(memory_format=torch.contiguous_format)
-    for k, image in enumerate(images):
+    for k, one in enumerate(candidates):
         taken = np.flatnonzero(chosen == k)
-        colours = image.reshape(3, -1).take(taken, 1)
+        y, x = np.divmod(taken, free.shape[1])
+        at = y // step * current.shape[2] + x // step
+        colours = images[k].reshape(3, -1).take(at, 1)
+        if step > 1:  # what a pixel has more than its sample
+            detail = _levels(one.image, levels).reshape(3, -1).take(taken, 1) - recorded[k].reshape(3, -1).take(at, 1)
+            colours += gains[k] * detail
         colours = np.clip(np.rint(colours) if levels == 1 else colours / np.float32(levels), 0, 255 / levels)
         pixels.view(3, -1).index_copy_(1, torch.from_numpy(taken).to(view.device), torch.from_numpy(colours).to(view))
     return pixels, chosen
+
+
+def _beside(flags: BoolArray) -> BoolArray:
+    """(h, w) True on True pixels and those next to them."""
+    return np.asarray(cv2.dilate(flags.view(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
 def _levels(image: torch.Tensor, levels: float) -> Levels:
@@ -128,7 +150,12 @@ def _levels(image: torch.Tensor, levels: float) -> Levels:
 
 # --- votes ------------------------------------------------------------------------------------------------------------
 def _accepted(
-    current: Levels, toned: Sequence[Levels], shown: BoolArray, seam: BoolArray, candidates: Sequence[Candidate]
+    current: Levels,
+    toned: Sequence[Levels],
+    shown: BoolArray,
+    seam: BoolArray,
+    candidates: Sequence[Candidate],
+    window: int,
 ) -> BoolArray:
     """(n, h, w) whether each candidate shows what stands there now."""
     votes, nearest = np.zeros(shown.shape, np.uint8), np.full((2, *seam.shape), -1, np.int16)
@@ -138,7 +165,7 @@ def _accepted(
     static = shown.copy()  # as far as the nearest frames before and after the current one agree
     for pair in combinations(range(len(candidates)), 2):
         both = shown[pair[0]] & shown[pair[1]]
-        agree = _agreeing(toned[pair[0]], toned[pair[1]], both, _AGREEMENT_LEVELS)
+        agree = _agreeing(toned[pair[0]], toned[pair[1]], both, _AGREEMENT_LEVELS, window)
         for i, j in (pair, pair[::-1]):
             votes[i] += agree
             static[i] &= ~both | agree | (nearest[int(candidates[j].later)] != j)
@@ -152,18 +179,20 @@ def _accepted(
         on_both_sides = (nearest[0] >= 0) & (nearest[1] >= 0)
         static = (static & on_both_sides) | (unanimous & (votes >= (0 if few else 2)) & ~on_both_sides)
         if len(candidates) > 1:  # a single candidate may itself show the moving object
-            static &= ~_arrived(current, toned, seam, candidates)
+            static &= ~_arrived(current, toned, seam, candidates, window)
         accepted = (static & unlabelled) | (accepted & ~unlabelled)
     return np.asarray(accepted)
 
 
-def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate]) -> BoolArray:
+def _arrived(
+    current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate], window: int
+) -> BoolArray:
     """(h, w) where a hole continues what the current frame alone shows on the seam."""
     known, agree = np.zeros_like(seam), np.zeros_like(seam)
     for image, one in zip(toned, candidates, strict=True):
         both = seam & one.shows
         known |= both
-        agree |= _agreeing(image, current, both, _CONTRADICTION_LEVELS)
+        agree |= _agreeing(image, current, both, _CONTRADICTION_LEVELS, window)
     contradicts = known & ~agree
     if not contradicts.any():
         return contradicts
@@ -173,12 +202,12 @@ def _arrived(current: Levels, toned: Sequence[Levels], seam: BoolArray, candidat
     return np.asarray(away / _CONTRADICTION_REACH < near)
 
 
-def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float) -> BoolArray:
+def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float, window: int) -> BoolArray:
     """(h, w) where two images differ by less than a limit: means over the channels and a window's valid pixels."""
     apart = np.asarray(cv2.absdiff(one.reshape(-1, one.shape[2]), two.reshape(-1, one.shape[2]))).reshape(one.shape)
     valid = where.astype(np.float32)
     total, count = (
-        np.asarray(cv2.boxFilter(part, -1, (_WINDOW_PX, _WINDOW_PX), normalize=False, borderType=cv2.BORDER_CONSTANT))
+        np.asarray(cv2.boxFilter(part, -1, (window, window), normalize=False, borderType=cv2.BORDER_CONSTANT))
         for part in ((apart[0] + apart[1] + apart[2]) * valid, valid)
     )
     return np.asarray(where & (total < 3 * limit * count))
@@ -192,36 +221,41 @@ def _tone(
     seam: BoolArray,
     candidates: Sequence[Candidate],
     cell: int,
-) -> None:
-    """Bring the candidates to the view's exposure, in place.
+) -> list[Levels]:
+    """Bring the candidates to the view's exposure, in place; return their gains (3, 1).
 
     Candidates with too little of the seam are matched to those with enough. Their offsets are of cells of pixels.
     """
-    unmatched = []
+    unmatched, gains = [], [np.ones((3, 1), np.float32)] * len(candidates)
     for k, one in enumerate(candidates):
         match = _expose(images[k], view, seam & one.shows, _SEAM_INLIERS)
         if match is None:
             unmatched.append(k)
         else:
-            images[k] += _offset(*match, seam.shape, cell)
+            gains[k] = match[0]
+            images[k] += _offset(*match[1:], seam.shape, cell)
     if not unmatched:
-        return
+        return gains
     reference, known = view.copy(), seam.copy()
     for k in sorted(range(len(candidates)), key=unmatched.__contains__):
         shows = free & candidates[k].shows
-        if k in unmatched and _expose(images[k], reference, shows & known, _OVERLAP_INLIERS) is None:
-            continue
+        if k in unmatched:
+            match = _expose(images[k], reference, shows & known, _OVERLAP_INLIERS)
+            if match is None:
+                continue
+            gains[k] = match[0]
         np.copyto(reference, images[k], where=shows & ~known)
         known |= shows
+    return gains
 
 
 def _expose(
     image: Levels, reference: Levels, where: BoolArray, min_inliers: float
-) -> tuple[npt.NDArray[np.int64], Levels] | None:
+) -> tuple[Levels, npt.NDArray[np.int64], Levels] | None:
     """Give an image the gain of a reference, in place; None if it is implausible.
 
     Returns:
-        Pixels (n,) that then agree, and what they lack (3, n).
+        The gain (3, 1), pixels (n,) that then agree, and what they lack (3, n).
     """
     pixel = np.flatnonzero(where)
     if len(pixel) < _MIN_SEAM_PX:
@@ -238,7 +272,7 @@ def _expose(
         return None
     image *= gain[:, :, None]
     image += np.float32(_DARK_LEVELS) * (gain[:, :, None] - 1)
-    return pixel[agree], error.take(agree, 1)
+    return gain, pixel[agree], error.take(agree, 1)
 
 
 def _offset(pixel: npt.NDArray[np.int64], error: Levels, size: tuple[int, ...], cell: int) -> Levels:

@@ -21,7 +21,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import PixelRays, RayCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.image_ops import FRESH, Memory, bounding_box, some_of_cells
+from arbiview_aug.image_ops import FRESH, Memory, bounding_box, of_cells, some_of_cells
 from arbiview_aug.inpaint.merging import Candidate, merged
 from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
@@ -251,7 +251,7 @@ def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neig
         corners = np.zeros(q.shape, np.uint8)
         corners[hole.near] = risks
         cells = np.maximum.reduce([corners[:-1, :-1], corners[1:, :-1], corners[:-1, 1:], corners[1:, 1:]])
-        risk = cells.repeat(_CELL_PX, axis=0).repeat(_CELL_PX, axis=1)[: usable.shape[0], : usable.shape[1]]
+        risk = of_cells(cells, _CELL_PX, usable.shape)
     return Candidate(usable, blur, risk, neighbour.is_later)
 
 
@@ -281,9 +281,9 @@ def fill_from_neighbours(
         if view.requires_grad or view.device.type != "cpu":
             views[hole.target] = view.clone()
         views[hole.target][place] = pixels
+        _write(rendered.coverage, hole, chosen >= 0, np.True_)
         for n, (fill, _) in enumerate(neighbours):
             taken, target = chosen == n, fill.plan.targets[k]
-            _write(rendered.coverage, hole, taken, np.True_)
             _write(rendered.source_camera, hole, taken, target.source_camera)
             _write(rendered.source_frame, hole, taken, np.int8(fill.neighbour.number + 1))
             _write(certain if target.certainty is not None else None, hole, taken, target.certainty)
