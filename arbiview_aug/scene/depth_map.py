@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any, NamedTuple
 
 import cv2
@@ -218,7 +218,7 @@ def hidden_by(maps: Sequence[DepthMap], camera: Camera) -> Layer | None:
         side = 2 * round(GAP_RAD * float(one.camera.K[0, 0])) + 1
         np.copyto(hidden, cv2.dilate(hidden, np.ones((side, side), np.uint8)), where=hidden == 0)
         layers.append(_warped(one.camera, hidden, camera, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE))
-    return np.asarray(np.max(layers, axis=0)) if layers else None
+    return reduce(np.maximum, layers) if layers else None
 
 
 def _warped(one: Camera, layer: Layer, two: Camera, interpolation: int, border: int) -> Layer:
@@ -227,5 +227,9 @@ def _warped(one: Camera, layer: Layer, two: Camera, interpolation: int, border: 
         return layer
     scale = one.K[[0, 1], [0, 1]] / two.K[[0, 1], [0, 1]]
     to_one = np.column_stack([np.diag(scale), one.K[:2, 2] - scale * two.K[:2, 2]])
+    sides = np.divide(one.size, two.size)[::-1]
+    is_whole = np.allclose(to_one, np.column_stack([np.diag(sides), (sides - 1) / 2]), rtol=0, atol=1e-9)
+    if is_whole and interpolation == cv2.INTER_LINEAR:  # ten times as fast
+        return np.asarray(cv2.resize(layer, two.size[::-1], interpolation=interpolation))
     flags = interpolation | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(layer, to_one, two.size[::-1], flags=flags, borderMode=border))
