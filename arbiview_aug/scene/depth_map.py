@@ -63,7 +63,7 @@ class DepthMap(NamedTuple):
         known = (depth_m > 0) & (depth_m <= MOST_M)
         if camera.mask is not None:
             known &= camera.mask
-        return cls(camera, np.where(known, depth_m, 0).astype(np.float32))
+        return cls(camera, np.where(known, depth_m, 0).astype(np.float32, copy=False))
 
     def is_of(self, camera: Camera) -> bool:
         """Whether it is of a camera, of whatever size."""
@@ -146,8 +146,8 @@ def anchored_maps(maps: Iterable[DepthMap], before: Iterable[Points | Maps]) -> 
     """The maps of a rig, fused with its points (P, 3) and other maps, camera by camera; none if nothing is known."""
     before = list(before)
     others = [one for part in before if isinstance(part, tuple) for one in part]
-    arrays = [part[:, :3] for part in before if not isinstance(part, tuple)]
-    points = np.concatenate([np.zeros((0, 3), np.float32), *arrays])
+    rows = [part[:, :3].T for part in before if not isinstance(part, tuple)]
+    points = np.concatenate([np.zeros((3, 0), np.float32), *rows], axis=1, dtype=np.float32).T  # as cameras read them
     fused = tuple(anchored(one, points, [other for other in others if other.is_of(one.camera)]) for one in maps)
     return fused if any(one.depth_m.any() for one in fused) else ()
 
