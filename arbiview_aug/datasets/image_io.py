@@ -86,11 +86,6 @@ def decode_images(
     return [torch.from_numpy(image).permute(2, 0, 1) for image in images]
 
 
-def stack_or_list(tensors: list[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
-    """Stack tensors of one shape; else return the list."""
-    return torch.stack(tensors) if len({tensor.shape for tensor in tensors}) == 1 else tensors
-
-
 def check_reduce(reduce: int) -> None:
     """Raise ValueError unless ``reduce`` is 1, 2 or 4."""
     if reduce not in get_args(Reduce):
