@@ -23,7 +23,7 @@ from arbiview_aug.render.confidence import confidence
 from arbiview_aug.render.harmonise import LEVELS, SHARES, Curves
 from arbiview_aug.render.plan import AtlasLayout, BilinearFallback, Paint, RenderPlan
 from arbiview_aug.render.torch_backend import render_torch
-from arbiview_aug.sample.batching import barred, covered, empty_views, framed, stacked
+from arbiview_aug.sample.batching import barred, covered, framed, stacked
 from arbiview_aug.sample.inputs import Frame
 
 _REMAP_COLUMNS = 32000  # cv2.remap needs sizes below 32767
@@ -59,7 +59,7 @@ def render_opencv(
     work = torch.uint8 if dtype == torch.uint8 else torch.float32
     atlas = _fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
     rows_of_bytes = atlas.view(np.uint8).reshape(len(atlas), -1)
-    views = empty_views([(3, *target.source_camera.shape) for target in plan.targets], work)
+    views = _empty_views(plan, work)
     scale = LEVELS if work == torch.uint8 else SHARES
     sizes = {target.source_camera.shape for target in plan.targets}
     buffers = {size: scratch.get(f"view {size}", (*size, 3), atlas.dtype) for size in sizes}
@@ -74,7 +74,8 @@ def render_opencv(
         if not target.pairs:
             view.zero_()
             continue
-        buffer, at, packed, winner = buffers[h, w], target.at, target.at.packed, target.source_camera
+        buffer, at, winner = buffers[h, w], target.at, target.source_camera
+        packed = at.xy.view(np.int32)[..., 0]
         for y in range(0, h, _STRIP_ROWS):
             rows = slice(y, y + _STRIP_ROWS)
             strip = buffer[rows]
@@ -108,6 +109,13 @@ def _put_edge(edge: BilinearFallback, atlas: np.ndarray, strip: np.ndarray) -> N
     for first in range(0, len(edge.pixel), _REMAP_COLUMNS):
         some = slice(first, first + _REMAP_COLUMNS)
         flat[edge.pixel[some]] = _remap(atlas, edge.at.xy[:, some], edge.at.frac[:, some], "linear")[0]
+
+
+def _empty_views(plan: RenderPlan, dtype: torch.dtype) -> list[torch.Tensor]:
+    sizes = [target.source_camera.shape for target in plan.targets]
+    if len(set(sizes)) == 1:
+        return list(torch.empty((len(sizes), 3, *sizes[0]), dtype=dtype))
+    return [torch.empty((3, *size), dtype=dtype) for size in sizes]
 
 
 def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch) -> np.ndarray:

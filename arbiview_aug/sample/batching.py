@@ -62,21 +62,17 @@ def stacked(views: list[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
     return torch.stack(views)
 
 
-def empty_views(shapes: Sequence[tuple[int, ...]], dtype: torch.dtype) -> list[torch.Tensor]:
-    """Tensors of arbitrary content on the CPU, slices of one where all shapes agree."""
-    if len(set(shapes)) > 1:
-        return [torch.empty(shape, dtype=dtype) for shape in shapes]
-    return list(torch.empty((len(shapes), *shapes[0]), dtype=dtype))
-
-
 def covered(winners: Sequence[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
     """Coverage of (h, w) int8 winning sources, stacked where all sizes agree."""
     if winners[0].device.type != "cpu":
         return stacked([winner >= 0 for winner in winners])
-    coverage = empty_views([tuple(winner.shape) for winner in winners], torch.bool)
-    for winner, seen in zip(winners, coverage, strict=True):
-        np.greater_equal(winner.numpy(), 0, out=seen.numpy())  # six times as fast as torch
-    return stacked(coverage)
+    # On the CPU numpy compares six times faster than torch.
+    if len({winner.shape for winner in winners}) > 1:
+        return [torch.from_numpy(winner.numpy() >= 0) for winner in winners]
+    coverage = torch.empty((len(winners), *winners[0].shape), dtype=torch.bool)
+    for winner, seen in zip(winners, coverage.numpy(), strict=True):
+        np.greater_equal(winner.numpy(), 0, out=seen)
+    return coverage
 
 
 def gathered(parts: Sequence[Any], lead: tuple[int, ...]) -> Any:
