@@ -23,7 +23,6 @@ LENS_CODES = {
 }  # fmt: skip
 """Lenses that kernels know. Others are projected by their class, image by image."""
 
-_FOLD, _FIRST = 5, 6  # entries of ``camera_parameters``
 _ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
 _FOUR, _FIVE = np.float32(4), np.float32(5)
 _NEWTON_STEPS, _LEAST_SLOPE = 4, np.float32(1e-2)

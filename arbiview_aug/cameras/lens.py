@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -215,20 +215,36 @@ class _PolynomialLens(_AngularLens):
         return min(math.pi, _smallest_positive_root(self._slope_polynomial))
 
     @property
+    def _slopes(self) -> list[float]:
+        return [(1 + self.step * n) * k for n, k in enumerate(self.distortion, 1)]
+
+    @property
     def _slope_polynomial(self) -> FloatArray:
         """The slope's coefficients from the highest power down."""
-        polynomial = np.zeros(2 + self.step * len(self.distortion))
-        polynomial[:-1: self.step] = [*self.distortion[::-1], 1.0]
-        return np.asarray(np.polyder(polynomial), np.float64)
+        polynomial = np.zeros(1 + self.step * len(self.distortion))
+        polynomial[:: self.step] = [*self._slopes[::-1], 1.0]
+        return polynomial
 
     def _polynomial(self, t: FloatArray) -> FloatArray:
-        return t * np.polyval([*self.distortion[::-1], 1.0], t**self.step)
+        return t * _series(t**self.step, self.distortion)
+
+    def _inverse(self, values: FloatArray, limit: float) -> FloatArray:
+        """Arguments from 0 to ``limit`` at which the polynomial rises through the values (...,): Newton's method."""
+        arguments = np.minimum(values, limit)
+        for _ in range(_NEWTON_STEPS):
+            slope = np.maximum(_series(arguments**self.step, self._slopes), 1e-3)
+            # The polynomial rises up to the limit: a bounded step cannot leave that branch.
+            step = np.clip((self._polynomial(arguments) - values) / slope, -0.25, 0.25)
+            arguments = np.clip(arguments - step, 0.0, limit)
+            if np.abs(step).max(initial=0.0) < 1e-14:
+                break
+        return arguments
 
     def _radius(self, theta: FloatArray) -> FloatArray:
         return self._polynomial(theta)
 
     def _angle(self, radius: FloatArray) -> FloatArray:
-        return _inverse(self._polynomial, self._slope_polynomial, radius, self.fold_limit)
+        return self._inverse(radius, self.fold_limit)
 
 
 class Fisheye(_PolynomialLens):
@@ -286,7 +302,7 @@ class FThetaBackward(FTheta):
         return *self.distortion, *start.tolist()
 
     def _radius(self, theta: FloatArray) -> FloatArray:
-        return _inverse(self._polynomial, self._slope_polynomial, theta, self._largest_radius)
+        return self._inverse(theta, self._largest_radius)
 
     def _angle(self, radius: FloatArray) -> FloatArray:
         return self._polynomial(np.minimum(radius, self._largest_radius))
@@ -394,18 +410,14 @@ def _unit(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.stack([a / norm, b / norm, 1 / norm], -1)
 
 
-def _inverse(
-    function: Callable[[FloatArray], FloatArray], slope: FloatArray, values: FloatArray, limit: float
-) -> FloatArray:
-    """Arguments from 0 to ``limit`` at which a polynomial that rises there has the values (...,): Newton's method."""
-    arguments = np.minimum(values, limit)
-    for _ in range(_NEWTON_STEPS):
-        # The function rises up to the limit: a bounded step cannot leave that branch.
-        step = np.clip((function(arguments) - values) / np.maximum(np.polyval(slope, arguments), 1e-3), -0.25, 0.25)
-        arguments = np.clip(arguments - step, 0.0, limit)
-        if np.abs(step).max(initial=0.0) < 1e-14:
-            break
-    return arguments
+def _series(x: FloatArray, coefficients: Sequence[float]) -> FloatArray:
+    """1 + c₁ x + c₂ x² + ..., by Horner's rule."""
+    value: FloatArray = coefficients[-1] * x
+    for c in coefficients[-2::-1]:
+        value += c
+        value *= x
+    value += 1
+    return value
 
 
 def _smallest_positive_root(polynomial: FloatArray) -> float:
