@@ -239,12 +239,12 @@ class Panorama:
 
 @dataclass(frozen=True, eq=False)
 class PointCloudSurface(DenseSurface):
-    """Points made dense over the street. Points of the own car are left out.
+    """Points made dense over the street.
 
     Attributes:
         street: Surface where nothing was measured.
-        points: (P, 3) in the ego frame, finite, metres.
-        mapped: Number of the last points that are of depth maps; none of these is of the own car.
+        points: (P, 3) in the ego frame, finite, metres; none of the own car's.
+        mapped: Number of the last points that are of depth maps.
         swept: Whether points of neighbouring frames are among them.
         maps: These depth maps, which tell what is hidden from their own cameras.
     """
@@ -260,10 +260,7 @@ class PointCloudSurface(DenseSurface):
     _nodes: dict[tuple[bytes, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
-        measured = len(self.points) - self.mapped  # maps leave out their own
-        is_own = own_car(self.points[:measured])
-        points = np.delete(self.points, np.flatnonzero(is_own), axis=0) if is_own.any() else self.points
-        object.__setattr__(self, "points", np.ascontiguousarray(points, np.float32))
+        object.__setattr__(self, "points", np.ascontiguousarray(self.points, np.float32))
 
     @cached_property
     def _measured(self) -> PointCloudSurface:

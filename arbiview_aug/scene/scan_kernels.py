@@ -10,14 +10,14 @@ from arbiview_aug.environment import compiled, inlined
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _LOW_M, _LOW = np.float32(0.2), np.float32(0.01)
-"""Points lie on the road up to this height over it, and this share of their distance."""
+"""Points lie on the road up to this height over it, and this share of their distance. Cars stand that high over it."""
 _LOWEST_LINE_M = np.float32(10.0)
 """The lowest beams of scanners on roofs, -12 to -31 degrees, meet the road within this distance."""
 _JOINED_STEP_M, _JOINED_SLOPE = np.float32(0.3), np.float32(0.05)
 """Level surfaces that differ by this height, and this share of their distance, are one: kerbs, and roads that rise.
 0.1 m loses 7 % of the points on synthetic vehicles at 15 to 25 m, which stand on the road."""
 _TOP_M = np.float32(2.0)
-"""Tops of things go on from point to point up to this distance."""
+"""Tops of things go on from point to point up to this distance, and floors under what hangs over them."""
 _JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
 """... and upright ones whose distances differ by that much, and so many times by how far they are apart across."""
 
@@ -79,7 +79,7 @@ def meet_points(
     far = 2 * reach
     aside = int(side) + 1
     above, below = _next_points(index)
-    spoken, is_level = np.empty(seeds.shape[1], np.float32), np.zeros(seeds.shape[1], np.bool_)
+    spoken, is_level = np.empty(seeds.shape[1], np.float32), np.zeros((2, seeds.shape[1]), np.bool_)
     _describe(above, below, index, seeds, ground, reach, spoken, is_level)
     for y in range(rows.shape[0]):
         for x in range(rows.shape[1]):
@@ -112,7 +112,8 @@ def meet_points(
                 apart = (to_over + to_under) * rad
                 inverse, met = _between_points(seeds, is_level, over, under, slope, apart, ground)
             if inverse <= _ZERO and min(to_over, to_under) <= spoken[one]:
-                inverse, met = _going_on(seeds, is_level, one, slope), one
+                is_flat = is_level[0, one] if one == over else is_level[1, one]
+                inverse, met = slope / seeds[3, one] if is_flat else seeds[2, one], one
             if inverse > _ZERO:
                 q[y, x], nearest[y, x] = inverse * level, numbers[met]
 
@@ -161,7 +162,7 @@ def _next_points(index: Any) -> tuple[Any, Any]:
 
 @inlined
 def _cost(seeds: Any, i: int, row: float, column: float, far: float, side: float) -> Any:
-    """What tells points next to a ray apart, the nearer the less; infinite out of reach."""
+    """Cost of a point for a ray: its squared distance in cells, aside counted double; infinite out of reach."""
     if i < 0:
         return np.float32(np.inf)
     away, off = seeds[0, i] - row, seeds[1, i] - column
@@ -172,9 +173,10 @@ def _cost(seeds: Any, i: int, row: float, column: float, far: float, side: float
 def _describe(
     above: Any, below: Any, index: Any, seeds: Any, ground: float, reach: float, spoken: Any, is_level: Any
 ) -> None:
-    """Write for how many cells above and below points (n,) speak, and which lie on level surfaces.
+    """Write for how many cells above and below points (n,) speak, and which lie on level surfaces (2, n).
 
-    A point speaks for half the spacing of points there, at most ``reach``.
+    A point speaks for half the spacing of points there, at most ``reach``. Rows say how its surface goes on below and
+    above it: as it lies on its other side where it stands upright on this one, so that a top ends in a level edge.
     """
     h, w = index.shape
     for row in range(h):
@@ -182,13 +184,14 @@ def _describe(
             i = index[row, column]
             if i < 0:
                 continue
-            least = 2 * reach
-            is_level[i] = _is_road(seeds, i, ground)
+            least, is_flat = 2 * reach, _is_road(seeds, i, ground)
             for j in (above[row + 1, column], below[row - 1, column]):
                 if j >= 0 and abs(seeds[0, j] - seeds[0, i]) <= 2 * reach:
                     least = min(least, abs(seeds[0, j] - seeds[0, i]))
-                    is_level[i] |= _are_level(seeds, i, j, ground)
+                    is_flat |= _are_level(seeds, i, j, ground)
             spoken[i] = least / _TWO
+            is_level[0, i] = is_flat and not _are_upright(seeds, i, above[row + 1, column], reach)
+            is_level[1, i] = is_flat and not _are_upright(seeds, i, below[row - 1, column], reach)
 
 
 @inlined
@@ -209,16 +212,17 @@ def _are_level(seeds: Any, i: int, j: int, ground: float) -> bool:
 
 
 @inlined
+def _are_upright(seeds: Any, i: int, j: int, reach: float) -> bool:
+    """Whether two points next to each other, of which the second may be -1, lie one over the other beyond noise."""
+    up, wide = abs(seeds[3, i] - seeds[3, j]), abs(_ONE / seeds[2, i] - _ONE / seeds[2, j])
+    return j >= 0 and abs(seeds[0, i] - seeds[0, j]) <= _TWO * reach and up >= max(wide, _JOINED_M)
+
+
+@inlined
 def _are_apart(seeds: Any, i: int, j: int, ground: float) -> bool:
     """Whether two points are tops of different things: nearer to the rays' height than to the road's, and far apart."""
     is_high = _TWO * max(seeds[3, i], seeds[3, j]) > ground
     return is_high and abs(_ONE / seeds[2, i] - _ONE / seeds[2, j]) > _TOP_M
-
-
-@inlined
-def _going_on(seeds: Any, is_level: Any, i: int, slope: float) -> Any:
-    """Inverse level distance at which a ray of this slope meets the surface of a point; up to 0 if it does not."""
-    return slope / seeds[3, i] if is_level[i] else seeds[2, i]
 
 
 @inlined
@@ -229,18 +233,19 @@ def _between_points(
     that is; 0 if they differ."""
     a, b = seeds[2, over], seeds[2, under]
     wide = abs(_ONE / a - _ONE / b)
-    if is_level[under] and not is_level[over] and a <= b:  # a floor up to the foot of something
-        floor = _going_on(seeds, is_level, under, slope)
+    is_top, is_floor = is_level[0, over], is_level[1, under]
+    if is_floor and not is_top and a <= b:  # a floor up to the foot of something
+        floor = slope / seeds[3, under]
         return (floor, under) if floor > a else (a, over)
-    is_edge = is_level[over] and not is_level[under] and a <= b and seeds[3, over] >= seeds[3, under]
-    if is_edge:  # of the top of something, over its face
-        top = _going_on(seeds, is_level, over, slope)
+    if is_top and not is_floor and a <= b and seeds[3, over] >= seeds[3, under]:  # the top of something, over its face
+        top = slope / seeds[3, over]
         return (top, over) if top < b else (b, under)
-    if is_level[over] and is_level[under]:
+    if is_floor and a > b and _JOINED_M < wide <= _TOP_M:  # a floor under what hangs over it, down to its clearance
+        return (a, over) if slope / a - seeds[3, under] >= _LOW_M else (slope / seeds[3, under], under)
+    is_same = wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
+    if is_top and is_floor and not is_same:
         is_same = abs(seeds[3, over] - seeds[3, under]) <= _JOINED_STEP_M + _JOINED_SLOPE * wide
         is_same &= not _are_apart(seeds, over, under, ground)
-    else:
-        is_same = not (is_level[over] or is_level[under]) and wide <= _JOINED_M + _JOINED_STEEP * apart / min(a, b)
     if not is_same:
         return _ZERO, over
     s, t = seeds[3, over] * a, seeds[3, under] * b  # slopes to both

@@ -26,8 +26,8 @@ from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from arbiview_aug.transforms.settings import is_number
 
-Coverages = Sequence[BoolArray | float]
-"""Coverage (h, w) of each target camera, or its share."""
+Coverages = Sequence[BoolArray]
+"""Coverage (h, w) of each target camera."""
 
 _UNREACHABLE = 0.5  # warn of target cameras of which less than this share is covered
 _SUSPICIOUS = 0.3  # a rig of which less is covered may have wrong poses
@@ -46,7 +46,7 @@ def check_reach(source: Rig, target: Rig, coverages: Coverages, unseen: str, war
     if is_empty:
         cause = _likely_cause(source, target)
         raise UnreachableError(f"{lost}: expected some pixels to be covered, got none. {cause}")
-    shares = [float(np.count_nonzero(c) / c.size if isinstance(c, np.ndarray) else c) for c in coverages]
+    shares = [np.count_nonzero(covered) / covered.size for covered in coverages]
     poor = [f"{c.name} {share:.0%}" for c, share in zip(target, shares, strict=True) if share < _UNREACHABLE]
     if poor:
         cause = f"{_likely_cause(source, target)}. " if np.mean(shares) < _SUSPICIOUS else ""

@@ -101,10 +101,7 @@ def test_depth_maps_show_gaps_as_they_are() -> None:
     lines, maps = (PointCloudSurface(Street(), points, mapped) for mapped in (0, len(points)))
     assert np.allclose(inverse_distance(lines, EYE, gap), 3 * q, rtol=0.02)
     assert np.allclose(inverse_distance(maps, EYE, gap), q, rtol=0.02)
-    # Points before those of maps are scan lines, and stay so where the own car's are left out.
-    bonnet = np.array([[3.0, y, 1.0] for y in np.arange(-0.8, 0.8, 0.05)])
-    mixed = PointCloudSurface(Street(), np.concatenate([bonnet, FAR, posts]), len(posts))
-    assert len(mixed.points) == len(FAR) + len(posts)
+    mixed = PointCloudSurface(Street(), np.concatenate([FAR, posts]), len(posts))  # those before maps' are scan lines
     assert np.allclose(inverse_distance(mixed, EYE, gap), 3 * q, rtol=0.02)
 
 
@@ -138,7 +135,9 @@ def test_a_wall_hides_what_is_behind_it() -> None:
 def test_the_own_car_is_no_obstacle() -> None:
     bonnet = np.array([[x, y, 1.0] for x in np.arange(2.5, 3.9, 0.05) for y in np.arange(-0.8, 0.8, 0.05)])
     rays, _ = towards(np.array([[12.0, 0.0, 1.0], [6.0, 0.3, 0.0]]))
-    got = inverse_distance(PointCloudSurface(Street(), np.concatenate([bonnet, NEAR])), EYE, rays)
+    surface = Scene(points=np.concatenate([bonnet, NEAR])).surface("lidar", 0.0)
+    assert isinstance(surface, PointCloudSurface) and len(surface.points) == len(NEAR)
+    got = inverse_distance(surface, EYE, rays)
     assert np.allclose(got, inverse_distance(PointCloudSurface(Street(), NEAR), EYE, rays))
 
 

@@ -118,6 +118,23 @@ def test_a_top_ends_at_its_face() -> None:
         np.testing.assert_allclose(scan([ray], points, 0.0).points[:, 0], expected_m, atol=0.02)
 
 
+@pytest.mark.parametrize(
+    ("column", "z_m", "expected_m"),
+    [
+        ([(5.4, 0.97), (5.0, 0.95), (5.03, 0.85)], 0.92, 5.01),  # noise: a face is under its edge, not before it
+        ([(17.0, 0.6), (17.0, 0.3), (16.0, 0.0)], -0.01, 16.35),  # the foot of a face, low over the road, is no ramp
+        ([(20.0, 0.8), (20.0, 0.45), (20.4, 0.0)], 0.24, 20.0),  # a car reaches down to its clearance
+        ([(20.0, 0.8), (20.0, 0.45), (20.4, 0.0)], 0.15, 21.7),  # the road goes on under it
+    ],
+)
+def test_edges_and_feet(column: list[tuple[float, float]], z_m: float, expected_m: float) -> None:
+    """Rays meet upright and level surfaces as these lie with the points beyond; ``z_m`` at the lowest upright one."""
+    points = np.array([(x, 0.0, z) for x, z in column], np.float32)
+    deg = float(np.degrees(np.arctan2(z_m - 1.9, expected_m if z_m < 0 else column[1][0])))
+    ray = replace(scanner(1, at()), elevations_deg=(deg,), azimuth_step_deg=0.25)
+    np.testing.assert_allclose(scan([ray], points, 0.0).points[:, 0], expected_m, atol=0.1)
+
+
 def test_other_frames_fill_what_the_own_scan_does_not_support() -> None:
     a, b = scanner(32, at()), scanner(64, at())
     points, nearer = measured(a), measured(scanner(64, at()), with_box=True)
