@@ -213,7 +213,8 @@ def test_demo_loader_and_convert(root: Path, tmp_path: Path, capsys: pytest.Capt
     (batch,) = loader
     assert batch["images"].shape == (3, 7, 3, 24, 40) and len(batch["boxes_3d"]) == 3
     capsys.readouterr()
-    convert = command(f"py123d:{root}", tmp_path / "new", "--images", "png", "--report", "1", "--neighbours", "1")
+    options = "--images", "png", "--report", "1", "--neighbours", "1", "--points", "source"
+    convert = command(f"py123d:{root}", tmp_path / "new", *options)
     assert main(convert) == 0
     said = capsys.readouterr().err
     assert said.startswith("note: kitti360: licence CC BY-NC-SA 3.0: read it before you share the conversion")
