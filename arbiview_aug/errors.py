@@ -74,6 +74,15 @@ class CalibrationError(ArbiviewError, ValueError):
     """A camera, rig or rig file that does not describe real cameras."""
 
 
+@contextmanager
+def calibration_of(where: str) -> Iterator[None]:
+    """Name a file or frame in front of the errors of the calibrations in it."""
+    try:
+        yield
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from None
+
+
 class SampleError(ArbiviewError, ValueError):
     """A sample whose images, calibration and labels do not fit together."""
 

@@ -23,7 +23,6 @@ LENS_CODES = {
 }  # fmt: skip
 """Lenses that kernels know. Others are projected by their class, image by image."""
 
-_FOLD, _FIRST = 5, 6  # entries of ``camera_parameters``
 _ZERO, _ONE, _TWO, _THREE = np.float32(0), np.float32(1), np.float32(2), np.float32(3)
 _FOUR, _FIVE = np.float32(4), np.float32(5)
 _NEWTON_STEPS, _LEAST_SLOPE = 4, np.float32(1e-2)
@@ -239,13 +238,8 @@ def _sphere_row(x: Row, y: Row, z: Row, P: Row, scale: Row) -> None:
 def project_image(rays: Row, q: Row, A: Row, o: Row, kind: int, P: Row, u: Row, v: Row, nearness: Row) -> None:
     """Source pixels (h, w) of points on rays (3, h, w) at inverse distances (h, w), and theirs from the source."""
     h, w = q.shape
-    x, y, z, a, b = (
-        np.empty(w, np.float32),
-        np.empty(w, np.float32),
-        np.empty(w, np.float32),
-        np.empty(w, np.float32),
-        np.empty(w, np.float32),
-    )
+    rows = np.empty((5, w), np.float32)
+    x, y, z, a, b = rows[0], rows[1], rows[2], rows[3], rows[4]
     for j in range(h):
         turn_row(rays[0, j], rays[1, j], rays[2, j], q[j], A, o, x, y, z)
         project_row(x, y, z, kind, P, a, b, u[j], v[j])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
@@ -204,33 +204,58 @@ class _AngularLens(Lens):
         return np.stack([xd * scale, yd * scale, np.cos(theta)], -1)
 
 
-class Fisheye(_AngularLens):
+class _PolynomialLens(_AngularLens):
+    """An angular lens with the polynomial t + k₁ t^(1 + n) + k₂ t^(1 + 2n) + ..., n ``step``: the angle's radius."""
+
+    coefficient_counts = (4,)
+    step: ClassVar[int]
+
+    @cached_property
+    def fold_limit(self) -> float:
+        return min(math.pi, _smallest_positive_root(self._slope_polynomial))
+
+    @property
+    def _slopes(self) -> list[float]:
+        return [(1 + self.step * n) * k for n, k in enumerate(self.distortion, 1)]
+
+    @property
+    def _slope_polynomial(self) -> FloatArray:
+        """The slope's coefficients from the highest power down."""
+        polynomial = np.zeros(1 + self.step * len(self.distortion))
+        polynomial[:: self.step] = [*self._slopes[::-1], 1.0]
+        return polynomial
+
+    def _polynomial(self, t: FloatArray) -> FloatArray:
+        return t * _series(t**self.step, self.distortion)
+
+    def _inverse(self, values: FloatArray, limit: float) -> FloatArray:
+        """Arguments from 0 to ``limit`` at which the polynomial rises through the values (...,): Newton's method."""
+        arguments = np.minimum(values, limit)
+        for _ in range(_NEWTON_STEPS):
+            slope = np.maximum(_series(arguments**self.step, self._slopes), 1e-3)
+            # The polynomial rises up to the limit: a bounded step cannot leave that branch.
+            step = np.clip((self._polynomial(arguments) - values) / slope, -0.25, 0.25)
+            arguments = np.clip(arguments - step, 0.0, limit)
+            if np.abs(step).max(initial=0.0) < 1e-14:
+                break
+        return arguments
+
+    def _radius(self, theta: FloatArray) -> FloatArray:
+        return self._polynomial(theta)
+
+    def _angle(self, radius: FloatArray) -> FloatArray:
+        return self._inverse(radius, self.fold_limit)
+
+
+class Fisheye(_PolynomialLens):
     """Kannala-Brandt with OpenCV's k1..k4."""
 
     name = "fisheye"
     aliases = ("opencv_fisheye",)
-    coefficient_counts = (4,)
-
-    @cached_property
-    def fold_limit(self) -> float:
-        k1, k2, k3, k4 = self.distortion
-        return min(math.pi, _smallest_positive_root(np.array([9 * k4, 0, 7 * k3, 0, 5 * k2, 0, 3 * k1, 0, 1.0])))
-
-    def _radius(self, theta: FloatArray) -> FloatArray:
-        k1, k2, k3, k4 = self.distortion
-        t2 = theta * theta
-        return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-
-    def _slope(self, theta: FloatArray) -> FloatArray:
-        k1, k2, k3, k4 = self.distortion
-        t2 = theta * theta
-        return 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-
-    def _angle(self, radius: FloatArray) -> FloatArray:
-        return _inverse(self._radius, self._slope, radius, self.fold_limit)
+    step = 2
 
 
-class FTheta(_AngularLens):
+class FTheta(_PolynomialLens):
     """NVIDIA's f-theta with the forward polynomial: r = θ + k2 θ² + k3 θ³ + k4 θ⁴ + k5 θ⁵.
 
     θ is the angle off the optical axis. NVIDIA's files have the polynomial in pixels, j1 θ + ... + j5 θ⁵, and linear
@@ -242,29 +267,7 @@ class FTheta(_AngularLens):
     """
 
     name = "ftheta"
-    coefficient_counts = (4,)
-
-    @cached_property
-    def fold_limit(self) -> float:
-        return min(math.pi, _smallest_positive_root(self._slope_polynomial))
-
-    @property
-    def _slope_polynomial(self) -> FloatArray:
-        return np.array([n * k for n, k in zip((5, 4, 3, 2), self.distortion[::-1], strict=True)] + [1.0])
-
-    def _polynomial(self, t: FloatArray) -> FloatArray:
-        k2, k3, k4, k5 = self.distortion
-        return t * (1 + t * (k2 + t * (k3 + t * (k4 + t * k5))))
-
-    def _slope(self, t: FloatArray) -> FloatArray:
-        k2, k3, k4, k5 = self.distortion
-        return 1 + t * (2 * k2 + t * (3 * k3 + t * (4 * k4 + t * 5 * k5)))
-
-    def _radius(self, theta: FloatArray) -> FloatArray:
-        return self._polynomial(theta)
-
-    def _angle(self, radius: FloatArray) -> FloatArray:
-        return _inverse(self._polynomial, self._slope, radius, self.fold_limit)
+    step = 1
 
 
 class FThetaBackward(FTheta):
@@ -299,7 +302,7 @@ class FThetaBackward(FTheta):
         return *self.distortion, *start.tolist()
 
     def _radius(self, theta: FloatArray) -> FloatArray:
-        return _inverse(self._polynomial, self._slope, theta, self._largest_radius)
+        return self._inverse(theta, self._largest_radius)
 
     def _angle(self, radius: FloatArray) -> FloatArray:
         return self._polynomial(np.minimum(radius, self._largest_radius))
@@ -407,21 +410,14 @@ def _unit(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.stack([a / norm, b / norm, 1 / norm], -1)
 
 
-def _inverse(
-    function: Callable[[FloatArray], FloatArray],
-    slope: Callable[[FloatArray], FloatArray],
-    values: FloatArray,
-    limit: float,
-) -> FloatArray:
-    """Arguments from 0 to ``limit`` at which a function that rises there has the values (...,): Newton's method."""
-    arguments = np.minimum(values, limit)
-    for _ in range(_NEWTON_STEPS):
-        # The function rises up to the limit: a bounded step cannot leave that branch.
-        step = np.clip((function(arguments) - values) / np.maximum(slope(arguments), 1e-3), -0.25, 0.25)
-        arguments = np.clip(arguments - step, 0.0, limit)
-        if np.abs(step).max(initial=0.0) < 1e-14:
-            break
-    return arguments
+def _series(x: FloatArray, coefficients: Sequence[float]) -> FloatArray:
+    """1 + c₁ x + c₂ x² + ..., by Horner's rule."""
+    value: FloatArray = coefficients[-1] * x
+    for c in coefficients[-2::-1]:
+        value += c
+        value *= x
+    value += 1
+    return value
 
 
 def _smallest_positive_root(polynomial: FloatArray) -> float:

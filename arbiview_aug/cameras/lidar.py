@@ -13,8 +13,9 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.lidar_fit import checked_scans, fitted_fields
 from arbiview_aug.cameras.validation import checked_numbers, checked_pose
-from arbiview_aug.errors import CalibrationError, shown
+from arbiview_aug.errors import CalibrationError, calibration_of, shown
 
 MOST_BEAMS, MOST_RAYS = 1024, 1 << 21
 """Largest scanner; sensors on sale have 128 beams and 500,000 rays."""
@@ -158,8 +159,6 @@ class Lidar:
         Raises:
             CalibrationError: Too few points, or no distinct beams.
         """
-        from arbiview_aug.cameras.lidar_fit import checked_scans, fitted_fields
-
         pose = checked_pose(name, lidar2ego, "lidar2ego")
         scans, numbers = checked_scans(name, points, rings)
         local = [(scan - pose[:3, 3]) @ pose[:3, :3] for scan in scans]
@@ -184,10 +183,8 @@ class Lidar:
         if missing := [key for key in _KEYS if entry.get(key) is None]:
             expected, guesses = ", ".join((*_KEYS, "azimuth_deg")), hint(entry, missing)
             raise CalibrationError(f"{where}: expected keys {expected}, missing {', '.join(missing)}{guesses}")
-        try:
+        with calibration_of(where):
             return cls(**{key: entry[key] for key in (*_KEYS, "azimuth_deg") if key in entry})
-        except CalibrationError as error:
-            raise CalibrationError(f"{where}: {error}") from None
 
 
 def hdl64e(lidar2ego: Any, name: str = "hdl64e") -> Lidar:

@@ -55,7 +55,7 @@ def fitted_fields(name: str, scans: Sequence[FloatArray], rings: Sequence[Number
     Raises:
         CalibrationError: Too few points, or elevations that do not gather at beams.
     """
-    polar = [_polar(scan) for scan in scans]
+    polar = [polar_deg(scan[_is_return(scan)]) for scan in scans]
     elevation, azimuth, distance = np.concatenate(polar, axis=1)
     if len(elevation) < LEAST_POINTS:
         raise _error(name, f"at least {LEAST_POINTS} finite points off the scanner's own place, got {len(elevation)}")
@@ -87,9 +87,9 @@ def _is_return(scan: FloatArray) -> BoolArray:
     return np.isfinite(distance) & (distance > _NEAREST_M)
 
 
-def _polar(scan: FloatArray) -> FloatArray:
-    """(3, n) elevations and azimuths in degrees, and distances, of the returns among points (P, 3)."""
-    x, y, z = scan[_is_return(scan)].T
+def polar_deg(points: FloatArray) -> FloatArray:
+    """(3, n) elevations and azimuths in degrees, and distances, of points (n, 3) in a scanner's frame."""
+    x, y, z = points.T
     level = np.hypot(x, y)
     return np.stack([np.degrees(np.arctan2(z, level)), np.degrees(np.arctan2(y, x)), np.hypot(level, z)])
 

@@ -103,6 +103,7 @@ Planes = npt.NDArray[np.float32]
 _NO_PLANES = np.zeros((3, 0, 0), np.float32)
 _NO_MASK, _NO_DISTANCE = np.zeros((0, 0), np.uint8), np.zeros((0, 0), np.float32)
 _ROWS = 64  # unprojected at once: they stay in the cache
+_MAX_BYTES = 256 * 2**20
 CELL_PX = 8
 """Side of the cells in which cones of rays and distances to a mask are known."""
 
@@ -180,12 +181,12 @@ class RayCache:
     ``memory`` is that of what does change.
     """
 
-    def __init__(self, max_bytes: int = 256 * 2**20) -> None:
-        self._cache: LRUCache[Any, Any] = LRUCache(max_bytes, lambda item: item.nbytes)
+    def __init__(self) -> None:
+        self._cache: LRUCache[Any, Any] = LRUCache(_MAX_BYTES, lambda item: item.nbytes)
         self.memory = Memory()
 
-    def __reduce__(self) -> tuple[type[RayCache], tuple[int]]:
-        return RayCache, (self._cache.limit,)
+    def __reduce__(self) -> tuple[type[RayCache], tuple[()]]:
+        return RayCache, ()
 
     def rays(self, camera: Camera, known: PixelRays | None = None) -> PixelRays:
         """The rays of a camera; ``known`` are taken for it from now on."""

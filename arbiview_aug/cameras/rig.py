@@ -33,7 +33,7 @@ from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.plain_yaml import parse_yaml
 from arbiview_aug.cameras.shipped import shipped_rigs
 from arbiview_aug.cameras.validation import MOST_M
-from arbiview_aug.errors import CalibrationError, shown
+from arbiview_aug.errors import CalibrationError, calibration_of, shown
 
 MOST_CAMERAS, MOST_LIDARS = 128, 32
 """Largest rig."""
@@ -244,10 +244,8 @@ class Rig:
             for k, entry in enumerate(entries)
         ]
         name = data.get("name", data.get("dataset", ""))
-        try:
+        with calibration_of(where):
             return cls(cameras, ground_z_m=data.get("ground_z_m", 0.0), name=str(name), lidars=lidars)
-        except CalibrationError as error:
-            raise CalibrationError(f"{where}: {error}") from None
 
     def save(self, path: str | Path) -> Path:
         """Write the rig to a .yaml, .yml or .json file; masks become PNGs beside it. Returns the path."""
@@ -336,10 +334,8 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
             raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {shown(distortion)}")
         calibration |= {"lens": distortion["model"], "distortion": distortion["coeffs"]}
     mask = None if entry.get("mask") is None else read_mask(entry["mask"], folder, label)
-    try:
+    with calibration_of(where):
         return Camera(width_px=entry["width"], height_px=entry["height"], mask=mask, **calibration)
-    except CalibrationError as error:
-        raise CalibrationError(f"{where}: {error}") from None
 
 
 def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:

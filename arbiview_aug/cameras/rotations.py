@@ -22,7 +22,12 @@ def rotation_x(angle_deg: float) -> FloatArray:
 
 def rotation_z(angle_deg: float) -> FloatArray:
     """(3, 3) right-handed rotation about z."""
-    c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
+    return yaw_matrix(math.radians(angle_deg))
+
+
+def yaw_matrix(yaw: float) -> FloatArray:
+    """(3, 3) right-handed rotation about z, radians."""
+    c, s = math.cos(yaw), math.sin(yaw)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 

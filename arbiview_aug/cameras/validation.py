@@ -150,10 +150,10 @@ def checked_pose(name: str, value: Any, field: str = "cam2ego") -> FloatArray:
 
 def checked_lens(name: str, value: Any) -> LensName:
     """The name of a lens in ``LENSES``, also for its aliases."""
-    value = canonical_name(value) if isinstance(value, str) and value not in LENSES else value
-    if not isinstance(value, str) or value not in LENSES:
+    lens = canonical_name(value) if isinstance(value, str) else ""
+    if lens not in LENSES:
         raise _error(name, "lens", f"one of {', '.join(LENSES)}", shown(value))
-    return cast(LensName, value)
+    return cast(LensName, lens)
 
 
 def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:

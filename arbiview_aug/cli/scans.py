@@ -6,6 +6,7 @@ import argparse
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,8 +53,9 @@ def evaluate_scans(arguments: argparse.Namespace, folder: Path) -> None:
     scans = _displaced(arguments) if arguments.displaced else _synthetic(arguments)
     rows: list[dict[str, Any]] = []
     picture, notes = None, list[str]()
-    with named_steps(notes, arguments.frames or 1) as tick:
-        for scan in scans:
+    count = arguments.frames or 1
+    with named_steps(notes, count) as tick:
+        for scan in islice(scans, count):
             tick(scan.name, 1)
             for lidar in scan.rig.lidars:
                 clouds = clouds_of(scan, lidar)
@@ -64,7 +66,7 @@ def evaluate_scans(arguments: argparse.Namespace, folder: Path) -> None:
     if picture is None:
         expected = "a later frame of the drive with points (sequence.json and ego2world)"
         raise DataError(f"--displaced: {arguments.data}: expected {expected}, found none; see docs/formats.md")
-    means = {name: mean_of([_numbers(row) for row in rows if row["points"] == name]) for name in clouds}
+    means = {name: mean_of(row for row in rows if row["points"] == name) for name in clouds}
     (folder / "evaluate.json").write_text(json.dumps({"arguments": vars(arguments), "scans": means, "rows": rows}))
     for note in notes:
         print(f"note: {note}\n")
@@ -88,15 +90,11 @@ def clouds_of(scan: TrueScan, lidar: Lidar) -> dict[str, FloatArray]:
 def scored(scan: TrueScan, lidar: Lidar, clouds: Mapping[str, FloatArray]) -> Iterator[dict[str, Any]]:
     """A row of metrics for each cloud; where the source's scanner is known, at rays near which it measured."""
     truth = scan.truth[~own_car(scan.truth)]
-    where = None if scan.source is None else measured_near(scan.source, lidar, scan.points)
+    where = True if scan.source is None else measured_near(scan.source, lidar, scan.points)
     for name, cloud in clouds.items():
         metrics = scan_metrics(lidar, cloud, truth, where, scan.boxes)
         known = {key: value for key, value in metrics.items() if np.isfinite(value)}
         yield {"frame": scan.name, "lidar": lidar.name, "points": name, **known}
-
-
-def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
-    return {key: value for key, value in row.items() if not isinstance(value, str)}
 
 
 def _synthetic(arguments: argparse.Namespace) -> Iterator[TrueScan]:
@@ -121,24 +119,24 @@ def _displaced(arguments: argparse.Namespace) -> Iterator[TrueScan]:
     from sklearn.neighbors import KDTree
 
     options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
-    data, left = open_data(arguments.data, neighbours=WANTED, **options), arguments.frames or 1
+    data = open_data(arguments.data, neighbours=WANTED, **options)
     chosen = None if arguments.target is None else load_rig(arguments.target)
     for index in range(len(data)):
         sample = data[index]
         later = FrameFolder(arguments.displaced)[0] if isinstance(arguments.displaced, str) else _next_frame(sample)
-        if left and later is not None and "points" in later and "points" in sample:
-            move = np.linalg.inv(np.asarray(later["ego2world"])) @ np.asarray(sample["ego2world"])
-            points, boxes = sample["points"].double().numpy(), np.zeros((0, 7))
-            points[:, :3] = points[:, :3] @ move[:3, :3].T + move[:3, 3]
-            if "boxes_3d" in later and "boxes_3d" in sample:
-                boxes, before = (np.asarray(one["boxes_3d"], np.float64)[:, :7] for one in (later, sample))
-                apart = boxes[:, None, :3] - (before[:, :3] @ move[:3, :3].T + move[:3, 3])
-                boxes = boxes[(np.linalg.norm(apart, axis=-1) < _PARKED_M).any(axis=1)]
-            truth = later["points"].double().numpy()
-            truth = truth[KDTree(points[:, :3]).query(truth[:, :3])[0][:, 0] <= _STATIC_M]
-            rig = _with_scanners(later["rig"], chosen, str(arguments.data))
-            yield TrueScan(str(sample["token"]), rig, points, boxes, truth)
-            left -= 1
+        if later is None or "points" not in later or "points" not in sample:
+            continue
+        move = np.linalg.inv(np.asarray(later["ego2world"])) @ np.asarray(sample["ego2world"])
+        points, boxes = sample["points"].double().numpy(), np.zeros((0, 7))
+        points[:, :3] = points[:, :3] @ move[:3, :3].T + move[:3, 3]
+        if "boxes_3d" in later and "boxes_3d" in sample:
+            boxes, before = (np.asarray(one["boxes_3d"], np.float64)[:, :7] for one in (later, sample))
+            apart = boxes[:, None, :3] - (before[:, :3] @ move[:3, :3].T + move[:3, 3])
+            boxes = boxes[(np.linalg.norm(apart, axis=-1) < _PARKED_M).any(axis=1)]
+        truth = later["points"].double().numpy()
+        truth = truth[KDTree(points[:, :3]).query(truth[:, :3])[0][:, 0] <= _STATIC_M]
+        rig = _with_scanners(later["rig"], chosen, str(arguments.data))
+        yield TrueScan(str(sample["token"]), rig, points, boxes, truth)
 
 
 def _with_scanners(rig: Rig, chosen: Rig | None, where: str) -> Rig:
@@ -152,9 +150,5 @@ def _with_scanners(rig: Rig, chosen: Rig | None, where: str) -> Rig:
 
 def _next_frame(sample: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """The nearest neighbour recorded later."""
-    if not sample.get("neighbours"):
-        return None
     (frame,) = read_frames(sample, None)
-    numbers = (one.number for one in read_neighbours(frame, lambda *_: None) if one.is_later)
-    number = next(numbers, None)
-    return None if number is None else sample["neighbours"][number]
+    return next((one.given for one in read_neighbours(frame, lambda *_: None) if one.is_later), None)

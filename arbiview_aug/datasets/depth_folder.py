@@ -14,8 +14,8 @@ from arbiview_aug.atomic_io import BROKEN_ARRAY, file_name, inside, whole_file
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.datasets.drive import Neighbours
-from arbiview_aug.datasets.image_io import stack_or_list
 from arbiview_aug.errors import DataError, SampleError
+from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
@@ -136,7 +136,7 @@ class WithDepth(Dataset[dict[str, Any]]):
         for folder in self.folders:
             depth = folder.read(str(token), rig)
             is_learned = isinstance(depth, LearnedDepth)
-            out[LEARNED_KEY if is_learned else MOTION_KEY] = stack_or_list([*map(torch.from_numpy, depth.depth_m)])
+            out[LEARNED_KEY if is_learned else MOTION_KEY] = stacked([*map(torch.from_numpy, depth.depth_m)])
             if is_learned:
                 out[LEARNED_WORDS_KEY] = str(depth)
         return out

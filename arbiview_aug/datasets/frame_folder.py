@@ -24,7 +24,16 @@ from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields, parts_of_clock
 from arbiview_aug.datasets.image_io import decode_images, encoded_image, reduced_rig
 from arbiview_aug.datasets.registry import CALIBRATION_FILE
-from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, SampleError, WarnOnce, shown, warn
+from arbiview_aug.errors import (
+    ArbiviewError,
+    CalibrationError,
+    DataError,
+    SampleError,
+    WarnOnce,
+    calibration_of,
+    shown,
+    warn,
+)
 from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
 from arbiview_aug.scene.point_cloud import finite_rows, shape_mistake
@@ -320,10 +329,8 @@ def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) ->
         mask = _cached_mask(os.path.realpath(path), clean)
     except CalibrationError:
         mask = read_mask(str(path), path.parent, f"{frame.where}: camera {camera.name!r}")  # again, in its frame's name
-    try:
+    with calibration_of(frame.where):
         return replace(camera, mask=mask)
-    except CalibrationError as error:
-        raise CalibrationError(f"{frame.where}: {error}") from None
 
 
 @lru_cache(maxsize=_CACHED_MASKS)

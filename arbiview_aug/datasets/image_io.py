@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.camera import Camera, resize_matrix
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
 from arbiview_aug.errors import DataError, SampleTypeError
@@ -86,11 +86,6 @@ def decode_images(
     return [torch.from_numpy(image).permute(2, 0, 1) for image in images]
 
 
-def stack_or_list(tensors: list[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
-    """Stack tensors of one shape; else return the list."""
-    return torch.stack(tensors) if len({tensor.shape for tensor in tensors}) == 1 else tensors
-
-
 def check_reduce(reduce: int) -> None:
     """Raise ValueError unless ``reduce`` is 1, 2 or 4."""
     if reduce not in get_args(Reduce):
@@ -112,8 +107,7 @@ def reduced_camera(camera: Camera, reduce: Reduce) -> Camera:
     check_reduce(reduce)
     if reduce == 1:
         return camera
-    scale, shift = 1 / reduce, 0.5 / reduce - 0.5
-    A = np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]])
+    A = resize_matrix((reduce, reduce), (1, 1))
     height_px, width_px = reduced_size(camera.size, reduce)
     mask = camera.mask
     if mask is not None:

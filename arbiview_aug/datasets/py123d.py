@@ -19,10 +19,11 @@ from arbiview_aug.cameras.rotations import poses_from, rotation_from_quaternion
 from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
 from arbiview_aug.datasets.frame_folder import checked_points
-from arbiview_aug.datasets.image_io import area_reduced, reduced_rig, stack_or_list
+from arbiview_aug.datasets.image_io import area_reduced, reduced_rig
 from arbiview_aug.datasets.registry import log_folders
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, described
+from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, calibration_of, described
+from arbiview_aug.sample.batching import stacked
 
 LICENCES = {
     "av2-sensor": "CC BY-NC-SA 4.0",
@@ -51,6 +52,7 @@ class _Log:
     cameras: Mapping[Any, Camera]
     ground_z_m: float
     lidars: Sequence[Any]
+    dataset: str
 
     def pose(self, iteration: int, column: str, *modality: Any) -> FloatArray | None:
         """(4, 4) pose in the world; None where the modality recorded nothing."""
@@ -100,13 +102,11 @@ class Py123dDataset(WritableRecording):
         if not folders:
             raise DataError(f"py123d {root}: expected logs (folders with sync.arrow), found none")
         self._logs: list[_Log] = []
-        self.datasets: list[str] = []
         frames: list[tuple[int, int, int]] = []
         for folder in folders:
             with _reading(folder):
                 log = _open(folder, scene_of(folder), cameras)
                 times_us = [int(time.time_us) for time in log.scene.get_all_iteration_timestamps()]
-                self.datasets.append(str(log.scene.get_log_metadata().dataset))
             frames += [(len(self._logs), k, time_us) for k, time_us in enumerate(times_us)]
             self._logs.append(log)
         self._frames = frames
@@ -116,7 +116,7 @@ class Py123dDataset(WritableRecording):
     @property
     def licences(self) -> dict[str, str]:
         """Licences by the names of the data sets that the logs were made of."""
-        return {name: LICENCES.get(name, "unknown") for name in sorted(set(self.datasets))}
+        return {name: LICENCES.get(name, "unknown") for name in sorted({log.dataset for log in self._logs})}
 
     @property
     def is_one_drive(self) -> bool:
@@ -125,14 +125,19 @@ class Py123dDataset(WritableRecording):
     def time_s(self, index: int) -> float:
         return 1e-6 * self._frames[index][2]
 
+    def _at(self, index: int) -> tuple[_Log, int]:
+        """A sample's log, and its iteration there."""
+        number, iteration, _ = self._frames[index]
+        return self._logs[number], iteration
+
     def files(self, index: int) -> list[Path]:
         """Files of the log; images and points that a log names elsewhere are not among them."""
-        folder = self._logs[self._frames[index][0]].folder
-        return sorted(path for path in folder.iterdir() if path.suffix in (".arrow", ".mp4"))
+        log, _ = self._at(index)
+        return sorted(path for path in log.folder.iterdir() if path.suffix in (".arrow", ".mp4"))
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         index = range(len(self))[index]  # IndexError, and negative indices
-        with _reading(self._logs[self._frames[index][0]].folder):
+        with _reading(self._at(index)[0].folder):
             fields = self._fields(index)
             sample = fields | camera_fields(fields["rig"], self._images(index, fields["rig"]), self.tokens[index])
             if self.load_points and (points := self._points(index)) is not None:
@@ -143,8 +148,7 @@ class Py123dDataset(WritableRecording):
 
     def _fields(self, index: int) -> dict[str, Any]:
         """Everything but the images and points."""
-        number, iteration, _ = self._frames[index]
-        log = self._logs[number]
+        log, iteration = self._at(index)
         ego2world = self._ego2world(index)
         world2ego = np.linalg.inv(ego2world).astype(np.float64, copy=False)
         rig = []
@@ -154,9 +158,8 @@ class Py123dDataset(WritableRecording):
                 rig.append(replace(camera, cam2ego=world2ego @ cam2world))
         if not rig:
             raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected a camera's image, got none")
-        name = self.datasets[number]
         fields = {"token": self.tokens[index], "time_s": self.time_s(index), "ego2world": torch.from_numpy(ego2world)}
-        fields["rig"] = reduced_rig(Rig(rig, ground_z_m=log.ground_z_m, name=name), self.reduce)
+        fields["rig"] = reduced_rig(Rig(rig, ground_z_m=log.ground_z_m, name=log.dataset), self.reduce)
         detections = log.scene.get_box_detections_se3_at_iteration(iteration)
         if detections is not None:
             fields["boxes_3d"] = torch.from_numpy(_boxes(detections, world2ego))
@@ -164,8 +167,7 @@ class Py123dDataset(WritableRecording):
         return fields
 
     def _images(self, index: int, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
-        number, iteration, _ = self._frames[index]
-        log, images = self._logs[number], []
+        (log, iteration), images = self._at(index), []
         for identity, camera in log.cameras.items():
             if camera.name in rig.names:
                 with _reading(log.folder):
@@ -174,19 +176,17 @@ class Py123dDataset(WritableRecording):
                     if image.shape != (*camera.size, 3) or image.dtype != np.uint8:
                         raise DataError(f"{where}: expected {(*camera.size, 3)} uint8, got {image.shape} {image.dtype}")
                     images.append(torch.from_numpy(area_reduced(image, self.reduce)).permute(2, 0, 1).contiguous())
-        return stack_or_list(images)
+        return stacked(images)
 
     def _points(self, index: int) -> torch.Tensor | None:
-        number, iteration, _ = self._frames[index]
-        log = self._logs[number]
+        log, iteration = self._at(index)
         with _reading(log.folder):
             scans = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
             clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in scans if one is not None]
         return checked_points(np.concatenate(clouds), f"of {self.tokens[index]}") if clouds else None
 
     def _ego2world(self, index: int) -> FloatArray:
-        number, iteration, _ = self._frames[index]
-        log = self._logs[number]
+        log, iteration = self._at(index)
         pose = log.pose(iteration, "imu_se3", "ego_state_se3")
         if pose is None:
             raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected the ego's pose, got none")
@@ -194,14 +194,14 @@ class Py123dDataset(WritableRecording):
 
     def _find_drive(self) -> Drive:
         positions_m = []
-        for index, (number, _, _) in enumerate(self._frames):
-            with _reading(self._logs[number].folder):
+        for index in range(len(self)):
+            with _reading(self._at(index)[0].folder):
                 positions_m.append(self._ego2world(index)[:3, 3])
         parts = np.array([number for number, _, _ in self._frames], np.int64)
         return Drive(np.array(positions_m).reshape(-1, 3), parts)
 
     def _neighbour(self, index: int) -> LazyFrame:
-        with _reading(self._logs[self._frames[index][0]].folder):
+        with _reading(self._at(index)[0].folder):
             fields = self._fields(index)
         points = partial(self._points, index) if self.load_points else None
         return LazyFrame(fields, partial(self._images, index, fields["rig"]), points)
@@ -219,7 +219,8 @@ def _open(folder: Path, scene: Any, names: Sequence[str] | None) -> _Log:
         raise DataError(f"py123d log {folder}: expected the ego's poses (ego_state_se3.arrow), found none")
     keys = scene.get_all_modality_metadatas()
     lidars = ["lidar_merged"] if "lidar.lidar_merged" in keys else [*scene.get_lidar_metadatas()]
-    return _Log(folder, scene, cameras, float(ego.center_to_imu_se3.z - ego.half_height), lidars)
+    road_m, dataset = float(ego.center_to_imu_se3.z - ego.half_height), str(scene.get_log_metadata().dataset)
+    return _Log(folder, scene, cameras, road_m, lidars, dataset)
 
 
 def _camera(metadata: Any, where: str) -> Camera:
@@ -242,10 +243,8 @@ def _camera(metadata: Any, where: str) -> Camera:
         )
     optics: dict[str, Any] = {"K": K, "lens": lens, "distortion": tuple(map(float, distortion))}
     optics |= {"width_px": int(metadata.width), "height_px": int(metadata.height)}
-    try:
+    with calibration_of(where):
         return Camera(name=metadata.camera_name, cam2ego=np.eye(4), **optics)
-    except CalibrationError as error:
-        raise CalibrationError(f"{where}: {error}") from None
 
 
 def _fisheye(metadata: Any, where: str) -> tuple[FloatArray, FloatArray]:

@@ -169,8 +169,7 @@ class Evaluation:
 
     def means(self, method: str, target: str | None = None) -> dict[str, float]:
         """Mean the per-image values over cameras and frames; over all targets by default."""
-        rows = [row for row in self.views if row["method"] == method and target in (None, row["target"])]
-        return mean_of([{key: value for key, value in row.items() if not isinstance(value, str)} for row in rows])
+        return mean_of(row for row in self.views if row["method"] == method and target in (None, row["target"]))
 
     def spread(self, method: str, metric: str) -> float:
         """Standard deviation over the frames of a metric's mean."""

@@ -51,12 +51,13 @@ def ssim_map(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> npt.NDArray[np.flo
     return luminance * (2 * covariance + c2) / (var_a + var_b + c2)
 
 
-def mean_of(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Mean of each key over the rows that have it."""
+def mean_of(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Mean of each key over the rows that have it; text is left out."""
     values: dict[str, list[float]] = {}
     for row in rows:
         for key, value in row.items():
-            values.setdefault(key, []).append(value)
+            if not isinstance(value, str):
+                values.setdefault(key, []).append(value)
     return {key: float(np.mean(column)) for key, column in values.items()}
 
 

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.lidar import Lidar
+from arbiview_aug.cameras.lidar_fit import polar_deg
 from arbiview_aug.scene.boxes import points_by_box
 
 TOLERANCE_M, TOLERANCE = 0.2, 0.02
@@ -39,18 +40,9 @@ class Returns(NamedTuple):
     range_m: FloatArray
 
 
-class _Polar(NamedTuple):
-    elevation_deg: FloatArray
-    azimuth_deg: FloatArray
-    distance_m: FloatArray
-
-
-def _polar(lidar: Lidar, points: FloatArray) -> _Polar:
-    """Directions and distances (P,) of points as a scanner sees them."""
-    local = (points[:, :3].astype(np.float64) - lidar.center_m) @ lidar.lidar2ego[:3, :3]
-    distance = np.maximum(np.linalg.norm(local, axis=1), 1e-9)
-    elevation = np.degrees(np.arcsin(np.clip(local[:, 2] / distance, -1, 1)))
-    return _Polar(elevation, np.degrees(np.arctan2(local[:, 1], local[:, 0])), distance)
+def _polar(lidar: Lidar, points: FloatArray) -> FloatArray:
+    """(3, P) elevations and azimuths in degrees, and distances, of points as a scanner sees them."""
+    return polar_deg((points[:, :3].astype(np.float64) - lidar.center_m) @ lidar.lidar2ego[:3, :3])
 
 
 def returns_of(lidar: Lidar, points: FloatArray) -> Returns:
@@ -87,7 +79,7 @@ def scan_metrics(
     lidar: Lidar,
     points: FloatArray,
     truth: FloatArray,
-    where: BoolArray | None = None,
+    where: BoolArray | bool = True,
     boxes: FloatArray | None = None,
 ) -> dict[str, float]:
     """Compare a cloud with a scanner's true one.
@@ -107,9 +99,7 @@ def scan_metrics(
         another ring, or among ``RANGES_M``, for the true densities. ``in_boxes``: sum over the boxes of how far the
         numbers of points are apart, over the sum of the true ones. NaN where undefined.
     """
-    ours, true = range_image(lidar, points), range_image(lidar, truth)
-    if where is not None:
-        ours, true = np.where(where, ours, 0), np.where(where, true, 0)
+    ours, true = (np.where(where, range_image(lidar, cloud), 0) for cloud in (points, truth))
     both = (ours > 0) & (true > 0)
     error = np.abs(ours - true)
     right = np.count_nonzero(both & (error <= np.maximum(TOLERANCE_M, TOLERANCE * true)))
@@ -157,7 +147,7 @@ def rings_dropped(a: Lidar, b: Lidar, points: FloatArray) -> FloatArray:
 
     It shifts heights too, so that roads coincide: in the ego frame they do.
     """
-    elevation = _polar(a, points).elevation_deg
+    elevation, _, _ = _polar(a, points)
     table = np.array(a.elevations_deg)
     kept = np.unique(np.abs(np.array(b.elevations_deg)[:, None] - table).argmin(1))
     return np.asarray(points[np.isin(np.abs(elevation[:, None] - table).argmin(1), kept)])

@@ -60,7 +60,6 @@ class Verdict:
     frame: str
     method: str  # or ``SOURCES``, ``TRUTH``
     target: str
-    camera: str
     size: tuple[int, int]
     detections: Detections | None = None
     labels: Labels | None = None
@@ -90,11 +89,8 @@ class TrueImage(NamedTuple):
     road: BoolArray | None
 
 
-class Target(NamedTuple):
-    """What views for a rig are compared with, by camera; None where there is nothing."""
-
-    labels: Sequence[Labels | None]
-    truth: Sequence[TrueImage | None]
+Target = tuple[Sequence[Labels | None], Sequence[TrueImage | None]]
+"""Labels and true images that views for a rig are compared with, by camera; None where there is nothing."""
 
 
 @dataclass
@@ -121,23 +117,23 @@ class Panel:
         labels, truth = self._targets[target]
         for k, view in enumerate(views):
             image = to_bytes(view.image)
-            verdict = Verdict(name, method, target, rig[k].name, rig[k].size, labels=labels[k])
+            verdict = Verdict(name, method, target, rig[k].size, labels=labels[k])
             self._add(image, self._judged(verdict, image, view.generated, truth[k]))
 
     def _look_at_truth(self, name: str, frame: ScoredFrame, target: str, rig: Rig) -> Target:
         """Judge the true images of a rig, if there are some; their masks hide labelled objects."""
         mounted = rig.in_frame_of(frame.sample["rig"])
         if frame.truth is None:
-            return Target(self._labels(frame, mounted), [None] * len(rig))
+            return self._labels(frame, mounted), [None] * len(rig)
         true = frame.truth(rig)
         images, masks = [to_bytes(image) for image in as_arrays(true.images)], valid_pixels(true)
         masked = mounted.with_cameras([replace(camera, mask=mask) for camera, mask in zip(mounted, masks, strict=True)])
-        labels, truth = self._labels(frame, masked), []
+        labels, truth = self._labels(frame, masked), list[TrueImage | None]()
         for camera, image, mask, of_camera in zip(rig, images, masks, labels, strict=True):
             detections = None if self.detector is None else self.detector(image)
             truth.append(TrueImage(mask, detections, None if self.segmenter is None else self.segmenter(image)))
-            self._add(image, Verdict(name, TRUTH, target, camera.name, camera.size, detections, of_camera))
-        return Target(labels, truth)
+            self._add(image, Verdict(name, TRUTH, target, camera.size, detections, of_camera))
+        return labels, truth
 
     def _labels(self, frame: ScoredFrame, rig: Rig) -> Sequence[Labels | None]:
         """Labels that a detector is compared with, by camera."""
@@ -148,7 +144,7 @@ class Panel:
         rig: Rig = frame.sample["rig"]
         images = map(to_bytes, as_arrays(frame.sample["images"]))
         for camera, image, labels in zip(rig, images, self._labels(frame, rig), strict=True):
-            self._add(image, Verdict(name, SOURCES, SOURCES, camera.name, camera.size, detector(image), labels))
+            self._add(image, Verdict(name, SOURCES, SOURCES, camera.size, detector(image), labels))
 
     def _judged(
         self, verdict: Verdict, image: Picture, generated: BoolArray | None, true: TrueImage | None
@@ -261,11 +257,8 @@ def _precision(verdicts: Sequence[Verdict], seed: int) -> Figures:
     """AP of all images together, at each of ``OVERLAPS``."""
     seen = [v.scored for v in verdicts if v.scored is not None]
     in_truth = [v.true for v in verdicts if v.true is not None]
-    true, doubtful = [], []
-    for of_image in in_truth:
-        is_sure = of_image.scores >= CONFIDENCE
-        true.append(of_image.boxes[is_sure])
-        doubtful.append(of_image.boxes[~is_sure])
+    true = [of_image.boxes[of_image.scores >= CONFIDENCE] for of_image in in_truth]
+    doubtful = [of_image.boxes[of_image.scores < CONFIDENCE] for of_image in in_truth]
     row: Figures = {"true_objects": np.array([sum(map(len, true))], float)}
     for overlap in OVERLAPS if row["true_objects"][0] else ():
         generator, found = np.random.default_rng(seed), pooled(seen, true, doubtful, overlap)

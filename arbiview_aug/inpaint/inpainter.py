@@ -102,7 +102,7 @@ class Inpainter(ABC):
         lead = leading_shape(batch["images"])
         if len(sources) != len(views):
             raise SampleError(f"complete: expected sources of {len(views)} frames, got {len(sources)}")
-        maps = {key: split(batch[key], lead) for key in MAP_KEYS if key in batch}
+        maps = {key: split(key, batch[key], lead) for key in MAP_KEYS if key in batch}
         is_filled = maps.pop("generated", None) is not None  # by ``holes`` of the transform
         rendered = []
         for b, view in enumerate(views):

@@ -21,6 +21,7 @@ from arbiview_aug.datasets.drive import camera_fields
 from arbiview_aug.datasets.image_io import encoded, encoded_image
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError
+from arbiview_aug.sample.batching import stacked
 
 ARRAYS = ("points", "boxes_3d", "ego2world")
 """Entries that are stored as .npy files."""
@@ -82,7 +83,7 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
             camera = replace(camera, mask=_decoded(entry, f"{k:02}.mask.png", where, cv2.IMREAD_GRAYSCALE) > 0)
         cameras.append(camera)
     rig = rig.with_cameras(cameras)
-    sample = camera_fields(rig, torch.stack(images) if len(set(rig.sizes)) == 1 else images, token)
+    sample = camera_fields(rig, stacked(images), token)
     for name in (name for name in ARRAYS if f"{name}.npy" in entry):
         try:
             sample[name] = torch.from_numpy(np.load(io.BytesIO(entry[f"{name}.npy"]), allow_pickle=False))

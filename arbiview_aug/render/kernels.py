@@ -130,7 +130,7 @@ def cells_in_view(
 @compiled
 def measure_nodes(
     rays: Any, q: Any, A: Any, o: Any, kind: int, P: Any, y: Any, x: Any, size: Any, to_mask: Any, cell_px: int,
-    offset_m: Any, uncertainty: Any, u: Any, v: Any, resolution: Any, edge_px: Any, parallax_rad: Any,
+    offset_m: Any, uncertainty: Any, focal_px: float, u: Any, v: Any, measured: Any, rounded: Any,
 ) -> None:  # fmt: skip
     """Compute what weights depend on, at the nodes of a target.
 
@@ -148,15 +148,16 @@ def measure_nodes(
         cell_px: Side of those cells.
         offset_m: (3,) float64 the target's centre minus the source's, target's frame.
         uncertainty: (ny, nx) expected error of the inverse distance, 1/m.
+        focal_px: The target's focal length.
         u: (ny, nx) float32 columns in the source: given for lenses that kernels do not know, else written.
         v: (ny, nx) its rows.
-        resolution: (ny, nx) float64, written: source pixels per target pixel along the worse axis, which is the smaller
-            singular value of the Jacobian.
-        edge_px: (ny, nx) float64, written: ``rays.edge_distance``.
-        parallax_rad: (ny, nx) float64, written: displacement that unknown depth may cause, offset across the ray times
-            uncertainty.
+        measured: (3, ny, nx) float64, written: source pixels per target pixel along the worse axis, which is the
+            smaller singular value of the Jacobian; ``rays.edge_distance``; displacement that unknown depth may cause,
+            target pixels: offset across the ray times uncertainty.
+        rounded: (2, ny, nx) float32, written: that displacement; the edge's distance in target pixels.
     """
     ny, nx = u.shape
+    resolution, edge_px, parallax_px = measured[0], measured[1], measured[2]
     if kind >= 0:
         work = np.empty((5, nx), np.float32)
         for j in range(ny):
@@ -165,6 +166,7 @@ def measure_nodes(
     # The last nodes may coincide: their difference says nothing.
     last_y = max(ny - 2 - (ny > 2 and y[ny - 1] == y[ny - 2]), 0)
     last_x = max(nx - 2 - (nx > 2 and x[nx - 1] == x[nx - 2]), 0)
+    is_line = y[ny - 1] == y[0] or x[nx - 1] == x[0]
     length2 = offset_m[0] ** 2 + offset_m[1] ** 2 + offset_m[2] ** 2
     for j in range(ny):
         jj = min(j, last_y)
@@ -176,22 +178,26 @@ def measure_nodes(
             b, d = (u[jj + 1, i] - u[jj, i]) * per_y, (v[jj + 1, i] - v[jj, i]) * per_y
             half_sum, determinant = (a * a + b * b + c * c + d * d) / 2, a * d - b * c
             root = np.sqrt(max(half_sum * half_sum - determinant * determinant, 0.0))
-            resolution[j, i] = np.sqrt(max(half_sum - root, 0.0))
+            resolution[j, i] = 1.0 if is_line else np.sqrt(max(half_sum - root, 0.0))
         edge_distance_row(u[j], v[j], size, to_mask, cell_px, edge_px[j])
         for i in range(nx):
             along = rays[0, j, i] * offset_m[0] + rays[1, j, i] * offset_m[1] + rays[2, j, i] * offset_m[2]
-            parallax_rad[j, i] = np.sqrt(max(length2 - along * along, 0.0)) * uncertainty[j, i]
+            parallax_px[j, i] = focal_px * (np.sqrt(max(length2 - along * along, 0.0)) * uncertainty[j, i])
+        for i in range(nx):
+            rounded[0, j, i] = parallax_px[j, i]
+        for i in range(nx):
+            rounded[1, j, i] = edge_px[j, i] / max(resolution[j, i], 1e-3)
 
 
 @compiled
-def keep_objects_whole(
+def win_nodes(
     scores: Any, parallax: Any, boxes: Any, center: Any, R: Any, rays: Any, axis: Any, node_rad: float, winner: Any
 ) -> None:  # fmt: skip
-    """Give the nodes of each labelled object that a seam would cross to one source, where that sees it.
+    """Let the source of the largest weight win each node, but one source all that it sees of a labelled object.
 
-    A seam repeats or cuts what it crosses. Among the sources that see the object whole, the one of the least parallax
-    is read. Nearer objects decide last. Objects that a source shows exactly, from the target's own centre, stay as
-    they are.
+    A seam repeats or cuts what it crosses. An object that one would cross is read from the source of the least parallax
+    among those that see it whole. Nearer objects decide last. Objects that a source shows exactly, from the target's
+    own centre, stay as they are.
 
     Args:
         scores: (K, ny, nx) weight of each source, 0 where it sees nothing.
@@ -202,7 +208,7 @@ def keep_objects_whole(
         rays: (3, ny, nx) of the nodes.
         axis: (4,) middle of a cone around the target's rays, camera frame, and its half angle.
         node_rad: Angle between nodes: objects are wider by it.
-        winner: (ny, nx) int8 the source of the largest weight, -1 for none; updated.
+        winner: (ny, nx) int8, written; -1 for none.
     """
     K, ny, nx = scores.shape
     n = ny * nx
@@ -212,7 +218,13 @@ def keep_objects_whole(
     along, vectors, count, total = np.empty(n, np.float32), np.empty((7, 3)), np.empty(K), np.empty(K)
     axes, to_box, across, away, half = vectors[:3], vectors[3], vectors[4], vectors[5], vectors[6]
     for i in range(n):
-        first[i] = chosen[i]
+        first[i] = 0 if score[0, i] > _ZERO else -1
+    for k in range(1, K):
+        for i in range(n):
+            better = score[k, i] > (score[first[i], i] if first[i] >= 0 else _ZERO)
+            first[i] = k if better else first[i]
+    for i in range(n):
+        chosen[i] = first[i]
     for b in range(boxes.shape[0]):
         c, s = np.cos(boxes[b, 6]), np.sin(boxes[b, 6])
         for i in range(3):
@@ -271,6 +283,39 @@ def keep_objects_whole(
                 chosen[near[j]] = one
 
 
+@compiled
+def soften(winner: Any, border_px: Any, radius: int, width_px: float, weights: Any) -> None:
+    """Write ``weights.seam_weights`` (K, ny, nx) float32, by the borders (K, ny, nx) of what the sources see."""
+    K, ny, nx = border_px.shape
+    side, width = 2 * radius + 1, np.float32(width_px)
+    row, across, total = np.empty(nx + 2 * radius, np.float32), np.empty((ny, nx)), np.empty(nx)
+    for k in range(K):
+        soft = weights[k]
+        for j in range(ny):
+            for i in range(nx):
+                soft[j, i] = _ONE if winner[j, i] == k else _ZERO
+        for _ in range(2):  # two passes of a box make a smooth ramp
+            for j in range(ny):
+                for i in range(row.shape[0]):
+                    row[i] = soft[j, min(max(i - radius, 0), nx - 1)]
+                across[j] = 0.0
+                for shift in range(side):
+                    part = row[shift : shift + nx]
+                    for i in range(nx):
+                        across[j, i] += part[i]
+            for j in range(ny):
+                total[:] = 0.0
+                for shift in range(side):
+                    part = across[min(max(j + shift - radius, 0), ny - 1)]
+                    for i in range(nx):
+                        total[i] += part[i]
+                for i in range(nx):
+                    soft[j, i] = total[i] * (1.0 / (side * side))
+        for j in range(ny):
+            for i in range(nx):
+                soft[j, i] *= min(max(border_px[k, j, i] / width, _ZERO), _ONE)
+
+
 @inlined
 def _fixed(value: Any) -> Any:
     """32nds of a pixel."""
@@ -318,9 +363,12 @@ def _occlude_row(
             above = beyond[k] * (_ONE - t) + beyond[k + right] * t
             below = beyond[k + down] * (_ONE - t) + beyond[k + down + right] * t
             hides[i] = above * (_ONE - s) + below * s
-        for i in range(n if before_m.shape[0] else 0):
-            if number_at[np.uint32(place[i])] >= 0 or (face.shape[0] and face[i] >= 0):
-                hides[i] = beyond[np.uint32(place[i])]
+        for i in range(n if before_m.shape[0] else 0):  # whose it is decides few pixels, and costs a cache miss to read
+            nearest = beyond[np.uint32(place[i])]
+            if face.shape[0] and face[i] >= 0:
+                hides[i] = nearest
+            elif (nearest <= pz[i]) != (hides[i] <= pz[i]) and number_at[np.uint32(place[i])] >= 0:
+                hides[i] = nearest
     else:
         for i in range(n):
             hides[i] = beyond[np.uint32(place[i])]
@@ -331,13 +379,15 @@ def _occlude_row(
         number = face[i]
         if number < 0:
             continue
-        me, there = np.uint32(number), number_at[np.uint32(place[i])]
+        me = np.uint32(number)
         if before_m[me] <= _ZERO or before_m[me] * pz[i] < LEAST_INCIDENCE:
             pz[i] = -_ONE
-        elif there == number // 6:  # pieces are convex
-            pz[i] = _MOST
-        elif there // PIECES == number // (6 * PIECES):
-            pz[i] = pz[i] / max(_ONE - SAME_OBJECT_M * pz[i], _TINY)
+        elif hides[i] > pz[i]:
+            there = number_at[np.uint32(place[i])]
+            if there == number // 6:  # pieces are convex
+                pz[i] = _MOST
+            elif there // PIECES == number // (6 * PIECES):
+                pz[i] = pz[i] / max(_ONE - SAME_OBJECT_M * pz[i], _TINY)
     for i in range(n):
         seen[i] = seen[i] & (hides[i] <= pz[i])
 
@@ -396,7 +446,7 @@ def put_source(
     shared: Any, best: Any, winner: Any, xy: Any, frac: Any, in_image: Any,
     next_best: Any, second: Any, next_xy: Any, next_frac: Any,
 ) -> None:  # fmt: skip
-    """Let a source win the pixels that it sees with more weight than the best so far; see also ``seen_image``.
+    """Let a source win the pixels that it sees with more weight than the best so far; see also ``clear_unseen``.
 
     Args:
         planes: (3, h, w) the target's rays; (3, 0, 0) for a pinhole.
@@ -410,17 +460,17 @@ def put_source(
         columns: (ny, 2) first and last (exclusive) cell of each row of cells that it may see.
         shared: (ny, nx) bool, cells in which the second-best source is kept.
         best: (h, w) float32 largest weight so far, below 0 where there is none; updated, as are all that follow.
-            If it is (0, 0), ``in_image`` becomes 255 where the source sees a pixel, and nothing else is written.
+            If it is (0, 0), ``weight`` (h, w) becomes 0 where the source does not see a pixel, and nothing is written.
         winner: (h, w) int8.
         xy: (h, w) int32, two int16: whole pixels in the source.
         frac: (h, w) uint16, 32nds of a pixel.
-        in_image: (h, w) uint8, 255 where some source's image contains the pixel.
+        in_image: (h, w) uint8, 255 where some source's image contains the pixel; (0, 0) where that is not asked.
         next_best: (h, w) float32 weight of the second-best source in these cells, 0 for none.
         second: (h, w) int8 whose that is, -1 for none.
         next_xy: (h, w) int32 where it is read.
         next_frac: (h, w) uint16.
     """
-    h, w = in_image.shape
+    h, w = q.shape
     work, share = np.empty((_WORK_ROWS, w), np.float32), np.empty(w, np.float32)
     inside, seen = np.empty(w, np.int32), np.empty(w, np.int32)
     fu, fv = np.empty(w, np.int32), np.empty(w, np.int32)
@@ -434,8 +484,9 @@ def put_source(
             continue
         _evaluate_row(planes, target, q, face, source, y, x0, n, work, inside[:n], seen[:n], fu[:n])
         if not best.shape[0]:
+            of_pixels = weight[y]
             for i in range(n):
-                in_image[y, x0 + i] = np.uint8(255) if seen[i] else in_image[y, x0 + i]
+                of_pixels[i] = of_pixels[i] if seen[i] else _ZERO
             continue
         u, v = work[0, :n], work[1, :n]
         upsampled_row(weight, step, y, x0, row, share[:n])
@@ -463,7 +514,7 @@ def put_source(
             xy[y, x0:x1],
             frac[y, x0:x1],
             winner[y, x0:x1],
-            in_image[y, x0:x1],
+            in_image[y, x0:x1] if in_image.shape[0] else in_image[:, 0],
         )
         for i in range(n):
             place = (((fv[i] >> 5) + top) << 16) | (((fu[i] >> 5) + left) & 0xFFFF)
@@ -473,21 +524,19 @@ def put_source(
             part[i] = fraction if share[i] > held[i] else part[i]
         for i in range(n):
             mine[i] = me if share[i] > held[i] else mine[i]
-        for i in range(n):
+        for i in range(image.shape[0]):
             image[i] = np.uint8(255) if inside[i] else image[i]
         for i in range(n):
             held[i] = max(share[i], held[i])
 
 
-def seen_image(planes: Any, target: Any, q: Any, face: Any, source: Any) -> npt.NDArray[np.bool_]:
-    """Find the pixels (h, w) that a source sees; arguments as in ``put_source``, whose compiled code it runs."""
-    no_weight, no_name, no_place, no_fraction = (np.zeros((0, 0), t) for t in ("f4", "i1", "i4", "u2"))
-    columns, seen = np.array([[0, 1]]), np.zeros(q.shape, np.uint8)
-    put_source(
-        planes, target, q, face, source, (0, 0, 0), no_weight, max(q.shape), columns,
-        no_weight > 0, no_weight, no_name, no_place, no_fraction, seen, no_weight, no_name, no_place, no_fraction,
-    )  # fmt: skip
-    return seen > 0
+_NOTHING = tuple(np.zeros((0, 0), dtype) for dtype in ("?", "f4", "i1", "i4", "u2", "u1", "f4", "i1", "i4", "u2"))
+_ONE_CELL = np.array([[0, 1]])
+
+
+def clear_unseen(planes: Any, target: Any, q: Any, face: Any, source: Any, weight: npt.NDArray[np.float32]) -> None:
+    """Clear the weights (h, w) of pixels that a source does not see, by ``put_source``; arguments as there."""
+    put_source(planes, target, q, face, source, (0, 0, 0), weight, max(q.shape), _ONE_CELL, *_NOTHING)
 
 
 @compiled
@@ -507,7 +556,7 @@ def find_bands(
         sources: (S,) sources in content order.
         bands: (n, 5) int64, written: source, first and last (exclusive) row, first and last (exclusive) column.
     """
-    (h, w), nx = second.shape, shared.shape[1]
+    (h, w), nx, low = second.shape, shared.shape[1], np.float32(least)
     rows = np.empty((128, (h + strip - 1) // strip, nx, 2), np.int32)  # first and last of each column of cells
     for k in sources:
         rows[k, ..., 0] = h
@@ -516,12 +565,15 @@ def find_bands(
         for i in range(nx):
             if not shared[y // step, i]:
                 continue
-            for x in range(i * step, min(i * step + step, w)):
-                k = second[y, x]
-                part = share[y, x] / max(best[y, x] + share[y, x], _TINY)
-                share[y, x] = part if k >= 0 and part >= least else _ZERO
-                if share[y, x] > _ZERO:
-                    ends = rows[k, y // strip, i]
+            x0, x1 = i * step, min(i * step + step, w)
+            part, whole, who, last = share[y, x0:x1], best[y, x0:x1], second[y, x0:x1], np.int8(-1)
+            for x in range(x1 - x0):
+                value = part[x] / max(whole[x] + part[x], _TINY)
+                part[x] = value if (who[x] >= 0) & (value >= low) else _ZERO
+            for x in range(x1 - x0):
+                if part[x] > _ZERO and who[x] != last:
+                    last = who[x]
+                    ends = rows[last, y // strip, i]
                     ends[0], ends[1] = min(ends[0], y), max(ends[1], y + 1)
     count = 0
     for k in sources:
@@ -542,8 +594,7 @@ def find_bands(
 
 @compiled
 def cut_bands(
-    bands: Any, shared: Any, step: int, share: Any, second: Any, xy: Any, frac: Any,
-    band_xy: Any, band_frac: Any, weight: Any,
+    bands: Any, share: Any, second: Any, xy: Any, frac: Any, band_xy: Any, band_frac: Any, weight: Any
 ) -> None:  # fmt: skip
     """Copy the positions and shares in rectangles (n, 5), one after the other; others than its source's read nothing.
 
@@ -551,13 +602,21 @@ def cut_bands(
     """
     at = 0
     for k in range(bands.shape[0]):
+        source, x0, x1 = np.int8(bands[k, 0]), bands[k, 3], bands[k, 4]
         for y in range(bands[k, 1], bands[k, 2]):
-            for x in range(bands[k, 3], bands[k, 4]):
-                adds = shared[y // step, x // step] and second[y, x] == bands[k, 0] and share[y, x] > _ZERO
-                band_xy[at] = xy[y, x] if adds else _OUTSIDE
-                band_frac[at] = frac[y, x] if adds else 0
-                weight[at] = share[y, x] if adds else _ZERO
-                at += 1
+            out, out_xy, out_frac = (
+                weight[at : at + x1 - x0],
+                band_xy[at : at + x1 - x0],
+                band_frac[at : at + x1 - x0],
+            )
+            part, who, where, fraction = share[y, x0:x1], second[y, x0:x1], xy[y, x0:x1], frac[y, x0:x1]
+            for x in range(out.shape[0]):
+                out[x] = part[x] if who[x] == source else _ZERO
+            for x in range(out.shape[0]):
+                out_xy[x] = where[x] if out[x] > _ZERO else _OUTSIDE
+            for x in range(out.shape[0]):
+                out_frac[x] = fraction[x] if out[x] > _ZERO else np.uint16(0)
+            at += x1 - x0
 
 
 @compiled

@@ -110,6 +110,12 @@ class _Region:
     fineness: float  # median of the pixels, as they are read, per target pixel
     certainty: npt.NDArray[np.float32] | None  # in 255ths, if asked for
 
+    @property
+    def hides(self) -> bool:
+        """Whether occluders or a mask may hide what lies in the source's image."""
+        _, _, _, _, _, clean, _, shadow, *_ = self.kernel
+        return bool(clean.size or shadow.size)
+
 
 class ViewPlanner:
     """Builds one target's plan in two steps: what each source sees, then who wins and where ``seams`` are blended.
@@ -139,10 +145,8 @@ class ViewPlanner:
         coarse = min(camera.size) >= SMALL_SIDE_PX
         coarse &= is_within_wall(camera.center_m) or not GEOMETRIES[surface].has_wall
         self.step = GRID_STEP_PX if coarse else 1
-        corners = [np.minimum(np.arange(0, n + self.step, self.step), n - 1) for n in camera.size]
-        # The outermost nodes lie half a cell inside: a magnified source does not see the outermost pixels.
-        inset = self.step // 2
-        y, x = self.nodes = [c.clip(inset, n - 1 - inset) for c, n in zip(corners, camera.size, strict=True)]
+        corners, self.nodes = nodes_of(camera.size, self.step)
+        y, x = self.nodes
         self.at_nodes = y[:, None], x[None]
         self.corner_rays, self.node_rays = maps.of_lens(
             camera, self.step, lambda: np.stack([continued(self.rays.at(*corners)), self.rays.at(y, x)])
@@ -178,13 +182,14 @@ class ViewPlanner:
 
     def _around_unseen(self, region: _Region) -> BoolArray:
         """Cells (ny, nx) that an exact source does not certainly win, and those around them that seams may reach."""
-        from arbiview_aug.render.kernels import depth_range, seen_image
+        from arbiview_aug.render.kernels import clear_unseen, depth_range
 
         whole = _whole_cells(region.score > 1)  # no weight of a source elsewhere exceeds 1
         # Borders, masks and image circles may lie between nodes.
-        visible = seen_image(*self._target(region), region.kernel)
-        most, least = np.empty(whole.shape, np.float32), np.empty(whole.shape, np.float32)
-        depth_range(visible.astype(np.float32), self.step, most, least)
+        visible = self.maps.memory.full(self.camera.size, 1, np.float32)
+        clear_unseen(*self._target(region), region.kernel, visible)
+        most, least = np.empty((2, *whole.shape), np.float32)
+        depth_range(visible, self.step, most, least)
         whole &= least > 0
         unseen = (~whole).astype(np.uint8)
         side = 2 * (2 * self._seam_radius + 1) + 1  # two passes of a box, and a node
@@ -263,13 +268,13 @@ class ViewPlanner:
 
     def _region(self, index: int) -> _Region | None:
         from arbiview_aug.cameras.kernels import FAR_AWAY_PX
-        from arbiview_aug.render.kernels import measure_nodes, seen_image
+        from arbiview_aug.render.kernels import clear_unseen, measure_nodes
 
+        if not self._open.any():
+            return None
         source = self.sources[index]
         baseline_m, focal_px = self.baselines_m[index], float(self.camera.K[0, 0])
         name, reason = self._choose_surface(index)
-        if not self._open.any():
-            return None
         geometry = self._geometry(name)
         if geometry.apart[index]:
             return None
@@ -277,29 +282,27 @@ class ViewPlanner:
         columns = self._in_view(source, projection, geometry.nearest, geometry.farthest)
         if not columns.any():
             return None
-        u, v = np.empty((2, *geometry.behind.shape), np.float32)
+        uv, rounded = np.empty((2, 2, *geometry.behind.shape), np.float32)
+        u, v = uv
         if kind < 0:
             u, v, _ = source_pixels(self.camera, self.node_rays, geometry.behind, source)
-        resolution, edge_px, parallax_rad = np.empty((3, *u.shape))
+        measured = np.empty((3, *u.shape))
+        resolution, edge_px, parallax = measured
         offset_m = (self.camera.center_m - source.center_m) @ self.camera.cam2ego[:3, :3]
         measure_nodes(
-            self.node_rays, geometry.behind, A, o, kind, P, *self.nodes, source.size,
-            self.maps.to_mask(source), CELL_PX, offset_m, geometry.uncertainty, u, v, resolution, edge_px, parallax_rad,
+            self.node_rays, geometry.behind, A, o, kind, P, *self.nodes, source.size, self.maps.to_mask(source),
+            CELL_PX, offset_m, geometry.uncertainty, focal_px, u, v, measured, rounded,
         )  # fmt: skip
-        if min(self.camera.size) < 2:
-            resolution[:] = 1
-        parallax = focal_px * parallax_rad
-        seen = edge_px > 0  # pixels that it cannot project lie far outside
-        most = np.sort(resolution[seen][::4])
+        most = np.sort(resolution[edge_px > 0][::4])  # pixels that it cannot project lie far outside
         level = halvings(most[len(most) // 5], source.size) if self.config.antialias and len(most) else 0
         kernel = self._kernel(source, level, geometry, A, o, P)
         positions = np.ascontiguousarray(kernel[-1][(slice(None), *self.at_nodes)]) if kind < 0 else kernel[-1]
-        on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
-        visible = seen_image(*on_nodes, (*kernel[:-1], positions))
-        self.counters[f"pairs_{name}"] += 1
         is_primary = baseline_m < SAME_CENTER_M
-        score = source_weight(edge_px, min(source.size) / 2, parallax, resolution, is_primary)
-        certain = 255 * certainty(parallax_rad, resolution) if self.config.certainty else None
+        score = source_weight(edge_px, min(source.size) / 2, parallax, resolution, is_primary).astype(np.float32)
+        on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
+        clear_unseen(*on_nodes, (*kernel[:-1], positions), score)
+        self.counters[f"pairs_{name}"] += 1
+        certain = 255 * certainty(parallax / focal_px, resolution) if self.config.certainty else None
         return _Region(
             source=index,
             level=level,
@@ -309,9 +312,9 @@ class ViewPlanner:
             geometry=geometry,
             columns=columns,
             kernel=kernel,
-            score=np.where(visible & seen, score, 0).astype(np.float32),
-            parallax=parallax.astype(np.float32),
-            border_px=(edge_px / np.maximum(resolution, 1e-3)).astype(np.float32),
+            score=score,
+            parallax=rounded[0],
+            border_px=rounded[1],
             fineness=float(most[len(most) // 2]) / 2**level if len(most) else 1.0,
             certainty=None if certain is None else _filled(certain, np.abs(u) < 0.9 * FAR_AWAY_PX),
         )
@@ -341,7 +344,7 @@ class ViewPlanner:
             o,
             kind,
             source.parameters_at(0.5**level) if level else P,
-            np.array([*source_bounds(source, level), shadow_scale], np.float32),
+            np.array([*source_bounds(source.size, level), shadow_scale], np.float32),
             self.maps.clean_pixels(source, level),
             before_m,
             shadow,
@@ -358,17 +361,18 @@ class ViewPlanner:
         size, memory = self.camera.size, self.maps.memory
         fixed = FixedMap.outside(size, memory)
         packed = fixed.packed
-        winner, in_image = memory.full(size, -1, np.int8), memory.full(size, 0, np.uint8)
+        winner = memory.full(size, -1, np.int8)
+        hides = any(region.hides for region in self.regions)
+        in_image = memory.full(size if hides else (0, 0), 0, np.uint8)
         best = memory.full(size, -1, np.float32)  # a source that sees a pixel beats none, even with a weight of 0
         weights = self._weights()
-        seconds = SecondBest(weights if self.config.seam_width else (), self.step, size, memory)
+        seconds = SecondBest(weights if self.config.seam_width else weights[:0], self.step, size, memory)
         for region, weight in zip(self.regions, weights, strict=True):
             slot = layout.slot(region.source, region.level)
             self.counters["cells"] += int((region.columns[:, 1] - region.columns[:, 0]).sum())
-            place = region.source, slot.x, slot.y
             put_source(
-                *self._target(region), region.kernel, place, weight, self.step, region.columns,
-                seconds.shared, best, winner, packed, fixed.frac, in_image, *seconds.images,
+                *self._target(region), region.kernel, (region.source, slot.x, slot.y), weight, self.step,
+                region.columns, seconds.shared, best, winner, packed, fixed.frac, in_image, *seconds.images,
             )  # fmt: skip
         won_px = Counter({r.source: int(np.count_nonzero(winner == r.source)) for r in self.regions})
         bands = tuple(seconds.blend_regions([region.source for region in self.regions], best))
@@ -384,10 +388,10 @@ class ViewPlanner:
         reports = tuple(self._reports(winner, won_px))
         if not self.config.layers:
             return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
-        holes = winner < 0
-        layers = (holes & (in_image > 0)).view(np.uint8)
-        road = self._road() if holes.any() else None
-        if not layers.any():
+        is_whole = sum(won_px.values()) == winner.size
+        road = None if is_whole else self._road()
+        layers = None if is_whole or not hides else ((winner < 0) & (in_image > 0)).view(np.uint8)
+        if layers is None or not layers.any():
             return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, road=road)
         paint = self._mark_objects(winner, layers)
         return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, layers, paint, road)
@@ -420,24 +424,24 @@ class ViewPlanner:
         mark_objects(geometry.q, geometry.face, winner, limit, self.step, layers)
         return find_paint(geometry.face, winner, geometry.surface.face_parts) if geometry.face.size else None
 
-    def _weights(self) -> list[npt.NDArray[np.float32]]:
-        """Weights of the sources on the nodes: their scores, for one source or hard seams."""
-        from arbiview_aug.render.kernels import keep_objects_whole
+    def _weights(self) -> npt.NDArray[np.float32]:
+        """Weights (K, ny + 1, nx + 1) of the sources: their scores, for one source or hard seams."""
+        from arbiview_aug.render.kernels import win_nodes
 
-        scores, width_px = [region.score for region in self.regions], self.config.seam_width * self.camera.width_px
+        width_px = self.config.seam_width * self.camera.width_px
+        scores = np.array([region.score for region in self.regions], np.float32).reshape(-1, *self.node_rays.shape[1:])
         if width_px == 0 or len(scores) < 2:
             return scores
-        stacked = np.stack(scores)
-        winner = np.where(stacked.any(axis=0), stacked.argmax(axis=0), -1).astype(np.int8)
+        parallax, border_px = (
+            np.array([getattr(region, name) for region in self.regions]) for name in ("parallax", "border_px")
+        )
         labelled = self.scene.boxes if "boxes" in GEOMETRIES[self.surface].reads else None
-        if labelled is not None and len(labelled):
-            near_last = np.argsort(-np.linalg.norm(labelled[:, :3] - self.camera.center_m, axis=-1), kind="stable")
-            parallax = np.stack([region.parallax for region in self.regions])
-            pose = np.ascontiguousarray(self.camera.center_m), np.ascontiguousarray(self.camera.cam2ego[:3, :3])
-            node_rad = self.step / float(self.camera.K[0, 0])
-            boxes = labelled[near_last, :7]
-            keep_objects_whole(stacked, parallax, boxes, *pose, self.node_rays, self.rays.cone, node_rad, winner)
-        return seam_weights(winner, [region.border_px for region in self.regions], self._seam_radius, width_px)
+        boxes = np.zeros((0, 7)) if labelled is None else labelled[:, :7]
+        near_last = np.argsort(-np.linalg.norm(boxes[:, :3] - self.camera.center_m, axis=-1), kind="stable")
+        pose = np.ascontiguousarray(self.camera.center_m), np.ascontiguousarray(self.camera.cam2ego[:3, :3])
+        node_rad, winner = self.step / float(self.camera.K[0, 0]), np.empty(scores.shape[1:], np.int8)
+        win_nodes(scores, parallax, boxes[near_last], *pose, self.node_rays, self.rays.cone, node_rad, winner)
+        return seam_weights(winner, border_px, self._seam_radius, width_px)
 
     def _target(self, region: _Region) -> tuple[Any, Any, Any, Any]:
         return self.rays.planes, self.rays.parameters, region.geometry.q, region.geometry.face
@@ -478,16 +482,26 @@ class ViewPlanner:
             if won_px[region.source] == 0:
                 continue
             won = np.sort(region.parallax[on_nodes == region.source])
-            middle = won[(len(won) - 1) // 2 : len(won) // 2 + 1]
+            middle_px = float(won[(won.size - 1) // 2] + won[won.size // 2]) / 2 if won.size else 0.0
             yield SourceUse(
                 source=region.source,
                 surface=region.surface,
                 reason=region.reason,
                 baseline_m=region.baseline_m,
-                parallax_px=float(middle.mean()) if won.size else 0.0,
+                parallax_px=middle_px,
                 share=won_px[region.source] / winner.size,
                 level=region.level,
             )
+
+
+@lru_cache(32)
+def nodes_of(size: tuple[int, int], step: int) -> tuple[list[npt.NDArray[np.int64]], list[npt.NDArray[np.int64]]]:
+    """Rows and columns of the corners of cells in an image (h, w), the last ones its last; and of nodes.
+
+    The outermost nodes lie half a cell inside: a magnified source does not see the outermost pixels.
+    """
+    corners, inset = [np.minimum(np.arange(0, n + step, step), n - 1) for n in size], step // 2
+    return corners, [corner.clip(inset, n - 1 - inset) for corner, n in zip(corners, size, strict=True)]
 
 
 def _whole_cells(on_nodes: BoolArray) -> BoolArray:
@@ -504,15 +518,15 @@ def halvings(resolution: float, size: tuple[int, int]) -> int:
     return level
 
 
-def source_bounds(source: Camera, level: int) -> npt.NDArray[np.float64]:
-    """(6,) least and largest columns and rows of what a source halved ``level`` times shows; its last ones, or -1."""
-    (h, w), scale = level_size(source.size, level), 0.5**level
-    slack_px = _SLACK_PX + _ROUNDING * max(source.size)
-    bounds = np.array([-slack_px, -slack_px, source.width_px - 1 + slack_px, source.height_px - 1 + slack_px])
-    bounds = (bounds + 0.5) * scale - 0.5
+@lru_cache(32)
+def source_bounds(full: tuple[int, int], level: int) -> tuple[float, ...]:
+    """Least and largest columns and rows of what an image (h, w) halved ``level`` times shows; its last ones, or -1."""
+    (h, w), scale = level_size(full, level), 0.5**level
+    slack_px = _SLACK_PX + _ROUNDING * max(full)
+    first, *last = ((side + 0.5) * scale - 0.5 for side in (-slack_px, full[1] - 1 + slack_px, full[0] - 1 + slack_px))
     # Halving leaves out the last row or column of an odd size: nothing is known there.
-    bounds[2:] = np.minimum(bounds[2:], (w - 0.5, h - 0.5))
-    return np.array([*bounds, *((w - 1, h - 1) if level else (-1, -1))])
+    right, bottom = min(last[0], w - 0.5), min(last[1], h - 0.5)
+    return first, first, right, bottom, *((w - 1, h - 1) if level else (-1, -1))
 
 
 @lru_cache(32)  # all targets ask for the same ones

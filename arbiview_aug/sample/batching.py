@@ -22,15 +22,15 @@ def leading_shape(images: Any) -> tuple[int, ...]:
     return ()
 
 
-def split(value: Any, lead: tuple[int, ...]) -> list[Any]:
-    """The entries of each frame, from a (*lead, ...) tensor or a list of (*lead, ...) tensors, one per camera."""
-    if not lead:
-        return [value]
-    if isinstance(value, list | tuple):
-        return [list(frame) for frame in zip(*(split(v, lead) for v in value), strict=True)]
-    if tuple(value.shape[: len(lead)]) != lead:
-        raise ValueError(f"expected the images' leading dimensions {lead}, got shape {tuple(value.shape)}")
-    return list(value.reshape(math.prod(lead), *value.shape[len(lead) :]).unbind(0))
+def split(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
+    """The entries of each frame, from a (*lead, ...) tensor or a list of (*lead, ...) tensors, one per camera.
+
+    SampleError, which begins with ``key``, for other leading dimensions.
+    """
+    try:
+        return [entry(value, lead, index) for index in np.ndindex(*lead)]
+    except ValueError as error:
+        raise SampleError(f"{key}: {error}") from None
 
 
 def entry(value: Any, lead: tuple[int, ...], index: tuple[int, ...]) -> Any:

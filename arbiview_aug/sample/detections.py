@@ -13,7 +13,8 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.sample.boxes_2d import outline
-from arbiview_aug.sample.inputs import Frame, numbers, read_scene
+from arbiview_aug.sample.inputs import Frame, numbers
+from arbiview_aug.scene.boxes import checked_boxes
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,9 @@ def read_detections(frame: Frame) -> OfCameras:
     sample = frame.sample
     if sample.get("detections") is not None:
         return _of_cameras(_of_frame("detections", frame), frame)
-    if sample.get("boxes_3d") is None:
+    if (array := frame.array("boxes_3d")) is None:
         return {}
-    scene = read_scene(frame, "boxes")
-    assert scene is not None and scene.boxes is not None
-    boxes = scene.boxes
+    boxes = checked_boxes(array)
     names = [UNNAMED_TYPE] * len(boxes)
     if sample.get("box_names") is not None:
         names = _names("box_names", _of_frame("box_names", frame), len(boxes))

@@ -19,7 +19,7 @@ from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
 from arbiview_aug.sample.masks import CLEANING, dark_rims
 from arbiview_aug.scene.boxes import checked_boxes
-from arbiview_aug.scene.depth_map import DepthMap, Maps, anchored_maps, believed, motion_camera
+from arbiview_aug.scene.depth_map import DepthMap, anchored_maps, believed, motion_camera
 from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import GEOMETRIES, Geometry, Scene
 from arbiview_aug.scene.surface import Points
@@ -137,13 +137,9 @@ def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
     lead = leading_shape(images)
     if 0 in lead:
         raise SampleError(f"images: expected at least one frame, got the leading dimensions {lead}")
-    try:
-        frames = split(images, lead)
-    except ValueError as error:
-        raise SampleError(f"images: {error}") from None
     return [
         frame_from(checked_images(frame), sample, source, lead, index)
-        for frame, index in zip(frames, np.ndindex(*lead), strict=True)
+        for frame, index in zip(split("images", images, lead), np.ndindex(*lead), strict=True)
     ]
 
 
@@ -183,27 +179,23 @@ _CHECKS: dict[str, Callable[[Points], Points]] = {"boxes_3d": checked_boxes, "po
 
 
 def _geometry(name: str, frame: Frame, arrays: Mapping[str, Geometry], is_doubted: bool) -> Geometry | None:
-    """The arrays or maps of a name in ``GeometryRow.reads``, beside the ``arrays`` read before; None without any.
+    """The arrays or maps of a name in ``GeometryRow.reads``; None without any.
 
-    Depth from motion that ``is_doubted`` is left out where a network's maps, if there are any, contradict it.
+    Maps are fused with the points and maps in ``arrays``, which were read before. Depth from motion that ``is_doubted``
+    is left out where a network's maps, if there are any, contradict it.
     """
     (key,) = _SAMPLE_KEYS.get(name, (name,))
     if frame.sample.get(key) is None:
         return None
     if key in DEPTH_KEYS:
+        maps = _depth_maps(key, frame)
+        if is_doubted and frame.sample.get(LEARNED_KEY) is not None:
+            maps = list(map(believed, maps, _depth_maps(LEARNED_KEY, frame)))
         before = [arrays[one] for one in ("points", "depth_m", "motion") if one in arrays and key != "depth_m"]
-        return _maps(key, frame, before, is_doubted)
+        return anchored_maps(maps, before)
     array = frame.array(key)
     assert array is not None
     return _CHECKS[key](array) if key in _CHECKS else array
-
-
-def _maps(key: str, frame: Frame, before: Sequence[Geometry], is_doubted: bool) -> Maps:
-    """A frame's depth maps, fused with the points and maps ``before`` them; none if nothing is known."""
-    maps = _depth_maps(key, frame)
-    if is_doubted and frame.sample.get(LEARNED_KEY) is not None:
-        maps = list(map(believed, maps, _depth_maps(LEARNED_KEY, frame)))
-    return anchored_maps(maps, before)
 
 
 def _depth_maps(key: str, frame: Frame) -> list[DepthMap]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -96,17 +96,19 @@ def check(sample: Mapping[str, Any], source: Rig | None = None, **unknown: Any) 
     """
     refuse_old_options("check", unknown)
     frames = read_frames(sample, source)
-    boxes, points = (_arrays(sample, key, frames) for key in ("boxes_3d", "points"))
     findings = [
         Finding(wrong, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
         for wrong, meant in misnamed_keys(sample, source is not None or sample.get("rig") is not None).items()
     ]
-    for frame, of_frame, cloud in zip(frames, boxes, points, strict=True):
+    for frame in frames:
         # Holes of an earlier retargeting are masks too, of any shape.
         own_masks = sample.get("coverage") is None and sample.get("ego_mask") is None
         findings += check_rig(frame.rig, masks=own_masks)
         findings += _image_findings(frame)
-        findings += _label_findings(frame.rig, of_frame, cloud)
+        boxes, points = frame.array("boxes_3d"), frame.array("points")
+        boxes = None if boxes is None else checked_boxes(boxes)
+        points = None if points is None else checked_points(points)
+        findings += _label_findings(frame.rig, boxes, points)
     return CheckReport(tuple(dict.fromkeys(findings)))
 
 
@@ -137,14 +139,6 @@ def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
             seen = f"{1 - upper:.0%} of the upper third hidden"
             findings.append(Finding(f"camera {camera.name!r}: mask", "True on the scene", seen, "pass ~mask"))
     return findings
-
-
-def _arrays(sample: Mapping[str, Any], key: str, frames: Sequence[Frame]) -> list[Any]:
-    """The boxes or points of each frame, checked; None where the sample has none."""
-    if sample.get(key) is None:
-        return [None] * len(frames)
-    checked: Callable[[Any], Any] = checked_boxes if key == "boxes_3d" else checked_points
-    return [checked(frame.array(key)) for frame in frames]
 
 
 def _resolution_findings(rig: Rig) -> Iterator[Finding]:

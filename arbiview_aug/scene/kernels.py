@@ -147,12 +147,13 @@ def draw_solids(
         number: (h, w) int32 the nearest face or piece; updated.
     """
     h, w = q.shape
-    _, ny, nx = cones.shape
-    work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
+    nx = cones.shape[2]
+    work, near_box, heights = np.empty((5, w), np.float32), np.empty(nx, np.bool_), _heights(cones)
     factor = np.float32(scale)
     for k in range(rows.shape[0]):
         b, me = rows[k], np.int32(numbers[k])
-        for j in range(ny):
+        first, last = _rows_of_piece(b, heights)
+        for j in range(first, last):
             x0, n = columns_of_piece(b, cones[:, j], near_box, step, w)
             if n == 0:
                 continue
@@ -181,11 +182,12 @@ def sum_silhouettes(
     ``sums`` (all pieces,) float64 is updated; the other arguments are as in ``draw_solids``.
     """
     h, w = weight.shape
-    _, ny, nx = cones.shape
-    work, near_box = np.empty((5, w), np.float32), np.empty(nx, np.bool_)
+    nx = cones.shape[2]
+    work, near_box, heights = np.empty((5, w), np.float32), np.empty(nx, np.bool_), _heights(cones)
     for k in range(rows.shape[0]):
         b = rows[k]
-        for j in range(ny):
+        first, last = _rows_of_piece(b, heights)
+        for j in range(first, last):
             x0, n = columns_of_piece(b, cones[:, j], near_box, step, w)
             if n == 0:
                 continue
@@ -196,6 +198,30 @@ def sum_silhouettes(
                 for x in range(n):
                     if enter[x] > leave[x]:
                         sums[numbers[k]] += weight[y, x0 + x]
+
+
+@inlined
+def _heights(cones: Any) -> Any:
+    """Least and largest vertical component (2, ny) of the rays in each row of cells."""
+    heights = np.empty((2, cones.shape[1]), np.float32)
+    for j in range(cones.shape[1]):
+        heights[0, j], heights[1, j] = (cones[1, j] - cones[3, j]).min(), (cones[1, j] + cones[3, j]).max()
+    return heights
+
+
+@inlined
+def _rows_of_piece(b: Any, heights: Any) -> tuple[int, int]:
+    """First and last (exclusive) row of cells whose ``_heights`` may meet the cone around a piece's box."""
+    height, cosine = b[26], b[28]
+    aside = np.sqrt(max(_ONE - height * height, _ZERO) * max(_ONE - cosine * cosine, _ZERO))
+    low = height * cosine - aside if -height < cosine else -_ONE  # else it holds the direction straight down
+    high = height * cosine + aside if height < cosine else _ONE
+    low, high = (low, high) if cosine >= -_ONE else (-_ONE, _ONE)
+    first, last = heights.shape[1], 0
+    for j in range(heights.shape[1]):
+        if heights[0, j] <= high and heights[1, j] >= low:
+            first, last = min(first, j), j + 1
+    return first, last
 
 
 @called

@@ -194,7 +194,7 @@ class _RoadAndWall(StaticSurface):
         such way: the integral of (1/t - 1/t_surface) over t. The road nearby is certain, the wall is not.
         """
         wall = wall_inverse_distance(origin, directions, Street.half_length_m, Street.half_width_m)
-        t = np.clip(wall / np.maximum(inverse_distance, 1e-9), FREE_SHARE, 1.0)
+        t = np.minimum(np.maximum(wall / np.maximum(inverse_distance, 1e-9), FREE_SHARE), 1.0)
         return np.asarray(OBJECT_DENSITY * wall * (np.log(t / FREE_SHARE) - 1 + FREE_SHARE / t))
 
 
@@ -278,7 +278,7 @@ def wall_inverse_distance(
         q = np.where(b > 0, (root + b) / -c, towards)
     else:
         q = np.where((b < 0) & (b * b >= a * c), towards, 0.0)
-    return np.clip(q, 0.0, MAX_INVERSE_DISTANCE)
+    return np.minimum(np.maximum(q, 0.0), MAX_INVERSE_DISTANCE)
 
 
 def is_within_wall(origin: FloatArray) -> bool:

@@ -7,7 +7,6 @@ functions of a camera and the road's height alone, for every lens, so they are c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -91,8 +90,8 @@ class CameraMaps(torch.nn.Module):
         return stacked([maps.to(image.device) for maps, image in zip(of_cameras, frame.images, strict=True)])
 
     def _held(self, camera: Camera, ground_z_m: float) -> torch.Tensor:
-        make = partial(camera_maps, camera, ground_z_m, self.maps, self.stride)
-        return self._cache.get((camera.content_key, ground_z_m), lambda: torch.from_numpy(make()))
+        key, settings = (camera.content_key, ground_z_m), (self.maps, self.stride)
+        return self._cache.get(key, lambda: torch.from_numpy(camera_maps(camera, ground_z_m, *settings)))
 
 
 def camera_maps(

@@ -125,12 +125,8 @@ def target_labels(
         raise SampleTypeError(f"{key}: expected label maps as tensors, got {got}; use torch.as_tensor")
     if isinstance(value, torch.Tensor) and value.ndim < len(lead) + 3:
         raise SampleError(f"{key}: expected label maps of shape (..., N, H, W), got {tuple(value.shape)}")
-    try:
-        of_frames = split(value, lead)
-    except ValueError as error:
-        raise SampleError(f"{key}: {error}") from None
     views = []
-    for frame, of_frame, maps in zip(frames, rendered, of_frames, strict=True):
+    for frame, of_frame, maps in zip(frames, rendered, split(key, value, lead), strict=True):
         _check_maps(key, maps, frame)
         assert of_frame.labels is not None
         plain = [label.as_subclass(torch.Tensor) for label in maps]

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.cameras.camera import Camera, resize_matrix
-from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.errors import SampleError, WarnOnce
@@ -51,7 +50,8 @@ class _PixelTransform(torch.nn.Module, ABC):
             SampleError: As ``RigRetarget`` raises; ``CropRig``: a window that leaves an image.
         """
         images = sample.get("images")
-        sizes = [tuple(image.shape[-2:]) for image in read_frames(sample, None)[0].images]
+        frames = read_frames(sample, None)
+        sizes = [tuple(image.shape[-2:]) for image in frames[0].images]
         labels = check_other_keys(sample, sizes, self.keys.labels, self.keys.keep)
         out = dict(sample)
         for key in (*PIXEL_BOUND_KEYS, MOTION_KEY, LEARNED_KEY, "neighbours"):
@@ -67,8 +67,8 @@ class _PixelTransform(torch.nn.Module, ABC):
         if isinstance(sample.get("rig"), Rig):
             out["rig"] = sample["rig"].with_cameras([self._camera(camera) for camera in sample["rig"]])
         if sample.get("K") is not None:
-            K = np.stack([self._matrix(*size) for size in sizes]) @ numbers("K", sample["K"])
-            out["K"] = like(torch.from_numpy(K), sample["K"])
+            K = np.stack([self._camera(camera).K for frame in frames for camera in frame.rig])
+            out["K"] = like(torch.from_numpy(K.reshape(numbers("K", sample["K"]).shape)), sample["K"])
         return out
 
     @abstractmethod
@@ -82,10 +82,6 @@ class _PixelTransform(torch.nn.Module, ABC):
     @abstractmethod
     def _camera(self, camera: Camera) -> Camera:
         """The camera of the changed image."""
-
-    @abstractmethod
-    def _matrix(self, h: int, w: int) -> FloatArray:
-        """(3, 3) pixel of an (h, w) image to pixel of the changed image."""
 
 
 class ResizeRig(_PixelTransform):
@@ -111,9 +107,6 @@ class ResizeRig(_PixelTransform):
 
     def _camera(self, camera: Camera) -> Camera:
         return camera.resize(self.size)
-
-    def _matrix(self, h: int, w: int) -> FloatArray:
-        return resize_matrix((h, w), self.size)
 
 
 class CropRig(_PixelTransform):
@@ -155,9 +148,6 @@ class CropRig(_PixelTransform):
 
     def _camera(self, camera: Camera) -> Camera:
         return camera.crop(self.top, self.left, self.size)
-
-    def _matrix(self, h: int, w: int) -> FloatArray:
-        return np.array([[1.0, 0.0, -self.left], [0.0, 1.0, -self.top], [0.0, 0.0, 1.0]])
 
 
 def _each(value: Any, change: Callable[[torch.Tensor], torch.Tensor], dims: int) -> torch.Tensor:

@@ -161,7 +161,7 @@ def verdicts(found: Sequence[bool], copies: int = 1, method: str = "own") -> lis
         boxes, yes = box[: int(is_found)], np.ones(1, bool)
         seen = Detections(boxes, np.full(len(boxes), 0.9), ["car"] * len(boxes))
         labels = Labels(np.array([0]), box, yes, yes)
-        rows += [Verdict(f"{k}", method, "van", f"c{c}", SIZE, seen, labels) for c in range(copies)]
+        rows += [Verdict(f"{k}", method, "van", SIZE, seen, labels) for _ in range(copies)]
     return rows
 
 

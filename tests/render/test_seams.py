@@ -12,23 +12,24 @@ STEP = 4
 
 
 def second_best(*weights: np.ndarray, size: tuple[int, int]) -> SecondBest:
-    return SecondBest([np.float32(weight) for weight in weights], STEP, size, FRESH)
+    nodes = len(weights), size[0] // STEP + 1, size[1] // STEP + 1
+    return SecondBest(np.array(weights, np.float32).reshape(nodes), STEP, size, FRESH)
 
 
 def test_weights_ramp_over_the_seam_and_add_up_to_one() -> None:
     winner = np.repeat([[0] * 6 + [1] * 6], 5, axis=0).astype(np.int8)
     far = np.full(winner.shape, 1e3, np.float32)
-    left, right = seam_weights(winner, [far, far], radius=1, width_px=8.0)
+    left, right = seam_weights(winner, np.array([far, far]), radius=1, width_px=8.0)
     ramp = np.array([1, 1, 1, 1, 8 / 9, 6 / 9, 3 / 9, 1 / 9, 0, 0, 0, 0])  # two boxes of three nodes
     np.testing.assert_allclose(left, np.broadcast_to(ramp, left.shape), atol=1e-6)
     np.testing.assert_allclose(left + right, 1, atol=1e-6)
 
 
 def test_weights_fade_at_a_sources_own_border() -> None:
-    border = np.array([[-2.0, 0.0, 2.0, 4.0, 8.0, 20.0]], np.float32)
-    (weight,) = seam_weights(np.zeros((1, 6), np.int8), [border], radius=2, width_px=8.0)
+    border = np.array([[[-2.0, 0.0, 2.0, 4.0, 8.0, 20.0]]], np.float32)
+    (weight,) = seam_weights(np.zeros((1, 6), np.int8), border, radius=2, width_px=8.0)
     np.testing.assert_allclose(weight, [[0, 0, 0.25, 0.5, 1, 1]])
-    (nobody,) = seam_weights(np.full((1, 6), -1, np.int8), [border], radius=2, width_px=8.0)
+    (nobody,) = seam_weights(np.full((1, 6), -1, np.int8), border, radius=2, width_px=8.0)
     assert not nobody.any()
 
 

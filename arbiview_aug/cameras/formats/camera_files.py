@@ -140,12 +140,8 @@ def _file_storage(path: Path) -> Mapping[str, Any]:
         nodes = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise CalibrationError(f"{path.name}: expected XML, got {error}") from None
-    matrices = {node.tag: {"data": _numbers(node.findtext("data"))} for node in nodes if len(node)}
+    matrices = {node.tag: {"data": [*map(float, node.findtext("data", "").split())]} for node in nodes if len(node)}
     return {node.tag: (node.text or "").strip() for node in nodes} | matrices
-
-
-def _numbers(text: str | None) -> list[float]:
-    return [float(number) for number in (text or "").split()]
 
 
 def write_ros(data: Mapping[str, Any], folder: Path) -> None:

@@ -35,6 +35,7 @@ import torch
 
 from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import Pinhole, intrinsics_for_fov
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Reduce
 from arbiview_aug.cli.arguments import device_named, output_file
@@ -213,9 +214,7 @@ def _own(sample: Sample, views: tuple[int, int]) -> Calls:
 
 def lowered(rig: Rig, size: tuple[int, int]) -> Rig:
     """Raise a rig by 0.6 m, pitch it down by 15 degrees and widen it to 100: it sees road that no camera sees."""
-    h, w = size
-    f = w / 2 / np.tan(np.radians(100.0 / 2))
-    K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
+    (h, w), K = size, intrinsics_for_fov("lowered", 100.0, size, Pinhole())
     poses = {c.name: c.turned(pitch_deg=-15.0).shifted(z_m=0.6).cam2ego for c in rig}
     cameras = [Camera(name=name, width_px=w, height_px=h, K=K, cam2ego=pose) for name, pose in poses.items()]
     return Rig(cameras, ground_z_m=rig.ground_z_m, name="lowered")

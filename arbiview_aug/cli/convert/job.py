@@ -173,14 +173,10 @@ class Jobs(Dataset[Done]):
             "ground_z_m": rig.ground_z_m,
             "cameras": [{**camera, "file": image} for camera, image in zip(cameras, images, strict=True)],
             "coverage": coverage,
-            "files": {
-                **{name: len(content) for name, content in files.items()},
-                **{name: source.stat().st_size for name, source in kept.items()},
-            },
-            "checksums": {
-                **{name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
-                **{name: sums[source] for name, source in kept.items()},
-            },
+            "files": {name: len(content) for name, content in files.items()}
+            | {name: source.stat().st_size for name, source in kept.items()},
+            "checksums": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+            | {name: sums[source] for name, source in kept.items()},
             "sources": {name: sums[path] for name, path in sources.items()},
             "source_bytes": _total_bytes(sources.values()),
             **facts,

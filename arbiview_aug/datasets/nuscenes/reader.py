@@ -22,7 +22,7 @@ from arbiview_aug.datasets.image_io import decode_images, reduced_rig
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables
-from arbiview_aug.errors import CalibrationError, DataError, warn
+from arbiview_aug.errors import DataError, calibration_of, warn
 
 CAMERA_RING = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT")
 """Order of the cameras in a sample, clockwise from above; other cameras follow by name."""
@@ -141,10 +141,8 @@ class NuScenesDataset(WritableRecording):
             if self.compensate_ego_motion:
                 cam2ego = own2ego @ cam2ego
             height_px, width_px = recordings.size(row)
-            try:
+            with calibration_of(f"nuScenes {self.root}: image {recordings.file(row)}"):
                 rig.append(Camera(name=channel, width_px=width_px, height_px=height_px, K=K, cam2ego=cam2ego))
-            except CalibrationError as error:
-                raise CalibrationError(f"nuScenes {self.root}: image {recordings.file(row)}: {error}") from None
         return reduced_rig(Rig(rig, ground_z_m=0.0, name="nuscenes"), self.reduce)
 
     def _file(self, row: int) -> Path:

@@ -17,7 +17,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rotations import poses_from
 from arbiview_aug.datasets.drive import clock_message
 from arbiview_aug.datasets.nuscenes import tables as kinds
-from arbiview_aug.datasets.nuscenes.tables import TOKENS, Row, Tables, Tokens
+from arbiview_aug.datasets.nuscenes.tables import TOKENS, Tables, Tokens
 from arbiview_aug.errors import DataError, warn
 
 LIDAR = "LIDAR_TOP"  # sensor whose time and ego pose are the sample's
@@ -175,19 +175,14 @@ def read_recordings(
 
 def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int], list[int], FloatArray, FloatArray]:
     """Number of each calibrated sensor, -1 for others such as radars; channels, sensor2ego and K by number."""
-    calibrated: dict[str, int] = {}
-    rows: list[Row] = []
-    channel_of: list[int] = []
     by_token = tables.by_token("calibrated_sensor")
     sensors = tables.follow(
         "calibrated_sensor", [*by_token.values()], "sensor_token", "sensor", tables.by_token("sensor")
     )
-    for (token, row), sensor in zip(by_token.items(), sensors, strict=True):
-        calibrated[token] = -1
-        if sensor["channel"] in wanted:
-            calibrated[token] = len(rows)
-            rows.append(row)
-            channel_of.append(wanted.index(sensor["channel"]))
+    channels = {token: sensor["channel"] for token, sensor in zip(by_token, sensors, strict=True)}
+    read = [token for token in by_token if channels[token] in wanted]
+    calibrated = dict.fromkeys(by_token, -1) | {token: k for k, token in enumerate(read)}
+    rows, channel_of = [by_token[token] for token in read], [wanted.index(channels[token]) for token in read]
     sensor2ego = poses_from(tables.poses("calibrated_sensor", rows))
     K = np.tile(np.eye(3), (len(rows), 1, 1))
     cameras = [k for k, channel in enumerate(channel_of) if wanted[channel] != LIDAR]

@@ -185,16 +185,13 @@ class Tables:
 
     def poses(self, table: str, rows: Sequence[Row]) -> FloatArray:
         """(len(rows), 7) x y z from the column ``translation``, and w x y z from ``rotation``."""
-        return np.hstack([self.numbers(table, rows, "translation", (3,)), self.quaternions(table, rows)])
-
-    def quaternions(self, table: str, rows: Sequence[Row]) -> FloatArray:
-        """(len(rows), 4) w x y z from the column ``rotation``."""
+        positions = self.numbers(table, rows, "translation", (3,))
         quaternions = self.numbers(table, rows, "rotation", (4,))
         bad = np.flatnonzero(np.abs(np.linalg.norm(quaternions, axis=-1) - 1) > _QUATERNION_NORM_TOLERANCE)
         if len(bad):
             row = rows[int(bad[0])]
             raise self.error(table, "unit quaternions w x y z", f"{row['rotation']} in row {row.get('token')!r}")
-        return quaternions
+        return np.hstack([positions, quaternions])
 
     def error(
         self, table: str, expected: str, got: str, fix: str = "mend the table, or unpack the archive again"

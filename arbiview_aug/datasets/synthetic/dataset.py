@@ -15,11 +15,11 @@ from torch.utils.data import Dataset
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import LazyFrame, Neighbours, camera_fields, check_neighbours
-from arbiview_aug.datasets.image_io import stack_or_list
 from arbiview_aug.datasets.synthetic.render import Renderer
 from arbiview_aug.datasets.synthetic.scanning import ScanErrors, scan_scene
 from arbiview_aug.datasets.synthetic.scene import Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
+from arbiview_aug.sample.batching import stacked
 
 LIDAR_POSITION_M = (0.9, 0.0, 1.9)  # ego x, y and height over the road: on the roof, as on nuScenes' vehicles
 LIDAR_BEAMS_DEG = (-30.67, 10.67)  # elevations of the lowest and the highest of 32 beams (Velodyne HDL-32E)
@@ -140,7 +140,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def _images(self, scene: Scene) -> Tensor | list[Tensor]:
         views = self._renderer.render(scene, self.rig.cameras, self.rig.ground_z_m)
-        return stack_or_list([view.image for view in views])
+        return stacked([view.image for view in views])
 
     def _boxes(self, scene: Scene) -> Tensor:
         return torch.from_numpy(scene.boxes_ego(self.rig.ground_z_m).astype(np.float32))
@@ -154,7 +154,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         """
         rig = self.rig if rig is None else _checked_rig(rig)
         views = self._renderer.render(self.scene(index), rig.cameras, rig.ground_z_m)
-        return RenderedViews(*(stack_or_list([v[k] for v in views]) for k in range(4)))
+        return RenderedViews(*(stacked([v[k] for v in views]) for k in range(4)))
 
     def points(self, index: int, rig: Rig | None = None) -> Tensor:
         """(P, 4) float32 LiDAR-like points x y z intensity (0 to 255) of scene ``index``, in the rig's ego frame.

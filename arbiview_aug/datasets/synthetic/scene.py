@@ -15,7 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rotations import yaw_matrix
+
 IntArray = npt.NDArray[np.int64]
 Range = tuple[float, float]
 Vector = tuple[float, float, float]
@@ -137,12 +139,6 @@ class Scene:
 _ZEROS = (0.0, 0.0, 0.0, 0.0)
 _NO_TURN, _NO_PLANES = np.eye(3), np.zeros((6, 4))
 _SIGNS = np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)], dtype=np.float64)
-
-
-def yaw_matrix(yaw: float) -> FloatArray:
-    """(3, 3) rotation about z, radians."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 class SceneBuilder:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from arbiview_aug.cameras.rotations import yaw_matrix
 from arbiview_aug.datasets.synthetic import objects
 from arbiview_aug.datasets.synthetic.scene import (
     BOX,
@@ -18,7 +19,6 @@ from arbiview_aug.datasets.synthetic.scene import (
     SceneBuilder,
     SceneClass,
     Street,
-    yaw_matrix,
 )
 
 CLEAR_X_M, CLEAR_Y_M = (-3.0, 6.5), 2.2  # of the ego frame without objects: no camera of a sensible rig is inside one

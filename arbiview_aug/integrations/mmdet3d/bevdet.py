@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.rotations import poses_from
+from arbiview_aug.cameras.rotations import poses_from, quaternion_from_rotation
 from arbiview_aug.errors import SampleError
 from arbiview_aug.integrations.mmdet3d.images import Norm, levels, normalised
 from arbiview_aug.integrations.mmdet3d.matrices import Views, padded, upper_triangular
@@ -178,10 +178,9 @@ def _lidar2key(info: Any, key2global: FloatArray) -> FloatArray | None:
 
 def _infos(target: Views, key2global: FloatArray) -> dict[str, dict[str, Any]]:
     """``curr["cams"]``: what ``PointToMultiViewDepth`` reads."""
-    from kornia.geometry.conversions import rotation_matrix_to_quaternion
 
     def pose(prefix: str, matrix: FloatArray) -> dict[str, Any]:
-        quaternion = rotation_matrix_to_quaternion(torch.from_numpy(matrix[:3, :3].copy()))
+        quaternion = quaternion_from_rotation(matrix[:3, :3])
         return {f"{prefix}_rotation": quaternion.tolist(), f"{prefix}_translation": matrix[:3, 3].tolist()}
 
     of_key = pose("ego2global", key2global)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.camera import Camera
@@ -250,7 +249,9 @@ def scanned(results: Mapping[str, Any], out: Mapping[str, Any], lidar2ego: Float
     changed = {"points": given.new_point(points) if hasattr(given, "new_point") else like_array(given, points)}
     counts = out[COUNTS_KEY].numpy() if COUNTS_KEY in out else np.zeros(0, np.int64)
     if isinstance(annotated := results.get("ann_info"), Mapping):
-        changed["ann_info"] = with_counts(annotated, counts)
+        given_counts = annotated.get("num_lidar_pts", ())
+        if len(given_counts) == len(counts) > 0:
+            changed["ann_info"] = {**annotated, "num_lidar_pts": like_array(given_counts, counts)}
     instances = results.get("instances")
     if isinstance(instances, list) and len(instances) == len(counts):
         changed["instances"] = [
@@ -258,12 +259,6 @@ def scanned(results: Mapping[str, Any], out: Mapping[str, Any], lidar2ego: Float
             for one, n in zip(instances, counts.tolist(), strict=True)
         ]
     return changed
-
-
-def with_counts(annotated: Mapping[str, Any], counts: npt.NDArray[np.int64]) -> dict[str, Any]:
-    """Annotations with the ``num_lidar_pts`` of their boxes, if they have such a column for as many boxes."""
-    given = annotated.get("num_lidar_pts", ())
-    return {**annotated, **({"num_lidar_pts": like_array(given, counts)} if len(given) == len(counts) > 0 else {})}
 
 
 def check_no_lenses(lenses: Sequence[str]) -> None:
