@@ -89,6 +89,22 @@ def some_of_cells(flags: npt.NDArray[np.bool_], step: int) -> npt.NDArray[np.boo
     return np.asarray(largest[::step, ::step] > 0)
 
 
+def of_cells(values: Any, step: int, size: tuple[int, ...]) -> Any:
+    """The pixels (h, w) of cells (ny, nx) of ``step`` pixels."""
+    return values.repeat(step, axis=1).repeat(step, axis=0)[: size[0], : size[1]]  # the longer rows last: faster
+
+
+def bounding_box(flags: npt.NDArray[np.bool_], margin_px: int = 0) -> tuple[slice, slice]:
+    """Rows and columns of an image (h, w) that hold its True pixels, with a margin."""
+    x, y, width, height = cv2.boundingRect(flags.view(np.uint8))
+    ends = (y, y + height), (x, x + width)
+    rows, columns = (
+        slice(max(first - margin_px, 0), min(end + margin_px, n))
+        for (first, end), n in zip(ends, flags.shape, strict=True)
+    )
+    return rows, columns
+
+
 _PAGES = 1 << 16  # smaller arrays come from memory that the process has
 
 

@@ -30,7 +30,7 @@ BOUNDS = {
     "learned depth": (27, 600),
     "generated": (27, 1500),
     "neighbours, all": (32, 2500),
-    "motion": (39, 2600),
+    "motion": (40, 2600),
     "paper": (19, 180),
 }
 """Most files and crossings that a call may have."""

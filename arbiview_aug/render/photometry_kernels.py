@@ -1,4 +1,4 @@
-"""Compiled inner loops of photometric harmonisation: readings of shared pixels, and tone curves."""
+"""Compiled inner loops over colours: readings of shared pixels, tone curves, and blended seams."""
 
 from __future__ import annotations
 
@@ -91,6 +91,22 @@ def tone(values: Any, runs: Any, curves: Any, top: Any, rounding: Any) -> None:
                 part[j] = max(x * gain, x * slope + offset) + rounding
 
 
+@compiled
+def blend(first: Any, second: Any, weight: Any, rounding: Any) -> None:
+    """Blend images (h, 3 w) of interleaved colours, uint8 or float32, into the first one.
+
+    ``weight`` (h, w) float32 is the share of the second; ``rounding`` is added before the fraction is cut off.
+    """
+    (h, w), shares = weight.shape, np.empty(first.shape[1], np.float32)
+    for y in range(h):
+        one, two = first[y], second[y]
+        for x in range(w):
+            shares[3 * x] = shares[3 * x + 1] = shares[3 * x + 2] = weight[y, x]
+        for x in range(3 * w):
+            level = np.float32(one[x])
+            one[x] = level + (np.float32(two[x]) - level) * shares[x] + rounding
+
+
 def warm_up() -> None:
     """Compile these kernels, or load them from numba's cache."""
     reads, pixels, curve = np.zeros((2, 1, 1), np.int64), np.ones((1, 3), np.float32), np.ones((1, 2), np.float32)
@@ -100,3 +116,4 @@ def warm_up() -> None:
         for image in (planes, planes.transpose(0, 2, 1)):  # channels first, and last
             read_pixels(image, reads[:, :, 0].T.copy(), _ONE, pixels)
         tone(planes.reshape(-1), np.zeros((1, 3), np.int64), curve, _ONE, _ZERO)
+        blend(planes.reshape(1, 3), planes.reshape(1, 3), pixels[:, :1], _ZERO)

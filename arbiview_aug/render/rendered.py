@@ -52,7 +52,7 @@ def render_opencv(
         M views (3, h, w) of the images' type, black where no source sees; slices of one block where sizes agree.
     """
     from arbiview_aug.render.kernels import read_ahead
-    from arbiview_aug.render.photometry_kernels import tone
+    from arbiview_aug.render.photometry_kernels import blend, tone
 
     scratch = scratch or Scratch()
     dtype = images[0].dtype
@@ -74,13 +74,13 @@ def render_opencv(
         if not target.pairs:
             view.zero_()
             continue
-        buffer = buffers[h, w]
+        buffer, at, winner = buffers[h, w], target.at, target.source_camera
+        packed = at.xy.view(np.int32)[..., 0]
         for y in range(0, h, _STRIP_ROWS):
             rows = slice(y, y + _STRIP_ROWS)
             strip = buffer[rows]
-            xy = target.at.xy[rows]
-            read_ahead(rows_of_bytes, 3 * atlas.itemsize, xy.view(np.int32)[..., 0], target.source_camera[rows])
-            _remap(atlas, xy, target.at.frac[rows], target.interpolation, dst=strip)
+            read_ahead(rows_of_bytes, 3 * atlas.itemsize, packed[rows], winner[rows])
+            _remap(atlas, at.xy[rows], at.frac[rows], target.interpolation, dst=strip)
             if target.edge is not None:
                 _put_edge(target.edge.rows(y, y + _STRIP_ROWS, w), atlas, strip)
         # Tone the views, not the sources: these have more pixels, and would have to be copied.
@@ -88,14 +88,15 @@ def render_opencv(
             tone(buffer.reshape(-1), target.runs, tones, *scale)
         for band, runs in zip(target.bands, target.band_runs, strict=True):
             bh, bw = band.weight.shape
-            part = buffer[band.y : band.y + bh, band.x : band.x + bw]
+            rows, columns = slice(band.y, band.y + bh), slice(band.x, band.x + bw)
             second = _remap(atlas, band.at.xy, band.at.frac, target.seam_interpolation)
             if curves is not None:
                 tone(second.reshape(-1), runs, tones, *scale)
             if change is not None:
-                difference = np.abs(part.astype(np.float32) - second).mean(-1)
-                change[band.y : band.y + bh, band.x : band.x + bw] += difference * band.weight
-            part[...] = cv2.blendLinear(part, second, 1 - band.weight, band.weight)
+                difference = np.abs(buffer[rows, columns].astype(np.float32) - second).mean(-1)
+                change[rows, columns] += difference * band.weight
+            part = buffer.reshape(h, -1)[rows, 3 * columns.start : 3 * columns.stop]
+            blend(part, second.reshape(bh, -1), band.weight, scale[1])
         cv2.split(buffer, list(view.numpy()))
     return [view.to(dtype) for view in views]
 

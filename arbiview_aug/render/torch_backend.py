@@ -93,6 +93,8 @@ def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
     the index of every pixel that is written.
     """
     rows, columns = layout.size
+    if not layout.slots:
+        return torch.zeros((len(images[0]), 3, rows, columns), device=images[0].device)
     edges = [*sorted({slot.x for slot in layout.slots}), columns]
     parts = []
     for left, right in pairwise(edges):

@@ -64,8 +64,15 @@ def stacked(views: list[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
 
 def covered(winners: Sequence[torch.Tensor]) -> torch.Tensor | list[torch.Tensor]:
     """Coverage of (h, w) int8 winning sources, stacked where all sizes agree."""
+    if winners[0].device.type != "cpu":
+        return stacked([winner >= 0 for winner in winners])
     # On the CPU numpy compares six times faster than torch.
-    return stacked([torch.from_numpy(w.numpy() >= 0) if w.device.type == "cpu" else w >= 0 for w in winners])
+    if len({winner.shape for winner in winners}) > 1:
+        return [torch.from_numpy(winner.numpy() >= 0) for winner in winners]
+    coverage = torch.empty((len(winners), *winners[0].shape), dtype=torch.bool)
+    for winner, seen in zip(winners, coverage.numpy(), strict=True):
+        np.greater_equal(winner.numpy(), 0, out=seen)
+    return coverage
 
 
 def gathered(parts: Sequence[Any], lead: tuple[int, ...]) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Any, NamedTuple
 
 import cv2
@@ -63,7 +63,7 @@ class DepthMap(NamedTuple):
         known = (depth_m > 0) & (depth_m <= MOST_M)
         if camera.mask is not None:
             known &= camera.mask
-        return cls(camera, np.where(known, depth_m, 0).astype(np.float32))
+        return cls(camera, np.where(known, depth_m, 0).astype(np.float32, copy=False))
 
     def is_of(self, camera: Camera) -> bool:
         """Whether it is of a camera, of whatever size."""
@@ -146,8 +146,8 @@ def anchored_maps(maps: Iterable[DepthMap], before: Iterable[Points | Maps]) -> 
     """The maps of a rig, fused with its points (P, 3) and other maps, camera by camera; none if nothing is known."""
     before = list(before)
     others = [one for part in before if isinstance(part, tuple) for one in part]
-    arrays = [part[:, :3] for part in before if not isinstance(part, tuple)]
-    points = np.concatenate([np.zeros((0, 3), np.float32), *arrays])
+    rows = [part[:, :3].T for part in before if not isinstance(part, tuple)]
+    points = np.concatenate([np.zeros((3, 0), np.float32), *rows], axis=1, dtype=np.float32).T  # as cameras read them
     fused = tuple(anchored(one, points, [other for other in others if other.is_of(one.camera)]) for one in maps)
     return fused if any(one.depth_m.any() for one in fused) else ()
 
@@ -218,7 +218,7 @@ def hidden_by(maps: Sequence[DepthMap], camera: Camera) -> Layer | None:
         side = 2 * round(GAP_RAD * float(one.camera.K[0, 0])) + 1
         np.copyto(hidden, cv2.dilate(hidden, np.ones((side, side), np.uint8)), where=hidden == 0)
         layers.append(_warped(one.camera, hidden, camera, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE))
-    return np.asarray(np.max(layers, axis=0)) if layers else None
+    return reduce(np.maximum, layers) if layers else None
 
 
 def _warped(one: Camera, layer: Layer, two: Camera, interpolation: int, border: int) -> Layer:
@@ -227,5 +227,9 @@ def _warped(one: Camera, layer: Layer, two: Camera, interpolation: int, border: 
         return layer
     scale = one.K[[0, 1], [0, 1]] / two.K[[0, 1], [0, 1]]
     to_one = np.column_stack([np.diag(scale), one.K[:2, 2] - scale * two.K[:2, 2]])
+    sides = np.divide(one.size, two.size)[::-1]
+    is_whole = np.allclose(to_one, np.column_stack([np.diag(sides), (sides - 1) / 2]), rtol=0, atol=1e-9)
+    if is_whole and interpolation == cv2.INTER_LINEAR:  # ten times as fast
+        return np.asarray(cv2.resize(layer, two.size[::-1], interpolation=interpolation))
     flags = interpolation | cv2.WARP_INVERSE_MAP
     return np.asarray(cv2.warpAffine(layer, to_one, two.size[::-1], flags=flags, borderMode=border))

@@ -179,7 +179,7 @@ def _read(
             words[x] = image[np.uint64(at[x])]
         for x in range(first, last):
             inside = (u[x] >= _ZERO) & (u[x] <= last_x + _ONE) & (v[x] >= _ZERO) & (v[x] <= last_y + _ONE)
-            right, below = np.int32(16) if t[x] >= _HALF else _NONE, np.int32(32) if s[x] >= _HALF else _NONE
+            right, below = _RIGHT if t[x] >= _HALF else _NONE, np.int32(32) if s[x] >= _HALF else _NONE
             bit = np.int32(words[x] >> np.int32(_MASK_BIT + right + below))
             seen[y, x] = np.int32(bit & np.int32(1)) if inside else _NONE
         for x in range(first, last):

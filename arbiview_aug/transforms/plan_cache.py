@@ -156,7 +156,6 @@ class Plans:
         self.cache: LRUCache[bytes, RenderPlan] = LRUCache(max_bytes, attrgetter("nbytes"))
         self.maps = RayCache()
         self._keep_refined = keep_refined
-        self._last: LRUCache[bytes, RenderPlan] = LRUCache(1)
         self._pairs: LRUCache[tuple[bytes, bytes], RigPair] = LRUCache(_MAX_RIG_PAIRS)
 
     def pair(self, source: Rig, target: Rig) -> RigPair:
@@ -165,7 +164,8 @@ class Plans:
         return self._pairs.get(key, lambda: RigPair(source, target, self.surface, self.config))
 
     def plan(self, pair: RigPair, scene: Scene) -> RenderPlan:
-        """The plan of a pair in a scene; cached. The scene is ignored where no pixel depends on it.
+        """The plan of a pair in a scene; cached without a frame's own geometry. Where no pixel depends on the scene, it
+        is ignored.
 
         Raises:
             ValueError: There are no plans.
@@ -174,9 +174,9 @@ class Plans:
             raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
         if scene.is_empty or not pair.needs_geometry:
             return self.cache.get(pair.road_key, lambda: self._built(pair, pair.road))
-        # A frame's own geometry never comes back: its plan must not push out those that do.
-        cache = self.cache if self._keep_refined and scene.best == "street" else self._last
-        return cache.get(pair.plan_key(scene), lambda: self._built(pair, scene))
+        if self._keep_refined and scene.best == "street":
+            return self.cache.get(pair.plan_key(scene), lambda: self._built(pair, scene))
+        return self._built(pair, scene)  # a frame's own geometry never comes back
 
     def _built(self, pair: RigPair, scene: Scene) -> RenderPlan:
         source, target = pair.source, pair.target

@@ -9,7 +9,7 @@ import torch
 from arbiview_aug import Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
-from arbiview_aug.inpaint.neighbours import Candidate, merged
+from arbiview_aug.inpaint.merging import Candidate, merged
 from arbiview_aug.sample.neighbours import ChangeRisk
 
 RIG = demo_source_rig((96, 256))

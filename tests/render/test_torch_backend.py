@@ -37,6 +37,7 @@ def test_images_lie_in_their_slots_halved_as_asked(dtype: torch.dtype, halved: f
     assert atlas.dtype == torch.float32 and tuple(atlas.shape[2:]) == layout.size
     assert torch.equal(atlas[..., :4], image.float())
     assert (atlas[:, :, 0, 4:6] == halved).all() and not atlas[:, :, 1, 4:].any()
+    assert _fill_atlas(AtlasLayout(()), [image]).tolist() == [[[[0]]] * 3]
 
 
 def test_curves_brighten_and_darken_up_to_the_ends_of_the_range() -> None:

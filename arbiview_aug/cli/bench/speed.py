@@ -8,12 +8,13 @@ outputs, with float32 maps that read a source of the view's own size at
 A time is the median over the rounds; a ratio is the median of call / floor within a round.
 
 The targets are Waymo's five cameras without and with their lenses, four fisheye cameras, and the source's own, turned
-or lowered, all without scanners. *Depth maps* from motion and from a network cost the same; these say at every pixel
-the depth of the nearest LiDAR point. *Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it
-the plan; every other call plans anew. Images are decoded at half size where they are then still larger than the views.
-They lie channels-last in one block, as this package's readers give them; contiguous ones are planes, torch's usual
-layout. Holes stay black unless they are *filled*. *Points by rays*: ``retarget_points`` alone. With ``--device`` the
-floor is a copy there of as many bytes as rendering must move; the clock of a GPU is its events.
+or lowered, all without scanners. *Motion estimate*: nuScenes' six cameras in a synthetic drive. *Depth maps* from
+motion and from a network cost the same; these say at every pixel the depth of the nearest LiDAR point. *Fused* is LiDAR
+with two maps. *Held*: the calibration comes back, and with it the plan; every other call plans anew. Images are decoded
+at half size where they are then still larger than the views. They lie channels-last in one block, as this package's
+readers give them; contiguous ones are planes, torch's usual layout. Holes stay black unless they are *filled*. *Points
+by rays*: ``retarget_points`` alone. With ``--device`` the floor is a copy there of as many bytes as rendering must
+move; the clock of a GPU is its events.
 """
 
 from __future__ import annotations
@@ -42,7 +43,9 @@ from arbiview_aug.cli.arguments import device_named, output_file
 from arbiview_aug.cli.bench.data import Recorded, lidar_maps, lifted, recorded
 from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, show, timed_rounds
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
-from arbiview_aug.errors import DataError
+from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.synthetic import SyntheticDrive
+from arbiview_aug.errors import DataError, WarnOnce
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.image_ops import resized
@@ -50,7 +53,10 @@ from arbiview_aug.render.harmonise import Harmonise
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.torch_backend import maps_on, render_torch
 from arbiview_aug.render.view_planner import build_plan
-from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, read_frames
+from arbiview_aug.sample.neighbours import read_neighbours
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.temporal.motion_depth import estimate_motion
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.scans import retarget_points
 from arbiview_aug.transforms.warm_up import compile_kernels
@@ -145,6 +151,8 @@ def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tup
         yield name, calls
     if is_small:
         yield "own", {_FLOOR: remap_floor(sample["images"], size)} | _own(sample, size) | _scans(sample)
+    if size == FULL_SIZE:
+        yield "own", {_FLOOR: remap_floor(sample["images"], size)} | _motion()
 
 
 def _cameras_of(name: str) -> Rig:
@@ -190,6 +198,13 @@ def _scans(sample: Sample) -> Calls:
         name: partial(retarget_points, points, target),
         f"{name}, 75 boxes": partial(retarget_points, points, target, boxes_3d=boxes_around(75)),
     }
+
+
+def _motion() -> Calls:
+    """Depth from motion, from one frame of a synthetic drive before and one after."""
+    drive = SyntheticDrive(load_rig("nuscenes"), num_frames=3, neighbours=Neighbours(count=1, step_m=_TRAVEL_M))
+    frame, warn = read_frames(drive[1], None)[0], WarnOnce()
+    return {"motion estimate": partial(estimate_motion, frame, Scene(), read_neighbours(frame, warn), warn)}
 
 
 def _own(sample: Sample, views: tuple[int, int]) -> Calls:
