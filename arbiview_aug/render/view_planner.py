@@ -50,7 +50,7 @@ from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.weights import SecondBest, seam_weights, source_weight
 from arbiview_aug.scene.point_cloud import occlusion_level, seen_through
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
-from arbiview_aug.scene.surface import FAR_PARALLAX_PX, is_within_wall, worst_parallax_px
+from arbiview_aug.scene.surface import FAR_PARALLAX_PX, OcclusionMap, is_within_wall, worst_parallax_px
 
 SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
@@ -328,17 +328,14 @@ class ViewPlanner:
         if kind < 0:
             u, v, _ = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), geometry.q, source)
             positions = at_level(np.stack([u, v]), level).astype(np.float32)
-        shadow, solid = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
+        occluders = OcclusionMap(np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32))
         shadow_scale = 1.0
         if surface.is_layered or surface.is_dense:
             # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
             coarser = level if surface.is_layered else max(level, occlusion_level(source))
             half = halved_camera(source, coarser) if coarser else source
-            shadow, solid = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)
+            occluders = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)
             shadow_scale = 0.5 ** (coarser - level)
-        before_m = np.zeros(0, np.float32)
-        if surface.is_layered:
-            before_m = surface.before_faces(source.center_m).astype(np.float32)
         return (
             A,
             o,
@@ -346,9 +343,9 @@ class ViewPlanner:
             source.parameters_at(0.5**level) if level else P,
             np.array([*source_bounds(source.size, level), shadow_scale], np.float32),
             self.maps.clean_pixels(source, level),
-            before_m,
-            shadow,
-            np.ascontiguousarray(solid),
+            occluders.before_m,
+            occluders.beyond,
+            np.ascontiguousarray(occluders.solid),
             geometry.is_guess,
             positions,
         )

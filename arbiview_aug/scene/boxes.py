@@ -190,6 +190,7 @@ ROOF_M2 = 2.0
 PARTS, TOP_PART = 6, 5
 """Parts of an object that ``BoxSurface.face_parts`` tells apart, and the one that is its tops."""
 
+_WIDER = np.array([1, 1, 1, 1, 0, 1])  # all planes of a piece but its floor
 _ROUNDING = 1e-4  # of float32 images against float64
 
 
@@ -223,7 +224,8 @@ class BoxSurface(LayeredSurface):
             onto = self._hidden(camera, rays, memory, coarse=True)
             widened = self._widened(camera.center_m, pixel_rad, lift=0.5)
             drawn = draw_solids(camera, *widened, rays, memory, scale=scale, faces=False, onto=onto)
-            self._shadows[key] = OcclusionMap(*drawn)
+            before_m = self.before_faces(camera.center_m).astype(np.float32)
+            self._shadows[key] = OcclusionMap(*drawn, before_m)
         return self._shadows[key]
 
     def drawn(
@@ -274,7 +276,7 @@ class BoxSurface(LayeredSurface):
         pixel_m = pixel_rad * np.linalg.norm(self.boxes[:, :3] - origin, axis=-1)
         boxes, planes = self.boxes.copy(), self.solids.copy()
         boxes[:, 3:6] += pixel_m[:, None]
-        planes[..., [0, 1, 2, 3, 5], 3] += pixel_m[:, None, None] / 2
+        planes[..., 3] += pixel_m[:, None, None] / 2 * _WIDER
         planes[:, 0, 4, 3] -= pixel_m * lift
         return boxes, planes
 

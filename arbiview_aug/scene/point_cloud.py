@@ -115,15 +115,19 @@ class Window(NamedTuple):
         if not len(directions):
             return cls(0, 0, 1, 1, cells)
         x, y, z = directions.T
-        rows = np.arcsin(np.clip(z, -1, 1)) / cells.rad
-        low = math.floor(max(rows.min(), reach[0] / cells.rad))
-        high = math.ceil(min(rows.max(), reach[1] / cells.rad))
-        inside = (rows >= low) & (rows <= high)
+        ends = math.asin(max(z.min(), -1)), math.asin(min(z.max(), 1))
+        low, high = math.floor(max(ends[0], reach[0]) / cells.rad), math.ceil(min(ends[1], reach[1]) / cells.rad)
+        inside = np.ones(len(z), bool)
+        if low * cells.rad > ends[0]:
+            inside &= z >= math.sin(low * cells.rad)
+        if high * cells.rad < ends[1]:
+            inside &= z <= math.sin(high * cells.rad)
         if not inside.any():
             return cls.around(directions, cells)
         x, y = x[inside], y[inside]
         middle = math.atan2(y.sum(), x.sum())
-        azimuth = (np.arctan2(y, x) - middle + math.pi) % (2 * math.pi) - math.pi + middle
+        azimuth = np.arctan2(y, x)
+        azimuth -= 2 * math.pi * np.rint((azimuth - middle) / (2 * math.pi))  # within half a turn of the middle
         column = math.floor(azimuth.min() / cells.rad)
         return cls(low, column, high - low, math.ceil(azimuth.max() / cells.rad) - column, cells)
 

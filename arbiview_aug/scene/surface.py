@@ -63,10 +63,12 @@ class OcclusionMap(NamedTuple):
         beyond: (h, w) float32, 1/m: points with a smaller inverse distance are occluded, and so is a background with
             ``is_guess``. 0 without an occluder.
         solid: (h, w) int32 index of the occluder, -1 for none.
+        before_m: (F,) float32 metres by which the camera lies before the planes of all faces; (0,) without objects.
     """
 
     beyond: npt.NDArray[np.float32]
     solid: npt.NDArray[np.int32]
+    before_m: npt.NDArray[np.float32] = np.zeros(0, np.float32)
 
 
 class LayeredSurface(Surface):
