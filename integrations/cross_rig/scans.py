@@ -1,8 +1,9 @@
 """``python -m integrations.cross_rig.scans``: does a LiDAR detector trained on retargeted scans of A work on B's?
 
 Both vehicles drive the same streets. A pillar network is trained on A's points as they are, on those of its rings next
-to B's, on A's points as B's scanner would have measured them, and on B's own; all are tested on B's own scans. Scans
-are cast anew for each run; a result is a file, so that a killed run goes on where it was.
+to B's, on A's points as B's scanner would have measured them, and on B's own; all are tested on B's own scans, one also
+without B's rings above all of A's. Scans are cast anew for each run; a result is a file, so that a killed run goes on
+where it was.
 """
 
 from __future__ import annotations
@@ -36,12 +37,13 @@ from integrations.cross_rig.scoring import VariantScore, ap_scores, iou_scores
 from integrations.cross_rig.training import Draws, Schedule, evaluate, train
 from integrations.cross_rig.worlds import Split, street_seed
 
-Kind = Literal["raw", "dropped", "retargeted", "oracle"]
+Kind = Literal["raw", "dropped", "retargeted", "below", "oracle"]
 
 TITLES: dict[Kind, str] = {
     "raw": "A's points",
     "dropped": "A's points, rings dropped",
     "retargeted": "A's points, retargeted",
+    "below": "the same, tested without B's rings above A's",
     "oracle": "B's own points",
 }
 
@@ -122,13 +124,19 @@ def _points(points: Any, a: Lidar, b: Lidar, kind: Kind) -> Any:
 
 
 # --- trainings and tests ----------------------------------------------------------------------------------------------
+def kinds(change: str) -> Iterator[Kind]:
+    """The variants of a change; ``below`` only where B's scanner looks higher than A's."""
+    a, b = (max(lidar.elevations_deg) for lidar in CHANGES[change])
+    yield from (kind for kind in get_args(Kind) if kind != "below" or b > a)
+
+
 def scans_of(change: str, kind: Kind) -> tuple[Lidar, Lidar, Kind]:
     """Scanner that records, B's, and what is done to the points: sets that are the same have one name."""
     a, b = CHANGES[change]
     if kind == "oracle":
         return b, b, "raw"
     is_as_recorded = kind == "raw" or (kind == "dropped" and a.elevations_deg == b.elevations_deg)
-    return (a, a, "raw") if is_as_recorded else (a, b, kind)
+    return (a, a, "raw") if is_as_recorded else (a, b, "retargeted" if kind == "below" else kind)
 
 
 @lru_cache(maxsize=16)  # raw sets serve several changes
@@ -154,7 +162,8 @@ def result(settings: Settings, change: str, kind: Kind, seed: int, output: Path)
         return json.loads(path.read_text()), True
     start = time.process_time()
     model, losses = trained(scans, settings.train_frames, settings.schedule, seed)
-    val, test = (point_set(b, b, "raw", split, frames) for split, frames in _tested(settings))
+    tested_on: tuple[Lidar, Lidar, Kind] = (b, scans[0], "dropped") if kind == "below" else (b, b, "raw")
+    val, test = (point_set(*tested_on, split, frames) for split, frames in _tested(settings))
     tested = evaluate(model, val, test, test.height_dm, settings.schedule)
     counts = {
         "by_distance": tested.tally.by_distance.tolist(),
@@ -213,7 +222,8 @@ def main(argv: list[str] | None = None) -> int:
     settings = Settings(**arguments)
     one_thread()
     done: dict[str, dict[Kind, list[dict[str, Any]]]] = {}
-    for change, kind, seed in product(settings.changes, get_args(Kind), settings.seeds):
+    jobs = ((change, *job) for change in settings.changes for job in product(kinds(change), settings.seeds))
+    for change, kind, seed in jobs:
         counts, was_there = result(settings, change, kind, seed, output)
         done.setdefault(change, {}).setdefault(kind, []).append(counts)
         if not was_there:

@@ -9,7 +9,7 @@ import torch
 from integrations.cross_rig import scans
 from integrations.cross_rig.labels import VEHICLE, Grid
 from integrations.cross_rig.pillars import PillarDetector, PointFrame, PointSet
-from integrations.cross_rig.scans import CHANGES, main, point_set, rig_of, scanner, scans_of
+from integrations.cross_rig.scans import CHANGES, kinds, main, point_set, rig_of, scanner, scans_of
 
 CELLS = Grid().cells
 
@@ -50,6 +50,8 @@ def test_the_order_of_points_and_frames_does_not_matter(model):
 def test_sets_that_are_the_same_have_one_name():
     assert scans_of("fewer", "oracle") == scans_of("more", "raw") == scans_of("up70", "dropped")
     assert scans_of("fewer", "dropped") == (*CHANGES["fewer"], "dropped")
+    assert scans_of("sixteen", "below") == scans_of("sixteen", "retargeted")
+    assert [change for change in CHANGES if "below" in kinds(change)] == ["sixteen"]
 
 
 def test_vehicles_count_by_their_points():
@@ -72,10 +74,10 @@ def test_a_study_goes_on_where_it_was(tmp_path, capsys, monkeypatch):
     asked += ["--steps", "2", "--output", str(tmp_path)]
     assert main(asked) == 0
     first = capsys.readouterr()
-    assert first.out.count("| 32 beams at 1.8 m -> 16 beams at 1.8 m |") == 4 and first.err.count("CPU s") == 4
-    assert "A's points, rings dropped" in first.out
+    assert first.out.count("| 32 beams at 1.8 m -> 16 beams at 1.8 m |") == 5 and first.err.count("CPU s") == 5
+    assert "A's points, rings dropped" in first.out and "without B's rings above A's" in first.out
     results = sorted(tmp_path.iterdir())
-    assert len(results) == 4 and json.loads(results[0].read_text())["positives"]
+    assert len(results) == 5 and json.loads(results[0].read_text())["positives"]
     results[1].unlink()
     assert main(asked) == 0
     again = capsys.readouterr()
