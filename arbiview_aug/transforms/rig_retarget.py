@@ -151,13 +151,17 @@ class RigRetarget(torch.nn.Module):
         self.overlaps = overlap_cache(cache.share_overlap, self.config)
         self._warn = WarnOnce()
         self._check_reach = partial(check_reach, unseen=unseen_note(self.inpainter), warn=self._warn)
-        # Plans of rigs drawn for each sample are never reused.
-        drawn_anew = isinstance(self.target, RandomRig) and self.target.per == "sample"
-        config, max_bytes = None if self._is_paper else self.config, 0 if drawn_anew else cache.max_bytes
-        self._plans = Plans(config, self.geometry, max_bytes, self.overlaps is not None, self._check_reach)
+        self._plans = self._empty_plans()
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
         self._checked: dict[str, type] = {}  # keys and types of the sample that was last checked for misnamed keys
         self._limited_process: int | None = None
+
+    def _empty_plans(self) -> Plans:
+        # Plans of rigs drawn for each sample are never reused.
+        drawn_anew = isinstance(self.target, RandomRig) and self.target.per == "sample"
+        max_bytes = 0 if drawn_anew else self.cache.max_bytes
+        config = None if self._is_paper else self.config
+        return Plans(config, self.geometry, max_bytes, self.overlaps is not None, self._check_reach)
 
     @property
     def _is_paper(self) -> bool:
