@@ -77,7 +77,7 @@ def load_detector(
             asked for detections from ``LEAST_SCORE`` on, a function by its parameter ``score`` if it has one.
         weights: File of a torchvision detector's weights.
         classes: Labels that count, names or numbers as text. By default names of vehicles and people, and all numbers.
-        device: Where a network of transformers or torchvision runs.
+        device: The device of a network of transformers or torchvision.
 
     Raises:
         DataError: No such detector, or one that does not fit; its calls raise it for outputs of other shapes.
@@ -114,7 +114,7 @@ def _asked_for_all(detect: Callable[..., Any]) -> Callable[[Picture], Any]:
 
 
 def checked_detections(option: str, output: Any, image: Picture) -> Detections:
-    """What a detector returned for an image, as ``Detections`` cut at the image's border.
+    """A detector's output for an image, as ``Detections`` cut at the image's border.
 
     Raises:
         DataError: Not boxes (n, 4), scores (n,) and n labels; or boxes that are not finite and ordered.

@@ -55,7 +55,7 @@ Figures = dict[str, FloatArray]
 
 @dataclass(frozen=True)
 class Verdict:
-    """What judges see in one image."""
+    """Judges' answers to one image."""
 
     frame: str
     method: str  # or ``SOURCES``, ``TRUTH``
@@ -82,7 +82,7 @@ def valid_detections(detections: Detections, valid: BoolArray) -> Detections:
 
 
 class TrueImage(NamedTuple):
-    """What judges see in a true image."""
+    """Judges' answers to a true image."""
 
     valid: BoolArray  # (h, w) pixels that count
     detections: Detections | None
@@ -188,7 +188,7 @@ class Panel:
         return {name: row for name, row in rows.items() if row}
 
     def notes(self, methods: Sequence[str], chosen: Sequence[str] = ()) -> list[str]:
-        """What a reader of the rows must know: figures that say nothing, labels not ``chosen``, nothing to score."""
+        """Notes for readers of the rows: figures that say nothing, labels not ``chosen``, nothing to score."""
         verdicts = {method: [v for v in self.verdicts if v.method == method] for method in methods}
         rows = {method: figures(of_method) for method, of_method in verdicts.items() if of_method}
         wide, notes = ", ".join(indistinct(rows)), []

@@ -80,7 +80,7 @@ class Hole:
 
     @property
     def points(self) -> FloatArray:
-        """What lies at these corners, in the ego frame (n, 3)."""
+        """Points that these corners see, in the ego frame (n, 3)."""
         directions, q = (of[self.near] for of in self.nodes)
         return np.asarray(self.camera.center_m + directions / q[:, None])
 

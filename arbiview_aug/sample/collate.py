@@ -22,7 +22,7 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     Cameras and maps over their images are stacked; of points, boxes and all else there is a list, an entry a frame.
     ``lens`` stays a name for each camera, or has a list over the frames where they differ; torch's ``default_collate``
     makes tuples of each camera's names, which ``RigRetarget`` reads as well.
-    Frames of one rig keep it. Where each has its own (nuScenes: cameras and LiDAR expose at different times), ``K`` and
+    Frames of one rig keep it. If each has its own (nuScenes: cameras and LiDAR expose at different times), ``K`` and
     ``cam2ego`` say so.
 
     Args:

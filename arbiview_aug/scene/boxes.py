@@ -127,8 +127,8 @@ def kinds(boxes: FloatArray) -> npt.NDArray[np.int64]:
 def solids(boxes: FloatArray) -> FloatArray:
     """Planes (B, 2, 6, 4) of what boxes (B, 7) hold: points n · x <= d of the ego frame lie in a piece.
 
-    Planes are those of the rear, the front, the right, the left, the bottom and the top. Of the profiles that fit a
-    box, it is the first.
+    Planes are those of the rear, the front, the right, the left, the bottom and the top. The profile is the
+    first one that fits a box.
     """
     return _planes(boxes, PROFILES[OF_KIND[kinds(boxes), 0]])
 
@@ -260,7 +260,7 @@ class BoxSurface(LayeredSurface):
 
     @cached_property
     def face_parts(self) -> npt.NDArray[np.int32]:
-        """What each face (n,) shows: ``PARTS`` times its object, and ``TOP_PART`` more for tops.
+        """Part that each face (n,) shows: ``PARTS`` times its object, and ``TOP_PART`` more for tops.
 
         The sides of the lowest piece, the body under the windows, have 1 to 4 in the order of their planes. All else
         has 0, also small objects.

@@ -2,7 +2,7 @@
 
 A panorama has one cell per 0.2 degrees of azimuth and elevation, or per 0.4 for a coarse view. Its cells hold
 *residuals* against a static surface, so that a road stays a plane between the scan lines, and what no point tells fades
-back to the static surface. Where the scene steps from near to far, a cell holds both, and the share of near ones around
+back to the static surface. A cell at a step from near to far holds both, and the share of near ones around
 it; the outline runs where the share is one half. Interpolating the two layers and the share apart keeps outlines sharp
 between the cells too.
 """

@@ -26,7 +26,7 @@ SIDE_SUPPORT_RAD = math.radians(0.3)
 of the recall on synthetic streets and 2 % on DDAD's next scan, and gain 0.1 % of precision on the former."""
 
 SCANNED = FINE._replace(see_through=round(math.radians(1.0) / FINE.rad), side=1)
-"""Cells of scans. What a scanner shows through gaps is mostly there for another one too: with the see-through angle of
+"""Cells of scans. Another scanner mostly meets what one shows through gaps, too: with the see-through angle of
 images, 2 degrees, a scan misses an eighth of the static returns of DDAD's next one, and synthetic ones lose 1 to 2 %
 of their recall. 0.6 to 1.4 degrees are within 2 % of each other."""
 

@@ -164,8 +164,8 @@ class Plans:
         return self._pairs.get(key, lambda: RigPair(source, target, self.surface, self.config))
 
     def plan(self, pair: RigPair, scene: Scene) -> RenderPlan:
-        """The plan of a pair in a scene; cached without a frame's own geometry. Where no pixel depends on the scene, it
-        is ignored.
+        """The plan of a pair in a scene; cached without a frame's own geometry. A scene that no
+        pixel depends on is ignored.
 
         Raises:
             ValueError: There are no plans.

@@ -2,8 +2,8 @@
 
 Sweeps quality, surface, decoded size, execution and cached depth from overlap; marks the Pareto front, and
 recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again. Static surfaces are not recommended
-where cameras move (``requirements.static_harm``): PSNR does not show what a detector learns from them. What fills holes
-is compared at the recommended setting: the default fill, inpainting, and every ``--generator``.
+where cameras move (``requirements.static_harm``): PSNR does not show what a detector learns from them. Fillers of holes
+are compared at the recommended setting: the default fill, inpainting, and every ``--generator``.
 
 Times are CPU time of a ``RigRetarget`` call on one thread, with the plan where every frame needs its own. Accuracy is
 the mean PSNR of pixels that some source sees, against LiDAR points or the true views, in the colours of images decoded

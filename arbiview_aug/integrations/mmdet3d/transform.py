@@ -23,7 +23,7 @@ class RigRetargetMultiView:
 
     It stands right after what loads images (and points and annotations, where they are loaded: geometry), before
     resizing, cropping, flipping and whatever turns points and boxes. Several frames in one dict (BEVDet4D, collected
-    queues) share one draw of ``p`` and of a ``RandomRig``. Where each frame of a drive passes the pipeline by itself,
+    queues) share one draw of ``p`` and of a ``RandomRig``. If each frame of a drive passes the pipeline by itself,
     ``sequence_key`` does that.
 
     Args:
