@@ -11,8 +11,8 @@ import torch
 class OnImages(torch.nn.Module):
     """Runs a photometric module on a sample's images alone, all cameras (of all frames) as one batch.
 
-    kornia's modules want float images (B, 3, H, W) in [0, 1]; uint8 images come back as uint8. Pixels that no source saw
-    and nothing filled stay black: changed with the rest, holes would look like something that was seen.
+    kornia's modules want float images (B, 3, H, W) in [0, 1]; uint8 images come back as uint8. Pixels that no source
+    saw and nothing filled stay black: changed with the rest, holes would look like something that was seen.
 
     Args:
         module: An ``ImageSequential``, or any module from a batch of images to a batch of images.

@@ -199,8 +199,8 @@ def _lidar_case(
 ) -> Case | None:
     """A target of a real frame, scored by LiDAR points (P, >=3) in holes; None with too few of them.
 
-    Points in the holes of a real target have no colour, since no camera saw them. Therefore a drawn mask hides a part of
-    the camera at this place from FAVS and from the generator, and colours the points there.
+    Points in the holes of a real target have no colour, since no camera saw them. Therefore a drawn mask hides a part
+    of the camera at this place from FAVS and from the generator, and colours the points there.
     """
     camera, cameras = frame.rig[place], list(frame.rig)
     seed = int(torch.randint(2**31, (), generator=rng))
