@@ -554,7 +554,10 @@ def find_paint(face: npt.NDArray[np.int32], winner: npt.NDArray[np.int8], parts:
     step = max(1, min(face.shape) // _SAMPLES)
     columns = np.empty((4, face.size), np.int32)
     hidden, sampled = kernels.find_paint(face, parts, winner, step, _INSIDE_PX, columns)
-    return Paint(*columns[:2, :hidden].copy(), *columns[2:, :sampled].copy())
+    pixel, part = columns[:2, :hidden].copy()
+    nearest = np.empty((4, hidden), np.int32)
+    kernels.nearest_seen(face, winner, pixel, nearest)
+    return Paint(pixel, part, *columns[2:, :sampled].copy(), nearest)
 
 
 # --- all views of a rig -----------------------------------------------------------------------------------------------
