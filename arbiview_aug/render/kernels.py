@@ -664,11 +664,12 @@ def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table:
 
 
 @compiled
-def nearest_seen(face: Any, winner: Any, pixel: Any, nearest: Any) -> None:
-    """Find the seen pixels next to unseen ones in their row and column, across unseen pixels of the same face.
+def nearest_seen(face: Any, part: Any, winner: Any, pixel: Any, nearest: Any) -> None:
+    """Find the seen pixels next to unseen ones in their row and column, across unseen ones of the same body or cabin.
 
     Args:
         face: (h, w) int32 faces of objects.
+        part: (F,) int32 ``scene.boxes.BoxSurface.face_parts``.
         winner: (h, w) int8 source, -1 for none.
         pixel: (n,) int32 unseen pixels of objects, into the flattened view, ascending.
         nearest: (4, n) int32, written: seen pixels to the left, above, to the right, below; -1 for none.
@@ -681,11 +682,12 @@ def nearest_seen(face: Any, winner: Any, pixel: Any, nearest: Any) -> None:
         dy, dx = (way == 3) - (way == 1), (way == 2) - (way == 0)
         for n in range(pixel.shape[0]):
             k = pixel.shape[0] - 1 - n if way > 1 else n
-            y, x = pixel[k] // w, pixel[k] % w
-            j, i = y + dy, x + dx
+            y, x = pixel[k] // w + dy, pixel[k] % w + dx
             nearest[way, k] = -1
-            if 0 <= j < h and 0 <= i < w and face[j, i] == face[y, x]:
-                nearest[way, k] = j * w + i if winner[j, i] >= 0 else nearest[way, number[j, i]]
+            if 0 <= y < h and 0 <= x < w and face[y, x] >= 0:
+                one, two = part[face[pixel[k] // w, pixel[k] % w]], part[face[y, x]]
+                if one // PARTS == two // PARTS and (one % PARTS > 0) == (two % PARTS > 0):
+                    nearest[way, k] = y * w + x if winner[y, x] >= 0 else nearest[way, number[y, x]]
 
 
 @compiled

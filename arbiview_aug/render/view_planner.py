@@ -556,7 +556,7 @@ def find_paint(face: npt.NDArray[np.int32], winner: npt.NDArray[np.int8], parts:
     hidden, sampled = kernels.find_paint(face, parts, winner, step, _INSIDE_PX, columns)
     pixel, part = columns[:2, :hidden].copy()
     nearest = np.empty((4, hidden), np.int32)
-    kernels.nearest_seen(face, winner, pixel, nearest)
+    kernels.nearest_seen(face, parts, winner, pixel, nearest)
     return Paint(pixel, part, *columns[2:, :sampled].copy(), nearest)
 
 
