@@ -320,34 +320,21 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
 
 
 @compiled
-def paint(pixel: Any, part: Any, table: Any, seen: Any, layers: Any, reach: float, view: Any) -> None:
+def paint(pixel: Any, part: Any, nearest: Any, table: Any, seen: Any, reach: float, view: Any) -> None:
     """Paint the unseen pixels of objects in a view: tops in their part's colour, without a colour not at all.
 
-    Sides mix their part's colour with the nearest seen pixels of objects in their row and column.
+    Sides mix their part's colour with the nearest seen pixels of their face.
 
     Args:
-        pixel: (n,) into the flattened view, ascending.
+        pixel: (n,) into the flattened view.
         part: (n,) what they show, as in ``Paint``.
+        nearest: (4, n) seen pixels, as in ``Paint``.
         table: (P, 3) float32 colours of the parts; the first is negative where unknown.
         seen: (h, w) bool.
-        layers: (h, w) uint8 as in ``ViewPlan``.
         reach: Distance in pixels at which a seen pixel weighs as much as the part's colour.
         view: (3, h w), painted.
     """
-    h, w = seen.shape
-    number, nearest = np.full((h, w), -1, np.int32), np.full((pixel.shape[0], 4), -1, np.int32)
-    for k in range(pixel.shape[0]):
-        number[pixel[k] // w, pixel[k] % w] = k
-    for way in range(4):  # to the left, above, to the right, below
-        dy, dx = (way == 3) - (way == 1), (way == 2) - (way == 0)
-        for n in range(pixel.shape[0]):
-            k = pixel.shape[0] - 1 - n if way > 1 else n
-            y, x = pixel[k] // w + dy, pixel[k] % w + dx
-            if 0 <= y < h and 0 <= x < w:
-                if seen[y, x]:
-                    nearest[k, way] = y * w + x if layers[y, x] == 2 else -1
-                elif number[y, x] >= 0:
-                    nearest[k, way] = nearest[number[y, x], way]
+    w = seen.shape[1]
     mixed = np.empty(3, np.float32)
     for k in range(pixel.shape[0]):
         at = pixel[k]
@@ -357,7 +344,7 @@ def paint(pixel: Any, part: Any, table: Any, seen: Any, layers: Any, reach: floa
         for c in range(3):
             mixed[c] = table[part[k], c]
         for way in range(0 if part[k] % PARTS == TOP_PART else 4):
-            source = nearest[k, way]
+            source = nearest[way, k]
             if source >= 0:
                 weight = np.float32(reach) / np.float32(abs(source // w - at // w) + abs(source % w - at % w))
                 total += weight
@@ -378,4 +365,4 @@ def warm_up() -> None:
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
         sum_cells(view, chosen, 1, cells[0])
         put_cells(cells[0], 1, chosen, 0.5, view)
-        paint(pixel, pixel, colours, seen, chosen, 1.0, view.reshape(3, 4))
+        paint(pixel, pixel, np.zeros((4, 1), np.int32), colours, seen, 1.0, view.reshape(3, 4))

@@ -688,7 +688,7 @@ def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table:
         winner: (h, w) int8 source, -1 for none.
         step: Distance of samples.
         margin: Distance at which pixels around a sample must be of its face.
-        table: (4, h w) int32, written: the attributes of ``view_plan.Paint``.
+        table: (4, h w) int32, written: the first four attributes of ``plan.Paint``.
     """
     h, w = face.shape
     hidden, sampled, is_known = 0, 0, np.ones(part.shape[0], np.bool_)
@@ -720,6 +720,33 @@ def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table:
                 table[2, sampled], table[3, sampled] = y * w + x, part[number]
                 sampled += 1
     return hidden, sampled
+
+
+@compiled
+def nearest_seen(face: Any, part: Any, winner: Any, pixel: Any, nearest: Any) -> None:
+    """Find the seen pixels next to unseen ones in their row and column, across unseen ones of the same body or cabin.
+
+    Args:
+        face: (h, w) int32 faces of objects.
+        part: (F,) int32 ``scene.boxes.BoxSurface.face_parts``.
+        winner: (h, w) int8 source, -1 for none.
+        pixel: (n,) int32 unseen pixels of objects, into the flattened view, ascending.
+        nearest: (4, n) int32, written: seen pixels to the left, above, to the right, below; -1 for none.
+    """
+    h, w = face.shape
+    number = np.empty((h, w), np.int32)
+    for k in range(pixel.shape[0]):
+        number[pixel[k] // w, pixel[k] % w] = k
+    for way in range(4):
+        dy, dx = (way == 3) - (way == 1), (way == 2) - (way == 0)
+        for n in range(pixel.shape[0]):
+            k = pixel.shape[0] - 1 - n if way > 1 else n
+            y, x = pixel[k] // w + dy, pixel[k] % w + dx
+            nearest[way, k] = -1
+            if 0 <= y < h and 0 <= x < w and face[y, x] >= 0:
+                one, two = part[face[pixel[k] // w, pixel[k] % w]], part[face[y, x]]
+                if one // PARTS == two // PARTS and (one % PARTS > 0) == (two % PARTS > 0):
+                    nearest[way, k] = y * w + x if winner[y, x] >= 0 else nearest[way, number[y, x]]
 
 
 @compiled

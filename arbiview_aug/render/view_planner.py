@@ -565,7 +565,10 @@ def find_paint(face: npt.NDArray[np.int32], winner: npt.NDArray[np.int8], parts:
     step = max(1, min(face.shape) // _SAMPLES)
     columns = np.empty((4, face.size), np.int32)
     hidden, sampled = kernels.find_paint(face, parts, winner, step, _INSIDE_PX, columns)
-    return Paint(*columns[:2, :hidden].copy(), *columns[2:, :sampled].copy())
+    (pixel, part), (sample, sample_part) = columns[:2, :hidden].copy(), columns[2:, :sampled].copy()
+    nearest = np.empty((4, hidden), np.int32)
+    kernels.nearest_seen(face, parts, winner, pixel, nearest)
+    return Paint(pixel, part, sample, sample_part, nearest)
 
 
 # --- all views of a rig -----------------------------------------------------------------------------------------------

@@ -468,6 +468,21 @@ def test_sides_take_the_seen_pixels_in_their_row_and_column() -> None:
     assert abs(int(out[0, 42, 35]) - (median + 120 * reach / far) / (1 + reach / far)) <= 1
 
 
+def test_unseen_sides_take_no_colour_of_what_stands_before_them() -> None:
+    face = np.full((64, 64), -1, np.int32)
+    face[20:50, 10:54], face[10:50, 26:30] = 0, 6  # a dark object before the side of a bright one, hidden right of it
+    face[10:20, 30:54] = 4  # a cabin over it, seen
+    seen = np.ones(face.shape, bool)
+    seen[20:50, 30:54] = False
+    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
+    view[:, 20:50, 10:26], view[:, 10:50, 26:30], view[:, 10:20, 30:54] = 180, 10, 90
+    paint = find_paint(face, np.where(seen, 0, -1).astype(np.int8), FACE_PARTS)
+    assert len(paint.pixel) == 30 * 24 and (paint.nearest == -1).all()
+    layers = np.where(face >= 0, OBJECT, 0).astype(np.uint8)
+    (out,) = fill_holes([view * torch.from_numpy(seen)], [torch.from_numpy(seen)], [layers], [paint])
+    assert (out[:, ~seen] == 180).all()
+
+
 def test_unseen_cabins_and_bodies_have_colours_of_their_own() -> None:
     face = np.full((64, 64), -1, np.int32)
     face[10:30, 4:60], face[30:50, 4:60] = 4, 0  # the cabin, and a side of the body
