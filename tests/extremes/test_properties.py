@@ -28,7 +28,7 @@ from tests.helpers import examples, in_source, noise
 BOXES = np.array([[12.03, 1.0, 0.807, 2.5, 1.9, 1.613, 0.3], [-8.0, -3.0, 1.01, 2.9, 2.0, 2.02, 1.5]])
 MAP_TOLERANCE_PX = 1 / 32
 ROUNDING_PX = 1e-3  # the slack that maps allow at an image's border
-BLEND_ERROR = 2e-6  # rounding of float32: torch reads one shade by cubics to within 1.7e-6
+BLEND_ERROR = 2e-5  # rounding of float32: torch reads at shares of the side of an atlas, so up to 1e-5 px off
 UNBLENDED = RenderConfig(seam_width=0.0, interpolation="linear")
 
 
