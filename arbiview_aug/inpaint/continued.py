@@ -32,7 +32,7 @@ REACH = np.array([(0, 0), (0, 1 / 8), (1 / 2, 0), (1 / 16, 1 / 16), (1 / 4, 0)],
 view's shorter side: nothing; upright things and road outside the sources' images; both where something hides them."""
 
 SIDE_REACH = 1 / 4
-"""The same of seen pixels of a face in the row and column of its unseen ones, against the object's colour."""
+"""The same of seen pixels of a body or cabin in the row and column of its unseen ones, against its colour."""
 
 _LENS_NODES = 17  # directions of lines are interpolated between so many nodes along each side; a pinhole's are linear
 _MOVE = 1e-4  # by which rays are moved along a line, as a share of their length

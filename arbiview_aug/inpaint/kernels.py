@@ -323,7 +323,7 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
 def paint(pixel: Any, part: Any, nearest: Any, table: Any, seen: Any, reach: float, view: Any) -> None:
     """Paint the unseen pixels of objects in a view: tops in their part's colour, without a colour not at all.
 
-    Sides mix their part's colour with the nearest seen pixels of their face.
+    Sides mix their part's colour with the nearest seen pixels of the same body or cabin.
 
     Args:
         pixel: (n,) into the flattened view.
