@@ -181,5 +181,5 @@ def real(base: Settings) -> Settings:
 
 def large() -> Settings:
     """Everything at 256×704 with a ResNet-34: for a data-centre GPU."""
-    schedule = Schedule(steps=6000, batch=8, lr=1e-3, backbone="resnet34", device="cuda")
+    schedule = Schedule(steps=6000, batch=8, lr=1e-3, backbone="resnet34", device="cuda", precision="bf16")
     return Settings(size=(256, 704), train_frames=4000, schedule=schedule)
