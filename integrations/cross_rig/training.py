@@ -35,7 +35,7 @@ _BOXES = 0.05
 
 def fast_precision() -> Literal["bf16", "fp32"]:
     """bfloat16 on CPUs that have instructions for it (AMX, AVX-512 BF16): others take forty times as long for it."""
-    has = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.6 has none
+    has: dict[str, bool] = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.6 has none
     return "bf16" if has.get("amx_bf16") or has.get("avx512_bf16") else "fp32"
 
 
