@@ -65,13 +65,14 @@ def run(arguments: argparse.Namespace) -> None:
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
     names = [method.name for method in methods]
     judged = {name: numbers(row) for name, row in panel.rows(names, list(done.targets)).items()}
-    tables = evaluation_tables(done, names) + judge_tables(judged)
+    scored = evaluation_tables(done, names)
+    tables = scored + judge_tables(judged)
     notes.extend(panel.notes(names, arguments.detector_classes))
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
     title = f"{source}: {frames_text(len({view['frame'] for view in done.views}))}"
     settings = {key: value for key, value in vars(arguments).items() if key != "displaced"}
     report: dict[str, Any] = {"arguments": settings, "scored_on_other_points": done.first.held_out}
-    report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in tables), strict=False))
+    report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in scored), strict=False))
     report |= {"views": done.views, "pairs": done.pairs} | ({"judges": judged} if judged else {})
     (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
     _save_pictures(folder, done, panel)

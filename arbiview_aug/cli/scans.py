@@ -50,10 +50,14 @@ class TrueScan(NamedTuple):
 
 def evaluate_scans(arguments: argparse.Namespace, folder: Path) -> None:
     """Measure, print the table, write ``evaluate.json`` and a picture of the first frame."""
-    scans = _displaced(arguments) if arguments.displaced else _synthetic(arguments)
+    if arguments.displaced:
+        options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
+        data = open_data(arguments.data, neighbours=WANTED, **options)
+        scans, count = _displaced(arguments, data), arguments.frames or len(data)
+    else:
+        scans, count = _synthetic(arguments), arguments.frames or 1
     rows: list[dict[str, Any]] = []
     picture, notes = None, list[str]()
-    count = arguments.frames or 1
     with named_steps(notes, count) as tick:
         for scan in islice(scans, count):
             tick(scan.name, 1)
@@ -114,12 +118,10 @@ def _synthetic(arguments: argparse.Namespace) -> Iterator[TrueScan]:
         yield TrueScan(f"street {k}", mounted, points, boxes, truth, source)
 
 
-def _displaced(arguments: argparse.Namespace) -> Iterator[TrueScan]:
+def _displaced(arguments: argparse.Namespace, data: Any) -> Iterator[TrueScan]:
     """Scans of a drive, each against the next one, from where that was taken; of static things."""
     from sklearn.neighbors import KDTree
 
-    options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
-    data = open_data(arguments.data, neighbours=WANTED, **options)
     chosen = None if arguments.target is None else load_rig(arguments.target)
     for index in range(len(data)):
         sample = data[index]

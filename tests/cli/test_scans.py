@@ -42,14 +42,15 @@ def test_synthetic_streets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 def test_the_next_frame_of_a_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its scan is the truth; the scanner is that of calib.json."""
-    drive = SyntheticDrive(RIG, num_frames=1, neighbours=Neighbours(count=1, step_m=1.5, direction="future"))
+    """Its scan is the truth, of all frames that have a next one; the scanner is that of calib.json."""
+    drive = SyntheticDrive(RIG, num_frames=1, neighbours=Neighbours(count=2, step_m=1.5, direction="future"))
     sample = drive[0]
-    later = dict(sample["neighbours"][0])
-    frames = [{key: value for key, value in one.items() if key != "neighbours"} for one in (sample, later)]
+    recorded = (sample, *sample["neighbours"])
+    frames = [{key: value for key, value in one.items() if key != "neighbours"} for one in recorded]
     write_drive(tmp_path / "drive", frames)
     report = run(["--data", str(tmp_path / "drive"), "--displaced"], tmp_path)
     scans = report["scans"]
+    assert len({row["frame"] for row in report["rows"]}) == 2
     assert list(scans) == ["as they are", "scanned"] and scans["scanned"]["recall"] > scans["as they are"]["recall"]
     assert scans["scanned"]["precision"] > 0.7
     bare = [{**one, "rig": replace(RIG, lidars=())} for one in frames]

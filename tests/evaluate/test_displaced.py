@@ -49,6 +49,9 @@ def test_a_camera_that_is_the_source_itself(tmp_path: Path) -> None:
     found = run(stereo(tmp_path / "data", 0.0, 1), tmp_path / "out", "--geometry", "infinity")
     for row in found["means"].values():
         assert row["true_covered_psnr_db"] == pytest.approx(SAME_DB, abs=0.1) and row["spread_db"] == 0
+    (tmp_path / "own.py").write_text("def detect(rgb):\n    return [[0, 0, 9, 9]], [0.6], ['car']\n")
+    judged = run(tmp_path / "data", tmp_path / "out", "--geometry", "street", "--detector", f"{tmp_path}/own.py:detect")
+    assert "copy" in judged["judges"] and "agreement" not in judged, "photographs have no table of agreement"
 
 
 @pytest.mark.slow
