@@ -379,9 +379,7 @@ class Camera:
 def _half_angle_rad(size: tuple[int, int], lens: LensName, distortion: tuple[float, ...], K: bytes) -> float:
     h, w = size
     K_px = np.frombuffer(K).reshape(3, 3)
-    camera = Camera(
-        name="lens", width_px=w, height_px=h, K=K_px, cam2ego=np.eye(4), lens=lens, distortion=distortion
-    )
+    camera = Camera(name="lens", width_px=w, height_px=h, K=K_px, cam2ego=np.eye(4), lens=lens, distortion=distortion)
     border = np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, 9), np.linspace(-0.5, h - 0.5, 9)), -1)
     directions, valid = camera.unproject_cam(border)
     return math.acos(float(np.clip(directions[..., 2].min(), -1, 1))) if valid.all() else math.pi

@@ -296,9 +296,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
     return Rig.from_dict(read_calibration(path, where), folder=path.parent, where=where)
 
 
-def save_rig(
-    rig: Rig, path: str | Path, *, format: Literal["rig", "ros", "kalibr", "colmap"] = "rig"
-) -> Path:
+def save_rig(rig: Rig, path: str | Path, *, format: Literal["rig", "ros", "kalibr", "colmap"] = "rig") -> Path:
     """Write a rig for another tool, or as a rig file. Returns the path.
 
     Args:

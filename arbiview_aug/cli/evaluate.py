@@ -124,9 +124,7 @@ def _displaced(arguments: argparse.Namespace, notes: list[str], look: Look | Non
         if arguments.geometry == ["auto"]:
             arguments.geometry = surfaces_for(first[1].sample)
         methods = [COPY, *_methods(arguments, neighbours=None)]
-        return methods, evaluate(
-            chain([first], frames), lambda _: {}, methods, tick, agreement=False, look=look
-        )
+        return methods, evaluate(chain([first], frames), lambda _: {}, methods, tick, agreement=False, look=look)
 
 
 # --- frames and targets -----------------------------------------------------------------------------------------------

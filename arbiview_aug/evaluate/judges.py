@@ -183,9 +183,7 @@ def _of_torchvision(
     return detect, names
 
 
-def _of_transformers(
-    option: str, name: str, device: torch.device | str
-) -> tuple[Callable[[Picture], Any], list[str]]:
+def _of_transformers(option: str, name: str, device: torch.device | str) -> tuple[Callable[[Picture], Any], list[str]]:
     try:
         transformers = optional_package("transformers", "depth")
     except ImportError as error:

@@ -146,9 +146,7 @@ class Panel:
         for camera, image, labels in zip(rig, images, self._labels(frame, rig), strict=True):
             self._add(image, Verdict(name, SOURCES, SOURCES, camera.size, detector(image), labels))
 
-    def _judged(
-        self, verdict: Verdict, image: Picture, generated: BoolArray | None, true: TrueImage | None
-    ) -> Verdict:
+    def _judged(self, verdict: Verdict, image: Picture, generated: BoolArray | None, true: TrueImage | None) -> Verdict:
         """Add to a verdict what the judges see in a view, and in the true image."""
         if self.segmenter is not None and true is not None and true.road is not None:
             one, two = self.segmenter(image) & true.valid, true.road & true.valid

@@ -73,4 +73,3 @@ def scan_sheet(
 def _pixels(points: Any) -> npt.NDArray[np.int64]:
     """(n, 2) int rows and columns of points (n, >=2)."""
     return np.floor((1 - points[:, :2] / _REACH_M) * _SIDE_PX / 2).astype(int)
-
