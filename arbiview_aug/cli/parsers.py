@@ -271,7 +271,6 @@ def pareto() -> argparse.ArgumentParser:
     reduces = [*get_args(Reduce)]
     add("--downscale", dest="reduce", nargs="+", type=int, choices=reduces, default=reduces, help="decode at 1/N")
     add("--execution", nargs="+", choices=EXECUTIONS, help="backends (default: those of this machine)")
-    add("--generator", nargs="+", default=[], metavar="PATH", help=f"also fill holes by a {_GENERATOR}")
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-ms", type=positive, metavar="MS", help="recommend the most accurate within it")
     limit.add_argument("--min-psnr", type=positive, metavar="DB", help="recommend the fastest that reaches it")

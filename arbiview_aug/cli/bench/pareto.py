@@ -2,8 +2,7 @@
 
 Sweeps quality, surface, decoded size, execution and cached depth from overlap; marks the Pareto front, and
 recommends a setting for ``--budget-ms`` or ``--min-psnr``, measured again. Static surfaces are not recommended
-where cameras move (``requirements.static_harm``): PSNR does not show what a detector learns from them. Fillers of holes
-are compared at the recommended setting: the default fill, inpainting, and every ``--generator``.
+where cameras move (``requirements.static_harm``): PSNR does not show what a detector learns from them.
 
 Times are CPU time of a ``RigRetarget`` call on one thread, with the plan where every frame needs its own. Accuracy is
 the mean PSNR of pixels that some source sees, against LiDAR points or the true views, in the colours of images decoded
@@ -25,7 +24,7 @@ from tqdm import tqdm
 
 from arbiview_aug import PlanCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import GeometryName, Holes, Quality, Reduce
+from arbiview_aug.choices import GeometryName, Quality, Reduce
 from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
 from arbiview_aug.cli.bench.speed import remap_floor
@@ -37,8 +36,6 @@ from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Sample, views_of
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import metric_table
-from arbiview_aug.generator import load_inpainter
-from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.render.requirements import HELPFUL_DATA, static_harm
 from arbiview_aug.scene.scene import GEOMETRIES
@@ -59,7 +56,6 @@ class Setting:
     reduce: Reduce  # images are decoded at 1 / this
     execution: Execution  # ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU
     cached: bool = False  # whether depth from overlap is cached
-    holes: Holes | Inpainter = "black"
 
     @property
     def name(self) -> str:
@@ -72,7 +68,7 @@ class Setting:
             target,
             quality=self.quality,
             geometry=self.surface,
-            holes=self.holes,
+            holes="black",
             backend="opencv" if self.execution == "opencv" else "torch",
             cache=PlanCache(share_overlap=self.cached, max_bytes=0),
         )
@@ -123,7 +119,6 @@ def run(arguments: argparse.Namespace) -> int:
     if "cuda" in (arguments.execution or ()) and not is_there:
         raise DataError("--execution cuda: expected a CUDA device that is there, found none")
     arguments.execution = arguments.execution or EXECUTIONS[: 2 + is_there]
-    arguments.generator = {path: load_inpainter(path) for path in arguments.generator}
     h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
     with recorded(arguments.data, frames=arguments.frames, size=(h, w)) as data:
         report = measure(data, arguments)
@@ -133,7 +128,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 @benchmark
 def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
-    """Score and time all settings, and what fills the holes of the recommended one."""
+    """Score and time all settings, and recommend one."""
     source: Rig = data.sample(0, REFERENCE)["rig"]
     target = replace(data.target(arguments.target, arguments.size), lidars=())  # ``bench speed`` times scans
     if "paper" in arguments.quality:  # homographies know no lens; all settings share the target
@@ -150,32 +145,6 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     noise = torch.randint(0, 256, (len(target), 3, h, w), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     floor = remap_floor(noise, (h, w))
 
-    def measured(candidates: Mapping[str, Setting]) -> list[dict[str, Any]]:
-        rows = []
-        for name, one in tqdm(candidates.items(), desc="accuracy", unit="setting", leave=False):
-            memory = peak_mib(alternating(one))
-            network: Any = getattr(one.holes, "generator", one.holes)  # counts its calls, if it is one
-            before = getattr(network, "calls", None)
-            frames = [frame(index, one.reduce) for index in range(arguments.frames)]
-            render = partial(_render, one.call(target))
-            means = mean_of(row for each in frames for row in scores(each, render, target, ("even",))[1])
-            prefix = "even" if data.truth is None else "true"
-            row: dict[str, Any] = {"name": name, "peak_mib": memory, "seen": means["seen"]}
-            row |= {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
-            row["hole_psnr_db"] = means.get("true_hole_psnr_db")
-            row["calls"] = None if before is None else (network.calls - before) / len(frames)
-            rows.append(row)
-        timed = {"floor": floor}
-        timed |= {f"decode 1/{reduce}": data.reader(reduce) for reduce in {one.reduce for one in candidates.values()}}
-        timed |= {name: alternating(one) for name, one in candidates.items()}
-        times = timed_rounds(timed, arguments.repeats, "times", enough_ms=_ENOUGH_MS)
-        for row, one in zip(rows, candidates.values(), strict=True):
-            own_times, decode = times[row["name"]], quartiles(times[f"decode 1/{one.reduce}"]).median_ms
-            row |= quartiles(own_times)._asdict() | {"decode_ms": decode}
-            row["floor_ratio"] = quartiles(own_times / times["floor"][: len(own_times)]).median_ms
-            row["decode_ratio"] = row["median_ms"] / decode
-        return rows
-
     known = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3d", "lidar": "points"}
     offered: list[Any] = [name for name, key in known.items() if key in frame(0, REFERENCE).scored_sample]
     by_name = {
@@ -187,10 +156,24 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
             executions=arguments.execution,
         )
     }
-    rows = measured(by_name)
-    for row, one in zip(rows, by_name.values(), strict=True):
+    prefix, rows = "even" if data.truth is None else "true", []
+    for name, one in tqdm(by_name.items(), desc="accuracy", unit="setting", leave=False):
+        memory = peak_mib(alternating(one))
+        frames = [frame(index, one.reduce) for index in range(arguments.frames)]
+        render = partial(_render, one.call(target))
+        means = mean_of(row for each in frames for row in scores(each, render, target, ("even",))[1])
+        row: dict[str, Any] = {"name": name, "peak_mib": memory, "seen": means["seen"]}
+        row |= {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
         row |= {"quality": one.quality, "surface": one.surface, "reduce": one.reduce, "execution": one.execution}
-        row["harm"] = static_harm(source, target, one.surface, RenderConfig())
+        rows.append(row | {"harm": static_harm(source, target, one.surface, RenderConfig())})
+    timed = {"floor": floor} | {f"decode 1/{reduce}": data.reader(reduce) for reduce in {row["reduce"] for row in rows}}
+    timed |= {name: alternating(one) for name, one in by_name.items()}
+    times = timed_rounds(timed, arguments.repeats, "times", enough_ms=_ENOUGH_MS)
+    for row in rows:
+        own_times, decode = times[row["name"]], quartiles(times[f"decode 1/{row['reduce']}"]).median_ms
+        row |= quartiles(own_times)._asdict() | {"decode_ms": decode}
+        row["floor_ratio"] = quartiles(own_times / times["floor"][: len(own_times)]).median_ms
+        row["decode_ratio"] = row["median_ms"] / decode
 
     def again(row: Row) -> Quartiles:
         name = row["name"]
@@ -198,9 +181,6 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
 
     recommended = advice(rows, again, budget_ms=arguments.budget_ms, min_psnr_db=arguments.min_psnr)
     front = {row["name"] for row in pareto_front(rows)}
-    steps = [row["name"] for row in distinct_steps(rows)]
-    filled = by_name[recommended["setting"] if recommended and recommended["setting"] else steps[-1]]
-    fillings = {how: how for how in ("black", "continue", "telea")} | arguments.generator
     return {
         "clock": "CPU time of the process, milliseconds, one thread",
         "data": data.name,
@@ -209,13 +189,8 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         "frames": arguments.frames,
         "against": "true views" if data.truth is not None else "LiDAR points, exposures made even",
         "settings": [{**row, "front": row["name"] in front} for row in rows],
-        "steps": steps,
+        "steps": [row["name"] for row in distinct_steps(rows)],
         "advice": recommended,
-        "filled": filled.name,
-        "fills": [
-            {**row, "kept": None if arguments.budget_ms is None else row["q3_ms"] <= arguments.budget_ms}
-            for row in measured({name: replace(filled, holes=how) for name, how in fillings.items()})
-        ],
     }
 
 
@@ -299,7 +274,6 @@ COLUMNS = (
     ("seen", "{seen:.1%}"),
     ("whole dB", "{whole_psnr_db:.2f}"),
 )
-FILL_COLUMNS = (*COLUMNS, ("holes dB", "{hole_psnr_db:.2f}"), ("calls", "{calls:.1f}"))
 NOTES = (
     "CPU ms a frame on one thread, with the plan where every frame needs its own; x floor: bare cv2.remap of the same "
     "views; x decode: reading the images that the setting reads (1/2: at half size); MiB: growth over the first call; "
@@ -327,12 +301,6 @@ def table(report: Mapping[str, Any]) -> str:
     ]
     if len(rows) > len(shown):
         lines += ["", f"{len(rows) - len(shown)} more settings, none of them on the front, are in the JSON."]
-    lines += ["", f"What fills the holes of {report['filled']}; calls: of the network, for each frame."]
-    lines += ["", metric_table(report["fills"], FILL_COLUMNS)]
-    kept = [row for row in report["fills"] if row["kept"]]
-    if kept:
-        best = max(kept, key=lambda row: row["whole_psnr_db"])
-        lines += ["", f"Nearest to the whole view within the budget: {best['name']}, {best['whole_psnr_db']:.2f} dB."]
     if report["advice"]:
         lines += ["", advice_line(report["advice"])]
     return "\n".join(lines)
