@@ -23,6 +23,7 @@ from arbiview_aug.errors import UnreachableError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.metrics import psnr_db
+from arbiview_aug.render.overlap_depth import fitted_psnr_db
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.view_planner import build_plan
 
@@ -49,15 +50,9 @@ def overlap_psnr(one: npt.NDArray[Any], two: npt.NDArray[Any], both: BoolArray, 
     fit, test = both & ~odd, both & odd
     if fit.sum() < MIN_PIXELS or test.sum() < MIN_PIXELS:
         return None
-    squared = []
-    for channel in range(3):
-        x, y = one[..., channel].astype(np.float64), two[..., channel].astype(np.float64)
-        gain, offset = 1.0, 0.0
-        if fitted:
-            design = np.stack([x[fit], np.ones(int(fit.sum()))], 1)
-            gain, offset = np.linalg.lstsq(design, y[fit], rcond=None)[0]
-        squared.append(float(((x[test] * gain + offset - y[test]) ** 2).mean()))
-    return psnr_db(float(np.mean(squared)))
+    if fitted:
+        return fitted_psnr_db(one, two, fit, test)
+    return psnr_db(float(((one[test].astype(np.float64) - two[test]) ** 2).mean()))
 
 
 def overlap_scores(

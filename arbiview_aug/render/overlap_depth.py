@@ -135,7 +135,7 @@ class OverlapReport:
     first: str  # names of the two cameras
     second: str
     accepted: bool  # whether the surface changes
-    reason: str  # why, or why not; PSNR is that of the two in their half-way view, fitted as ``overlap_psnr`` does
+    reason: str  # why, or why not; PSNR is that of the two in their half-way view, as ``fitted_psnr_db``
 
     def __str__(self) -> str:
         return f"{self.first} and {self.second}: {'' if self.accepted else 'distances as they were, '}{self.reason}"
@@ -262,9 +262,9 @@ def _refine(
     along, epipolar = _epipolar(strip, cameras, surface, flow)
     trial = _smoothed(along, epipolar, trust * fit)
     changed = strip.q * (1 + trial.change)
-    before = _fitted_db(one, two, fit, test)
+    before = fitted_psnr_db(one, two, fit, test)
     one, two = (_read_over(changed, strip, c, image) for c, image in zip(cameras, images, strict=True))
-    after = _fitted_db(one, two, fit, test)
+    after = fitted_psnr_db(one, two, fit, test)
     reason = f"{before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < MIN_RISE_DB:
         return None, OverlapReport(*names, False, f"refining would not help, {reason}")
@@ -359,7 +359,7 @@ def _fade(t: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return 1 - t * t * (3 - 2 * t)
 
 
-def _fitted_db(one: npt.NDArray[Any], two: npt.NDArray[Any], fit: BoolArray, test: BoolArray) -> float:
+def fitted_psnr_db(one: npt.NDArray[Any], two: npt.NDArray[Any], fit: BoolArray, test: BoolArray) -> float:
     """PSNR of (h, w, 3) views on ``test``, after a gain and an offset per channel fitted on ``fit``."""
     errors = []
     for channel in range(3):
