@@ -12,7 +12,7 @@ import torch
 
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator.checkpoint import CONFIG_FILE, load_weights, read_checkpoint, write_checkpoint
+from arbiview_aug.generator.checkpoint import load_weights, read_checkpoint, write_checkpoint
 from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
 from arbiview_aug.generator.config import GeneratorConfig, TrainedOn, from_plain, paper
@@ -30,11 +30,6 @@ _PLAIN_UNET = {  # entries of Stable Diffusion 1.5's configuration on which ``De
     "time_embedding_act_fn": None,
     "center_input_sample": False,
 }
-
-
-def has_shipped() -> bool:
-    """Whether the package was installed with its weights."""
-    return (_SHIPPED / CONFIG_FILE).is_file()
 
 
 def _networks() -> tuple[Any, Any]:
