@@ -187,6 +187,11 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
             executions=arguments.execution,
         )
     }
+    if not by_name or not set(offered).issuperset(arguments.geometry or ()):
+        wanted = f"--geometry {' '.join(arguments.geometry or ['none'])} --quality {' '.join(arguments.quality)}"
+        refined = [name for name in offered if GEOMETRIES[name].overlap_depth]
+        expected = f"{', '.join(offered)}, which the samples offer (accurate: {', '.join(refined)})"
+        raise DataError(f"{wanted}: expected geometry of {expected}")
     rows = measured(by_name)
     for row, one in zip(rows, by_name.values(), strict=True):
         row |= {"quality": one.quality, "surface": one.surface, "reduce": one.reduce, "execution": one.execution}
