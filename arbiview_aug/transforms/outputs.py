@@ -78,7 +78,7 @@ class SampleWriter:
         named = (*labels, *self.keys.keep)
         stale = [key for key in sample if key in (*PIXEL_BOUND_KEYS, *POSE_KEYS) and key not in named]
         # The coverage of an earlier retargeting already masks what it generated.
-        dropped = [key for key in stale if key not in self.keys.extra and key != "generated"]
+        dropped = [key for key in stale if key not in (*self.keys.extra, "generated", "depth_m")]
         if dropped:
             meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
             message = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels or cameras{meant}"

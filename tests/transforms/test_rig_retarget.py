@@ -223,9 +223,10 @@ def test_pixel_bound_keys_are_dropped_with_one_warning() -> None:
     source, retarget = ring(), RigRetarget(ring().turned(yaw_deg=3))
     matrices = {key: torch.eye(4).expand(4, 4, 4) for key in ("lidar2img", "extrinsics")}
     sample = sample_of(source, boxes_2d=torch.rand(3, 4), depth=torch.rand(4, *SIZE), neighbours=[], **matrices)
+    sample["depth_m"] = torch.ones(4, *SIZE)  # read, and dropped without a word
     with pytest.warns(UserWarning, match="drops boxes_2d, depth, lidar2img, extrinsics: they speak of the source's"):
         out = retarget(sample)
-    assert not {"boxes_2d", "depth", "neighbours", *matrices} & set(out)
+    assert not {"boxes_2d", "depth", "depth_m", "neighbours", *matrices} & set(out)
     retarget(sample)  # without a second warning
 
 
@@ -601,6 +602,7 @@ def test_prepare_builds_the_plan_that_samples_use() -> None:
     retarget({"images": smooth_images(source)})
     retarget({"images": smooth_images(source), "rig": ring()})  # an equal rig
     assert retarget.plans.misses == 1
+    assert RigRetarget("waymo", geometry="street").prepare("nuscenes").source.name == "nuscenes"
     for bad in (RigRetarget(ring()), RigRetarget(RandomRig(ring()), source=source)):
         with pytest.raises(ValueError, match="prepare: expected a source rig and a fixed target rig"):
             bad.prepare()
