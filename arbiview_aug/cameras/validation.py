@@ -199,6 +199,11 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
     body, metres, upside_down = np.eye(4), cam2ego.copy(), np.diag([1.0, -1, -1, 1])
     body[:3, :3] = CAMERA_AXES_IN_EGO
     metres[:, :3, 3] /= 1000
+    # Cameras of one vehicle, far from the origin: millimetres would be metres apart by thousands.
+    middle = cam2ego[:, :3, 3].mean(axis=0)
+    is_together = len(cam2ego) > 1 and np.ptp(cam2ego[:, :3, 3], axis=0).max() < _FARTHEST_M
+    if is_together and np.abs(middle[:2]).max() > _FARTHEST_M and _stands(cam2ego).mean() > 0.5:
+        return "poses in the world's frame", "pass np.linalg.inv(ego2world) @ cam2world"
     axes = f"by {CAMERA_AXES_IN_EGO.astype(int).tolist()} from the"
     for right, mistake, fix in (
         (metres, "positions in millimetres", "divide cam2ego[:3, 3] by 1000"),
@@ -211,7 +216,7 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
             return mistake, fix
     heights = ", ".join(f"{z:+.1f}" for z in cam2ego[:, 2, 3] - ground_z_m)
     if _stands(cam2ego).all():
-        return f"heights over the road of {heights} m", "is ground_z_m the road's height in the ego frame?"
+        return f"heights over the road of {heights} m", "check that ground_z_m is the road's height in the ego frame"
     return f"cameras that lie on their side or look up, {heights} m over the road", "compare docs/rigs.md"
 
 

@@ -25,6 +25,7 @@ from arbiview_aug.evaluate.methods import Method, retargeting, views_of
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.scan_pictures import scan_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
+from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.scans import retarget_points
 
@@ -42,12 +43,14 @@ def run(arguments: argparse.Namespace) -> None:
     writable_folder(path.parent, arguments.output)
     if arguments.size is None and arguments.data is None:
         arguments.size = _SYNTHETIC_SIZE
-    data = open_frames(arguments, [arguments.geometry], lidar=False)
+    data = open_frames(arguments, [arguments.geometry], lidar=arguments.geometry == "lidar")
+    sample = data[0]
+    read_scene(read_frames(sample, None)[0], arguments.geometry)  # refuses what the sample lacks before minutes of work
     methods = _compared(arguments.quality, arguments.geometry, arguments.holes)
     notes: list[str] = []
     done = measured(arguments, data, methods, notes, agreement=False)
     with gathered_warnings(notes):
-        (target,), sample = done.targets.values(), data[0]
+        (target,) = done.targets.values()
         retarget = RigRetarget(target, quality=arguments.quality, geometry=arguments.geometry, holes=arguments.holes)
         times_ms = [1e3 * timeit(partial(retarget, sample), timer=working_s, number=1) for _ in range(1 + _TIMED_CALLS)]
         views, explained = views_of(retarget(sample)), retarget.explain(sample)

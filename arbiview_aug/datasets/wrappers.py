@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset, IterableDataset
 
-from arbiview_aug.errors import DataError, SampleTypeError
+from arbiview_aug.errors import ArbiviewError, DataError, SampleTypeError
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import is_number
@@ -38,11 +38,12 @@ class RetargetedDataset(Dataset[Any]):
         return len(self.dataset)
 
     def __getitem__(self, index: Any) -> Any:
-        return self.retarget(self.dataset[index])
+        return _retargeted(self.retarget, self.dataset[index], index)
 
     def __getitems__(self, indices: Sequence[Any]) -> list[Any]:
         if callable(getattr(self.dataset, "__getitems__", None)):
-            return [self.retarget(sample) for sample in self.dataset.__getitems__(indices)]
+            samples = self.dataset.__getitems__(indices)
+            return [_retargeted(self.retarget, *pair) for pair in zip(samples, indices, strict=False)]
         return [self[index] for index in indices]
 
 
@@ -114,8 +115,16 @@ class RetargetedIterable(IterableDataset[Any]):
         self.retarget = _checked_retarget(retarget, name)
 
     def __iter__(self) -> Iterator[Any]:
-        for sample in self.dataset:
-            yield self.retarget(sample)
+        for number, sample in enumerate(self.dataset):
+            yield _retargeted(self.retarget, sample, number)
+
+
+def _retargeted(retarget: Retarget, sample: Any, index: Any) -> Any:
+    """The retargeted sample; errors name the sample, which no one else knows in a DataLoader's worker."""
+    try:
+        return retarget(sample)
+    except ArbiviewError as error:
+        raise type(error)(f"sample {index}: {error}") from None
 
 
 def _checked_map_style(dataset: Any, name: str, fix: str) -> Any:

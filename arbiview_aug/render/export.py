@@ -6,6 +6,7 @@ and holes stay black.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -35,15 +36,18 @@ def export_plan(plan: RenderPlan, path: str | Path) -> None:
         path: The file; its folder is created.
 
     Raises:
-        ValueError: Another ending.
+        ValueError: Another ending, or no plan.
         ImportError: ``.onnx`` without the package onnx.
         OutputError: A file that cannot be written.
     """
+    if not isinstance(plan, RenderPlan):
+        raise ValueError(f"plan: expected what RigRetarget.prepare returns, got {type(plan).__name__}")
     path = Path(path)
     write = _WRITERS.get(path.suffix)
     if write is None:
         raise ValueError(f"{path}: expected a name ending in {', '.join(_WRITERS)}, got {path.suffix!r}")
-    with whole_file(path) as file:
+    with whole_file(path) as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch's, of tracing constants and of what will be deprecated
         write(plan, file)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.key_names import hint, misnamed
+from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError, one_line
@@ -381,8 +381,11 @@ PIXEL_BOUND_KEYS = (
     "confidence",
     "generated",
     "sources",
+    *(*USUAL_NAMES["K"], "lidar2img", "ego2img", "projection_mat"),
 )
 """Keys bound to the source's pixels; they are dropped, as they would be stale in the target's views."""
+
+POSE_KEYS = (*USUAL_NAMES["cam2ego"], "lidar2cam")  # of the source's cameras: stale, too
 
 EGO_KEYS = ("points", "boxes_3d", "ego2world")  # they pass, or move with ``SampleKeys(frame="target")``
 _MAX_ENTRIES = 64  # checked per list: longer lists are tokens or numbers

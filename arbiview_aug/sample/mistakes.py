@@ -39,6 +39,7 @@ _LONG_M, _LEAST_LONG, _MOST_LONG = 3.0, 3, 0.75
 """Boxes longer than this are vehicles, longest along their length: 3 of them at least, three quarters of all."""
 
 _NEAR_M = 40.0  # boxes farther away stand on another height of the road
+_ELSEWHERE_M = 200.0  # nothing nearer than this: another frame, or another unit
 _MANY_DEG = 2 * math.pi + 1e-3
 
 _OFF_CENTER, _OFF_CENTER_ALONE, _ALIKE = 0.04, 0.08, 0.06
@@ -170,6 +171,13 @@ def _image_findings(frame: Frame) -> Iterator[Finding]:
 # --- boxes and points -------------------------------------------------------------------------------------------------
 def _label_findings(rig: Rig, boxes: FloatArray | None, points: Points | None) -> list[Finding]:
     findings = []
+    for key, rows in (("boxes_3d", boxes), ("points", points)):
+        nearest_m = np.inf if rows is None else np.hypot(rows[:, 0], rows[:, 1]).min(initial=np.inf)
+        if _ELSEWHERE_M < nearest_m < np.inf:
+            fix = "are they in the world's frame? Apply inv(ego2world), to yaw too; or in millimetres? Divide by 1000"
+            findings.append(Finding(key, "positions around the vehicle", f"the nearest {nearest_m:.0f} m away", fix))
+    if findings:
+        return findings
     road_m = None if points is None else road_height_m(points)
     if boxes is not None and (np.abs(boxes[:, 6]) > _MANY_DEG).any():
         largest = float(np.abs(boxes[:, 6]).max())

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
-from arbiview_aug.errors import SampleError
+from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, StaticSurface, Surface
 
@@ -382,7 +382,11 @@ def _in_box_frame(box: FloatArray, vectors: FloatArray) -> FloatArray:
 
 def checked_boxes(boxes: Any) -> FloatArray:
     """(B, 7) float64 boxes of a sample; refuse other shapes, numbers that are not finite, and sizes up to 0."""
-    array = np.asarray(boxes.detach().cpu() if hasattr(boxes, "detach") else boxes, dtype=np.float64)
+    try:
+        array = np.asarray(boxes.detach().cpu() if hasattr(boxes, "detach") else boxes, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        got = f"{type(boxes).__name__} ({one_line(error, 120)})"
+        raise SampleTypeError(f"boxes_3d: expected rows of numbers, of one frame, got {got}") from None
     if array.size == 0:
         return np.zeros((0, 7))
     if array.ndim != 2 or array.shape[1] < 7:
@@ -391,7 +395,9 @@ def checked_boxes(boxes: Any) -> FloatArray:
     valid = np.isfinite(array).all(axis=1) & (array[:, 3:6] > 0).all(axis=1)
     if not valid.all():
         bad = int(valid.argmin())
-        raise SampleError(f"boxes_3d[{bad}]: expected finite numbers and positive sizes, got {array[bad].tolist()}")
+        fix = "" if np.nan_to_num(array[bad]).any() else "; leave out rows that pad: a batch takes a list of boxes"
+        got = f"{array[bad].tolist()}{fix}"
+        raise SampleError(f"boxes_3d[{bad}]: expected finite numbers and positive sizes, got {got}")
     return array
 
 

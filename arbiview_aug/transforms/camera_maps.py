@@ -60,7 +60,7 @@ class CameraMaps(torch.nn.Module):
 
     def __init__(self, maps: Sequence[str] = tuple(CHANNELS), *, stride: int = 1) -> None:
         super().__init__()
-        if isinstance(maps, str) or not maps:
+        if not isinstance(maps, list | tuple) or not maps:
             raise ValueError(f"maps: expected names among {', '.join(CHANNELS)}, got {maps!r}")
         self.maps = tuple(choice("maps", name, CHANNELS) for name in maps)
         self.stride = checked_stride("stride", stride)

@@ -16,7 +16,7 @@ from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, is_readable, lens_names, like, rewrapped, split, stacked
-from arbiview_aug.sample.inputs import CALIBRATION_KEYS, PIXEL_BOUND_KEYS, Frame
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, PIXEL_BOUND_KEYS, POSE_KEYS, Frame
 from arbiview_aug.transforms.camera_maps import CameraMaps
 from arbiview_aug.transforms.scans import RetargetedPoints, entries_of
 from arbiview_aug.transforms.settings import SampleKeys
@@ -76,12 +76,12 @@ class SampleWriter:
     def _passed_on(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
         """The entries that do not depend on the images, as the same objects."""
         named = (*labels, *self.keys.keep)
-        stale = [key for key in sample if key in PIXEL_BOUND_KEYS and key not in named]
+        stale = [key for key in sample if key in (*PIXEL_BOUND_KEYS, *POSE_KEYS) and key not in named]
         # The coverage of an earlier retargeting already masks what it generated.
-        dropped = [key for key in stale if key not in self.keys.extra and key != "generated"]
+        dropped = [key for key in stale if key not in (*self.keys.extra, "generated", "depth_m")]
         if dropped:
             meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
-            message = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels{meant}"
+            message = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels or cameras{meant}"
             self.warn(f"dropped {dropped}", message)
         replaced = ("images", "K", "cam2ego")  # these keep their places in the dict
         return {k: v for k, v in sample.items() if k in replaced or k not in (*CALIBRATION_KEYS, *stale)}
@@ -141,6 +141,10 @@ def _check_maps(key: str, maps: Any, frame: Frame) -> None:
         size = tuple(label.shape[-2:])
         if size != camera.size:
             raise SampleError(f"{key}: camera {camera.name!r}: expected a map of (h, w) = {camera.size}, got {size}")
+        if (label.shape[:-2], label.dtype) != (maps[0].shape[:-2], maps[0].dtype):
+            expected, got = ((str(m.dtype), *m.shape[:-2], "H", "W") for m in (maps[0], label))
+            fix = "merge masks of instances into one map of their numbers"
+            raise SampleError(f"{key}: camera {camera.name!r}: expected {expected} as of the first, got {got}; {fix}")
 
 
 def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:

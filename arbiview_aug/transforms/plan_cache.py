@@ -56,10 +56,16 @@ def check_reach(source: Rig, target: Rig, coverages: Coverages, unseen: str, war
 
 def _likely_cause(source: Rig, target: Rig) -> str:
     """Why a target sees nothing of the sources, and the fix."""
+    hint = "No source camera looks where the target's do, or masks hide it; python -m arbiview_aug check tests the data"
+    return _mistaken_poses(source, target) or hint
+
+
+def _mistaken_poses(source: Rig, target: Rig) -> str:
+    """The rig whose poses are probably wrong, and the fix; empty without one."""
     for whose, rig in (("source", source), ("target", target)):
         if mistake := pose_mistake(rig.cam2ego, rig.ground_z_m):
             return f"The {whose}'s cam2ego seems to be {mistake[0]}: {mistake[1]}"
-    return "No source camera looks where the target's do, or masks hide it; python -m arbiview_aug check tests the data"
+    return ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +188,8 @@ class Plans:
         source, target = pair.source, pair.target
         plan = build_plan(source, target, geometry=self.surface, config=self.config, scene=scene, maps=self.maps)
         coverage = plan.coverage
-        if not scene.is_empty and not any(map(np.any, coverage)):  # objects may hide all of a frame's target
+        # Objects may hide all of a frame's target, if its cameras are where they should be.
+        if not scene.is_empty and not any(map(np.any, coverage)) and not _mistaken_poses(source, target):
             coverage = build_plan(source, target, geometry="street", config=self.config, maps=self.maps).coverage
         self.check_reach(source, target, coverage)
         return plan

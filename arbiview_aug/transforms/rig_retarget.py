@@ -391,7 +391,7 @@ class RigRetarget(torch.nn.Module):
         """
         return self._plans.plan(self._plans.pair(source, target), scene or Scene())
 
-    def prepare(self, source: Rig | None = None) -> RenderPlan:
+    def prepare(self, source: Rig | str | Path | None = None) -> RenderPlan:
         """Build the plan for a source rig before DataLoader workers fork: they share its memory.
 
         Args:
@@ -400,7 +400,7 @@ class RigRetarget(torch.nn.Module):
         Raises:
             ValueError: No source rig, a random target, ``quality="paper"``, or a surface that every frame has anew.
         """
-        source = source or self.source
+        source = self.source if source is None else source if isinstance(source, Rig) else load_rig(source)
         if source is None or self._fixed_target is None:
             raise ValueError("prepare: expected a source rig and a fixed target rig")
         pair = self._plans.pair(source, self._fixed_target)

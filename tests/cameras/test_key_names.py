@@ -84,7 +84,7 @@ def test_no_false_alarm(more: dict[str, Any], settings: dict[str, Any]) -> None:
 
 def test_depth_that_is_dropped_is_named() -> None:
     (words,) = warned(sample(depth=torch.rand(1, 12, 16)))
-    assert "drops depth: they speak of the source's pixels; found 'depth': did you mean 'depth_m'?" in words
+    assert "drops depth: they speak of the source's pixels or cameras; found 'depth': did you mean 'depth_m'?" in words
     assert not warned(sample(depth=torch.rand(1, 12, 16), depth_m=torch.zeros(1, 12, 16)))
 
 

@@ -81,6 +81,14 @@ def test_lenses_without_points(fisheye_root: Path, tmp_path: Path, capsys: pytes
     assert numbers(printed, "infinity")[0] > 80 and numbers(printed, "ground")[0] > 80
 
 
+def test_geometry_that_the_sample_has_and_one_that_it_lacks(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    options = ["--size", "16x44", "--output", str(tmp_path), "--geometry"]
+    assert main(["demo", *options, "lidar"]) == 0
+    assert numbers(capsys.readouterr().out, "lidar")[0] > 60
+    assert main(["demo", *options, "learned"]) == 2
+    assert "expected 'learned_depth_m' in the sample" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     "arguments", [["--size", "704"], ["--size", "0x3"], ["--seed", "-1"], ["--frames", "0"], ["--geometry", "flat"]]
 )

@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import DataLoader, IterableDataset, Subset, get_worker_info
 
 from arbiview_aug.datasets import MixedDataset, RetargetedDataset, RetargetedIterable
-from arbiview_aug.errors import DataError, SampleTypeError
+from arbiview_aug.errors import DataError, SampleError, SampleTypeError
 
 
 class Numbers:
@@ -69,6 +69,20 @@ def test_iterable_in_a_data_loader(workers: int) -> None:
     loader = DataLoader(RetargetedIterable(Stream(), add_ten), batch_size=None, num_workers=workers)
     for _ in range(2):
         assert sorted(int(sample["images"]) for sample in loader) == [10, 11, 12, 13, 14, 15]
+
+
+def refuse_three(sample: dict[str, Any]) -> dict[str, Any]:
+    if sample["images"] % 100 == 3:
+        raise SampleError("K: expected shape (6, 3, 3)")
+    return sample
+
+
+@pytest.mark.parametrize("dataset", [Numbers(), BatchedNumbers(), Stream()])
+@pytest.mark.parametrize("workers", [0, 1])
+def test_errors_name_the_sample(dataset: Any, workers: int) -> None:
+    wrapper, more = (RetargetedIterable, {}) if isinstance(dataset, Stream) else (RetargetedDataset, {"sampler": [3]})
+    with pytest.raises(SampleError, match="sample 3: K: expected shape"):
+        list(DataLoader(wrapper(dataset, refuse_three), num_workers=workers, **more))
 
 
 UNSIZED = type("Unsized", (), {"__getitem__": lambda self, k: k})()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -86,7 +87,9 @@ def test_readers_give_the_views(file: str, case: str, tmp_path: Path) -> None:
     smooth = [cv2.GaussianBlur(rng.integers(0, 256, (h, w, 3), np.uint8), (0, 0), 2) for _ in source]
     images = torch.from_numpy(np.stack(smooth)).permute(0, 3, 1, 2).contiguous()
     plan = retarget.prepare(source)
-    export_plan(plan, tmp_path / "new" / file)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        export_plan(plan, tmp_path / "new" / file)
     views = READERS[file](tmp_path / "new" / file, plan, images)
     expected = retarget({"images": images, "rig": source})["images"]
     assert len(views) == len(target) and (case != "seams" or any(view.bands for view in plan.targets))
@@ -100,6 +103,8 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     plan = RigRetarget(CASES["seams"][1], geometry="street").prepare(CASES["seams"][0])
     with pytest.raises(ValueError, match=r"plan\.txt: expected a name ending in \.npz, \.onnx, \.pt, got '\.txt'"):
         export_plan(plan, "plan.txt")
+    with pytest.raises(ValueError, match=r"plan: expected what RigRetarget\.prepare returns, got RigRetarget"):
+        export_plan(RigRetarget("waymo"), "plan.npz")  # type: ignore[arg-type]
     (tmp_path / "file").touch()
     with pytest.raises(OutputError):
         export_plan(plan, tmp_path / "file" / "plan.npz")

@@ -83,6 +83,19 @@ def millimetres(cam2ego: FloatArray) -> FloatArray:
     return np.hstack([cam2ego[:, :3], cam2ego[:, 3:] * [[1000], [1000], [1000], [1]]])
 
 
+WORLD = np.array([[0.6, -0.8, 0, 411.0], [0.8, 0.6, 0, 1181], [0, 0, 1, 0.4], [0, 0, 0, 1]])
+"""A pose of the ego in the world."""
+
+
+def in_world(key: str) -> Callable[[Sample], Sample]:
+    def mistaken(sample: Sample) -> Sample:
+        rows = sample[key].clone()
+        rows[:, :3] = torch.from_numpy(rows[:, :3].numpy() @ WORLD[:3, :3].T + WORLD[:3, 3])
+        return {**sample, key: rows}
+
+    return mistaken
+
+
 def scaled_K(factor: float) -> Callable[[Sample], Sample]:
     """K of images of ``factor`` times the size."""
     return cameras(lambda camera: replace(camera, K=np.diag([factor, factor, 1]) @ camera.K))
@@ -126,6 +139,9 @@ MISTAKES: dict[str, tuple[Callable[[Sample], Sample], str]] = {
     "ROS axes": (poses(lambda pose: pose @ BODY.T), r"cam2ego: .*ROS.*\[\[0, 0, 1\], \[-1, 0, 0\], \[0, -1, 0\]\]"),
     "inverted cam2ego": (poses(np.linalg.inv), r"cam2ego: .*inverse.*np\.linalg\.inv"),
     "millimetres": (poses(millimetres), "cam2ego: .*millimetres.* by 1000"),
+    "poses in the world": (poses(lambda pose: WORLD @ pose), "cam2ego: .*world's frame; pass np.linalg.inv.ego2world"),
+    "points in the world": (in_world("points"), "points: .*nearest 1[12].. m away; are they in the world's frame"),
+    "boxes in the world": (in_world("boxes_3d"), "boxes_3d: .*nearest 1[12].. m away; are they in the world's frame"),
     "OpenGL's axes": (poses(lambda pose: pose @ np.diag([1.0, -1, -1, 1])), r"cam2ego: .*OpenGL.*negate"),
     "an ego frame with a camera's axes": (poses(lambda pose: BODY.T @ pose), "cam2ego: .*from the left"),
     "K of a smaller image": (scaled_K(0.8), "K: .*another resolution"),

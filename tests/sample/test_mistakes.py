@@ -170,7 +170,7 @@ def test_one_camera_elsewhere(street: Sample) -> None:
 def test_a_rig_of_heights_that_no_vehicle_has(street: Sample) -> None:
     rig = Rig(list(street["rig"]), ground_z_m=2.0)
     (finding,) = check_rig(rig)
-    assert "is ground_z_m the road's height" in finding.fix
+    assert "ground_z_m is the road's height" in finding.fix
     on_its_side = rig.with_cameras([camera.turned(roll_deg=90) for camera in street["rig"]])
     (finding,) = check_rig(Rig(list(on_its_side)))
     assert "lie on their side" in finding.found

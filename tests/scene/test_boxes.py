@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Rig, RigRetarget, SampleError
+from arbiview_aug import Rig, RigRetarget, SampleError, SampleTypeError, project_boxes_3d
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -211,6 +211,10 @@ def test_in_a_sample() -> None:
         retarget(sample | {"boxes_3d": torch.zeros(2, 5)})
     with pytest.raises(SampleError, match=r"boxes_3d\[0\]: expected finite numbers and positive sizes"):
         retarget(sample | {"boxes_3d": torch.full((1, 7), float("nan"))})
+    with pytest.raises(SampleError, match=r"boxes_3d\[0\]: .*; leave out rows that pad: a batch takes a list of boxes"):
+        retarget(sample | {"boxes_3d": torch.zeros(2, 7)})
+    with pytest.raises(SampleTypeError, match="boxes_3d: expected rows of numbers, of one frame, got list"):
+        project_boxes_3d([torch.zeros(2, 7), torch.zeros(0, 7)], rig)
 
 
 def test_auto_takes_boxes_where_there_are_some_and_warns_where_cameras_move_without() -> None:

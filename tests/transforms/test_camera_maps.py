@@ -157,6 +157,7 @@ def test_the_stem_adds_nothing_at_first_and_learns() -> None:
     [
         ({"maps": "rays"}, "maps: expected names among rays"),
         ({"maps": ()}, "maps: expected names"),
+        ({"maps": 16}, "maps: expected names among rays, .*got 16"),
         ({"maps": ("depth",)}, "maps: expected one of rays"),
         ({"stride": 0}, "stride: expected a number of pixels from 1, got 0"),
         ({"stride": 2.0}, "stride: expected"),

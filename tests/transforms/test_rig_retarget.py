@@ -221,10 +221,12 @@ def test_outputs_collate() -> None:
 
 def test_pixel_bound_keys_are_dropped_with_one_warning() -> None:
     source, retarget = ring(), RigRetarget(ring().turned(yaw_deg=3))
-    sample = sample_of(source, boxes_2d=torch.rand(3, 4), depth=torch.rand(4, *SIZE), neighbours=[])
-    with pytest.warns(UserWarning, match="drops boxes_2d, depth: they speak of the source's pixels"):
+    matrices = {key: torch.eye(4).expand(4, 4, 4) for key in ("lidar2img", "extrinsics")}
+    sample = sample_of(source, boxes_2d=torch.rand(3, 4), depth=torch.rand(4, *SIZE), neighbours=[], **matrices)
+    sample["depth_m"] = torch.ones(4, *SIZE)  # read, and dropped without a word
+    with pytest.warns(UserWarning, match="drops boxes_2d, depth, lidar2img, extrinsics: they speak of the source's"):
         out = retarget(sample)
-    assert not {"boxes_2d", "depth", "neighbours"} & set(out)
+    assert not {"boxes_2d", "depth", "depth_m", "neighbours", *matrices} & set(out)
     retarget(sample)  # without a second warning
 
 
@@ -290,6 +292,8 @@ def test_label_maps_that_do_not_fit() -> None:
         labels(torch.zeros((4, *SIZE), dtype=torch.int32), ignore_index=float("nan"))
     with pytest.raises(SampleError, match=r"classes: expected label maps of shape \(..., N, H, W\), got \(\)"):
         labels(torch.tensor(3))
+    with pytest.raises(SampleError, match=r"'camera 1': expected .*torch.bool', 1, 'H', .*, got .*2, .*; merge masks"):
+        labels([torch.zeros((k, *SIZE), dtype=torch.bool) for k in range(1, 5)])
     labels(torch.zeros((4, *SIZE), dtype=torch.int8), ignore_index=-1)
     with pytest.raises(SampleTypeError, match="classes: expected label maps as tensors, got ndarray"):
         labels(np.zeros((4, *SIZE)))
@@ -598,6 +602,7 @@ def test_prepare_builds_the_plan_that_samples_use() -> None:
     retarget({"images": smooth_images(source)})
     retarget({"images": smooth_images(source), "rig": ring()})  # an equal rig
     assert retarget.plans.misses == 1
+    assert RigRetarget("waymo", geometry="street").prepare("nuscenes").source.name == "nuscenes"
     for bad in (RigRetarget(ring()), RigRetarget(RandomRig(ring()), source=source)):
         with pytest.raises(ValueError, match="prepare: expected a source rig and a fixed target rig"):
             bad.prepare()
@@ -705,6 +710,16 @@ def test_an_object_that_hides_everything_is_no_error() -> None:
     before = torch.tensor([[3.0, 0, 1.5, 0.5, 40, 40, 0]])
     out = RigRetarget(source.shifted(x_m=8.0), geometry="boxes")({**sample_of(source), "boxes_3d": before})
     assert not out["coverage"].any()
+
+
+def test_points_hide_no_mistake_in_the_poses() -> None:
+    """Over the street, cameras of the world's frame see something at any distance."""
+    world = np.eye(4)
+    world[:3, 3] = 664_000, 5_400_000, 430
+    sample = helpers.street_sample()
+    rig = sample["rig"].with_cameras([camera.moved(world) for camera in sample["rig"]])
+    with pytest.raises(SampleError, match=r"source's cam2ego seems to be poses in the world's frame: pass np\.linalg"):
+        RigRetarget(sample["rig"].shifted(z_m=1))({**sample, "rig": rig})
 
 
 @pytest.mark.parametrize(

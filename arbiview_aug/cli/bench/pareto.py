@@ -156,6 +156,11 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
             executions=arguments.execution,
         )
     }
+    if not by_name or not set(offered).issuperset(arguments.geometry or ()):
+        wanted = f"--geometry {' '.join(arguments.geometry or ['none'])} --quality {' '.join(arguments.quality)}"
+        refined = [name for name in offered if GEOMETRIES[name].overlap_depth]
+        expected = f"{', '.join(offered)}, which the samples offer (accurate: {', '.join(refined)})"
+        raise DataError(f"{wanted}: expected geometry of {expected}")
     prefix, rows = "even" if data.truth is None else "true", []
     for name, one in tqdm(by_name.items(), desc="accuracy", unit="setting", leave=False):
         memory = peak_mib(alternating(one))

@@ -108,6 +108,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.motion_depth is not None and not FOLDERS.keys() & GEOMETRIES[arguments.geometry].reads:
         fitting = "auto, motion, fused or learned"
         raise DataError(f"--depth: expected it with --geometry {fitting}, got {arguments.geometry}")
+    if arguments.motion_depth is not None and not arguments.motion_depth.is_dir():
+        raise DataError(f"--depth {arguments.motion_depth}: expected a folder that the depth command wrote, found none")
     settings = _settings(arguments)
     check_output(settings)
     if arguments.verify:

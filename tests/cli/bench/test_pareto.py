@@ -119,6 +119,12 @@ def test_real_frames_need_points(fisheye_root: Path, tmp_path: Path, capsys: pyt
     assert "expected LiDAR points to score by, got none" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("chosen", [["--geometry", "motion"], ["--quality", "accurate", "--geometry", "infinity"]])
+def test_geometry_that_is_not_offered(chosen: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", *chosen, "--size", "16x44", "--output", str(tmp_path)]) == 2
+    assert "expected geometry of infinity, ground, street, boxes, lidar, which" in capsys.readouterr().err
+
+
 def test_real_frames_are_scored_by_points_that_nobody_read(nuscenes_root: Path) -> None:
     """Whatever is decoded, the same points score, by the same colours."""
     with recorded(nuscenes_root) as data:

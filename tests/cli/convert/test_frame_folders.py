@@ -161,7 +161,8 @@ def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.
 
 
 def test_impossible_settings(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for asked in (["--holes", "diffusion", "--generator", str(tmp_path / "none")], ["--size", "40000x8"]):
+    none = str(tmp_path / "none")
+    for asked in (["--holes", "diffusion", "--generator", none], ["--size", "40000x8"], ["--depth", none]):
         assert main(command(source, tmp_path / "new", *asked)) == 2
         assert "expected" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
