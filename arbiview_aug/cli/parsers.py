@@ -325,8 +325,9 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
     if name == "depth" and arguments.device and not arguments.model:
         parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
     if name == "evaluate":
-        if arguments.generator and "diffusion" not in arguments.holes:
-            parser.error("argument --generator: expected it with --holes diffusion")
+        for option in ("generator", "steps"):
+            if getattr(arguments, option) != parser.get_default(option) and "diffusion" not in arguments.holes:
+                parser.error(f"argument --{option}: expected it with --holes diffusion")
         fixed = _FIXED if not arguments.lidar else [name for name in _FIXED if name != "target"]
         for option in fixed if arguments.displaced else ():
             if getattr(arguments, option) != parser.get_default(option):

@@ -142,6 +142,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("evaluate --holes diffusion --generator /nope", "generator /nope: expected a folder of a generator"),
         ("evaluate --quality paper fast --geometry street", "quality paper knows the far surface alone, got street"),
         ("evaluate --generator /nope", "argument --generator: expected it with --holes diffusion"),
+        ("evaluate --steps 3", "argument --steps: expected it with --holes diffusion"),
         ("view --output a.mp4", r"expected a name ending in \.rrd, got 'a\.mp4'"),
         ("depth --data frame --device nope", "argument --device: expected it with --model alone"),
         ("depth --data frame --model m --device nope", "expected cpu, cuda, cuda:1, ..., got 'nope'"),
