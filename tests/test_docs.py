@@ -182,7 +182,10 @@ def check_completed(names: dict[str, Any]) -> None:
 
 
 CHECKS: dict[str, Callable[[dict[str, Any]], None]] = {
-    "rigs.md": check_truck, "drives.md": check_filled, "holes.md": check_completed, "contributing.md": check_read,
+    "rigs.md": check_truck,
+    "drives.md": check_filled,
+    "holes.md": check_completed,
+    "contributing.md": check_read,
 }
 """Values that a page's code must leave in its names."""
 
@@ -377,7 +380,8 @@ def test_the_reference_lists_what_is_public() -> None:
 
 def test_names_are_complete() -> None:
     for page, names in (
-        ("rigs.md", shipped_rigs()), ("surfaces.md", [*get_args(GeometryName), *get_args(Quality)]),
+        ("rigs.md", shipped_rigs()),
+        ("surfaces.md", [*get_args(GeometryName), *get_args(Quality)]),
     ):
         for name in names:
             assert f"`{name}`" in text_of(ROOT / "docs" / page)

@@ -20,7 +20,9 @@ def _garbled(content: bytes) -> bytes:
 
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {
-    "emptied": lambda content: b"", "cut": lambda content: content[: len(content) // 2], "garbled": _garbled,
+    "emptied": lambda content: b"",
+    "cut": lambda content: content[: len(content) // 2],
+    "garbled": _garbled,
 }
 
 

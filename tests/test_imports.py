@@ -38,6 +38,8 @@ HEAVY = (
     "accelerate",
     "transformers",
 )
+
+
 def modules() -> dict[str, Path]:
     """Dotted names below the package; a package's ``__init__`` goes by the package's name."""
     paths = {}

@@ -250,7 +250,7 @@ _MIN_SEAM_PIXELS, _SEAM_PRIOR, _MAX_SEAM_LOG_GAIN = 4, 0.1, 0.15
 """Along seams: pixels that a group needs; the weight of no change, where a group without noise has 1; the bound of what
 is added to log-gains."""
 
-_SMOOTH = np.exp(-np.subtract.outer(np.arange(SEAM_ROWS), np.arange(SEAM_ROWS)) ** 2)
+_SMOOTH = np.exp(-(np.subtract.outer(np.arange(SEAM_ROWS), np.arange(SEAM_ROWS)) ** 2))
 """Weights between the parts of a view's height."""
 
 

@@ -68,5 +68,3 @@ def _timed(
 
     views, metrics = scores(frame, render, target, ("even",))
     return views, metrics, times
-
-

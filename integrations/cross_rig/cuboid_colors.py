@@ -186,9 +186,10 @@ def _road(s: Surface) -> Tensor:
     else:
         tone, joint = _tiles(x, y, (5.0, street.lane_width_m), 0.06, f, salt + 3)
         grain = 0.08 * octave(x, y, 0.15, f, salt + 4)
-        color = torch.tensor([1.0, 0.99, 0.95]) * (
-            street.asphalt * 1.15 * (1 + 0.07 * tone - 0.5 * joint + stains + grain)
-        )[:, None]
+        color = (
+            torch.tensor([1.0, 0.99, 0.95])
+            * (street.asphalt * 1.15 * (1 + 0.07 * tone - 0.5 * joint + stains + grain))[:, None]
+        )
     edge = street.lanes * street.lane_width_m
     line = band(y.abs(), edge - 0.15, edge, f) + band(y.abs(), -1.0, 0.06, f) * pulses(x, 4.0, 1.5, f)
     return mix(color, torch.tensor([0.86, 0.66, 0.10]), 0.85 * line.clamp(0, 1) * scene.lined)

@@ -307,9 +307,7 @@ class _World:
         place.ellipsoid((0, 0, middle), (spread, spread, height - middle), Look(Material.LEAF, crown))
 
 
-def _add_body(
-    place: Placed, kind: _Kind, size: Vector, color: Callable[..., Vector], rng: np.random.Generator
-) -> None:
+def _add_body(place: Placed, kind: _Kind, size: Vector, color: Callable[..., Vector], rng: np.random.Generator) -> None:
     """A cuboid body with a cuboid cabin on it, a load behind the cab of a lorry, and wheels, which give the width."""
     length, width, height = size
     x, y = length / 2, width / 2 - 0.02

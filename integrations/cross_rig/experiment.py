@@ -274,9 +274,7 @@ def jobs_of(setup: Run, family: str, length: Length) -> list[Job]:
     return [job for job in jobs(setup.settings) if (job.family, job.length) == (family, length)]
 
 
-def load_results(
-    setup: Run, family: str, length: Length = "short"
-) -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
+def load_results(setup: Run, family: str, length: Length = "short") -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
     """The results of a family on a schedule that are there: by change, variant and seed."""
     found: dict[str, dict[str, dict[int, dict[str, Any]]]] = {}
     for job in jobs_of(setup, family, length):

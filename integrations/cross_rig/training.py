@@ -152,9 +152,7 @@ class Draws:
         augment_s: CPU seconds that scaling and cropping took so far.
     """
 
-    def __init__(
-        self, own: Frames, raw: Frames | None, num_frames: int, seed: int, *, augmented: bool = False
-    ) -> None:
+    def __init__(self, own: Frames, raw: Frames | None, num_frames: int, seed: int, *, augmented: bool = False) -> None:
         self.own, self.raw, self.num_frames, self.augmented = own, raw, num_frames, augmented
         self.order = np.random.default_rng([seed, 0])
         self.rng = np.random.default_rng([seed, 1])

@@ -56,7 +56,8 @@ BAD = {
     "K with another scale": ({"K": 2 * K}, r"divide K by K\[2, 2\]"),
     "transposed pose": ({"cam2ego": POSE.T}, r"cam2ego: expected last row \(0, 0, 0, 1\).*pass cam2ego.T"),
     "negative focal": (
-        {"K": edited(K, (0, 0), -500.0)}, r"K: expected positive focal lengths, 1e-06 px at least, got fx -500",
+        {"K": edited(K, (0, 0), -500.0)},
+        r"K: expected positive focal lengths, 1e-06 px at least, got fx -500",
     ),
     "zero focal": ({"K": edited(K, (1, 1), 0.0)}, r"positive focal lengths, 1e-06 px at least, got fx 500, fy 0"),
     "focal whose inverse is infinite": ({"K": edited(K, (1, 1), 5e-324)}, r"1e-06 px at least, got fx 500, fy 4.94"),

@@ -217,7 +217,13 @@ def test_opencvs_lenses_by_their_other_names(alias: Any, lens: str, tmp_path: Pa
     folder = write_frame(tmp_path / "a", {}, {"distortion": data["cameras"][0]["distortion"]})
     assert FrameFolder(folder)[0]["rig"] == expected
     camera = Camera.looking(
-        name="front", azimuth_deg=0, width_px=16, height_px=12, K=RIG.K[0], lens=alias, distortion=coefficients,
+        name="front",
+        azimuth_deg=0,
+        width_px=16,
+        height_px=12,
+        K=RIG.K[0],
+        lens=alias,
+        distortion=coefficients,
     )
     assert camera == expected[0]
     padded = torch.tensor([[*coefficients, 0, 0, 0, 0]])

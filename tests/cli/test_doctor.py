@@ -31,9 +31,7 @@ def test_a_sound_installation(
         ({"opencv-python": "5.0", "opencv-contrib-python": "4.9"}, False, "pip uninstall -y opencv-python opencv-c"),
     ],
 )
-def test_wheels_of_opencv(
-    wheels: dict[str, str], is_fine: bool, text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_wheels_of_opencv(wheels: dict[str, str], is_fine: bool, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (doctor, environment):
         monkeypatch.setattr(module, "cv2_wheels", lambda: wheels)
     line = doctor._opencv()

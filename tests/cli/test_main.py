@@ -300,7 +300,12 @@ HELP = {
     "demo": ("--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--geometry", "--seed N seed of"),
     "depth": ("--data [KIND:]PATH", "--output", "--workers"),
     "evaluate": (
-        "--data [KIND:]PATH", "--target RIG", "--output DIR", "--quality", "--target-set", "--displaced",
+        "--data [KIND:]PATH",
+        "--target RIG",
+        "--output DIR",
+        "--quality",
+        "--target-set",
+        "--displaced",
     ),
     "doctor": ("--size HxW", "extras"),
     "inspect": ("RIG", "--output FILE"),

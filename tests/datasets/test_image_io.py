@@ -71,7 +71,9 @@ def test_without_the_rgb_flag_of_newer_opencv(jpeg: Path, tmp_path: Path, monkey
     monkeypatch.setattr(images_module, "_RGB_FLAG", None)
     monkeypatch.setattr(images_module, "_FLAGS", cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_COLOR)
     monkeypatch.setattr(
-        images_module, "_REDUCED_FLAGS", {1: 0, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4},
+        images_module,
+        "_REDUCED_FLAGS",
+        {1: 0, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4},
     )
     images = decode_images(files)
     assert isinstance(images, torch.Tensor) and isinstance(expected, torch.Tensor)

@@ -173,7 +173,8 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
     target.save(tmp_path / "target.yaml")
     common = ["--data", str(tmp_path / "data"), "--target", str(tmp_path / "target.yaml"), "--images", "png"]
     ways = {
-        "seen": ["--holes", "black"], "done": ["--holes", "diffusion", "--generator", str(pipeline), "--steps", "1"],
+        "seen": ["--holes", "black"],
+        "done": ["--holes", "diffusion", "--generator", str(pipeline), "--steps", "1"],
     }
     for name, way in ways.items():
         assert (

@@ -88,7 +88,8 @@ def test_names_in_parts_have_the_weight_of_a_part() -> None:
 @pytest.mark.slow
 def test_labels_of_a_real_frame_reach_stage_3(nuscenes_root) -> None:
     labelled, small = (
-        NuScenesDataset(nuscenes_root, "v1.0-mini", load_points=False)[0], FrameFolder(nuscenes_root, reduce=2)[0],
+        NuScenesDataset(nuscenes_root, "v1.0-mini", load_points=False)[0],
+        FrameFolder(nuscenes_root, reduce=2)[0],
     )
     sample = {key: small[key] for key in ("images", "rig")} | {k: labelled[k] for k in ("boxes_3d", "box_names")}
     rendering = RigRetarget(sample["rig"].turned(yaw_deg=-22), quality="paper").explain(sample).rendering

@@ -214,7 +214,8 @@ ERRORS: dict[str, tuple[Callable[[Sample], Sample], str]] = {
     "ROS axes": (MISTAKES["ROS axes"][0], "ROS.*multiply cam2ego"),
     "positions in millimetres": (MISTAKES["millimetres"][0], "millimetres: divide"),
     "a mask of 0 and 255": (
-        lambda s: {**s, "ego_mask": torch.zeros(6, 64, 176, dtype=torch.uint8)}, "ego_mask: .*bool",
+        lambda s: {**s, "ego_mask": torch.zeros(6, 64, 176, dtype=torch.uint8)},
+        "ego_mask: .*bool",
     ),
     "images under another key": (lambda s: {**without("images")(s), "imgs": s["images"]}, "did you mean 'images'"),
 }

@@ -62,7 +62,8 @@ def layer_at(view: Panorama, layer: np.ndarray, directions: np.ndarray) -> np.nd
     """Bilinear values (...,) of a panorama's layer along unit rays (..., 3); its border beyond it."""
     (first, lead, low), rad = view.window.place[:3].astype(np.float64), view.window.cells.rad
     azimuth, elevation = (
-        np.arctan2(directions[..., 1], directions[..., 0]), np.arcsin(np.clip(directions[..., 2], -1, 1)),
+        np.arctan2(directions[..., 1], directions[..., 0]),
+        np.arcsin(np.clip(directions[..., 2], -1, 1)),
     )
     column = lead + ((azimuth - first) / rad - lead) % (2 * np.pi / rad)
     at = [np.clip(a, 0, n - 1) for a, n in zip(((elevation - low) / rad, column), layer.shape, strict=True)]
