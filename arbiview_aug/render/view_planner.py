@@ -104,17 +104,12 @@ class _Region:
     geometry: _Geometry
     columns: npt.NDArray[np.int64]  # (ny, 2) first and last (exclusive) cell in view of each row of cells
     kernel: tuple[Any, ...]
+    hides: bool  # whether occluders or a mask may hide what lies in the source's image
     score: npt.NDArray[np.float32]  # stage-4 weight, 0 where not visible
     parallax: npt.NDArray[np.float32]  # expected displacement, target pixels
     border_px: npt.NDArray[np.float32]  # distance to the border of what the source sees, target pixels
     fineness: float  # median of the pixels, as they are read, per target pixel
     certainty: npt.NDArray[np.float32] | None  # in 255ths, if asked for
-
-    @property
-    def hides(self) -> bool:
-        """Whether occluders or a mask may hide what lies in the source's image."""
-        _, _, _, _, _, clean, _, shadow, *_ = self.kernel
-        return bool(clean.size or shadow.size)
 
 
 class ViewPlanner:
@@ -295,7 +290,7 @@ class ViewPlanner:
         )  # fmt: skip
         most = np.sort(resolution[edge_px > 0][::4])  # pixels that it cannot project lie far outside
         level = halvings(most[len(most) // 5], source.size) if self.config.antialias and len(most) else 0
-        kernel = self._kernel(source, level, geometry, A, o, P)
+        kernel, hides = self._kernel(source, level, geometry, A, o, P)
         positions = np.ascontiguousarray(kernel[-1][(slice(None), *self.at_nodes)]) if kind < 0 else kernel[-1]
         is_primary = baseline_m < SAME_CENTER_M
         score = source_weight(edge_px, min(source.size) / 2, parallax, resolution, is_primary).astype(np.float32)
@@ -312,6 +307,7 @@ class ViewPlanner:
             geometry=geometry,
             columns=columns,
             kernel=kernel,
+            hides=hides,
             score=score,
             parallax=rounded[0],
             border_px=rounded[1],
@@ -319,8 +315,10 @@ class ViewPlanner:
             certainty=None if certain is None else _filled(certain, np.abs(u) < 0.9 * FAR_AWAY_PX),
         )
 
-    def _kernel(self, source: Camera, level: int, geometry: _Geometry, A: Any, o: Any, P: Any) -> tuple[Any, ...]:
-        """The source as ``kernels.put_source`` reads it, halved ``level`` times."""
+    def _kernel(
+        self, source: Camera, level: int, geometry: _Geometry, A: Any, o: Any, P: Any
+    ) -> tuple[tuple[Any, ...], bool]:
+        """The source as ``kernels.put_source`` reads it, halved ``level`` times, and whether it has what hides."""
         from arbiview_aug.cameras.kernels import LENS_CODES
 
         kind, surface = LENS_CODES.get(source.lens, -1), geometry.surface
@@ -336,19 +334,21 @@ class ViewPlanner:
             half = halved_camera(source, coarser) if coarser else source
             occluders = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)
             shadow_scale = 0.5 ** (coarser - level)
-        return (
+        clean = self.maps.clean_pixels(source, level)
+        kernel = (
             A,
             o,
             kind,
             source.parameters_at(0.5**level) if level else P,
             np.array([*source_bounds(source.size, level), shadow_scale], np.float32),
-            self.maps.clean_pixels(source, level),
+            clean,
             occluders.before_m,
             occluders.beyond,
             np.ascontiguousarray(occluders.solid),
             geometry.is_guess,
             positions,
         )
+        return kernel, bool(clean.size or occluders.beyond.size)
 
     # --- who wins -----------------------------------------------------------------------------------------------------
     def finish(self, layout: AtlasLayout) -> ViewPlan:
