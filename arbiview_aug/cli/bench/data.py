@@ -50,10 +50,11 @@ class Recorded:
         return partial(data.__getitem__, 0)
 
     def target(self, name: str | None, size: tuple[int, int]) -> Rig:
-        """Rig to render, stretched to (h, w); by default the one that other commands take."""
+        """Rig to render, stretched to (h, w), by default the one that other commands take; without scanners, which
+        ``bench speed`` times."""
         if name is None and self.truth is not None:
-            return demo_target_rig(size)
-        return without_masks(load_rig(name or REAL_TARGET)).resized(size, "stretch")
+            return replace(demo_target_rig(size), lidars=())
+        return replace(without_masks(load_rig(name or REAL_TARGET)).resized(size, "stretch"), lidars=())
 
     def frame(self, index: int, reduce: Reduce, reference: Reduce) -> ScoredFrame:
         """Frame with images at 1 / ``reduce``, scored by the colours of images at 1 / ``reference``.

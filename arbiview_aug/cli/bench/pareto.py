@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -130,7 +130,7 @@ def run(arguments: argparse.Namespace) -> int:
 def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     """Score and time all settings, and recommend one."""
     source: Rig = data.sample(0, REFERENCE)["rig"]
-    target = replace(data.target(arguments.target, arguments.size), lidars=())  # ``bench speed`` times scans
+    target = data.target(arguments.target, arguments.size)
     if "paper" in arguments.quality:  # homographies know no lens; all settings share the target
         target = target.undistorted()
 
