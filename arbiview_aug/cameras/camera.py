@@ -161,7 +161,7 @@ class Camera:
     @cached_property
     def center_m(self) -> FloatArray:
         """(3,) optical centre in the ego frame."""
-        return self.cam2ego[:3, 3].copy()  # contiguous, as kernels are compiled for it
+        return self.cam2ego[:3, 3]
 
     @property
     def azimuth_deg(self) -> float:

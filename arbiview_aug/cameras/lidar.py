@@ -113,7 +113,7 @@ class Lidar:
     @property
     def center_m(self) -> FloatArray:
         """(3,) origin of the rays in the ego frame."""
-        return self.lidar2ego[:3, 3].copy()
+        return np.asarray(self.lidar2ego[:3, 3])
 
     @cached_property
     def content_key(self) -> bytes:

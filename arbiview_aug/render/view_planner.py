@@ -435,7 +435,7 @@ class ViewPlanner:
         labelled = self.scene.boxes if "boxes" in GEOMETRIES[self.surface].reads else None
         boxes = np.zeros((0, 7)) if labelled is None else labelled[:, :7]
         near_last = np.argsort(-np.linalg.norm(boxes[:, :3] - self.camera.center_m, axis=-1), kind="stable")
-        pose = self.camera.center_m, np.ascontiguousarray(self.camera.cam2ego[:3, :3])
+        pose = np.ascontiguousarray(self.camera.center_m), np.ascontiguousarray(self.camera.cam2ego[:3, :3])
         node_rad, winner = self.step / float(self.camera.K[0, 0]), np.empty(scores.shape[1:], np.int8)
         win_nodes(scores, parallax, boxes[near_last], *pose, self.node_rays, self.rays.cone, node_rad, winner)
         return seam_weights(winner, border_px, self._seam_radius, width_px)

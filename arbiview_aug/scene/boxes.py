@@ -297,7 +297,7 @@ def solid_rows(
 
     most = planes.shape[0] * planes.shape[1] + 1
     rows, numbers = np.empty((most, ROW), np.float32), np.empty(most, np.int64)
-    pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), camera.center_m
+    pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), np.ascontiguousarray(camera.center_m)
     boxes, planes = np.ascontiguousarray(boxes), np.ascontiguousarray(planes)
     count = describe(boxes, planes, pose[1], pose[0], rays.cone, rows, numbers)
     return rows[:count], numbers[:count]

@@ -100,7 +100,7 @@ def _returns(lidar: Lidar, rays: Layer, scenes: Sequence[Points], ground_z_m: fl
     from arbiview_aug.scene.completion import cells_of, elevations
     from arbiview_aug.scene.scan_kernels import continue_road, meet_points
 
-    size, origin = rays.shape[1:], lidar.center_m
+    size, origin = rays.shape[1:], lidar.center_m.copy()
     q, nearest = np.zeros(size, np.float32), np.full(size, -1, np.int32)
     if not len(scenes[-1]):
         return q, nearest

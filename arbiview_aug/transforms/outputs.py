@@ -76,7 +76,8 @@ class SampleWriter:
     def _passed_on(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
         """The entries that do not depend on the images, as the same objects."""
         named = (*labels, *self.keys.keep)
-        stale = [key for key in sample if key in (*PIXEL_BOUND_KEYS, *POSE_KEYS) and key not in named]
+        bound = (*PIXEL_BOUND_KEYS, *POSE_KEYS)
+        stale = [key for key in sample if key in bound and key not in named]
         # The coverage of an earlier retargeting already masks what it generated.
         dropped = [key for key in stale if key not in (*self.keys.extra, "generated", "depth_m")]
         if dropped:

@@ -126,7 +126,7 @@ def test_arrays_are_copies_and_read_only() -> None:
     camera = make(K=intrinsics, mask=mask)
     intrinsics[0, 0], mask[0, 0] = 1.0, False
     assert camera.K[0, 0] == 500.0 and camera.mask is not None and camera.mask.all()
-    for array in (camera.K, camera.cam2ego, camera.mask):
+    for array in (camera.K, camera.cam2ego, camera.mask, camera.center_m[None]):
         with pytest.raises(ValueError, match="read-only"):
             array[0, 0] = 0
 
