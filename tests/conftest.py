@@ -1,6 +1,7 @@
 """Fixtures that several test modules share."""
 
 import importlib.util
+import logging
 import math
 import os
 import subprocess
@@ -122,6 +123,10 @@ def own_ray(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     yield
     ray.shutdown()
+    # Ray's handlers keep the stream that stood for standard error when it was imported: the capture of a first test
+    # is closed in the second, and each record then ends in a traceback.
+    for name in [name for name in logging.root.manager.loggerDict if name.split(".")[0] == "ray"]:
+        logging.getLogger(name).handlers.clear()
 
 
 def _frame(data_root: Path, name: str) -> Path:
