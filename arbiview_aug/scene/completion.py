@@ -157,17 +157,18 @@ def nearest_points(points: Any, cones: Any, origin: Any, bounds: Any, place: Any
 @compiled
 def drop_hidden(
     q: Any, most: Any, number: Any, points: Any, origin: Any, away: int, side: int, sparse: int
-) -> tuple[Any, Any]:
-    """Drop points that shine through gaps of what is nearer on both sides of them.
+) -> tuple[Any, Any, Any]:
+    """Drop points that shine through gaps of what is nearer on both sides of them, and find thin things.
 
     ``q`` and ``number`` are those of ``nearest_points``, ``most`` is ``window_max`` of ``q`` over ``2 * side`` cells,
     ``away`` and ``side`` are ``SEE_THROUGH_RAD`` and ``SIDE_RAD`` in cells. Points from number ``sparse`` on are of
     depth maps, which show gaps as they are: only cells next to them count. Returns the flat indices (n,) of cells that
-    keep their point, and its ray (3, 1, n) in the ego frame, float32.
+    keep their point, its ray (3, 1, n) in the ego frame, float32, and whether it lies clearly before all points above
+    and below it, within ``away`` and not next to it: such as a tape that one scan line met.
     """
     h, w = q.shape
     more = away - 1 - 2 * side  # windows are longer than wide
-    cells, n, rays = np.empty(h * w, np.int64), 0, np.empty((3, h * w), np.float32)
+    cells, n, rays, thin = np.empty(h * w, np.int64), 0, np.empty((3, h * w), np.float32), np.empty(h * w, np.bool_)
     between, inner = np.zeros(w, np.float32), w - 2
     for y in range(h):
         inside = away <= y < h - away
@@ -181,6 +182,7 @@ def drop_hidden(
         for x in range(w):
             if q[y, x] <= _ZERO:
                 continue
+            thin[n] = False
             if number[y, x] >= sparse:
                 if q[y, x] < between[x]:
                     continue
@@ -188,8 +190,9 @@ def drop_hidden(
                 row, west, east = most[y - side], x - away, x + 1
                 across = min(max(row[west], row[west + more]), max(row[east], row[east + more]))
                 column, top, bottom = x - side, y - away, y + 1
-                above = max(most[top, column], most[top + more, column])
-                below = max(most[bottom, column], most[bottom + more, column])
+                above, below, behind = most[top, column], most[bottom + more, column], hidden_below(q[y, x])
+                thin[n] = _ZERO < above < behind and _ZERO < below < behind
+                above, below = max(above, most[top + more, column]), max(below, most[bottom, column])
                 if q[y, x] < hidden_below(max(across, min(above, below))):
                     continue
             point, near = points[number[y, x]], q[y, x]
@@ -197,7 +200,7 @@ def drop_hidden(
                 rays[axis, n] = (point[axis] - origin[axis]) * near
             cells[n] = y * w + x
             n += 1
-    return cells[:n].copy(), rays[:, :n].copy().reshape(3, 1, n)
+    return cells[:n].copy(), rays[:, :n].copy().reshape(3, 1, n), thin[:n].copy()
 
 
 @compiled
@@ -350,6 +353,44 @@ def average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, layers: Any)
             rest = _ONE - share0[x]
             one = (every[x] - part[x]) * per / max(rest, LEAST_WEIGHT) if rest > LEAST_WEIGHT else r0[x]
             out[x] = flat[x] if flat[x] == flat[x] else one
+
+
+@compiled
+def draw_thin(cells: Any, residuals: Any, up: int, side: int, code: Any, layers: Any) -> None:
+    """Draw points on layers that are made of all others: each takes the cells that are nearer to it than to another.
+
+    Around these cells three rings are left: one that leads from what the layers show to one side, the farther side of a
+    step, and the residual of its nearer side. Each blends with its neighbours without showing a third depth.
+
+    Args:
+        cells: (n,) flat indices of the points' cells.
+        residuals: (n,) their residuals.
+        up: Most cells above and below that a point takes.
+        side: ... on both sides.
+        code: That of ``nearest_residuals``, of the other points.
+        layers: ``Panorama.layers``; the first three are updated.
+    """
+    _, h, w = layers.shape
+    near, far, share = layers[0], layers[1], layers[2]
+    for ring in (3, 2, 1, 0):
+        for i in range(cells.shape[0]):
+            y0, x0 = cells[i] // w, cells[i] % w
+            for y in range(max(y0 - up, 3), min(y0 + up + 1, h - 3)):
+                for x in range(max(x0 - side, 3), min(x0 + side + 1, w - 3)):
+                    other = np.float32(code[y + 2, x + 2] >> 14) * np.float32(1 / 1024)
+                    if (y - y0) ** 2 + (x - x0) ** 2 > other * other:
+                        continue
+                    for j in range(y - ring, y + ring + 1):
+                        for k in range(x - ring, x + ring + 1):
+                            if ring == 3:
+                                shows_near = share[j, k] > _HALF
+                                near[j, k] = far[j, k] = near[j, k] if shows_near else far[j, k]
+                                share[j, k] = _ONE if shows_near else _ZERO
+                            elif ring == 2:
+                                share[j, k] = _ZERO
+                            else:
+                                near[j, k] = residuals[i]
+                                share[j, k] = share[j, k] if ring else _ONE
 
 
 @inlined

@@ -99,6 +99,10 @@ AROUND_CELLS = 5, 2
 """Half the height and width of the window in which a scan's own points speak against those of another frame: 1 by 0.4
 degrees. 0.6 to 1.4 by 0.2 to 0.8 degrees lie within 0.2 dB of each other."""
 
+THIN_CELLS = 1, 5
+"""Cells above and below, and on both sides, of a point of a thin thing that show it: 5 bridge gaps of 1 degree. A tape
+met by one scan line would else show what lies beside it in an oval as high as the lines are apart."""
+
 
 class Window(NamedTuple):
     """A part of the sphere, in cells: row 0 begins at the horizon, column 0 straight ahead."""
@@ -177,7 +181,8 @@ class Panorama:
     """Depth by the points (P, 3) within a window of the view from ``origin`` (3,), made dense over a static surface.
 
     Nearest point first in each cell, none within ``NEAREST_M``; points that shine through gaps of what is nearer are
-    dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart.
+    dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart;
+    what one scan line alone met is drawn on that.
 
     Attributes:
         layers: (4, rows, columns) residual of the nearer side of a step, or of everything where there is none, 1/m;
@@ -195,14 +200,15 @@ class Panorama:
         memory: Memory = FRESH,
         mapped: int = 0,
     ) -> None:
-        from arbiview_aug.scene.completion import average_sides, drop_hidden, nearest_points, nearest_residuals
+        from arbiview_aug.scene import completion
 
         self.window, self._origin, self._street, self._place = window, origin, street, window.place
         shape, cells = window.shape, window.cells
         q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
-        nearest_points(points, cones, origin, window.bounds, self._place, q, number)
+        completion.nearest_points(points, cones, origin, window.bounds, self._place, q, number)
         most, sparse = window_max(q, 2 * cells.side, 2 * cells.side), len(points) - mapped
-        cell, rays = drop_hidden(q, most, number, points, origin, cells.see_through, cells.side, sparse)
+        away = cells.see_through, cells.side, sparse
+        cell, rays, thin = completion.drop_hidden(q, most, number, points, origin, *away)
         own_q = q.reshape(-1)[cell]
         residual = own_q - street.along(origin, rays)[0]
         # Windows differ by some rows from frame to frame: blocks of few sizes are found again.
@@ -211,9 +217,11 @@ class Panorama:
         r, q_near, code = memory.empty((3, block), np.float32)
         r, q_near = (plane[: q.size].reshape(shape) for plane in (r, q_near))
         code = code[: (shape[0] + 4) * (shape[1] + 4)].view(np.int32).reshape(shape[0] + 4, -1)
-        nearest_residuals(cell, own_q, residual, cells.reach, cells.support, code, r, q_near, self.layers)
+        others = (part[~thin] for part in (cell, own_q, residual))
+        completion.nearest_residuals(*others, cells.reach, cells.support, code, r, q_near, self.layers)
         high, low = (window_max(of, 2 * cells.smooth, 2 * cells.smooth) for of in (r, -r))
-        average_sides(r, q_near, high, low, cells.smooth, self.layers)
+        completion.average_sides(r, q_near, high, low, cells.smooth, self.layers)
+        completion.draw_thin(cell[thin], residual[thin], *THIN_CELLS, code, self.layers)
 
     @cached_property
     def hidden_below(self) -> Layer:

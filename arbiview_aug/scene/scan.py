@@ -127,7 +127,7 @@ def _visible(window: Window, origin: FloatArray, points: Points) -> tuple[Number
     nearest_points(points, block_cones(points), origin, window.bounds, window.place, closest, number)
     most = window_max(closest, 2 * SCANNED.side, 2 * SCANNED.side)
     visible = SCANNED.see_through, SCANNED.side, len(points)
-    cell, directions = drop_hidden(closest, most, number, points, origin, *visible)
+    cell, directions, _ = drop_hidden(closest, most, number, points, origin, *visible)
     at = np.empty((2, 1, len(cell)), np.float32)
     cells_of(directions, np.eye(3, dtype=np.float32), window.place, *at)
     index = np.full(window.shape, -1, np.int32)

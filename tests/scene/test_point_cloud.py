@@ -105,6 +105,24 @@ def test_depth_maps_show_gaps_as_they_are() -> None:
     assert np.allclose(inverse_distance(mixed, EYE, gap), 3 * q, rtol=0.02)
 
 
+def test_a_tape_that_one_scan_line_met_is_no_higher_than_the_line() -> None:
+    """It ends where the line meets the wall again, and lines 1.3 degrees above and below it meet the wall."""
+    degree = np.radians(1)
+    azimuth, line = (grid.ravel() for grid in np.meshgrid(np.arange(-20, 20, 0.2), 1.3 * np.arange(-6, 7)))
+    x_m = np.where((line == 0) & (abs(azimuth) < 2.1), 12.0, 32.0)
+    surface = PointCloudSurface(Street(), EYE + seen_at(azimuth * degree, line * degree, x_m - EYE[0]))
+    across, up = np.array([[0.0, 0.0], [1.5, 0.0], [0.0, 0.7], [1.5, -0.7], [2.7, 0.0], [-2.7, 0.0]]).T * degree
+    rays, _ = towards(EYE + seen_at(across, up, np.ones(6)))
+    ahead_m = rays[:, 0] / inverse_distance(surface, EYE, rays)
+    assert np.allclose(ahead_m, np.array([12, 12, 32, 32, 32, 32]) - EYE[0], rtol=0.02)
+
+
+def seen_at(azimuth: np.ndarray, elevation: np.ndarray, ahead_m: np.ndarray) -> np.ndarray:
+    """Offsets (n, 3) of points at angles, whose x is known."""
+    y = np.tan(azimuth)
+    return ahead_m[:, None] * np.stack([np.ones_like(y), y, np.hypot(1, y) * np.tan(elevation)], -1)
+
+
 def test_silence_is_the_street() -> None:
     surface, street = PointCloudSurface(Street(), NEAR), Street()
     beyond = 2 / 10 + np.tan(REACH_RAD) + 0.1
