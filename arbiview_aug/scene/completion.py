@@ -357,10 +357,10 @@ def average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, layers: Any)
 
 @compiled
 def draw_thin(cells: Any, residuals: Any, up: int, side: int, code: Any, layers: Any) -> None:
-    """Draw points on layers that are made of all others: each takes the cells that are nearer to it than to another.
+    """Draw thin things' points on layers made of all others: each takes the cells nearer to it than to another point.
 
-    Around these cells three rings are left: one that leads from what the layers show to one side, the farther side of a
-    step, and the residual of its nearer side. Each blends with its neighbours without showing a third depth.
+    Neighbouring cells blend, so three rings of cells around are prepared. In the outermost both sides of a step become
+    what is shown; the next one shows the farther side; the innermost has the point's residual on the nearer side.
 
     Args:
         cells: (n,) flat indices of the points' cells.
@@ -380,17 +380,18 @@ def draw_thin(cells: Any, residuals: Any, up: int, side: int, code: Any, layers:
                     other = np.float32(code[y + 2, x + 2] >> 14) * np.float32(1 / 1024)
                     if (y - y0) ** 2 + (x - x0) ** 2 > other * other:
                         continue
-                    for j in range(y - ring, y + ring + 1):
-                        for k in range(x - ring, x + ring + 1):
-                            if ring == 3:
+                    if ring == 3:
+                        for j in range(y - ring, y + ring + 1):
+                            for k in range(x - ring, x + ring + 1):
                                 shows_near = share[j, k] > _HALF
                                 near[j, k] = far[j, k] = near[j, k] if shows_near else far[j, k]
                                 share[j, k] = _ONE if shows_near else _ZERO
-                            elif ring == 2:
-                                share[j, k] = _ZERO
-                            else:
-                                near[j, k] = residuals[i]
-                                share[j, k] = share[j, k] if ring else _ONE
+                    elif ring == 2:
+                        share[y - 2 : y + 3, x - 2 : x + 3] = _ZERO
+                    elif ring == 1:
+                        near[y - 1 : y + 2, x - 1 : x + 2] = residuals[i]
+                    else:
+                        near[y, x], share[y, x] = residuals[i], _ONE
 
 
 @inlined

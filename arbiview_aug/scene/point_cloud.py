@@ -100,8 +100,8 @@ AROUND_CELLS = 5, 2
 degrees. 0.6 to 1.4 by 0.2 to 0.8 degrees lie within 0.2 dB of each other."""
 
 THIN_CELLS = 1, 5
-"""Cells above and below, and on both sides, of a point of a thin thing that show it: 5 bridge gaps of 1 degree. A tape
-met by one scan line would else show what lies beside it in an oval as high as the lines are apart."""
+"""Most cells above and below, and aside, that a thin thing's point takes: 5 bridge gaps of 1 degree. A tape that one
+scan line met would else take what lies beside it to its own distance, in ovals as high as the lines are apart."""
 
 
 class Window(NamedTuple):
@@ -181,8 +181,8 @@ class Panorama:
     """Depth by the points (P, 3) within a window of the view from ``origin`` (3,), made dense over a static surface.
 
     Nearest point first in each cell, none within ``NEAREST_M``; points that shine through gaps of what is nearer are
-    dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart;
-    what one scan line alone met is drawn on that.
+    dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart.
+    What one scan line alone met is drawn last (``THIN_CELLS``).
 
     Attributes:
         layers: (4, rows, columns) residual of the nearer side of a step, or of everything where there is none, 1/m;
@@ -207,8 +207,8 @@ class Panorama:
         q, number = np.zeros(shape, np.float32), np.empty(shape, np.int32)
         completion.nearest_points(points, cones, origin, window.bounds, self._place, q, number)
         most, sparse = window_max(q, 2 * cells.side, 2 * cells.side), len(points) - mapped
-        away = cells.see_through, cells.side, sparse
-        cell, rays, thin = completion.drop_hidden(q, most, number, points, origin, *away)
+        reach = cells.see_through, cells.side, sparse
+        cell, rays, thin = completion.drop_hidden(q, most, number, points, origin, *reach)
         own_q = q.reshape(-1)[cell]
         residual = own_q - street.along(origin, rays)[0]
         # Windows differ by some rows from frame to frame: blocks of few sizes are found again.
