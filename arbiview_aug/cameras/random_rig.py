@@ -65,7 +65,7 @@ class RandomRig:
         per: Literal["sample", "sequence"] = "sample",
         sequence_key: str = "scene_token",
     ) -> None:
-        self.base = base if isinstance(base, Rig) else load_rig(base)
+        self.base = load_rig(base)
         if per not in ("sample", "sequence"):
             raise CalibrationError(f"RandomRig: per: expected 'sample' or 'sequence', got {per!r}")
         self.per, self.sequence_key = per, sequence_key

@@ -268,17 +268,19 @@ class Rig:
         return path
 
 
-def load_rig(name_or_path: str | Path) -> Rig:
+def load_rig(name_or_path: Rig | str | Path) -> Rig:
     """A shipped rig by name (see ``shipped_rigs``), a rig file (YAML or JSON), or another tool's calibration.
 
     Recognised are files and folders of ROS (CameraInfo as camera_calibration writes it, with tf), Kalibr, COLMAP,
     OpenCV, nuScenes, Argoverse 2 and Waymo, with a file ``mounting.yaml`` beside them that holds what they lack
-    (docs/rigs.md). Files are read by safe parsers.
+    (docs/rigs.md). Files are read by safe parsers. A ``Rig`` is returned as it is.
 
     Raises:
         CalibrationError: An unknown name, a missing or unreadable file, or an impossible or ambiguous calibration.
         ImportError: Argoverse 2's files without pyarrow.
     """
+    if isinstance(name_or_path, Rig):
+        return name_or_path
     if not isinstance(name_or_path, str | Path):
         got = type(name_or_path).__name__
         raise CalibrationError(f"rig: expected a shipped rig's name or the path of a rig file, got {got}")

@@ -136,8 +136,8 @@ class RigRetarget(torch.nn.Module):
         super().__init__()
         refuse_old_options("RigRetarget", unknown)
         warn_about_cv2_wheels()
-        self.target = target if isinstance(target, Rig | RandomRig) else load_rig(target)
-        self.source = source if isinstance(source, Rig) or source is None else load_rig(source)
+        self.target = target if isinstance(target, RandomRig) else load_rig(target)
+        self.source = None if source is None else load_rig(source)
         self.geometry: GeometryName = choice("geometry", geometry, GEOMETRIES)
         self.neighbours = None if neighbours is None else choice("neighbours", neighbours, get_args(Reach))
         self.fit, self.p = choice("fit", fit, get_args(Fit)), checked_p(p, size)
@@ -400,7 +400,7 @@ class RigRetarget(torch.nn.Module):
         Raises:
             ValueError: No source rig, a random target, ``quality="paper"``, or a surface that every frame has anew.
         """
-        source = self.source if source is None else source if isinstance(source, Rig) else load_rig(source)
+        source = self.source if source is None else load_rig(source)
         if source is None or self._fixed_target is None:
             raise ValueError("prepare: expected a source rig and a fixed target rig")
         pair = self._plans.pair(source, self._fixed_target)
