@@ -13,7 +13,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_mounted, pose_mistake
 from arbiview_aug.choices import refuse_old_options
-from arbiview_aug.sample.inputs import Frame, misnamed_keys, read_frames
+from arbiview_aug.sample.inputs import Frame, focal_mistake, misnamed_keys, read_frames
 from arbiview_aug.sample.masks import CLEANING, dark_rims, without_specks
 from arbiview_aug.scene.boxes import checked_boxes, points_in
 from arbiview_aug.scene.point_cloud import checked_points, own_car
@@ -127,6 +127,8 @@ def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
             findings.append(Finding(f"camera {camera.name!r}: cam2ego", "a place on a vehicle", f"({at}) m", fix))
     findings += _resolution_findings(rig)
     for camera in rig:
+        if found := focal_mistake(camera):
+            findings.append(Finding(f"camera {camera.name!r}: K", "a focal length in pixels", *found))
         if camera.mask is None or not masks:
             continue
         turned = int((without_specks(camera.mask) != camera.mask).sum())

@@ -40,8 +40,8 @@ from arbiview_aug.sample.inputs import (
     check_other_keys,
     read_frames,
     read_scene,
+    warn_of_cameras,
     warn_of_misnamed,
-    warn_of_rims,
 )
 from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
@@ -273,7 +273,7 @@ class RigRetarget(torch.nn.Module):
             named = (*self.keys.labels, *self.keys.keep)
             reads_ego_frame = not self._row.is_static or self.keys.frame == "target"
             warn_of_misnamed(sample, calibrated, not reads_ego_frame, named, self._warn)
-            warn_of_rims(frames, self._warn)
+            warn_of_cameras(frames, self._warn)
             self._checked = types
         return check_other_keys(sample, list(sizes), self.keys.labels, self.keys.keep)
 

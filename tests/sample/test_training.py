@@ -62,7 +62,7 @@ def test_cells_are_lifted_that_are_covered_and_no_own_car() -> None:
     assert torch.equal(one, expected[0, 0])
     with pytest.raises(SampleError, match="'coverage'"):
         lift_mask({}, 4)
-    for stride in (0, 4.0, "4"):
+    for stride in (0, 4.0, "4", True):
         with pytest.raises(ValueError, match="stride: expected a number of pixels from 1, got"):
             lift_mask({"coverage": coverage}, stride)  # type: ignore[arg-type]
 

@@ -297,6 +297,8 @@ def test_label_maps_that_do_not_fit() -> None:
     labels(torch.zeros((4, *SIZE), dtype=torch.int8), ignore_index=-1)
     with pytest.raises(SampleTypeError, match="classes: expected label maps as tensors, got ndarray"):
         labels(np.zeros((4, *SIZE)))
+    with pytest.raises(SampleTypeError, match=r"classes: expected uint8 or .*torch.uint16; use .to\(torch.int32\)"):
+        labels(torch.zeros((4, *SIZE), dtype=torch.uint16))
     with pytest.raises(SampleError, match=r"SampleKeys.labels: expected classes in the sample, got images, K, cam2ego"):
         RigRetarget(ring(), keys=SampleKeys(labels=["classes"]))(sample_of(ring()))
 
