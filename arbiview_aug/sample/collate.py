@@ -29,7 +29,7 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         samples: At least one; with equal keys.
 
     Raises:
-        SampleError: No samples, different keys, or rigs that differ and have lenses or masks, which tensors do not carry.
+        SampleError: No samples, different keys, or rigs that differ and have lenses or masks: tensors carry neither.
     """
     if not samples or not all(isinstance(sample, Mapping) and "images" in sample for sample in samples):
         raise SampleError("collate: expected one or more samples with 'images', got none or something else")

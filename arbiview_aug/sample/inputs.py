@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from typing import Any
@@ -339,7 +339,7 @@ def _with_masks(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], inde
                     masks[k] = visible if mask is None else mask & visible
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:  # RuntimeError: meta, sparse
             raise SampleError(
-                f"{key}: expected a bool tensor of the size of each image, as an earlier retargeting gives it ({error}); "
+                f"{key}: expected a bool tensor of each image's size, as an earlier retargeting gives it ({error}); "
                 "rename the key if it is something else"
             ) from None
     if all(mask is camera.mask for mask, camera in zip(masks, rig, strict=True)):

@@ -402,7 +402,8 @@ class RigRetarget(torch.nn.Module):
         """
         source = self.source if source is None else load_rig(source)
         if source is None or self._fixed_target is None:
-            raise ValueError("prepare: expected a source rig and a fixed target rig")
+            got = f"{'no source' if source is None else 'a source'} and a target {type(self.target).__name__}"
+            raise ValueError(f"prepare: expected a source rig and a fixed target rig, got {got}")
         pair = self._plans.pair(source, self._fixed_target)
         if self._row.needs is not None and pair.needs_geometry:
             raise ValueError(

@@ -132,8 +132,11 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "rig of another size": (sample(rig=rig().resized(0.5)), r"camera 'c0': .*\(18, 32\), as calibrated, got \(36"),
     "swapped": (sample(images=torch.zeros(2, 3, W, H), rig=rig()), r"'c0': .* got \(64, 36\); height and width"),
     "swapped, no rig": (sample(images=torch.zeros(2, 3, W, H)), r"K\[0\]: .*; height and width are swapped"),
-    "coverage": (sample(coverage=0.7), "coverage: expected a bool tensor of the size of each image, .* rename the key"),
-    "ego_mask": (sample(ego_mask=torch.zeros(2, 5, 5, dtype=torch.bool)), "ego_mask: expected a bool tensor of the size"),
+    "coverage": (sample(coverage=0.7), "coverage: expected a bool tensor of each image's size, .* rename the key"),
+    "ego_mask": (
+        sample(ego_mask=torch.zeros(2, 5, 5, dtype=torch.bool)),
+        "ego_mask: expected a bool tensor of each",
+    ),
 }
 
 
