@@ -90,7 +90,7 @@ class Neighbours:
     def __post_init__(self) -> None:
         if not isinstance(self.count, int) or isinstance(self.count, bool) or self.count < 1:
             raise ValueError(f"neighbours: count: expected a whole number from 1, got {self.count!r}")
-        if not 0 < self.step_m < float("inf"):
+        if not isinstance(self.step_m, int | float) or not 0 < self.step_m < float("inf"):
             raise ValueError(f"neighbours: step_m: expected metres above 0, got {self.step_m!r}")
         if self.direction not in ("both", "past", "future"):
             raise ValueError(f"neighbours: direction: expected both, past or future, got {self.direction!r}")

@@ -606,9 +606,7 @@ def test_prepare_builds_the_plan_that_samples_use() -> None:
     assert retarget.plans.misses == 1
     assert RigRetarget("waymo", geometry="street").prepare("nuscenes").source.name == "nuscenes"
     for bad in (RigRetarget(ring()), RigRetarget(RandomRig(ring()), source=source)):
-        with pytest.raises(
-            ValueError, match=r"prepare: expected a source rig .*, got (no|a) source and a"
-        ):
+        with pytest.raises(ValueError, match=r"prepare: expected a source rig .*, got (no|a) source and a"):
             bad.prepare()
     of_frames = RigRetarget(ring().shifted(z_m=0.5), source=source, geometry="lidar")
     with pytest.raises(ValueError, match="prepare: expected a geometry whose plans come back, got 'lidar'"):
