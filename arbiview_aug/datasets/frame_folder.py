@@ -334,7 +334,8 @@ def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) ->
     if path is None:
         return camera
     try:
-        mask = _cached_mask(os.path.realpath(path), clean)
+        file = os.path.realpath(path)
+        mask = _cached_mask(file, clean, os.path.getmtime(file) if os.path.isfile(file) else 0.0)
     except CalibrationError:
         mask = read_mask(str(path), path.parent, f"{frame.where}: camera {camera.name!r}")  # again, in its frame's name
     with calibration_of(frame.where):
@@ -342,7 +343,7 @@ def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) ->
 
 
 @lru_cache(maxsize=_CACHED_MASKS)
-def _cached_mask(path: str, clean: bool) -> BoolArray:
+def _cached_mask(path: str, clean: bool, modified_s: float) -> BoolArray:
     mask = read_mask(path, Path(path).parent, "rig")
     return without_specks(mask) if clean else mask
 
@@ -379,6 +380,7 @@ def checked_points(array: Any, where: str) -> torch.Tensor:
         raise DataError(f"points {where}: expected a float array of shape (P, >=3), got {got}")
     if mistake := shape_mistake(array.shape):
         raise DataError(f"points {where}: {mistake}")
+    array = array.astype(np.float32) if array.dtype == np.float16 else array  # which holds no ``MOST_M``
     return torch.from_numpy(np.ascontiguousarray(returns(array), dtype=np.float32))
 
 

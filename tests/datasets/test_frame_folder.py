@@ -1,6 +1,7 @@
 """Frame folders: the sample, real frames, DataLoader, and folders that are not right."""
 
 import json
+import os
 import pickle
 import shutil
 from collections.abc import Callable
@@ -214,6 +215,15 @@ def test_mask_of_another_size(tmp_path: Path) -> None:
         FrameFolder(tmp_path)[0]
 
 
+def test_a_mask_that_was_drawn_anew_is_read_again(tmp_path: Path) -> None:
+    """In one process, as a notebook's, masks are held."""
+    frame(tmp_path)
+    assert FrameFolder(tmp_path)[0]["rig"]["back"].mask[:40].all()
+    cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((48, 64), np.uint8))
+    os.utime(tmp_path / "mask.png", (0, 0))  # another time, however coarse the clock
+    assert not FrameFolder(tmp_path)[0]["rig"]["back"].mask.any()
+
+
 def test_bad_points(tmp_path: Path) -> None:
     frame(tmp_path)
     dataset = FrameFolder(tmp_path)
@@ -244,6 +254,9 @@ def test_missing_returns_are_left_out(tmp_path: Path) -> None:
     """As RigRetarget leaves them out of a sample of the user's own."""
     np.save(frame(tmp_path) / "lidar.npy", np.array([[0, 0, np.nan], [1, 2, 3], [np.inf, 0, 0], [0, 0, 1e300]]))
     with pytest.warns(UserWarning, match="points: rows with NaN, infinity or over 1e.09 m are left out"):
+        assert FrameFolder(tmp_path)[0]["points"].tolist() == [[1, 2, 3]]
+    np.save(tmp_path / "lidar.npy", np.array([[np.inf, 0, 0], [1, 2, 3]], np.float16))
+    with pytest.warns(UserWarning, match="points: rows with NaN"):
         assert FrameFolder(tmp_path)[0]["points"].tolist() == [[1, 2, 3]]
 
 
