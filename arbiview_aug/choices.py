@@ -133,7 +133,7 @@ def choice(option: str, value: object, choices: Iterable[str]) -> Any:
 
 def checked_stride(name: str, value: Any) -> int:
     """A whole number of pixels from 1; ValueError for anything else."""
-    if not isinstance(value, int) or value < 1:
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name}: expected a number of pixels from 1, got {value!r}")
     return value
 

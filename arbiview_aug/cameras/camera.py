@@ -93,6 +93,12 @@ class Camera:
     def __post_init__(self) -> None:
         self.__dict__.update(checked_calibration(**self.__dict__))
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # Copies and unpickled cameras are read-only, too, and their centres views: kernels are compiled for those.
+        self.__dict__.update({key: value for key, value in state.items() if key != "center_m"})
+        for array in (self.K, self.cam2ego, *([] if self.mask is None else [self.mask])):
+            array.setflags(write=False)
+
     # --- construction ---------------------------------------------------------------------------------------------
     @classmethod
     def looking(

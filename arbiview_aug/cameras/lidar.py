@@ -85,6 +85,10 @@ class Lidar:
             "azimuth_deg": (first, end),
         }
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.lidar2ego.setflags(write=False)
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Lidar):
             return NotImplemented

@@ -65,7 +65,7 @@ class RandomRig:
         per: Literal["sample", "sequence"] = "sample",
         sequence_key: str = "scene_token",
     ) -> None:
-        self.base = base if isinstance(base, Rig) else load_rig(base)
+        self.base = load_rig(base)
         if per not in ("sample", "sequence"):
             raise CalibrationError(f"RandomRig: per: expected 'sample' or 'sequence', got {per!r}")
         self.per, self.sequence_key = per, sequence_key
@@ -150,8 +150,8 @@ def _range(name: str, value: Any) -> tuple[float, float]:
     except (TypeError, ValueError):
         low, high = math.nan, math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low <= high) or (is_scale and low <= 0):
-        positive = "positive " if is_scale else ""
-        raise CalibrationError(f"RandomRig: {name}: expected a half-width or a {positive}(low, high), got {value!r}")
+        kind = "half-width below 1 or a positive" if is_scale else "half-width or a"
+        raise CalibrationError(f"RandomRig: {name}: expected a {kind} (low, high), got {value!r}")
     return low, high
 
 

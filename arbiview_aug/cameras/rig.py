@@ -14,7 +14,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
@@ -61,7 +61,7 @@ class Rig:
     lidars: Sequence[Lidar] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        cameras = tuple(self.cameras)
+        cameras = tuple(self.cameras) if isinstance(self.cameras, Iterable) else (self.cameras,)
         where = f"rig {self.name!r}" if self.name else "rig"
         if not cameras:
             raise CalibrationError(f"{where}: expected at least one camera, got none")
@@ -268,17 +268,19 @@ class Rig:
         return path
 
 
-def load_rig(name_or_path: str | Path) -> Rig:
+def load_rig(name_or_path: Rig | str | Path) -> Rig:
     """A shipped rig by name (see ``shipped_rigs``), a rig file (YAML or JSON), or another tool's calibration.
 
     Recognised are files and folders of ROS (CameraInfo as camera_calibration writes it, with tf), Kalibr, COLMAP,
     OpenCV, nuScenes, Argoverse 2 and Waymo, with a file ``mounting.yaml`` beside them that holds what they lack
-    (docs/rigs.md). Files are read by safe parsers.
+    (docs/rigs.md). Files are read by safe parsers. A ``Rig`` is returned as it is.
 
     Raises:
         CalibrationError: An unknown name, a missing or unreadable file, or an impossible or ambiguous calibration.
         ImportError: Argoverse 2's files without pyarrow.
     """
+    if isinstance(name_or_path, Rig):
+        return name_or_path
     if not isinstance(name_or_path, str | Path):
         got = type(name_or_path).__name__
         raise CalibrationError(f"rig: expected a shipped rig's name or the path of a rig file, got {got}")
@@ -296,11 +298,13 @@ def load_rig(name_or_path: str | Path) -> Rig:
     return Rig.from_dict(read_calibration(path, where), folder=path.parent, where=where)
 
 
-def save_rig(rig: Rig, path: str | Path, *, format: Literal["rig", "ros", "kalibr", "colmap"] = "rig") -> Path:
+def save_rig(
+    rig: Rig | str | Path, path: str | Path, *, format: Literal["rig", "ros", "kalibr", "colmap"] = "rig"
+) -> Path:
     """Write a rig for another tool, or as a rig file. Returns the path.
 
     Args:
-        rig: The cameras; their masks and the rig's scanners are in rig files alone.
+        rig: A rig, or what ``load_rig`` reads; masks of cameras and the rig's scanners are in rig files alone.
         path: A file for ``rig``, a folder for the others, which ``load_rig`` reads.
         format: ``rig``: see ``Rig.save``. ``ros``: a CameraInfo YAML for each camera, and ``tf_static.yaml``.
             ``kalibr``: ``camchain.yaml``, whose cameras are cam0, cam1 and so on. ``colmap``: ``cameras.txt`` and
@@ -309,6 +313,7 @@ def save_rig(rig: Rig, path: str | Path, *, format: Literal["rig", "ros", "kalib
     Raises:
         CalibrationError: A lens or a skew that the format has not.
     """
+    rig = load_rig(rig)
     if format == "rig":
         return rig.save(path)
     from arbiview_aug.cameras.formats.calibration import write_calibration

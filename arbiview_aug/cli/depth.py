@@ -128,12 +128,12 @@ def run(arguments: argparse.Namespace) -> int:
     data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
     _, root = split_kind(arguments.data)
     folder = Path(arguments.output or inside(root, LEARNED_FOLDER if arguments.model else FOLDER, "depth"))
-    depths = DepthFolder(writable_folder(folder, str(folder)))
-    remove_parts(folder, lambda owner: False)
     warned: list[str] = []
     with gathered_warnings(warned):
-        if arguments.model:
-            model = TransformersDepth(arguments.model, device)
+        model = TransformersDepth(arguments.model, device) if arguments.model else None  # before the folder is made
+        depths = DepthFolder(writable_folder(folder, str(folder)))
+        remove_parts(folder, lambda owner: False)
+        if model is not None:
             done = list(_learned(model, data, depths, DepthFolder(inside(root, FOLDER, "depth")), arguments))
         else:
             with compilation_announced():

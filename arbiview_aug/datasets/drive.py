@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,22 @@ from arbiview_aug.sample.neighbours import STILL_M
 Direction = Literal["both", "past", "future"]
 
 
+def checked_index(index: Any, count: int) -> int:
+    """The place from 0 of one of ``count`` samples.
+
+    Raises:
+        TypeError: No whole number, such as a slice.
+        IndexError: A number beyond them.
+    """
+    try:
+        return range(count)[operator.index(index)]
+    except TypeError:
+        fix = "take several with torch.utils.data.Subset"
+        raise TypeError(f"index: expected a whole number, got {type(index).__name__}; {fix}") from None
+    except IndexError:
+        raise IndexError(f"index: expected one of {count} samples, got {index}") from None
+
+
 class Recording(Dataset[dict[str, Any]]):
     """Base class of the readers: samples on disk, each with a token."""
 
@@ -39,6 +56,9 @@ class Recording(Dataset[dict[str, Any]]):
 
     def __len__(self) -> int:
         return len(self.tokens)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self)} samples in {self.root})"
 
     def by_token(self, token: str) -> dict[str, Any]:
         """The sample with this token; DataError if there is none."""
@@ -70,7 +90,7 @@ class Neighbours:
     def __post_init__(self) -> None:
         if not isinstance(self.count, int) or isinstance(self.count, bool) or self.count < 1:
             raise ValueError(f"neighbours: count: expected a whole number from 1, got {self.count!r}")
-        if not 0 < self.step_m < float("inf"):
+        if not isinstance(self.step_m, int | float) or not 0 < self.step_m < float("inf"):
             raise ValueError(f"neighbours: step_m: expected metres above 0, got {self.step_m!r}")
         if self.direction not in ("both", "past", "future"):
             raise ValueError(f"neighbours: direction: expected both, past or future, got {self.direction!r}")

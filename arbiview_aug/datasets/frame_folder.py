@@ -21,7 +21,15 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.plain_yaml import parse_json
 from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig, read_mask
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields, parts_of_clock
+from arbiview_aug.datasets.drive import (
+    Drive,
+    LazyFrame,
+    Neighbours,
+    WritableRecording,
+    camera_fields,
+    checked_index,
+    parts_of_clock,
+)
 from arbiview_aug.datasets.image_io import decode_images, encoded_image, reduced_rig
 from arbiview_aug.datasets.registry import CALIBRATION_FILE
 from arbiview_aug.errors import (
@@ -36,7 +44,7 @@ from arbiview_aug.errors import (
 )
 from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
-from arbiview_aug.scene.point_cloud import finite_rows, shape_mistake
+from arbiview_aug.scene.point_cloud import returns, shape_mistake
 
 SEQUENCE_FILE = "sequence.json"
 POINTS_FILE = "lidar.npy"
@@ -127,7 +135,7 @@ class FrameFolder(WritableRecording):
 
     def files(self, index: int) -> list[Path]:
         """Source files of a frame: calibration, images, masks and points."""
-        frame = self._frames[index]
+        frame = self._frames[checked_index(index, len(self))]
         calib = _read_calibration(frame)
         paths = [frame.folder / CALIBRATION_FILE, *(_image_file(entry, frame) for entry in calib["cameras"])]
         paths += [mask for entry in calib["cameras"] if (mask := _mask_file(entry, frame)) is not None]
@@ -135,7 +143,7 @@ class FrameFolder(WritableRecording):
         return paths if points is None else [*paths, points]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        frame = self._frames[index]
+        frame = self._frames[checked_index(index, len(self))]
         calib = _read_calibration(frame)
         rig = self._rig(calib, frame)
         keys = "boxes_3d", "ego2world", "lidar", "lidars"
@@ -153,7 +161,7 @@ class FrameFolder(WritableRecording):
 
     def truth(self, index: int) -> dict[str, Any] | None:
         """``rig`` and ``images`` of a frame's ``truth`` camera, by default of its first camera's size; None without."""
-        frame = self._frames[index]
+        frame = self._frames[checked_index(index, len(self))]
         calib = _read_calibration(frame)
         entry = calib.get("truth")
         if entry is None:
@@ -326,7 +334,8 @@ def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) ->
     if path is None:
         return camera
     try:
-        mask = _cached_mask(os.path.realpath(path), clean)
+        file = os.path.realpath(path)
+        mask = _cached_mask(file, clean, os.path.getmtime(file) if os.path.isfile(file) else 0.0)
     except CalibrationError:
         mask = read_mask(str(path), path.parent, f"{frame.where}: camera {camera.name!r}")  # again, in its frame's name
     with calibration_of(frame.where):
@@ -334,7 +343,7 @@ def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) ->
 
 
 @lru_cache(maxsize=_CACHED_MASKS)
-def _cached_mask(path: str, clean: bool) -> BoolArray:
+def _cached_mask(path: str, clean: bool, modified_s: float) -> BoolArray:
     mask = read_mask(path, Path(path).parent, "rig")
     return without_specks(mask) if clean else mask
 
@@ -365,16 +374,14 @@ def _read_points(calib: Mapping[str, Any], frame: _Frame) -> torch.Tensor | None
 
 
 def checked_points(array: Any, where: str) -> torch.Tensor:
-    """Check points and convert them to (P, >=3) float32; DataError for another shape or type, or NaN and infinity."""
+    """Check points and convert their ``returns`` to (P, >=3) float32; DataError for another shape or type."""
     if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
         got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
         raise DataError(f"points {where}: expected a float array of shape (P, >=3), got {got}")
     if mistake := shape_mistake(array.shape):
         raise DataError(f"points {where}: {mistake}")
-    if bad := int(np.count_nonzero(~finite_rows(array))):
-        fix = "drop them: points[np.isfinite(points[:, :3]).all(1)]"
-        raise DataError(f"points {where}: expected finite coordinates, got {bad} points with NaN or infinity; {fix}")
-    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+    array = array.astype(np.float32) if array.dtype == np.float16 else array  # which holds no ``MOST_M``
+    return torch.from_numpy(np.ascontiguousarray(returns(array), dtype=np.float32))
 
 
 def _boxes(rows: Any, where: str) -> torch.Tensor:

@@ -17,7 +17,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.rotations import poses_from, rotation_from_quaternion
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields, checked_index
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import area_reduced, reduced_rig
 from arbiview_aug.datasets.registry import log_folders
@@ -136,7 +136,7 @@ class Py123dDataset(WritableRecording):
         return sorted(path for path in log.folder.iterdir() if path.suffix in (".arrow", ".mp4"))
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        index = range(len(self))[index]  # IndexError, and negative indices
+        index = checked_index(index, len(self))
         with _reading(self._at(index)[0].folder):
             fields = self._fields(index)
             sample = fields | camera_fields(fields["rig"], self._images(index, fields["rig"]), self.tokens[index])

@@ -72,7 +72,7 @@ class Inpainter(ABC):
             for k in range(len(frame.rig))
         ]
         views = [view for frame in rendered for view in frame.images]
-        filled = iter(self.inpaint(views, unknown, seeds))
+        filled = iter(_checked(type(self).__name__, self.inpaint(views, unknown, seeds), views))
         frames_and_holes = zip(rendered, parts, strict=True)
         return [put(frame, [next(filled) for _ in holes], holes) for frame, (_, holes) in frames_and_holes]
 
@@ -118,6 +118,18 @@ class Inpainter(ABC):
             out[key] = gathered([getattr(frame, key) for frame in done], lead)
         out["images"] = rewrapped(gathered([stacked(frame.images) for frame in done], lead), batch["images"])
         return out
+
+
+def _checked(name: str, images: Any, views: Tensors) -> list[torch.Tensor]:
+    """The images that an inpainter made of views; GeneratorError for another number, type or shape."""
+    images = list(images) if isinstance(images, Iterable) else [images]
+    got, expected = (
+        [f"{getattr(x, 'dtype', type(x).__name__)} {tuple(getattr(x, 'shape', ()))}" for x in of]
+        for of in (images, views)
+    )
+    if got != expected:
+        raise GeneratorError(f"{name}.inpaint: expected images as its views, {', '.join(expected)}, got {got}")
+    return images
 
 
 class Black(Inpainter):
@@ -204,6 +216,8 @@ class CompletedLoader:
     """
 
     def __init__(self, loader: Iterable[Mapping[str, Any]], inpainter: Inpainter) -> None:
+        if not callable(getattr(inpainter, "complete_batch", None)):
+            raise ValueError(f"inpainter: expected an Inpainter or a Generator, got {type(inpainter).__name__}")
         self.loader, self.inpainter = loader, inpainter
 
     def __iter__(self) -> Iterator[dict[str, Any]]:

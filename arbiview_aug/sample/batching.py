@@ -190,4 +190,5 @@ def _check_image(k: int, image: torch.Tensor) -> None:
         raise SampleTypeError(f"images[{k}]: expected a dense tensor with pixels, got {kind}; use .to_dense()")
     if image.dtype != torch.uint8 and image.dtype not in _IMAGE_FLOATS:
         fix = ".float()" if image.dtype.is_floating_point else ".to(torch.uint8)"
+        fix = ".float() / 65535" if image.dtype == torch.uint16 else fix
         raise SampleTypeError(f"images[{k}]: expected uint8 or float, got {image.dtype}; convert with {fix}")

@@ -29,8 +29,10 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         samples: At least one; with equal keys.
 
     Raises:
-        SampleError: Different keys, or rigs that differ and have lenses or masks, which tensors do not carry.
+        SampleError: No samples, different keys, or rigs that differ and have lenses or masks: tensors carry neither.
     """
+    if not samples or not all(isinstance(sample, Mapping) and "images" in sample for sample in samples):
+        raise SampleError("collate: expected one or more samples with 'images', got none or something else")
     first = samples[0]
     if any(set(sample) != set(first) for sample in samples):
         odd = sorted({str(key) for sample in samples for key in set(sample) ^ set(first)})

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,7 @@ CALIBRATION_KEYS = (
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
 
 MAX_CAMERAS = 128  # winning sources are int8
+_LONGEST_SIDE = 20  # focal lengths: 169 degrees of a pinhole image, and more than any lens sees
 _OFF_CENTER = 0.2  # a principal point is never off centre by this share of the image's size along both axes
 
 
@@ -250,7 +251,10 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
     K, cam2ego = (numbers(key, sample[key], index) for key in ("K", "cam2ego"))
     for key, array, expected in (("K", K, (len(images), 3, 3)), ("cam2ego", cam2ego, (len(images), 4, 4))):
         if array.shape != expected:
-            raise SampleError(f"{key}: expected shape {expected} for {len(images)} images, got {array.shape}")
+            of_frame = " in a frame of the batch" if index else ""
+            fix = "; pass K[..., :3, :3]" if key == "K" and array.shape[1:] in ((3, 4), (4, 4)) else ""
+            got = f"got {array.shape}{of_frame}{fix}"
+            raise SampleError(f"{key}: expected shape {expected} for {len(images)} images, {got}")
     cameras = []
     for k, (image, (lens, distortion)) in enumerate(zip(images, _lenses(sample, len(images), index), strict=True)):
         h, w = image.shape[-2:]
@@ -335,7 +339,7 @@ def _with_masks(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], inde
                     masks[k] = visible if mask is None else mask & visible
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:  # RuntimeError: meta, sparse
             raise SampleError(
-                f"{key}: expected a bool map of the size of each image, as an earlier retargeting gives it ({error}); "
+                f"{key}: expected a bool tensor of each image's size, as an earlier retargeting gives it ({error}); "
                 "rename the key if it is something else"
             ) from None
     if all(mask is camera.mask for mask, camera in zip(masks, rig, strict=True)):
@@ -469,8 +473,19 @@ def warn_of_misnamed(
             warn(f"key {wrong}", f"{message} {fix}")
 
 
-def warn_of_rims(frames: Iterable[Frame], warn: Callable[[str, str], None]) -> None:
-    """Warn, by topic and message, of fisheye images with a dark rim that no mask hides."""
+def focal_mistake(camera: Camera) -> tuple[str, str] | None:
+    """Say that a focal length is too short for pixels, as (found, fix); None if it is not."""
+    f, size = camera.K[0, 0], max(camera.size)
+    if size < _LONGEST_SIDE * f:
+        return None
+    return f"{f:g} px for an image of {size} px", "is K in millimetres, or normalised? It is in pixels"
+
+
+def warn_of_cameras(frames: Sequence[Frame], warn: Callable[[str, str], None]) -> None:
+    """Warn, by topic and message, of focal lengths in another unit, and of dark fisheye rims that no mask hides."""
+    for camera in chain.from_iterable(frame.rig for frame in frames):
+        if mistake := focal_mistake(camera):
+            warn("focal", f"camera {camera.name!r}: K: a focal length of {'; '.join(mistake)}")
     for camera, _ in (rim for frame in frames for rim in dark_rims(frame.rig, frame.images)):
         warn("rim", f"camera {camera.name!r}: the dark rim of the image is read as scene; mask it: {CLEANING}")
         return

@@ -13,6 +13,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import SampleError
 
 SPECK_SHARE = 2e-4
 """Largest speck as a share of the image. In DDAD's masks specks have up to 0.5e-4, parts of the car from 250e-4."""
@@ -130,7 +131,12 @@ def cleaned_rig(rig: Rig, images: Sequence[torch.Tensor]) -> Rig:
     Args:
         rig: The rig.
         images: An image (3, h, w) of each camera, uint8 or float in [0, 1].
+
+    Raises:
+        SampleError: Another number of images.
     """
+    if len(images) != len(rig):
+        raise SampleError(f"images: expected {len(rig)} for cameras {', '.join(rig.names)}, got {len(images)}")
     rims = {camera.name: circle.holds(camera) for camera, circle in dark_rims(rig, images)}
     cameras = []
     for camera in rig:

@@ -13,7 +13,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_mounted, pose_mistake
 from arbiview_aug.choices import refuse_old_options
-from arbiview_aug.sample.inputs import Frame, misnamed_keys, read_frames
+from arbiview_aug.sample.inputs import Frame, as_array, focal_mistake, misnamed_keys, read_frames
 from arbiview_aug.sample.masks import CLEANING, dark_rims, without_specks
 from arbiview_aug.scene.boxes import checked_boxes, points_in
 from arbiview_aug.scene.point_cloud import checked_points, own_car
@@ -101,6 +101,7 @@ def check(sample: Mapping[str, Any], source: Rig | None = None, **unknown: Any) 
         Finding(wrong, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
         for wrong, meant in misnamed_keys(sample, source is not None or sample.get("rig") is not None).items()
     ]
+    findings += _depth_findings(sample.get("depth_m"))
     for frame in frames:
         # Holes of an earlier retargeting are masks too, of any shape.
         own_masks = sample.get("coverage") is None and sample.get("ego_mask") is None
@@ -127,6 +128,8 @@ def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
             findings.append(Finding(f"camera {camera.name!r}: cam2ego", "a place on a vehicle", f"({at}) m", fix))
     findings += _resolution_findings(rig)
     for camera in rig:
+        if found := focal_mistake(camera):
+            findings.append(Finding(f"camera {camera.name!r}: K", "a focal length in pixels", *found))
         if camera.mask is None or not masks:
             continue
         turned = int((without_specks(camera.mask) != camera.mask).sum())
@@ -166,6 +169,15 @@ def _image_findings(frame: Frame) -> Iterator[Finding]:
             f"no mask, and {1 - circle.holds(camera).mean():.0%} of the image that would be read as scene",
             f"mask it: {CLEANING}",
         )
+
+
+def _depth_findings(depth_m: Any) -> Iterator[Finding]:
+    maps = depth_m if isinstance(depth_m, list | tuple) else [] if depth_m is None else [depth_m]
+    arrays = [as_array("depth_m", one) for one in maps]
+    nearest_m = min((float(array[array > 0].min(initial=np.inf)) for array in arrays), default=np.inf)
+    if _ELSEWHERE_M < nearest_m < np.inf:
+        found = f"the nearest pixel {nearest_m:.0f} m away"
+        yield Finding("depth_m", "metres, 0 where unknown", found, "is it in millimetres? Divide by 1000")
 
 
 # --- boxes and points -------------------------------------------------------------------------------------------------

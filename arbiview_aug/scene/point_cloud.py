@@ -481,21 +481,22 @@ def finite_rows(points: Points) -> BoolArray:
     return np.asarray(x & y & z)
 
 
-def checked_points(points: Points, key: str = "points") -> Points:
-    """(P, 3) finite points of a sample's (P, >= 3); nothing is copied if all are.
+def returns(points: Points) -> Points:
+    """Points (P, >= 3) without missing returns, which LiDARs mark by NaN; nothing is copied if all are there.
 
-    LiDARs mark missing returns by NaN: rows that are not finite, or farther than ``MOST_M``, are left out with a
-    warning.
-
-    Raises:
-        SampleError: Another shape.
+    Rows that are not finite, or farther than ``MOST_M``, are left out with a warning.
     """
+    finite = finite_rows(points)
+    if finite.all():
+        return points
+    warn(f"points: rows with NaN, infinity or over {MOST_M:g} m are left out as missing returns")
+    return points[finite]
+
+
+def checked_points(points: Points) -> Points:
+    """(P, 3) ``returns`` of a sample's points (P, >= 3); SampleError for another shape."""
     if points.size == 0:
         return np.zeros((0, 3))
     if mistake := shape_mistake(points.shape):
-        raise SampleError(f"{key}: {mistake}")
-    finite = finite_rows(points)
-    if finite.all():
-        return points[:, :3]
-    warn(f"{key}: rows with NaN, infinity or over {MOST_M:g} m are left out as missing returns")
-    return points[finite, :3]
+        raise SampleError(f"points: {mistake}")
+    return returns(points)[:, :3]

@@ -7,6 +7,7 @@ functions of a camera and the road's height alone, for every lens, so they are c
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,7 @@ class CameraMaps(torch.nn.Module):
             raise ValueError(f"maps: expected names among {', '.join(CHANNELS)}, got {maps!r}")
         self.maps = tuple(choice("maps", name, CHANNELS) for name in maps)
         self.stride = checked_stride("stride", stride)
-        self._cache: LRUCache[Any, torch.Tensor] = LRUCache(_MAX_BYTES, lambda maps: maps.nbytes)
+        self._cache: LRUCache[Any, torch.Tensor] = LRUCache(_MAX_BYTES, attrgetter("nbytes"))
 
     @property
     def channels(self) -> int:
@@ -153,5 +154,8 @@ class CameraPriorStem(torch.nn.Module):
 
     def forward(self, features: torch.Tensor, camera_maps: torch.Tensor) -> torch.Tensor:
         """Features (..., F, h, w) with what the maps (..., C, h, w) add; leading dimensions are the same."""
+        if camera_maps.shape[-2:] != features.shape[-2:]:
+            expected, got = (tuple(x.shape[-2:]) for x in (features, camera_maps))
+            raise SampleError(f"camera_maps: expected the features' (h, w) = {expected}, got {got}; is stride= theirs?")
         maps = camera_maps.reshape(-1, *camera_maps.shape[-3:]).to(features)
         return features + self.stem(maps).reshape(features.shape)

@@ -46,11 +46,12 @@ class JitteredCalibration(torch.nn.Module):
         Raises:
             SampleError: A sample that ``RigRetarget`` would not take either.
         """
-        read_frames(sample, None)
+        lead = read_frames(sample, None)[0].lead
         out, rig = dict(sample), sample.get("rig")
         poses = self._jittered(rig.cam2ego if isinstance(rig, Rig) else numbers("cam2ego", sample["cam2ego"]))
         if isinstance(rig, Rig):
             out["rig"] = rig.with_cameras([replace(c, cam2ego=pose) for c, pose in zip(rig, poses, strict=True)])
+            poses = np.tile(poses, (*lead, 1, 1, 1))
         if sample.get("cam2ego") is not None:
             out["cam2ego"] = like(torch.from_numpy(poses), sample["cam2ego"])
         return out

@@ -138,6 +138,8 @@ def target_labels(
 def _check_maps(key: str, maps: Any, frame: Frame) -> None:
     if len(maps) != len(frame.images):
         raise SampleError(f"{key}: expected {len(frame.images)} label maps, one an image, got {len(maps)}")
+    if maps[0].dtype in (torch.uint16, torch.uint32, torch.uint64):  # torch cannot index them
+        raise SampleTypeError(f"{key}: expected uint8 or signed label maps, got {maps[0].dtype}; use .to(torch.int32)")
     for camera, label in zip(frame.rig, maps, strict=True):
         size = tuple(label.shape[-2:])
         if size != camera.size:

@@ -40,8 +40,8 @@ from arbiview_aug.sample.inputs import (
     check_other_keys,
     read_frames,
     read_scene,
+    warn_of_cameras,
     warn_of_misnamed,
-    warn_of_rims,
 )
 from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
@@ -136,8 +136,8 @@ class RigRetarget(torch.nn.Module):
         super().__init__()
         refuse_old_options("RigRetarget", unknown)
         warn_about_cv2_wheels()
-        self.target = target if isinstance(target, Rig | RandomRig) else load_rig(target)
-        self.source = source if isinstance(source, Rig) or source is None else load_rig(source)
+        self.target = target if isinstance(target, RandomRig) else load_rig(target)
+        self.source = None if source is None else load_rig(source)
         self.geometry: GeometryName = choice("geometry", geometry, GEOMETRIES)
         self.neighbours = None if neighbours is None else choice("neighbours", neighbours, get_args(Reach))
         self.fit, self.p = choice("fit", fit, get_args(Fit)), checked_p(p, size)
@@ -273,7 +273,7 @@ class RigRetarget(torch.nn.Module):
             named = (*self.keys.labels, *self.keys.keep)
             reads_ego_frame = not self._row.is_static or self.keys.frame == "target"
             warn_of_misnamed(sample, calibrated, not reads_ego_frame, named, self._warn)
-            warn_of_rims(frames, self._warn)
+            warn_of_cameras(frames, self._warn)
             self._checked = types
         return check_other_keys(sample, list(sizes), self.keys.labels, self.keys.keep)
 
@@ -400,9 +400,10 @@ class RigRetarget(torch.nn.Module):
         Raises:
             ValueError: No source rig, a random target, ``quality="paper"``, or a surface that every frame has anew.
         """
-        source = self.source if source is None else source if isinstance(source, Rig) else load_rig(source)
+        source = self.source if source is None else load_rig(source)
         if source is None or self._fixed_target is None:
-            raise ValueError("prepare: expected a source rig and a fixed target rig")
+            got = f"{'no source' if source is None else 'a source'} and a target {type(self.target).__name__}"
+            raise ValueError(f"prepare: expected a source rig and a fixed target rig, got {got}")
         pair = self._plans.pair(source, self._fixed_target)
         if self._row.needs is not None and pair.needs_geometry:
             raise ValueError(

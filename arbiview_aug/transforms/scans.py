@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError
 from arbiview_aug.sample.batching import is_readable
 from arbiview_aug.sample.inputs import Frame, as_array
 from arbiview_aug.sample.neighbours import Warn, points_of_neighbours
@@ -40,7 +41,7 @@ class RetargetedPoints(NamedTuple):
 
 def retarget_points(
     points: Any,
-    target: Rig,
+    target: Rig | str | Path,
     *,
     boxes_3d: Any = None,
     ground_z_m: float = 0.0,
@@ -52,7 +53,7 @@ def retarget_points(
     Args:
         points: (P, C >= 3) float tensor or array x y z ... in the frame's ego frame. Columns beyond z are those of
             the measured point whose surface a ray meets.
-        target: A rig with ``lidars``.
+        target: A rig with ``lidars``, as ``RigRetarget`` takes it.
         boxes_3d: (B, >= 7) labelled objects, to count the points in each; they change no point.
         ground_z_m: Height of the road in the frame's ego frame.
         skip: Leave the points as they are, and count those in boxes.
@@ -62,8 +63,11 @@ def retarget_points(
     Raises:
         SampleError: Points or boxes of another shape.
         SampleTypeError: Points that are no floats.
-        CalibrationError: A scanner that is not over the road.
+        CalibrationError: A rig without scanners, or with one that is not over the road.
     """
+    target = load_rig(target)
+    if not (target.lidars or skip):
+        raise CalibrationError(f"rig {target.name!r}: expected lidars, which measure the points, got none")
     if not (isinstance(points, np.ndarray) and points.dtype.kind == "f"):
         if not is_readable(points) or not points.is_floating_point():
             kind = points.dtype if isinstance(points, torch.Tensor) else type(points).__name__

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from arbiview_aug import Rig
+from arbiview_aug.datasets.drive import checked_index
 from arbiview_aug.datasets.synthetic import BoxClass, SceneClass, SyntheticDrive
 from arbiview_aug.datasets.synthetic.scene import (
     Light,
@@ -72,7 +73,7 @@ class CuboidDrive(SyntheticDrive):
         self._renderer = CuboidRenderer(supersampling=self._renderer.supersampling, device=self._renderer.device)
 
     def scene(self, index: int) -> CuboidScene:
-        return make_scene(self.seed, self._checked_index(index))
+        return make_scene(self.seed, checked_index(index, len(self)))
 
 
 @lru_cache(maxsize=4)

@@ -564,6 +564,8 @@ def test_what_a_format_has_not_is_refused(tmp_path: Path) -> None:
         save_rig(skewed, tmp_path / "colmap", format="colmap")
     with pytest.raises(CalibrationError, match=r"format: expected rig, colmap, kalibr, ros, got 'waymo'"):
         save_rig(skewed, tmp_path / "waymo", format="waymo")  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+    assert load_rig(save_rig("waymo", tmp_path / "zeros", format="kalibr")).sizes == load_rig("waymo").sizes
     assert load_rig(save_rig(skewed, tmp_path / "rig.yaml")) == skewed
 
 

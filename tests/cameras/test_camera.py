@@ -267,9 +267,13 @@ def test_content_key_is_about_pixels_not_names() -> None:
 
 
 def test_pickle_and_copy() -> None:
+    """Frozen, as numba's kernels are compiled for: an array that can be written to has another signature."""
     camera = make(mask=np.ones((480, 640), bool), lens="fisheye", distortion=(0.01, 0, 0, 0))
+    assert camera.center_m.base is not None
     for again in (pickle.loads(pickle.dumps(camera)), copy.deepcopy(camera)):
         assert again == camera and again.content_key == camera.content_key
+        for array in (again.K, again.cam2ego, again.mask, again.center_m):
+            assert array is not None and not array.flags.writeable
 
 
 def test_repr_shows_the_camera_at_a_glance() -> None:

@@ -142,8 +142,8 @@ def test_batches_of_sequences() -> None:
         ({"height_m": float("nan")}, "height_m: expected a half-width"),
         ({"height_m": (0, float("inf"))}, "height_m: expected a half-width"),
         ({"height_m": (0, 1, 2)}, "height_m: expected a half-width"),
-        ({"focal_scale": 1.0}, "focal_scale: expected a half-width or a positive .low, high., got 1.0"),
-        ({"focal_scale": (0.0, 2.0)}, "focal_scale: expected a half-width or a positive"),
+        ({"focal_scale": 1.0}, "focal_scale: expected a half-width below 1 or a positive .low, high., got 1.0"),
+        ({"focal_scale": (0.0, 2.0)}, "focal_scale: expected a half-width below 1 or a positive"),
         ({"per": "epoch"}, "per: expected 'sample' or 'sequence', got 'epoch'"),
     ],
 )

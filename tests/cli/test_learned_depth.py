@@ -178,6 +178,7 @@ def test_models_that_cannot_be_used_are_named(
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     assert main([*asked, str(tmp_path / "nowhere")]) == 2
     assert "nowhere: expected a folder with config.json, or a model of the" in capsys.readouterr().err
+    assert not (recorded / LEARNED_FOLDER).exists()
     folder = saved_depth_model(tmp_path / "without weights")
     os.remove(folder / "model.safetensors")
     assert main([*asked, str(folder)]) == 2

@@ -34,7 +34,9 @@ def test_frames_are_picked_by_distance(wanted: Neighbours, expected: list[int]) 
     assert wanted.select(travelled_m, 4) == expected
 
 
-@pytest.mark.parametrize("bad", [{"count": 0}, {"count": 1.5}, {"step_m": 0}, {"step_m": np.nan}, {"direction": "up"}])
+@pytest.mark.parametrize(
+    "bad", [{"count": 0}, {"count": 1.5}, {"step_m": 0}, {"step_m": np.nan}, {"step_m": "1"}, {"direction": "up"}]
+)
 def test_settings_are_checked(bad: dict) -> None:
     with pytest.raises(ValueError, match="neighbours: "):
         Neighbours(**bad)

@@ -1,6 +1,7 @@
 """Frame folders: the sample, real frames, DataLoader, and folders that are not right."""
 
 import json
+import os
 import pickle
 import shutil
 from collections.abc import Callable
@@ -77,6 +78,10 @@ def test_a_folder_of_frames_in_the_order_of_their_names(tmp_path: Path) -> None:
     assert dataset.by_token("b")["token"] == "b"
     with pytest.raises(DataError, match="expected the token of one of 3 samples, got 'z'; they are a, b, c"):
         dataset.by_token("z")
+    for error, index in ((TypeError, slice(0, 2)), (IndexError, 3)):
+        with pytest.raises(error, match=r"index: expected (a whole number, got slice|one of 3 samples, got 3)"):
+            dataset[index]  # type: ignore[call-overload]
+    assert repr(dataset) == f"FrameFolder(3 samples in {tmp_path})"
 
 
 def test_frames_of_one_calibration_share_their_rig(tmp_path: Path) -> None:
@@ -210,6 +215,15 @@ def test_mask_of_another_size(tmp_path: Path) -> None:
         FrameFolder(tmp_path)[0]
 
 
+def test_a_mask_that_was_drawn_anew_is_read_again(tmp_path: Path) -> None:
+    """In one process, as a notebook's, masks are held."""
+    frame(tmp_path)
+    assert FrameFolder(tmp_path)[0]["rig"]["back"].mask[:40].all()
+    cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((48, 64), np.uint8))
+    os.utime(tmp_path / "mask.png", (0, 0))  # another time, however coarse the clock
+    assert not FrameFolder(tmp_path)[0]["rig"]["back"].mask.any()
+
+
 def test_bad_points(tmp_path: Path) -> None:
     frame(tmp_path)
     dataset = FrameFolder(tmp_path)
@@ -217,7 +231,6 @@ def test_bad_points(tmp_path: Path) -> None:
         (np.zeros((5, 2)), r"points .*expected shape \(P, >= 3\), x y z in the ego frame, got \(5, 2\)"),
         (np.zeros((4, 500)), r"got \(4, 500\); transpose them: points\.T"),
         (np.zeros((5, 3), int), r"got int64 \(5, 3\)"),
-        (np.array([[0, 0, np.nan], [1, 1, 1]]), "got 1 points with NaN or infinity"),
     ):
         np.save(tmp_path / "lidar.npy", array)
         with pytest.raises(DataError, match=message):
@@ -235,6 +248,16 @@ def test_bad_points(tmp_path: Path) -> None:
         make(tmp_path / "lidar.npy")
         with pytest.raises(DataError, match=r"lidar: expected the points .*npy, found no file"):
             dataset[0]
+
+
+def test_missing_returns_are_left_out(tmp_path: Path) -> None:
+    """As RigRetarget leaves them out of a sample of the user's own."""
+    np.save(frame(tmp_path) / "lidar.npy", np.array([[0, 0, np.nan], [1, 2, 3], [np.inf, 0, 0], [0, 0, 1e300]]))
+    with pytest.warns(UserWarning, match="points: rows with NaN, infinity or over 1e.09 m are left out"):
+        assert FrameFolder(tmp_path)[0]["points"].tolist() == [[1, 2, 3]]
+    np.save(tmp_path / "lidar.npy", np.array([[np.inf, 0, 0], [1, 2, 3]], np.float16))
+    with pytest.warns(UserWarning, match="points: rows with NaN"):
+        assert FrameFolder(tmp_path)[0]["points"].tolist() == [[1, 2, 3]]
 
 
 def test_folders_that_are_none(tmp_path: Path) -> None:

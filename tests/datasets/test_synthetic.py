@@ -158,11 +158,11 @@ def test_bad_arguments_are_named(changes, error, message):
 
 def test_bad_indices_and_rigs_are_named(drive):
     for index in (5, -6):
-        with pytest.raises(IndexError, match=f"has 5 frames, got index {index}"):
+        with pytest.raises(IndexError, match=f"expected one of 5 samples, got {index}"):
             drive[index]
     with pytest.raises(IndexError):
         drive.render(5)
-    with pytest.raises(TypeError, match="expected an int, got str"):
+    with pytest.raises(TypeError, match="index: expected a whole number, got str"):
         drive["front"]
     with pytest.raises(TypeError, match="expected a Rig"):
         drive.render(0, rig=drive.rig[0])

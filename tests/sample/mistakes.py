@@ -137,7 +137,12 @@ MISTAKES: dict[str, tuple[Callable[[Sample], Sample], str]] = {
     "ground_z_m too low": (ground(-0.33), r"ground_z_m: .*found -0.33; set ground_z_m=-?0.0\d"),
     "ground_z_m too high": (ground(0.33), r"ground_z_m: .*found \+0.33; set ground_z_m=-?0.0\d"),
     "ROS axes": (poses(lambda pose: pose @ BODY.T), r"cam2ego: .*ROS.*\[\[0, 0, 1\], \[-1, 0, 0\], \[0, -1, 0\]\]"),
+    "K in millimetres": (cameras(lambda c: replace(c, K=np.diag([0.02, 0.02, 1]) @ c.K)), "K: .*pixels.*millimetres"),
     "inverted cam2ego": (poses(np.linalg.inv), r"cam2ego: .*inverse.*np\.linalg\.inv"),
+    "depth in millimetres": (
+        lambda s: {**s, "depth_m": torch.full((len(s["rig"]), *s["rig"].sizes[0]), 4000, dtype=torch.int32)},
+        "depth_m: .*nearest pixel 4000 m away; is it in millimetres",
+    ),
     "millimetres": (poses(millimetres), "cam2ego: .*millimetres.* by 1000"),
     "poses in the world": (poses(lambda pose: WORLD @ pose), "cam2ego: .*world's frame; pass np.linalg.inv.ego2world"),
     "points in the world": (in_world("points"), "points: .*nearest 1[12].. m away; are they in the world's frame"),

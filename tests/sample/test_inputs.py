@@ -111,6 +111,7 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "K of a smaller image": (sample(K=HALF), r"K\[0\]: .* near the middle of the image of \(h, w\) = \(36, 64\)"),
     "swapped in K": (edited("K", (1, 1, 2), 40.0), r"K\[1\]: .*inside the image .*K of another image size\?"),
     "K of one camera": (sample(K=torch.eye(3)), r"K: expected shape \(2, 3, 3\) for 2 images, got \(3, 3\)"),
+    "4x4": (sample(K=torch.eye(4).repeat(2, 1, 1)), r"got \(2, 4, 4\); pass K\[..., :3, :3\]"),
     "text": (sample(K="pinhole"), "K: expected a tensor of numbers, got str"),
     "unknown lens": (with_distortion(np.zeros((2, 4)), ["cubic"] * 2), "lens: expected one of pinhole, .* got 'cubic'"),
     "one lens": (sample(lens=["radtan"]), r"lens: expected a list of 2 names, one for each camera, got \['radtan'\]"),
@@ -131,8 +132,11 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "rig of another size": (sample(rig=rig().resized(0.5)), r"camera 'c0': .*\(18, 32\), as calibrated, got \(36"),
     "swapped": (sample(images=torch.zeros(2, 3, W, H), rig=rig()), r"'c0': .* got \(64, 36\); height and width"),
     "swapped, no rig": (sample(images=torch.zeros(2, 3, W, H)), r"K\[0\]: .*; height and width are swapped"),
-    "coverage": (sample(coverage=0.7), "coverage: expected a bool map of the size of each image, .* rename the key"),
-    "ego_mask": (sample(ego_mask=torch.zeros(2, 5, 5, dtype=torch.bool)), "ego_mask: expected a bool map of the size"),
+    "coverage": (sample(coverage=0.7), "coverage: expected a bool tensor of each image's size, .* rename the key"),
+    "ego_mask": (
+        sample(ego_mask=torch.zeros(2, 5, 5, dtype=torch.bool)),
+        "ego_mask: expected a bool tensor of each",
+    ),
 }
 
 
@@ -147,7 +151,7 @@ def test_bad_calibration(case: str) -> None:
 
 def test_calibration_without_the_images_leading_dimensions() -> None:
     images = torch.zeros((3, 2, 3, H, W), dtype=torch.uint8)
-    with pytest.raises(SampleError, match=r"K: expected shape \(2, 3, 3\) for 2 images, got \(3, 3\)"):
+    with pytest.raises(SampleError, match=r"K: expected shape \(2, 3, 3\) for 2 images, got \(3, 3\) in a frame of"):
         read_frames(sample(images=images), None)
     wide = torch.zeros((2, 3, 2, 3, H, W), dtype=torch.uint8)
     with pytest.raises(SampleError, match=r"K: expected shape \(2, 3, 3\) for 2 images, got \(3,\)"):

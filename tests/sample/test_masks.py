@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, Rig, RigRetarget
+from arbiview_aug import Camera, Rig, RigRetarget, SampleError
 from arbiview_aug.datasets import FrameFolder, cleaned_rig
 from arbiview_aug.sample.masks import image_circle, without_specks
 from tests.helpers import camera
@@ -68,6 +68,8 @@ def test_a_rim_is_warned_of_once_and_masked() -> None:
         before = retarget({"images": image, "rig": rig})
     cleaned = cleaned_rig(rig, image)
     assert cleaned[0].mask is not None and cleaned_rig(cleaned, image)[0] is cleaned[0]
+    with pytest.raises(SampleError, match="images: expected 1 for cameras fish, got 2"):
+        cleaned_rig(rig, [image[0], image[0]])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         retarget({"images": image, "rig": rig})

@@ -221,6 +221,7 @@ ERRORS: dict[str, tuple[Callable[[Sample], Sample], str]] = {
 }
 WARNINGS: dict[str, tuple[Callable[[Sample], Sample], str]] = {
     "an inverted cam2ego": (MISTAKES["inverted cam2ego"][0], r"ego2cam, the inverse: pass np\.linalg\.inv"),
+    "K in millimetres": (MISTAKES["K in millimetres"][0], "camera 'front': K: .*millimetres"),
     "boxes as gt_boxes": (MISTAKES["gt_boxes"][0], "gt_boxes.*did you mean 'boxes_3d'"),
 }
 

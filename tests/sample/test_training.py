@@ -62,7 +62,7 @@ def test_cells_are_lifted_that_are_covered_and_no_own_car() -> None:
     assert torch.equal(one, expected[0, 0])
     with pytest.raises(SampleError, match="'coverage'"):
         lift_mask({}, 4)
-    for stride in (0, 4.0, "4"):
+    for stride in (0, 4.0, "4", True):
         with pytest.raises(ValueError, match="stride: expected a number of pixels from 1, got"):
             lift_mask({"coverage": coverage}, stride)  # type: ignore[arg-type]
 
@@ -92,6 +92,9 @@ def test_lenses_of_a_batch() -> None:
     sample = SyntheticDrive(plain, num_frames=1)[0]
     skipped, done = (step(sample, params={"skipped": value}) for value in (1.0, 0.0))
     assert collate([done, done])["lens"] == done["lens"] == ["radtan"] * len(plain)
+    for wrong in ([], [5], [{"points": plain}]):
+        with pytest.raises(SampleError, match="collate: expected one or more samples with 'images'"):
+            collate(wrong)  # type: ignore[list-item]
     mixed = collate([skipped, done])
     assert mixed["lens"] == [["pinhole", "radtan"]] * len(plain)
     back = RigRetarget(plain, geometry="street")

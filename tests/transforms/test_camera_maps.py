@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -139,6 +140,8 @@ def test_calibration_that_comes_back_is_computed_once() -> None:
     maps = CameraMaps(stride=8)
     first, again = (maps(sample_of((64, 96)))["camera_maps"] for _ in range(2))
     assert torch.equal(first, again) and (maps._cache.misses, maps._cache.hits) == (1, 1)
+    in_a_worker = pickle.loads(pickle.dumps(maps))
+    assert torch.equal(in_a_worker(sample_of((64, 96)))["camera_maps"], first)
 
 
 def test_the_stem_adds_nothing_at_first_and_learns() -> None:
@@ -148,6 +151,8 @@ def test_the_stem_adds_nothing_at_first_and_learns() -> None:
     out = stem(features, read)
     assert torch.equal(out, features)
     assert torch.equal(stem(features[0], read[0]), features[0])
+    with pytest.raises(SampleError, match=r"camera_maps: expected the features' \(h, w\) = \(8, 12\), got \(12, 8\)"):
+        stem(features, read.mT)
     (out * torch.rand_like(out)).sum().backward()
     assert stem.stem[-1].weight.grad.abs().sum() > 0
 

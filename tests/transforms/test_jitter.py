@@ -57,6 +57,8 @@ def test_tensors_of_batches() -> None:
     out = JitteredCalibration(angle_deg=1.0)(batch)["cam2ego"]
     assert out.shape == (3, 2, 4, 4) and out.dtype == torch.float32
     assert not torch.equal(out[0], out[1]) and torch.equal(out[..., :3, 3], batch["cam2ego"][..., :3, 3])
+    shared = JitteredCalibration(angle_deg=1.0)({**batch, "rig": sample["rig"]})
+    assert np.array_equal(shared["cam2ego"], np.tile(shared["rig"].cam2ego.astype(np.float32), (3, 1, 1, 1)))
 
 
 @pytest.mark.parametrize("arguments", [{"angle_deg": -1}, {"position_m": float("inf")}, {"angle_deg": "1"}])

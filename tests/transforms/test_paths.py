@@ -17,8 +17,9 @@ import torch
 from torch.utils.data import DataLoader, default_collate
 
 from arbiview_aug import Rig, RigRetarget, SampleError, SampleKeys
+from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, Generator
-from arbiview_aug.inpaint import CompletedLoader, Telea
+from arbiview_aug.inpaint import CompletedLoader, Inpainter, Telea
 from arbiview_aug.inpaint.telea import telea
 from tests.generator.small import ring, small_config, stirred
 from tests.helpers import assert_same_to_a_level
@@ -215,6 +216,29 @@ def test_one_sample_and_no_generator() -> None:
     done = CompletedLoader([out], Telea())
     inpainted = RigRetarget(TARGET, holes="telea")(a_sample())
     assert torch.equal(next(iter(done))["images"], inpainted["images"])
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda views: views[:1],
+        lambda views: [view.float() for view in views],
+        lambda views: [view[:, 1:] for view in views],
+        lambda views: [view.numpy() for view in views],
+        lambda views: None,
+    ],
+)
+def test_what_an_inpainter_made_is_checked(made: Callable[[Any], Any]) -> None:
+    """Fewer images would end iteration, and floats would make views of bytes floats to 255."""
+
+    class Own(Inpainter):
+        def inpaint(self, views: Any, holes: Any, seeds: Any) -> Any:
+            return made(views)
+
+    with pytest.raises(GeneratorError, match=r"Own\.inpaint: expected images as its views, torch.uint8 \(3, .*, got"):
+        RigRetarget(TARGET, holes=Own())(a_sample())
+    with pytest.raises(ValueError, match="inpainter: expected an Inpainter or a Generator, got str"):
+        CompletedLoader([], "telea")  # type: ignore[arg-type]
 
 
 def test_a_generator_on_the_cpu_works_in_workers(generator: Generator) -> None:

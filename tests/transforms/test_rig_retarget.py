@@ -297,6 +297,8 @@ def test_label_maps_that_do_not_fit() -> None:
     labels(torch.zeros((4, *SIZE), dtype=torch.int8), ignore_index=-1)
     with pytest.raises(SampleTypeError, match="classes: expected label maps as tensors, got ndarray"):
         labels(np.zeros((4, *SIZE)))
+    with pytest.raises(SampleTypeError, match=r"classes: expected uint8 or .*torch.uint16; use .to\(torch.int32\)"):
+        labels(torch.zeros((4, *SIZE), dtype=torch.uint16))
     with pytest.raises(SampleError, match=r"SampleKeys.labels: expected classes in the sample, got images, K, cam2ego"):
         RigRetarget(ring(), keys=SampleKeys(labels=["classes"]))(sample_of(ring()))
 
@@ -604,7 +606,7 @@ def test_prepare_builds_the_plan_that_samples_use() -> None:
     assert retarget.plans.misses == 1
     assert RigRetarget("waymo", geometry="street").prepare("nuscenes").source.name == "nuscenes"
     for bad in (RigRetarget(ring()), RigRetarget(RandomRig(ring()), source=source)):
-        with pytest.raises(ValueError, match="prepare: expected a source rig and a fixed target rig"):
+        with pytest.raises(ValueError, match=r"prepare: expected a source rig .*, got (no|a) source and a"):
             bad.prepare()
     of_frames = RigRetarget(ring().shifted(z_m=0.5), source=source, geometry="lidar")
     with pytest.raises(ValueError, match="prepare: expected a geometry whose plans come back, got 'lidar'"):

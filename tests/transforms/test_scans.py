@@ -288,5 +288,7 @@ def test_what_is_refused() -> None:
         retarget_points([[1.0, 2.0, 3.0]], target())
     with pytest.raises(SampleError, match="points: expected shape"):
         retarget_points(torch.ones((5, 2)), target())
+    with pytest.raises(CalibrationError, match="rig 'lyft_l5': expected lidars, which measure the points, got none"):
+        retarget_points(torch.ones((5, 4)), "lyft_l5")
     with pytest.raises(CalibrationError, match="lidar 'top': expected a place over the road"):
         retarget_points(torch.ones((5, 4)), target(lidars=[TOP.shifted(z_m=-3)]))

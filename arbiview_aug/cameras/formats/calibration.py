@@ -25,7 +25,7 @@ class Format(NamedTuple):
     convention: str  # assumed on reading, for ``inspect``
     read: Callable[[Path, Mounting], list[dict[str, Any]]]  # cameras as in a rig file
     ground_z_m: float = 0.0  # road in the ego frame, where mounting.yaml does not say otherwise
-    write: Callable[[Mapping[str, Any], Path], None] | None = None
+    files_of: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None
 
 
 FORMATS = {
@@ -33,7 +33,7 @@ FORMATS = {
         "COLMAP", ("images.bin", "images.txt"),
         "images of one moment as cameras; COLMAP's first pixel centre is (0.5, 0.5), so principal points are moved by "
         f"half a pixel; scale and ego frame from {MOUNTING}",
-        colmap.read_colmap, write=colmap.write_colmap,
+        colmap.read_colmap, files_of=colmap.colmap_files,
     ),
     "argoverse2": Format(
         "Argoverse 2", ("intrinsics.feather", "calibration/intrinsics.feather"),
@@ -48,7 +48,7 @@ FORMATS = {
     "kalibr": Format(
         "Kalibr", ("*camchain*.yaml",),
         f"T_cn_cnm1 takes points from the camera before to the camera; pose of one camera from {MOUNTING}",
-        kalibr.read_kalibr, write=kalibr.write_kalibr,
+        kalibr.read_kalibr, files_of=kalibr.kalibr_files,
     ),
     "opencv": Format(
         "OpenCV", (),
@@ -59,7 +59,7 @@ FORMATS = {
         "ROS", (),
         "K and D of the raw image, not P; optical frames (x right, y down, z forward) below base_link in "
         f"{camera_files.TF}, or poses from {MOUNTING}",
-        camera_files.read_camera_files, write=camera_files.write_ros,
+        camera_files.read_camera_files, files_of=camera_files.ros_files,
     ),
     "waymo": Format(
         "Waymo", (),
@@ -138,10 +138,14 @@ def _by_content(data: Any) -> str | None:
 
 def write_calibration(data: Mapping[str, Any], folder: Path, name: str) -> Path:
     """Write the plain data of a rig file to a folder, in the format of another tool. Returns the folder."""
-    write = FORMATS[name].write if name in FORMATS else None
-    if write is None:
-        known = ", ".join(key for key, form in FORMATS.items() if form.write)
+    files_of = FORMATS[name].files_of if name in FORMATS else None
+    if files_of is None:
+        known = ", ".join(key for key, form in FORMATS.items() if form.files_of)
         raise CalibrationError(f"save_rig: format: expected rig, {known}, got {name!r}")
+    files = files_of(data)  # before the folder is made
     folder.mkdir(parents=True, exist_ok=True)
-    write(data, folder)
+    for file, content in files.items():
+        is_text = isinstance(content, str)
+        text = content if is_text else yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
+        (folder / file).write_text(text)
     return folder

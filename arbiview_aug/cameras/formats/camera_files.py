@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import camera_entry, lens_of, write_yaml
+from arbiview_aug.cameras.formats.entries import camera_entry, lens_of
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting, pose_of
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import MOST_BYTES, parse_yaml, refuse_large
@@ -144,8 +144,8 @@ def _file_storage(path: Path) -> Mapping[str, Any]:
     return {node.tag: (node.text or "").strip() for node in nodes} | matrices
 
 
-def write_ros(data: Mapping[str, Any], folder: Path) -> None:
-    """Write a CameraInfo YAML for each camera, as camera_calibration does, and the poses as a TFMessage."""
+def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
+    """A CameraInfo YAML for each camera, as camera_calibration does, and the poses as a TFMessage."""
     files, transforms = {}, []
     for k, camera in enumerate(data["cameras"]):
         name, K, pose = camera["name"], np.array(camera["K"]), np.array(camera["cam2ego"])
@@ -165,9 +165,7 @@ def write_ros(data: Mapping[str, Any], folder: Path) -> None:
         transform = {"translation": dict(zip("xyz", at, strict=True)), "rotation": dict(zip("wxyz", wxyz, strict=True))}
         frames = {"header": {"frame_id": _EGO_FRAMES[0]}, "child_frame_id": f"{name}_optical_frame"}
         transforms.append({**frames, "transform": transform})
-    files |= {TF: {"transforms": transforms}, MOUNTING: {"ground_z_m": data["ground_z_m"]}}
-    for file, content in files.items():
-        write_yaml(folder / file, content)
+    return files | {TF: {"transforms": transforms}, MOUNTING: {"ground_z_m": data["ground_z_m"]}}
 
 
 def _node(values: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import camera_entry, focal_and_center, lens_of, matrix, write_yaml
+from arbiview_aug.cameras.formats.entries import camera_entry, focal_and_center, lens_of, matrix
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import refuse_large
@@ -122,9 +122,9 @@ def _image(name: str, camera: int, numbers: list[float]) -> _Image:
     return _Image(name, camera, np.asarray(np.linalg.inv(world2cam), np.float64))
 
 
-def write_colmap(data: Mapping[str, Any], folder: Path) -> None:
-    """Write ``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``; the world is the ego frame, in metres."""
-    cameras, images = [], []
+def colmap_files(data: Mapping[str, Any]) -> dict[str, Any]:
+    """``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``; the world is the ego frame, in metres."""
+    cameras, images, files = [], [], dict[str, Any]()
     for number, camera in enumerate(data["cameras"], 1):
         lens, coefficients = lens_of(camera, "COLMAP", {"radtan": 8, "fisheye": 4})
         if len(coefficients) == 5:
@@ -141,7 +141,7 @@ def write_colmap(data: Mapping[str, Any], folder: Path) -> None:
         ("points3D", "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)", []),
     ):
         lines = (" ".join(map(str, row)) for row in rows)
-        (folder / f"{file}.txt").write_text("\n".join([f"# {head}", *lines, ""]))
+        files[f"{file}.txt"] = "\n".join([f"# {head}", *lines, ""])
     first = data["cameras"][0]
     mounting = {"metres_per_unit": 1.0, "poses": {first["name"]: first["cam2ego"]}}
-    write_yaml(folder / MOUNTING, {"ground_z_m": data["ground_z_m"], **mounting})
+    return files | {MOUNTING: {"ground_z_m": data["ground_z_m"], **mounting}}

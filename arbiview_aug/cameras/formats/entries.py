@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import CalibrationError
@@ -48,12 +46,10 @@ def lens_of(camera: Mapping[str, Any], tool: str, most: Mapping[str, int]) -> tu
     """
     bent = camera["distortion"] or {"model": "radtan", "coeffs": [0.0] * 4}
     lens, coefficients = bent["model"], list(bent["coeffs"])
+    if lens == "radtan" and not any(coefficients[4:]):
+        coefficients = coefficients[:4]
     if len(coefficients) > most.get(lens, -1):
         known = ", ".join(f"{name} ({count} coefficients at most)" for name, count in most.items())
         got = f"{lens} with {len(coefficients)}"
         raise CalibrationError(f"camera {camera['name']!r}: expected a lens of {tool}: pinhole, {known}, got {got}")
     return lens, coefficients
-
-
-def write_yaml(path: Path, data: Any) -> None:
-    path.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120))

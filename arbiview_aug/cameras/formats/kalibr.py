@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import camera_entry, focal_and_center, lens_of, matrix, write_yaml
+from arbiview_aug.cameras.formats.entries import camera_entry, focal_and_center, lens_of, matrix
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import read_plain
@@ -57,8 +57,8 @@ def _camera(name: str, entry: Mapping[str, Any], cam2ego: FloatArray) -> dict[st
     return camera_entry(name, (width, height), matrix(*numbers[leading:]), cam2ego, lens, coefficients)
 
 
-def write_kalibr(data: Mapping[str, Any], folder: Path) -> None:
-    """Write ``camchain.yaml``; its cameras are cam0, cam1 and so on."""
+def kalibr_files(data: Mapping[str, Any]) -> dict[str, Any]:
+    """``camchain.yaml``; its cameras are cam0, cam1 and so on."""
     chain: dict[str, Any] = {}
     poses = [np.array(camera["cam2ego"]) for camera in data["cameras"]]
     for k, camera in enumerate(data["cameras"]):
@@ -72,5 +72,5 @@ def write_kalibr(data: Mapping[str, Any], folder: Path) -> None:
         }
         if k:
             chain[f"cam{k}"]["T_cn_cnm1"] = (np.linalg.inv(poses[k]) @ poses[k - 1]).tolist()
-    write_yaml(folder / "camchain.yaml", chain)
-    write_yaml(folder / MOUNTING, {"ground_z_m": data["ground_z_m"], "poses": {"cam0": poses[0].tolist()}})
+    mounting = {"ground_z_m": data["ground_z_m"], "poses": {"cam0": poses[0].tolist()}}
+    return {"camchain.yaml": chain, MOUNTING: mounting}

@@ -29,7 +29,7 @@ from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
 from arbiview_aug.cli.bench.speed import remap_floor
 from arbiview_aug.cli.bench.timing import Quartiles, benchmark, machine_line, peak_mib, quartiles, show, timed_rounds
-from arbiview_aug.cli.parsers import EXECUTIONS
+from arbiview_aug.cli.parsers import EXECUTIONS, SCORED
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import ScoredFrame, scores
 from arbiview_aug.evaluate.images import RenderedView
@@ -145,8 +145,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     noise = torch.randint(0, 256, (len(target), 3, h, w), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     floor = remap_floor(noise, (h, w))
 
-    known = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3d", "lidar": "points"}
-    offered: list[Any] = [name for name, key in known.items() if key in frame(0, REFERENCE).scored_sample]
+    offered: list[Any] = [name for name, key in SCORED.items() if key in frame(0, REFERENCE).scored_sample]
     by_name = {
         one.name: one
         for one in settings(

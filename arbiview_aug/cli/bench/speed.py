@@ -26,7 +26,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from itertools import count, cycle
+from itertools import chain, count, cycle
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +91,8 @@ def run(arguments: argparse.Namespace) -> None:
     """Measure, print the table, write the JSON."""
     path = output_file(arguments.output)
     device = None if arguments.device is None else device_named(arguments.device)
+    if device is None and arguments.only:
+        _check_only(arguments.only, arguments.size)
     with recorded(arguments.data or default_data(), size=FULL_SIZE) as data:
         report = measure(data, arguments.repeats, arguments.size, arguments.only, device)
     show(table(report), report, path)
@@ -133,8 +135,21 @@ def measure(
                 row = {"size": [h, w], "target": target, "name": name, **quartiles(taken)._asdict(), "ratio": ratio}
                 rows.append(row | {"bound": BOUNDS.get((h, w), {}).get(name)})
     if not rows:
-        raise DataError(f"--only {only}: expected part of a call's name, such as boxes or neighbour")
+        raise _unnamed(only)
     return {"data": data.name, "rounds": repeats, "ready_s": ready_s, "measures": rows}
+
+
+def _check_only(only: str, sizes: Sequence[tuple[int, int]]) -> None:
+    """Refuse a text that is in no call's name before anything is read; images of twice the size have all calls."""
+    rig = load_rig("nuscenes").resized((2 * max(h for h, _ in sizes), 2 * max(w for _, w in sizes)))
+    sample = {"images": torch.zeros(len(rig), 3, 1, 1, dtype=torch.uint8), "rig": rig}
+    calls = chain.from_iterable(_calls_of(sample, sample, size) for size in sizes)
+    if not any(only in name for _, (_, *names) in calls for name in names):
+        raise _unnamed(only)
+
+
+def _unnamed(only: str) -> DataError:
+    return DataError(f"--only {only}: expected part of a call's name, such as boxes or neighbour")
 
 
 def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tuple[str, Calls]]:
@@ -190,13 +205,18 @@ def _calls(sample: Sample, target: Rig) -> Calls:
 def _scans(sample: Sample) -> Calls:
     """A dense scan by Waymo's scanner, without images."""
     rig, waymo = sample["rig"], load_rig("waymo").lidars
-    beams = tuple(np.linspace(-30, 15, 256).tolist())
-    dense = retarget_points(sample["points"], replace(rig, lidars=[replace(waymo[0], elevations_deg=beams)])).points
-    points, target = dense[torch.linspace(0, len(dense) - 1, SCANNED).long()], replace(rig, lidars=waymo)
+    target = replace(rig, lidars=waymo)
+
+    @cache
+    def points() -> torch.Tensor:
+        beams = tuple(np.linspace(-30, 15, 256).tolist())
+        dense = retarget_points(sample["points"], replace(rig, lidars=[replace(waymo[0], elevations_deg=beams)])).points
+        return dense[torch.linspace(0, len(dense) - 1, SCANNED).long()]
+
     name = f"{SCANNED:,} points by 64 x 2,650 rays"
     return {
-        name: partial(retarget_points, points, target),
-        f"{name}, 75 boxes": partial(retarget_points, points, target, boxes_3d=boxes_around(75)),
+        name: lambda: retarget_points(points(), target),
+        f"{name}, 75 boxes": lambda: retarget_points(points(), target, boxes_3d=boxes_around(75)),
     }
 
 

@@ -18,7 +18,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import checksum, inside, remove_parts, write_whole
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.cli.arguments import writable_folder
+from arbiview_aug.cli.arguments import gathered_warnings, writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, State, checksum_once, coverage_of
 from arbiview_aug.cli.convert.manifest import Manifest
 from arbiview_aug.cli.convert.ray_runner import ray_results
@@ -254,7 +254,8 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: in
         print(f"note: {note}", file=sys.stderr)
     jobs.manifest.write_provenance(facts, tokens, jobs.format.finished())
     if report_frames:
-        write_report(settings, jobs.data, converted, report_frames)
+        with gathered_warnings([]):  # each sample's were told when it was converted
+            write_report(settings, jobs.data, converted, report_frames)
         print(f"report: {settings.output / FOLDER / 'report.html'}")
 
 

@@ -16,7 +16,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields
+from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields, checked_index
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import decode_images, reduced_rig
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
@@ -112,7 +112,7 @@ class NuScenesDataset(WritableRecording):
         return [self.root / self._recordings.file(row) for row in self._recordings.keyframes[index]]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        index = range(len(self))[index]  # IndexError, and negative indices
+        index = checked_index(index, len(self))
         recordings = self._recordings
         cameras, lidar = recordings.keyframes[index, :-1], recordings.keyframes[index, -1]
         ego2global = recordings.ego2global(lidar)
@@ -261,7 +261,6 @@ def _read_points(path: Path, sensor2ego: FloatArray) -> torch.Tensor:
     if size == 0 or size % (4 * _POINT_FLOATS):
         got = f"got {size} bytes (truncated?); copy it again"
         raise DataError(f"points {path}: expected whole points of {_POINT_FLOATS} float32, {got}")
-    points = numbers.reshape(-1, _POINT_FLOATS)
-    checked_points(points, str(path))
+    points = checked_points(numbers.reshape(-1, _POINT_FLOATS), str(path)).numpy()
     points[:, :3] = points[:, :3].astype(np.float64) @ sensor2ego[:3, :3].T + sensor2ego[:3, 3]
     return torch.from_numpy(points)

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.datasets.drive import LazyFrame, Neighbours, camera_fields, check_neighbours
+from arbiview_aug.datasets.drive import LazyFrame, Neighbours, camera_fields, check_neighbours, checked_index
 from arbiview_aug.datasets.synthetic.render import Renderer
 from arbiview_aug.datasets.synthetic.scanning import ScanErrors, scan_scene
 from arbiview_aug.datasets.synthetic.scene import Scene, SceneClass
@@ -111,13 +111,13 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def scene(self, index: int) -> Scene:
         """The street as plain data; IndexError past the end."""
-        index = self._checked_index(index)
+        index = checked_index(index, len(self))
         if self._scene is None or self._scene[0] != index:
             self._scene = (index, make_scene(self.seed, index, two_wheelers=self.two_wheelers))
         return self._scene[1]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        scene, index = self.scene(index), self._checked_index(index)
+        scene, index = self.scene(index), checked_index(index, len(self))
         sample = camera_fields(self.rig, self._images(scene), f"synthetic-{self.seed}-{index}")
         sample |= {"boxes_3d": self._boxes(scene), "box_classes": torch.from_numpy(scene.box_classes.copy())}
         if self.lidar:
@@ -166,7 +166,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
             IndexError: Past the end.
             TypeError: ``rig`` is not a ``Rig``.
         """
-        index = self._checked_index(index)
+        index = checked_index(index, len(self))
         return self._points(self.scene(index), (self.seed, index, 1), None if rig is None else _checked_rig(rig))
 
     def _points(self, scene: Scene, noise: tuple[int, ...], rig: Rig | None = None) -> Tensor:
@@ -182,14 +182,6 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         )
         points[:, 2] += rig.ground_z_m
         return torch.from_numpy(points.astype(np.float32))
-
-    def _checked_index(self, index: int) -> int:
-        if not isinstance(index, int | np.integer) or isinstance(index, bool):
-            raise TypeError(f"SyntheticDrive index: expected an int, got {type(index).__name__}")
-        n = len(self)
-        if not -n <= index < n:
-            raise IndexError(f"SyntheticDrive has {n} frames, got index {index}")
-        return int(index) % n
 
 
 def _usual_rays() -> np.ndarray:

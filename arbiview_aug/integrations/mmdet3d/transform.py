@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError, SampleKeys, load_rig
+from arbiview_aug import CalibrationError, RandomRig, Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.cameras.random_rig import sequence_rng
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, retarget_img_inputs
 from arbiview_aug.integrations.mmdet3d.images import Norm
@@ -38,7 +39,7 @@ class RigRetargetMultiView:
             ``holes``, ``keys`` (a dict of ``SampleKeys``' values in a config file).
 
     Raises:
-        CalibrationError: A target with lenses, or that cannot be loaded.
+        CalibrationError: A target with lenses, or that cannot be loaded; a pose of another shape.
     """
 
     def __init__(
@@ -53,7 +54,8 @@ class RigRetargetMultiView:
     ) -> None:
         if isinstance(keys := settings.get("keys"), Mapping):
             settings["keys"] = SampleKeys(**keys)
-        target = load_rig(target) if isinstance(target, str | Path) else target
+        if lidar2ego is not None and np.shape(lidar2ego) != (4, 4):
+            raise CalibrationError(f"lidar2ego: expected a pose (4, 4), got shape {np.shape(lidar2ego)}")
         self.retarget = RigRetarget(target, **settings)
         held = self.retarget.target
         rig = held.base if isinstance(held, RandomRig) else held

@@ -216,8 +216,8 @@ def test_messages(given: Recording) -> None:
         RigRetargetMultiView("waymo")
     with pytest.raises(SampleError, match="lidar2ego: expected the LiDAR's pose"):
         RigRetargetMultiView(TARGET)(results)
-    with pytest.raises(SampleError, match=r"lidar2ego: expected 1 matrices.*got shape \(1, 2, 2\)"):
-        RigRetargetMultiView(TARGET, lidar2ego=np.eye(2))(results)
+    with pytest.raises(CalibrationError, match=r"lidar2ego: expected a pose \(4, 4\), got shape \(3, 3\)"):
+        RigRetargetMultiView(TARGET, lidar2ego=np.eye(3))
     with pytest.raises(SampleError, match="lidar2img: expected K @ lidar2cam, got matrices that differ by"):
         step()({**results, "lidar2img": [np.diag([0.5, 0.5, 1, 1]) @ m for m in results["lidar2img"]]})
     with pytest.raises(SampleError, match="cam_intrinsic: expected 6 matrices, 3×3 or 4×4"):

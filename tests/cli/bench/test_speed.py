@@ -60,6 +60,14 @@ def test_command_writes_the_report(
     assert f"report: {path}" in capsys.readouterr().out
 
 
+def test_a_name_without_calls_is_refused_before_anything_is_read(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("arbiview_aug.cli.bench.speed.recorded", None)
+    assert main(["bench", "speed", "--only", "WRONG", "--size", "16x44"]) == 2
+    assert "--only WRONG: expected part of a call's name, such as boxes" in capsys.readouterr().err
+
+
 def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "speed", "--data", str(tmp_path)]) == 2
     assert "expected a frame folder (calib.json" in capsys.readouterr().err

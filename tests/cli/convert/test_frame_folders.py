@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,6 +61,18 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
             assert (image.parent / camera["confidence"]).is_file()
             made_up = cv2.imread(str(image.parent / camera["generated"]), cv2.IMREAD_GRAYSCALE) > 0
             assert np.array_equal(made_up, out["generated"][k].numpy())
+
+
+def test_missing_returns_are_told_once(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Where the frame is converted; not again by the report, as a warning of Python's."""
+    shutil.copytree(source / "0001", tmp_path / "0001")
+    points = np.load(tmp_path / "0001" / "lidar.npy")
+    points[::7, 1] = np.nan
+    np.save(tmp_path / "0001" / "lidar.npy", points)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert main(command(tmp_path / "0001", tmp_path / "new", "--report", "1")) == 0
+    assert capsys.readouterr().err.count("left out as missing returns") == 1
 
 
 def test_points_stay_the_same_file_on_demand(source: Path, tmp_path: Path) -> None:
