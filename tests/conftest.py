@@ -1,5 +1,6 @@
 """Fixtures that several test modules share."""
 
+import gc
 import importlib.util
 import logging
 import math
@@ -34,9 +35,23 @@ def pytest_xdist_node_collection_finished(node: Any) -> None:
         pytest.exit("the kernels do not compile", returncode=1)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Keep a module's tests in one process: they share what is dear."""
+    from xdist.scheduler import LoadFileScheduling
+
+    return LoadFileScheduling(config, log)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the modules that train for minutes: everything else fits beside them."""
     items.sort(key=lambda item: item.path.name not in ("test_learning.py", "test_experiment.py"))
+
+
+def pytest_collection_finish() -> None:
+    """Take what was imported out of the garbage collector's sight: a search through it takes half a second."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

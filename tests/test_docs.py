@@ -70,7 +70,7 @@ TINY = {
         *["--frames", "2", "--epochs", "1"],
     ],
     "bench speed --only neighbour": ["--repeats", "1", "--size", "32x88"],
-    "bench speed --device cuda": ["--device", "cpu", "--repeats", "1"],
+    "bench speed --device cuda": ["--device", "cpu", "--repeats", "1", "--size", "32x88"],
     "bench speed": ["--repeats", "1", "--size", "32x88"],
     "convert --data FOLDER --target argoverse2 --output converted --size 256x704": [
         *("--size", "24x40", "--downscale", "4", "--workers", "1", "--geometry", "street", "--report", "0")
@@ -92,6 +92,8 @@ SLOW = (
     "evaluate --data FOLDER --target-set",
     "view",
 )
+ALIKE = ("bench --data FOLDER --budget-ms 200", "bench speed")
+"""Commands that run as others do: with another budget, and in ``tests/cli/bench/test_speed.py``."""
 
 
 @cache
@@ -205,7 +207,10 @@ def test_every_command_is_known_here() -> None:
 @pytest.mark.parametrize(
     "command",
     # These take as long as all the others together; the pictures' commands are others with a seed and a width.
-    [pytest.param(c, marks=pytest.mark.slow) if c.startswith(SLOW) or "docs/images" in c else c for c in sorted(TINY)],
+    [
+        pytest.param(c, marks=pytest.mark.slow) if c.startswith(SLOW) or "docs/images" in c else c
+        for c in sorted(TINY.keys() - {*ALIKE})
+    ],
 )
 def test_the_commands_run(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest

@@ -250,7 +250,7 @@ def pixels_of(rays: Planes, inverse_distance: Planes, A: Any, o: Any, source: Ca
     """As ``source_pixels``, by the rotation (3, 3) to the source's frame, and the rays' start (3,) there."""
     from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, project_image
 
-    A, o = (np.ascontiguousarray(part, np.float32) for part in (A, o))
+    rays, A, o = (np.ascontiguousarray(part, np.float32) for part in (rays, A, o))
     u, v, nearness = (np.empty(inverse_distance.shape, np.float32) for _ in range(3))
     kind = LENS_CODES.get(source.lens, 0)
     project_image(rays, inverse_distance, A, o, kind, source.parameters, u, v, nearness)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Quality
 from arbiview_aug.cli.arguments import frames_text, gathered_warnings, writable_folder
 from arbiview_aug.cli.evaluate import measured, open_frames
@@ -43,6 +43,8 @@ def run(arguments: argparse.Namespace) -> None:
     writable_folder(path.parent, arguments.output)
     if arguments.size is None and arguments.data is None:
         arguments.size = _SYNTHETIC_SIZE
+    if arguments.target is not None:
+        load_rig(arguments.target)  # refused before a street is drawn
     data = open_frames(arguments, [arguments.geometry], lidar=arguments.geometry == "lidar")
     sample = data[0]
     read_scene(read_frames(sample, None)[0], arguments.geometry)  # refuses what the sample lacks before minutes of work

@@ -253,7 +253,7 @@ def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
     rays = camera.unproject_cam(at).directions
     start = camera.project_cam(rays).uv
     moved = [camera.project_cam(rays + _MOVE * axis).uv - start for axis in camera.cam2ego[:3:2, :3]]
-    return np.nan_to_num(np.moveaxis(np.stack(moved), -1, 1) / _MOVE, posinf=0, neginf=0).astype(np.float32)
+    return np.nan_to_num(np.moveaxis(np.stack(moved), -1, 1) / _MOVE, posinf=0, neginf=0).astype(np.float32, "C")
 
 
 def _road_below_horizon(camera: Camera | None, size: tuple[int, ...]) -> BoolArray:

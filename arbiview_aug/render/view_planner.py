@@ -224,7 +224,7 @@ class ViewPlanner:
             wide[y0:y1, x0:x1] = image
             return wide
 
-        q = widened(background.image(camera, rays, memory), 0)
+        q = np.ascontiguousarray(widened(background.image(camera, rays, memory), 0))  # kernels know no other order
         self.counters["dense_pixels"] += (y1 - y0) * (x1 - x0) if background.is_dense else 0
         behind = q[self.at_nodes]
         face = np.zeros((0, 0), np.int32)

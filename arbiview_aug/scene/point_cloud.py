@@ -368,6 +368,7 @@ class PointCloudSurface(DenseSurface):
         """The panorama around a centre that holds rays (..., 3); without ``cells`` one that was made before will do."""
         from arbiview_aug.scene.completion import elevations
 
+        origin = origin.copy()  # of one type, whoever asks: each other is compiled for again
         if origin.tobytes() not in self._panoramas:
             ends = (-math.pi, math.pi) if self.mapped else tuple(elevations(self.points, origin).tolist())
             self._panoramas[origin.tobytes()] = ends, []
@@ -440,6 +441,7 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
     from arbiview_aug.scene import completion
 
     points, others = (np.ascontiguousarray(part, np.float32) for part in (points[~own_car(points)], others))
+    origin = origin.copy()  # of one type, as in ``PointDepth.view``
     low, high = completion.elevations(points, origin) / CELL_RAD
     window = Window(math.floor(low), 0, max(math.ceil(high) - math.floor(low), 0), FINE.turn)
     most, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)

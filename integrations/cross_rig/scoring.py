@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from integrations.cross_rig.boxes import average_precision
 from integrations.cross_rig.cell_counts import Counts, Floats, iou
@@ -88,7 +88,7 @@ def t_interval(differences: Floats) -> Interval | None:
     if len(differences) < 3:
         return None
     mean = float(np.mean(differences))
-    half = float(student.ppf(0.975, len(differences) - 1) * np.std(differences, ddof=1) / np.sqrt(len(differences)))
+    half = float(stdtrit(len(differences) - 1, 0.975) * np.std(differences, ddof=1) / np.sqrt(len(differences)))
     return Interval(mean, mean - half, mean + half)
 
 

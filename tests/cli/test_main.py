@@ -117,7 +117,8 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         Path(name).symlink_to(name)
     Path("logs/log").mkdir(parents=True)
     Path("logs/log/sync.arrow").touch()
-    Path("million.yaml").write_text("cameras:\n" + "- {name: a, cam2ego: []}\n" * 1_000_000)
+    Path("large.yaml").touch()
+    os.truncate("large.yaml", 25_000_000)
     monkeypatch.setitem(sys.modules, "py123d", None)
 
 
@@ -135,7 +136,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         *((f"demo --target {name}", "expected a file or one of the shipped rigs") for name in (LONG, "loop.yaml")),
         *((f"demo --output {name}", "expected a folder that can be written to") for name in ("loop", "loop/a.png")),
         ("convert --data frame --target waymo --output loop", "expected a folder, got a file or a link"),
-        ("inspect million.yaml", r"expected at most 1 MiB, got 23\.8 MiB"),
+        ("inspect large.yaml", r"expected at most 1 MiB, got 23\.8 MiB"),
         *((f"check {name}", "expected at most 128 cameras, got 1[25]. or more") for name in ("crowd", "few")),
         ("convert --data frame --target waymo --output o --version v1.0-mini", "expected no version, which a frame f"),
         *((f"bench pareto --budget-ms {ms}", "expected a finite number above 0") for ms in (-1, 0, "nan", "inf")),

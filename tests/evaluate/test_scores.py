@@ -1,11 +1,10 @@
-"""Dense PSNR and SSIM against scikit-image's."""
+"""Dense PSNR and SSIM against scikit-image's, which takes a second to import."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 import pytest
-from skimage.metrics import mean_squared_error, peak_signal_noise_ratio, structural_similarity
 
 from arbiview_aug.evaluate.metrics import errors, psnr_db, spectrum_distance_db, ssim_map, truth_metrics
 
@@ -22,6 +21,8 @@ def pair(request: pytest.FixtureRequest) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_psnr(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    from skimage.metrics import mean_squared_error, peak_signal_noise_ratio
+
     one, two = pair
     found = errors(one.reshape(-1, 3), two.reshape(-1, 3))
     assert found["psnr_db"] == pytest.approx(peak_signal_noise_ratio(two, one, data_range=255), abs=1e-9)
@@ -31,6 +32,8 @@ def test_psnr(pair: tuple[np.ndarray, np.ndarray]) -> None:
 
 
 def test_ssim(pair: tuple[np.ndarray, np.ndarray]) -> None:
+    from skimage.metrics import structural_similarity
+
     one, two = pair
     settings = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
     mean, full = structural_similarity(one, two, channel_axis=2, full=True, **settings)

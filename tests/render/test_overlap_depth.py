@@ -109,22 +109,22 @@ def grating(period_px: float, shift_px: float) -> torch.Tensor:
 
 
 USELESS = {
-    "blank": torch.full((2, 3, *SIZE), 90, dtype=torch.uint8),
-    "black": torch.zeros((2, 3, *SIZE), dtype=torch.uint8),
-    "saturated": torch.full((2, 3, *SIZE), 255, dtype=torch.uint8),
-    "night": random_images(1, 0, 6),
-    "noise": random_images(2),
-    "stripes": grating(20, 6),
-    "narrow stripes": grating(9, 3),
-    "shuffled": photographs(NEARER).flip(0),
-    "of two places": torch.stack([photographs(NEARER)[0], photographs(Street(half_width_m=9)).flip(-1)[1]]),
+    "blank": lambda: torch.full((2, 3, *SIZE), 90, dtype=torch.uint8),
+    "black": lambda: torch.zeros((2, 3, *SIZE), dtype=torch.uint8),
+    "saturated": lambda: torch.full((2, 3, *SIZE), 255, dtype=torch.uint8),
+    "night": lambda: random_images(1, 0, 6),
+    "noise": lambda: random_images(2),
+    "stripes": lambda: grating(20, 6),
+    "narrow stripes": lambda: grating(9, 3),
+    "shuffled": lambda: photographs(NEARER).flip(0),
+    "of two places": lambda: torch.stack([photographs(NEARER)[0], photographs(Street(half_width_m=9)).flip(-1)[1]]),
 }
 
 
 @pytest.mark.parametrize("name", USELESS)
 def test_declines_what_says_nothing(name: str) -> None:
     """Bit for bit the unrefined picture, and a reason."""
-    sample = {"images": USELESS[name]}
+    sample = {"images": USELESS[name]()}
     refining = RigRetarget(TARGET, source=RIG, geometry="street", quality="accurate")
     plain = RigRetarget(
         TARGET, source=RIG, geometry="street", quality=replace(render_config("accurate"), overlap_depth=False)

@@ -87,14 +87,18 @@ def assert_of_one_rig(out: dict[str, Any], rig: Any) -> None:
     np.testing.assert_array_equal(out["num_points"], np.diff(ends, prepend=0))
 
 
+@pytest.fixture(scope="module")
+def recorded() -> list[dict[str, Any]]:
+    drive = SyntheticDrive(demo_source_rig((32, 88)), num_frames=4)
+    return [drive[k] for k in range(4)]
+
+
 @pytest.mark.parametrize("workers", [0, 1])
-def test_everything_of_a_sample_is_of_one_rig(workers: int) -> None:
+def test_everything_of_a_sample_is_of_one_rig(recorded: list[dict[str, Any]], workers: int) -> None:
     """Each sample has its own draw of the rig, and of whether to retarget."""
-    size = (32, 88)
-    drive, base = SyntheticDrive(demo_source_rig(size), num_frames=8), replace(demo_source_rig(size), lidars=[TOP])
+    base = replace(recorded[0]["rig"], lidars=[TOP])
     random = RandomRig(base, yaw_deg=8.0, height_m=0.4, forward_m=0.3)
-    data = RetargetedDataset(drive, RigRetarget(random, p=0.6, size=size, geometry="street"))
-    recorded = [drive.points(n) for n in range(len(drive))]
+    data = RetargetedDataset(recorded * 2, RigRetarget(random, p=0.6, size=(32, 88), geometry="street"))
     torch.manual_seed(4)
     skipped = set()
     for batch in torch.utils.data.DataLoader(data, batch_size=4, num_workers=workers, collate_fn=collate):
@@ -103,17 +107,16 @@ def test_everything_of_a_sample_is_of_one_rig(workers: int) -> None:
             drawn = {name: value for name, value in params.items() if name != "skipped"}
             skipped.add(bool(params["skipped"]))
             if params["skipped"]:
-                np.testing.assert_allclose(out["cam2ego"], drive.rig.cam2ego)
-                (index,) = (n for n, points in enumerate(recorded) if torch.equal(points, out["points"]))
-                assert torch.equal(out["images"], drive[index]["images"]) and (out["point_rings"] == -1).all()
+                np.testing.assert_allclose(out["cam2ego"], base.cam2ego)
+                (of,) = (frame for frame in recorded if torch.equal(frame["points"], out["points"]))
+                assert torch.equal(out["images"], of["images"]) and (out["point_rings"] == -1).all()
             else:
                 assert_of_one_rig(out, random.rig(drawn))
     assert skipped == {True, False}
 
 
-def test_a_mixture_has_whole_samples() -> None:
-    drive = SyntheticDrive(demo_source_rig((32, 88)), num_frames=4)
-    mixed = MixedDataset(drive, RetargetedDataset(drive, RigRetarget(target(), size=(32, 88))), share=0.5)
+def test_a_mixture_has_whole_samples(recorded: list[dict[str, Any]]) -> None:
+    mixed = MixedDataset(recorded, RetargetedDataset(recorded, RigRetarget(target(), size=(32, 88))), share=0.5)
     torch.manual_seed(0)
     kinds = set()
     for k, (out,) in enumerate(torch.utils.data.DataLoader(mixed, collate_fn=list)):
@@ -121,7 +124,7 @@ def test_a_mixture_has_whole_samples() -> None:
         if "point_rings" in out:
             assert_of_one_rig(out, target().resized((32, 88), "crop"))
         else:
-            assert torch.equal(out["points"], drive.points(k)) and torch.equal(out["images"], drive[k]["images"])
+            assert all(torch.equal(out[key], recorded[k][key]) for key in ("points", "images"))
     assert kinds == {True, False}
 
 
@@ -135,17 +138,15 @@ def test_arrays_and_dtypes_stay(sample: dict[str, Any]) -> None:
     assert double.dtype == torch.float64 and torch.equal(double.float(), expected)
 
 
-def test_batches_are_their_frames() -> None:
-    drive = SyntheticDrive(demo_source_rig(SIZE), num_frames=2)
+def test_batches_are_their_frames(recorded: list[dict[str, Any]]) -> None:
     retarget = RigRetarget(target())
-    singles, batch = [retarget(drive[k]) for k in range(2)], retarget(collate([drive[0], drive[1]]))
+    singles, batch = [retarget(frame) for frame in recorded[:2]], retarget(collate(recorded[:2]))
     for key in ("points", "point_rings", "num_points"):
         assert all(torch.equal(one[key], two) for one, two in zip(singles, batch[key], strict=True))
 
 
-def test_in_a_data_loader() -> None:
-    drive = SyntheticDrive(demo_source_rig((32, 88)), num_frames=2)
-    data = RetargetedDataset(drive, RigRetarget(target(), size=(32, 88)))
+def test_in_a_data_loader(recorded: list[dict[str, Any]]) -> None:
+    data = RetargetedDataset(recorded[:2], RigRetarget(target(), size=(32, 88)))
     (batch,) = torch.utils.data.DataLoader(data, batch_size=2, num_workers=1, collate_fn=collate)
     assert [len(points) for points in batch["points"]] == [len(rings) for rings in batch["point_rings"]]
 

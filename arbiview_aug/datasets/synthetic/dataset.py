@@ -19,6 +19,7 @@ from arbiview_aug.datasets.synthetic.render import Renderer
 from arbiview_aug.datasets.synthetic.scanning import ScanErrors, scan_scene
 from arbiview_aug.datasets.synthetic.scene import Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
+from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.sample.batching import stacked
 
 LIDAR_POSITION_M = (0.9, 0.0, 1.9)  # ego x, y and height over the road: on the roof, as on nuScenes' vehicles
@@ -26,6 +27,9 @@ LIDAR_BEAMS_DEG = (-30.67, 10.67)  # elevations of the lowest and the highest of
 LIDAR_COLUMNS = 1088
 LIDAR_RANGE_M = (1.0, 90.0)
 _BEAMS = 32
+
+_SCENES: LRUCache[tuple[int, int, bool], Scene] = LRUCache(4)
+"""Streets that drives of several rigs look at, by seed, index and whether two-wheelers join."""
 
 
 class RenderedViews(NamedTuple):
@@ -97,10 +101,6 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         self.neighbours = neighbours
         self.two_wheelers = bool(two_wheelers)
         self._renderer = Renderer(supersampling=_checked_count("supersampling", supersampling, 1, 8), device=device)
-        self._scene: tuple[int, Scene] | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_scene": None}
 
     def __len__(self) -> int:
         return self.num_frames
@@ -111,10 +111,8 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def scene(self, index: int) -> Scene:
         """The street as plain data; IndexError past the end."""
-        index = checked_index(index, len(self))
-        if self._scene is None or self._scene[0] != index:
-            self._scene = (index, make_scene(self.seed, index, two_wheelers=self.two_wheelers))
-        return self._scene[1]
+        asked = self.seed, checked_index(index, len(self)), self.two_wheelers
+        return _SCENES.get(asked, partial(make_scene, *asked[:2], two_wheelers=self.two_wheelers))
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         scene, index = self.scene(index), checked_index(index, len(self))
@@ -123,7 +121,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         if self.lidar:
             sample["points"] = self.points(index)
         if self.neighbours is not None:
-            sample |= {"ego2world": torch.from_numpy(scene.ego2street), "time_s": 0.0}
+            sample |= {"ego2world": torch.tensor(scene.ego2street), "time_s": 0.0}
             steps = [sign * k for sign in self.neighbours.signs for k in range(1, self.neighbours.count + 1)]
             moments = [step * self.neighbours.step_m / scene.speed_mps for step in steps]
             sample["neighbours"] = [
@@ -134,7 +132,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def _neighbour(self, scene: Scene, seconds: float, token: str, noise: tuple[int, ...]) -> LazyFrame:
         fields = {"rig": self.rig, "boxes_3d": self._boxes(scene), "token": f"{token}{seconds:+.3f}s"}
-        fields |= {"ego2world": torch.from_numpy(scene.ego2street), "time_s": seconds}
+        fields |= {"ego2world": torch.tensor(scene.ego2street), "time_s": seconds}
         points = partial(self._points, scene, noise) if self.lidar else None
         return LazyFrame(fields, partial(self._images, scene), points)
 

@@ -18,7 +18,6 @@ from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, Scene
 
 SKY_ID, GROUND_ID = -1, -2  # ids of hits on no primitive
 _MIN_COS = 0.2  # packets with a ray further than 78 degrees off their axis have no pyramid: all are candidates
-_PAIRS_PER_STEP = 96  # packets handled at a time: temporaries of 96 x 6 x 256 floats fit in a core's cache
 
 
 class LocalScene(NamedTuple):
@@ -66,7 +65,6 @@ class Candidates(NamedTuple):
 
     packet: Tensor  # [C] row of the packet
     primitive: Tensor  # [C] row of the local scene
-    rank: Tensor  # [C] 0 for a packet's nearest candidate, 1 for the next
 
 
 def pyramids(rays: Tensor) -> Tensor:
@@ -103,8 +101,7 @@ def find_candidates(local: LocalScene, rays: Tensor) -> Candidates:
         coarse = pyramids(rays[rows].permute(1, 0, 2).reshape(1, 3, -1))
         some = _inside(coarse, local.corners)[0].nonzero()[:, 0]
         seen[rows[:, None], some[None]] = _inside(sides[rows], local.corners[some])
-    packet, primitive = seen.nonzero(as_tuple=True)
-    return Candidates(packet, primitive, ranks(packet, seen.sum(1)))
+    return Candidates(*seen.nonzero(as_tuple=True))
 
 
 def ranks(group: Tensor, counts: Tensor) -> Tensor:
@@ -123,63 +120,31 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
     """Find the first hits of packets of unit rays (n, 3, R) from ``start`` (n or 1, 3), in the street frame.
 
     ``local`` may be several scenes, one after the other, each relative to the origin of other packets. Gives (n, R)
-    distance, infinite for the sky, and (n, R) int64 row in the scene, ``GROUND_ID`` or ``SKY_ID``.
+    distance, infinite for the sky, and (n, R) int64 row in the scene, ``GROUND_ID`` or ``SKY_ID``. The intersections
+    run on the CPU, wherever the tensors lie.
     """
+    from arbiview_aug.datasets.synthetic.kernels import cast_packets, chord_squares
+
     t, hit = _ground(start[:, 2:], rays)
-    order = torch.sort(candidates.rank, stable=True).indices
-    packets, primitives = candidates.packet[order], candidates.primitive[order]
-    rounds = torch.bincount(candidates.rank).tolist()
-    for packet, primitive in zip(packets.split(rounds), primitives.split(rounds), strict=True):
-        in_front = local.distance[primitive] < t.index_select(0, packet).amax(1)
-        for boxes, meet in ((True, _meet_box), (False, _meet_quadric)):
-            chosen = (in_front & (local.is_box[primitive] == boxes)).nonzero()[:, 0]
-            for part in chosen.split(_PAIRS_PER_STEP):
-                n, p = packet[part], primitive[part]
-                before = t.index_select(0, n)
-                hits = meet(local, p, rays.index_select(0, n))
-                nearer = hits < before
-                t[n] = torch.where(nearer, hits, before)
-                hit[n] = torch.where(nearer, local.order[p][:, None], hit.index_select(0, n))
-    return t, hit
+    curved = (~local.is_box[candidates.primitive]).nonzero()[:, 0]
+    ends = torch.bincount(candidates.packet, minlength=len(rays)).cumsum(0)
+    row, first, box, normals, offsets, *quadric, packets, packet, primitive, end, out_t, out_hit = (
+        tensor.cpu().contiguous().numpy()
+        for tensor in (
+            *(local.order, local.distance, local.is_box, local.normals, local.offsets),
+            *(local.to_unit, local.origin, local.round_z, rays),
+            *(candidates.packet[curved], candidates.primitive, ends, t, hit),
+        )
+    )
+    roots = np.empty((len(packet), rays.shape[2]), np.float32)
+    chord_squares(*quadric, packets, packet, primitive[curved.cpu().numpy()], roots)
+    # torch's square roots, whose last bit numba's need not have: streets stay the same.
+    halves = torch.sqrt(torch.as_tensor(roots, device="cpu").clamp_min(0)).numpy()
+    cast_packets(row, first, box, normals, offsets, *quadric, packets, end, primitive, halves, out_t, out_hit)
+    return torch.as_tensor(out_t), torch.as_tensor(out_hit)
 
 
 def _ground(height_m: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
     down = -rays[:, 2]
     t = torch.where((down > 1e-7) & (height_m > 0), height_m * down.clamp_min(1e-7).reciprocal(), torch.inf)
     return t, torch.where(torch.isfinite(t), GROUND_ID, SKY_ID)
-
-
-def _meet_box(local: LocalScene, p: Tensor, rays: Tensor) -> Tensor:
-    """Distance (n, R) at which rays (n, 3, R) enter box p (n,); infinite where they miss or start inside."""
-    normal = local.normals.index_select(0, p)
-    x, y, z = (normal[:, :, k : k + 1] * rays[:, None, k] for k in range(3))
-    speed = x + y + z  # [n, 6, R]
-    # A ray parallel to a half-space enters it at a huge distance: from outside it misses.
-    speed = torch.where(speed.abs() < 1e-9, -1e-9, speed)
-    t = local.offsets[p][:, :, None] / speed
-    entering = speed < 0
-    enter = torch.where(entering, t, -torch.inf).amax(1)
-    leave = torch.where(entering, torch.inf, t).amin(1)
-    return torch.where((enter < leave) & (enter > 0), enter, torch.inf)
-
-
-def _meet_quadric(local: LocalScene, p: Tensor, rays: Tensor) -> Tensor:
-    """As ``_meet_box`` for the unit sphere or the capped unit cylinder."""
-    A, o, w = local.to_unit[p], local.origin[p], local.round_z[p][:, None]
-    dx, dy, dz = (_dot(A[:, k], rays) for k in range(3))
-    ox, oy, oz = o[:, 0:1], o[:, 1:2], o[:, 2:3]
-    rz, qz = dz * w, oz * w
-    a = (dx * dx + dy * dy + rz * rz).clamp_min(1e-12)
-    b = dx * ox + dy * oy + rz * qz
-    # |d|^2 - |o x d|^2 instead of b^2 - a c, which cancels for distant, thin primitives.
-    cx, cy, cz = oy * rz - qz * dy, qz * dx - ox * rz, ox * dy - oy * dx
-    root = a - (cx * cx + cy * cy + cz * cz)
-    half = root.clamp_min(0).sqrt()
-    enter, leave = (-b - half) / a, (half - b) / a
-    # The caps of a cylinder; an ellipsoid has none.
-    safe = torch.where(dz.abs() < 1e-9, 1e-9, dz)
-    t0, t1 = (-1 - oz) / safe, (1 - oz) / safe
-    flat = w == 0
-    enter = torch.where(flat, torch.maximum(enter, torch.minimum(t0, t1)), enter)
-    leave = torch.where(flat, torch.minimum(leave, torch.maximum(t0, t1)), leave)
-    return torch.where((root > 0) & (enter < leave) & (enter > 0), enter, torch.inf)

@@ -39,6 +39,8 @@ _THIN_PX = 1.5
 _BATCH_PX = 1_500_000
 """Maximum number of pixels shaded together, with 150 MB of intermediate results."""
 _CACHED_CAMERAS = 24
+_TABLES: LRUCache[tuple[int, torch.device], SceneTables] = LRUCache(4)
+"""Tables of the last scenes, which they keep, so that no other scene has the same id."""
 
 
 class CameraView(NamedTuple):
@@ -124,15 +126,14 @@ def _from_tiles(a: Tensor, size: tuple[int, int]) -> Tensor:
 
 
 class Renderer:
-    """Renders scenes; keeps the rays of the last cameras and the tables of the last scene."""
+    """Renders scenes; keeps the rays of the last cameras."""
 
     shade = staticmethod(shade)
     """Colours of hits; a subclass may have others."""
 
     def __init__(self, *, supersampling: int = 2, device: torch.device | str = "cpu") -> None:
         self.supersampling, self.device = supersampling, torch.device(device)
-        self._rays: LRUCache[bytes, CameraRays] = LRUCache(_CACHED_CAMERAS, lambda _: 1)
-        self._tables: SceneTables | None = None
+        self._rays: LRUCache[bytes, CameraRays] = LRUCache(_CACHED_CAMERAS)
 
     def __reduce__(self) -> tuple[Any, tuple[()]]:
         return partial(type(self), supersampling=self.supersampling, device=self.device), ()  # without the caches
@@ -154,9 +155,7 @@ class Renderer:
             return [view for batch in batches for view in self._render_batch(scene, batch, ground_z_m)]
 
     def _render_batch(self, scene: Scene, cameras: list[Camera], ground_z_m: float) -> list[CameraView]:
-        if self._tables is None or self._tables.scene is not scene:
-            self._tables = SceneTables.build(scene)
-        tables = self._tables
+        tables = _TABLES.get((id(scene), self.device), partial(SceneTables.build, scene))
         first = self._cast(scene, cameras, ground_z_m)
         hits = first.hits
         face = faces(tables, hits.point, hits.primitive)
@@ -180,8 +179,8 @@ class Renderer:
         scenes = [scene_from(scene, origin) for origin in origins]
         casts, first_tile = [], 0
         for k, (local, packets) in enumerate(zip(scenes, directions.split(tiles), strict=True)):
-            packet, primitive, rank = find_candidates(local, packets)
-            casts.append((packet + first_tile, primitive + k * len(local.order), rank))
+            packet, primitive = find_candidates(local, packets)
+            casts.append((packet + first_tile, primitive + k * len(local.order)))
             first_tile += tiles[k]
         local = LocalScene(*map(torch.cat, zip(*scenes, strict=True)))
         candidates = Candidates(*map(torch.cat, zip(*casts, strict=True)))
@@ -286,4 +285,4 @@ def _for_packets(candidates: Candidates, owner: Tensor, tiles: int) -> Candidate
     first = counts.cumsum(0) - counts
     packet = torch.repeat_interleave(torch.arange(len(owner)), counts[owner])
     rank = ranks(packet, counts[owner])
-    return Candidates(packet, candidates.primitive[first[owner[packet]] + rank], rank)
+    return Candidates(packet, candidates.primitive[first[owner[packet]] + rank])

@@ -122,7 +122,8 @@ def measure(seed: int, sums: dict[tuple[str, str, str], Sums]) -> None:
     of_blocks = BoxSurface(Street(ground_z_m=rig.ground_z_m), geometry.boxes, filled)
     vehicles = np.flatnonzero(scene.box_classes != BoxClass.PEDESTRIAN)
     for world in WORLDS:
-        drive._scene = (0, blocks(scene) if world == "blocks" else scene)
+        shown = blocks(scene) if world == "blocks" else scene
+        drive.scene = lambda _, shown=shown: shown
         if world == "blocks":
             geometry._surfaces["boxes", rig.ground_z_m] = of_blocks
         recorded = drive.render(0)
