@@ -141,7 +141,7 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
     # torch's square roots, whose last bit numba's need not have: streets stay the same.
     halves = torch.sqrt(torch.as_tensor(roots, device="cpu").clamp_min(0)).numpy()
     cast_packets(row, first, box, normals, offsets, *quadric, packets, end, primitive, halves, out_t, out_hit)
-    return torch.as_tensor(out_t), torch.as_tensor(out_hit)
+    return torch.as_tensor(out_t, device=rays.device), torch.as_tensor(out_hit, device=rays.device)
 
 
 def _ground(height_m: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
