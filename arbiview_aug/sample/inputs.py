@@ -48,7 +48,7 @@ CALIBRATION_KEYS = (
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
 
 MAX_CAMERAS = 128  # winning sources are int8
-_LONGEST_SIDE = 20  # focal lengths: 169 degrees of a pinhole image, and more than any lens sees
+_MOST_FOCALS = 20  # of a side: 169 degrees of a pinhole image, and more than any lens sees
 _OFF_CENTER = 0.2  # a principal point is never off centre by this share of the image's size along both axes
 
 
@@ -475,10 +475,10 @@ def warn_of_misnamed(
 
 def focal_mistake(camera: Camera) -> tuple[str, str] | None:
     """Say that a focal length is too short for pixels, as (found, fix); None if it is not."""
-    f, size = camera.K[0, 0], max(camera.size)
-    if size < _LONGEST_SIDE * f:
+    f, size = camera.K[0, 0], min(camera.size)
+    if size < _MOST_FOCALS * f:
         return None
-    return f"{f:g} px for an image of {size} px", "is K in millimetres, or normalised? It is in pixels"
+    return f"{f:g} px for an image with a side of {size} px", "is K in millimetres, or normalised? It is in pixels"
 
 
 def warn_of_cameras(frames: Sequence[Frame], warn: Callable[[str, str], None]) -> None:
