@@ -37,10 +37,10 @@ def pytest_xdist_node_collection_finished(node: Any) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Keep a module's tests in one process: they share what is dear."""
+    """Keep a module's tests in one process, as ``--dist loadfile`` does: they share what is dear."""
     from xdist.scheduler import LoadFileScheduling
 
-    return LoadFileScheduling(config, log)
+    return LoadFileScheduling(config, log) if config.getoption("dist") == "load" else None  # that of ``-n`` alone
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

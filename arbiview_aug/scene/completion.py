@@ -372,26 +372,31 @@ def draw_thin(cells: Any, residuals: Any, up: int, side: int, code: Any, layers:
     """
     _, h, w = layers.shape
     near, far, share = layers[0], layers[1], layers[2]
-    for ring in (3, 2, 1, 0):
-        for i in range(cells.shape[0]):
-            y0, x0 = cells[i] // w, cells[i] % w
-            for y in range(max(y0 - up, 3), min(y0 + up + 1, h - 3)):
-                for x in range(max(x0 - side, 3), min(x0 + side + 1, w - 3)):
-                    other = np.float32(code[y + 2, x + 2] >> 14) * np.float32(1 / 1024)
-                    if (y - y0) ** 2 + (x - x0) ** 2 > other * other:
-                        continue
-                    if ring == 3:
-                        for j in range(y - ring, y + ring + 1):
-                            for k in range(x - ring, x + ring + 1):
-                                shows_near = share[j, k] > _HALF
-                                near[j, k] = far[j, k] = near[j, k] if shows_near else far[j, k]
-                                share[j, k] = _ONE if shows_near else _ZERO
-                    elif ring == 2:
-                        share[y - 2 : y + 3, x - 2 : x + 3] = _ZERO
-                    elif ring == 1:
-                        near[y - 1 : y + 2, x - 1 : x + 2] = residuals[i]
-                    else:
-                        near[y, x], share[y, x] = residuals[i], _ONE
+    taken, n = np.empty((cells.shape[0] * (2 * up + 1) * (2 * side + 1), 3), np.int64), 0  # row, column, point
+    for i in range(cells.shape[0]):
+        y0, x0 = cells[i] // w, cells[i] % w
+        for y in range(max(y0 - up, 3), min(y0 + up + 1, h - 3)):
+            for x in range(max(x0 - side, 3), min(x0 + side + 1, w - 3)):
+                other = np.float32(code[y + 2, x + 2] >> 14) * np.float32(1 / 1024)
+                if (y - y0) ** 2 + (x - x0) ** 2 <= other * other:
+                    taken[n, 0], taken[n, 1], taken[n, 2] = y, x, i
+                    n += 1
+    for m in range(n):
+        y, x = taken[m, 0], taken[m, 1]
+        for j in range(y - 3, y + 4):
+            for k in range(x - 3, x + 4):
+                shows_near = share[j, k] > _HALF
+                near[j, k] = far[j, k] = near[j, k] if shows_near else far[j, k]
+                share[j, k] = _ONE if shows_near else _ZERO
+    for m in range(n):
+        y, x = taken[m, 0], taken[m, 1]
+        share[y - 2 : y + 3, x - 2 : x + 3] = _ZERO
+    for m in range(n):
+        y, x = taken[m, 0], taken[m, 1]
+        near[y - 1 : y + 2, x - 1 : x + 2] = residuals[taken[m, 2]]
+    for m in range(n):
+        y, x = taken[m, 0], taken[m, 1]
+        near[y, x], share[y, x] = residuals[taken[m, 2]], _ONE
 
 
 @inlined

@@ -441,7 +441,7 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
     from arbiview_aug.scene import completion
 
     points, others = (np.ascontiguousarray(part, np.float32) for part in (points[~own_car(points)], others))
-    origin = origin.copy()  # of one type, as in ``PointDepth.view``
+    origin = origin.copy()  # of one type, as in ``PointCloudSurface.view``
     low, high = completion.elevations(points, origin) / CELL_RAD
     window = Window(math.floor(low), 0, max(math.ceil(high) - math.floor(low), 0), FINE.turn)
     most, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)

@@ -109,7 +109,8 @@ class NuScenesDataset(WritableRecording):
 
     def files(self, index: int) -> list[Path]:
         """Source files of a sample: each camera's image, then the LiDAR's points."""
-        return [self.root / self._recordings.file(row) for row in self._recordings.keyframes[index]]
+        rows = self._recordings.keyframes[checked_index(index, len(self))]
+        return [self.root / self._recordings.file(row) for row in rows]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         index = checked_index(index, len(self))

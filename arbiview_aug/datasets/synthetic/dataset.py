@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,6 @@ from arbiview_aug.datasets.synthetic.render import Renderer
 from arbiview_aug.datasets.synthetic.scanning import ScanErrors, scan_scene
 from arbiview_aug.datasets.synthetic.scene import Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
-from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.sample.batching import stacked
 
 LIDAR_POSITION_M = (0.9, 0.0, 1.9)  # ego x, y and height over the road: on the roof, as on nuScenes' vehicles
@@ -28,8 +27,7 @@ LIDAR_COLUMNS = 1088
 LIDAR_RANGE_M = (1.0, 90.0)
 _BEAMS = 32
 
-_SCENES: LRUCache[tuple[int, int, bool], Scene] = LRUCache(4)
-"""Streets that drives of several rigs look at, by seed, index and whether two-wheelers join."""
+_street = lru_cache(maxsize=4)(make_scene)  # drives of several rigs look at the same streets
 
 
 class RenderedViews(NamedTuple):
@@ -111,8 +109,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def scene(self, index: int) -> Scene:
         """The street as plain data; IndexError past the end."""
-        asked = self.seed, checked_index(index, len(self)), self.two_wheelers
-        return _SCENES.get(asked, partial(make_scene, *asked[:2], two_wheelers=self.two_wheelers))
+        return _street(self.seed, checked_index(index, len(self)), two_wheelers=self.two_wheelers)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         scene, index = self.scene(index), checked_index(index, len(self))
