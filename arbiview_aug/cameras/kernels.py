@@ -43,8 +43,9 @@ def pinhole_rays_row(P: Row, v: float, first: int, rx: Row, ry: Row, rz: Row) ->
     """Unit rays of the pixels of row ``v`` from column ``first`` on, camera frame."""
     y = (np.float32(v) - P[4]) / P[3]
     per_fx, cx = _ONE / P[0], P[2] + P[1] * y
+    start = np.int32(first)
     for i in range(rx.shape[0]):
-        rx[i] = (np.float32(first + i) - cx) * per_fx
+        rx[i] = (np.float32(start + np.int32(i)) - cx) * per_fx
     for i in range(rx.shape[0]):
         rz[i] = _ONE / np.sqrt(rx[i] * rx[i] + y * y + _ONE)
     for i in range(rx.shape[0]):
@@ -158,7 +159,9 @@ def project_row(x: Row, y: Row, z: Row, kind: int, P: Row, a: Row, b: Row, u: Ro
     fold2 = P[5] * P[5]
     for i in range(n):  # past the fold the polynomial is not the lens
         r2 = (x[i] * x[i] + y[i] * y[i]) * a[i] * a[i]
-        a[i] = a[i] if r2 <= fold2 else _ZERO
+        v[i] = a[i] if r2 <= fold2 else _ZERO
+    for i in range(n):
+        a[i] = v[i]
     for i in range(n):
         r2 = (x[i] * x[i] + y[i] * y[i]) * a[i] * a[i]
         b[i] = (_ONE + r2 * (k1 + r2 * (k2 + r2 * k3))) / (_ONE + r2 * (k4 + r2 * (k5 + r2 * k6)))

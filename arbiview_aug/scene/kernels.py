@@ -148,8 +148,8 @@ def draw_solids(
     """
     h, w = q.shape
     nx = cones.shape[2]
-    work, near_box, heights = np.empty((5, w), np.float32), np.empty(nx, np.bool_), _heights(cones)
-    factor = np.float32(scale)
+    work, near_box, heights = np.empty((7, w), np.float32), np.empty(nx, np.bool_), _heights(cones)
+    kept, factor = np.empty((2, w), np.int32), np.float32(scale)
     for k in range(rows.shape[0]):
         b, me = rows[k], np.int32(numbers[k])
         first, last = _rows_of_piece(b, heights)
@@ -158,19 +158,29 @@ def draw_solids(
             if n == 0:
                 continue
             rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
+            part, value, first_face, next_face = work[5, :n], work[6, :n], kept[0, :n], kept[1, :n]
             for y in range(j * step, min(j * step + step, h)):
                 rays_row(planes, P, y, x0, rx, ry, rz)
-                through_row(b, rx, ry, rz, enter, leave)
+                through_row(b, rx, ry, rz, enter, leave, part)
                 near, which = q[y, x0 : x0 + n], number[y, x0 : x0 + n]
-                if faces:
-                    first_face_row(b, rx, ry, rz, enter, leave, np.int32(6) * me, near, which)
-                else:
-                    for x in range(n):
-                        met = (enter[x] > leave[x]) & (min(enter[x], _MOST) * factor > near[x])
-                        which[x] = me if met else which[x]
                 for x in range(n):  # the first distance below 1 cm counts as 1 cm
-                    value = min(enter[x], _MOST) * factor if enter[x] > leave[x] else _ZERO
-                    near[x] = max(near[x], value)
+                    value[x] = min(enter[x], _MOST) * factor if enter[x] > leave[x] else _ZERO
+                for x in range(n):
+                    first_face[x] = me
+                for k in range(int(b[24]) if faces else 0):
+                    a0, a1, a2, face = b[4 * k], b[4 * k + 1], b[4 * k + 2], np.int32(6) * me + np.int32(b[29 + k])
+                    for x in range(n):
+                        is_last = a0 * rx[x] + a1 * ry[x] + a2 * rz[x] <= enter[x]
+                        next_face[x] = face if is_last else first_face[x]
+                    first_face, next_face = next_face, first_face
+                for x in range(n):
+                    next_face[x] = first_face[x] if value[x] > near[x] else which[x]
+                for x in range(n):
+                    which[x] = next_face[x]
+                for x in range(n):
+                    part[x] = max(near[x], value[x])
+                for x in range(n):
+                    near[x] = part[x]
 
 
 @compiled
@@ -183,7 +193,7 @@ def sum_silhouettes(
     """
     h, w = weight.shape
     nx = cones.shape[2]
-    work, near_box, heights = np.empty((5, w), np.float32), np.empty(nx, np.bool_), _heights(cones)
+    work, near_box, heights = np.empty((6, w), np.float32), np.empty(nx, np.bool_), _heights(cones)
     for k in range(rows.shape[0]):
         b = rows[k]
         first, last = _rows_of_piece(b, heights)
@@ -194,7 +204,7 @@ def sum_silhouettes(
             rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
             for y in range(j * step, min(j * step + step, h)):
                 rays_row(planes, P, y, x0, rx, ry, rz)
-                through_row(b, rx, ry, rz, enter, leave)
+                through_row(b, rx, ry, rz, enter, leave, work[5, :n])
                 for x in range(n):
                     if enter[x] > leave[x]:
                         sums[numbers[k]] += weight[y, x0 + x]
@@ -252,47 +262,39 @@ def columns_of_piece(b: Any, cones: Any, near: Any, step: int, w: int) -> tuple[
 
 
 @called
-def through_row(b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any) -> None:
-    """Inverse distances (n,) at which rays enter and leave a piece; those that enter before they leave meet it."""
+def through_row(b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any, some: Any) -> None:
+    """Inverse distances (n,) at which rays enter and leave a piece; those that enter before they leave meet it.
+
+    ``some`` (n,) is scratch.
+    """
     before = int(b[24])
     # Three planes at a time: some twice.
     for part in range(0, before, 3):
         k, j, i = 4 * part, 4 * min(part + 1, before - 1), 4 * min(part + 2, before - 1)
         a0, a1, a2, b0, b1, b2 = b[k], b[k + 1], b[k + 2], b[j], b[j + 1], b[j + 2]
         c0, c1, c2 = b[i], b[i + 1], b[i + 2]
+        out = some if part + 3 < before else enter
         if part:
             for x in range(enter.shape[0]):
                 one, two = a0 * rx[x] + a1 * ry[x] + a2 * rz[x], b0 * rx[x] + b1 * ry[x] + b2 * rz[x]
-                enter[x] = min(min(one, two), enter[x])
+                out[x] = min(min(one, two), some[x])
         else:
             for x in range(enter.shape[0]):
                 one, two = a0 * rx[x] + a1 * ry[x] + a2 * rz[x], b0 * rx[x] + b1 * ry[x] + b2 * rz[x]
-                enter[x] = min(min(one, two), c0 * rx[x] + c1 * ry[x] + c2 * rz[x])
+                out[x] = min(min(one, two), c0 * rx[x] + c1 * ry[x] + c2 * rz[x])
     for part in range(before, 6, 3):
         k, j, i = 4 * part, 4 * min(part + 1, 5), 4 * min(part + 2, 5)
         a0, a1, a2, b0, b1, b2 = b[k], b[k + 1], b[k + 2], b[j], b[j + 1], b[j + 2]
         c0, c1, c2 = b[i], b[i + 1], b[i + 2]
+        out = some if part + 3 < 6 else leave
         if part > before:
             for x in range(leave.shape[0]):
                 one, two = a0 * rx[x] + a1 * ry[x] + a2 * rz[x], b0 * rx[x] + b1 * ry[x] + b2 * rz[x]
-                leave[x] = max(max(one, two), leave[x])
+                out[x] = max(max(one, two), some[x])
         else:
             for x in range(leave.shape[0]):
                 one, two = a0 * rx[x] + a1 * ry[x] + a2 * rz[x], b0 * rx[x] + b1 * ry[x] + b2 * rz[x]
-                leave[x] = max(max(max(one, two), c0 * rx[x] + c1 * ry[x] + c2 * rz[x]), _ZERO)
-
-
-@inlined
-def first_face_row(
-    b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any, first: int, near: Any, which: Any
-) -> None:
-    """Number the planes (n,) by which rays enter a piece, where that is nearer than ``near`` (n,)."""
-    for k in range(int(b[24])):
-        a0, a1, a2, face = b[4 * k], b[4 * k + 1], b[4 * k + 2], first + np.int32(b[29 + k])
-        for x in range(which.shape[0]):
-            met = (enter[x] > leave[x]) & (min(enter[x], _MOST) > near[x])
-            last = a0 * rx[x] + a1 * ry[x] + a2 * rz[x] <= enter[x]
-            which[x] = face if met & last else which[x]
+                out[x] = max(max(max(one, two), c0 * rx[x] + c1 * ry[x] + c2 * rz[x]), _ZERO)
 
 
 @compiled
@@ -379,10 +381,9 @@ def upsampled_row(nodes: Any, step: int, y: int, x0: int, row: Any, out: Any) ->
     n = out.shape[0]
     per = _ONE / np.float32(step)
     for i in range(x0 // step, (x0 + n + step - 1) // step):
-        first, slope = row[i], (row[i + 1] - row[i]) * per
-        part = out[i * step - x0 : min(i * step + step - x0, n)]
-        for k in range(part.shape[0]):
-            part[k] = first + slope * np.float32(k)
+        first, slope, at = row[i], (row[i + 1] - row[i]) * per, i * step - x0
+        for k in range(min(step, n - at)):  # to slice ``out`` takes longer than the loop
+            out[at + k] = first + slope * np.float32(np.int32(k))
 
 
 _NEAR_M, _NEAR_CELLS = 1.0, 256  # a grid around all boxes, over which it repeats
