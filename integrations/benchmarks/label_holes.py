@@ -2,8 +2,8 @@
 
 For every moved rig and surface: rings around labelled objects against the same rings slid sideways (the protocol of
 ``label_leak``), holes against the true ones, fills against the true views, and a probe: a small classifier that learns
-on retargeted views to tell rings around objects from slid ones. What it finds on other retargeted views beyond what it
-finds on true ones is artefact.
+on retargeted views to tell rings around objects from slid ones. It is an artefact that it learned if it finds more on
+other retargeted views than on true ones.
 """
 
 from __future__ import annotations

@@ -34,8 +34,8 @@ PLACE_M = (0.9, 0.0, 1.9)
 UP_M = 0.7
 
 ERRORS = ScanErrors(divergence_deg=0.17, reach_m=150.0)
-"""An HDL-32E's divergence, 3 mrad. Of rays between others that return from one surface, 95, 94 and 84 % return at 20 to
-30, 30 to 50 and 50 to 100 m; in nuScenes' frame 92, 92 and 83 %."""
+"""An HDL-32E's divergence, 3 mrad. Among rays between others that return from one surface, 95, 94 and 84 % return at 20
+to 30, 30 to 50 and 50 to 100 m; in nuScenes' frame 92, 92 and 83 %."""
 
 
 def scanner(beams: int, up_m: float = 0.0) -> Lidar:

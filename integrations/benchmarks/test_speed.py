@@ -85,7 +85,7 @@ def test_bounds(
 @pytest.mark.filterwarnings("ignore:target cameras")
 def test_fast_costs_the_same_without_neighbours(report_bound: Callable[..., None]) -> None:
     """A transform that would read neighbours against itself told not to, on a sample that has none: the median of pairs
-    of CPU times, in turn. Of two transforms one may be 7 % the slower, by where its memory lies."""
+    of CPU times, in turn. Two equal transforms may differ by 7 %, by where their memory lies."""
     sample = SyntheticDrive(demo_source_rig((450, 800)), num_frames=1, lidar=False)[0]
     del sample["boxes_3d"]
     retarget = RigRetarget(sample["rig"].turned(yaw_deg=22))

@@ -109,7 +109,7 @@ class Source:
                 "source": source_rig(self.size).content_key.hex(),
                 "arm": variant.views_spec(),  # the key that names existing frame stores
                 "renderer": code_hash("arbiview_aug.transforms.rig_retarget", without=_UNUSED[variant.holes]),
-                # What a variant says of its views is in ``variant``; another variant's needs may change without it.
+                # ``variant`` holds what a variant says of its views, so changes of other variants keep these frames.
                 "noise": code_hash("integrations.cross_rig.noise") if variant.noise else None,
                 "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.variant",)),
             }

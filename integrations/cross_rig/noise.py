@@ -12,7 +12,8 @@ import torch
 from arbiview_aug import Camera, Rig
 
 DEPTH, BOX_M, BOX_DEG, MISSED, LATE_S, TURNED_DEG = 0.05, 0.1, 2.0, 0.1, 0.05, 0.2
-"""Standard deviations: relative, of depths; of boxes' centres and yaws. A share of boxes. Seconds. Of cameras."""
+"""Standard deviations of depths (a share of the depth), of boxes' centres in metres and of their yaws in degrees; the
+share of boxes that are missed; by how many seconds points and boxes are late; the cameras' turn in degrees."""
 
 
 def noisy_depth(depth_m: torch.Tensor, index: int) -> torch.Tensor:
