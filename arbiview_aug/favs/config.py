@@ -70,7 +70,12 @@ class PaperConfig:
                 f"PaperConfig.consistent_px: expected less than inconsistent_px={self.inconsistent_px!r}, "
                 f"got {self.consistent_px!r}"
             )
-        for kind, weight in self.type_weights:
+        try:
+            weights = dict(self.type_weights)
+        except (TypeError, ValueError):
+            message = "PaperConfig.type_weights: expected pairs of a type and its weight"
+            raise ValueError(f"{message}, got {self.type_weights!r}") from None
+        for kind, weight in weights.items():
             if not isinstance(weight, Real) or not 0 <= weight <= 1e6:
                 raise ValueError(f"PaperConfig.type_weights: {kind}: expected a number from 0 to 1e+06, got {weight!r}")
 

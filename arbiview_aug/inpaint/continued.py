@@ -81,7 +81,7 @@ class Continue(Inpainter):
         return fill_holes([view.clone() for view in views], [~hole for hole in holes], only_mean=self.only_mean)
 
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
-        """Fill rendered frames, in place where possible."""
+        """Fill rendered frames, in place where possible; the own car too."""
         filled = []
         for frame in rendered:
             plans = frame.layers, frame.paint, frame.road, frame.rig
@@ -134,26 +134,30 @@ def fill_holes(
     for view, known, layer, objects, on_road, camera in of_views:
         if known.all():
             continue
+        rounding = 0.5 if view.dtype == np.uint8 else 0.0
         if only_mean:
-            view[:, ~known] = (mean + (0.5 if view.dtype == np.uint8 else 0.0))[:, None].astype(view.dtype)
+            view[:, ~known] = (mean + rounding)[:, None].astype(view.dtype)
             continue
         of_view = np.zeros(known.shape, np.uint8) if layer is None else layer
         _fill(view, known, of_view, on_road, camera, mean)
         if objects is not None:
             reach = SIDE_REACH * min(known.shape)
             of_objects = objects.pixel, objects.part, objects.nearest
-            kernels.paint(*of_objects, colours, known, reach, view.reshape(3, -1))
+            kernels.paint(*of_objects, colours, known, reach, rounding, view.reshape(3, -1))
     return [_like(*of_view) for of_view in zip(arrays, views, coverage, strict=True)]
 
 
 def mean_colour(views: Sequence[npt.NDArray[Any]], coverage: Sequence[npt.NDArray[Any]]) -> Colour:
     """Mean colour of the covered pixels of M views (3, h, w); grey without any. Large views are sampled."""
-    total, count = np.zeros(3), 0
-    for view, seen in zip(views, coverage, strict=True):
-        step = _cell_px(seen.shape)
-        sampled = seen[::step, ::step]
-        total += (view[:, ::step, ::step].astype(np.float64) * sampled).sum((1, 2))
-        count += int(sampled.sum())
+    for is_sampled in (True, False):  # few covered pixels may lie between the samples
+        total, count = np.zeros(3), 0
+        for view, seen in zip(views, coverage, strict=True):
+            step = _cell_px(seen.shape) if is_sampled else 1
+            sampled = seen[::step, ::step]
+            total += (view[:, ::step, ::step].astype(np.float64) * sampled).sum((1, 2))
+            count += int(sampled.sum())
+        if count:
+            break
     top = 255 if views[0].dtype == np.uint8 else 1
     return np.clip(total / count if count else np.full(3, top * GREY), 0, top).astype(np.float32)
 

@@ -18,6 +18,8 @@ from arbiview_aug.sample.inputs import Frame, read_frames
 
 Tensors = Sequence[torch.Tensor]
 
+_MASK_KEYS = ("coverage", "generated")
+
 SOURCES_KEY = "sources"
 """Sample key of the source images and calibration, for inpainting after collating."""
 
@@ -56,7 +58,6 @@ class Inpainter(ABC):
             seeds: A seed for each view.
         """
 
-    @torch.no_grad()
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
         """Fill rendered ``frames``.
 
@@ -72,23 +73,26 @@ class Inpainter(ABC):
             for k in range(len(frame.rig))
         ]
         views = [view for frame in rendered for view in frame.images]
-        filled = iter(_checked(type(self).__name__, self.inpaint(views, unknown, seeds), views))
+        with torch.no_grad():
+            images = self.inpaint(views, unknown, seeds)
+        filled = iter(_checked(type(self).__name__, images, views, unknown))
         frames_and_holes = zip(rendered, parts, strict=True)
         return [put(frame, [next(filled) for _ in holes], holes) for frame, (_, holes) in frames_and_holes]
 
     def complete_batch(self, batch: Mapping[str, Any]) -> dict[str, Any]:
         """Fill collated samples, on the device of a network: DataLoader workers cannot use a GPU.
 
-        The pixels are those of ``RigRetarget(holes=self)``, but for rounding: frames are computed together.
+        The pixels are those of ``RigRetarget(holes=self)``, but for rounding: frames are computed together. Those of
+        ``Continue`` are not: batches do not say what holes lie behind.
 
         Args:
             batch: From ``RigRetarget(..., keys=SampleKeys(extra=("sources", "confidence")))``: a sample or a batch.
 
         Returns:
-            A new dict without ``sources``, with ``generated``.
+            A new dict without ``sources``, with ``generated``. Bars and the own car (``ego_mask``) stay black.
 
         Raises:
-            SampleError: The batch lacks the sources, the coverage or the confidence.
+            SampleError: The batch lacks the sources, the coverage or the confidence, or maps are not the views'.
             GeneratorError: Impossible settings.
         """
         missing = [key for key in ("images", "coverage", "confidence", SOURCES_KEY) if batch.get(key) is None]
@@ -103,16 +107,18 @@ class Inpainter(ABC):
         if len(sources) != len(views):
             raise SampleError(f"complete: expected sources of {len(views)} frames, got {len(sources)}")
         maps = {key: split(key, batch[key], lead) for key in MAP_KEYS if key in batch}
+        for key, frames in maps.items():
+            _check_maps(key, frames, views)
         is_filled = maps.pop("generated", None) is not None  # by ``holes`` of the transform
         rendered = []
         for b, view in enumerate(views):
-            images = list(view.images)
+            images = [image.clone() for image in view.images]  # some fill in place
             if is_filled:
                 images = [torch.where(seen, image, 0) for seen, image in zip(maps["coverage"][b], images, strict=True)]
             rendered.append(RenderedFrame(images, view.rig, **{key: frames[b] for key, frames in maps.items()}))
         if batch.get("token") is not None:
             sources = [replace(frame, sample={**frame.sample, "token": batch["token"]}) for frame in sources]
-        done = self.fill(rendered, sources)
+        done = [_without_own_car(frame) for frame in self.fill(rendered, sources)]
         out = {key: value for key, value in batch.items() if key != SOURCES_KEY}
         for key in (*maps, "generated"):
             out[key] = gathered([getattr(frame, key) for frame in done], lead)
@@ -120,8 +126,26 @@ class Inpainter(ABC):
         return out
 
 
-def _checked(name: str, images: Any, views: Tensors) -> list[torch.Tensor]:
-    """The images that an inpainter made of views; GeneratorError for another number, type or shape."""
+def _check_maps(key: str, maps: Sequence[Any], frames: Sequence[Frame]) -> None:
+    """Raise SampleError unless the maps of each frame are tensors (M, h, w) of its images' sizes, of the key's type."""
+    for number, (of_frame, frame) in enumerate(zip(maps, frames, strict=True)):
+        of_frame = of_frame if isinstance(of_frame, torch.Tensor | list | tuple) else [of_frame]
+        got = [(getattr(m, "dtype", type(m)), tuple(getattr(m, "shape", ()))) for m in of_frame]
+        sizes = [tuple(image.shape[-2:]) for image in frame.images]
+        is_mask = key in _MASK_KEYS
+        is_typed = all(isinstance(kind, torch.dtype) and (kind == torch.bool) == is_mask for kind, _ in got)
+        if not is_typed or [size for _, size in got] != sizes:
+            raise SampleError(
+                f"complete: {key}: frame {number}: expected {'bool' if is_mask else 'numbers'} of the images' sizes "
+                f"{sizes}, got {[f'{kind} {size}' for kind, size in got]}: pass what RigRetarget wrote"
+            )
+
+
+def _checked(name: str, images: Any, views: Tensors, holes: Tensors) -> list[torch.Tensor]:
+    """The images that an inpainter made of views, float ones cut to [0, 1].
+
+    GeneratorError for another number, type or shape, and where pixels of the holes are not finite.
+    """
     images = list(images) if isinstance(images, Iterable) else [images]
     got, expected = (
         [f"{getattr(x, 'dtype', type(x).__name__)} {tuple(getattr(x, 'shape', ()))}" for x in of]
@@ -129,7 +153,9 @@ def _checked(name: str, images: Any, views: Tensors) -> list[torch.Tensor]:
     )
     if got != expected:
         raise GeneratorError(f"{name}.inpaint: expected images as its views, {', '.join(expected)}, got {got}")
-    return images
+    if any(bool((~image.isfinite().all(0) & hole).any()) for image, hole in zip(images, holes, strict=True)):
+        raise GeneratorError(f"{name}.inpaint: expected finite pixels in the holes, got NaN or infinity")
+    return [image.clamp(0, 1) if image.is_floating_point() else image for image in images]
 
 
 class Black(Inpainter):
@@ -162,6 +188,14 @@ def put(rendered: RenderedFrame, images: Sequence[torch.Tensor], holes: Sequence
     pixels = zip(holes, images, rendered.images, strict=True)
     views = [torch.where(hole, filled, view) for hole, filled, view in pixels]
     return replace(rendered.with_maps(without_holes), images=views, generated=stacked(list(holes)))
+
+
+def _without_own_car(frame: RenderedFrame) -> RenderedFrame:
+    """The frame, black and not marked as generated where no source shows what its cameras' masks hide."""
+    _, holes = holes_of(frame, 0)
+    shown = [seen | hole for seen, hole in zip(frame.coverage, holes, strict=True)]
+    images = [torch.where(one, image, 0) for one, image in zip(shown, frame.images, strict=True)]
+    return replace(frame, images=images, generated=stacked(holes))
 
 
 # --- randomness -------------------------------------------------------------------------------------------------------
@@ -217,7 +251,9 @@ class CompletedLoader:
 
     def __init__(self, loader: Iterable[Mapping[str, Any]], inpainter: Inpainter) -> None:
         if not callable(getattr(inpainter, "complete_batch", None)):
-            raise ValueError(f"inpainter: expected an Inpainter or a Generator, got {type(inpainter).__name__}")
+            raise ValueError(
+                f"inpainter: expected an Inpainter, such as Diffusion(generator), got {type(inpainter).__name__}"
+            )
         self.loader, self.inpainter = loader, inpainter
 
     def __iter__(self) -> Iterator[dict[str, Any]]:

@@ -320,7 +320,7 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
 
 
 @compiled
-def paint(pixel: Any, part: Any, nearest: Any, table: Any, seen: Any, reach: float, view: Any) -> None:
+def paint(pixel: Any, part: Any, nearest: Any, table: Any, seen: Any, reach: float, rounding: float, view: Any) -> None:
     """Paint the unseen pixels of objects in a view: tops in their part's colour, without a colour not at all.
 
     Sides mix their part's colour with the nearest seen pixels of the same body or cabin.
@@ -332,6 +332,7 @@ def paint(pixel: Any, part: Any, nearest: Any, table: Any, seen: Any, reach: flo
         table: (P, 3) float32 colours of the parts; the first is negative where unknown.
         seen: (h, w) bool.
         reach: Distance in pixels at which a seen pixel weighs as much as the part's colour.
+        rounding: Added to what is written.
         view: (3, h w), painted.
     """
     w = seen.shape[1]
@@ -351,7 +352,7 @@ def paint(pixel: Any, part: Any, nearest: Any, table: Any, seen: Any, reach: flo
                 for c in range(3):
                     mixed[c] += weight * np.float32(view[c, source])
         for c in range(3):
-            view[c, at] = mixed[c] / total
+            view[c, at] = mixed[c] / total + np.float32(rounding)
 
 
 def warm_up() -> None:
@@ -365,4 +366,4 @@ def warm_up() -> None:
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
         sum_cells(view, chosen, 1, cells[0])
         put_cells(cells[0], 1, chosen, 0.5, view)
-        paint(pixel, pixel, np.zeros((4, 1), np.int32), colours, seen, 1.0, view.reshape(3, 4))
+        paint(pixel, pixel, np.zeros((4, 1), np.int32), colours, seen, 1.0, 0.5, view.reshape(3, 4))

@@ -54,8 +54,12 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
     ) -> None:
         super().__init__()
         self.min_confidence, self.seed = checked_settings(min_confidence, seed)
-        if size < multiple or size % multiple or batch < 1:
-            raise ValueError(f"size, batch: expected a multiple of {multiple}, and 1 or more, got {size} and {batch}")
+        whole = all(type(value) is int and value > 0 for value in (size, multiple, batch))
+        if not whole or size % multiple:
+            raise ValueError(
+                "size, multiple, batch: expected whole numbers from 1, size a multiple of multiple, "
+                f"got {size!r}, {multiple!r} and {batch!r}"
+            )
         self.network = network.eval()
         for parameter in network.parameters():  # a script's module has no requires_grad_
             parameter.requires_grad_(False)
@@ -106,8 +110,9 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         images, holes = zip(*(drawn(canvas, pixels, left) for canvas in canvases), strict=True)
         inputs = torch.from_numpy(np.stack(images)).to(self.device), torch.from_numpy(np.stack(holes)).to(self.device)
         outputs = self.run(*inputs, [seeds[canvas.windows[0][0].view] for canvas in canvases])
-        if outputs.shape != inputs[0].shape:
-            raise GeneratorError(f"inpainting: expected images {tuple(inputs[0].shape)}, got {tuple(outputs.shape)}")
+        if not isinstance(outputs, torch.Tensor) or outputs.shape != inputs[0].shape:
+            got = tuple(getattr(outputs, "shape", ())) or type(outputs).__name__
+            raise GeneratorError(f"inpainting: expected images {tuple(inputs[0].shape)}, got {got}")
         if not bool(torch.isfinite(outputs).all()):
             raise GeneratorError("inpainting: expected finite images, got NaN or infinity; try float32")
         self.calls += 1
@@ -209,19 +214,32 @@ class TorchScriptInpainter(NetworkInpainter):
         size: Longest side of an image that it sees.
         multiple: Number that divides both sides.
         batch: Images that it sees at once.
-        settings: ``min_confidence`` and ``seed``, as for every ``Inpainter``.
+        min_confidence: As for every ``Inpainter``, like ``seed``.
 
     Raises:
         GeneratorError: No such file, or no TorchScript.
     """
 
     def __init__(
-        self, path: str | Path, *, size: int = 512, multiple: int = 8, batch: int = 4, **settings: Any
+        self,
+        path: str | Path,
+        *,
+        size: int = 512,
+        multiple: int = 8,
+        batch: int = 4,
+        min_confidence: float = 0.0,
+        seed: int = 0,
     ) -> None:
-        super().__init__(load_torchscript(path, str(path), GeneratorError), size, multiple, batch, **settings)
+        network = load_torchscript(path, str(path), GeneratorError)
+        super().__init__(network, size, multiple, batch, min_confidence=min_confidence, seed=seed)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
-        return self.network(images, holes[:, None].to(images.dtype))
+        try:
+            return self.network(images, holes[:, None].to(images.dtype))
+        except RuntimeError as error:
+            raise GeneratorError(
+                f"inpainting: the TorchScript file failed on images and masks: {one_line(error)}"
+            ) from None
 
 
 def load_torchscript(path: str | Path, what: str, kind: type[ArbiviewError]) -> Any:

@@ -353,7 +353,7 @@ _CACHED_RIGS = 8  # about 0.2 MB each; every frame of a drive may have its own c
 
 def _checked_gains(choice: object) -> tuple[float, ...]:
     try:
-        gains = tuple(float(gain) for gain in choice)  # type: ignore[attr-defined]
+        gains = () if isinstance(choice, str) else tuple(float(gain) for gain in choice)  # type: ignore[attr-defined]
     except (TypeError, ValueError):
         gains = ()
     if not gains or not all(1 / _MAX_GIVEN_GAIN <= gain <= _MAX_GIVEN_GAIN for gain in gains):  # NaN fails too

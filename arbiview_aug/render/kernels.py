@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_row, turn_row
+from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.environment import called, compiled, inlined
 from arbiview_aug.render.plan import OUTSIDE
 from arbiview_aug.scene.boxes import PARTS, PIECES
@@ -32,7 +33,7 @@ WHOLE = 0.97
 _BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
 _WORK_ROWS = 10  # of scratch memory in ``_evaluate_row``
-MAP_LIMIT_PX = np.float32(32000)
+MAP_LIMIT_PX = np.float32(MAX_SIZE_PX)
 _MAX_SIDE_PX = 32767
 _AHEAD_COLUMNS, _MOST_AHEAD = 176, 32  # of a strip at a time; at most so many pixels are read for each of its own
 
@@ -643,7 +644,7 @@ def farthest_occluded(q: Any, face: Any, layers: Any, cell: int, farthest: Any) 
     Args:
         q: (h, w) inverse distances, 0 where unknown.
         face: (h, w) int32 faces of objects, -1 elsewhere; (0, 0) without any.
-        layers: (h, w) uint8, 1 (``view_plan.OCCLUDED``) where a pixel is a hole in a source's image.
+        layers: (h, w) uint8, 1 (``plan.OCCLUDED``) where a pixel is a hole in a source's image.
         cell: Side of a cell, pixels.
         farthest: (ny, nx) float32, written.
     """
@@ -679,7 +680,7 @@ def mark_objects(q: Any, face: Any, winner: Any, limit: Any, cell: int, layers: 
         winner: (h, w) int8 source, -1 for none.
         limit: (ny, nx) float32 inverse distances above which seen pixels of a cell are nearer.
         cell: Side of a cell, pixels.
-        layers: (h, w) uint8, updated to ``view_plan.OBJECT``.
+        layers: (h, w) uint8, updated to ``plan.OBJECT``.
     """
     (h, w), nx = q.shape, limit.shape[1]
     limits = np.empty(w, np.float32)

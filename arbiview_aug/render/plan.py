@@ -15,7 +15,7 @@ An atlas holds the source images that a plan reads, below and beside each other,
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from numbers import Real
 from typing import Any, Literal
@@ -42,7 +42,7 @@ class RenderConfig:
             off. Wider bands show double images of near objects, narrower ones the exposure step.
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
         certainty: Store the geometry's accuracy in plans, one byte a pixel; ``outputs=("confidence",)`` needs it.
-        layers: Store what holes show (``ViewPlan.layers``, ``paint`` and ``road``); ``holes="continue"`` needs it.
+        layers: Store what holes show (``ViewPlan.layers``, ``paint``, ``road``); ``RigRetarget`` sets it by ``holes``.
     """
 
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
@@ -61,7 +61,10 @@ class RenderConfig:
 
 
 def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
-    """Raise ValueError for fields of a config outside their (lowest, highest) value."""
+    """Raise ValueError for fields of a config outside their (lowest, highest) value, and flags that are no bool."""
+    for flag in (one.name for one in fields(config) if isinstance(one.default, bool)):
+        if not isinstance(value := getattr(config, flag), bool):
+            raise ValueError(f"{type(config).__name__}.{flag}: expected True or False, got {value!r}")
     for name, (low, high) in ranges.items():
         value = getattr(config, name)
         if not isinstance(value, Real) or not low <= float(value) <= high:

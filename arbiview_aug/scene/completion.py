@@ -559,12 +559,12 @@ def add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any) -> No
 def interpolate_layer(rows: Any, columns: Any, step: int, layer: Any, apart: int, out: Any) -> None:
     """Values (h, w) between those of a panorama's layer every ``apart`` pixels; the rest is as in ``add_residuals``."""
     h, w = out.shape
-    around, v, u = np.full((3, 2, w + 1), -2, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    around, v, u = np.full((3, 2, w + 1), -2, np.float32), np.empty(w + 1, np.float32), np.empty(w + 1, np.float32)
     nodes = np.empty((-(-h // apart) + 1, -(-w // apart) + 1), np.float32)
     for j in range(nodes.shape[0]):
         y = min(j * apart, h - 1)
-        _between_rows(rows, step, y, h, around[0], v)
-        _between_rows(columns, step, y, h, around[1], u)
+        _between_rows(rows, step, y, h, around[0], v[:w])
+        _between_rows(columns, step, y, h, around[1], u[:w])
         for i in range(nodes.shape[1]):
             x = min(i * apart, w - 1)
             v[i], u[i] = v[x], u[x]

@@ -100,8 +100,9 @@ def motion_camera(camera: Camera) -> Camera:
 
 
 def halvings(camera: Camera) -> int:
-    """Number of halvings of a camera's images."""
-    return max(0, round(math.log2(camera.width_px / MOTION_WIDTH_PX)))
+    """Number of halvings of a camera's images; two rows are left."""
+    most = int(math.log2(camera.height_px / 2)) if camera.height_px > 1 else 0
+    return min(max(0, round(math.log2(camera.width_px / MOTION_WIDTH_PX))), most)
 
 
 @lru_cache(16)

@@ -16,11 +16,12 @@ _MOST = np.float32(MAX_INVERSE_DISTANCE)
 ROW = 35
 
 GROUND, STREET = 0, 1
+_USUAL_STEP = 8
 
 
 @compiled
 def static_image(planes: Any, P: Any, R: Any, kind: int, S: Any, q: Any) -> None:
-    """Inverse distances of a static surface along a camera's rays (``static.Street``, ``static.Ground``).
+    """Inverse distances of a static surface along a camera's rays (``surface.Street``, ``surface.Ground``).
 
     Args:
         planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
@@ -299,7 +300,7 @@ def through_row(b: Any, rx: Any, ry: Any, rz: Any, enter: Any, leave: Any, some:
 
 @compiled
 def planes_of(box: Any, profile: Any, planes: Any) -> None:
-    """Planes (pieces, 6, 4), ego frame, of a profile (pieces, 8) in a box (7,): see ``shapes.Piece``."""
+    """Planes (pieces, 6, 4), ego frame, of a profile (pieces, 8) in a box (7,): see ``boxes.Piece``."""
     c, s = np.cos(box[6]), np.sin(box[6])
     for piece in range(profile.shape[0]):
         low, high = profile[piece, 0] * box[5], profile[piece, 1] * box[5]
@@ -378,12 +379,16 @@ def upsampled_row(nodes: Any, step: int, y: int, x0: int, row: Any, out: Any) ->
     t = np.float32(y - j * step) / np.float32(step)
     for i in range(row.shape[0]):
         row[i] = nodes[j, i] + (nodes[j + 1, i] - nodes[j, i]) * t
-    n = out.shape[0]
-    per = _ONE / np.float32(step)
-    for i in range(x0 // step, (x0 + n + step - 1) // step):
+    n, left, per = out.shape[0], x0 // step, _ONE / np.float32(step)
+    whole = n // _USUAL_STEP if step == _USUAL_STEP else 0
+    for i in range(whole):  # a number of pixels that the compiler knows is one vector
+        first, slope = row[left + i], (row[left + i + 1] - row[left + i]) * per
+        for k in range(_USUAL_STEP):
+            out[i * _USUAL_STEP + k] = first + slope * np.float32(k)
+    for i in range(left + whole, (x0 + n + step - 1) // step):
         first, slope, at = row[i], (row[i + 1] - row[i]) * per, i * step - x0
-        for k in range(min(step, n - at)):  # to slice ``out`` takes longer than the loop
-            out[at + k] = first + slope * np.float32(np.int32(k))
+        for k in range(min(step, n - at)):
+            out[at + k] = first + slope * np.float32(k)
 
 
 _NEAR_M, _NEAR_CELLS = 1.0, 256  # a grid around all boxes, over which it repeats

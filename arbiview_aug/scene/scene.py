@@ -101,8 +101,10 @@ class Scene:
         key = name, ground_z_m
         if key not in self._surfaces:
             row = GEOMETRIES.get(name)
-            if row is None or (row.needs is not None and self.geometry(row.needs) is None):
-                raise ValueError(f"surface: {name!r} is unknown, or the scene has no geometry for it")
+            if row is None:
+                raise ValueError(f"geometry: expected one of {', '.join(GEOMETRIES)}, got {name!r}")
+            if row.needs is not None and self.geometry(row.needs) is None:
+                raise ValueError(f"geometry={name!r}: expected a scene with {row.needs!r}, got one without")
             self._surfaces[key] = row.make(self, ground_z_m)
         return self._surfaces[key]
 

@@ -223,11 +223,15 @@ class Ground(_RoadAndWall):
         return np.maximum(plane_inverse_distance(origin, directions, self.ground_z_m), wall)
 
 
+SHARPNESS = 4
+"""Exponent of the norm that joins road and wall; infinity would be the nearer of both, with a crease."""
+
+
 @dataclass(frozen=True)
 class Street(_RoadAndWall):
     """The road joined smoothly to an elliptical far wall, which is nearer at the sides than ahead.
 
-    The p-norm of two inverse distances, (q_road^k + q_wall^k)^(1/k), is a smooth minimum of the distances. It shortens
+    The norm of two inverse distances, (q_road^4 + q_wall^4)^(1/4), is a smooth minimum of the distances. It shortens
     them by 16 % where road and wall cross, 1.5 % where the road is at half the wall's distance. docs/surfaces.md says
     how the defaults were measured.
 
@@ -235,13 +239,11 @@ class Street(_RoadAndWall):
         ground_z_m: Height of the road in the ego frame.
         half_length_m: Semi-axis of the wall along the road.
         half_width_m: Semi-axis across it.
-        sharpness: k; infinity is the hard minimum with its crease.
     """
 
     ground_z_m: float = 0.0
     half_length_m: float = 40.0
     half_width_m: float = 20.0
-    sharpness: float = 4.0
 
     @property
     def semi_axes_m(self) -> tuple[float, float]:
@@ -254,7 +256,7 @@ class Street(_RoadAndWall):
         wall = wall_inverse_distance(origin, directions, self.half_length_m, self.half_width_m)
         nearer, farther = np.maximum(road, wall), np.minimum(road, wall)
         ratio = farther / np.maximum(nearer, 1e-300)
-        joined = nearer * (1 + ratio**self.sharpness) ** (1 / self.sharpness)
+        joined = nearer * (1 + ratio**SHARPNESS) ** (1 / SHARPNESS)
         return np.minimum(joined, MAX_INVERSE_DISTANCE)
 
 

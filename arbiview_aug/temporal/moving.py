@@ -136,6 +136,7 @@ def _stand_off_road(
         below = np.cumsum(gains[::-1])[::-1]
         middle = int(np.median(rows)) - first
         foot = first + middle + int(below[middle:].argmax()) - RADIUS_PX  # windows that touch it are matched by it
+        foot = max(foot, first)
         wall = np.median(image.road[foot, left:right] / image.horizontal[foot, left:right])
         if not wall > 0:
             continue

@@ -14,7 +14,7 @@ import numpy as np
 from arbiview_aug import Camera
 from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
 from arbiview_aug.render.plan import Slot
-from arbiview_aug.scene.surface import WALL_CENTER_M, Ground, Street
+from arbiview_aug.scene.surface import SHARPNESS, WALL_CENTER_M, Ground, Street
 
 LEAST_DEPTH = 1e-6  # of unit directions, for lenses that see less than half a turn
 
@@ -143,7 +143,7 @@ def inverse_distance(surface: str, origin: np.ndarray, directions: np.ndarray, g
     with np.errstate(all="ignore"):
         farther = (-b + np.sqrt(b * b - a * c)) / a
         wall = np.where(farther > 0, 1 / farther, 0.0)  # NaN, a miss, compares as False
-    k = np.inf if surface == "ground" else Street().sharpness
+    k = np.inf if surface == "ground" else SHARPNESS
     joined = np.linalg.norm(np.stack([road, wall]), k, axis=0)
     return np.minimum(joined, MAX_INVERSE_DISTANCE)
 

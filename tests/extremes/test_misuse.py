@@ -123,6 +123,12 @@ def test_configs_refuse_by_name() -> None:
         RenderConfig(seam_width="a")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"PaperConfig\.beta"):
         PaperConfig(beta=None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"PaperConfig\.type_weights: expected pairs"):
+        PaperConfig(type_weights=None)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"PaperConfig\.use_feature_matching: expected True or False, got 'off'"):
+        PaperConfig(use_feature_matching="off")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"RenderConfig\.antialias: expected True or False"):
+        RenderConfig(antialias="no")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="yaw_deg"):
         RandomRig(TARGET, yaw_deg="x")  # type: ignore[arg-type]
 

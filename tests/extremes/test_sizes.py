@@ -80,6 +80,14 @@ def test_too_large_an_atlas_is_refused_by_name() -> None:
     assert AtlasLayout.for_sources(sizes, [(k, 1) for k in range(29)]).size[1] <= 32766, "halved ones fit"
 
 
+@pytest.mark.parametrize("size", [(4, 32766), (32766, 4)])
+def test_the_last_pixels_of_the_longest_images(size: tuple[int, int]) -> None:
+    rig = Rig([camera("long", width_px=size[1], height_px=size[0])])
+    image = (torch.arange(size[0])[:, None] + torch.arange(size[1])).remainder(251).to(torch.uint8).expand(1, 3, *size)
+    out = RigRetarget(rig)({"images": image, "rig": rig})
+    assert out["coverage"].all() and torch.equal(out["images"], image)
+
+
 @pytest.mark.parametrize(
     ("which", "size", "how"),
     sampled(

@@ -11,9 +11,12 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, default_collate
 
-from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys
+from arbiview_aug import Camera, Rig, RigRetarget, SampleError, SampleKeys
+from arbiview_aug.errors import GeneratorError
 from arbiview_aug.inpaint import continued as holes_module
-from arbiview_aug.inpaint.continued import Continue, _line_directions, fill_holes, mean_colour, object_colours
+from arbiview_aug.inpaint.continued import Continue, Mean, _line_directions, fill_holes, mean_colour, object_colours
+from arbiview_aug.inpaint.inpainter import Inpainter
+from arbiview_aug.inpaint.telea import Telea
 from arbiview_aug.render.kernels import farthest_occluded, mark_objects
 from arbiview_aug.render.plan import BACKGROUND, OBJECT, OCCLUDED, Paint
 from arbiview_aug.render.view_planner import build_plan, find_paint
@@ -196,11 +199,11 @@ def test_gradients_of_seen_pixels_stay() -> None:
     target = source.turned(yaw_deg=30)
     out = RigRetarget(target)({"images": images, "rig": source})
     gradients = []
-    for how in ("continue", "black"):
+    for how in ("continue", "telea", "black"):
         out = RigRetarget(target, holes=how)({"images": images, "rig": source})  # type: ignore[arg-type]
         weights = torch.arange(out["images"].numel()).reshape(out["images"].shape) % 7
         gradients.append(torch.autograd.grad((out["images"] * weights).sum(), images)[0])
-    assert gradients[0].any() and torch.equal(*gradients)
+    assert gradients[0].any() and torch.equal(gradients[0], gradients[2]) and torch.equal(gradients[1], gradients[2])
 
 
 def test_views_of_several_sizes() -> None:
@@ -359,12 +362,67 @@ def test_plans_know_where_the_road_lies_behind_holes(street: dict[str, Any]) -> 
 def test_batches_without_a_plan_are_filled(street: dict[str, Any]) -> None:
     keys = SampleKeys(extra=("sources", "confidence"))
     batch = default_collate([RigRetarget(raised(street), holes="black", keys=keys)(street)])
-    black = batch["images"]
+    black = batch["images"].clone()
     done = Continue().complete_batch(batch)
+    assert torch.equal(batch["images"], black), "the batch itself is not written to"
     hole = ~done["coverage"]
     assert torch.equal(done["generated"], hole) and hole.any()
     assert torch.equal(done["images"].movedim(2, -1)[~hole], black.movedim(2, -1)[~hole])
     assert (done["images"].movedim(2, -1)[hole].float().mean(-1) > 0).float().mean() > 0.99
+
+
+@pytest.mark.parametrize("holes", ["continue", "mean", "telea"])
+def test_the_own_car_of_a_batch_is_neither_filled_nor_marked(street: dict[str, Any], holes: str) -> None:
+    masks = [np.arange(camera.height_px)[:, None].repeat(camera.width_px, 1) < 20 for camera in street["rig"]]
+    cameras = [replace(camera, mask=mask) for camera, mask in zip(raised(street), masks, strict=True)]
+    keys = SampleKeys(extra=("sources", "confidence"))
+    black = RigRetarget(Rig(cameras), holes="black", keys=keys)(street)
+    inpainter = {"continue": Continue, "mean": Mean, "telea": Telea}[holes]()
+    out = inpainter.complete_batch(black)
+    own = out["ego_mask"] & ~out["coverage"]
+    assert own.any() and not out["images"].movedim(1, -1)[own].any()
+    assert torch.equal(out["generated"], ~out["coverage"] & ~own) and out["generated"].any()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("coverage", torch.ones(3, 4, dtype=torch.bool), "coverage: frame 0: expected bool of the images' sizes"),
+        ("coverage", torch.ones(3, 64, 96), "coverage: frame 0: expected bool"),
+        ("confidence", "x", "confidence: frame 0: expected numbers of the images' sizes .*, got .*str"),
+    ],
+)
+def test_maps_of_a_batch_that_are_not_its_views_are_refused(
+    street: dict[str, Any], key: str, value: object, message: str
+) -> None:
+    keys = SampleKeys(extra=("sources", "confidence"))
+    batch = RigRetarget(raised(street), holes="black", keys=keys)(street)
+    with pytest.raises(SampleError, match=message):
+        Continue().complete_batch({**batch, key: value})
+
+
+class Painter(Inpainter):
+    """Gives holes one value."""
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+
+    def inpaint(self, views: Any, holes: Any, seeds: Any) -> list[torch.Tensor]:
+        return [torch.full_like(view, self.value) for view in views]
+
+
+def test_what_an_inpainter_makes_is_finite_and_in_range(street: dict[str, Any]) -> None:
+    sample = street | {"images": street["images"].float() / 255}
+    out = RigRetarget(raised(street), holes=Painter(7.5))(sample)
+    assert (out["images"].movedim(1, -1)[out["generated"]] == 1).all()
+    with pytest.raises(GeneratorError, match=r"Painter\.inpaint: expected finite pixels"):
+        RigRetarget(raised(street), holes=Painter(float("nan")))(sample)
+
+
+def test_few_seen_pixels_have_a_mean_colour() -> None:
+    view, seen = np.zeros((3, 512, 512), np.uint8), np.zeros((512, 512), bool)
+    view[:, 1:5, 1:5], seen[1:5, 1:5] = 200, True
+    assert (mean_colour([view], [seen]) == 200).all()
 
 
 def test_unlabelled_things_before_a_hole_are_found_by_their_distance() -> None:
@@ -415,7 +473,7 @@ def test_tops_take_their_body_s_paint_in_the_light_of_tops() -> None:
         assert top == pytest.approx(expected, abs=1e-3) if expected else in_light(100) < top < 150
         layers = np.full(seen.shape, OBJECT, np.uint8)
         (out,) = fill_holes([view.clone()], [seen], [layers], [paint])
-        assert (out[:, ~seen] == int(top)).all() and torch.equal(out[:, seen], view[:, seen])
+        assert (out[:, ~seen] == round(float(top))).all() and torch.equal(out[:, seen], view[:, seen])
         of_float, paint, _ = painted(top_seen, 1 / 255)
         (out,) = fill_holes([of_float], [seen], [layers], [paint])
         torch.testing.assert_close(out[:, ~seen], torch.full_like(out[:, ~seen], float(top) / 255))

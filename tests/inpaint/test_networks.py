@@ -241,13 +241,22 @@ class Broken(nn.Module):
         return image / 0 * 0
 
 
-@pytest.mark.parametrize("how", ["nan", "shape"])
+@pytest.mark.parametrize("settings", [{"size": "512"}, {"size": 0}, {"size": 36}, {"batch": None}, {"multiple": 0}])
+def test_impossible_sizes_of_a_network_are_refused(lama: Path, settings: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="size, multiple, batch: expected whole numbers from 1"):
+        TorchScriptInpainter(lama, **settings)
+
+
+@pytest.mark.parametrize("how", ["nan", "shape", "pair", "signature"])
 def test_what_a_network_must_not_return(tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     torch.jit.script(Broken()).save(str(tmp_path / "broken.pt"))
     filler = TorchScriptInpainter(tmp_path / "broken.pt", size=64)
-    if how == "shape":
-        monkeypatch.setattr(filler, "run", lambda images, *_: images[..., 1:])
+    if how in ("shape", "pair"):
+        monkeypatch.setattr(filler, "run", lambda images, *_: images[..., 1:] if how == "shape" else (images, images))
+    if how == "signature":
+        filler.network = torch.jit.script(nn.Identity())
     hole = torch.zeros(64, 64, dtype=torch.bool)
     hole[20:30, 20:30] = True
-    with pytest.raises(GeneratorError, match="expected finite images" if how == "nan" else "expected images"):
+    expected = {"nan": "expected finite images", "signature": "failed on images and masks"}.get(how, "expected images")
+    with pytest.raises(GeneratorError, match=expected):
         filler.inpaint([torch.rand(3, 64, 64)], [hole], [0])

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.temporal import moving
+from arbiview_aug.temporal.kernels import PER_CORRELATION
 from arbiview_aug.temporal.motion_depth import _match
 from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage
 
@@ -84,3 +86,21 @@ def test_what_moves_stands_where_its_foot_is(by_m: tuple[float, float]) -> None:
 def test_legs_carry_what_stands() -> None:
     """The road that is seen below a board does not make it hang."""
     assert distances(True, (0, 0), legs=True)[0] == pytest.approx(BOARD_M, rel=0.05)
+
+
+@pytest.mark.parametrize("rows", [2, 3])
+def test_a_thing_in_the_uppermost_rows_stands_on_the_road_there(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera.looking(
+        name="down", azimuth_deg=0, elevation_deg=-35, width_px=120, height_px=80, horizontal_fov_deg=60,
+        position_m=(0, 0, 1.6),
+    )  # fmt: skip
+    image = SweptImage(camera, np.zeros(camera.size, np.float32), 0.0)
+    thing = np.zeros(camera.size, bool)
+    thing[:rows, 40:80] = True
+    monkeypatch.setattr(moving, "_road_flow", lambda *_: None)
+    monkeypatch.setattr(moving, "_off_road", lambda *_: iter([thing]))
+    monkeypatch.setattr(moving, "_correlations", lambda *of: np.where(thing[of[-1]], 0.9, 0.1))
+    costs = np.where(thing, 0.8 * PER_CORRELATION, 0.1 * PER_CORRELATION).astype(np.float32)
+    q, valid = image.road.copy(), np.ones(camera.size, bool)
+    moving._stand_off_road(image, [image], costs, costs, q, valid)
+    assert q[0, 60] == pytest.approx(image.road[0, 60], rel=0.2)

@@ -31,7 +31,7 @@ TARGETS = {
 WALLS: dict[str, StaticSurface] = {
     "the street's own": Street(),
     "circle of 40 m": Ground(radius_m=40),
-    "ellipse of 60 by 30 m": Street(half_length_m=60, half_width_m=30, sharpness=64),
+    "ellipse of 60 by 30 m": Street(half_length_m=60, half_width_m=30),
 }
 QUALITIES: tuple[Quality, ...] = ("fast", "accurate")
 PARTS = 4
