@@ -287,8 +287,8 @@ class ViewPlan:
     # (h, w) uint8 layer of each pixel, for fillers; None if no pixel in a source's image is occluded
     layers: npt.NDArray[np.uint8] | None = None
     paint: Paint | None = None  # unseen parts of objects; None without ``layers`` or objects
-    # (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the nodes ``GRID_STEP_PX``
-    # apart; None without holes, or with sources at its own centre alone
+    # (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the planner's nodes: one a pixel in
+    # small views; None without holes, or with sources at its own centre alone
     road: BoolArray | None = None
 
     @property

@@ -363,7 +363,7 @@ def confidence_of(rendered: RenderedFrame) -> Maps:
 
 # --- resized only -----------------------------------------------------------------------------------------------------
 def resize_only(frame: Frame, size: tuple[int, int], fit: Fit, outputs: Collection[str] = ()) -> RenderedFrame:
-    """Resize a frame to ``size`` (h, w) without retargeting it; its views are fully covered."""
+    """Resize a frame to ``size`` (h, w) without retargeting it; all but bars is covered."""
     device = frame.images[0].device
     framings = [framing(camera.name, camera.size, size, fit) for camera in frame.rig]
     coverage = torch.stack([framed(torch.ones(f.scaled, dtype=torch.bool, device=device), f) for f in framings])
