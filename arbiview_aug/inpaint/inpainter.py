@@ -153,9 +153,12 @@ def _checked(name: str, images: Any, views: Tensors, holes: Tensors) -> list[tor
     )
     if got != expected:
         raise GeneratorError(f"{name}.inpaint: expected images as its views, {', '.join(expected)}, got {got}")
-    if any(bool((~image.isfinite().all(0) & hole).any()) for image, hole in zip(images, holes, strict=True)):
-        raise GeneratorError(f"{name}.inpaint: expected finite pixels in the holes, got NaN or infinity")
-    return [image.clamp(0, 1) if image.is_floating_point() else image for image in images]
+    for k, (image, hole) in enumerate(zip(images, holes, strict=True)):
+        if image.is_floating_point():
+            if not bool(image[:, hole].isfinite().all()):
+                raise GeneratorError(f"{name}.inpaint: expected finite pixels in the holes, got NaN or infinity")
+            images[k] = image.clamp(0, 1)
+    return images
 
 
 class Black(Inpainter):
