@@ -22,7 +22,7 @@ from arbiview_aug.generator.correspondence import TokenWindow
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, GeneratorNetworks
 from arbiview_aug.generator.sampler import guided, noise_schedule, sample
 from arbiview_aug.image_ops import resized
-from arbiview_aug.inpaint.inpainter import check_device, holes_of, seeded
+from arbiview_aug.inpaint.inpainter import check_device, checked_settings, holes_of, seeded
 from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.rendered import Maps, RenderedFrame
 from arbiview_aug.sample.batching import stacked
@@ -127,7 +127,8 @@ def complete_together(
         seed: Seed of the noise.
 
     Raises:
-        SampleError: Views, coverage and cameras that do not fit together.
+        SampleError: Images, maps and cameras that do not fit together.
+        ValueError: Impossible ``min_confidence`` or ``seed``.
         GeneratorError: Impossible settings, one step of a generator that was not trained for it, or a generator on a
             GPU in a DataLoader worker.
     """
@@ -140,6 +141,7 @@ def complete_together(
             "trained (loss.regression=0)"
         )
     check_device(generator)
+    checked_settings(min_confidence, seed)
     drafts = [_draft(*frame, min_confidence) for frame in zip(rendered, sources, names, strict=True)]
     alike: dict[tuple[int, int], list[_Draft]] = {}
     for draft in drafts:
@@ -163,8 +165,15 @@ def _draft(rendered: RenderedFrame, source: Frame, name: str, min_confidence: fl
     rig, images, left = rendered.rig.in_frame_of(source.rig), list(rendered.images), []
     if len(source.images) != len(source.rig):
         raise SampleError(f"complete: expected {len(source.rig)} source images, got {len(source.images)}")
-    _check_sizes(images, rendered.coverage, rig)
     trust = rendered.coverage if rendered.confidence is None else rendered.confidence
+    _check_sizes(images, rendered.coverage, trust, rig)
+    for camera, image in zip(source.rig, source.images, strict=True):
+        if tuple(image.shape) != (3, *camera.size):
+            expected, got = (3, *camera.size), tuple(image.shape)
+            raise SampleError(f"camera {camera.name!r}: expected a source image {expected}, got {got}")
+    types = {image.dtype for image in (*images, *source.images)}
+    if any(dtype != torch.uint8 and not dtype.is_floating_point for dtype in types):
+        raise SampleError(f"complete: expected images of uint8, or of floats in [0, 1], got {types}")
     known, holes = holes_of(rendered, min_confidence)
     for m, hole in enumerate(holes):
         if float(hole.float().mean()) > 1 - ALMOST_COMPLETE:
@@ -280,13 +289,14 @@ def valid_pixels(camera: Camera) -> torch.Tensor:
     return torch.ones(camera.size, dtype=torch.bool) if camera.mask is None else torch.tensor(camera.mask)
 
 
-def _check_sizes(views: Maps, coverage: Maps, targets: Rig) -> None:
-    counts = {"views": len(views), "coverage": len(coverage), "target cameras": len(targets)}
+def _check_sizes(views: Maps, coverage: Maps, trust: Maps, targets: Rig) -> None:
+    counts = {"views": len(views), "coverage": len(coverage), "confidence": len(trust), "target cameras": len(targets)}
     if len(set(counts.values())) > 1:
         raise SampleError(f"complete: expected as many of each, got {counts}")
-    for camera, view, seen in zip(targets, views, coverage, strict=True):
-        if tuple(view.shape) != (3, *camera.size) or tuple(seen.shape) != camera.size:
-            expected, got = f"a view (3, h, w) and coverage of {camera.size}", (tuple(view.shape), tuple(seen.shape))
-            raise SampleError(f"camera {camera.name!r}: expected {expected}, got {got[0]} and {got[1]}")
+    for camera, *maps in zip(targets, views, coverage, trust, strict=True):
+        got, seen = [tuple(one.shape) for one in maps], maps[1]
+        if got != [(3, *camera.size), camera.size, camera.size]:
+            expected = f"a view (3, h, w), coverage and confidence of {camera.size}"
+            raise SampleError(f"camera {camera.name!r}: expected {expected}, got {got[0]}, {got[1]} and {got[2]}")
         if seen.dtype != torch.bool:
             raise SampleError(f"camera {camera.name!r}: coverage: expected bool, got {seen.dtype}; pass coverage > 0")
