@@ -51,7 +51,7 @@ class LossConfig:
     geo_mode: GeoMode = "normalised"  # mean over rows; frobenius_sum: as printed, grows with resolution
     perceptual: float = 0.01  # β of the paper
     perceptual_below_t: int = 300  # the x0 error is 0.57 times the ε error at t = 200, 14.6 times at t = 999
-    perceptual_every: int = 4  # steps between two L_perceptual: decoding costs more than the U-Net
+    perceptual_every: int = 4  # steps between two L_perceptual, whose mean weight is β / 4: decoding is slow
     perceptual_crop: int = 64  # side in pixels of the square that is compared
     snr_limit: float = 5.0  # γ of Min-SNR-γ (Hang et al. 2023); 0 as printed. Unused by residual generators
     snr_floor: float = 0.1  # lower bound of the weight: Min-SNR is .0047 at t = 999, where few-step samplers start
@@ -141,8 +141,9 @@ def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: st
 def paper() -> TrainConfig:
     """Algorithm 1 as published, on Stable Diffusion's frozen weights and the published stages' pseudo views.
 
-    See Sec. Training Parameters. Two deviations: L_geo is normalised, since as printed it outgrows L_main
-    (``loss.geo_mode="frobenius_sum"``), and L_perceptual compares crops at early times.
+    See Sec. Training Parameters. Deviations: x0 is the real view's latent (``training.losses``). L_geo is normalised,
+    since as printed it outgrows L_main (``loss.geo_mode="frobenius_sum"``). L_perceptual compares crops at early times,
+    in every 4th step. The learning rate is warmed up for 100 steps, and guidance is rescaled.
     """
     return TrainConfig(
         generator=generators.paper(),
