@@ -138,8 +138,8 @@ def favs(
 ) -> Rendered:
     """Render N images (3, H, W), uint8 or in [0, 1], at M target cameras of one size in the rig's ego frame by FAVS.
 
-    On the surface ``far`` if all centres coincide, else on ``street``: training has images and poses alone. The
-    published stages (``paper``) know ``far`` alone, run on the CPU and have no confidence: it is 1 where they see.
+    Over ``infinity`` if all centres coincide, else over ``street``: training has images and poses alone. The
+    published stages (``paper``) know ``infinity`` alone, run on the CPU and have no confidence: it is 1 where they see.
     """
     target = Rig([replace(c, name=str(k), mask=None) for k, c in enumerate(targets)], ground_z_m=rig.ground_z_m)
     if quality == "paper":
