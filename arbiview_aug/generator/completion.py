@@ -16,7 +16,7 @@ from torch.nn import functional
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import GeneratorError, SampleError
-from arbiview_aug.generator.conditioning import FrameGeometry, Views, batched, frame_geometry
+from arbiview_aug.generator.conditioning import FrameGeometry, Views, batched, frame_geometry, nearest_sources
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.correspondence import TokenWindow
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, GeneratorNetworks
@@ -29,7 +29,6 @@ from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import Frame
 
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
-SOURCES_PER_TARGET = 2  # source branches of a target camera, as in training (Algorithm 1: left and right)
 VIEWS_AT_ONCE = 24  # views that the denoiser sees in one call; a whole frame in any case
 
 
@@ -180,7 +179,7 @@ def _draft(rendered: RenderedFrame, source: Frame, name: str, min_confidence: fl
             left.append(m)
         elif bool(hole.any()):
             images[m] = torch.where(hole, telea(images[m], ~known[m]), images[m])
-    branches = sorted({k for m in left for k in nearest_sources(rig[m], source.rig)})
+    branches = sorted({k for m in left for k in nearest_sources(rig[m], source.rig.cameras)})
     return _Draft(rig, trust, source, name, images, known, holes, left, branches)
 
 
@@ -244,12 +243,6 @@ def denoised(
 def shown_condition(config: GeneratorConfig, prefilled: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
     """The condition (..., 3, H, W) as in training: inpainted, or with grey holes if the config is not ``prefilled``."""
     return prefilled if config.prefilled else torch.where(known[..., None, :, :] >= 0.5, prefilled, 0.5)
-
-
-def nearest_sources(target: Camera, sources: Rig) -> list[int]:
-    """Indices of the sources whose optical axes are nearest to a target's; ties are broken by content."""
-    likeness = [(float(-s.cam2ego[:3, 2] @ target.cam2ego[:3, 2]), s.content_key, k) for k, s in enumerate(sources)]
-    return [k for _, _, k in sorted(likeness)[:SOURCES_PER_TARGET]]
 
 
 # --- pixels -----------------------------------------------------------------------------------------------------------

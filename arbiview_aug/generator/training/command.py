@@ -64,7 +64,7 @@ def _evaluate(
     generator = Generator.from_pretrained(output / "generator").to(device)
     trained_on, size, seeds = generator.trained_on, generator.config.image_size, range(arguments.seeds)
     data = arguments.data or (trained_on.data if trained_on else "synthetic")
-    unseen = trained_on and trained_on.unseen(None if data == "synthetic" else data)
+    unseen = None if trained_on is None else trained_on.unseen(None if data == "synthetic" else data)
     scenes, seed = config.scenes, config.seed
     if trained_on is not None and unseen is not None:
         if arguments.set or arguments.config not in ("tiny", generator.config.name):

@@ -19,7 +19,7 @@ from arbiview_aug.generator import Generator
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.denoiser import REGRESSION
 from arbiview_aug.generator.training import checkpointing, trainer
-from arbiview_aug.generator.training.config import LossConfig, tiny
+from arbiview_aug.generator.training.config import LossConfig
 from arbiview_aug.generator.training.data import one_thread_worker
 from arbiview_aug.generator.training.losses import Perceptual
 from arbiview_aug.generator.training.pseudo_views import collate
