@@ -100,7 +100,7 @@ def settings(
     reduces: Sequence[Reduce] = get_args(Reduce),
     executions: Sequence[Execution] = ("opencv", "torch"),
 ) -> list[Setting]:
-    """List all combinations that differ: ``paper`` has ``infinity`` and the CPU alone; ``accurate`` needs overlap depth."""
+    """List combinations that differ: ``paper`` has ``infinity`` and the CPU alone; ``accurate`` needs overlap depth."""
     rows = []
     for quality, reduce, execution in itertools.product(qualities, reduces, executions):
         if quality == "paper":
