@@ -323,7 +323,7 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
     if name in ("convert", "demo", "evaluate", "view") and "paper" in arguments.quality:
         surfaces = arguments.geometry if isinstance(arguments.geometry, list) else [arguments.geometry]
         if {*surfaces} - {"auto", "infinity"}:
-            parser.error(f"argument --geometry: quality paper knows the far surface alone, got {', '.join(surfaces)}")
+            parser.error(f"argument --geometry: quality paper knows infinity alone, got {', '.join(surfaces)}")
     if name == "depth" and arguments.device and not arguments.model:
         parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
     if name == "evaluate":

@@ -19,7 +19,7 @@ _TILE_PX = 32
 
 
 def errors(got: npt.NDArray[Any], want: npt.NDArray[Any], prefix: str = "") -> dict[str, float]:
-    """PSNR (177.9 dB for equal colours), MAE and RMSE of colours (n, 3) on the scale 0-255; empty for none."""
+    """PSNR (138.1 dB for equal colours), MAE and RMSE of colours (n, 3) on the scale 0-255; empty for none."""
     if len(got) == 0:
         return {}
     difference = got.astype(np.float64) - want

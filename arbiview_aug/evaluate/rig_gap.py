@@ -33,7 +33,8 @@ class RigGap:
         row: Mean |ln| of the factor by which the source's relation of rows to distances is wrong in the target's
             images.
         size: The same of the relation of sizes to distances.
-        parallax_deg: Mean angle between the directions in which both see an object.
+        parallax_deg: Mean angle between the directions in which both see an object. These three are NaN where no
+            object is in both rigs' images.
     """
 
     unseen: float
@@ -47,6 +48,8 @@ class RigGap:
         return _OF_ROW * self.row + _OF_PARALLAX * self.parallax_deg
 
     def __str__(self) -> str:
+        if self.unseen == 1:
+            return "For a detector: the first rig sees none of the objects in the other's images; nothing to compare."
         row, size = (100 * np.expm1(value) for value in (self.row, self.size))
         return (
             f"For a detector: {self.unseen:.0%} of the objects unseen; distances wrong by {row:.0f}% by their row, by "
@@ -115,7 +118,8 @@ def _row_error(a: Camera, b: Camera, feet: FloatArray, ground_z_m: float) -> Flo
     middle = np.array([[b.width_px - 1, b.height_px - 1], [a.width_px - 1, a.height_px - 1]]) / 2
     rays, valid = a.unproject((uv - middle[0]) * (a.width_px / b.width_px) + middle[1])
     down = np.maximum(-rays[:, 2], 1e-6)
-    told = (a.center_m[2] - ground_z_m) * np.hypot(rays[:, 0], rays[:, 1]) / down
+    height_m = max(a.center_m[2] - ground_z_m, 1e-6)  # rows tell cameras below the road no distance
+    told = height_m * np.hypot(rays[:, 0], rays[:, 1]) / down
     true = np.hypot(*(feet - b.center_m)[:, :2].T)
     return np.where(valid & (rays[:, 2] < 0), np.log(told / true), _MOST)
 

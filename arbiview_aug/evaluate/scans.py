@@ -156,7 +156,7 @@ def rings_dropped(a: Lidar, b: Lidar, points: FloatArray) -> FloatArray:
 def measured_near(a: Lidar, b: Lidar, points: FloatArray) -> BoolArray:
     """(beams, columns) rays of ``b`` within half a line and a column spacing of which ``a`` measured a point."""
     half = np.diff(np.sort(a.elevations_deg)).mean() / 2, a.azimuth_step_deg / 2 + _GRID_DEG
-    elevation, azimuth, _ = _polar(b, points)
+    elevation, azimuth, _ = _polar(b, points[np.isfinite(points[:, :3]).all(1)])
     row, column = np.rint((elevation + 90) / _GRID_DEG), np.rint(azimuth / _GRID_DEG)
     turn = round(360 / _GRID_DEG)
     grid = np.zeros((turn // 2 + 1, turn), np.uint8)

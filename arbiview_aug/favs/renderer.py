@@ -1,4 +1,4 @@
-"""``quality="paper"``: FAVS stages 1 to 4 as published, on the far surface, each frame by itself.
+"""``quality="paper"``: FAVS stages 1 to 4 as published, over ``geometry="infinity"``, each frame by itself.
 
 The paper's section "Feature-Aware Adaptive View Synthesis (FAVS) Algorithm". For every target camera, one source is
 primary. Each source is warped by H_geom (stage 1), matched to the primary camera's warp (stage 2), shifted by its
@@ -135,10 +135,11 @@ def _render_view(
     # Stage 1.
     homographies = h_geom_of_visible(cameras, target)
     visible = [k for k in order if k in homographies]
-    warped = ((k, warp_perspective(arrays[k], homographies[k], size, cameras[k].mask)) for k in visible)
-    warps = {k: warp for k, warp in warped if warp.coverage.any()}
+    warped = {k: warp_perspective(arrays[k], homographies[k], size, cameras[k].mask) for k in visible}
+    warps = {k: warp for k, warp in warped.items() if warp.coverage.any()}
     if not warps:
-        return PaperView(torch.zeros(3, *size, dtype=dtype), np.full(size, -1, np.int8), ())
+        nothing = np.full(size, -1, np.int8)
+        return PaperView(torch.zeros(3, *size, dtype=dtype), nothing, (), _occluded(warped, nothing))
     # Stages 2 and 3.
     primary = primary_camera(cameras, target, list(warps))
     reference = warps[primary]
@@ -175,8 +176,13 @@ def _render_view(
         SourceReport(k, k == primary, objects.H_aligned, features, objects, float((winners == k).mean()))
         for k, (features, objects) in results.items()
     )
+    return PaperView(_as_tensor(fused, dtype), winners, reports, _occluded(warped | warps, winners))
+
+
+def _occluded(warps: Mapping[int, Warp], winners: npt.NDArray[np.int8]) -> BoolArray | None:
+    """(h, w) uncovered pixels that lie in some source's image; None for none."""
     occluded = np.logical_or.reduce([warp.in_image for warp in warps.values()]) & (winners < 0)
-    return PaperView(_as_tensor(fused, dtype), winners, reports, occluded if occluded.any() else None)
+    return occluded if occluded.any() else None
 
 
 def paper_labels(rendering: PaperRendering, labels: Sequence[torch.Tensor], fill: float) -> list[torch.Tensor]:

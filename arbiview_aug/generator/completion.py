@@ -16,20 +16,19 @@ from torch.nn import functional
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import GeneratorError, SampleError
-from arbiview_aug.generator.conditioning import FrameGeometry, Views, batched, frame_geometry
+from arbiview_aug.generator.conditioning import FrameGeometry, Views, batched, frame_geometry, nearest_sources
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.correspondence import TokenWindow
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, GeneratorNetworks
 from arbiview_aug.generator.sampler import guided, noise_schedule, sample
 from arbiview_aug.image_ops import resized
-from arbiview_aug.inpaint.inpainter import check_device, holes_of, seeded
+from arbiview_aug.inpaint.inpainter import check_device, checked_settings, holes_of, seeded
 from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.rendered import Maps, RenderedFrame
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import Frame
 
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
-SOURCES_PER_TARGET = 2  # source branches of a target camera, as in training (Algorithm 1: left and right)
 VIEWS_AT_ONCE = 24  # views that the denoiser sees in one call; a whole frame in any case
 
 
@@ -127,7 +126,8 @@ def complete_together(
         seed: Seed of the noise.
 
     Raises:
-        SampleError: Views, coverage and cameras that do not fit together.
+        SampleError: Images, maps and cameras that do not fit together.
+        ValueError: Impossible ``min_confidence`` or ``seed``.
         GeneratorError: Impossible settings, one step of a generator that was not trained for it, or a generator on a
             GPU in a DataLoader worker.
     """
@@ -140,6 +140,7 @@ def complete_together(
             "trained (loss.regression=0)"
         )
     check_device(generator)
+    checked_settings(min_confidence, seed)
     drafts = [_draft(*frame, min_confidence) for frame in zip(rendered, sources, names, strict=True)]
     alike: dict[tuple[int, int], list[_Draft]] = {}
     for draft in drafts:
@@ -163,15 +164,22 @@ def _draft(rendered: RenderedFrame, source: Frame, name: str, min_confidence: fl
     rig, images, left = rendered.rig.in_frame_of(source.rig), list(rendered.images), []
     if len(source.images) != len(source.rig):
         raise SampleError(f"complete: expected {len(source.rig)} source images, got {len(source.images)}")
-    _check_sizes(images, rendered.coverage, rig)
     trust = rendered.coverage if rendered.confidence is None else rendered.confidence
+    _check_sizes(images, rendered.coverage, trust, rig)
+    for camera, image in zip(source.rig, source.images, strict=True):
+        if tuple(image.shape) != (3, *camera.size):
+            expected, got = (3, *camera.size), tuple(image.shape)
+            raise SampleError(f"camera {camera.name!r}: expected a source image {expected}, got {got}")
+    types = {image.dtype for image in (*images, *source.images)}
+    if any(dtype != torch.uint8 and not dtype.is_floating_point for dtype in types):
+        raise SampleError(f"complete: expected images of uint8, or of floats in [0, 1], got {types}")
     known, holes = holes_of(rendered, min_confidence)
     for m, hole in enumerate(holes):
         if float(hole.float().mean()) > 1 - ALMOST_COMPLETE:
             left.append(m)
         elif bool(hole.any()):
             images[m] = torch.where(hole, telea(images[m], ~known[m]), images[m])
-    branches = sorted({k for m in left for k in nearest_sources(rig[m], source.rig)})
+    branches = sorted({k for m in left for k in nearest_sources(rig[m], source.rig.cameras)})
     return _Draft(rig, trust, source, name, images, known, holes, left, branches)
 
 
@@ -237,12 +245,6 @@ def shown_condition(config: GeneratorConfig, prefilled: torch.Tensor, known: tor
     return prefilled if config.prefilled else torch.where(known[..., None, :, :] >= 0.5, prefilled, 0.5)
 
 
-def nearest_sources(target: Camera, sources: Rig) -> list[int]:
-    """Indices of the sources whose optical axes are nearest to a target's; ties are broken by content."""
-    likeness = [(float(-s.cam2ego[:3, 2] @ target.cam2ego[:3, 2]), s.content_key, k) for k, s in enumerate(sources)]
-    return [k for _, _, k in sorted(likeness)[:SOURCES_PER_TARGET]]
-
-
 # --- pixels -----------------------------------------------------------------------------------------------------------
 def _prefilled(
     image: torch.Tensor, known: torch.Tensor, trust: torch.Tensor, size: tuple[int, int]
@@ -280,13 +282,14 @@ def valid_pixels(camera: Camera) -> torch.Tensor:
     return torch.ones(camera.size, dtype=torch.bool) if camera.mask is None else torch.tensor(camera.mask)
 
 
-def _check_sizes(views: Maps, coverage: Maps, targets: Rig) -> None:
-    counts = {"views": len(views), "coverage": len(coverage), "target cameras": len(targets)}
+def _check_sizes(views: Maps, coverage: Maps, trust: Maps, targets: Rig) -> None:
+    counts = {"views": len(views), "coverage": len(coverage), "confidence": len(trust), "target cameras": len(targets)}
     if len(set(counts.values())) > 1:
         raise SampleError(f"complete: expected as many of each, got {counts}")
-    for camera, view, seen in zip(targets, views, coverage, strict=True):
-        if tuple(view.shape) != (3, *camera.size) or tuple(seen.shape) != camera.size:
-            expected, got = f"a view (3, h, w) and coverage of {camera.size}", (tuple(view.shape), tuple(seen.shape))
-            raise SampleError(f"camera {camera.name!r}: expected {expected}, got {got[0]} and {got[1]}")
+    for camera, *maps in zip(targets, views, coverage, trust, strict=True):
+        got, seen = [tuple(one.shape) for one in maps], maps[1]
+        if got != [(3, *camera.size), camera.size, camera.size]:
+            expected = f"a view (3, h, w), coverage and confidence of {camera.size}"
+            raise SampleError(f"camera {camera.name!r}: expected {expected}, got {got[0]}, {got[1]} and {got[2]}")
         if seen.dtype != torch.bool:
             raise SampleError(f"camera {camera.name!r}: coverage: expected bool, got {seen.dtype}; pass coverage > 0")

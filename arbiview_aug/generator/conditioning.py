@@ -35,6 +35,7 @@ from arbiview_aug.generator.correspondence import (
 )
 
 RAY_CHANNELS = 6
+SOURCES_PER_TARGET = 2  # source branches of a target camera, as in training (Algorithm 1: left and right)
 POSE_WIDTH = 16  # numbers of a pose: R (9), t (3), K (4)
 _KNOWN_SHARE = 0.99  # known share of a latent pixel from which it is no hole
 _OCTAVES = 4  # number of Fourier frequencies π, 2π, 4π, 8π
@@ -70,9 +71,10 @@ def input_channels(latent_channels: int) -> int:
 
 
 # --- geometry ---------------------------------------------------------------------------------------------------------
-def reference_camera(target: Camera, sources: Sequence[Camera]) -> Camera:
-    """The source whose optical axis is nearest to the target's; ties are broken by content."""
-    return max(sources, key=lambda source: (float(source.cam2ego[:3, 2] @ target.cam2ego[:3, 2]), source.content_key))
+def nearest_sources(target: Camera, sources: Sequence[Camera]) -> list[int]:
+    """Indices of the sources whose optical axes are nearest to a target's; ties are broken by content."""
+    likeness = [(float(-s.cam2ego[:3, 2] @ target.cam2ego[:3, 2]), s.content_key, k) for k, s in enumerate(sources)]
+    return [k for _, _, k in sorted(likeness)[:SOURCES_PER_TARGET]]
 
 
 def relative_pose(camera: Camera, reference: Camera) -> tuple[FloatArray, FloatArray]:
@@ -170,7 +172,10 @@ def frame_geometry(
 ) -> FrameGeometry:
     """The geometry of one frame (B = 1), whose N targets, S sources and road lie in one ego frame."""
     size = config.latent_size
-    viewed = [(target, reference_camera(target, sources)) for target in targets], [(one, one) for one in sources]
+    viewed = (
+        [(target, sources[nearest_sources(target, sources)[0]]) for target in targets],
+        [(one, one) for one in sources],
+    )
     rays = [torch.stack([plucker_rays(*pair, size) for pair in pairs])[None] for pairs in viewed]
     poses = [torch.stack([pose_vector(*pair) for pair in pairs])[None] for pairs in viewed]
     keys, count = [*sources, *targets], len(sources)

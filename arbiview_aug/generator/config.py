@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 from arbiview_aug.choices import setting_hint
 from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
@@ -90,6 +90,7 @@ class UNetConfig:
         check_fields(self, f"{count} values", lambda t: len(t) == count, "transformers")
         expected = f"{count} values, one of them true"
         check_fields(self, expected, lambda c: not c or (len(c) == count and any(c)), "cross_view")
+        check_fields(self, f"{count} values above 0", lambda h: not h or (len(h) == count and all(h)), "heads")
         check_fields(self, f"a divisor of {widths}", lambda g: not any(w % g for w in widths), "norm_groups")
 
     def arguments(self, in_channels: int, out_channels: int) -> dict[str, Any]:
@@ -171,13 +172,16 @@ class GeneratorConfig:
     def __post_init__(self) -> None:
         check_sizes(self, _MOST_PIXELS, "image_size", "prompt_tokens", "steps", "lora_rank")
         factor, epsilon = self.autoencoder.factor, self.prediction == "epsilon"
-        expected = f"multiples of {factor}"
+        expected = f"two multiples of {factor}"
+        check_fields(self, expected, lambda size: isinstance(size, tuple) and len(size) == 2, "image_size")
         check_fields(self, expected, lambda size: all(n > 0 and n % factor == 0 for n in size), "image_size")
+        check_fields(self, " or ".join(get_args(Prediction)), lambda p: p in get_args(Prediction), "prediction")
         expected = "False with prediction 'epsilon', or prediction 'v_prediction'"
         check_fields(self, expected, lambda used: not (used and epsilon), "zero_snr", "residual")
         check_fields(self, "at least 1", lambda n: n >= 1, "steps")
         check_fields(self, "a value in (0, 1]", lambda s: 0 < s <= 1, "strength")
         check_fields(self, "a value in [0, 1]", lambda t: 0 <= t <= 1, "temperature")
+        check_fields(self, "a finite number above 0", lambda x: 0 < x < math.inf, "facing_m")
         check_fields(self, "a finite number", lambda x: -math.inf < x < math.inf, "guidance", "guidance_rescale")
 
     @property

@@ -70,7 +70,7 @@ def test_the_published_method_beside_fast(nuscenes_root: Path, tmp_path: Path, c
     assert numbers(capsys.readouterr().out, "paper")[0] > 80
     with pytest.raises(SystemExit, match="2"):
         main(["demo", *options, "--geometry", "street"])
-    assert "quality paper knows the far surface alone" in capsys.readouterr().err
+    assert "quality paper knows infinity alone" in capsys.readouterr().err
 
 
 def test_lenses_without_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -141,7 +141,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("convert --data frame --target waymo --output o --version v1.0-mini", "expected no version, which a frame f"),
         *((f"bench pareto --budget-ms {ms}", "expected a finite number above 0") for ms in (-1, 0, "nan", "inf")),
         ("evaluate --holes diffusion --generator no/no/no", "generator no/no/no: expected a folder of a generator"),
-        ("evaluate --quality paper fast --geometry street", "quality paper knows the far surface alone, got street"),
+        ("evaluate --quality paper fast --geometry street", "quality paper knows infinity alone, got street"),
         ("evaluate --generator /nope", "argument --generator: expected it with --holes diffusion"),
         ("evaluate --steps 3", "argument --steps: expected it with --holes diffusion"),
         ("view --output a.mp4", r"expected a name ending in \.rrd, got 'a\.mp4'"),

@@ -280,6 +280,9 @@ def test_scene_is_plain_data():
     for name in ("center", "planes", "color", "boxes"):
         np.testing.assert_array_equal(getattr(scene, name), getattr(again, name))
     assert scene.street == again.street and scene.light == again.light
+    for shared in (scene, scene.after(1.0)):
+        with pytest.raises(ValueError, match="read-only"):
+            shared.boxes[:, 0] += 100
 
 
 def test_tensors_are_made_on_the_device():

@@ -59,6 +59,14 @@ def test_what_the_source_never_sees_is_a_share_of_what_the_target_sees():
     assert rig_gap(ring(), front).unseen == 0
     behind = rig_gap(front, Rig([ring()[3]]))
     assert behind.unseen == 1 and math.isnan(behind.row)
+    assert "sees none of the objects in the other's images" in str(behind) and "nan" not in str(behind)
+
+
+@pytest.mark.filterwarnings("error")
+def test_cameras_below_the_road_have_a_finite_gap():
+    for source, target in ((ring(height_m=-1), ring()), (ring(), ring(height_m=-1))):
+        gap = rig_gap(source, target)
+        assert gap.unseen < 1 and math.isfinite(gap.expected_loss) and gap.row == pytest.approx(math.log(4))
 
 
 def test_shipped_rigs_with_lenses():

@@ -61,7 +61,7 @@ def test_rings_next_to_the_targets_stay() -> None:
 def test_rays_near_which_something_was_measured() -> None:
     """Half a line spacing above and below, half a column aside."""
     fine = replace(LIDAR, elevations_deg=tuple(np.arange(-20.0, 21.0, 4)), azimuth_step_deg=30.0)
-    near = measured_near(LIDAR, fine, np.array([at(8, 0, 0)]))
+    near = measured_near(LIDAR, fine, np.array([at(8, 0, 0), [np.nan] * 3]))
     assert fine.azimuth_deg == (-180.0, 180.0)
     rows, columns = np.nonzero(near)
     assert set(np.array(fine.elevations_deg)[rows]) == {-4.0, 0.0, 4.0}

@@ -69,7 +69,7 @@ class Target:
 
     def _read_generator(self) -> None:
         with contextlib.suppress(ArbiviewError):
-            saved_config(self.generator, self.training)
+            saved_config(self.generator)
         Generator.from_pretrained(self.generator)
 
     def _go_on(self, *more: str) -> None:

@@ -147,6 +147,16 @@ def test_the_own_car_never_contributes(pair_images) -> None:
     assert not clean.image[:, torch.from_numpy(~clean.coverage)].any()
 
 
+@pytest.mark.parametrize("seen_px", [0, 3])
+def test_a_wholly_masked_source_hides_pixels_too(pair_images, seen_px: int) -> None:
+    mask = np.zeros((240, 400), bool)
+    mask[:seen_px, :seen_px] = True
+    rig = PAIR.with_cameras([replace(PAIR[0], mask=mask), PAIR[1]])
+    for sources, images in ((rig, pair_images), (Rig([rig[0]]), pair_images[:1])):
+        view = render_paper(sources, Rig([PAIR[0]]), images, OFF).targets[0]
+        assert view.occluded is not None and np.array_equal(view.occluded, ~view.coverage)
+
+
 def test_deterministic_and_independent_of_the_source_order(pair_images) -> None:
     cv2.setRNGSeed(5)
     one = render_paper(PAIR, MIDDLE, pair_images).targets[0]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
+import re
 import socket
 import zlib
 from copy import deepcopy
@@ -202,7 +204,7 @@ def test_configurations_survive_json(make) -> None:
 
 
 def test_impossible_configurations_are_refused() -> None:
-    with pytest.raises(GeneratorError, match=r"image_size: expected multiples of 4, got \(30, 56\)"):
+    with pytest.raises(GeneratorError, match=r"image_size: expected two multiples of 4, got \(30, 56\)"):
         small_config(image_size=(30, 56), autoencoder=compact().autoencoder)
     with pytest.raises(GeneratorError, match="zero_snr: expected False with prediction 'epsilon'"):
         small_config(prediction="epsilon")
@@ -216,6 +218,14 @@ def test_impossible_configurations_are_refused() -> None:
         AutoencoderConfig(patch=2)
     with pytest.raises(GeneratorError, match="cross_view: expected 2 values, one of them true"):
         UNetConfig(widths=(32, 32), transformers=(False, True), cross_view=(False, False))
+    with pytest.raises(GeneratorError, match=r"heads: expected 2 values above 0, got \(8,\)"):
+        UNetConfig(widths=(32, 32), transformers=(False, True), heads=(8,))
+    for name, values in {"facing_m": (0.0, -5.0, math.nan), "image_size": (32, (64,), (32, 56, 3))}.items():
+        for value in values:
+            with pytest.raises(GeneratorError, match=f"{name}: expected .*, got {re.escape(str(value))}"):
+                small_config(**{name: value})
+    with pytest.raises(GeneratorError, match="prediction: expected epsilon or v_prediction, got 'sample'"):
+        small_config(prediction="sample")
     with pytest.raises(GeneratorError, match=r"strength: expected a value in \(0, 1\], got 0.0"):
         small_config(strength=0.0)
     with pytest.raises(GeneratorError, match="expected multiples of 32"):

@@ -172,12 +172,24 @@ def test_messages(generator: Generator) -> None:
         generator.complete_views(views[:2], coverage, TARGETS, images, SOURCES)
     with pytest.raises(SampleError, match="expected 4 source images, got 1"):
         generator.complete_views(views, coverage, TARGETS, images[:1], SOURCES)
-    with pytest.raises(SampleError, match=r"camera 't1': expected a view \(3, h, w\) and coverage of \(48, 80\)"):
+    with pytest.raises(SampleError, match=r"camera 't1': expected a view \(3, h, w\), coverage and .* \(48, 80\)"):
         generator.complete_views([views[0], views[1][:, 1:], views[2]], coverage, TARGETS, images, SOURCES)
     with pytest.raises(SampleError, match=r"camera 't0': coverage: expected bool.*pass coverage > 0"):
         generator.complete_views(views, [c.float() for c in coverage], TARGETS, images, SOURCES)
     with pytest.raises(GeneratorError, match="steps: expected at least 1, got 0"):
         generator.complete_views(views, coverage, TARGETS, images, SOURCES, steps=0)
+    small, permuted = [image[:, :32, :50] for image in images], [image.permute(1, 2, 0) for image in images]
+    for maps, message in (
+        ({"source_images": small}, r"camera '.*': expected a source image \(3, 48, 80\), got \(3, 32, 50\)"),
+        ({"source_images": permuted}, r"expected a source image \(3, 48, 80\), got \(48, 80, 3\)"),
+        ({"views": [view.int() for view in views]}, r"expected images of uint8, or of floats in \[0, 1\], got"),
+        ({"confidence": torch.ones(3, 10, 10)}, r"camera 't0': .*, got .* and \(10, 10\)"),
+        ({"confidence": torch.ones(2, 48, 80)}, "'confidence': 2"),
+        ({"min_confidence": "a"}, "min_confidence: expected a number from 0 to 1, got 'a'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            given = {"views": views, "coverage": coverage, "source_images": images, **maps}
+            generator.complete_views(targets=TARGETS, sources=SOURCES, **given)
 
 
 def test_it_can_be_sent_to_workers(generator: Generator) -> None:

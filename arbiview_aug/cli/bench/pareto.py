@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -30,6 +31,7 @@ from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, as_of_anot
 from arbiview_aug.cli.bench.speed import remap_floor
 from arbiview_aug.cli.bench.timing import Quartiles, benchmark, machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.cli.parsers import EXECUTIONS, SCORED
+from arbiview_aug.datasets import open_data
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import ScoredFrame, scores
 from arbiview_aug.evaluate.images import RenderedView
@@ -98,7 +100,7 @@ def settings(
     reduces: Sequence[Reduce] = get_args(Reduce),
     executions: Sequence[Execution] = ("opencv", "torch"),
 ) -> list[Setting]:
-    """List all combinations that differ: ``paper`` is always far and on the CPU; ``accurate`` needs overlap depth."""
+    """List combinations that differ: ``paper`` has ``infinity`` and the CPU alone; ``accurate`` needs overlap depth."""
     rows = []
     for quality, reduce, execution in itertools.product(qualities, reduces, executions):
         if quality == "paper":
@@ -141,6 +143,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     def alternating(one: Setting) -> Callable[[], Any]:
         return one.alternating(target, frame(0, one.reduce).scored_sample)
 
+    num_frames = min(arguments.frames, len(open_data(data.root)))
     h, w = target.sizes[0]
     noise = torch.randint(0, 256, (len(target), 3, h, w), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     floor = remap_floor(noise, (h, w))
@@ -163,7 +166,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     prefix, rows = "even" if data.truth is None else "true", []
     for name, one in tqdm(by_name.items(), desc="accuracy", unit="setting", leave=False):
         memory = peak_mib(alternating(one))
-        frames = [frame(index, one.reduce) for index in range(arguments.frames)]
+        frames = [frame(index, one.reduce) for index in range(num_frames)]
         render = partial(_render, one.call(target))
         means = mean_of(row for each in frames for row in scores(each, render, target, ("even",))[1])
         row: dict[str, Any] = {"name": name, "peak_mib": memory, "seen": means["seen"]}
@@ -176,7 +179,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     for row in rows:
         own_times, decode = times[row["name"]], quartiles(times[f"decode 1/{row['reduce']}"]).median_ms
         row |= quartiles(own_times)._asdict() | {"decode_ms": decode}
-        row["floor_ratio"] = quartiles(own_times / times["floor"][: len(own_times)]).median_ms
+        row["floor_ratio"] = statistics.median(a / b for a, b in zip(own_times, times["floor"], strict=False))
         row["decode_ratio"] = row["median_ms"] / decode
 
     def again(row: Row) -> Quartiles:
@@ -190,7 +193,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         "data": data.name,
         "target": target.name or "target",
         "size": list(target.sizes[0]),
-        "frames": arguments.frames,
+        "frames": num_frames,
         "against": "true views" if data.truth is not None else "LiDAR points, exposures made even",
         "settings": [{**row, "front": row["name"] in front} for row in rows],
         "steps": [row["name"] for row in distinct_steps(rows)],

@@ -23,10 +23,10 @@ import argparse
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from itertools import chain, count, cycle
+from itertools import chain, count, cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -158,7 +158,8 @@ def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tup
     is_small = all(2 * side <= of_camera for side, of_camera in zip(size, full["rig"].sizes[0], strict=True))
     sample = half if is_small else full
     for name, rig in {"pinhole": waymo.undistorted(), "radtan": waymo, "fisheye": fisheye}.items():
-        calls = {_FLOOR: remap_floor(sample["images"][: len(rig)], size)} | _calls(sample, rig)
+        images = islice(cycle(sample["images"]), len(rig))  # a remap for each view, also of fewer cameras
+        calls = {_FLOOR: remap_floor(images, size)} | _calls(sample, rig)
         if is_small and name == "radtan":
             cropped = _cameras_of("waymo").resized(size, "crop")
             calls |= _both_layouts("street, held, squashed from full size", full, waymo)
@@ -312,7 +313,7 @@ def boxes_around(number: int) -> torch.Tensor:
     return torch.from_numpy(np.stack([x, y, lwh[2] / 2, *lwh, yaw], 1).astype(np.float32))
 
 
-def remap_floor(images: torch.Tensor, size: tuple[int, int]) -> Callable[[], None]:
+def remap_floor(images: Iterable[torch.Tensor], size: tuple[int, int]) -> Callable[[], None]:
     """Bare remaps to views of ``size`` (h, w), one for each of the images (N, 3, >=h, >=w) uint8."""
     h, w = size
     sources = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()[:h, :w]) for image in images]

@@ -229,11 +229,11 @@ class Renderer:
         depth = first.t * (axis + rays.directions[:, 2] * rays.axis[:, 2:])
         depth = torch.where(torch.isfinite(first.t), depth, torch.inf)
         row = hit.clamp_min(0)
-        classes = torch.as_tensor(scene.cls)[row]
+        classes = torch.tensor(scene.cls)[row]
         classes = torch.where(hit == GROUND_ID, int(SceneClass.GROUND), classes)
         classes = torch.where(hit == SKY_ID, int(SceneClass.SKY), classes)
         classes = torch.where(rays.valid, classes, int(SceneClass.VOID))
-        instances = torch.where(hit >= 0, torch.as_tensor(scene.instance)[row], -1)
+        instances = torch.where(hit >= 0, torch.tensor(scene.instance)[row], -1)
         image = (color.view(*hit.shape, 3) * 255 + 0.5).to(torch.uint8) * rays.valid[..., None]
         maps = image, depth, classes.to(torch.uint8), instances.to(torch.int16)
         views = []

@@ -109,6 +109,11 @@ class Scene:
     light: Light
     salt: int  # seed of the textures
 
+    def __post_init__(self) -> None:
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)  # drives share their streets
+
     def __len__(self) -> int:
         return len(self.kind)
 

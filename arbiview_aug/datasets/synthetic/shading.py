@@ -35,7 +35,7 @@ class SceneTables(NamedTuple):
     def build(cls, scene: Scene) -> SceneTables:
         columns = {name: getattr(scene, name) for name in cls._fields[1:-1]}
         rounded = {name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in columns.items()}
-        tensors = {name: torch.as_tensor(array) for name, array in rounded.items()}
+        tensors = {name: torch.tensor(array) for name, array in rounded.items()}
         return cls(scene=scene, light=torch.as_tensor(light_map(scene)), **tensors)
 
 

@@ -61,10 +61,8 @@ def has_state(folder: Path) -> bool:
     return (folder / CONFIG_FILE).is_file()
 
 
-def saved_config(folder: Path, otherwise: TrainConfig) -> TrainConfig:
-    """The settings of the run whose state a folder holds, TrainingError if broken; ``otherwise`` without a state."""
-    if not has_state(folder):
-        return otherwise
+def saved_config(folder: Path) -> TrainConfig:
+    """The settings of the run whose state a folder holds; TrainingError without a state, or for a broken one."""
     with _broken(folder):
         return from_plain(TrainConfig, read_config(folder)[0]["training"], "config", TrainingError)
 
@@ -77,7 +75,7 @@ def load_state(
     optimiser: torch.optim.Optimizer,
 ) -> int:
     """Load a saved state into a run; returns its steps. TrainingError for other settings, or a broken state."""
-    before, now = asdict(saved_config(folder, config)), asdict(config)
+    before, now = asdict(saved_config(folder)), asdict(config)
     changed = [key for key in now if key not in _MAY_DIFFER and before[key] != now[key]]
     if changed:
         raise TrainingError(

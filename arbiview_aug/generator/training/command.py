@@ -15,7 +15,6 @@ from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.training.checkpointing import saved_config
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.data import open_frames
 from arbiview_aug.generator.training.held_out import held_out_scores, report
@@ -27,9 +26,9 @@ _TIMEOUT = timedelta(hours=3)  # of a process that waits for the others: they pr
 
 def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
     config = overridden(CONFIGS[arguments.config](), arguments.set)
-    output = writable_folder(Path(arguments.output), arguments.output)
-    if arguments.command == "evaluate":
-        config = saved_config(output / "state", config)
+    output = Path(arguments.output)
+    if arguments.command == "train":
+        writable_folder(output, arguments.output)
     accelerate = optional_package("accelerate", "generator")
     processes = accelerate.PartialState(cpu=not torch.cuda.is_available(), timeout=_TIMEOUT)
     if not processes.is_main_process:
@@ -63,10 +62,22 @@ def _evaluate(
     say: Callable[[str], None],
 ) -> None:
     generator = Generator.from_pretrained(output / "generator").to(device)
-    data = arguments.data or (generator.trained_on.data if generator.trained_on else "synthetic")
-    size, seed, seeds = config.generator.image_size, config.seed, range(arguments.seeds)
-    frames = open_frames(data, size, scenes=config.scenes, seed=seed, points=True, device=device)
-    indices = frames.split(seed).held_out[: arguments.views]
+    trained_on, size, seeds = generator.trained_on, generator.config.image_size, range(arguments.seeds)
+    data = arguments.data or (trained_on.data if trained_on else "synthetic")
+    unseen = None if trained_on is None else trained_on.unseen(None if data == "synthetic" else data)
+    scenes, seed = config.scenes, config.seed
+    if trained_on is not None and unseen is not None:
+        if arguments.set or arguments.config not in ("tiny", generator.config.name):
+            name = generator.config.name
+            raise TrainingError(f"evaluate: expected no --set and no --config but {name}: the generator has its own")
+        scenes, seed = max(unseen, default=0) + 1, trained_on.seed
+    frames = open_frames(data, size, scenes=scenes, seed=seed, points=True, device=device)
+    held_out = tuple(frames.split(seed).held_out)
+    if unseen is not None:
+        if data != "synthetic" and held_out != unseen:
+            raise TrainingError(f"evaluate: {data}: expected the scenes that the generator was trained on, got others")
+        held_out = unseen
+    indices = held_out[: arguments.views]
     if not indices:
         raise TrainingError(f"evaluate: {data}: expected at least two scenes, one to train on and one held out")
     scores = held_out_scores(generator, frames, indices, seeds=seeds, steps=arguments.steps, show=show)

@@ -39,8 +39,8 @@ class PseudoViewConfig:
         _check(self, "a probability", lambda p: 0 <= p <= 1, "p_translate", "p_mask_transfer", "hidden")
         _check(self, "fast or paper", lambda q: q in ("fast", "paper"), "quality")
         _check(self, "at least 1", lambda n: n >= 1, "targets", "mask_bank")
-        _check(self, "0 <= low <= high <= 90", lambda yaw: 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
-        _check(self, "0 < low <= high", lambda factor: 0 < factor[0] <= factor[1], "focal")
+        _check(self, "0 <= low <= high <= 90", lambda yaw: len(yaw) == 2 and 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
+        _check(self, "0 < low <= high", lambda factor: len(factor) == 2 and 0 < factor[0] <= factor[1], "focal")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class LossConfig:
     geo_mode: GeoMode = "normalised"  # mean over rows; frobenius_sum: as printed, grows with resolution
     perceptual: float = 0.01  # β of the paper
     perceptual_below_t: int = 300  # the x0 error is 0.57 times the ε error at t = 200, 14.6 times at t = 999
-    perceptual_every: int = 4  # steps between two L_perceptual: decoding costs more than the U-Net
+    perceptual_every: int = 4  # steps between two L_perceptual, whose mean weight is β / 4: decoding is slow
     perceptual_crop: int = 64  # side in pixels of the square that is compared
     snr_limit: float = 5.0  # γ of Min-SNR-γ (Hang et al. 2023); 0 as printed. Unused by residual generators
     snr_floor: float = 0.1  # lower bound of the weight: Min-SNR is .0047 at t = 999, where few-step samplers start
@@ -76,7 +76,7 @@ class TrainConfig:
     lr: float
     warmup: int = 100  # steps of linear warm-up, before the cosine to 0
     weight_decay: float = 1e-2
-    max_grad_norm: float = 1.0
+    max_grad_norm: float = 1.0  # 0 switches clipping off
     ema: float = 0.999  # decay of diffusers' EMAModel; step / (9 + step) after each step while that is smaller
     cond_drop_prob: float = 0.1  # of condition, pose and sources together, for classifier-free guidance
     attention: bool = True  # whether views read each other; off for the ablation only
@@ -95,7 +95,8 @@ class TrainConfig:
         _check(self, "no or bf16 (never fp16: it overflows)", lambda p: p in ("no", "bf16"), "precision")
         _check(self, "a value above 0", lambda lr: lr > 0, "lr")
         _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "ema", "cond_drop_prob")
-        _check(self, "at least 0", lambda n: n >= 0, "warmup", "workers")
+        _check(self, "at least 0", lambda n: n >= 0, "warmup", "workers", "weight_decay", "max_grad_norm")
+        _check(self, "a value from 0 to 2**28", lambda seed: 0 <= seed <= 2**28, "seed")  # 10 seed 2**32 in 64 bits
 
 
 # --- overrides --------------------------------------------------------------------------------------------------------
@@ -140,8 +141,9 @@ def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: st
 def paper() -> TrainConfig:
     """Algorithm 1 as published, on Stable Diffusion's frozen weights and the published stages' pseudo views.
 
-    See Sec. Training Parameters. Two deviations: L_geo is normalised, since as printed it outgrows L_main
-    (``loss.geo_mode="frobenius_sum"``), and L_perceptual compares crops at early times.
+    See Sec. Training Parameters. Deviations: x0 is the real view's latent (``training.losses``). L_geo is normalised,
+    since as printed it outgrows L_main (``loss.geo_mode="frobenius_sum"``). L_perceptual compares crops at early times,
+    in every 4th step. The learning rate is warmed up for 100 steps, and guidance is rescaled.
     """
     return TrainConfig(
         generator=generators.paper(),

@@ -1,4 +1,8 @@
-"""The loss terms of a training step of CVC-SSL: L_total = L_main + α L_geo + β L_perceptual (Algorithm 1)."""
+"""The loss terms of a training step of CVC-SSL: L_total = L_main + α L_geo + β L_perceptual (Algorithm 1).
+
+x0 is the latent of the real view. The paper's sentence under L_main says FAVS's image, but its overview and Algorithm 1
+reconstruct the real one; FAVS's image has the very holes that the model is to fill.
+"""
 
 from __future__ import annotations
 
@@ -213,7 +217,7 @@ class Step(nn.Module):
             y, x = (int(torch.randint(span, (), generator=draws.rng)) for span in spans)
             compared = (image, truth, known)
             image, truth, known = (value[..., y : y + side, x : x + side].flatten(0, 1) for value in compared)
-            terms["perceptual"] = vgg(torch.where(known, image, truth), truth).sum() / len(t)
+            terms["perceptual"] = vgg(torch.where(known, image, truth), truth).sum() / valid.shape[:2].numel()
         return terms
 
     def _latents(self, batch: Batch) -> torch.Tensor:

@@ -23,8 +23,8 @@ from torch.utils.data import Dataset
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.favs.renderer import render_paper
-from arbiview_aug.generator.completion import Conditions, nearest_sources, seeded, unit, valid_pixels
-from arbiview_aug.generator.conditioning import FrameGeometry, batched, frame_geometry
+from arbiview_aug.generator.completion import Conditions, seeded, unit, valid_pixels
+from arbiview_aug.generator.conditioning import FrameGeometry, batched, frame_geometry, nearest_sources
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.training.config import PseudoQuality, PseudoViewConfig
 from arbiview_aug.generator.training.data import Frames
@@ -138,8 +138,8 @@ def favs(
 ) -> Rendered:
     """Render N images (3, H, W), uint8 or in [0, 1], at M target cameras of one size in the rig's ego frame by FAVS.
 
-    On the surface ``far`` if all centres coincide, else on ``street``: training has images and poses alone. The
-    published stages (``paper``) know ``far`` alone, run on the CPU and have no confidence: it is 1 where they see.
+    Over ``infinity`` if all centres coincide, else over ``street``: training has images and poses alone. The
+    published stages (``paper``) know ``infinity`` alone, run on the CPU and have no confidence: it is 1 where they see.
     """
     target = Rig([replace(c, name=str(k), mask=None) for k, c in enumerate(targets)], ground_z_m=rig.ground_z_m)
     if quality == "paper":
@@ -147,7 +147,9 @@ def favs(
         covered = torch.from_numpy(np.stack(published.coverage)).to(images[0].device)
         views = unit(torch.stack([view.image for view in published.targets])).clamp(0, 1)
         return Rendered(views.to(covered.device), covered, covered.float())
-    is_moved = any(abs(c.center_m - rig[k].center_m).max() > 1e-6 for c in targets for k in nearest_sources(c, rig)[:1])
+    is_moved = any(
+        abs(c.center_m - rig[k].center_m).max() > 1e-6 for c in targets for k in nearest_sources(c, rig.cameras)[:1]
+    )
     plan = build_plan(rig, target, geometry="street" if is_moved else "infinity", config=_FAVS)
     (rendered,) = Renderer().render([plan], [Frame(tuple(images), rig)], [None], ("confidence",))
     assert isinstance(rendered.coverage, torch.Tensor) and isinstance(rendered.confidence, torch.Tensor)  # one size

@@ -93,13 +93,13 @@ class Trainer:
         self.model, self._optimiser = self.accelerator.prepare(
             self.step, self.optimiser, device_placement=[True, False]
         )
-        rig, seeds = frames[self.split.training[0]].rig, {name: 10 * config.seed + k for name, k in _SEEDS.items()}
+        rig, first = frames[self.split.training[0]].rig, 10 * config.seed
         masks = mask_bank(rig, config.pseudo_views.mask_bank, config.seed + _SEEDS["masks"])
         shared = config.pseudo_views, config.generator, masks
         maker = "cpu" if config.workers else self.device
-        self.items = PseudoViews(frames, self.split.training, *shared, seeds["items"], maker)
+        self.items = PseudoViews(frames, self.split.training, *shared, first + _SEEDS["items"], maker)
         validation = self.split.validation or self.split.training
-        self.validation = PseudoViews(frames, validation, *shared, seeds["validation"], maker)
+        self.validation = PseudoViews(frames, validation, *shared, first + _SEEDS["validation"], maker)
         if config.generator.residual:
             self._measure_deviation()
         if not self.split.validation:

@@ -12,6 +12,7 @@ import pytest
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.data import recorded
 from arbiview_aug.cli.bench.pareto import Setting, settings, table
+from arbiview_aug.cli.bench.timing import timed_rounds
 from arbiview_aug.datasets.synthetic import demo_source_rig
 
 SIZE = (64, 176)
@@ -112,6 +113,22 @@ def test_static_surfaces_are_recommended_where_cameras_only_turn(
     printed = capsys.readouterr().out
     assert "No recommendation: nothing was measured that may be recommended. Static surfaces (infinity" in printed
     assert "stand up to 0.60 m" in printed and "or depth from the frames before and after" in printed
+
+
+def test_fewer_frames_and_rounds_than_asked_for(
+    nuscenes_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The floor stops early where it is slower than a setting; a folder may have fewer frames than ``--frames``."""
+
+    def timed(*arguments: Any, **options: Any) -> Any:
+        return {name: t[:1] if name == "floor" else t for name, t in timed_rounds(*arguments, **options).items()}
+
+    monkeypatch.setattr("arbiview_aug.cli.bench.pareto.timed_rounds", timed)
+    only = ["--quality", "draft", "--geometry", "street", "--downscale", "4", "--execution", "opencv"]
+    only += ["--size", "32x88", "--data", str(nuscenes_root), "--frames", "3", "--output", str(tmp_path)]
+    assert main(["bench", *only, "--repeats", "2"]) == 0
+    report = json.loads((tmp_path / "pareto.json").read_text())
+    assert report["frames"] == 1 and report["settings"][0]["floor_ratio"] > 0
 
 
 def test_real_frames_need_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from arbiview_aug.__main__ import main
+from arbiview_aug.cameras.rig import load_rig
+from arbiview_aug.cli.bench import speed
 from arbiview_aug.cli.bench.data import recorded
 from arbiview_aug.cli.bench.speed import BOUNDS, BOXES, bytes_moved, default_data, measure, table
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
@@ -58,6 +60,15 @@ def test_command_writes_the_report(
     assert report["data"] == "nuscenes-one" and report["machine"]["cpu"] and report["versions"]["torch"]
     assert all(m["bound"] == BOUNDS[SIZE].get(m["name"]) for m in report["measures"])
     assert f"report: {path}" in capsys.readouterr().out
+
+
+def test_the_floor_has_a_remap_for_each_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of samples with fewer cameras than the target."""
+    counts: list[int] = []
+    monkeypatch.setattr(speed, "remap_floor", lambda images, _: counts.append(len(list(images))))
+    sample = {"images": torch.zeros(2, 3, 64, 176, dtype=torch.uint8), "rig": load_rig("nuscenes").resized((64, 176))}
+    _ = [*speed._calls_of(sample, sample, (64, 176))]
+    assert counts == [len(load_rig(name)) for name in ("waymo", "waymo", "fisheye_surround")]
 
 
 def test_a_name_without_calls_is_refused_before_anything_is_read(

@@ -10,10 +10,12 @@ import pytest
 
 from arbiview_aug.__main__ import main as package_main
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.generator.training import command
+from arbiview_aug.generator.training.data import Frames
 from arbiview_aug.train import main
 from integrations.benchmarks import training
-from tests.generator.training.small import frames
+from tests.generator.training.small import SIZE, config, frames
 
 SMALLER = [
     f"--set={setting}"
@@ -58,7 +60,7 @@ def test_both_entries_have_the_same_help(capsys: pytest.CaptureFixture[str]) -> 
 def test_train_and_evaluate_on_streets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     common = ["--config", "tiny", "--output", str(tmp_path), "--quiet", *SMALLER]
     assert main(common) == 0
-    assert main(["evaluate", *common, "--views", "1"]) == 0
+    assert main(["evaluate", "--output", str(tmp_path), "--quiet", "--views", "1"]) == 0
     out = capsys.readouterr().out
     assert "held-out views; Telea" in out and "one_step" in out and "mean" in out
     study = ["--config", "tiny", "--output", str(tmp_path / "study"), "--quiet", *SMALLER]
@@ -85,6 +87,48 @@ def test_what_cannot_be_used_is_said_in_one_line(
     assert main([*arguments, *few, *no_vgg]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
+    assert (tmp_path / "o").exists() == (arguments != ["evaluate"] and "expected one of generator" not in message)
+
+
+@pytest.mark.parametrize(
+    ("data", "scenes", "more", "message"),
+    [
+        ("synthetic", 4, [], None),
+        ("synthetic", 4, ["--config", "compact"], "expected no --set and no --config but test"),
+        ("synthetic", 4, ["--set", "scenes=9"], "expected no --set and no --config but test"),
+        ("frames:/drive", 5, [], None),
+        ("frames:/drive", 10, [], "expected the scenes that the generator was trained on, got others"),
+        ("frames:/another", 5, ["--set", "seed=7", "--data", "frames:/drive"], None),
+    ],
+)
+def test_evaluate_scores_frames_that_the_generator_never_saw(
+    data: str,
+    scenes: int,
+    more: list[str],
+    message: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """At its own size, whatever the defaults of ``--config`` are."""
+    generator, held_out = Generator.from_config(config().generator), tuple(frames(5).split(7).held_out)
+    generator.trained_on = TrainedOn(data=data, seed=7, held_out=held_out)
+    generator.save_pretrained(tmp_path / "generator")
+    scored = []
+
+    def opened(_: str, size: tuple[int, int], *, scenes: int, seed: int, **__: object) -> Frames:
+        scored.append((size, seed, scenes > max(held_out)))
+        return drawn
+
+    drawn = frames(scenes)
+    monkeypatch.setattr(command, "open_frames", opened)
+    monkeypatch.setattr(command, "held_out_scores", lambda _, __, indices, **___: scored.append(indices) or {})
+    monkeypatch.setattr(command, "report", lambda *_: None)
+    assert main(["evaluate", "--output", str(tmp_path), "--quiet", *more]) == (0 if message is None else 2)
+    if message is None:
+        assert scored == [(SIZE, 7, True), held_out]
+    else:
+        assert message in capsys.readouterr().err
 
 
 def test_missing_vgg_weights_stop_the_run(

@@ -51,6 +51,12 @@ def test_overrides() -> None:
         ("pseudo_views.hidden=2", "expected a probability"),
         ("pseudo_views.virtual=0", "since 0.3 virtual is gone: no measurement showed a gain"),
         ("pseudo_views.quality=draft", "PseudoViewConfig.quality: expected fast or paper, got 'draft'"),
+        ("pseudo_views.yaw_deg=[5]", r"yaw_deg: expected 0 <= low <= high <= 90, got \(5.0,\)"),
+        ("pseudo_views.focal=[0.7, 1, 2]", "focal: expected 0 < low <= high"),
+        ("max_grad_norm=-1", "max_grad_norm: expected at least 0, got -1"),
+        ("weight_decay=-1", "weight_decay: expected at least 0, got -1"),
+        ("seed=-1", r"seed: expected a value from 0 to 2\*\*28, got -1"),
+        ("seed=1234567890", r"seed: expected a value from 0 to 2\*\*28, got 1234567890"),
         ("loss.regression=1", r"LossConfig.regression: expected a value in \[0, 1\), got 1"),
     ],
 )
