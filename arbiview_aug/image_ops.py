@@ -160,12 +160,17 @@ class Memory:
         return array
 
     def _take_back(self, block: np.ndarray) -> None:
-        with self._lock:
+        # The garbage collector may call this in the thread that holds the lock: waiting would never end.
+        if not self._lock.acquire(blocking=False):
+            return
+        try:
             if self._kept + block.nbytes > self.limit:  # other sizes are asked for now
                 self._free.clear()
                 self._kept = 0
             self._free.setdefault(block.nbytes, []).append(block)
             self._kept += block.nbytes
+        finally:
+            self._lock.release()
 
     def __reduce__(self) -> tuple[type[Memory], tuple[int]]:
         return Memory, (self.limit,)

@@ -121,7 +121,7 @@ def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
 
     Args:
         sample: The sample dict; see ``RigRetarget``.
-        source: The rig of all samples, if the transform has one.
+        source: The rig of samples that carry none; one that carries another calibration is refused.
 
     Raises:
         SampleError: Missing calibration, mismatched counts or sizes, values out of range.
@@ -138,10 +138,13 @@ def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
     lead = leading_shape(images)
     if 0 in lead:
         raise SampleError(f"images: expected at least one frame, got the leading dimensions {lead}")
-    return [
+    frames = [
         frame_from(checked_images(frame), sample, source, lead, index)
         for frame, index in zip(split("images", images, lead), np.ndindex(*lead), strict=True)
     ]
+    if source is not None and sample.get("rig") is None and not (sample.get("K") is sample.get("cam2ego") is None):
+        _check_agrees(source, sample, lead)
+    return frames
 
 
 def read_scene(frame: Frame, surface: str) -> Scene | None:
@@ -238,6 +241,16 @@ def frame_from(
             expected = f"an image of (h, w) = {camera.size}, as calibrated"
             raise SampleError(f"camera {camera.name!r}: expected {expected}, got {size}; {fix}")
     return Frame(images, _with_masks(rig, sample, lead, index), sample, lead, index)
+
+
+def _check_agrees(source: Rig, sample: Mapping[str, Any], lead: tuple[int, ...]) -> None:
+    """Refuse a sample whose K or cam2ego is not that of the transform's ``source``, beyond rounding."""
+    for key, expected in (("K", source.K), ("cam2ego", source.cam2ego)):
+        got = expected if sample.get(key) is None else numbers(key, sample[key])
+        if got.shape not in (expected.shape, (*lead, *expected.shape)) or not np.allclose(got, expected, 1e-4, 1e-3):
+            raise SampleError(
+                f"{key}: expected the calibration of source=, got another; drop source=, or {key} from the sample"
+            )
 
 
 def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], index: tuple[int, ...]) -> Rig:
@@ -371,6 +384,9 @@ def as_array(key: str, value: Any) -> Points:
         raise SampleTypeError(f"{key}: expected a tensor of numbers, got {got}") from None
 
 
+PROJECTION_KEYS = ("lidar2img", "ego2img", "projection_mat", "camera_maps")
+"""Keys that are functions of intrinsics and poses."""
+
 PIXEL_BOUND_KEYS = (
     "boxes_2d",
     "labels_2d",
@@ -385,7 +401,9 @@ PIXEL_BOUND_KEYS = (
     "confidence",
     "generated",
     "sources",
-    *(*USUAL_NAMES["K"], "lidar2img", "ego2img", "projection_mat"),
+    "camera_maps_coverage",
+    *USUAL_NAMES["K"],
+    *PROJECTION_KEYS,
 )
 """Keys bound to the source's pixels; they are dropped, as they would be stale in the target's views."""
 

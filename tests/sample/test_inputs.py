@@ -149,6 +149,18 @@ def test_bad_calibration(case: str) -> None:
         RigRetarget(rig())(bad)
 
 
+@pytest.mark.parametrize("key", ["K", "cam2ego"])
+def test_the_source_of_a_transform_overrides_no_sample(key: str) -> None:
+    source = rig()
+    rounded = {k: torch.from_numpy(getattr(source, k)).float() for k in ("K", "cam2ego")}
+    assert read_frames(sample(**rounded), source) and read_frames(sample(**{key: None}), source)
+    other = {"K": source.resized((72, 128)).K, "cam2ego": source.turned(yaw_deg=1).cam2ego}[key]
+    for bad in (other, other[:1]):
+        with pytest.raises(SampleError, match=rf"{key}: expected the calibration of source=, got another; drop source"):
+            read_frames(sample(**{key: torch.from_numpy(bad)}), source)
+    assert read_frames(sample(**{key: torch.from_numpy(other)}, rig=source), rig(3))[0].rig is source
+
+
 def test_calibration_without_the_images_leading_dimensions() -> None:
     images = torch.zeros((3, 2, 3, H, W), dtype=torch.uint8)
     with pytest.raises(SampleError, match=r"K: expected shape \(2, 3, 3\) for 2 images, got \(3, 3\) in a frame of"):
