@@ -74,7 +74,8 @@ def _ros(path: Path, mounting: Mounting, frames: Mapping[str, FloatArray]) -> di
         data = {key.lower(): value for key, value in data.items()}  # ROS 1 has K and D
         optical, K, coefficients = [data["header"]["frame_id"].strip("/")], data["k"], data["d"]
         size = data["width"], data["height"]
-        if data["binning_x"] > 1 or data["binning_y"] > 1 or data["roi"]["width"] not in (0, size[0]):
+        window = data["roi"]["width"] or size[0], data["roi"]["height"] or size[1]
+        if data["binning_x"] > 1 or data["binning_y"] > 1 or window != size:
             raise CalibrationError(f"camera {name!r}: expected full images, got binning or a region of interest")
     else:
         K, coefficients = (data[key]["data"] for key in ("camera_matrix", "distortion_coefficients"))
@@ -94,20 +95,28 @@ def _messages(path: Path) -> list[Any]:
 
 
 def _tf_poses(path: Path) -> dict[str, FloatArray]:
-    """Poses (4, 4) in the ego frame of the frames of TFMessages."""
-    links = {}
+    """Poses (4, 4) of the frames of TFMessages in the ego frame: base_link, or base_footprint where there is none."""
+    links: dict[str, tuple[str, FloatArray]] = {}
     for one in (one for message in _messages(path) for one in message["transforms"]):
         child, parent = (frame.strip("/") for frame in (one["child_frame_id"], one["header"]["frame_id"]))
         links[child] = parent, pose_of(child, one["transform"])
+
+    def climbed(at: str, end: str) -> tuple[str, FloatArray]:
+        pose: FloatArray = np.eye(4)
+        for _ in links:  # no more steps than links, which may run in a circle
+            if at in links and at != end:
+                at, pose = links[at][0], links[at][1] @ pose
+        return at, pose
+
+    known = {*links, *(parent for parent, _ in links.values())}
+    ego = next((frame for frame in _EGO_FRAMES if frame in known), "")
+    root, ego2root = climbed(ego, "")
     poses = {}
     for frame in links:
-        pose, at = np.eye(4), frame
-        for _ in links:  # no more steps than links, which may run in a circle
-            if at in links and at not in _EGO_FRAMES:
-                at, pose = links[at][0], links[at][1] @ pose
-        if at in _EGO_FRAMES:
-            poses[frame] = pose
-    if not poses:
+        at, pose = climbed(frame, ego)
+        if at in (ego, root):
+            poses[frame] = pose if at == ego else np.asarray(np.linalg.solve(ego2root, pose), np.float64)
+    if not ego:
         got = ", ".join(sorted({parent for parent, _ in links.values()})) or "no transforms"
         expected = f"{' or '.join(_EGO_FRAMES)}: x forward, y left, z up"
         raise CalibrationError(f"{TF}: which frame is the ego frame? Expected {expected}; got {got}: rename it there")
