@@ -52,7 +52,8 @@ def write_halved(image: torch.Tensor, level: int, dst: np.ndarray) -> None:
 def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     """Resize a (3, H, W) image to (h, w), antialiased; a copy if it has that size.
 
-    On the CPU by halving and then bilinearly, as target views are read: a tenth of torch's time. Torch resizes images
+    On the CPU by halving and then bilinearly, as target views are read, or by means of areas where an odd side cannot
+    be halved: a tenth of torch's time. Torch resizes images
     that need gradients or lie on other devices.
     """
     if image.device.type != "cpu" or image.requires_grad:
@@ -64,14 +65,16 @@ def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     level, sides = 0, list(zip(image.shape[1:], size, strict=True))
     while all(n % (2 << level) == 0 and 1.02 * n / (2 << level) >= to for n, to in sides):
         level += 1  # halving an odd side would lose the last row
+    still_halves = all(1.02 * n / (2 << level) >= to for n, to in sides)
+    how = cv2.INTER_AREA if still_halves else cv2.INTER_LINEAR
     out = torch.empty((3, *size), dtype=work.dtype)
     array = interleaved(work)
     if array is not None:
         small = halved(array, level)
-        cv2.split(small if small.shape[:2] == size else cv2.resize(small, size[::-1]), list(out.numpy()))
+        cv2.split(small if small.shape[:2] == size else cv2.resize(small, size[::-1], interpolation=how), list(out.numpy()))
     else:
         for plane, to in zip(work.contiguous().numpy(), out.numpy(), strict=True):
-            cv2.resize(halved(plane, level), size[::-1], dst=to)
+            cv2.resize(halved(plane, level), size[::-1], dst=to, interpolation=how)
     return out.to(image.dtype)
 
 
