@@ -105,7 +105,8 @@ class Frame:
         """The frame's name under a sample key that holds one name, or in a batch a list or tensor of names."""
         value, count = self.sample[key], math.prod(self.lead)
         if self.lead:
-            names = list(value.reshape(count, -1)) if isinstance(value, torch.Tensor) and value.ndim else value
+            is_whole = isinstance(value, torch.Tensor) and value.numel() and value.numel() % count == 0
+            names = list(value.reshape(count, -1)) if is_whole else value
             if not isinstance(names, list | tuple) or len(names) != count:
                 raise SampleError(f"{key}: expected a name for each of {count} frames, got {type(names).__name__}")
             value = names[self.number]
@@ -259,7 +260,7 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
     if missing:
         raise SampleError(
             f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', missing {', '.join(missing)}"
-            f"{hint(sample, missing)}; or pass source= to the transform"
+            f"{hint(sample, missing)}; or pass source= to RigRetarget"
         )
     K, cam2ego = (numbers(key, sample[key], index) for key in ("K", "cam2ego"))
     for key, array, expected in (("K", K, (len(images), 3, 3)), ("cam2ego", cam2ego, (len(images), 4, 4))):
@@ -442,7 +443,10 @@ def check_other_keys(
             if kind := _tv_tensor(leaf):
                 stale = f"{key}: a tv_tensors.{kind} is bound to the source's pixels and would be stale"
                 raise SampleError(f"{stale}; drop it, or name it in SampleKeys(keep=({key!r},))")
-            shape = tuple(getattr(leaf, "shape", ()))
+            try:
+                shape = tuple(leaf.shape)
+            except (AttributeError, TypeError, RuntimeError):  # RuntimeError: nested tensors
+                continue
             if any(pair in sizes for pair in pairwise(shape)):
                 raise SampleError(
                     f"{key}: shape {shape} looks like a map over the source's pixels and would be stale; name it in "

@@ -206,6 +206,7 @@ def test_ros_questions(tmp_path: Path) -> None:
         ("pose: {}", "mounting.yaml: expected the keys poses, ground_z_m"),
         ("poses: {front: {translation: {x: 1}}}", r"camera 'front': pose: expected a 4x4 matrix, or \{translation"),
         (f"poses: {{front: {(2 * FORWARD).tolist()}}}", "camera 'front': pose: expected last row"),
+        ("metres_per_unit: abc", "ROS: mounting.yaml: metres_per_unit: expected a positive number, got 'abc'"),
         ("metres_per_unit: -1", "metres_per_unit: expected a positive number, got -1"),
         (f"ground_z_m: low\nposes: {{front: {ROWS}}}", "ground_z_m: expected a finite height"),
         ("poses: !!python/name:os.system ''", "mounting.yaml: expected plain YAML"),

@@ -144,6 +144,9 @@ def test_batches_of_sequences() -> None:
         ({"height_m": (0, 1, 2)}, "height_m: expected a half-width"),
         ({"focal_scale": 1.0}, "focal_scale: expected a half-width below 1 or a positive .low, high., got 1.0"),
         ({"focal_scale": (0.0, 2.0)}, "focal_scale: expected a half-width below 1 or a positive"),
+        ({"yaw_deg": True}, "yaw_deg: expected a half-width or a .low, high., got True"),
+        ({"yaw_deg": 10**400}, "yaw_deg: expected a half-width"),
+        ({"yaw_deg": ("1", 2)}, "yaw_deg: expected a half-width"),
         ({"per": "epoch"}, "per: expected 'sample' or 'sequence', got 'epoch'"),
     ],
 )

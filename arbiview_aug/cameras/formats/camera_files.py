@@ -13,7 +13,7 @@ import numpy as np
 from arbiview_aug.cameras.formats.entries import camera_entry, lens_of
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting, pose_of
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.plain_yaml import MOST_BYTES, parse_yaml, refuse_large
+from arbiview_aug.cameras.plain_yaml import MOST_BYTES, file_stem, parse_yaml, refuse_large
 from arbiview_aug.cameras.rotations import quaternion_from_rotation
 from arbiview_aug.errors import CalibrationError
 
@@ -162,8 +162,7 @@ def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
         if lens == "radtan":
             coefficients += [0.0] * (5 - len(coefficients))
         model = "equidistant" if lens == "fisheye" else "plumb_bob" if len(coefficients) == 5 else "rational_polynomial"
-        file = name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", name) else f"camera {k}"
-        files[f"{file}.yaml"] = {
+        files[f"{file_stem(name, k)}.yaml"] = {
             **{"image_width": camera["width"], "image_height": camera["height"], "camera_name": name},
             "camera_matrix": _node(K),
             **{"distortion_model": model, "distortion_coefficients": _node([coefficients])},
