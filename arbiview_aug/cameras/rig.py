@@ -158,6 +158,12 @@ class Rig:
         keys = *(camera.content_key for camera in self.cameras), *(lidar.content_key for lidar in self.lidars)
         return hashlib.sha256(np.float64(self.ground_z_m).tobytes() + b"".join(keys)).digest()
 
+    @cached_property
+    def named_key(self) -> bytes:
+        """``content_key`` and names, for what is kept and shown."""
+        names = self.name, *(camera.name for camera in self.cameras), *(lidar.name for lidar in self.lidars)
+        return self.content_key + repr(names).encode()
+
     # --- changed copies -------------------------------------------------------------------------------------------
     def with_cameras(self, cameras: Sequence[Camera]) -> Rig:
         """The same rig with other cameras."""
