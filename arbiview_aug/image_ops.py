@@ -65,13 +65,15 @@ def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     level, sides = 0, list(zip(image.shape[1:], size, strict=True))
     while all(n % (2 << level) == 0 and 1.02 * n / (2 << level) >= to for n, to in sides):
         level += 1  # halving an odd side would lose the last row
-    still_halves = all(1.02 * n / (2 << level) >= to for n, to in sides)
-    how = cv2.INTER_AREA if still_halves else cv2.INTER_LINEAR
+    is_odd = all(1.02 * n / (2 << level) >= to for n, to in sides)
+    how = cv2.INTER_AREA if is_odd else cv2.INTER_LINEAR
     out = torch.empty((3, *size), dtype=work.dtype)
     array = interleaved(work)
     if array is not None:
         small = halved(array, level)
-        cv2.split(small if small.shape[:2] == size else cv2.resize(small, size[::-1], interpolation=how), list(out.numpy()))
+        if small.shape[:2] != size:
+            small = cv2.resize(small, size[::-1], interpolation=how)
+        cv2.split(small, list(out.numpy()))
     else:
         for plane, to in zip(work.contiguous().numpy(), out.numpy(), strict=True):
             cv2.resize(halved(plane, level), size[::-1], dst=to, interpolation=how)

@@ -17,7 +17,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
-from numbers import Real
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,7 +35,7 @@ from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import CalibrationError, calibration_of, shown
 
 MOST_CAMERAS, MOST_LIDARS = 128, 32
-"""Largest rig."""
+"""Largest rig: winning sources are int8."""
 
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
 
@@ -171,7 +170,7 @@ class Rig:
 
     def resized(self, size: tuple[int, int] | float, fit: Fit = "stretch") -> Rig:
         """All cameras resized to (h, w), see ``Camera.resize``, or by a scale."""
-        if not isinstance(size, Real):
+        if not isinstance(size, int | float | np.number):
             return self.with_cameras([c.resize(size, fit) for c in self])
         if not 0 < size < math.inf:
             raise CalibrationError(f"rig {self.name!r}: size: expected (h, w) or a positive scale, got {size}")

@@ -14,7 +14,8 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
-from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig
+from arbiview_aug.choices import KEYS
 from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
 from arbiview_aug.sample.masks import CLEANING, dark_rims
@@ -47,7 +48,6 @@ CALIBRATION_KEYS = (
 )
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
 
-MAX_CAMERAS = 128  # winning sources are int8
 _MOST_FOCALS = 20  # of a side: 169 degrees of a pinhole image, and more than any lens sees
 _OFF_CENTER = 0.2  # a principal point is never off centre by this share of the image's size along both axes
 
@@ -231,8 +231,8 @@ def frame_from(
         rig = source if source is not None else _rig_from_tensors(images, sample, index)
     if not isinstance(rig, Rig):
         raise SampleTypeError(f"rig: expected an arbiview_aug.Rig, got {type(rig).__name__}; use load_rig(path)")
-    if len(rig) > MAX_CAMERAS:
-        raise SampleError(f"images: expected at most {MAX_CAMERAS} cameras, got {len(rig)}")
+    if len(rig) > MOST_CAMERAS:
+        raise SampleError(f"images: expected at most {MOST_CAMERAS} cameras, got {len(rig)}")
     if len(rig) != len(images):
         raise SampleError(f"images: expected {len(rig)} images for cameras {', '.join(rig.names)}, got {len(images)}")
     for camera, image in zip(rig, images, strict=True):
@@ -428,10 +428,8 @@ def check_other_keys(
             f"SampleKeys.labels: expected {', '.join(absent)} in the sample, got {', '.join(map(str, sample))}"
         )
     labels = list(label_keys)
-    if "ignore" in sample and "ignore" not in (*label_keys, *pass_keys):
-        raise SampleError(
-            "ignore: since 0.3 masks of the own car are 'ego_mask'; rename the key, or keep it by SampleKeys"
-        )
+    for old in KEYS.keys() & sample.keys() - {*label_keys, *pass_keys}:
+        raise SampleError(f"{old}: since 0.3 it is {KEYS[old]!r}; rename the key, or keep it by SampleKeys")
     for key, value in sample.items():
         if key in (*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *EGO_KEYS, *labels, *pass_keys):
             continue

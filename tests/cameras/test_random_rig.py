@@ -123,6 +123,7 @@ def test_set_epoch_draws_anew_and_reaches_copies_in_other_processes() -> None:
 def test_batches_of_sequences() -> None:
     random_rig = by_sequence()
     assert random_rig.draw_for({"scene_token": ["a", "a"]}) == random_rig.draw_for({"scene_token": "a"})
+    assert random_rig.draw_for({"scene_token": [{"a": 1}] * 2})  # names need no hash
     expected, tensor = random_rig.draw_for({"scene_token": 3}), torch.tensor
     for same in (tensor(3), tensor([3]), tensor([3, 3, 3]), np.array([3, 3]), [tensor(3), tensor(3)], [[3, 3], [3, 3]]):
         assert random_rig.draw_for({"scene_token": same}) == expected, "however a name is collated"

@@ -48,7 +48,7 @@ def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
         if missing := [key for key in keys if entry.get(key) is None]:
             raise CalibrationError(f"camera {name!r}: expected {', '.join(keys)}, missing {', '.join(missing)}")
         if not relative and entry.get("T_cn_cnm1") is not None:
-            raise CalibrationError(f"camera {name!r}: expected no T_cn_cnm1, as it is first in the chain; sort the file")
+            raise CalibrationError(f"camera {name!r}: expected no T_cn_cnm1, as it is the first; sort the file")
         if relative:
             pose = pose @ np.asarray(np.linalg.inv(checked_pose(name, entry["T_cn_cnm1"], "T_cn_cnm1")), np.float64)
         relative[name] = pose
