@@ -338,7 +338,7 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
     _refuse_misnamed(entry, "mask", label)
     calibration = {key: entry[key] for key in ("name", "K", "cam2ego")}
     distortion = entry.get("distortion")
-    if distortion is None and entry.get("lens", "pinhole") != "pinhole":
+    if distortion is None and entry.get("lens") not in (None, "pinhole"):
         raise CalibrationError(f"{label}: 'lens' is not read: write distortion: {{model: LENS, coeffs: [...]}}")
     if distortion is not None:
         if not isinstance(distortion, Mapping) or not {"model", "coeffs"} <= distortion.keys():

@@ -445,7 +445,9 @@ def test_colmap_names_cameras_that_share_a_folder(tmp_path: Path) -> None:
     written(tmp_path, cameras__txt=CAMERAS_TXT, images__txt=folder, mounting__yaml=COLMAP_MOUNTING)
     assert load_rig(tmp_path).names == ["front", "left"]
     written(tmp_path, images__txt=folder.replace("rig/left.jpg", "rig/front.png"))
-    with pytest.raises(CalibrationError, match=r"how are the cameras called\? .* images: \{front: rig/front.jpg"):
+    with pytest.raises(
+        CalibrationError, match=r"different names .*, got front, front: write .* images: \{front: rig/front.jpg"
+    ):
         load_rig(tmp_path)
     written(tmp_path, mounting__yaml=f"{COLMAP_MOUNTING}\nimages: {{front: front.jpg}}")
     with pytest.raises(CalibrationError, match=r"mounting.yaml: images: expected files that images.txt has, such as "):
@@ -607,6 +609,8 @@ def test_what_a_format_has_not_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     assert load_rig(save_rig("waymo", tmp_path / "zeros", format="kalibr")).sizes == load_rig("waymo").sizes
     assert load_rig(save_rig(skewed, tmp_path / "rig.yaml")) == skewed
+    named = Rig([camera("mounting"), camera("tf_static", 40.0)])
+    assert load_rig(save_rig(named, tmp_path / "names", format="ros")).names == named.names
 
 
 def test_folders_that_are_no_calibration(tmp_path: Path) -> None:

@@ -162,7 +162,8 @@ def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
         if lens == "radtan":
             coefficients += [0.0] * (5 - len(coefficients))
         model = "equidistant" if lens == "fisheye" else "plumb_bob" if len(coefficients) == 5 else "rational_polynomial"
-        files[f"{file_stem(name, k)}.yaml"] = {
+        file = f"{file_stem(name, k)}.yaml"
+        files[f"camera {k}.yaml" if file in (MOUNTING, TF) else file] = {
             **{"image_width": camera["width"], "image_height": camera["height"], "camera_name": name},
             "camera_matrix": _node(K),
             **{"distortion_model": model, "distortion_coefficients": _node([coefficients])},

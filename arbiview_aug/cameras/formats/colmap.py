@@ -63,8 +63,8 @@ def read_colmap(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
         names = [Path(file).stem for file in by_file]
     if not mounting.images and len({*names}) < len(by_file):
         raise CalibrationError(
-            f"how are the cameras called? Their files have equal names: write one for each camera to {MOUNTING} beside "
-            f"the files: images: {{front: {images[0].name}, ...}}"
+            f"expected images with different names for the cameras, got {', '.join(names[:8])}: write one for each to "
+            f"{MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
         )
     chosen = {name: by_file[file] for name, file in (mounting.images or dict(zip(names, by_file, strict=True))).items()}
     if mounting.metres_per_unit is None:
