@@ -61,7 +61,7 @@ class _PixelTransform(torch.nn.Module, ABC):
         out["images"] = rewrapped(_each(images, self._image, 3), images)
         for key in {*_MAPS, *labels} & out.keys() - {*self.keys.keep}:
             maps = out[key]
-            if maps is None:
+            if maps is None and key in _MAPS:
                 continue
             parts = maps if isinstance(maps, list | tuple) else [maps]
             if not (parts and all(map(is_readable, parts))):

@@ -110,6 +110,8 @@ def test_what_cannot_follow_is_dropped_and_misuse_is_named() -> None:
         ResizeRig((30, 50))(blobs(classes=torch.zeros(2, *SIZE)))
     with pytest.raises(SampleError, match="missing K, cam2ego"):
         ResizeRig((30, 50))({"images": torch.zeros(1, 3, 4, 4)})
+    with pytest.raises(SampleError, match="seg: expected maps over the images' pixels as tensors, got NoneType"):
+        ResizeRig((30, 50), keys=SampleKeys(labels=("seg",)))(blobs(seg=None))
     for transform in (ResizeRig((30, 50)), CropRig(0, 0, (30, 50))):
         with pytest.raises(SampleError, match=r"depth_m: expected maps of .* = \(60, 100\), got \(30"):
             transform(blobs(depth_m=torch.zeros(2, 30, 50)))
