@@ -182,7 +182,11 @@ def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") ->
         except OSError as error:
             if error.errno not in (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.EACCES):
                 raise
-    with source.open("rb") as reading, whole_file(path, owner) as file:
+    try:
+        reading = source.open("rb")
+    except OSError as error:
+        raise DataError(f"{source}: expected a file that can be read, got {error.strerror}") from None
+    with reading, whole_file(path, owner) as file:
         shutil.copyfileobj(reading, file)
 
 

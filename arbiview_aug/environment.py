@@ -206,9 +206,14 @@ def _kernel_cache() -> type:
     class KernelCache(FunctionCache):  # type: ignore[misc]
         def __init__(self, function: Any) -> None:
             super().__init__(function)
-            kernels = [one for one in function.__globals__.values() if hasattr(one, "py_func")]
-            called = sorted({kernel.py_func.__code__.co_filename for kernel in kernels})
-            stamps = self._impl.locator.get_source_stamp(), *((s.st_mtime, s.st_size) for s in map(os.stat, called))
+            called, waiting = set[str](), [function]
+            while waiting:  # kernels of the modules that its module imports kernels from, and so on
+                kernels = [one.py_func for one in waiting.pop().__globals__.values() if hasattr(one, "py_func")]
+                new = {kernel.__code__.co_filename: kernel for kernel in kernels}
+                waiting += [new[file] for file in new.keys() - called]
+                called |= new.keys()
+            changes = ((s.st_mtime, s.st_size) for s in map(os.stat, sorted(called)))
+            stamps = self._impl.locator.get_source_stamp(), *changes
             self._cache_file = Files(self._cache_path, f"{self._impl.filename_base}.sha256", stamps)
 
         def save_overload(self, signature: Any, data: Any) -> None:

@@ -52,7 +52,8 @@ def write_halved(image: torch.Tensor, level: int, dst: np.ndarray) -> None:
 def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     """Resize a (3, H, W) image to (h, w), antialiased; a copy if it has that size.
 
-    On the CPU by halving and then bilinearly, as target views are read: a tenth of torch's time. Torch resizes images
+    On the CPU by halving and then bilinearly, as target views are read, or by means of areas where an odd side cannot
+    be halved: a tenth of torch's time. Torch resizes images
     that need gradients or lie on other devices.
     """
     if image.device.type != "cpu" or image.requires_grad:
@@ -64,14 +65,18 @@ def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     level, sides = 0, list(zip(image.shape[1:], size, strict=True))
     while all(n % (2 << level) == 0 and 1.02 * n / (2 << level) >= to for n, to in sides):
         level += 1  # halving an odd side would lose the last row
+    is_odd = all(1.02 * n / (2 << level) >= to for n, to in sides)
+    how = cv2.INTER_AREA if is_odd else cv2.INTER_LINEAR
     out = torch.empty((3, *size), dtype=work.dtype)
     array = interleaved(work)
     if array is not None:
         small = halved(array, level)
-        cv2.split(small if small.shape[:2] == size else cv2.resize(small, size[::-1]), list(out.numpy()))
+        if small.shape[:2] != size:
+            small = cv2.resize(small, size[::-1], interpolation=how)
+        cv2.split(small, list(out.numpy()))
     else:
         for plane, to in zip(work.contiguous().numpy(), out.numpy(), strict=True):
-            cv2.resize(halved(plane, level), size[::-1], dst=to)
+            cv2.resize(halved(plane, level), size[::-1], dst=to, interpolation=how)
     return out.to(image.dtype)
 
 
@@ -160,12 +165,17 @@ class Memory:
         return array
 
     def _take_back(self, block: np.ndarray) -> None:
-        with self._lock:
+        # The garbage collector may call this in the thread that holds the lock: waiting would never end.
+        if not self._lock.acquire(blocking=False):
+            return
+        try:
             if self._kept + block.nbytes > self.limit:  # other sizes are asked for now
                 self._free.clear()
                 self._kept = 0
             self._free.setdefault(block.nbytes, []).append(block)
             self._kept += block.nbytes
+        finally:
+            self._lock.release()
 
     def __reduce__(self) -> tuple[type[Memory], tuple[int]]:
         return Memory, (self.limit,)

@@ -51,6 +51,13 @@ def test_links_and_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         link_whole(tmp_path / "nothing", tmp_path / "d")
     assert names(tmp_path) == ["a", "b", "c"]
 
+    def forbidden(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", forbidden)  # root may read everything
+    with pytest.raises(DataError, match="a: expected a file that can be read, got Permission denied"):
+        link_whole(tmp_path / "a", tmp_path / "d", how="copy")
+
 
 def test_only_what_nobody_writes_is_removed(tmp_path: Path) -> None:
     """A living process's files stay unless they are of an owner that is ours alone; a dead one's go."""

@@ -70,16 +70,20 @@ def test_kernels_are_cached_where_their_folder_can_be_written_only(
 def test_kernels_are_compiled_anew_when_one_that_they_call_changes(
     kernel: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    file, scope = tmp_path / "other.py", dict[str, Any]()
-    file.write_text("def other(x):\n    return x\n")
-    exec(compile(file.read_text(), str(file), "exec"), scope)
-    monkeypatch.setitem(globals(), "other", compiled(scope["other"]))
+    inner = None
+    for name in ("inner", "outer"):  # a kernel that calls one that calls another
+        file, scope = tmp_path / f"{name}.py", {"inner": inner}
+        file.write_text(f"def {name}(x):\n    return x\n")
+        exec(compile(file.read_text(), str(file), "exec"), scope)
+        inner = compiled(scope[name])
+    monkeypatch.setitem(globals(), "outer", inner)
     assert kernel()(3) == 6
-    again = kernel()
-    assert again(3) == 6 and again.stats.cache_hits
-    file.write_text("def other(x):\n    return x + 1\n")
-    third = kernel()
-    assert third(3) == 6 and not third.stats.cache_hits
+    for name in ("inner", "outer"):
+        again = kernel()
+        assert again(3) == 6 and again.stats.cache_hits
+        (tmp_path / f"{name}.py").write_text(f"def {name}(x):\n    return x + 1\n")
+        third = kernel()
+        assert third(3) == 6 and not third.stats.cache_hits
 
 
 def test_compiling_is_announced_and_not_timed(

@@ -43,7 +43,7 @@ class Projection(NamedTuple):
     """Pixels of projected points.
 
     Attributes:
-        uv: (..., 2) pixels (x, y); meaningless where ``valid`` is False, but always finite.
+        uv: (..., 2) pixels (x, y); meaningless where ``valid`` is False, but finite if the points are.
         depth_m: (...,) z in the camera frame.
         valid: (...,) in front of the camera and on the lens's unfolded branch; says nothing about image bounds.
     """

@@ -43,6 +43,16 @@ def read_plain(path: Path, where: str, most_bytes: int = MOST_BYTES) -> Any:
         raise CalibrationError(f"{where}: expected plain YAML or JSON, got {one_line(error)}") from None
 
 
+def dump_yaml(data: Any) -> str:
+    """Plain data as YAML, in its own order."""
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120)
+
+
+def file_stem(name: str, index: int) -> str:
+    """A camera's name for files; names such as /camera/front are none, and no camera has the space of theirs."""
+    return name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", name) else f"camera {index}"
+
+
 def refuse_large(path: Path, where: str, most_bytes: int = MOST_BYTES) -> None:
     """Raise CalibrationError for a file of more bytes."""
     size = os.path.getsize(path)

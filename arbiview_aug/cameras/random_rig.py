@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.errors import CalibrationError, SampleError
+from arbiview_aug.errors import CalibrationError, SampleError, shown
 
 Range = float | tuple[float, float]
 """A half-width about the neutral value (0, or 1 for scales: 0.2 means 0.8 to 1.2), or (low, high)."""
@@ -112,7 +112,7 @@ class RandomRig:
         if key not in sample:
             keys = ", ".join(map(str, sample))
             raise SampleError(f"RandomRig(per='sequence'): expected {key!r} in the sample, got {keys}")
-        names = set(_leaves(sample[key]))
+        names = set(map(str, _leaves(sample[key])))
         if len(names) != 1:
             raise SampleError(f"RandomRig(per='sequence'): {key}: expected one sequence a batch, got {len(names)}")
         return self.draw(sequence_rng(names.pop(), self.epoch, rng))
@@ -143,15 +143,17 @@ def _range(name: str, value: Any) -> tuple[float, float]:
     is_scale = name == "focal_scale"
     neutral = 1.0 if is_scale else 0.0
     try:
+        if any(isinstance(x, bool | str) for x in (value if isinstance(value, tuple | list) else [value])):
+            raise TypeError
         if isinstance(value, tuple | list):
             low, high = (float(x) for x in value)
         else:
             low, high = neutral - float(value), neutral + float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         low, high = math.nan, math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low <= high) or (is_scale and low <= 0):
         kind = "half-width below 1 or a positive" if is_scale else "half-width or a"
-        raise CalibrationError(f"RandomRig: {name}: expected a {kind} (low, high), got {value!r}")
+        raise CalibrationError(f"RandomRig: {name}: expected a {kind} (low, high), got {shown(value)}")
     return low, high
 
 

@@ -12,7 +12,6 @@ import hashlib
 import json
 import math
 import os
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,20 +22,20 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-import yaml
 
+from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.lidar import Lidar
-from arbiview_aug.cameras.plain_yaml import parse_yaml
+from arbiview_aug.cameras.plain_yaml import dump_yaml, file_stem, parse_yaml
 from arbiview_aug.cameras.shipped import shipped_rigs
 from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import CalibrationError, calibration_of, shown
 
 MOST_CAMERAS, MOST_LIDARS = 128, 32
-"""Largest rig."""
+"""Largest rig: winning sources are int8."""
 
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
 
@@ -158,6 +157,12 @@ class Rig:
         keys = *(camera.content_key for camera in self.cameras), *(lidar.content_key for lidar in self.lidars)
         return hashlib.sha256(np.float64(self.ground_z_m).tobytes() + b"".join(keys)).digest()
 
+    @cached_property
+    def named_key(self) -> bytes:
+        """``content_key`` and names, for what is kept and shown."""
+        names = self.name, *(camera.name for camera in self.cameras), *(lidar.name for lidar in self.lidars)
+        return self.content_key + repr(names).encode()
+
     # --- changed copies -------------------------------------------------------------------------------------------
     def with_cameras(self, cameras: Sequence[Camera]) -> Rig:
         """The same rig with other cameras."""
@@ -165,8 +170,10 @@ class Rig:
 
     def resized(self, size: tuple[int, int] | float, fit: Fit = "stretch") -> Rig:
         """All cameras resized to (h, w), see ``Camera.resize``, or by a scale."""
-        if isinstance(size, tuple):
+        if not isinstance(size, int | float | np.number):
             return self.with_cameras([c.resize(size, fit) for c in self])
+        if not 0 < size < math.inf:
+            raise CalibrationError(f"rig {self.name!r}: size: expected (h, w) or a positive scale, got {size}")
         sizes = [(max(1, round(h * size)), max(1, round(w * size))) for h, w in self.sizes]
         return self.with_cameras([c.resize(to, fit) for c, to in zip(self, sizes, strict=True)])
 
@@ -176,8 +183,8 @@ class Rig:
 
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Rig:
         """All cameras and scanners moved along the ego axes; the road stays."""
-        lidars = [lidar.shifted(x_m, y_m, z_m) for lidar in self.lidars]
-        return replace(self, cameras=[c.shifted(x_m, y_m, z_m) for c in self], lidars=lidars)
+        cameras = [c.shifted(x_m, y_m, z_m) for c in self]
+        return replace(self, cameras=cameras, lidars=[lidar.shifted(x_m, y_m, z_m) for lidar in self.lidars])
 
     def undistorted(self) -> Rig:
         """The rig with pinhole cameras of the same K, sizes and poses."""
@@ -243,28 +250,26 @@ class Rig:
             Lidar.from_dict(entry, f"{where}: lidar {shown(entry.get('name', k) if isinstance(entry, Mapping) else k)}")
             for k, entry in enumerate(entries)
         ]
-        name = data.get("name", data.get("dataset", ""))
+        name = next((str(data[key]) for key in ("name", "dataset") if data.get(key) is not None), "")
         with calibration_of(where):
-            return cls(cameras, ground_z_m=data.get("ground_z_m", 0.0), name=str(name), lidars=lidars)
+            return cls(cameras, ground_z_m=data.get("ground_z_m", 0.0), name=name, lidars=lidars)
 
     def save(self, path: str | Path) -> Path:
-        """Write the rig to a .yaml, .yml or .json file; masks become PNGs beside it. Returns the path."""
+        """Write the rig to a .yaml, .yml or .json file; masks become PNGs beside it. Returns the path.
+
+        The folder is created. CalibrationError for another suffix, OutputError for a file that cannot be written.
+        """
         path = Path(path)
-        data = self.to_dict()
+        if path.suffix not in (".json", ".yaml", ".yml"):
+            raise CalibrationError(f"rig file {path}: expected the suffix .yaml, .yml or .json, got {path.suffix!r}")
+        data, files = self.to_dict(), dict[Path, bytes]()
         for k, (entry, camera) in enumerate(zip(data["cameras"], self.cameras, strict=True)):
             if camera.mask is not None:
-                # Names such as /camera/front are no file names; the space avoids clashes with a camera's own name.
-                name = camera.name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", camera.name) else f"camera {k}"
-                file = path.with_name(f"{path.stem}.{name}.mask.png")
-                cv2.imwrite(str(file), camera.mask.astype(np.uint8) * 255)
+                file = path.with_name(f"{path.stem}.{file_stem(camera.name, k)}.mask.png")
+                files[file] = cv2.imencode(".png", camera.mask.astype(np.uint8) * 255)[1].tobytes()
                 entry["mask"] = file.name
-        if path.suffix == ".json":
-            text = json.dumps(data, indent=1)
-        elif path.suffix in (".yaml", ".yml"):
-            text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120)
-        else:
-            raise CalibrationError(f"rig file {path}: expected the suffix .yaml, .yml or .json, got {path.suffix!r}")
-        path.write_text(text)
+        text = json.dumps(data, indent=1) if path.suffix == ".json" else dump_yaml(data)
+        write_whole({**files, path: text.encode()})
         return path
 
 
@@ -330,8 +335,11 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
         expected = ", ".join(sorted(_CAMERA_KEYS))
         raise CalibrationError(f"{label}: expected keys {expected}, missing {', '.join(missing)}{hint(entry, missing)}")
     _refuse_misnamed(entry, "distortion", label)
+    _refuse_misnamed(entry, "mask", label)
     calibration = {key: entry[key] for key in ("name", "K", "cam2ego")}
     distortion = entry.get("distortion")
+    if distortion is None and entry.get("lens") not in (None, "pinhole"):
+        raise CalibrationError(f"{label}: 'lens' is not read: write distortion: {{model: LENS, coeffs: [...]}}")
     if distortion is not None:
         if not isinstance(distortion, Mapping) or not {"model", "coeffs"} <= distortion.keys():
             raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {shown(distortion)}")
@@ -342,11 +350,11 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
 
 
 def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
-    """Refuse numbers under another name of an absent key, which would silently be 0; text may be a note."""
+    """Refuse another name of an absent key, which would not be read; of numbers, text may be a note."""
     for wrong in misnamed(entries, (key,)):
         value = entries[wrong]
         is_zero = not any(value) if isinstance(value, list) else not value
-        if isinstance(value, Mapping | list | int | float) and not is_zero:
+        if (key == "mask" or isinstance(value, Mapping | list | int | float)) and not is_zero:
             raise CalibrationError(
                 f"{label}: {key!r} is absent, and {wrong!r} is not read: did you mean {key!r}? Rename it, or add "
                 f"{key!r} if it is something else"

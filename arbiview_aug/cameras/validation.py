@@ -13,7 +13,7 @@ import numpy as np
 
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, LensName, canonical_name
 from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, nearest_rotation
-from arbiview_aug.errors import CalibrationError, shown
+from arbiview_aug.errors import CalibrationError, one_line, shown
 
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R Rᵀ - I| accepted as a rotation: published calibrations carry 5 to 7 digits."""
@@ -38,7 +38,7 @@ def checked_calibration(
     w, h = checked_pixels(name, "width_px", width_px), checked_pixels(name, "height_px", height_px)
     K, cam2ego, lens = checked_intrinsics(name, K), checked_pose(name, cam2ego), checked_lens(name, lens)
     return {
-        "name": name,
+        "name": str(name),  # numpy's text is no plain YAML
         "width_px": w,
         "height_px": h,
         "K": K,
@@ -90,7 +90,7 @@ def checked_array(name: str, field: str, value: Any, shape: tuple[int, ...]) -> 
         if isinstance(value, list | tuple) and _holds_booleans(value):
             raise TypeError("true or false")
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: tensors that need gradients
         raise _error(name, field, f"numbers of shape {shape}", f"{type(value).__name__} ({str(error)[:200]})") from None
     if array.shape != shape:
         raise _error(name, field, f"shape {shape}", f"shape {array.shape}")
@@ -160,7 +160,7 @@ def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:
     """As many coefficients as the lens takes, up to ``_MAX_COEFFICIENT``."""
     try:
         coefficients = tuple(float(k) + 0.0 for k in value)
-        if isinstance(value, list | tuple) and _holds_booleans(value):
+        if isinstance(value, str) or (isinstance(value, list | tuple) and _holds_booleans(value)):
             raise TypeError
     except (TypeError, ValueError, OverflowError):
         raise _error(name, "distortion", "a sequence of numbers", shown(value)) from None
@@ -181,7 +181,10 @@ def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:
 
 def checked_mask(name: str, value: Any, size: tuple[int, int]) -> BoolArray:
     """A copy (h, w) bool of the image's size."""
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError) as error:  # rows of several lengths; tensors on other devices
+        raise _error(name, "mask", "a bool array", one_line(error, 200)) from None
     if array.dtype != np.bool_:
         raise _error(name, "mask", "bool, True = scene", f"dtype {array.dtype}", "pass mask > 0")
     if array.shape != size:

@@ -573,10 +573,10 @@ def find_paint(face: npt.NDArray[np.int32], winner: npt.NDArray[np.int8], parts:
 
 # --- all views of a rig -----------------------------------------------------------------------------------------------
 def plan_key(source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene | None = None) -> bytes:
-    """Content key of a plan: calibrations, scene, surface and settings, without names."""
+    """Content key of a plan: calibrations with names, which ``explain`` shows, scene, surface and settings."""
     settings = tuple(getattr(config, f.name) for f in fields(config))
     geometry = (scene or Scene()).key
-    return hashlib.sha256(repr((source.content_key, target.content_key, surface, settings, geometry)).encode()).digest()
+    return hashlib.sha256(repr((source.named_key, target.named_key, surface, settings, geometry)).encode()).digest()
 
 
 def build_plan(

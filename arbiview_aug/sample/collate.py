@@ -38,10 +38,12 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         odd = sorted({str(key) for sample in samples for key in set(sample) ^ set(first)})
         raise SampleError(f"collate: expected equal keys in all samples, got {', '.join(odd)} in some")
     batch: dict[str, Any] = {}
-    for key in first:
+    for key in sorted(first, key=lambda key: key == "rig"):  # last, as a rig wins over K and cam2ego
         values = [sample[key] for sample in samples]
         if key == "rig":
             batch |= _rigs(values)
+        elif key in (*STACKED, "lens", "ground_z_m") and all(value is None for value in values):
+            batch[key] = None
         elif key in STACKED or are_maps(values, first["images"]):
             batch[key] = _stacked(key, values)
         elif isinstance(values[0], Mapping) and "images" in values[0]:  # the ``sources`` of a view

@@ -14,7 +14,8 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
-from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig
+from arbiview_aug.choices import KEYS
 from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
 from arbiview_aug.sample.masks import CLEANING, dark_rims
@@ -47,7 +48,6 @@ CALIBRATION_KEYS = (
 )
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
 
-MAX_CAMERAS = 128  # winning sources are int8
 _MOST_FOCALS = 20  # of a side: 169 degrees of a pinhole image, and more than any lens sees
 _OFF_CENTER = 0.2  # a principal point is never off centre by this share of the image's size along both axes
 
@@ -105,7 +105,8 @@ class Frame:
         """The frame's name under a sample key that holds one name, or in a batch a list or tensor of names."""
         value, count = self.sample[key], math.prod(self.lead)
         if self.lead:
-            names = list(value.reshape(count, -1)) if isinstance(value, torch.Tensor) and value.ndim else value
+            is_whole = isinstance(value, torch.Tensor) and value.numel() and value.numel() % count == 0
+            names = list(value.reshape(count, -1)) if is_whole else value
             if not isinstance(names, list | tuple) or len(names) != count:
                 raise SampleError(f"{key}: expected a name for each of {count} frames, got {type(names).__name__}")
             value = names[self.number]
@@ -121,7 +122,7 @@ def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
 
     Args:
         sample: The sample dict; see ``RigRetarget``.
-        source: The rig of all samples, if the transform has one.
+        source: The rig of samples that carry none; one that carries another calibration is refused.
 
     Raises:
         SampleError: Missing calibration, mismatched counts or sizes, values out of range.
@@ -138,10 +139,13 @@ def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
     lead = leading_shape(images)
     if 0 in lead:
         raise SampleError(f"images: expected at least one frame, got the leading dimensions {lead}")
-    return [
+    frames = [
         frame_from(checked_images(frame), sample, source, lead, index)
         for frame, index in zip(split("images", images, lead), np.ndindex(*lead), strict=True)
     ]
+    if source is not None and sample.get("rig") is None and not (sample.get("K") is sample.get("cam2ego") is None):
+        _check_agrees(source, sample, lead)
+    return frames
 
 
 def read_scene(frame: Frame, surface: str) -> Scene | None:
@@ -227,8 +231,8 @@ def frame_from(
         rig = source if source is not None else _rig_from_tensors(images, sample, index)
     if not isinstance(rig, Rig):
         raise SampleTypeError(f"rig: expected an arbiview_aug.Rig, got {type(rig).__name__}; use load_rig(path)")
-    if len(rig) > MAX_CAMERAS:
-        raise SampleError(f"images: expected at most {MAX_CAMERAS} cameras, got {len(rig)}")
+    if len(rig) > MOST_CAMERAS:
+        raise SampleError(f"images: expected at most {MOST_CAMERAS} cameras, got {len(rig)}")
     if len(rig) != len(images):
         raise SampleError(f"images: expected {len(rig)} images for cameras {', '.join(rig.names)}, got {len(images)}")
     for camera, image in zip(rig, images, strict=True):
@@ -240,13 +244,23 @@ def frame_from(
     return Frame(images, _with_masks(rig, sample, lead, index), sample, lead, index)
 
 
+def _check_agrees(source: Rig, sample: Mapping[str, Any], lead: tuple[int, ...]) -> None:
+    """Refuse a sample whose K or cam2ego is not that of the transform's ``source``, beyond rounding."""
+    for key, expected in (("K", source.K), ("cam2ego", source.cam2ego)):
+        got = expected if sample.get(key) is None else numbers(key, sample[key])
+        if got.shape not in (expected.shape, (*lead, *expected.shape)) or not np.allclose(got, expected, 1e-4, 1e-3):
+            raise SampleError(
+                f"{key}: expected the calibration of source=, got another; drop source=, or {key} from the sample"
+            )
+
+
 def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], index: tuple[int, ...]) -> Rig:
     """The rig of the sample's K, cam2ego and, where present, lens, distortion and ground_z_m."""
     missing = [key for key in ("K", "cam2ego") if sample.get(key) is None]
     if missing:
         raise SampleError(
             f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', missing {', '.join(missing)}"
-            f"{hint(sample, missing)}; or pass source= to the transform"
+            f"{hint(sample, missing)}; or pass source= to RigRetarget"
         )
     K, cam2ego = (numbers(key, sample[key], index) for key in ("K", "cam2ego"))
     for key, array, expected in (("K", K, (len(images), 3, 3)), ("cam2ego", cam2ego, (len(images), 4, 4))):
@@ -371,6 +385,9 @@ def as_array(key: str, value: Any) -> Points:
         raise SampleTypeError(f"{key}: expected a tensor of numbers, got {got}") from None
 
 
+PROJECTION_KEYS = ("lidar2img", "ego2img", "projection_mat", "camera_maps")
+"""Keys that are functions of intrinsics and poses."""
+
 PIXEL_BOUND_KEYS = (
     "boxes_2d",
     "labels_2d",
@@ -385,7 +402,9 @@ PIXEL_BOUND_KEYS = (
     "confidence",
     "generated",
     "sources",
-    *(*USUAL_NAMES["K"], "lidar2img", "ego2img", "projection_mat"),
+    "camera_maps_coverage",
+    *USUAL_NAMES["K"],
+    *PROJECTION_KEYS,
 )
 """Keys bound to the source's pixels; they are dropped, as they would be stale in the target's views."""
 
@@ -409,10 +428,8 @@ def check_other_keys(
             f"SampleKeys.labels: expected {', '.join(absent)} in the sample, got {', '.join(map(str, sample))}"
         )
     labels = list(label_keys)
-    if "ignore" in sample and "ignore" not in (*label_keys, *pass_keys):
-        raise SampleError(
-            "ignore: since 0.3 masks of the own car are 'ego_mask'; rename the key, or keep it by SampleKeys"
-        )
+    for old in KEYS.keys() & sample.keys() - {*label_keys, *pass_keys}:
+        raise SampleError(f"{old}: since 0.3 it is {KEYS[old]!r}; rename the key, or keep it by SampleKeys")
     for key, value in sample.items():
         if key in (*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *EGO_KEYS, *labels, *pass_keys):
             continue
@@ -424,7 +441,10 @@ def check_other_keys(
             if kind := _tv_tensor(leaf):
                 stale = f"{key}: a tv_tensors.{kind} is bound to the source's pixels and would be stale"
                 raise SampleError(f"{stale}; drop it, or name it in SampleKeys(keep=({key!r},))")
-            shape = tuple(getattr(leaf, "shape", ()))
+            try:
+                shape = tuple(leaf.shape)
+            except (AttributeError, TypeError, RuntimeError):  # RuntimeError: nested tensors
+                continue
             if any(pair in sizes for pair in pairwise(shape)):
                 raise SampleError(
                     f"{key}: shape {shape} looks like a map over the source's pixels and would be stale; name it in "

@@ -227,7 +227,7 @@ def _ego2ego(sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[s
 
 def _pose(key: str, value: Any, index: tuple[int, ...] = ()) -> FloatArray:
     pose = numbers(key, value)
-    pose = np.asarray(pose[index]) if pose.ndim > 2 else pose
+    pose = numbers(key, pose, index) if pose.ndim > 2 else pose
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise SampleError(f"{key}: expected (4, 4) finite numbers, got shape {pose.shape}")
     R = pose[:3, :3]

@@ -88,11 +88,14 @@ class CameraMaps(torch.nn.Module):
 
     def _of_frame(self, frame: Frame) -> torch.Tensor | list[torch.Tensor]:
         of_cameras = [self._held(camera, frame.rig.ground_z_m) for camera in frame.rig]
-        return stacked([maps.to(image.device) for maps, image in zip(of_cameras, frame.images, strict=True)])
+        return stacked([maps.to(image.device, copy=True) for maps, image in zip(of_cameras, frame.images, strict=True)])
 
     def _held(self, camera: Camera, ground_z_m: float) -> torch.Tensor:
-        key, settings = (camera.content_key, ground_z_m), (self.maps, self.stride)
-        return self._cache.get(key, lambda: torch.from_numpy(camera_maps(camera, ground_z_m, *settings)))
+        calibration = camera.size, camera.lens, camera.distortion, camera.K.tobytes(), camera.cam2ego.tobytes()
+        settings = self.maps, self.stride  # masks change no map
+        return self._cache.get(
+            (*calibration, ground_z_m), lambda: torch.from_numpy(camera_maps(camera, ground_z_m, *settings))
+        )
 
 
 def camera_maps(

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import WarnOnce
 from arbiview_aug.sample.batching import like
-from arbiview_aug.sample.inputs import numbers, read_frames
+from arbiview_aug.sample.inputs import POSE_KEYS, PROJECTION_KEYS, numbers, read_frames
 from arbiview_aug.transforms.settings import is_number
 
 
@@ -36,12 +37,13 @@ class JitteredCalibration(torch.nn.Module):
             if not is_number(value) or not 0 <= value < float("inf"):
                 raise ValueError(f"{name}: expected a standard deviation from 0, got {value!r}")
         self.angle_deg, self.position_m = float(angle_deg), float(position_m)
+        self._warn = WarnOnce()
 
     def extra_repr(self) -> str:
         return f"angle_deg={self.angle_deg:g}, position_m={self.position_m:g}"
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """A new dict with other ``cam2ego``, in ``rig`` too.
+        """A new dict with other ``cam2ego``, in ``rig`` too. What followed from the old one is dropped, with a warning.
 
         Raises:
             SampleError: A sample that ``RigRetarget`` would not take either.
@@ -54,6 +56,9 @@ class JitteredCalibration(torch.nn.Module):
             poses = np.tile(poses, (*lead, 1, 1, 1))
         if sample.get("cam2ego") is not None:
             out["cam2ego"] = like(torch.from_numpy(poses), sample["cam2ego"])
+        for key in (*POSE_KEYS, *PROJECTION_KEYS):
+            if out.pop(key, None) is not None:
+                self._warn(key, f"JitteredCalibration drops {key}: it speaks of poses that have moved")
         return out
 
     def _jittered(self, poses: Any) -> Any:

@@ -166,7 +166,7 @@ class Plans:
 
     def pair(self, source: Rig, target: Rig) -> RigPair:
         """The pair of a source and a target rig; cached."""
-        key = source.content_key, target.content_key
+        key = source.named_key, target.named_key
         return self._pairs.get(key, lambda: RigPair(source, target, self.surface, self.config))
 
     def plan(self, pair: RigPair, scene: Scene) -> RenderPlan:

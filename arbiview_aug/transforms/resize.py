@@ -20,7 +20,7 @@ from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.image_ops import nearest_resized, resized
 from arbiview_aug.sample.batching import is_readable, like, rewrapped
-from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, PIXEL_BOUND_KEYS, check_other_keys, numbers, read_frames
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, PIXEL_BOUND_KEYS, check_other_keys, read_frames
 from arbiview_aug.transforms.settings import SampleKeys, checked_pixels
 
 _MAPS = ("coverage", "ego_mask", "source_camera", "source_frame", "confidence", "generated", "depth", "depth_m")
@@ -49,8 +49,8 @@ class _PixelTransform(torch.nn.Module, ABC):
         Raises:
             SampleError: As ``RigRetarget`` raises; ``CropRig``: a window that leaves an image.
         """
-        images = sample.get("images")
         frames = read_frames(sample, None)
+        images = sample["images"]
         sizes = [tuple(image.shape[-2:]) for image in frames[0].images]
         labels = check_other_keys(sample, sizes, self.keys.labels, self.keys.keep)
         out = dict(sample)
@@ -61,14 +61,19 @@ class _PixelTransform(torch.nn.Module, ABC):
         out["images"] = rewrapped(_each(images, self._image, 3), images)
         for key in {*_MAPS, *labels} & out.keys() - {*self.keys.keep}:
             maps = out[key]
-            if not all(map(is_readable, maps if isinstance(maps, list | tuple) else [maps])):
+            if maps is None and key in _MAPS:
+                continue
+            parts = maps if isinstance(maps, list | tuple) else [maps]
+            if not (parts and all(map(is_readable, parts))):
                 raise SampleError(f"{key}: expected maps over the images' pixels as tensors, got {type(maps).__name__}")
+            if other := [tuple(one.shape[-2:]) for one in parts if tuple(one.shape[-2:]) not in sizes]:
+                raise SampleError(f"{key}: expected maps of the images' (h, w) = {sizes[0]}, got {other[0]}")
             out[key] = rewrapped(_each(maps, self._map, 2), maps)
         if isinstance(sample.get("rig"), Rig):
             out["rig"] = sample["rig"].with_cameras([self._camera(camera) for camera in sample["rig"]])
         if sample.get("K") is not None:
             K = np.stack([self._camera(camera).K for frame in frames for camera in frame.rig])
-            out["K"] = like(torch.from_numpy(K.reshape(numbers("K", sample["K"]).shape)), sample["K"])
+            out["K"] = like(torch.from_numpy(K.reshape(*frames[0].lead, -1, 3, 3)), sample["K"])
         return out
 
     @abstractmethod

@@ -75,7 +75,7 @@ def retarget_points(
     array = as_array("points", points)
     measured = checked_points(array)
     boxes = None if boxes_3d is None else checked_boxes(boxes_3d)
-    unsupported, rings = 0.0, torch.full((len(measured),), -1, dtype=torch.int32)
+    unsupported, rings = 0.0, torch.full((len(array),), -1, dtype=torch.int32)
     if not skip:
         up = ground_z_m - target.ground_z_m  # scanners keep their rays where nothing moves
         lidars = [lidar.shifted(z_m=up) for lidar in target.lidars] if up else target.lidars

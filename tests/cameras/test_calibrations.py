@@ -160,10 +160,24 @@ def test_ros_camera_info_as_topic_echo_prints_it(tmp_path: Path) -> None:
     assert load_rig(tmp_path) == expected == load_rig(tmp_path / "front.yaml").with_cameras(expected)
     of_ros_1 = CAMERA_INFO_MESSAGE.replace("\nd:", "\nD:").replace("\nk:", "\nK:")
     assert load_rig(written(tmp_path, front__yaml=of_ros_1)) == expected
-    for part in (("binning_y: 0", "binning_y: 2"), ("  width: 0", "  width: 320")):
+    for part in (("binning_y: 0", "binning_y: 2"), ("  width: 0", "  width: 320"), ("  height: 0", "  height: 240")):
         written(tmp_path, front__yaml=CAMERA_INFO_MESSAGE.replace(*part))
         with pytest.raises(CalibrationError, match="camera 'front': expected full images, got binning or a region"):
             load_rig(tmp_path)
+
+
+def test_ros_has_one_ego_frame(tmp_path: Path) -> None:
+    written(tmp_path, front__yaml=CAMERA_INFO, left__yaml=FISHEYE_INFO, tf_static__yaml=TF_STATIC)
+    expected = load_rig(tmp_path)
+    link = "---\ntransforms:\n- header: {{frame_id: {}}}\n  child_frame_id: {}\n  transform:\n    translation: "
+    link += "{{x: 0.0, y: 0.0, z: {}}}\n    rotation: {{x: 0.0, y: 0.0, z: 0.0, w: 1.0}}\n"
+    of_foot = TF_STATIC.replace("/base_link", "/base_footprint").replace("z: 1.5}", "z: 1.8}")
+    for ends in (("base_footprint", "base_link", 0.3), ("base_link", "base_footprint", -0.3)):
+        rig = load_rig(written(tmp_path, tf_static__yaml=of_foot + link.format(*ends)))
+        np.testing.assert_allclose(rig.cam2ego, expected.cam2ego, atol=1e-12)
+    assert load_rig(written(tmp_path, tf_static__yaml=TF_STATIC.replace("base_link", "base_footprint"))) == expected
+    with pytest.raises(CalibrationError, match=r"camera 'left': where is it on the vehicle"):
+        load_rig(written(tmp_path, tf_static__yaml=of_foot))
 
 
 def test_ros_questions(tmp_path: Path) -> None:
@@ -192,6 +206,7 @@ def test_ros_questions(tmp_path: Path) -> None:
         ("pose: {}", "mounting.yaml: expected the keys poses, ground_z_m"),
         ("poses: {front: {translation: {x: 1}}}", r"camera 'front': pose: expected a 4x4 matrix, or \{translation"),
         (f"poses: {{front: {(2 * FORWARD).tolist()}}}", "camera 'front': pose: expected last row"),
+        ("metres_per_unit: abc", "ROS: mounting.yaml: metres_per_unit: expected a positive number, got 'abc'"),
         ("metres_per_unit: -1", "metres_per_unit: expected a positive number, got -1"),
         (f"ground_z_m: low\nposes: {{front: {ROWS}}}", "ground_z_m: expected a finite height"),
         ("poses: !!python/name:os.system ''", "mounting.yaml: expected plain YAML"),
@@ -342,6 +357,19 @@ def test_kalibr_camchain(tmp_path: Path) -> None:
     written(tmp_path, other_camchain__yaml=CAMCHAIN)
     with pytest.raises(CalibrationError, match=r"which of camchain.yaml, other_camchain.yaml"):
         load_rig(tmp_path)
+    (tmp_path / "other_camchain.yaml").unlink()
+    ten = yaml.safe_load(CAMCHAIN)
+    ten["cam10"] = ten.pop("cam2")
+    assert load_rig(written(tmp_path, camchain__yaml=yaml.safe_dump(ten | {"cam2": ten["cam1"]}))).names[1:] == [
+        *("cam1", "cam2", "cam10")
+    ]
+    written(tmp_path, camchain__yaml=CAMCHAIN.replace("cam0", "cam3"))
+    with pytest.raises(CalibrationError, match=r"camera 'cam1': expected no T_cn_cnm1, as it is the first"):
+        load_rig(path)
+    for key in ("T_cn_cnm1", "resolution"):
+        written(tmp_path, camchain__yaml=CAMCHAIN.replace(f"  {key}:", f"  other_{key}:"))
+        with pytest.raises(CalibrationError, match=rf"camera 'cam[01]': expected intrinsics, .*, missing {key}"):
+            load_rig(path)
     written(tmp_path, camchain__yaml=CAMCHAIN.replace("ds", "omni"))
     with pytest.raises(CalibrationError, match=r"'cam0': camera_model-distortion_model: expected .*, got omni-none"):
         load_rig(path)
@@ -410,6 +438,20 @@ def test_colmap(tmp_path: Path) -> None:
         (tmp_path / "images.bin").write_bytes(data[:size])
         with pytest.raises(CalibrationError, match=r"expected a calibration as COLMAP writes it"):
             load_rig(tmp_path)
+
+
+def test_colmap_names_cameras_that_share_a_folder(tmp_path: Path) -> None:
+    folder = IMAGES_TXT.replace("front/0001", "rig/front").replace("left/0001", "rig/left")
+    written(tmp_path, cameras__txt=CAMERAS_TXT, images__txt=folder, mounting__yaml=COLMAP_MOUNTING)
+    assert load_rig(tmp_path).names == ["front", "left"]
+    written(tmp_path, images__txt=folder.replace("rig/left.jpg", "rig/front.png"))
+    with pytest.raises(
+        CalibrationError, match=r"different names .*, got front, front: write .* images: \{front: rig/front.jpg"
+    ):
+        load_rig(tmp_path)
+    written(tmp_path, mounting__yaml=f"{COLMAP_MOUNTING}\nimages: {{front: front.jpg}}")
+    with pytest.raises(CalibrationError, match=r"mounting.yaml: images: expected files that images.txt has, such as "):
+        load_rig(tmp_path)
 
 
 def test_colmap_asks_which_images_are_of_one_moment(tmp_path: Path) -> None:
@@ -567,6 +609,8 @@ def test_what_a_format_has_not_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     assert load_rig(save_rig("waymo", tmp_path / "zeros", format="kalibr")).sizes == load_rig("waymo").sizes
     assert load_rig(save_rig(skewed, tmp_path / "rig.yaml")) == skewed
+    named = Rig([camera("mounting"), camera("tf_static", 40.0)])
+    assert load_rig(save_rig(named, tmp_path / "names", format="ros")).names == named.names
 
 
 def test_folders_that_are_no_calibration(tmp_path: Path) -> None:

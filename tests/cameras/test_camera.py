@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 import pytest
+import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rotations import nearest_rotation
@@ -75,6 +76,12 @@ BAD = {
         r"mask: expected shape \(480, 640\), the size \(h, w\) of the image, got shape \(640, 480\)",
     ),
     "mask of bytes": ({"mask": np.ones((480, 640), np.uint8)}, r"mask: expected bool.*pass mask > 0"),
+    "mask of ragged rows": ({"mask": [[True], [True, False]]}, r"mask: expected a bool array, got "),
+    "coefficients as text": ({"lens": "radtan", "distortion": "1234"}, r"distortion: expected a sequence of numbers"),
+    "K that needs gradients": (
+        {"K": torch.tensor(K, requires_grad=True)},
+        r"K: expected numbers of shape \(3, 3\), got Tensor \(.*detach",
+    ),
     "no width": ({"width_px": 0}, rf"width_px: expected a whole number of pixels from 1 to {MAX_SIZE_PX}, got 0"),
     "half a pixel": ({"height_px": 480.5}, r"height_px: expected a whole number of pixels"),
     "too large": ({"width_px": 40000}, r"width_px: expected .* got 40000"),

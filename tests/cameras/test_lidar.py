@@ -72,6 +72,11 @@ def test_rigs_carry_scanners() -> None:
     assert rig == replace(rig, lidars=[scanner(elevations_deg=[-30, 0, 10])])
 
 
+def test_rigs_with_scanners_are_moved_by_numbers() -> None:
+    with pytest.raises(CalibrationError, match="shift: expected finite"):
+        replace(ring(1), lidars=[scanner()]).shifted("a")  # type: ignore[arg-type]
+
+
 def test_rigs_refuse_scanners() -> None:
     with pytest.raises(CalibrationError, match="expected Lidar objects, got str"):
         replace(ring(1), lidars=["top"])
@@ -90,6 +95,10 @@ def test_files_keep_scanners(tmp_path: Path, suffix: str) -> None:
     [
         ("top", "lidar 0: expected a mapping, got str"),
         ({"name": "top"}, "lidar 'top': expected keys .*, missing lidar2ego, elevations_deg"),
+        (
+            {k: v for k, v in scanner().to_dict().items() if k != "azimuth_deg"} | {"azimuths_deg": [0, 90]},
+            "lidar 'top': 'azimuths_deg' is not read: did you mean 'azimuth_deg'?",
+        ),
         (scanner().to_dict() | {"range_m": [0, 0]}, "rig: lidar 'top': lidar 'top': range_m: expected two distances"),
     ],
 )

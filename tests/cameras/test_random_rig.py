@@ -123,6 +123,7 @@ def test_set_epoch_draws_anew_and_reaches_copies_in_other_processes() -> None:
 def test_batches_of_sequences() -> None:
     random_rig = by_sequence()
     assert random_rig.draw_for({"scene_token": ["a", "a"]}) == random_rig.draw_for({"scene_token": "a"})
+    assert random_rig.draw_for({"scene_token": [{"a": 1}] * 2})  # names need no hash
     expected, tensor = random_rig.draw_for({"scene_token": 3}), torch.tensor
     for same in (tensor(3), tensor([3]), tensor([3, 3, 3]), np.array([3, 3]), [tensor(3), tensor(3)], [[3, 3], [3, 3]]):
         assert random_rig.draw_for({"scene_token": same}) == expected, "however a name is collated"
@@ -144,6 +145,9 @@ def test_batches_of_sequences() -> None:
         ({"height_m": (0, 1, 2)}, "height_m: expected a half-width"),
         ({"focal_scale": 1.0}, "focal_scale: expected a half-width below 1 or a positive .low, high., got 1.0"),
         ({"focal_scale": (0.0, 2.0)}, "focal_scale: expected a half-width below 1 or a positive"),
+        ({"yaw_deg": True}, "yaw_deg: expected a half-width or a .low, high., got True"),
+        ({"yaw_deg": 10**400}, "yaw_deg: expected a half-width"),
+        ({"yaw_deg": ("1", 2)}, "yaw_deg: expected a half-width"),
         ({"per": "epoch"}, "per: expected 'sample' or 'sequence', got 'epoch'"),
     ],
 )

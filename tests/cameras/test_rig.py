@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from arbiview_aug.cameras.rig import Rig, content_order, load_rig, shipped_rigs
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.cameras.rig import Rig, content_order, load_rig, save_rig, shipped_rigs
+from arbiview_aug.errors import CalibrationError, OutputError
 from tests import helpers
 
 camera = partial(helpers.camera, size=(48, 64), horizontal_fov_deg=70.0, position_m=(1.5, 0.1, 1.6))
@@ -72,6 +72,16 @@ def test_round_trip_is_exact(tmp_path: Path, suffix: str) -> None:
 def test_other_suffixes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"expected the suffix .yaml, .yml or .json, got '.toml'"):
         rig_with_everything().save(tmp_path / "rig.toml")
+    assert not list(tmp_path.iterdir())
+
+
+def test_files_are_written_whole(tmp_path: Path) -> None:
+    named = rig_with_everything().with_cameras([camera(np.str_("front"))])
+    assert load_rig(named.save(tmp_path / "new" / "rig.yaml")) == named
+    (tmp_path / "file").touch()
+    for write in (lambda path: named.save(path / "rig.yaml"), lambda path: save_rig(named, path, format="ros")):
+        with pytest.raises(OutputError, match="expected a file that can be written"):
+            write(tmp_path / "file")
 
 
 def entry(**changes: object) -> dict:
@@ -90,6 +100,8 @@ def entry(**changes: object) -> dict:
         ({"cameras": [entry(distortion=[0.1])]}, r"camera 'front': distortion: expected null or \{model, coeffs\}"),
         ({"cameras": [entry(distortion={"model": "mei", "coeffs": []})]}, r"lens: expected one of .* got 'mei'"),
         ({"cameras": [entry(mask="nowhere.png")]}, r"camera 'front': mask: expected an image file .*nowhere.png"),
+        ({"cameras": [entry(mask_file="nowhere.png")]}, r"'mask' is absent, and 'mask_file' is not read"),
+        ({"cameras": [entry(lens="fisheye")]}, r"camera 'front': 'lens' is not read: write distortion: \{model: LENS"),
         ({"cameras": [entry(width=48, height=64), entry()]}, r"different camera names"),
         ({"cameras": [entry()], "ground_z_m": None}, r"ground_z_m: expected a finite height"),
     ],
@@ -200,6 +212,11 @@ def test_heights_above_the_road_survive_retargeting() -> None:
 def test_changed_copies() -> None:
     rig = rig_with_everything()
     assert rig.resized(0.5).sizes == [(24, 32)] * 3 == rig.resized((24, 32)).sizes
+    assert rig.resized([24, 32]).sizes == [(24, 32)] * 3  # type: ignore[arg-type]
+    for scale in (-1.0, 0, np.nan):
+        with pytest.raises(CalibrationError, match=r"rig 'everything': size: expected .* or a positive scale, got"):
+            rig.resized(scale)
+    assert Rig.from_dict({**rig.to_dict(), "name": None}).name == ""
     assert rig.turned(yaw_deg=10.0)["left"].azimuth_deg == pytest.approx(87.7)
     moved = rig.shifted(z_m=0.6)
     assert moved.ground_z_m == rig.ground_z_m

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from arbiview_aug import PlanCache, RigRetarget
+from arbiview_aug.image_ops import Memory
 from arbiview_aug.lru_cache import LRUCache
 from tests.extremes import misuse
 
@@ -30,6 +33,21 @@ def sample(k: int) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(k)
     images = torch.randint(0, 256, (2, 3, *misuse.SIZE), generator=generator, dtype=torch.uint8)
     return {"images": images, "rig": misuse.rig(spread_deg=30.0 + k % 7), "scene": f"s{k}"}
+
+
+def test_memory_comes_back_while_its_lock_is_held() -> None:
+    """The garbage collector may free an array in the thread that asks for another."""
+    memory = Memory()
+
+    def free_within() -> None:
+        array = memory.empty((1 << 20,), np.uint8)
+        with memory._lock:
+            del array
+
+    thread = threading.Thread(target=free_within, daemon=True)
+    thread.start()
+    thread.join(10)
+    assert not thread.is_alive()
 
 
 @pytest.mark.parametrize(

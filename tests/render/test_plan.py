@@ -220,13 +220,13 @@ def test_plans_pickle_and_the_cache_is_bounded() -> None:
     assert len(pickle.loads(pickle.dumps(cache))) == 0
 
 
-def test_plan_key_knows_content_not_names() -> None:
-    rig = load_rig("nuscenes")
-    cameras = [replace(c, name=c.name + "x") for c in rig]
-    renamed = replace(rig, cameras=cameras, name="other")
-    config = RenderConfig()
-    assert plan_key(rig, renamed, "auto", config) == plan_key(renamed, rig, "auto", config)
+def test_plan_key_knows_content_and_names() -> None:
+    rig, config = load_rig("nuscenes"), RenderConfig()
+    renamed = rig.with_cameras([replace(c, name=c.name + "x") for c in rig])
+    assert plan_key(rig, rig, "auto", config) == plan_key(replace(rig), replace(rig), "auto", config)
     for other in (
+        plan_key(rig, renamed, "auto", config),
+        plan_key(replace(rig, name="other"), rig, "auto", config),
         plan_key(rig, rig.shifted(x_m=1e-9), "auto", config),
         plan_key(rig, rig, "infinity", config),
         plan_key(rig, rig, "auto", RenderConfig(seam_width=0.01)),

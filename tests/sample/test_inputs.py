@@ -9,6 +9,7 @@ can bring of these is here as well.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ import pytest
 import torch
 
 from arbiview_aug import ArbiviewError, Rig, RigRetarget, SampleError, SampleTypeError
-from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.sample.inputs import check_other_keys, read_frames
 from tests.helpers import camera
 
 H, W = 36, 64
@@ -102,7 +103,7 @@ def test_pil_images() -> None:
 HALF = torch.from_numpy(rig().K) * torch.tensor([[0.5], [0.5], [1.0]])
 CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "none": (sample(K=None, cam2ego=None), "expected calibration, 'rig' or 'K' and 'cam2ego', missing K, cam2ego"),
-    "no poses": (sample(cam2ego=None), "missing cam2ego; or pass source= to the transform"),
+    "no poses": (sample(cam2ego=None), "missing cam2ego; or pass source= to RigRetarget"),
     "no rotation": (edited("cam2ego", (1, 0, 0), 2.0), "'camera 1': cam2ego: expected a rotation .* the nearest"),
     "NaN K": (edited("K", (0, 0, 0), torch.nan), "camera 'camera 0': K: expected finite numbers, got NaN"),
     "NaN principal point": (edited("K", (1, 0, 2), torch.nan), "camera 'camera 1': K: expected finite numbers"),
@@ -147,6 +148,29 @@ def test_bad_calibration(case: str) -> None:
         read_frames(bad, None)
     with pytest.raises(ArbiviewError, match=message):
         RigRetarget(rig())(bad)
+
+
+def test_entries_that_say_nothing_of_their_shape() -> None:
+    nested = torch.nested.nested_tensor([torch.ones(2), torch.ones(3)])
+    for odd in (nested, SimpleNamespace(shape=None)):
+        assert check_other_keys(sample(mine=odd), [(H, W)], (), ()) == []
+    (frame,) = read_frames(sample(images=torch.zeros(1, 2, 3, H, W), rig=rig(), scene=torch.arange(1)), None)
+    assert frame.name("scene") == "[0]"
+    frame = read_frames(sample(images=torch.zeros(2, 2, 3, H, W), rig=rig(), scene=torch.arange(3)), None)[0]
+    with pytest.raises(SampleError, match="scene: expected a name for each of 2 frames, got Tensor"):
+        frame.name("scene")
+
+
+@pytest.mark.parametrize("key", ["K", "cam2ego"])
+def test_the_source_of_a_transform_overrides_no_sample(key: str) -> None:
+    source = rig()
+    rounded = {k: torch.from_numpy(getattr(source, k)).float() for k in ("K", "cam2ego")}
+    assert read_frames(sample(**rounded), source) and read_frames(sample(**{key: None}), source)
+    other = {"K": source.resized((72, 128)).K, "cam2ego": source.turned(yaw_deg=1).cam2ego}[key]
+    for bad in (other, other[:1]):
+        with pytest.raises(SampleError, match=rf"{key}: expected the calibration of source=, got another; drop source"):
+            read_frames(sample(**{key: torch.from_numpy(bad)}), source)
+    assert read_frames(sample(**{key: torch.from_numpy(other)}, rig=source), rig(3))[0].rig is source
 
 
 def test_calibration_without_the_images_leading_dimensions() -> None:

@@ -12,7 +12,7 @@ from arbiview_aug import Rig, RigRetarget, SampleError, SampleKeys, SampleTypeEr
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.neighbours import Neighbour, read_neighbours
+from arbiview_aug.sample.neighbours import Neighbour, _pose, read_neighbours
 from arbiview_aug.scene.point_cloud import seen_through
 
 RIG = demo_source_rig((64, 176))
@@ -199,6 +199,11 @@ def test_frames_of_two_leading_dimensions(sample: dict[str, Any]) -> None:
     for b in np.ndindex(2, 3):
         assert torch.equal(both["source_frame"][b], alone["source_frame"])
         assert torch.equal(both["images"][b], alone["images"])
+
+
+def test_poses_of_fewer_frames_are_named() -> None:
+    with pytest.raises(SampleError, match="ego2world: expected the images' leading dimensions, got shape"):
+        _pose("ego2world", torch.eye(4)[None], (1,))
 
 
 # --- LiDAR points of other frames -------------------------------------------------------------------------------------

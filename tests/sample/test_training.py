@@ -84,6 +84,16 @@ def test_retargeted_samples_of_differing_numbers_of_objects() -> None:
         assert batch["lens"] == sample["lens"]
 
 
+def test_what_is_absent_or_overruled_by_a_rig_stays_so() -> None:
+    rig = demo_source_rig((36, 64))
+    sample = {"images": torch.zeros(len(rig), 3, 36, 64), "rig": rig, "K": torch.from_numpy(rig.resized((72, 128)).K)}
+    batch = collate([sample, {**sample, "rig": rig.shifted(z_m=0.1)}])
+    assert torch.equal(batch["K"], torch.from_numpy(np.stack([rig.K, rig.K])))
+    nothing = dict.fromkeys(("lens", "ground_z_m", "coverage"))
+    batch = collate([{**sample, **nothing}] * 2)
+    assert {key: batch[key] for key in nothing} == nothing
+
+
 def test_lenses_of_a_batch() -> None:
     """A name for each camera, over the frames where they differ: what a loader gives can be retargeted again."""
     plain = demo_source_rig((36, 64))

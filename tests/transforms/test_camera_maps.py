@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import CameraMaps, CameraPriorStem, Rig, RigRetarget, SampleError, SampleKeys, collate
+from arbiview_aug import (
+    CameraMaps,
+    CameraPriorStem,
+    CropRig,
+    ResizeRig,
+    Rig,
+    RigRetarget,
+    SampleError,
+    SampleKeys,
+    collate,
+)
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import LENSES, Pinhole
 from arbiview_aug.transforms.camera_maps import CHANNELS, COVERAGE_KEY, camera_maps
@@ -134,6 +144,20 @@ def test_samples_before_and_after_retargeting() -> None:
 def test_sizes_that_differ_give_a_list() -> None:
     out = CameraMaps(("rays",), stride=16)(sample_of((64, 96), (40, 96)))["camera_maps"]
     assert isinstance(out, list) and [tuple(maps.shape) for maps in out] == [(3, 4, 6), (3, 3, 6)]
+
+
+def test_maps_are_the_users_and_do_not_outlive_their_calibration() -> None:
+    maps, sample = CameraMaps(("height",), stride=16), sample_of((64, 96), (40, 96))
+    out = maps(sample)
+    expected = [one.clone() for one in out["camera_maps"]]
+    out["camera_maps"][0].zero_()
+    masked = {**sample, "coverage": [torch.zeros(size, dtype=torch.bool) for size in ((64, 96), (40, 96))]}
+    assert all(map(torch.equal, maps(masked)["camera_maps"], expected)) and maps._cache.misses == 2
+    target = sample["rig"].turned(yaw_deg=5.0)  # type: ignore[attr-defined]
+    for change in (RigRetarget(target, holes="black"), ResizeRig((32, 48)), CropRig(0, 0, (32, 48))):
+        with pytest.warns(UserWarning, match="drops camera_maps"):
+            after = change({**out, "camera_maps_coverage": [torch.ones(4, 6) > 0] * 2})
+        assert not {"camera_maps", COVERAGE_KEY} & after.keys()
 
 
 def test_calibration_that_comes_back_is_computed_once() -> None:

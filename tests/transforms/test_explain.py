@@ -49,6 +49,16 @@ def test_text() -> None:
     assert repr(explained(ahead)) == text
 
 
+def test_vehicles_of_equal_calibration_keep_their_names() -> None:
+    first = nuscenes()
+    second = replace(first, cameras=[replace(camera, name=f"{camera.name} 2") for camera in first], name="other")
+    retarget = RigRetarget(first.turned(yaw_deg=5))
+    images = [torch.zeros((3, *size), dtype=torch.uint8) for size in first.sizes]
+    for rig in (first, second, first):
+        explanation = retarget.explain({"images": images, "rig": rig})
+        assert explanation.plan.source.names == explanation.planned.pair.source.names == rig.names
+
+
 @pytest.mark.parametrize("surface", ["auto", "street", "infinity"])
 def test_harm_of_a_static_street_is_explained_with_remedies(surface: GeometryName) -> None:
     source = nuscenes()

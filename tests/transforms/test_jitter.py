@@ -61,6 +61,12 @@ def test_tensors_of_batches() -> None:
     assert np.array_equal(shared["cam2ego"], np.tile(shared["rig"].cam2ego.astype(np.float32), (3, 1, 1, 1)))
 
 
+@pytest.mark.parametrize("key", ["lidar2img", "extrinsics", "camera_maps"])
+def test_what_the_old_poses_gave_is_dropped(key: str) -> None:
+    with pytest.warns(UserWarning, match=f"JitteredCalibration drops {key}: it speaks of poses that have moved"):
+        assert key not in JitteredCalibration(0.5)({**rig_sample(2), key: torch.eye(4).repeat(2, 1, 1)})
+
+
 @pytest.mark.parametrize("arguments", [{"angle_deg": -1}, {"position_m": float("inf")}, {"angle_deg": "1"}])
 def test_impossible_settings(arguments: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="expected a standard deviation from 0"):

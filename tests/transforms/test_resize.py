@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import CropRig, ResizeRig, Rig, RigRetarget, SampleError, SampleKeys
+from arbiview_aug import CropRig, ResizeRig, Rig, RigRetarget, SampleError, SampleKeys, SampleTypeError
+from arbiview_aug.image_ops import resized
 from tests.helpers import camera
 
 SIZE = (60, 100)
@@ -73,6 +74,17 @@ def test_resizing_before_or_after_is_the_same_calibration() -> None:
     assert torch.allclose(again["images"], after["images"], atol=0.02)
 
 
+@pytest.mark.parametrize("size", [(375, 1242), (376, 1240)])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_sides_that_do_not_halve_evenly_are_antialiased(size: tuple[int, int], dtype: torch.dtype) -> None:
+    y, x = torch.arange(size[0])[:, None], torch.arange(size[1])
+    stripes = (torch.sin((x + y) * (2 * np.pi / 5.3)) > 0).expand(3, *size) * (255 if dtype == torch.uint8 else 1)
+    planes = stripes.to(dtype).contiguous()
+    for image in (planes, planes.permute(1, 2, 0).contiguous().permute(2, 0, 1)):
+        small = resized(image, (47, 155)).double()
+        assert small.std() / (255 if dtype == torch.uint8 else 1) < 0.07
+
+
 def test_batches_lists_and_other_types() -> None:
     sample = blobs()
     batch = {"images": sample["images"].expand(3, -1, -1, -1, -1), "rig": RIG, "coverage": torch.ones(3, 2, *SIZE) > 0}
@@ -98,6 +110,15 @@ def test_what_cannot_follow_is_dropped_and_misuse_is_named() -> None:
         ResizeRig((30, 50))(blobs(classes=torch.zeros(2, *SIZE)))
     with pytest.raises(SampleError, match="missing K, cam2ego"):
         ResizeRig((30, 50))({"images": torch.zeros(1, 3, 4, 4)})
+    with pytest.raises(SampleError, match="seg: expected maps over the images' pixels as tensors, got NoneType"):
+        ResizeRig((30, 50), keys=SampleKeys(labels=("seg",)))(blobs(seg=None))
+    for transform in (ResizeRig((30, 50)), CropRig(0, 0, (30, 50))):
+        with pytest.raises(SampleError, match=r"depth_m: expected maps of .* = \(60, 100\), got \(30"):
+            transform(blobs(depth_m=torch.zeros(2, 30, 50)))
+        with pytest.raises(SampleTypeError, match="sample: expected a dict, got list"):
+            transform([1, 2])
+        out = transform(blobs(coverage=None, depth_m=None, K=torch.eye(4).repeat(2, 1, 1)))
+        assert out["coverage"] is None and np.allclose(out["K"].numpy(), out["rig"].K)
     for size in ((0, 5), (2.5, 5), 7, "ab"):
         with pytest.raises(ValueError, match=r"size: expected \(h, w\) in pixels.* whole numbers from 1"):
             ResizeRig(size)

@@ -156,6 +156,10 @@ def test_skipped_samples_have_the_same_keys(sample: dict[str, Any]) -> None:
     skipped, scanned = (retarget(sample, params={"skipped": skip}) for skip in (1.0, 0.0))
     assert skipped.keys() == scanned.keys() and skipped["points"] is sample["points"]
     assert (skipped["point_rings"] == -1).all() and len(skipped["point_rings"]) == len(sample["points"])
+    missing = torch.cat([sample["points"], torch.full_like(sample["points"][:3], torch.nan)])
+    with pytest.warns(UserWarning, match="rows with NaN"):
+        skipped = retarget({**sample, "points": missing}, params={"skipped": 1.0})
+    assert len(skipped["point_rings"]) == len(missing)
 
 
 def test_both_roads_coincide(sample: dict[str, Any]) -> None:

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.formats import camera_files, colmap, datasets, kalibr
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
-from arbiview_aug.cameras.plain_yaml import read_plain
+from arbiview_aug.cameras.plain_yaml import dump_yaml, read_plain
 from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line
 
 
@@ -142,10 +143,7 @@ def write_calibration(data: Mapping[str, Any], folder: Path, name: str) -> Path:
     if files_of is None:
         known = ", ".join(key for key, form in FORMATS.items() if form.files_of)
         raise CalibrationError(f"save_rig: format: expected rig, {known}, got {name!r}")
-    files = files_of(data)  # before the folder is made
-    folder.mkdir(parents=True, exist_ok=True)
-    for file, content in files.items():
-        is_text = isinstance(content, str)
-        text = content if is_text else yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120)
-        (folder / file).write_text(text)
+    files = files_of(data)
+    texts = {folder / file: one if isinstance(one, str) else dump_yaml(one) for file, one in files.items()}
+    write_whole({path: text.encode() for path, text in texts.items()})
     return folder

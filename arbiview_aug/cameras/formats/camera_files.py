@@ -13,7 +13,7 @@ import numpy as np
 from arbiview_aug.cameras.formats.entries import camera_entry, lens_of
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting, pose_of
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.plain_yaml import MOST_BYTES, parse_yaml, refuse_large
+from arbiview_aug.cameras.plain_yaml import MOST_BYTES, file_stem, parse_yaml, refuse_large
 from arbiview_aug.cameras.rotations import quaternion_from_rotation
 from arbiview_aug.errors import CalibrationError
 
@@ -74,7 +74,8 @@ def _ros(path: Path, mounting: Mounting, frames: Mapping[str, FloatArray]) -> di
         data = {key.lower(): value for key, value in data.items()}  # ROS 1 has K and D
         optical, K, coefficients = [data["header"]["frame_id"].strip("/")], data["k"], data["d"]
         size = data["width"], data["height"]
-        if data["binning_x"] > 1 or data["binning_y"] > 1 or data["roi"]["width"] not in (0, size[0]):
+        window = data["roi"]["width"] or size[0], data["roi"]["height"] or size[1]
+        if data["binning_x"] > 1 or data["binning_y"] > 1 or window != size:
             raise CalibrationError(f"camera {name!r}: expected full images, got binning or a region of interest")
     else:
         K, coefficients = (data[key]["data"] for key in ("camera_matrix", "distortion_coefficients"))
@@ -94,20 +95,28 @@ def _messages(path: Path) -> list[Any]:
 
 
 def _tf_poses(path: Path) -> dict[str, FloatArray]:
-    """Poses (4, 4) in the ego frame of the frames of TFMessages."""
-    links = {}
+    """Poses (4, 4) of the frames of TFMessages in the ego frame: base_link, or base_footprint where there is none."""
+    links: dict[str, tuple[str, FloatArray]] = {}
     for one in (one for message in _messages(path) for one in message["transforms"]):
         child, parent = (frame.strip("/") for frame in (one["child_frame_id"], one["header"]["frame_id"]))
         links[child] = parent, pose_of(child, one["transform"])
+
+    def climbed(at: str, end: str) -> tuple[str, FloatArray]:
+        pose: FloatArray = np.eye(4)
+        for _ in links:  # no more steps than links, which may run in a circle
+            if at in links and at != end:
+                at, pose = links[at][0], links[at][1] @ pose
+        return at, pose
+
+    known = {*links, *(parent for parent, _ in links.values())}
+    ego = next((frame for frame in _EGO_FRAMES if frame in known), "")
+    root, ego2root = climbed(ego, "")
     poses = {}
     for frame in links:
-        pose, at = np.eye(4), frame
-        for _ in links:  # no more steps than links, which may run in a circle
-            if at in links and at not in _EGO_FRAMES:
-                at, pose = links[at][0], links[at][1] @ pose
-        if at in _EGO_FRAMES:
-            poses[frame] = pose
-    if not poses:
+        at, pose = climbed(frame, ego)
+        if at in (ego, root):
+            poses[frame] = pose if at == ego else np.asarray(np.linalg.solve(ego2root, pose), np.float64)
+    if not ego:
         got = ", ".join(sorted({parent for parent, _ in links.values()})) or "no transforms"
         expected = f"{' or '.join(_EGO_FRAMES)}: x forward, y left, z up"
         raise CalibrationError(f"{TF}: which frame is the ego frame? Expected {expected}; got {got}: rename it there")
@@ -153,8 +162,8 @@ def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
         if lens == "radtan":
             coefficients += [0.0] * (5 - len(coefficients))
         model = "equidistant" if lens == "fisheye" else "plumb_bob" if len(coefficients) == 5 else "rational_polynomial"
-        file = name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", name) else f"camera {k}"
-        files[f"{file}.yaml"] = {
+        file = f"{file_stem(name, k)}.yaml"
+        files[f"camera {k}.yaml" if file in (MOUNTING, TF) else file] = {
             **{"image_width": camera["width"], "image_height": camera["height"], "camera_name": name},
             "camera_matrix": _node(K),
             **{"distortion_model": model, "distortion_coefficients": _node([coefficients])},

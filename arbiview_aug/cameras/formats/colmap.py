@@ -16,7 +16,7 @@ from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import refuse_large
 from arbiview_aug.cameras.rotations import poses_from, quaternion_from_rotation
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.errors import CalibrationError, shown
 
 # src/colmap/sensor/models.h: number of the model, name, numbers of focal lengths and coefficients, our lens. Parameters
 # are focal lengths, cx, cy, coefficients.
@@ -54,12 +54,23 @@ def read_colmap(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
             f"to {MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
         )
     by_file = {image.name: image for image in images}
-    named = {os.path.dirname(file) or Path(file).stem: file for file in by_file}
-    chosen = {name: by_file[file] for name, file in (mounting.images or named).items()}
+    for file in mounting.images.values():
+        if file not in by_file:
+            expected = f"files that images{end} has, such as {images[0].name}"
+            raise CalibrationError(f"{MOUNTING}: images: expected {expected}, got {shown(file)}")
+    names = [os.path.dirname(file) or Path(file).stem for file in by_file]
+    if len({*names}) < len(by_file):  # several cameras in a folder
+        names = [Path(file).stem for file in by_file]
+    if not mounting.images and len({*names}) < len(by_file):
+        raise CalibrationError(
+            f"expected images with different names for the cameras, got {', '.join(names[:8])}: write one for each to "
+            f"{MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
+        )
+    chosen = {name: by_file[file] for name, file in (mounting.images or dict(zip(names, by_file, strict=True))).items()}
     if mounting.metres_per_unit is None:
         raise CalibrationError(
             f"how many metres is a unit of the reconstruction? Write it and the pose of one camera to {MOUNTING} "
-            f"beside the files: metres_per_unit: 1.0, poses: {{{next(iter(chosen))}: [[r, r, r, x], ...]}}"
+            f"beside the files: metres_per_unit: 1.0, poses: {{{next(iter(chosen), 'front')}: [[r, r, r, x], ...]}}"
         )
     scale = np.ones((4, 4))
     scale[:3, 3] = mounting.metres_per_unit

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -38,9 +39,16 @@ def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
         if others:
             raise CalibrationError(f"which of {path.name}, {', '.join(one.name for one in others)}? Name the file")
     chain = entries(read_plain(path, path.name))
+    if all(re.fullmatch(r"cam\d{1,9}", str(name)) for name in chain):  # other tools sort cam10 before cam2
+        chain = dict(sorted(chain.items(), key=lambda pair: int(pair[0].removeprefix("cam"))))
     relative: dict[str, FloatArray] = {}  # poses in the first camera's frame
     pose: FloatArray = np.eye(4)
     for name, entry in chain.items():
+        keys = ("intrinsics", "resolution", "T_cn_cnm1")[: 3 if relative else 2]
+        if missing := [key for key in keys if entry.get(key) is None]:
+            raise CalibrationError(f"camera {name!r}: expected {', '.join(keys)}, missing {', '.join(missing)}")
+        if not relative and entry.get("T_cn_cnm1") is not None:
+            raise CalibrationError(f"camera {name!r}: expected no T_cn_cnm1, as it is the first; sort the file")
         if relative:
             pose = pose @ np.asarray(np.linalg.inv(checked_pose(name, entry["T_cn_cnm1"], "T_cn_cnm1")), np.float64)
         relative[name] = pose

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -55,8 +56,8 @@ class Mounting:
                 raise CalibrationError(f"{MOUNTING}: {key}: expected values by camera, got {shown(data[key])}")
         poses = {str(name): pose_of(str(name), value) for name, value in data.get("poses", {}).items()}
         scale = data.get("metres_per_unit")
-        if scale is not None and not checked_numbers(MOUNTING, "metres_per_unit", [scale], 1, "a number")[0] > 0:
-            raise CalibrationError(f"{MOUNTING}: metres_per_unit: expected a positive number, got {scale}")
+        if scale is not None and not (type(scale) in (int, float) and 0 < scale < math.inf):
+            raise CalibrationError(f"{MOUNTING}: metres_per_unit: expected a positive number, got {shown(scale)}")
         return cls(**{**data, "poses": poses})
 
     def pose(self, name: str, instead: str = "") -> FloatArray:
