@@ -6,7 +6,7 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tens
 from arbiview_aug.evaluate.methods import views_of
 from arbiview_aug.evaluate.report.pictures import BOX, HOLE, RIG_COLOURS, box_lines, left_to_right
 from arbiview_aug.evaluate.report.scan_pictures import height_colours
+from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys
 
@@ -87,7 +88,10 @@ def _frames(arguments: argparse.Namespace) -> Iterator[Mapping[str, Any]]:
     rig = demo_source_rig(arguments.size or _SYNTHETIC_SIZE)
     ahead = Neighbours(count=max(1, arguments.frames - 1), step_m=_STEP_M, direction="future")
     sample = SyntheticDrive(rig, num_frames=1, seed=arguments.seed, lidar=True, neighbours=ahead)[0]
-    yield from islice([sample, *sample.pop("neighbours")], arguments.frames)
+    frames = [sample, *sample.pop("neighbours")]
+    needs_others = GEOMETRIES[arguments.geometry].needs == "motion"
+    for frame in frames[: arguments.frames]:
+        yield {**frame, "neighbours": [one for one in frames if one is not frame]} if needs_others else frame
 
 
 class SampleRecording:

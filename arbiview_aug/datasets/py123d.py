@@ -140,7 +140,9 @@ class Py123dDataset(WritableRecording):
         (log, iteration), token = self._at(index), self.tokens[index]
         with _reading(log.folder):
             fields = self._fields(index)
-            sample = fields | camera_fields(fields["rig"], _images(log, iteration, fields["rig"].names, self.reduce), token)
+            sample = fields | camera_fields(
+                fields["rig"], _images(log, iteration, fields["rig"].names, self.reduce), token
+            )
             if self.load_points and (points := _points(log, iteration, token)) is not None:
                 sample["points"] = points
         if self._drive is not None:

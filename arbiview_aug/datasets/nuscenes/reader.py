@@ -245,6 +245,8 @@ def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str
     else:
         chosen = list(channels)
     unknown = [channel for channel in chosen if channel not in cameras]
+    if len(set(chosen)) < len(chosen):
+        raise DataError(f"nuScenes {tables.root}: channels: expected each once, got {', '.join(map(repr, chosen))}")
     if unknown or not chosen:
         expected, got = (", ".join(names) or "none" for names in (sorted(cameras), map(repr, unknown)))
         raise DataError(f"nuScenes {tables.root}: channels: expected some of {expected}, got {got}")

@@ -193,7 +193,9 @@ def test_frames_that_are_called_by_numbers(source: Path, tmp_path: Path) -> None
         calib = json.loads((tmp_path / "drive" / str(k) / "calib.json").read_text())
         calib["truth"] = calib["cameras"][0]
         (tmp_path / "drive" / str(k) / "calib.json").write_text(json.dumps(calib))
-    (tmp_path / "drive" / "sequence.json").write_text('{"frames": [{"name": 0, "time_s": 0}, {"name": 1, "time_s": 1}]}')
+    (tmp_path / "drive" / "sequence.json").write_text(
+        '{"frames": [{"name": 0, "time_s": 0}, {"name": 1, "time_s": 1}]}'
+    )
     (tmp_path / "drive" / "1" / "00.jpg").write_bytes(b"")
     assert main(command(tmp_path / "drive", tmp_path / "new", "--on-error", "skip")) == 0
     new = FrameFolder(tmp_path / "new")
