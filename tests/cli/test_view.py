@@ -12,7 +12,7 @@ import pytest
 
 from arbiview_aug import load_rig
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.view import _field_of_view, _frames
+from arbiview_aug.cli.view import SampleRecording, _field_of_view, _frames
 from tests.helpers import camera
 
 TINY = ["--size", "24x64", "--frames", "2"]
@@ -50,11 +50,15 @@ def test_without_rerun_one_line_says_how_to_install_it(
     assert capsys.readouterr().err == expected
 
 
-def test_a_recording_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_older_recording_stays_where_a_new_one_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rerun")
-    (tmp_path / "drive.rrd").symlink_to(tmp_path / "none" / "drive.rrd")
-    assert main(["view", "--size", "8x22", "--frames", "1", "--output", str(tmp_path / "drive.rrd")]) == 2
-    assert "expected a file that can be written to" in capsys.readouterr().err
+    asked = ["view", "--size", "8x22", "--frames", "1", "--output", str(tmp_path / "drive.rrd")]
+    assert main(asked) == 0
+    before = (tmp_path / "drive.rrd").read_bytes()
+    monkeypatch.setattr(SampleRecording, "add", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(asked)
+    assert (tmp_path / "drive.rrd").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize("count", [1, 3])

@@ -139,7 +139,7 @@ def test_the_own_rig_gives_everything_back(given: Recording, form: str) -> None:
 def test_every_key_of_mmdet3d(given: Recording) -> None:
     results = FORMS["mmdet3d"](given)
     results["lidar2img"], single = list(results["lidar2img"]), results["lidar2img"][0]
-    after = step()(results)
+    after = step()(results | {"gt_masks": np.zeros((6, 64, 176), bool), "gt_semantic_seg": np.zeros((6, 64, 176))})
     target = TARGET.in_frame_of(SOURCE)
     assert list(after["images"]) == after["filename"] == TARGET.names and after["num_views"] == 5
     for name, info in after["images"].items():
@@ -148,7 +148,7 @@ def test_every_key_of_mmdet3d(given: Recording) -> None:
         assert np.allclose(info["lidar2cam"], np.linalg.inv(target[name].cam2ego) @ LIDAR2EGO)
     assert np.allclose(after["cam2global"], EGO2GLOBAL @ target.cam2ego)
     assert after["img_shape"] == after["ori_shape"] == after["pad_shape"] == SIZE
-    assert "cam_instances" not in after
+    assert not {"cam_instances", "gt_masks", "gt_semantic_seg"} & {*after}
     assert "lidar2img" not in step()({**results, "lidar2img": single})  # one camera's, which may be gone
     # Only the nested infos: what is missing at the top is not invented.
     nested = {key: results[key] for key in ("images", "img", "lidar_points")}

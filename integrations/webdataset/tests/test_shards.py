@@ -16,6 +16,8 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleTypeError
 from arbiview_aug.integrations.webdataset import ARRAYS, stream, to_entry, to_sample, write_shard
 
+SMALL = encoded(np.zeros((4, 4), np.uint8), ".png")
+
 
 @pytest.fixture(scope="module")
 def sample() -> dict:
@@ -100,11 +102,7 @@ def test_messages(sample: dict, monkeypatch) -> None:
         ("rig.json", "[]", "rig.json: expected a rig with its token"),
         ("00.jpg", b"", "00.jpg: expected a JPEG or PNG, got an empty file"),
         ("00.mask.png", b"", "00.mask.png: expected a JPEG or PNG, got an empty file"),
-        (
-            "00.mask.png",
-            encoded(np.zeros((4, 4), np.uint8), ".png"),
-            r"camera 'front': mask: expected shape \(64, 176\)",
-        ),
+        pytest.param("00.mask.png", SMALL, r"camera 'front': mask: expected shape \(64, 176\)", id="a smaller mask"),
         ("points.npy", b"PK\x03\x04 no array", "points.npy: expected a .npy array of numbers"),
         ("boxes_3d.npy", b"", "boxes_3d.npy: expected a .npy array of numbers"),
     ],
