@@ -133,5 +133,5 @@ def open_data(
     options = {name: value for name, value in further.items() if value and name in reader.options}
     recording = reader.open(root, reduce=reduce, neighbours=neighbours, **options)
     if not recording.tokens:
-        raise DataError(f"data {root}: expected samples, found none in a {reader.description}")
+        raise DataError(f"data {root}: expected samples, got none; check the copy of the data")
     return recording

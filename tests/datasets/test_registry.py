@@ -67,7 +67,7 @@ def test_data_without_samples(toy: Path, monkeypatch: pytest.MonkeyPatch, capsys
     monkeypatch.setitem(READERS, "toy", replace(READERS["toy"], open=lambda root, **_: empty))
     for command in (["check"], ["demo", "--data"], ["view"]):
         assert main([*command, str(toy)]) == 2
-        assert "expected samples, found none in a toy folder" in capsys.readouterr().err
+        assert "toys: expected samples, got none" in capsys.readouterr().err
 
 
 def test_kind_and_path() -> None:
