@@ -199,9 +199,13 @@ def output_file(asked: str) -> Path:
 
 @contextmanager
 def gathered_warnings(lines: list[str]) -> Iterator[None]:
-    """Collect warnings in ``lines``, each once, instead of printing them across a progress bar."""
+    """Collect warnings in ``lines``, each once, instead of printing them across a progress bar.
+
+    What libraries deprecate is left out, as Python does.
+    """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
+        warnings.simplefilter("ignore", DeprecationWarning)
         yield
     lines.extend(dict.fromkeys(str(warning.message) for warning in caught))
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from arbiview_aug.atomic_io import file_name
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.cli.arguments import data, gathered_warnings, writable_folder
 from arbiview_aug.datasets.registry import open_data, split_kind
@@ -53,6 +53,5 @@ def _draw(sample: Mapping[str, Any], folder: Path) -> str:
     """Write a picture for each camera of a reader's sample; return what they are called."""
     points, boxes = (None if sample.get(key) is None else sample[key].numpy() for key in ("points", "boxes_3d"))
     for camera, image in zip(sample["rig"], as_arrays(sample["images"]), strict=True):
-        name = re.sub(r"[^\w+-]+", "-", camera.name)
-        save_picture(folder / f"check-{name}.png", draw_labels(camera, image, points, boxes))
+        save_picture(folder / f"check-{file_name(camera.name)}.png", draw_labels(camera, image, points, boxes))
     return f"{folder}/check-*.png"

@@ -324,8 +324,9 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
         surfaces = arguments.geometry if isinstance(arguments.geometry, list) else [arguments.geometry]
         if {*surfaces} - {"auto", "infinity"}:
             parser.error(f"argument --geometry: quality paper knows infinity alone, got {', '.join(surfaces)}")
-    if name == "depth" and arguments.device and not arguments.model:
-        parser.error("argument --device: expected it with --model alone: depth from motion is computed on the CPU")
+    for option in ("device", "batch", "reference") if name == "depth" and not arguments.model else ():
+        if getattr(arguments, option) != parser.get_default(option):
+            parser.error(f"argument --{option}: expected it with --model alone: depth from motion needs no network")
     if name == "evaluate":
         for option in ("generator", "steps"):
             if getattr(arguments, option) != parser.get_default(option) and "diffusion" not in arguments.holes:

@@ -6,12 +6,13 @@ import argparse
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from arbiview_aug.atomic_io import whole_file
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
@@ -21,11 +22,12 @@ from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.datasets.image_io import encoded_image
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import DataError, OutputError
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import views_of
 from arbiview_aug.evaluate.report.pictures import BOX, HOLE, RIG_COLOURS, box_lines, left_to_right
 from arbiview_aug.evaluate.report.scan_pictures import height_colours
+from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys
 
@@ -52,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     optional_package("rerun", "viewer")  # before work starts
     chosen = None if arguments.target is None else load_rig(arguments.target)
     notes: list[str] = []
-    with named_steps(notes, arguments.frames) as tick:
+    with named_steps(notes, arguments.frames) as tick, whole_file(path) as file:
         frames = _frames(arguments)
         first = next(frames)
         (target,) = target_rigs(arguments, chosen, first["rig"]).values()
@@ -63,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
             holes=arguments.holes,
             keys=SampleKeys(extra=() if arguments.quality == "paper" else ("confidence",)),
         )
-        recording = SampleRecording(path, first["rig"], target)
+        recording = SampleRecording(Path(file.name), first["rig"], target)
         for number, sample in enumerate(chain([first], frames)):
             tick(str(sample.get("token", number)), 1)
             recording.add(sample, retarget(sample))
@@ -87,7 +89,10 @@ def _frames(arguments: argparse.Namespace) -> Iterator[Mapping[str, Any]]:
     rig = demo_source_rig(arguments.size or _SYNTHETIC_SIZE)
     ahead = Neighbours(count=max(1, arguments.frames - 1), step_m=_STEP_M, direction="future")
     sample = SyntheticDrive(rig, num_frames=1, seed=arguments.seed, lidar=True, neighbours=ahead)[0]
-    yield from islice([sample, *sample.pop("neighbours")], arguments.frames)
+    frames = [sample, *sample.pop("neighbours")]
+    needs_others = GEOMETRIES[arguments.geometry].needs == "motion"
+    for frame in frames[: arguments.frames]:
+        yield {**frame, "neighbours": [one for one in frames if one is not frame]} if needs_others else frame
 
 
 class SampleRecording:
@@ -100,10 +105,7 @@ class SampleRecording:
     def __init__(self, path: Path, source: Rig, target: Rig) -> None:
         self._rr = optional_package("rerun", "viewer")
         self._stream = self._rr.RecordingStream("arbiview_aug")
-        try:
-            self._stream.save(path)
-        except RuntimeError as error:
-            raise OutputError(f"--output {path}: expected a file that can be written to; {error}") from None
+        self._stream.save(path)
         self._log, self._frames, self._target = self._stream.log, 0, target
         self._world2first: Any = None
         self._first_s: Any = None

@@ -150,8 +150,9 @@ def _calibration(rig: Rig) -> dict[str, Any]:
     return {"K": np.stack([camera.K for camera in cameras]), "cam2ego": np.stack([c.cam2ego for c in cameras])}
 
 
-def _misfit(path: Path, expected: str, got: str) -> DataError:
-    return DataError(f"{path}: expected depth of {expected}, got {got}; delete it and run the depth command again")
+def _misfit(path: Path, expected: str, got: str, fix: str = "") -> DataError:
+    fix += "delete it and run the depth command again"
+    return DataError(f"{path}: expected depth of {expected}, got {got}; {fix}")
 
 
 def _check_fits(path: Path, arrays: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> None:
@@ -162,7 +163,8 @@ def _check_fits(path: Path, arrays: Mapping[str, Any], rig: Rig, depth: tuple[La
         raise _misfit(path, f"{len(rig)} cameras", f"{len(depth)}")
     for camera, layer in zip(rig, depth, strict=True):
         if layer.shape != (size := motion_camera(camera).size):
-            raise _misfit(path, f"camera {camera.name!r} of shape {size}", f"{layer.shape}")
+            fix = "read the images at their full or half size (--downscale 1 or 2), as it was computed; or "
+            raise _misfit(path, f"camera {camera.name!r} of shape {size}", f"{layer.shape}", fix)
     for key, atol in (("K", _SAME_PX), ("cam2ego", _SAME_POSE)):
         for camera, recorded, expected in zip(rig, arrays[key], _calibration(rig)[key], strict=True):
             if not np.allclose(recorded, expected, rtol=0, atol=atol):

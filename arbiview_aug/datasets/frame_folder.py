@@ -150,7 +150,7 @@ class FrameFolder(WritableRecording):
         for entries, read in ((calib, keys), *((c, ("mask",)) for c in calib["cameras"])):
             for wrong, meant in misnamed(entries, read).items():
                 self._warn(wrong, f"{frame.where}: {wrong!r} is not read; did you mean {meant!r}?")
-        sample = camera_fields(rig, self._images(calib, frame, rig), frame.name)
+        sample = camera_fields(rig, _images(calib, frame, rig.names, self.reduce), frame.name)
         if self.load_points and (points := _read_points(calib, frame)) is not None:
             sample["points"] = points
         sample |= self._boxes_pose_time(calib, frame)
@@ -171,17 +171,12 @@ class FrameFolder(WritableRecording):
         size = {key: calib["cameras"][0].get(key) for key in ("width", "height")} if calib["cameras"] else {}
         calib = {**calib, "cameras": [size | entry]}
         rig = self._rig(calib, frame)
-        return camera_fields(rig, self._images(calib, frame, rig), frame.name)
+        return camera_fields(rig, _images(calib, frame, rig.names, self.reduce), frame.name)
 
     def _boxes_pose_time(self, calib: Mapping[str, Any], frame: _Frame) -> dict[str, Any]:
         checks: dict[str, Callable[[Any, str], Any]] = {"boxes_3d": _boxes, "ego2world": _pose}
         values = {key: check(calib[key], frame.where) for key, check in checks.items() if calib.get(key) is not None}
         return values | ({"time_s": self._times_s[frame.name]} if frame.name in self._times_s else {})
-
-    def _images(self, calib: Mapping[str, Any], frame: _Frame, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
-        files = [_image_file(entry, frame) for entry in calib["cameras"]]
-        sizes = [(int(entry["height"]), int(entry["width"])) for entry in calib["cameras"]]
-        return decode_images(files, names=rig.names, sizes=sizes, reduce=self.reduce)
 
     def _find_drive(self, order: Sequence[str]) -> Drive:
         """Read the poses of the frames of ``sequence.json``; broken frames give warnings."""
@@ -207,7 +202,7 @@ class FrameFolder(WritableRecording):
         rig = self._rig(calib, frame)
         fields = {"token": frame.name, "rig": rig, **self._boxes_pose_time(calib, frame)}
         points = partial(_read_points, calib, frame) if self.load_points else None
-        return LazyFrame(fields, partial(self._images, calib, frame, rig), points)
+        return LazyFrame(fields, partial(_images, calib, frame, rig.names, self.reduce), points)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_last_rig": None}
@@ -318,6 +313,14 @@ def _image_file(entry: Mapping[str, Any], frame: _Frame) -> Path:
     return frame.file(*_named(entry, "file", frame, DataError))
 
 
+def _images(
+    calib: Mapping[str, Any], frame: _Frame, names: Sequence[str], reduce: Reduce
+) -> torch.Tensor | list[torch.Tensor]:
+    files = [_image_file(entry, frame) for entry in calib["cameras"]]
+    sizes = [(int(entry["height"]), int(entry["width"])) for entry in calib["cameras"]]
+    return decode_images(files, names=names, sizes=sizes, reduce=reduce)
+
+
 def _mask_file(entry: Mapping[str, Any], frame: _Frame) -> Path | None:
     return None if entry.get("mask") is None else frame.mask(*_named(entry, "mask", frame, CalibrationError))
 
@@ -401,8 +404,11 @@ def _pose(value: Any, where: str) -> torch.Tensor:
         pose = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         pose = np.zeros(0)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise DataError(f"{where}: ego2world: expected 4x4 finite numbers, got {value!r}")
+    is_affine = pose.shape == (4, 4) and np.isfinite(pose).all() and np.allclose(pose[3], (0, 0, 0, 1))
+    R = pose[:3, :3] if is_affine else np.zeros((3, 3))
+    if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+        expected = "4x4 finite numbers, a rotation beside a position over 0 0 0 1 (not transposed)"
+        raise DataError(f"{where}: ego2world: expected {expected}, got {value!r}")
     return torch.from_numpy(pose)
 
 

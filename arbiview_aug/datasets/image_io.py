@@ -129,12 +129,15 @@ def read_header(path: Path, label: str) -> tuple[str, tuple[int, int]]:
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for
             raise DataError(f"{label}: expected an image file, got a folder, pipe, socket or device")
-        data = path.read_bytes()
+        return _header(path.read_bytes(), label)
     except FileNotFoundError:
         raise DataError(f"{label}: expected an image file, found none; check the path and the data root") from None
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         got = getattr(error, "strerror", None) or error
         raise DataError(f"{label}: expected a readable image file, got {got}") from None
+
+
+def _header(data: bytes, label: str) -> tuple[str, tuple[int, int]]:
     if not data:
         raise DataError(f"{label}: expected a JPEG or PNG, got an empty file (0 bytes); copy it again")
     if data.startswith(_JPEG_START):
@@ -146,6 +149,15 @@ def read_header(path: Path, label: str) -> tuple[str, tuple[int, int]]:
     if not ended:
         raise DataError(f"{label}: expected a complete {format}, got a truncated file; copy it again")
     return format, size
+
+
+def decode_bytes(data: bytes, label: str) -> ByteArray:
+    """Decode the bytes of a JPEG or PNG file as (h, w, 3) RGB, as ``decode_images`` does; DataError by ``label``."""
+    format, _ = _header(data, label)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS)
+    if image is None:
+        raise DataError(f"{label}: expected an image, got a {format} that cannot be decoded; copy it again")
+    return np.asarray(image if _RGB_FLAG is not None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _jpeg_size(data: bytes) -> tuple[tuple[int, int], bool]:

@@ -137,10 +137,13 @@ class Py123dDataset(WritableRecording):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         index = checked_index(index, len(self))
-        with _reading(self._at(index)[0].folder):
+        (log, iteration), token = self._at(index), self.tokens[index]
+        with _reading(log.folder):
             fields = self._fields(index)
-            sample = fields | camera_fields(fields["rig"], self._images(index, fields["rig"]), self.tokens[index])
-            if self.load_points and (points := self._points(index)) is not None:
+            sample = fields | camera_fields(
+                fields["rig"], _images(log, iteration, fields["rig"].names, self.reduce), token
+            )
+            if self.load_points and (points := _points(log, iteration, token)) is not None:
                 sample["points"] = points
         if self._drive is not None:
             sample["neighbours"] = self._neighbours(self._drive, index)
@@ -166,25 +169,6 @@ class Py123dDataset(WritableRecording):
             fields["box_names"] = [one.attributes.label.serialize() for one in detections]
         return fields
 
-    def _images(self, index: int, rig: Rig) -> torch.Tensor | list[torch.Tensor]:
-        (log, iteration), images = self._at(index), []
-        for identity, camera in log.cameras.items():
-            if camera.name in rig.names:
-                with _reading(log.folder):
-                    image = log.scene.get_camera_at_iteration(iteration, identity).rgb_image
-                    where = f"py123d log {log.folder}: iteration {iteration}: camera {camera.name!r}"
-                    if image.shape != (*camera.size, 3) or image.dtype != np.uint8:
-                        raise DataError(f"{where}: expected {(*camera.size, 3)} uint8, got {image.shape} {image.dtype}")
-                    images.append(torch.from_numpy(area_reduced(image, self.reduce)).permute(2, 0, 1).contiguous())
-        return stacked(images)
-
-    def _points(self, index: int) -> torch.Tensor | None:
-        log, iteration = self._at(index)
-        with _reading(log.folder):
-            scans = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
-            clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in scans if one is not None]
-        return checked_points(np.concatenate(clouds), f"of {self.tokens[index]}") if clouds else None
-
     def _ego2world(self, index: int) -> FloatArray:
         log, iteration = self._at(index)
         pose = log.pose(iteration, "imu_se3", "ego_state_se3")
@@ -201,10 +185,31 @@ class Py123dDataset(WritableRecording):
         return Drive(np.array(positions_m).reshape(-1, 3), parts)
 
     def _neighbour(self, index: int) -> LazyFrame:
-        with _reading(self._at(index)[0].folder):
+        log, iteration = self._at(index)
+        with _reading(log.folder):
             fields = self._fields(index)
-        points = partial(self._points, index) if self.load_points else None
-        return LazyFrame(fields, partial(self._images, index, fields["rig"]), points)
+        points = partial(_points, log, iteration, self.tokens[index]) if self.load_points else None
+        return LazyFrame(fields, partial(_images, log, iteration, fields["rig"].names, self.reduce), points)
+
+
+def _images(log: _Log, iteration: int, names: Sequence[str], reduce: Reduce) -> torch.Tensor | list[torch.Tensor]:
+    images = []
+    for identity, camera in log.cameras.items():
+        if camera.name in names:
+            with _reading(log.folder):
+                image = log.scene.get_camera_at_iteration(iteration, identity).rgb_image
+                where = f"py123d log {log.folder}: iteration {iteration}: camera {camera.name!r}"
+                if image.shape != (*camera.size, 3) or image.dtype != np.uint8:
+                    raise DataError(f"{where}: expected {(*camera.size, 3)} uint8, got {image.shape} {image.dtype}")
+                images.append(torch.from_numpy(area_reduced(image, reduce)).permute(2, 0, 1).contiguous())
+    return stacked(images)
+
+
+def _points(log: _Log, iteration: int, token: str) -> torch.Tensor | None:
+    with _reading(log.folder):
+        scans = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
+        clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in scans if one is not None]
+    return checked_points(np.concatenate(clouds), f"of {token}") if clouds else None
 
 
 def _open(folder: Path, scene: Any, names: Sequence[str] | None) -> _Log:

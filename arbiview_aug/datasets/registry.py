@@ -126,9 +126,12 @@ def open_data(
         clean_masks: As for ``FrameFolder``; nuScenes has no masks.
 
     Raises:
-        DataError: There is no such folder, no reader fits it, or the version is not for this kind.
+        DataError: There is no such folder, no reader fits it, the version is not for this kind, or it is empty.
     """
     root, reader = find_reader(data, kind, version=version)
     further = {"version": version, "clean_masks": clean_masks}
     options = {name: value for name, value in further.items() if value and name in reader.options}
-    return reader.open(root, reduce=reduce, neighbours=neighbours, **options)
+    recording = reader.open(root, reduce=reduce, neighbours=neighbours, **options)
+    if not recording.tokens:
+        raise DataError(f"data {root}: expected samples, got none; check the copy of the data")
+    return recording

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.errors import SampleError
+from arbiview_aug.integrations.mmdet3d.results import TARGET_OUTPUTS
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
 
 IMAGE_KEYS = ("camera_intrinsics", "lidar2cam", "lidar2img")
@@ -53,7 +54,7 @@ class RigRetargetMultiViewImages:
             "points": input_dict.get("points", input_dict.get("coord")),
         }
         out = self.step(results)
-        changed = {key: out[key] for key in (*IMAGE_KEYS, "coverage", "generated", "retarget_params") if key in out}
+        changed = {key: out[key] for key in (*IMAGE_KEYS, *TARGET_OUTPUTS) if key in out}
         changed["img"] = (out["img"].numpy() / scale).astype(images.dtype)
         if "points" in input_dict:
             changed["points"] = out["points"]

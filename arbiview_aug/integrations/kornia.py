@@ -7,6 +7,15 @@ from typing import Any
 
 import torch
 
+from arbiview_aug.sample.batching import rewrapped
+
+_MOVING = (
+    *("kornia.augmentation._2d.geometric", "kornia.augmentation._2d.mix", "kornia.augmentation.auto"),
+    *("kornia.geometry", "torchvision.transforms.v2._geometry"),
+    *("torchvision.transforms.v2._auto_augment", "torchvision.transforms.autoaugment"),
+)
+"""Modules whose classes move pixels, or draw from some that do."""
+
 
 class OnImages(torch.nn.Module):
     """Runs a photometric module on a sample's images alone, all cameras (of all frames) as one batch.
@@ -36,11 +45,14 @@ class OnImages(torch.nn.Module):
         changed = self.module(levels).clamp(0, 1)
         if flat.dtype == torch.uint8:
             changed = (changed * 255).round().to(torch.uint8)
+        if changed.shape != flat.shape:
+            got = tuple(changed.shape)
+            raise ValueError(f"OnImages: expected images of shape {tuple(flat.shape)} of its module, got {got}")
         changed = changed.reshape(images.shape)
         if "coverage" in sample:
             shown = sample["coverage"] | sample["generated"] if "generated" in sample else sample["coverage"]
             changed = changed * shown.unsqueeze(-3)
-        return {**sample, "images": changed}
+        return {**sample, "images": rewrapped(changed, images)}
 
 
 def check_photometric(module: torch.nn.Module) -> None:
@@ -49,15 +61,23 @@ def check_photometric(module: torch.nn.Module) -> None:
     Raises:
         ValueError: With the module's name and what to use.
     """
-    from kornia.augmentation import GeometricAugmentationBase2D
-
     for part in _parts(module):
-        kind = type(part)
-        if isinstance(part, GeometricAugmentationBase2D) or kind.__module__ == "torchvision.transforms.v2._geometry":
+        if _moves_pixels(type(part)):
             raise ValueError(
-                f"{kind.__name__}: moves pixels and leaves K as it was; resize and crop with ResizeRig and CropRig, "
-                "turn and shift cameras with RandomRig"
+                f"{type(part).__name__}: moves pixels and leaves K as it was; resize and crop with ResizeRig and "
+                "CropRig, turn and shift cameras with RandomRig"
             )
+
+
+def _moves_pixels(kind: type) -> bool:
+    for base in kind.__mro__:
+        if base.__module__ == "torchvision.transforms.transforms":  # of both sorts: their namesakes in v2 are apart
+            from torchvision.transforms import v2
+
+            base = getattr(v2, base.__name__, base)
+        if base.__module__.startswith(_MOVING):
+            return True
+    return False
 
 
 def _parts(module: torch.nn.Module) -> Iterator[torch.nn.Module]:

@@ -97,6 +97,8 @@ class RigRetargetDataDict:
     def _points(self, data_dict: Mapping[str, Any]) -> Any:
         target = self.step.retarget.target
         rig = target.rig(target.draw_for(data_dict)) if isinstance(target, RandomRig) else target
+        if self.step.retarget.keys.points == "source":
+            return data_dict["points"]
         if not rig.lidars:
             raise SampleError("target: expected scanners (Rig.lidars) for a data_dict without images, got none")
         given = geometry(_labels(data_dict), self.lidar2ego)
@@ -144,6 +146,9 @@ class RigRetargetDataDict:
         K, lidar2cam = (np.asarray(results[key][0])[:3] for key in ("cam2img", "lidar2cam"))
         _write_calib(new, K.astype(calib.P2.dtype), lidar2cam.astype(calib.V2C.dtype))
         out = {**data_dict, "images": (images[0] / 255).astype(image.dtype), "calib": new, "points": results["points"]}
+        if "road_plane" in out:  # in the rectified camera's frame
+            plane = np.asarray(out["road_plane"], np.float64) @ R0 @ V2C @ np.linalg.inv(padded(lidar2cam[None])[0])
+            out["road_plane"] = plane.astype(np.asarray(out["road_plane"]).dtype)
         for key in ("depth_maps", "gt_boxes2d"):
             out.pop(key, None)  # of the source's pixels
         matrices = {"trans_lidar_to_cam": padded(lidar2cam[None])[0], "trans_cam_to_img": K}

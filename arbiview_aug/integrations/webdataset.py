@@ -10,17 +10,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
-from arbiview_aug.atomic_io import BROKEN_ARRAY
+from arbiview_aug.atomic_io import BROKEN_ARRAY, whole_file
 from arbiview_aug.cameras.plain_yaml import parse_json
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import camera_fields
-from arbiview_aug.datasets.image_io import encoded, encoded_image
+from arbiview_aug.datasets.image_io import decode_bytes, encoded, encoded_image
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, SampleError, calibration_of
 from arbiview_aug.sample.batching import stacked
 
 ARRAYS = ("points", "boxes_3d", "ego2world")
@@ -37,9 +36,15 @@ def to_entry(sample: Mapping[str, Any], key: str) -> Entry:
         key: Unique, without dots.
 
     Raises:
+        SampleError: A key with dots, images of other sizes or of another number than the rig's cameras.
         SampleTypeError: Images of another type.
     """
     rig: Rig = sample["rig"]
+    if "." in key:
+        raise SampleError(f"key: expected none of dots, at which WebDataset splits names, got {key!r}")
+    shapes = [tuple(image.shape) for image in sample["images"]]
+    if shapes != (expected := [(3, *size) for size in rig.sizes]):
+        raise SampleError(f"images: expected {expected}, as the rig's cameras are, got {shapes}")
     entry: Entry = {"__key__": key, "rig.json": json.dumps({**rig.to_dict(), "token": str(sample.get("token", key))})}
     for k, (camera, image) in enumerate(zip(rig, sample["images"], strict=True)):
         entry[f"{k:02}.jpg"] = encoded_image(image)
@@ -75,12 +80,15 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
     rig = Rig.from_dict(described, where=where)
     images, cameras = [], []
     for k, camera in enumerate(rig):
-        image = _decoded(entry, f"{k:02}.jpg", where, cv2.IMREAD_COLOR)
+        if f"{k:02}.jpg" not in entry:
+            raise DataError(f"{where}: expected {k:02}.jpg, found none")
+        image = decode_bytes(entry[f"{k:02}.jpg"], f"{where}: {k:02}.jpg")
         if (size := image.shape[:2]) != camera.size:
             raise DataError(f"{where}: {k:02}.jpg: expected (h, w) = {camera.size}, as in rig.json, got {size}")
-        images.append(torch.from_numpy(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)).permute(2, 0, 1))
-        if f"{k:02}.mask.png" in entry:
-            camera = replace(camera, mask=_decoded(entry, f"{k:02}.mask.png", where, cv2.IMREAD_GRAYSCALE) > 0)
+        images.append(torch.from_numpy(image).permute(2, 0, 1))
+        if (name := f"{k:02}.mask.png") in entry:
+            with calibration_of(where):
+                camera = replace(camera, mask=decode_bytes(entry[name], f"{where}: {name}")[..., 0] > 0)
         cameras.append(camera)
     rig = rig.with_cameras(cameras)
     sample = camera_fields(rig, stacked(images), token)
@@ -93,20 +101,11 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
     return sample
 
 
-def _decoded(entry: Mapping[str, Any], name: str, where: str, flags: int) -> np.ndarray:
-    if name not in entry:
-        raise DataError(f"{where}: expected {name}, found none")
-    image = cv2.imdecode(np.frombuffer(entry[name], np.uint8), flags)
-    if image is None:
-        raise DataError(f"{where}: {name}: expected an image, got {len(entry[name])} bytes that are none (truncated?)")
-    return np.asarray(image)
-
-
 def write_shard(path: Path, samples: Iterable[Mapping[str, Any]]) -> Path:
-    """Write samples as one shard; webdataset itself is not needed. Returns the path."""
-    with tarfile.open(path, "w") as tar:
+    """Write samples as one shard, at once or not at all; webdataset itself is not needed. Returns the path."""
+    with whole_file(path) as file, tarfile.open(fileobj=file, mode="w") as tar:
         for k, sample in enumerate(samples):
-            entry = to_entry(sample, f"{path.stem}-{k:06}")
+            entry = to_entry(sample, f"{path.stem.replace('.', '-')}-{k:06}")
             key = entry.pop("__key__")
             for ending, content in entry.items():
                 data = content.encode() if isinstance(content, str) else content

@@ -25,9 +25,14 @@ EGO2GLOBAL[:3, 3] = 600.0, 1640.0, 0.0
 
 
 class Boxes:
-    """The part that is read of mmdet3d's ``LiDARInstance3DBoxes``: eight corners a box, in the LiDAR's frame."""
+    """The part that is read of mmdet3d's ``LiDARInstance3DBoxes``: numbers and corners of boxes in the LiDAR's frame.
 
-    def __init__(self, boxes_ego: FloatArray) -> None:
+    Args:
+        boxes_ego: (B, >=7) centre, length, width, height and yaw in the ego frame.
+        is_old: As before mmdet3d 1.0: x is the width's axis, and the yaw counts clockwise.
+    """
+
+    def __init__(self, boxes_ego: FloatArray, *, is_old: bool = False) -> None:
         signs = np.array([[-1, -1, -1], [-1, -1, 1], [-1, 1, 1], [-1, 1, -1], [1, -1, -1], [1, -1, 1], [1, 1, 1]])
         corners = []
         for box in boxes_ego:
@@ -35,7 +40,18 @@ class Boxes:
             corners.append(places @ rotation_z(np.degrees(box[6])).T + box[:3])
         ego2lidar = np.linalg.inv(LIDAR2EGO)
         x = np.array(corners).reshape(-1, 8, 3) @ ego2lidar[:3, :3].T + ego2lidar[:3, 3]
-        self.corners = torch.from_numpy(x)
+        yaw = boxes_ego[:, 6] - np.arctan2(LIDAR2EGO[1, 0], LIDAR2EGO[0, 0])
+        if is_old:
+            x, yaw = x[:, [4, 5, 1, 0, 7, 6, 2, 3]], -yaw - np.pi / 2
+        self.tensor = torch.from_numpy(np.column_stack([x.mean(axis=1), boxes_ego[:, 3:6], yaw]))
+        self._corners = torch.from_numpy(x)
+        self._is_old = is_old
+
+    @property
+    def corners(self) -> torch.Tensor:
+        """(B, 8, 3)."""
+        assert len(self.tensor) or not self._is_old
+        return self._corners
 
 
 def source_rig(size: tuple[int, int]) -> Rig:
@@ -183,6 +199,7 @@ def mit_bevfusion(given: Recording) -> dict[str, Any]:
 def detr3d(given: Recording) -> dict[str, Any]:
     """After ``LoadMultiViewImageFromFiles(to_float32=True)`` of mmdet3d before 1.0, with DETR3D's matrices."""
     shape = (*given.rig.sizes[0], 3, len(given.rig))
+    boxes = Boxes(given.sample["boxes_3d"].double().numpy(), is_old=True)
     return {
         "img_filename": [f"{name}.jpg" for name in given.rig.names],
         "img": [image.astype(np.float32) for image in given.arrays],
@@ -190,7 +207,8 @@ def detr3d(given: Recording) -> dict[str, Any]:
         "cam_intrinsic": list(given.K),
         "lidar2cam": list(given.lidar2cam),
         **{key: shape for key in ("img_shape", "ori_shape", "pad_shape")},
-        "ann_info": {"gt_bboxes_3d": given.labels["gt_bboxes_3d"], "bboxes": np.zeros((0, 4))},
+        "scale_factor": 1.0,
+        "ann_info": {"gt_bboxes_3d": boxes, "bboxes": np.zeros((0, 4))},
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 
 import cv2
@@ -10,7 +11,8 @@ import numpy as np
 import pytest
 
 from arbiview_aug.__main__ import main
-from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.cli import check as command
+from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.evaluate.report.pictures import draw_labels
 from tests.helpers import camera, street_sample
 
@@ -71,6 +73,23 @@ def test_a_rig_file_is_checked_alone(folder: Path, tmp_path: Path, capsys: pytes
         assert main(["check", str(tmp_path / "rig.json")]) == status
     assert capsys.readouterr().out.splitlines()[0] == "no findings"
     assert main(["check", str(tmp_path / "none.yaml")]) == 2
+
+
+def test_a_picture_for_each_camera_and_no_finding_of_libraries(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for frame in ("a", "b"):
+        cameras = json.loads((folder / frame / "calib.json").read_text())["cameras"]
+        change(
+            folder / frame, cameras=[{**c, "name": f"cam{sign}1"} for c, sign in zip(cameras, "-./: _", strict=True)]
+        )
+    monkeypatch.setattr(
+        command,
+        "open_data",
+        lambda *a, **k: warnings.warn("old", DeprecationWarning, stacklevel=2) or open_data(*a, **k),
+    )
+    assert main(["check", str(folder), "--output", str(tmp_path / "out")]) == 0
+    assert "old" not in capsys.readouterr().out and len(list((tmp_path / "out").iterdir())) == 6
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "fisheye"])

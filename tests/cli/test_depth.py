@@ -106,7 +106,8 @@ def test_files_that_do_not_fit_are_named(depth_root: Path, recorded: Path, tmp_p
     with pytest.raises(DataError, match=r"000\.npz: expected depth of 1 cameras, got 2"):
         depths.read("000", Rig([rig[0]]))
     with pytest.raises(
-        DataError, match=r"000\.npz: expected depth of camera '.*' of shape \(32, 88\), got \(64, 176\)"
+        DataError,
+        match=r"000\.npz: expected depth of camera '.*' of shape \(32, 88\), got \(64, 176\); read .*--downscale",
     ):
         depths.read("000", rig.resized((32, 88), "stretch"))
     shutil.copy(depths.path("000"), tmp_path / "001.npz")

@@ -145,7 +145,10 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("evaluate --generator /nope", "argument --generator: expected it with --holes diffusion"),
         ("evaluate --steps 3", "argument --steps: expected it with --holes diffusion"),
         ("view --output a.mp4", r"expected a name ending in \.rrd, got 'a\.mp4'"),
-        ("depth --data frame --device nope", "argument --device: expected it with --model alone"),
+        *(
+            (f"depth --data frame --{option}", f"argument --{option.split()[0]}: expected it with --model alone")
+            for option in ("device nope", "batch 4", "reference road")
+        ),
         ("depth --data frame --model m --device nope", "expected cpu, cuda, cuda:1, ..., got 'nope'"),
     ],
 )

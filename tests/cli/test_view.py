@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 from arbiview_aug import load_rig
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.view import _field_of_view
+from arbiview_aug.cli.view import SampleRecording, _field_of_view, _frames
 from tests.helpers import camera
 
 TINY = ["--size", "24x64", "--frames", "2"]
@@ -49,11 +50,25 @@ def test_without_rerun_one_line_says_how_to_install_it(
     assert capsys.readouterr().err == expected
 
 
-def test_a_recording_that_cannot_be_written_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_older_recording_stays_where_a_new_one_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rerun")
-    (tmp_path / "drive.rrd").symlink_to(tmp_path / "none" / "drive.rrd")
-    assert main(["view", "--size", "8x22", "--frames", "1", "--output", str(tmp_path / "drive.rrd")]) == 2
-    assert "expected a file that can be written to" in capsys.readouterr().err
+    asked = ["view", "--size", "8x22", "--frames", "1", "--output", str(tmp_path / "drive.rrd")]
+    assert main(asked) == 0
+    before = (tmp_path / "drive.rrd").read_bytes()
+    monkeypatch.setattr(SampleRecording, "add", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(asked)
+    assert (tmp_path / "drive.rrd").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_frames_of_a_street_for_depth_from_motion(count: int) -> None:
+    """Each frame has the others, which depth from motion needs; for other geometries none."""
+    arguments = argparse.Namespace(data=None, size=(8, 22), seed=0, frames=count, geometry="motion")
+    frames = list(_frames(arguments))
+    assert [len(frame["neighbours"]) for frame in frames] == [max(1, count - 1)] * count
+    arguments.geometry = "auto"
+    assert not any("neighbours" in frame for frame in _frames(arguments))
 
 
 def test_a_lens_sees_what_its_lines_enclose() -> None:

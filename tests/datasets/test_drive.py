@@ -1,6 +1,7 @@
 """Which frames of a drive are neighbours, and that they are read late or, broken, not at all."""
 
 import json
+import pickle
 import shutil
 from pathlib import Path
 
@@ -133,6 +134,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+def test_neighbours_pickle_without_the_data_set(recorded: Path) -> None:
+    assert b"FrameFolder" not in pickle.dumps(FrameFolder(recorded, neighbours=Neighbours())[1]["neighbours"])
+
+
 def low(rig: Rig) -> Rig:
     return rig.turned(pitch_deg=-12)
 
@@ -193,6 +198,5 @@ def test_images_are_read_where_they_fill_something(recorded: Path, monkeypatch: 
     sample = folder[1]
     read = []
     monkeypatch.setattr(cv2, "imread", lambda *a, **k: read.append(a) or np.zeros((1, 1, 3), np.uint8))
-    monkeypatch.setattr(FrameFolder, "_images", lambda *a: read.append(a))
     RigRetarget(sample["rig"].turned(yaw_deg=0))(sample)  # nothing is missing
     assert not read

@@ -244,6 +244,7 @@ def test_broken_tables(tmp_path: Path, change: Change, message: str) -> None:
         ({"version": "v1.0-x"}, DataError, r"expected a folder of tables 'v1\.0-x', found none.*: v1\.0-mini"),
         ({"root": None}, DataError, "expected either root or nusc, got both or none"),
         ({"root": None, "nusc": 3}, SampleTypeError, "nusc: expected a devkit NuScenes object, got int without dataro"),
+        ({"channels": ["CAM_FRONT"] * 2}, DataError, "channels: expected each once, got 'CAM_FRONT', 'CAM_FRONT'"),
         ({"channels": ["CAM_FRONT", "CAM_TOP"]}, DataError, "expected some of CAM_BACK, CAM_FRONT, got 'CAM_TOP'"),
         ({"split_scenes": ["scene-1", "scene-9"]}, DataError, "table scene: expected the scenes scene-9, got 2 others"),
         ({"split_scenes": "scene-1"}, DataError, "split_scenes: expected a collection of scene names"),

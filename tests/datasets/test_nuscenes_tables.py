@@ -46,6 +46,8 @@ def test_an_empty_table(tmp_path: Path) -> None:
         ('[{"token": 1},]', "expected JSON, got"),
         ('[{"token": 1} {"token": 2}]', "expected JSON, got Expecting ',' delimiter"),
         ('[{"token": "1', "expected JSON, got Unterminated string"),
+        ('[{"token": 1}] [', "expected JSON, got Extra data"),
+        ("[] {", "expected JSON, got Extra data"),
         ("{}", "expected a list of objects, got dict"),
         ("3", "expected a list of objects, got int"),
         ("[{}, 3]", "expected a list of objects, got an entry int"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -132,6 +133,7 @@ def test_what_was_written_is_read(root: Path) -> None:
     assert before["points"].shape == (50, 3) and "points" not in set(
         Py123dDataset(root, load_points=False, neighbours=Neighbours())[1]["neighbours"][0]
     )
+    assert b"Py123dDataset" not in pickle.dumps(before)
     for kind in (root / "logs", root / "logs" / "kitti360_train", root / "logs" / "kitti360_train" / "drive"):
         assert len(Py123dDataset(kind)) == 3
     halved = Py123dDataset(root, reduce=2)[0]

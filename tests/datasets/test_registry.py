@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,15 @@ def test_one_row_adds_a_kind(toy: Path, tmp_path: Path, capsys: pytest.CaptureFi
     convert = ["convert", "--data", str(toy), "--target", "waymo", "--output", str(tmp_path / "new")]
     assert main(convert) == 2
     assert "expected a kind that can be written, got a toy folder" in capsys.readouterr().err
+
+
+def test_data_without_samples(toy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    empty = Toy(toy)
+    empty.tokens = []
+    monkeypatch.setitem(READERS, "toy", replace(READERS["toy"], open=lambda root, **_: empty))
+    for command in (["check"], ["demo", "--data"], ["view"]):
+        assert main([*command, str(toy)]) == 2
+        assert "toys: expected samples, got none" in capsys.readouterr().err
 
 
 def test_kind_and_path() -> None:

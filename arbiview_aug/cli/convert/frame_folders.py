@@ -43,7 +43,7 @@ class FrameFolders(Writer):
         calibration, *_ = files = self.data.files(converted.index)
         source = json.loads(calibration.read_text(encoding="utf-8"))
         calib = _calibration(converted)
-        kept = {key: value for key, value in source.items() if key not in (*calib, "dataset", "lidar")}
+        kept = {key: value for key, value in source.items() if key not in (*calib, "dataset", "lidar", "truth")}
         folder, points = calibration.parent.name, converted.out.get("points")
         name, is_scanned = f"{folder}/{POINTS_FILE}", RINGS_KEY in converted.out
         if points is not None:
@@ -59,7 +59,7 @@ class FrameFolders(Writer):
         if path.is_file():
             sequence = json.loads(path.read_text(encoding="utf-8"))
             frames = sequence["frames"]
-            names = [entry["name"] if isinstance(entry, Mapping) else str(entry) for entry in frames]
+            names = [str(entry["name"] if isinstance(entry, Mapping) else entry) for entry in frames]
             sequence["frames"] = [frame for frame, name in zip(frames, names, strict=True) if name not in left_out]
             write_whole({self.output / SEQUENCE_FILE: json.dumps(sequence, indent=1).encode()})
         return []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
@@ -208,8 +209,14 @@ class Jobs(Dataset[Done]):
         files = self.data.files(index)
         if isinstance(self.samples, WithDepth):
             files += [folder.path(self.data.tokens[index]) for folder in self.samples.folders]
-        root = self.data.root  # files of a frame that is its own root, or beside it, are not below it
-        return {path.relative_to(root).as_posix() if path.is_relative_to(root) else path.name: path for path in files}
+        return {_name_from(path, self.data.root): path for path in files}
+
+
+def _name_from(path: Path, root: Path) -> str:
+    """The relative path from ``root``: files of a frame that is its own root, or beside it, are not below it."""
+    if path.is_relative_to(root):
+        return path.relative_to(root).as_posix()
+    return Path(os.path.relpath(os.path.realpath(path), os.path.realpath(root))).as_posix()
 
 
 def checksum_once(path: Path) -> str:

@@ -119,11 +119,9 @@ class NuScenes(Writer):
         """Read all tables once.
 
         Raises:
-            DataError: No samples; a malformed table; a dangling reference, a file outside the root or a missing column;
+            DataError: A malformed table; a dangling reference, a file outside the root or a missing column;
                 a duplicate token; a circle of ``next`` or ``prev``; image names that clash or no file can have.
         """
-        if not len(self.data):
-            raise DataError(f"nuScenes {self.data.root} {self.data.version}: expected samples, got none")
         names = [self.data.files(index)[-1].name for index in range(len(self.data))]
         (stem, times), *_ = Counter(view_stem(name, "") for name in names).most_common(1)
         if times > 1:

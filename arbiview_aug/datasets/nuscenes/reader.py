@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -118,11 +118,11 @@ class NuScenesDataset(WritableRecording):
         cameras, lidar = recordings.keyframes[index, :-1], recordings.keyframes[index, -1]
         ego2global = recordings.ego2global(lidar)
         rig = self._rig(cameras, ego2global)
-        sample = camera_fields(rig, self._images(cameras), self.tokens[index])
+        sample = camera_fields(rig, self._images(cameras)(), self.tokens[index])
         sample |= {"ego2world": torch.from_numpy(ego2global), "time_s": float(recordings.time_s(lidar))}
         sample["scene_token"] = self.scene_tokens[index]
         if self.load_points:
-            sample["points"] = self._points(lidar)
+            sample["points"] = self._points(lidar)()
         if self._annotations is not None:
             boxes = self._annotations.rows(index)
             sample["boxes_3d"] = torch.from_numpy(self._annotations.at_sample(index, _inverse(ego2global)))
@@ -146,20 +146,21 @@ class NuScenesDataset(WritableRecording):
                 rig.append(Camera(name=channel, width_px=width_px, height_px=height_px, K=K, cam2ego=cam2ego))
         return reduced_rig(Rig(rig, ground_z_m=0.0, name="nuscenes"), self.reduce)
 
-    def _file(self, row: int) -> Path:
-        """Path of a recording's file, which must lie below the root."""
+    def _file(self, row: int) -> tuple[Path, str, str]:
+        """A recording's file, which must lie below the root: arguments of ``inside``."""
         sample = self.tokens[self._recordings.rows["sample"][row]]
         where = f"nuScenes {self.root} {self.version}: table sample_data: row of sample {sample!r}: filename"
-        return inside(self.root, self._recordings.file(row), where)
+        return self.root, self._recordings.file(row), where
 
-    def _images(self, cameras: IntArray) -> torch.Tensor | list[torch.Tensor]:
+    def _images(self, cameras: IntArray) -> Callable[[], torch.Tensor | list[torch.Tensor]]:
+        """Decoder of the images of cameras, which pickles without the data set."""
         files, sizes = [*map(self._file, cameras)], [*map(self._recordings.size, cameras)]
-        return decode_images(files, names=self.channels, sizes=sizes, reduce=self.reduce)
+        return partial(_decode_images, files, names=self.channels, sizes=sizes, reduce=self.reduce)
 
-    def _points(self, lidar: int, own2ego: FloatArray | None = None) -> torch.Tensor:
-        """A recording's points in its own ego frame, or in the one that ``own2ego`` leads to."""
+    def _points(self, lidar: int, own2ego: FloatArray | None = None) -> Callable[[], torch.Tensor]:
+        """Reader of a recording's points in its own ego frame, or in the one that ``own2ego`` leads to."""
         sensor2ego = self._recordings.sensor2ego[self._recordings.rows["sensor"][lidar]]
-        return _read_points(self._file(lidar), sensor2ego if own2ego is None else own2ego @ sensor2ego)
+        return partial(_read_points, self._file(lidar), sensor2ego if own2ego is None else own2ego @ sensor2ego)
 
     def _find_drive_rows(self) -> IntArray:
         """Rows of the first camera that can be neighbours: all, or keyframes only if sweeps were not copied.
@@ -204,8 +205,8 @@ class NuScenesDataset(WritableRecording):
         lidar = moment if is_keyframe else recordings.lidar_beside(row) if self._has_lidar_sweeps else None
         points = None
         if self.load_points and lidar is not None:
-            points = partial(self._points, lidar, _inverse(ego2global) @ recordings.ego2global(lidar))
-        return LazyFrame(fields, partial(self._images, cameras), points)
+            points = self._points(lidar, _inverse(ego2global) @ recordings.ego2global(lidar))
+        return LazyFrame(fields, self._images(cameras), points)
 
 
 def _inverse(pose: FloatArray) -> FloatArray:
@@ -244,13 +245,20 @@ def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str
     else:
         chosen = list(channels)
     unknown = [channel for channel in chosen if channel not in cameras]
+    if len(set(chosen)) < len(chosen):
+        raise DataError(f"nuScenes {tables.root}: channels: expected each once, got {', '.join(map(repr, chosen))}")
     if unknown or not chosen:
         expected, got = (", ".join(names) or "none" for names in (sorted(cameras), map(repr, unknown)))
         raise DataError(f"nuScenes {tables.root}: channels: expected some of {expected}, got {got}")
     return chosen
 
 
-def _read_points(path: Path, sensor2ego: FloatArray) -> torch.Tensor:
+def _decode_images(files: Sequence[tuple[Path, str, str]], **settings: Any) -> torch.Tensor | list[torch.Tensor]:
+    return decode_images([inside(*file) for file in files], **settings)
+
+
+def _read_points(file: tuple[Path, str, str], sensor2ego: FloatArray) -> torch.Tensor:
+    path = inside(*file)
     try:
         numbers = np.fromfile(path, dtype="<f4")
         size = path.stat().st_size

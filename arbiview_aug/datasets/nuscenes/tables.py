@@ -270,9 +270,8 @@ def _entries(file: TextIO) -> Iterator[Any]:
     if not text.startswith("[", at):
         raise _NoListError(type(json.loads(text + file.read())).__name__)
     at = _SPACE.match(text, at + 1).end()  # type: ignore[union-attr]
-    if text.startswith("]", at):
-        return
-    while True:
+    end = at + 1 if text.startswith("]", at) else 0
+    while not end:
         if len(text) - at < _LONGEST_ROW and not ended:
             block = file.read(_BLOCK)
             text, at, ended = text[at:] + block, 0, not block
@@ -281,6 +280,7 @@ def _entries(file: TextIO) -> Iterator[Any]:
         delimiter = _DELIMITER.match(text, at)
         if delimiter is None:
             raise json.JSONDecodeError("Expecting ',' delimiter", text, at)
-        if delimiter[1] == "]":
-            return
         at = delimiter.end()
+        end = at if delimiter[1] == "]" else 0
+    if (rest := text[end:] + file.read()).strip():
+        raise json.JSONDecodeError("Extra data", rest, 0)

@@ -31,7 +31,8 @@ Retarget = Callable[[dict[str, Any]], dict[str, Any]]
 
 STALE_KEYS = (
     *("cam_instances", "gt_bboxes", "gt_bboxes_labels", "bboxes", "bboxes_ignore", "bboxes2d", "labels2d"),
-    *("centers_2d", "centers2d", "depths", "depth_map", "gt_depth", "canvas"),
+    *("centers_2d", "centers2d", "depths", "depth_map", "depth_maps", "gt_depth", "canvas"),
+    *("gt_masks", "gt_semantic_seg", "gt_seg_map", "seg_label"),
 )
 """Keys, also in ``ann_info``, that speak of the source's pixels: dropped (``project_boxes_3d`` makes 2D boxes anew)."""
 
@@ -41,6 +42,14 @@ FILE_KEYS = ("filename", "img_path", "img_filename", "image_paths")
 SHAPE_KEYS = ("img_shape", "ori_shape", "pad_shape")
 _MAX_PADDING_PX = 64
 """Images are padded at the right and below to multiples of 32 or 64."""
+
+_AS_RECORDED: dict[str, Any] = {
+    **dict.fromkeys(("img_aug_matrix", "lidar_aug_matrix"), np.eye(4)),
+    **dict.fromkeys(("flip", "pcd_horizontal_flip", "pcd_vertical_flip", "pcd_trans"), 0.0),
+    **dict.fromkeys(("scale_factor", "pcd_scale_factor"), 1.0),
+    "pcd_rotation": np.eye(3),
+}
+"""Keys that augmentations write, and what they hold where nothing was augmented: loading steps write that too."""
 
 TARGET_OUTPUTS = ("coverage", "ego_mask", "confidence", "generated", "source_camera", "source_frame", "retarget_params")
 """Entries of a retargeted sample that the results get besides, as arrays."""
@@ -140,10 +149,11 @@ def _lidar2ego(results: Mapping[str, Any], matrix: Any) -> FloatArray:
 
 
 def _check_not_augmented(results: Mapping[str, Any]) -> None:
-    for key in ("img_aug_matrix", "lidar_aug_matrix"):
+    for key, neutral in _AS_RECORDED.items():
         value = results.get(key)
-        if value is not None and np.abs(np.asarray(value, np.float64) - np.eye(4)).max() > 1e-6:
-            raise SampleError(f"{key}: expected none yet, got one; retarget right after loading, before augmentations")
+        if value is not None and np.abs(np.asarray(value, np.float64) - neutral).max() > 1e-6:
+            fix = "retarget right after loading, before augmentations"
+            raise SampleError(f"{key}: expected a frame as it was recorded, got an augmented one; {fix}")
 
 
 def _recorded(results: Mapping[str, Any]) -> Any:
@@ -186,20 +196,31 @@ def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, tor
         values["points"] = moved_points(points, lidar2ego)
     annotated = results.get("ann_info")
     boxes = results.get("gt_bboxes_3d", annotated.get("gt_bboxes_3d") if isinstance(annotated, Mapping) else None)
-    corners, rotation = getattr(boxes, "corners", None), lidar2ego[:3, :3]
+    tensor, rotation = getattr(boxes, "tensor", None), lidar2ego[:3, :3]
+    if tensor is not None and not len(tensor):  # mmdet3d before 1.0 asserts that there are corners
+        return values | {"boxes_3d": torch.zeros(0, 7)}
+    corners = getattr(boxes, "corners", None)
     if isinstance(boxes, np.ndarray) and boxes.ndim == 2 and boxes.shape[1] >= 7:
         centres, sizes, yaw = boxes[:, :3], boxes[:, 3:6].T, boxes[:, 6]
         along = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
     elif corners is not None:
-        # In both conventions corner 1 is above 0, 3 beside it, 4 at the other end.
+        # In both conventions corner 1 is above 0. From 1.0 on corner 4 is ahead of 0, at the yaw, and 3 to its left.
         x = np.asarray(corners, np.float64).reshape(-1, 8, 3)
-        centres, along = x.mean(axis=1), x[:, 4] - x[:, 0]
-        sizes = np.linalg.norm([along, x[:, 3] - x[:, 0], x[:, 1] - x[:, 0]], axis=-1)
+        centres, along, aside = x.mean(axis=1), x[:, 4] - x[:, 0], x[:, 3] - x[:, 0]
+        if tensor is not None and _is_clockwise(np.asarray(tensor[:, 6], np.float64), along):
+            along, aside = -aside, along
+        sizes = np.linalg.norm([along, aside, x[:, 1] - x[:, 0]], axis=-1)
     else:
         return values
     along = along @ rotation.T
     columns = [*(centres @ rotation.T + lidar2ego[:3, 3]).T, *sizes, np.arctan2(along[:, 1], along[:, 0])]
     return values | {"boxes_3d": torch.from_numpy(np.stack(columns, axis=1)).float()}
+
+
+def _is_clockwise(yaw: FloatArray, x_axes: FloatArray) -> bool:
+    """Whether boxes are those of mmdet3d before 1.0: their x axes (B, 3), of the width, are at minus the yaw (B,)."""
+    angles = np.arctan2(x_axes[:, 1], x_axes[:, 0])
+    return bool(np.cos(angles + yaw).sum() > np.cos(angles - yaw).sum() + 1e-6)
 
 
 def moved_points(points: Any, pose: FloatArray) -> torch.Tensor:

@@ -97,3 +97,4 @@ def test_config_of_the_readme(given: Recording, tmp_path: Path, monkeypatch: pyt
     assert transform(loaded(given))["img"].shape == (5, 3, 256, 704)
     more = RigRetargetMultiViewImages(**node, keys={"extra": ["confidence"]})
     assert more.step.retarget.keys == SampleKeys(extra=("confidence",))
+    assert more(loaded(given))["confidence"].shape == (5, 256, 704)

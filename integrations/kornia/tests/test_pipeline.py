@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import kornia
 import kornia.augmentation as K
 import pytest
 import torch
+from torchvision import transforms as v1
 from torchvision import tv_tensors
 from torchvision.transforms import v2
 
@@ -70,7 +72,16 @@ def test_kornias_image_sequential(sample: dict) -> None:
         K.ImageSequential(K.ColorJiggle(), K.RandomHorizontalFlip()),
         K.RandomResizedCrop((8, 8)),
         K.RandomPerspective(),
+        K.RandomThinPlateSpline(),
+        K.RandomFisheye(*(torch.tensor([-0.1, 0.1]),) * 3),
+        K.RandomElasticTransform(),
+        K.RandomJigsaw(),
+        K.RandomMosaic((8, 8)),
+        kornia.geometry.Hflip(),
+        v1.RandomHorizontalFlip(),
+        v1.RandomAffine(5),
         v2.RandomCrop(8),
+        v2.RandAugment(),
         v2.Compose([v2.ColorJitter(), v2.Resize(8)]),
     ],
     ids=lambda module: type(module).__name__,
@@ -81,8 +92,15 @@ def test_what_moves_pixels_is_refused(module: torch.nn.Module) -> None:
 
 
 def test_photometric_ones_pass() -> None:
-    for module in (K.ColorJiggle(), K.RandomGaussianBlur((3, 3), (0.1, 1.0)), v2.ColorJitter(), v2.GaussianBlur(3)):
+    kornias = K.ColorJiggle(), K.RandomGaussianBlur((3, 3), (0.1, 1.0)), K.RandomErasing()
+    for module in (*kornias, v1.ColorJitter(), v2.ColorJitter(), v2.GaussianBlur(3)):
         check_photometric(module)
+
+
+def test_images_keep_their_type_and_shape(sample: dict) -> None:
+    assert type(OnImages(K.ColorJiggle())(sample)["images"]) is tv_tensors.Image
+    with pytest.raises(ValueError, match=r"expected images of shape \(6, 3, 64, 176\).*got \(6, 3, 32, 88\)"):
+        OnImages(torch.nn.AvgPool2d(2))(sample)
 
 
 def test_lists_are_refused() -> None:

@@ -25,8 +25,9 @@ from arbiview_aug import (
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD
 from arbiview_aug.integrations.mmdet3d.matrices import MATRICES, decomposed, upper_triangular
+from arbiview_aug.integrations.mmdet3d.results import geometry
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
-from integrations.mmdet3d.fake_results import EGO2GLOBAL, FORMS, LIDAR2EGO, Recording, recording, source_rig
+from integrations.mmdet3d.fake_results import EGO2GLOBAL, FORMS, LIDAR2EGO, Boxes, Recording, recording, source_rig
 from integrations.mmdet3d.measure import worst_error_px
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
@@ -138,7 +139,7 @@ def test_the_own_rig_gives_everything_back(given: Recording, form: str) -> None:
 def test_every_key_of_mmdet3d(given: Recording) -> None:
     results = FORMS["mmdet3d"](given)
     results["lidar2img"], single = list(results["lidar2img"]), results["lidar2img"][0]
-    after = step()(results)
+    after = step()(results | {"gt_masks": np.zeros((6, 64, 176), bool), "gt_semantic_seg": np.zeros((6, 64, 176))})
     target = TARGET.in_frame_of(SOURCE)
     assert list(after["images"]) == after["filename"] == TARGET.names and after["num_views"] == 5
     for name, info in after["images"].items():
@@ -147,7 +148,7 @@ def test_every_key_of_mmdet3d(given: Recording) -> None:
         assert np.allclose(info["lidar2cam"], np.linalg.inv(target[name].cam2ego) @ LIDAR2EGO)
     assert np.allclose(after["cam2global"], EGO2GLOBAL @ target.cam2ego)
     assert after["img_shape"] == after["ori_shape"] == after["pad_shape"] == SIZE
-    assert "cam_instances" not in after
+    assert not {"cam_instances", "gt_masks", "gt_semantic_seg"} & {*after}
     assert "lidar2img" not in step()({**results, "lidar2img": single})  # one camera's, which may be gone
     # Only the nested infos: what is missing at the top is not invented.
     nested = {key: results[key] for key in ("images", "img", "lidar_points")}
@@ -209,6 +210,12 @@ def test_keys_of_a_config_file() -> None:
     assert RigRetargetMultiView(TARGET, keys={"labels": ["seg"]}).retarget.keys.labels == ("seg",)
 
 
+@pytest.mark.parametrize("is_old", [False, True])
+def test_frames_without_boxes(is_old: bool) -> None:
+    boxes = Boxes(np.zeros((0, 7)), is_old=is_old)
+    assert geometry({"gt_bboxes_3d": boxes}, LIDAR2EGO)["boxes_3d"].shape == (0, 7)
+
+
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_messages(given: Recording) -> None:
     results = FORMS["DETR3D"](given)
@@ -226,8 +233,11 @@ def test_messages(given: Recording) -> None:
         step()({"img": results["img"]})
     with pytest.raises(SampleError, match="expected 'img', loaded images"):
         step()({"filename": []})
-    with pytest.raises(SampleError, match="img_aug_matrix: expected none yet"):
-        step()({**results, "img_aug_matrix": [np.diag([0.5, 0.5, 1, 1])] * 6})
+    augmented = {"img_aug_matrix": [np.diag([0.5, 0.5, 1, 1])] * 6, "pcd_rotation": -torch.eye(3)}
+    augmented |= {"pcd_trans": np.ones(3), "flip": True, "pcd_horizontal_flip": True, "scale_factor": np.full(4, 0.5)}
+    for key, value in augmented.items():
+        with pytest.raises(SampleError, match=f"{key}: expected a frame as it was recorded, got an augmented one"):
+            step()({**results, key: value})
     with pytest.raises(SampleError, match=r"img\[0\]: expected grey levels from 0 to 255, got -"):
         step()({**results, "img": [image / 58 - 2 for image in results["img"]]})
     with pytest.raises(SampleTypeError, match=r"img\[0\]: expected \(H, W, 3\)"):

@@ -120,6 +120,8 @@ def test_the_camera_of_kitti(given: Recording) -> None:
     out = step(front)(data)
     assert out["images"].shape == data["images"].shape and 0 <= out["images"].min() <= out["images"].max() <= 1
     assert "depth_maps" not in out and data["calib"].P2[0, 3] > 0
+    planes = [one["road_plane"] @ np.vstack([one["calib"].V2C, [0, 0, 0, 1]]) for one in (data, out)]
+    np.testing.assert_allclose(*planes, atol=1e-4)  # in the LiDAR's frame the same
     points = out["points"][:, :3].astype(float)
     uv, depth_m = out["calib"].lidar_to_img(points)
     expected, true_m, valid = front[0].project(in_ego(out["points"], KITTI_LIDAR2EGO))
@@ -174,6 +176,11 @@ def test_without_labels_and_with_a_drawn_rig(given: Recording) -> None:
     torch.manual_seed(0)
     lengths = {len(step(RandomRig(TARGET, height_m=1.0))(data)["points"]) for _ in range(3)}
     assert len(lengths) > 1 and min(lengths) > 200
+
+
+def test_points_stay_on_demand(given: Recording) -> None:
+    data = kitti(given)
+    assert step(keys={"points": "source"})(data)["points"] is data["points"]
 
 
 def test_messages(given: Recording) -> None:

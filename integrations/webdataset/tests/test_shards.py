@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, DataError, Rig, RigRetarget
+from arbiview_aug import CalibrationError, Camera, DataError, Rig, RigRetarget, SampleError
+from arbiview_aug.datasets.image_io import encoded
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleTypeError
 from arbiview_aug.integrations.webdataset import ARRAYS, stream, to_entry, to_sample, write_shard
+
+SMALL = encoded(np.zeros((4, 4), np.uint8), ".png")
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +72,7 @@ def test_messages(sample: dict, monkeypatch) -> None:
     entry = to_entry(sample, "a")
     with pytest.raises(DataError, match=r"shard entry 'a': expected rig.json"):
         to_sample({"__key__": "a", "jpg": b""})
-    with pytest.raises(DataError, match=r"'a': 03.jpg: expected an image, got 5 bytes .*truncated"):
+    with pytest.raises(DataError, match=r"'a': 03.jpg: expected a JPEG or PNG, got a file that begins"):
         to_sample({**entry, "03.jpg": b"short"})
     with pytest.raises(DataError, match=r"'a': expected 05.jpg, found none"):
         to_sample({key: value for key, value in entry.items() if key != "05.jpg"})
@@ -97,13 +100,37 @@ def test_messages(sample: dict, monkeypatch) -> None:
     [
         ("rig.json", "{", "rig.json: expected a rig with its token"),
         ("rig.json", "[]", "rig.json: expected a rig with its token"),
+        ("00.jpg", b"", "00.jpg: expected a JPEG or PNG, got an empty file"),
+        ("00.mask.png", b"", "00.mask.png: expected a JPEG or PNG, got an empty file"),
+        pytest.param("00.mask.png", SMALL, r"camera 'front': mask: expected shape \(64, 176\)", id="a smaller mask"),
         ("points.npy", b"PK\x03\x04 no array", "points.npy: expected a .npy array of numbers"),
         ("boxes_3d.npy", b"", "boxes_3d.npy: expected a .npy array of numbers"),
     ],
 )
 def test_what_is_broken_is_named(sample: dict, name: str, content: str | bytes, message: str) -> None:
-    with pytest.raises(DataError, match=f"shard entry 'a': {message}"):
+    with pytest.raises((DataError, CalibrationError), match=f"shard entry 'a': {message}"):
         to_sample({**to_entry(sample, "a"), name: content})
+
+
+def test_shards_are_whole_and_keys_without_dots(sample: dict, tmp_path) -> None:
+    with tarfile.open(write_shard(tmp_path / "train.v1.tar", [sample])) as tar:
+        assert {name.split(".")[0] for name in tar.getnames()} == {"train-v1-000000"}
+    with pytest.raises(SampleError, match=r"images: expected \[.*as the rig's cameras are, got"):
+        write_shard(tmp_path / "half.tar", [sample, {**sample, "images": sample["images"][:5]}])
+    assert [path.name for path in tmp_path.iterdir()] == ["train.v1.tar"]
+    with pytest.raises(SampleError, match=r"key: expected none of dots.*'a\.b'"):
+        to_entry(sample, "a.b")
+
+
+def test_orientations_are_ignored(sample: dict) -> None:
+    """As for files: the calibration is of the pixels as they are stored."""
+    entry = to_entry(sample, "a")
+    turned = (
+        b"\xff\xe1\x00\x22Exif\x00\x00MM\x00\x2a\x00\x00\x00\x08\x00\x01\x01\x12\x00\x03\x00\x00\x00\x01\x00\x06\x00\x00"
+        + bytes(4)
+    )
+    rotated = {**entry, "00.jpg": entry["00.jpg"][:2] + turned + entry["00.jpg"][2:]}
+    assert torch.equal(to_sample(rotated)["images"], to_sample(entry)["images"])
 
 
 def test_images_of_another_type_are_refused(sample: dict) -> None:

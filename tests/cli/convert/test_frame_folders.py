@@ -186,6 +186,37 @@ def test_one_frame_alone(source: Path, tmp_path: Path) -> None:
     assert FrameFolder(tmp_path / "new").tokens == ["0001"]
 
 
+def test_frames_that_are_called_by_numbers(source: Path, tmp_path: Path) -> None:
+    """And that have a camera's truth, which is no file of the conversion."""
+    for k in range(2):
+        shutil.copytree(source / f"{k:04}", tmp_path / "drive" / str(k))
+        calib = json.loads((tmp_path / "drive" / str(k) / "calib.json").read_text())
+        calib["truth"] = calib["cameras"][0]
+        (tmp_path / "drive" / str(k) / "calib.json").write_text(json.dumps(calib))
+    (tmp_path / "drive" / "sequence.json").write_text(
+        '{"frames": [{"name": 0, "time_s": 0}, {"name": 1, "time_s": 1}]}'
+    )
+    (tmp_path / "drive" / "1" / "00.jpg").write_bytes(b"")
+    assert main(command(tmp_path / "drive", tmp_path / "new", "--on-error", "skip")) == 0
+    new = FrameFolder(tmp_path / "new")
+    assert new.tokens == ["0"] and new[0]["time_s"] == 0 and new.truth(0) is None
+
+
+def test_sources_outside_of_the_root_have_names_of_their_own(source: Path, tmp_path: Path) -> None:
+    """Here: of a frame that is its own root, opened by a link."""
+    shutil.copytree(source / "0001", tmp_path / "0001")
+    calib = json.loads((tmp_path / "0001" / "calib.json").read_text())
+    for entry in calib["cameras"]:
+        (tmp_path / "0001" / entry["name"]).mkdir()
+        (tmp_path / "0001" / entry["file"]).rename(tmp_path / "0001" / entry["name"] / "0.jpg")
+        entry["file"] = f"{entry['name']}/0.jpg"
+    (tmp_path / "0001" / "calib.json").write_text(json.dumps(calib))
+    (tmp_path / "link").symlink_to("0001")
+    assert main(command(tmp_path / "link", tmp_path / "new")) == 0
+    said = json.loads((tmp_path / "new" / "conversion" / "provenance.json").read_text())
+    assert set(said["sources"]["0001"]) == {"calib.json", "lidar.npy", *(entry["file"] for entry in calib["cameras"])}
+
+
 def test_neighbours_fill_by_a_switch(source: Path, tmp_path: Path) -> None:
     for n in (0, 1):
         assert main(command(source, tmp_path / str(n), "--neighbours", str(n))) == 0
