@@ -53,8 +53,7 @@ def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     """Resize a (3, H, W) image to (h, w), antialiased; a copy if it has that size.
 
     On the CPU by halving and then bilinearly, as target views are read, or by means of areas where an odd side cannot
-    be halved: a tenth of torch's time. Torch resizes images
-    that need gradients or lie on other devices.
+    be halved: a tenth of torch's time. Torch resizes images that need gradients or lie on other devices.
     """
     if image.device.type != "cpu" or image.requires_grad:
         if tuple(image.shape[-2:]) == size:

@@ -237,7 +237,7 @@ def test_what_an_inpainter_made_is_checked(made: Callable[[Any], Any]) -> None:
 
     with pytest.raises(GeneratorError, match=r"Own\.inpaint: expected images as its views, torch.uint8 \(3, .*, got"):
         RigRetarget(TARGET, holes=Own())(a_sample())
-    with pytest.raises(ValueError, match="inpainter: expected an Inpainter or a Generator, got str"):
+    with pytest.raises(ValueError, match=r"inpainter: expected an Inpainter, such as Diffusion\(generator\), got str"):
         CompletedLoader([], "telea")  # type: ignore[arg-type]
 
 
