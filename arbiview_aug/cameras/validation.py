@@ -121,6 +121,16 @@ def checked_intrinsics(name: str, value: Any) -> FloatArray:
     return K
 
 
+def is_rigid(pose: FloatArray) -> bool:
+    """Whether an array is a finite pose (4, 4): a rotation, within 1e-3, and a position over 0 0 0 1."""
+    if pose.shape != (4, 4) or not np.isfinite(pose).all() or not np.allclose(pose[3], (0, 0, 0, 1)):
+        return False
+    R = pose[:3, :3]
+    if np.abs(R).max() > 2:  # its squares could overflow
+        return False
+    return bool(np.abs(R @ R.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(R) > 0)
+
+
 def checked_pose(name: str, value: Any, field: str = "cam2ego") -> FloatArray:
     """(4, 4) pose; a rotation within ``ROTATION_TOLERANCE`` is made exact."""
     pose = checked_array(name, field, value, (4, 4))

@@ -20,6 +20,7 @@ from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.plain_yaml import parse_json
 from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig, read_mask
+from arbiview_aug.cameras.validation import is_rigid
 from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import (
     Drive,
@@ -253,6 +254,11 @@ def _find_frames(root: Path) -> list[_Frame]:
     return frames
 
 
+def entry_name(entry: Any) -> str:
+    """The frame's name of an entry in ``sequence.json``."""
+    return str(entry["name"] if isinstance(entry, Mapping) else entry)
+
+
 def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, float], list[str]]:
     """Read times (s) by frame and the frames in order; nothing without ``sequence.json``."""
     path = inside(root, SEQUENCE_FILE, str(root))
@@ -260,9 +266,9 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
         return {}, []
     try:
         listed = parse_json(path.read_text(encoding="utf-8"))["frames"]
-        entries = [entry if isinstance(entry, Mapping) else {"name": entry} for entry in listed]
-        names = [str(entry["name"]) for entry in entries]
-        times_s = {str(entry["name"]): float(entry["time_s"]) for entry in entries if "time_s" in entry}
+        names = [*map(entry_name, listed)]
+        timed = [entry for entry in listed if isinstance(entry, Mapping) and "time_s" in entry]
+        times_s = {entry_name(entry): float(entry["time_s"]) for entry in timed}
     except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         expected = "{'frames': [names, or {'name': ..., 'time_s': ...}]}"
         raise DataError(f"{path}: expected {expected}, got {type(error).__name__}: {error}") from None
@@ -404,9 +410,7 @@ def _pose(value: Any, where: str) -> torch.Tensor:
         pose = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         pose = np.zeros(0)
-    is_affine = pose.shape == (4, 4) and np.isfinite(pose).all() and np.allclose(pose[3], (0, 0, 0, 1))
-    R = pose[:3, :3] if is_affine else np.zeros((3, 3))
-    if np.abs(R).max() > 2 or np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
+    if not is_rigid(pose):
         expected = "4x4 finite numbers, a rotation beside a position over 0 0 0 1 (not transposed)"
         raise DataError(f"{where}: ego2world: expected {expected}, got {value!r}")
     return torch.from_numpy(pose)

@@ -112,9 +112,11 @@ class Inpainter(ABC):
         is_filled = maps.pop("generated", None) is not None  # by ``holes`` of the transform
         rendered = []
         for b, view in enumerate(views):
-            images = [image.clone() for image in view.images]  # some fill in place
             if is_filled:
-                images = [torch.where(seen, image, 0) for seen, image in zip(maps["coverage"][b], images, strict=True)]
+                seen_and_images = zip(maps["coverage"][b], view.images, strict=True)
+                images = [torch.where(seen, image, 0) for seen, image in seen_and_images]
+            else:
+                images = [image.clone() for image in view.images]  # some fill in place
             rendered.append(RenderedFrame(images, view.rig, **{key: frames[b] for key, frames in maps.items()}))
         if batch.get("token") is not None:
             sources = [replace(frame, sample={**frame.sample, "token": batch["token"]}) for frame in sources]

@@ -15,6 +15,7 @@ import torch
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.validation import is_rigid
 from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError
 from arbiview_aug.sample.batching import check_container, checked_images
 from arbiview_aug.sample.inputs import Frame, as_array, frame_from, numbers
@@ -230,9 +231,7 @@ def _pose(key: str, value: Any, index: tuple[int, ...] = ()) -> FloatArray:
     pose = numbers(key, pose, index) if pose.ndim > 2 else pose
     if pose.shape != (4, 4) or not np.isfinite(pose).all():
         raise SampleError(f"{key}: expected (4, 4) finite numbers, got shape {pose.shape}")
-    R = pose[:3, :3]
-    rigid = np.abs(R @ R.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(R) > 0
-    if not rigid or not np.allclose(pose[3], (0, 0, 0, 1)):
+    if not is_rigid(pose):
         raise SampleError(f"{key}: expected a rotation, a translation and a last row 0 0 0 1, got {pose.tolist()}")
     return pose
 

@@ -16,7 +16,7 @@ _MOST = np.float32(MAX_INVERSE_DISTANCE)
 ROW = 35
 
 GROUND, STREET = 0, 1
-_USUAL_STEP = 8
+_USUAL_STEP = 8  # ``render.plan.GRID_STEP_PX``; other steps take a slower loop
 
 
 @compiled
@@ -159,29 +159,29 @@ def draw_solids(
             if n == 0:
                 continue
             rx, ry, rz, enter, leave = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
-            part, value, first_face, next_face = work[5, :n], work[6, :n], kept[0, :n], kept[1, :n]
+            scratch, value, entered, other = work[5, :n], work[6, :n], kept[0, :n], kept[1, :n]
             for y in range(j * step, min(j * step + step, h)):
                 rays_row(planes, P, y, x0, rx, ry, rz)
-                through_row(b, rx, ry, rz, enter, leave, part)
+                through_row(b, rx, ry, rz, enter, leave, scratch)
                 near, which = q[y, x0 : x0 + n], number[y, x0 : x0 + n]
                 for x in range(n):  # the first distance below 1 cm counts as 1 cm
                     value[x] = min(enter[x], _MOST) * factor if enter[x] > leave[x] else _ZERO
                 for x in range(n):
-                    first_face[x] = me
+                    entered[x] = me
                 for k in range(int(b[24]) if faces else 0):
                     a0, a1, a2, face = b[4 * k], b[4 * k + 1], b[4 * k + 2], np.int32(6) * me + np.int32(b[29 + k])
                     for x in range(n):
                         is_last = a0 * rx[x] + a1 * ry[x] + a2 * rz[x] <= enter[x]
-                        next_face[x] = face if is_last else first_face[x]
-                    first_face, next_face = next_face, first_face
+                        other[x] = face if is_last else entered[x]
+                    entered, other = other, entered
                 for x in range(n):
-                    next_face[x] = first_face[x] if value[x] > near[x] else which[x]
+                    other[x] = entered[x] if value[x] > near[x] else which[x]
                 for x in range(n):
-                    which[x] = next_face[x]
+                    which[x] = other[x]
                 for x in range(n):
-                    part[x] = max(near[x], value[x])
+                    scratch[x] = max(near[x], value[x])
                 for x in range(n):
-                    near[x] = part[x]
+                    near[x] = scratch[x]
 
 
 @compiled

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from arbiview_aug.atomic_io import file_name, write_whole
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
-from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE
+from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE, entry_name
 from arbiview_aug.datasets.py123d import NOT_SHARED
 from arbiview_aug.errors import DataError
 from arbiview_aug.transforms.scans import RINGS_KEY
@@ -59,8 +59,7 @@ class FrameFolders(Writer):
         if path.is_file():
             sequence = json.loads(path.read_text(encoding="utf-8"))
             frames = sequence["frames"]
-            names = [str(entry["name"] if isinstance(entry, Mapping) else entry) for entry in frames]
-            sequence["frames"] = [frame for frame, name in zip(frames, names, strict=True) if name not in left_out]
+            sequence["frames"] = [frame for frame in frames if entry_name(frame) not in left_out]
             write_whole({self.output / SEQUENCE_FILE: json.dumps(sequence, indent=1).encode()})
         return []
 
