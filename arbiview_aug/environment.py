@@ -15,6 +15,7 @@ from functools import cache
 from hashlib import sha256
 from importlib import import_module, metadata
 from io import BytesIO
+from numbers import Number
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -181,7 +182,7 @@ def _compilation() -> Any:
 
 @cache
 def _kernel_cache() -> type:
-    """numba's cache of one kernel, which throws damaged files away and notices when kernels that it calls change."""
+    """numba's cache of one kernel, which throws damaged files away and notices changes in other modules."""
     from numba.core.caching import FunctionCache, IndexDataCacheFile
 
     class Files(IndexDataCacheFile):  # type: ignore[misc]
@@ -206,14 +207,16 @@ def _kernel_cache() -> type:
     class KernelCache(FunctionCache):  # type: ignore[misc]
         def __init__(self, function: Any) -> None:
             super().__init__(function)
-            called, waiting = set[str](), [function]
+            called, waiting, constants = set[str](), [function], set[str]()
             while waiting:  # kernels of the modules that its module imports kernels from, and so on
-                kernels = [one.py_func for one in waiting.pop().__globals__.values() if hasattr(one, "py_func")]
+                known = waiting.pop().__globals__
+                constants |= {f"{name} {value}" for name, value in known.items() if isinstance(value, Number)}
+                kernels = [one.py_func for one in known.values() if hasattr(one, "py_func")]
                 new = {kernel.__code__.co_filename: kernel for kernel in kernels}
                 waiting += [new[file] for file in new.keys() - called]
                 called |= new.keys()
             changes = ((s.st_mtime, s.st_size) for s in map(os.stat, sorted(called)))
-            stamps = self._impl.locator.get_source_stamp(), *changes
+            stamps = self._impl.locator.get_source_stamp(), *sorted(constants), *changes
             self._cache_file = Files(self._cache_path, f"{self._impl.filename_base}.sha256", stamps)
 
         def save_overload(self, signature: Any, data: Any) -> None:

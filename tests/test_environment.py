@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from numba.core import caching, config
 
@@ -67,7 +68,7 @@ def test_kernels_are_cached_where_their_folder_can_be_written_only(
     assert kernel()(4) == 8 and not list(tmp_path.rglob("*.nbi"))
 
 
-def test_kernels_are_compiled_anew_when_one_that_they_call_changes(
+def test_kernels_are_compiled_anew_when_one_that_they_call_or_a_constant_changes(
     kernel: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     inner = None
@@ -84,6 +85,11 @@ def test_kernels_are_compiled_anew_when_one_that_they_call_changes(
         (tmp_path / f"{name}.py").write_text(f"def {name}(x):\n    return x + 1\n")
         third = kernel()
         assert third(3) == 6 and not third.stats.cache_hits
+    monkeypatch.setitem(globals(), "SHARE", 1)
+    assert kernel()(3) == 6
+    monkeypatch.setitem(globals(), "SHARE", np.float32(2))  # imported from a module without kernels
+    fourth = kernel()
+    assert fourth(3) == 6 and not fourth.stats.cache_hits
 
 
 def test_compiling_is_announced_and_not_timed(

@@ -23,7 +23,7 @@ from arbiview_aug.render.plan import OBJECT, Paint
 from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import Frame
-from arbiview_aug.scene.boxes import PARTS, TOP_PART
+from arbiview_aug.scene.boxes import PARTS, RIM_PART, TOP_PART
 
 CELLS = 64  # cells along a view's shorter side; the pyramid starts with half as many
 
@@ -42,22 +42,23 @@ _WIDE = 2  # halvings of the columns alone: what is hidden looks like what is be
 _SWEEPS = 2
 """Sweeps of smoothing at each size of the cells. Synthetic streets: 0 to 0.08 dB of whole views; 4 sweeps: +0.03."""
 
-_TOP_SHARE, _BODY_SHARE = 0.9, 0.6
-"""Quantiles of what sources see of tops and of a body's side that are nearest to their paint: tops are seen at grazing
-angles, sides have wheels and sills. No lamps, plates and windows: these are less than the rest, or on other pieces."""
+_TOP_SHARE, _RIM_SHARE = 0.9, 0.6
+"""Quantiles of what sources see of tops and of their rims that are nearest to their paint: tops are seen at grazing
+angles, and below a rim windows begin."""
 
 _PAINT_SHARE = 0.8
 """Quantile of windows and the paint around them, by their largest channel, from which on all is paint."""
 
-_TOP_LIGHT, _TOP_SHINE = 1.8, 0.05
-"""Light on tops over that on the brightest side in view, and reflected sky, as a share of white; in linear light. An
-evenly bright sky gives 1.7; clear coat reflects 4 to 5 %. From ``integrations.benchmarks.tops``, seeds 7000, 7100."""
+_TOP_LIGHT, _TOP_SHINE = 1.4, 0.02
+"""Light on tops over that on their rims, and reflected sky, as a share of white; in linear light. An evenly bright sky
+gives 1.7, a low sun less than 1. From ``integrations.benchmarks.tops``, both worlds."""
 
-_SURE_SAMPLES = 6
-"""Samples of a seen top that weigh as much as its sides."""
+_SURE_SAMPLES, _SAME_HUE = 6, 0.06
+"""Samples of a seen top that weigh as much as its paint, and the largest difference of their hues, as shares of the
+channels' sum: others show what stands behind a top."""
 
-_LEAST_SAMPLES, _LEAST_SHARE = 3, 0.03
-"""Samples of a side that suffice for its paint, and the body's least share of those of all sides."""
+_LEAST_SAMPLES = 3
+"""Samples of a side or rim that suffice for its paint."""
 
 _GAMMA = 2.2
 """Exponent of displayed colours in linear light, as sRGB's on average."""
@@ -166,8 +167,8 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
     """Colours (P, 3) of the parts of objects by their numbers in ``Paint``; -1 where unknown.
 
     Sides take the median of what sources see of the body, or of the cabin. A body of which nothing is seen takes the
-    paint around the windows. Tops take the paint of the body's brightest side in the light that falls on tops, and what
-    sources see of them, the more the larger the part that they see.
+    paint around the windows. Tops take the paint of their rims, without one that of the body, in the light that falls
+    on tops, and what sources see of them, the more the larger the part that they see.
     """
     painted = [(view.reshape(3, -1), p) for view, p in zip(views, paint, strict=True) if p is not None]
     if not any(len(p.pixel) for _, p in painted):
@@ -180,31 +181,28 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
     colours = np.full((len(ends), 3), -1, np.float32)
     white = 255 if views[0].dtype == np.uint8 else 1
     for first in range(0, len(ends), PARTS):
-        sides, tops = samples[first : first + TOP_PART], samples[first + TOP_PART]
+        sides, tops, rim = samples[first : first + TOP_PART], samples[first + TOP_PART], samples[first + RIM_PART]
         of_sides, of_body = np.concatenate(sides), np.concatenate(sides[1:])
+        paint_of_top = _quantile(rim, _RIM_SHARE) if len(rim) >= _LEAST_SAMPLES else None
         if len(of_sides) >= _LEAST_SAMPLES:
             cabin = sides[0] if len(sides[0]) >= _LEAST_SAMPLES else of_sides
             body = _quantile(of_body, 0.5) if len(of_body) >= _LEAST_SAMPLES else _brightest(of_sides)
             colours[first], colours[first + 1 : first + TOP_PART] = _quantile(cabin, 0.5), body
-        paints = [_quantile(side, _BODY_SHARE) for side in sides[1:] if len(side) >= _LEAST_SAMPLES]
-        is_seen = len(of_sides) - len(sides[0]) >= _LEAST_SHARE * len(of_sides)  # few pixels may be another object's
-        if len(of_sides) >= _LEAST_SAMPLES and not (paints and is_seen):
-            paints = [_brightest(of_sides)]
-        colours[first + TOP_PART] = _top_colour(paints, tops, white)
+            paint_of_top = body if paint_of_top is None else paint_of_top
+        colours[first + TOP_PART] = _top_colour(paint_of_top, tops, white)
     return colours
 
 
-def _top_colour(paints: Sequence[Colour], tops: Colour, white: float) -> Colour:
-    """Colour (3,) of an object's tops by the paints (3,) of its sides and samples (n, 3) of tops; -1 without any."""
-    if not paints and not len(tops):
-        return np.full(3, -1, np.float32)
-    sure = len(tops) / (len(tops) + _SURE_SAMPLES) if paints else 1.0
-    light = np.zeros(3)
-    if paints:
-        brightest = max(paints, key=lambda paint: float(paint.sum()))
-        light += (1 - sure) * (_TOP_LIGHT * (brightest / white) ** _GAMMA + _TOP_SHINE)
+def _top_colour(paint: Colour | None, tops: Colour, white: float) -> Colour:
+    """Colour (3,) of an object's tops by its paint (3,) and samples (n, 3) of tops; -1 without any."""
+    if paint is None:
+        return _quantile(tops, _TOP_SHARE) if len(tops) else np.full(3, -1, np.float32)
+    light = _TOP_LIGHT * (paint / white) ** _GAMMA + _TOP_SHINE
     if len(tops):
-        light += sure * (_quantile(tops, _TOP_SHARE) / white) ** _GAMMA
+        seen = _quantile(tops, _TOP_SHARE)
+        one, two = ((colour + white / 50) / (colour + white / 50).sum() for colour in (paint, seen))
+        if np.abs(one - two).sum() < _SAME_HUE:
+            light += len(tops) / (len(tops) + _SURE_SAMPLES) * ((seen / white) ** _GAMMA - light)
     return np.asarray(white * np.minimum(light, 1) ** (1 / _GAMMA), np.float32)
 
 

@@ -16,7 +16,7 @@ from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_ro
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.environment import called, compiled, inlined
 from arbiview_aug.render.plan import OUTSIDE
-from arbiview_aug.scene.boxes import PARTS, PIECES
+from arbiview_aug.scene.boxes import PARTS, PIECES, RIM_PART, TOP_PART
 from arbiview_aug.scene.kernels import upsampled_row
 
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
@@ -29,6 +29,9 @@ SAME_OBJECT_M = np.float32(0.15)
 
 WHOLE = 0.97
 """Share of an object's nodes, among those of the source that sees most, from which a source sees it whole."""
+
+RIM_PX = 3
+"""Height of a rim: roofs have frames of some centimetres, below which windows begin."""
 
 _BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
@@ -700,7 +703,8 @@ def mark_objects(q: Any, face: Any, winner: Any, limit: Any, cell: int, layers: 
 def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table: Any) -> tuple[int, int]:
     """Find the unseen pixels of objects, and a sample of seen ones; return their numbers.
 
-    Vehicles without a sample give all their seen pixels.
+    The first ``RIM_PX`` seen pixels below each column of an unseen top are samples of its rim. Vehicles without another
+    sample give all their seen pixels.
 
     Args:
         face: (h, w) int32 faces of objects, -1 elsewhere.
@@ -708,7 +712,7 @@ def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table:
         winner: (h, w) int8 source, -1 for none.
         step: Distance of samples.
         margin: Distance at which pixels around a sample must be of its face.
-        table: (4, h w) int32, written: the first four attributes of ``plan.Paint``.
+        table: (4, 2 h w) int32, written: the first four attributes of ``plan.Paint``.
     """
     h, w = face.shape
     hidden, sampled, is_known = 0, 0, np.ones(part.shape[0], np.bool_)
@@ -723,6 +727,14 @@ def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table:
             if winner[y, x] < 0:
                 table[0, hidden], table[1, hidden] = y * w + x, part[number]
                 hidden += 1
+                of_object, below = part[number] // PARTS, face[min(y + 1, h - 1), x]
+                if part[number] % PARTS != TOP_PART or below < 0 or part[below] // PARTS != of_object:
+                    continue
+                for yy in range(y + 1, min(y + 1 + RIM_PX, h) if part[below] % PARTS != TOP_PART else 0):
+                    if face[yy, x] != below or winner[yy, x] < 0:
+                        break
+                    table[2, sampled], table[3, sampled] = yy * w + x, of_object * PARTS + RIM_PART
+                    sampled += 1
             elif y % step == 0 and x % step == 0 and min(y, x, h - 1 - y, w - 1 - x) >= margin:
                 if (
                     face[y - margin, x] == number

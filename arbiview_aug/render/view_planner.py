@@ -563,7 +563,7 @@ def find_paint(face: npt.NDArray[np.int32], winner: npt.NDArray[np.int8], parts:
     from arbiview_aug.render import kernels
 
     step = max(1, min(face.shape) // _SAMPLES)
-    columns = np.empty((4, face.size), np.int32)
+    columns = np.empty((4, 2 * face.size), np.int32)
     hidden, sampled = kernels.find_paint(face, parts, winner, step, _INSIDE_PX, columns)
     (pixel, part), (sample, sample_part) = columns[:2, :hidden].copy(), columns[2:, :sampled].copy()
     nearest = np.empty((4, hidden), np.int32)

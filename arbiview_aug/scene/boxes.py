@@ -187,8 +187,8 @@ TOP = 0.9
 ROOF_M2 = 2.0
 """Least footprint of objects whose tops have a colour of their own: heads, cones and barriers go on as their sides."""
 
-PARTS, TOP_PART = 6, 5
-"""Parts of an object that ``BoxSurface.face_parts`` tells apart, and the one that is its tops."""
+PARTS, TOP_PART, RIM_PART = 7, 5, 6
+"""Parts of an object; those that are its tops, and what lies just below their edges: samples of paint alone."""
 
 _WIDER = np.array([1, 1, 1, 1, 0, 1])  # all planes of a piece but its floor
 _ROUNDING = 1e-4  # of float32 images against float64

@@ -1,7 +1,8 @@
 """``python -m integrations.benchmarks.tops``: colours given to vehicles' tops that no camera saw, against true views.
 
-Vehicles of varied paint on synthetic streets, cameras 0.7 m higher, LiDAR and boxes. The error of a vehicle is the mean
-over the channels of how far the mean colour of its painted tops is from the true one, in levels of 255.
+Vehicles of varied paint on synthetic streets of either world, cameras 0.7 m higher, LiDAR and boxes. The error of a
+vehicle is the mean over the channels of how far the mean colour of its painted tops is from the true one, in levels of
+255.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from arbiview_aug.cli.arguments import command_parser, count, size
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.boxes import PARTS, TOP_PART
+from integrations.cross_rig.cuboids import CuboidDrive
 
 LEAST_PX = 40
 """Painted pixels of a vehicle that suffice to score it."""
@@ -25,7 +27,7 @@ LEAST_PX = 40
 def main(argv: list[str] | None = None) -> int:
     """Measure and print one line."""
     arguments = _parser().parse_args(argv)
-    error, pixels = np.array(list(errors(arguments.frames, arguments.seed, arguments.size))).T
+    error, pixels = np.array(list(errors(arguments.world, arguments.frames, arguments.seed, arguments.size))).T
     print(
         f"{len(error)} vehicles: mean {error.mean():.1f}, median {np.median(error):.1f}, "
         f"90 % {np.quantile(error, 0.9):.1f}, by pixel {np.average(error, weights=pixels):.1f} levels"
@@ -33,11 +35,12 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def errors(frames: int, seed: int, image_size: tuple[int, int]) -> Iterator[tuple[float, int]]:
+def errors(world: str, frames: int, seed: int, image_size: tuple[int, int]) -> Iterator[tuple[float, int]]:
     """Error of each vehicle, levels, and the number of pixels it is of."""
     source = demo_source_rig(image_size)
     target = source.shifted(z_m=0.7)
-    drive, retarget = SyntheticDrive(source, num_frames=frames, seed=seed), RigRetarget(target)
+    make = CuboidDrive if world == "cuboids" else SyntheticDrive
+    drive, retarget = make(source, num_frames=frames, seed=seed), RigRetarget(target)
     for k in range(frames):
         sample, truth = drive[k], drive.render(k, target)
         views = retarget(sample)["images"].numpy()
@@ -59,7 +62,8 @@ def errors(frames: int, seed: int, image_size: tuple[int, int]) -> Iterator[tupl
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser("", __doc__, "--frames 10", program="python -m integrations.benchmarks.tops")
-    parser.add_argument("--frames", type=count, default=90, metavar="N", help="streets (default: %(default)s)")
+    parser.add_argument("--world", choices=("drive", "cuboids"), default="drive", help="streets (default: %(default)s)")
+    parser.add_argument("--frames", type=count, default=90, metavar="N", help="number of them (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=8000, help="seed of the streets (default: %(default)s)")
     parser.add_argument("--size", type=size, default=(256, 704), metavar="HxW", help="size of the views")
     return parser

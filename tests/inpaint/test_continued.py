@@ -21,6 +21,7 @@ from arbiview_aug.render.kernels import farthest_occluded, mark_objects
 from arbiview_aug.render.plan import BACKGROUND, OBJECT, OCCLUDED, Paint
 from arbiview_aug.render.view_planner import build_plan, find_paint
 from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.scene.boxes import PARTS, RIM_PART, TOP_PART
 from arbiview_aug.transforms.resize import CropRig, ResizeRig
 from tests.helpers import camera, ring, street_sample
 
@@ -438,7 +439,7 @@ def test_unlabelled_things_before_a_hole_are_found_by_their_distance() -> None:
     assert not layers[:, :20].any() and not layers[:, 33:].any()
 
 
-FACE_PARTS = np.array([1, 2, 3, 4, 0, 5, 7, 8, 9, 10, 6, 11], np.int32)  # two boxes, whose last faces are tops
+FACE_PARTS = np.array([1, 2, 3, 4, 0, 5, 8, 9, 10, 11, 7, 12], np.int32)  # two boxes, whose last faces are tops
 
 
 def painted(top_seen: bool, scale: float = 1.0) -> tuple[torch.Tensor, Paint, torch.Tensor]:
@@ -459,17 +460,17 @@ def painted(top_seen: bool, scale: float = 1.0) -> tuple[torch.Tensor, Paint, to
 
 def in_light(paint: float) -> float:
     """A top over a side of this level, in the light of tops."""
-    return float(255 * (1.8 * (paint / 255) ** 2.2 + 0.05) ** (1 / 2.2))
+    return float(255 * (1.4 * (paint / 255) ** 2.2 + 0.02) ** (1 / 2.2))
 
 
-def test_tops_take_their_body_s_paint_in_the_light_of_tops() -> None:
+def test_tops_take_the_paint_of_their_rims_in_the_light_of_tops() -> None:
     for top_seen, expected in ((True, None), (False, in_light(100))):
         view, paint, seen = painted(top_seen)
         colours = object_colours([view.numpy()], [paint])
         np.testing.assert_array_equal(colours[:5, 0], 40)
-        np.testing.assert_array_equal(colours[6:11, 0], 100)
-        assert 80 < colours[5, 0] < in_light(40) and (colours == colours[:, :1]).all()
-        top = colours[11, 0]
+        np.testing.assert_array_equal(colours[PARTS : PARTS + 5, 0], 100)
+        assert in_light(40) < colours[5, 0] < 80 and (colours == colours[:, :1]).all()
+        top = colours[PARTS + TOP_PART, 0]
         assert top == pytest.approx(expected, abs=1e-3) if expected else in_light(100) < top < 150
         layers = np.full(seen.shape, OBJECT, np.uint8)
         (out,) = fill_holes([view.clone()], [seen], [layers], [paint])
@@ -479,13 +480,24 @@ def test_tops_take_their_body_s_paint_in_the_light_of_tops() -> None:
         torch.testing.assert_close(out[:, ~seen], torch.full_like(out[:, ~seen], float(top) / 255))
 
 
-def test_windows_and_lamps_do_not_colour_tops() -> None:
+def test_roofs_of_another_colour_than_the_body_take_that_of_their_rims() -> None:
     view, paint, _ = painted(top_seen=False)
-    lamp = replace(paint, sample_part=np.where(paint.sample_part == 7, 6, paint.sample_part))  # all on the cabin
-    assert object_colours([view.numpy()], [lamp])[11, 0] == pytest.approx(in_light(100), abs=1e-3)
-    side = paint.sample[paint.sample_part == 7]
-    view.reshape(3, -1)[:, side[: len(side) // 3]] = 255  # a lamp on a third of the side
-    assert object_colours([view.numpy()], [paint])[11, 0] == pytest.approx(in_light(100), abs=1e-3)
+    rim = paint.sample[paint.sample_part == PARTS + RIM_PART]
+    assert sorted(set((rim // 64).tolist())) == [20, 21, 22] and len(rim) == 3 * 24
+    view[0, 20:22, 36:60] = 50  # the upper two rows of the rim; windows begin in the third
+    top = object_colours([view.numpy()], [paint])[PARTS + TOP_PART]
+    np.testing.assert_allclose(top, [in_light(50), in_light(100), in_light(100)], atol=1e-3)
+    bare = replace(paint, sample_part=np.where(paint.sample_part == PARTS + RIM_PART, PARTS + 1, paint.sample_part))
+    assert object_colours([view.numpy()], [bare])[PARTS + TOP_PART, 0] == pytest.approx(in_light(100), abs=1e-3)
+
+
+def test_windows_and_what_stands_behind_do_not_colour_tops() -> None:
+    view, paint, _ = painted(top_seen=False)
+    lamp = replace(paint, sample_part=np.full_like(paint.sample_part, PARTS))  # all on the cabin, without a rim
+    assert object_colours([view.numpy()], [lamp])[PARTS + TOP_PART, 0] == pytest.approx(in_light(100), abs=1e-3)
+    view, paint, _ = painted(top_seen=True)
+    view[2, 10:20, 36:54] = 90  # what sources show there is yellow, the rim grey
+    assert object_colours([view.numpy()], [paint])[PARTS + TOP_PART, 0] == pytest.approx(in_light(100), abs=1e-3)
 
 
 def test_a_top_without_any_seen_part_is_left_to_the_background() -> None:
