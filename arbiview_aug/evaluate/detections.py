@@ -43,7 +43,7 @@ class Labels(NamedTuple):
 
     Attributes:
         rows: (n,) rows of ``boxes_3d``.
-        boxes: (n, 4) x0 y0 x1 y1 in pixels, cut at the border.
+        boxes: (n, 4) x0 y0 x1 y1 in pixels, cut at the border; pixel k reaches from k to k + 1, as in detections.
         whole: (n,) bool, within the image: those that NTA-IoU counts.
         clear: (n,) bool, whole, and neither hidden by other labelled objects nor by what only LiDAR knows.
     """
@@ -72,7 +72,8 @@ def labels_of(frame: ScoredFrame, rig: Rig) -> list[Labels] | None:
     for seen in project_boxes_3d(boxes, rig):
         whole = seen.truncation < 1e-6
         clear = whole & (seen.visibility >= CLEAR_SHARE) & measured[seen.rows]
-        labels.append(Labels(*(part[counts[seen.rows]] for part in (seen.rows, seen.boxes, whole, clear))))
+        edges = seen.boxes + 0.5  # those of 3D boxes refer to pixel centres
+        labels.append(Labels(*(part[counts[seen.rows]] for part in (seen.rows, edges, whole, clear))))
     return labels
 
 
@@ -178,8 +179,8 @@ def false_alarms(detections: Detections, there: FloatArray, generated: BoolArray
     """Count detections that lie on generated pixels (h, w) and touch none of the boxes (m, 4) that are there."""
     count = 0
     for box in detections.boxes[detections.scores >= CONFIDENCE]:
-        x0, y0, x1, y1 = np.round(box).astype(int)
-        within = generated[y0 : y1 + 1, x0 : x1 + 1]
+        (x0, y0), (x1, y1) = np.floor(box[:2]).astype(int), np.ceil(box[2:]).astype(int)
+        within = generated[y0:y1, x0:x1]
         touched = len(there) and ious(box[None], there).max() >= GHOST_IOU
         count += bool(within.size and within.mean() > GHOST_SHARE and not touched)
     return count

@@ -19,6 +19,7 @@ from arbiview_aug.evaluate.detections import (
 )
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.judges import Detections
+from arbiview_aug.sample.boxes_2d import project_boxes_3d
 from tests.helpers import camera
 
 BOXES = np.array([[0.0, 0, 10, 10], [20, 0, 30, 10]])
@@ -69,6 +70,8 @@ def test_labels_whole_and_clear() -> None:
     plain = frame(boxes)
     (labels,) = labels_of(plain, plain.sample["rig"]) or []
     assert labels.rows.tolist() == [0, 1, 2, 3], "the last is behind the camera"
+    outline = project_boxes_3d(boxes, plain.sample["rig"])[0].boxes
+    np.testing.assert_array_equal(labels.boxes, outline + 0.5, "pixel 0 is centred at 0, and reaches from 0 to 1 here")
     assert labels.whole.tolist() == [True, True, True, False] and labels.clear.tolist() == [True, False, True, False]
     points = torch.tensor([[20.0, 8.0, 1.5, 0.0]] * 4 + [[10.0, 0.0, 1.5, 0.0]] * 3)
     measured = frame(boxes, points=points)
@@ -125,3 +128,5 @@ def test_false_alarms_lie_on_generated_pixels_and_touch_nothing() -> None:
     assert false_alarms(found, NONE, generated) == 2, "the second and the third; the last is not sure"
     assert false_alarms(found, BOXES[1:], generated) == 1
     assert false_alarms(found, BOXES[1:], ~generated) == 1, "the first"
+    narrow = detections(np.array([[12.0, 0, 18, 10]]), 0.9)  # three of its six columns are generated, not more
+    assert false_alarms(narrow, NONE, generated) == 0
