@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.environment import called, compiled, inlined
-from arbiview_aug.scene.boxes import PARTS, TOP_PART
 
 _ZERO, _ONE, _HALF, _QUARTER = np.float32(0), np.float32(1), np.float32(0.5), np.float32(0.25)
 _TINY = np.float32(1e-12)
@@ -321,9 +320,9 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
 
 @compiled
 def paint(pixel: Any, part: Any, nearest: Any, table: Any, seen: Any, reach: float, rounding: float, view: Any) -> None:
-    """Paint the unseen pixels of objects in a view: tops in their part's colour, without a colour not at all.
+    """Paint the unseen pixels of objects in a view; without a colour of their part, not at all.
 
-    Sides mix their part's colour with the nearest seen pixels of the same body or cabin.
+    They mix that colour with the nearest seen pixels of the same body or cabin.
 
     Args:
         pixel: (n,) into the flattened view.
@@ -344,7 +343,7 @@ def paint(pixel: Any, part: Any, nearest: Any, table: Any, seen: Any, reach: flo
         total = _ONE
         for c in range(3):
             mixed[c] = table[part[k], c]
-        for way in range(0 if part[k] % PARTS == TOP_PART else 4):
+        for way in range(4):
             source = nearest[way, k]
             if source >= 0:
                 weight = np.float32(reach) / np.float32(abs(source // w - at // w) + abs(source % w - at % w))

@@ -473,11 +473,19 @@ def test_tops_take_the_paint_of_their_rims_in_the_light_of_tops() -> None:
         top = colours[PARTS + TOP_PART, 0]
         assert top == pytest.approx(expected, abs=1e-3) if expected else in_light(100) < top < 150
         layers = np.full(seen.shape, OBJECT, np.uint8)
-        (out,) = fill_holes([view.clone()], [seen], [layers], [paint])
+        alone = replace(paint, nearest=np.full_like(paint.nearest, -1))
+        (out,) = fill_holes([view.clone()], [seen], [layers], [alone])
         assert (out[:, ~seen] == round(float(top))).all() and torch.equal(out[:, seen], view[:, seen])
         of_float, paint, _ = painted(top_seen, 1 / 255)
-        (out,) = fill_holes([of_float], [seen], [layers], [paint])
+        (out,) = fill_holes([of_float], [seen], [layers], [alone])
         torch.testing.assert_close(out[:, ~seen], torch.full_like(out[:, ~seen], float(top) / 255))
+
+
+def test_tops_go_on_from_the_seen_pixels_of_their_body() -> None:
+    view, paint, seen = painted(top_seen=False)
+    (out,) = fill_holes([view.clone()], [seen], [np.full(seen.shape, OBJECT, np.uint8)], [paint])
+    column = out[0, 10:20, 50].float()  # the side below it is 100
+    assert (column.diff() < 0).all() and column[-1] < 103 and abs(column[0] - (in_light(100) + 1.6 * 100) / 2.6) < 1
 
 
 def test_roofs_of_another_colour_than_the_body_take_that_of_their_rims() -> None:
