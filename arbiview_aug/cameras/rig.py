@@ -15,7 +15,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -290,7 +290,8 @@ def load_rig(name_or_path: Rig | str | Path) -> Rig:
         got = type(name_or_path).__name__
         raise CalibrationError(f"rig: expected a shipped rig's name or the path of a rig file, got {got}")
     if isinstance(name_or_path, str) and name_or_path in shipped_rigs():
-        return _shipped_rig(name_or_path)
+        text = (resources.files("arbiview_aug.cameras") / "rigs" / f"{name_or_path}.yaml").read_text()
+        return Rig.from_dict(parse_yaml(text), where=f"rig {name_or_path}")
     path = Path(name_or_path)
     where = f"rig file {path}"
     if not (os.path.isfile(path) or os.path.isdir(path)):  # unlike Path.is_file, False for a name that is too long
@@ -300,13 +301,6 @@ def load_rig(name_or_path: Rig | str | Path) -> Rig:
     from arbiview_aug.cameras.formats.calibration import read_calibration
 
     return Rig.from_dict(read_calibration(path, where), folder=path.parent, where=where)
-
-
-@cache
-def _shipped_rig(name: str) -> Rig:
-    """Read once: YAML takes 20 ms a rig, and rigs cannot be changed."""
-    text = (resources.files("arbiview_aug.cameras") / "rigs" / f"{name}.yaml").read_text()
-    return Rig.from_dict(parse_yaml(text), where=f"rig {name}")
 
 
 def save_rig(

@@ -152,9 +152,7 @@ def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.
         rig = old[k]["rig"]
         depths.write(token, rig, MotionDepth(tuple(np.full(c.size, 6.0 + k, np.float32) for c in rig), "made"))
     assert main(asked) == 0
-    retarget = RigRetarget(
-        TARGET, size=(24, 40), geometry="motion", keys=SampleKeys(extra=("confidence",))
-    )
+    retarget = RigRetarget(TARGET, size=(24, 40), geometry="motion", keys=SampleKeys(extra=("confidence",)))
     static = RigRetarget(TARGET, size=(24, 40), geometry="street")
     new, samples = FrameFolder(tmp_path / "new"), WithDepth(old, depths.root)
     for k in range(len(old)):
