@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import itertools
 import json
@@ -12,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +107,11 @@ def same(one: Any, two: Any) -> bool:
 
 def street_sample(size: tuple[int, int] = (64, 176), **settings: Any) -> dict[str, Any]:
     """One frame of the demo rig on a synthetic street; settings are those of ``SyntheticDrive``."""
+    return copy.deepcopy(_street(size, **settings))
+
+
+@cache
+def _street(size: tuple[int, int], **settings: Any) -> dict[str, Any]:
     return SyntheticDrive(demo_source_rig(size), num_frames=1, **settings)[0]
 
 

@@ -90,6 +90,7 @@ SLOW = (
     "depth --model",
     "evaluate --data FOLDER --target waymo --geometry learned",
     "evaluate --data FOLDER --target-set",
+    "evaluate --lidar",
     "view",
 )
 ALIKE = ("bench --data FOLDER --budget-ms 200", "bench speed")

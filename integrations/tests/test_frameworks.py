@@ -43,8 +43,17 @@ def test_every_folder_has_readme_example_and_tests() -> None:
         assert (folder / "example.py").is_file() and list((folder / "tests").glob("test_*.py"))
 
 
-def test_frameworks_are_imported_where_they_are_used() -> None:
-    """Neither the package nor an adapter imports them; a missing one is one line with the command to install it."""
+def test_frameworks_are_imported_where_they_are_used(tmp_path: Path) -> None:
+    """Neither the package nor an adapter imports them; a missing one is one line with the command to install it.
+
+    Importing the adapter of mmdet3d registers the step, as ``custom_imports`` does, where mmengine is installed.
+    """
+    registry = tmp_path / "mmengine" / "registry.py"
+    registry.parent.mkdir()
+    (registry.parent / "__init__.py").write_text("")
+    registry.write_text(
+        "class TRANSFORMS:\n    def register_module(name, force, module): print(name, module.__module__)\n"
+    )
     code = (
         "import sys, arbiview_aug\n"
         "from arbiview_aug.integrations import kornia, lightning, mmdet3d, nuscenes, webdataset\n"
@@ -53,12 +62,15 @@ def test_frameworks_are_imported_where_they_are_used() -> None:
         "for use in (lambda: lightning.RetargetDataModule, lambda: webdataset.stream('no.tar', dict)):\n"
         "    try: use()\n"
         "    except ImportError as error: print(error)\n"
+        "mmdet3d.RigRetargetMultiView, mmdet3d.register\n"
+        "import importlib; sys.path.insert(0, sys.argv[1]); importlib.reload(mmdet3d)\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=500, check=True
+        [sys.executable, "-c", code, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=500, check=True
     )
     hints = [f"{name} is not installed: pip install {name}" for name in ("lightning", "webdataset")]
-    assert done.stdout.splitlines() == ["[]", *hints]
+    registered = "RigRetargetMultiView arbiview_aug.integrations.mmdet3d.transform"
+    assert done.stdout.splitlines() == ["[]", *hints, registered]
 
 
 @pytest.mark.slow
@@ -68,22 +80,6 @@ def test_examples_check_their_framework_first(name: str) -> None:
     command = [sys.executable, "-c", code, f"integrations.{name}.example"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=500)
     assert (done.returncode, done.stderr) == (1, f"{name} is not installed: pip install {name}\n")
-
-
-def test_importing_the_mmdet3d_adapter_registers_the_step(tmp_path: Path) -> None:
-    """As ``custom_imports`` does; without mmengine nothing is registered, and the import works."""
-    registry = tmp_path / "mmengine" / "registry.py"
-    registry.parent.mkdir()
-    (registry.parent / "__init__.py").write_text("")
-    registry.write_text(
-        "class TRANSFORMS:\n    def register_module(name, force, module): print(name, module.__module__)\n"
-    )
-    code = "import arbiview_aug.integrations.mmdet3d as m; m.RigRetargetMultiView, m.register"
-    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=500, check=True
-    )
-    assert done.stdout.split() == ["RigRetargetMultiView", "arbiview_aug.integrations.mmdet3d.transform"]
 
 
 @pytest.mark.integrations

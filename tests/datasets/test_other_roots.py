@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 from arbiview_aug import RetargetedDataset, Rig, RigRetarget, collate, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import Neighbours, NuScenesDataset, open_data
-from tests.cli.convert.drives import SIZE, SURROUND, command
+from tests.cli.convert.drives import SIZE, SURROUND, TARGET_FILE, command
 from tests.datasets.nuscenes_root import CHANNELS, streets, tables_of, write_root
 
 NAMES = ("CAM_BUMPER_FRONT", *(f"CAM_FENDER_{end}" for end in ("FRONT_LEFT", "FRONT_RIGHT", "L", "R")), "CAM_TAILGATE")
@@ -48,7 +48,7 @@ def test_one_vehicles_data_becomes_anothers(vehicles: tuple[Path, Path], tmp_pat
     (batch,) = DataLoader(RetargetedDataset(open_data(tall), retarget), batch_size=2, collate_fn=collate)
     assert batch["images"].shape == (2, 6, 3, *SIZE)
     converting = command(tall, tmp_path / "new", "--images", "png")
-    converting[converting.index("argoverse2")] = str(tmp_path / "small.yaml")
+    converting[converting.index(str(TARGET_FILE))] = str(tmp_path / "small.yaml")
     del converting[converting.index("--size") : converting.index("--size") + 2]
     assert main(converting) == 0 and main([*converting, "--verify"]) == 0
     converted, truth = NuScenesDataset(tmp_path / "new"), NuScenesDataset(small, compensate_ego_motion=False)

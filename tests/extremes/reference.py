@@ -6,6 +6,7 @@ by bisection or by OpenCV, boxes are met one by one.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -47,22 +48,27 @@ def wide_radius(camera: Camera, theta: np.ndarray) -> np.ndarray:
     if camera.lens.startswith("ftheta"):
         k2, k3, k4, k5 = camera.distortion
 
-        def polynomial(t: np.ndarray) -> np.ndarray:
-            return t + k2 * t**2 + k3 * t**3 + k4 * t**4 + k5 * t**5
-
         if camera.lens == "ftheta":
-            return polynomial(theta)
-        scan = np.linspace(0, 20, 2_000_001)
-        angles = polynomial(scan)
-        flat = np.flatnonzero(np.diff(angles) < 0.1 * (scan[1] - scan[0]))
-        end = flat[0] if len(flat) else len(scan)
-        return np.interp(theta, angles[:end], scan[:end], right=np.nan)
+            return theta + k2 * theta**2 + k3 * theta**3 + k4 * theta**4 + k5 * theta**5
+        return np.interp(theta, *backward_table(camera.distortion), right=np.nan)
     xi, alpha, beta = (*camera.distortion, 1.0) if camera.lens == "double_sphere" else (0.0, *camera.distortion)
     moved = xi + np.cos(theta)
     divisor = alpha * np.sqrt(beta * np.sin(theta) ** 2 + moved**2) + (1 - alpha) * moved
     return np.where(divisor > 0, np.sin(theta) / divisor, np.nan)
 
 
+@lru_cache(maxsize=16)
+def backward_table(distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Angles and radii of ``ftheta_backward``, scanned as far as the angle rises."""
+    k2, k3, k4, k5 = distortion
+    scan = np.linspace(0, 20, 2_000_001)
+    angles = scan + k2 * scan**2 + k3 * scan**3 + k4 * scan**4 + k5 * scan**5
+    flat = np.flatnonzero(np.diff(angles) < 0.1 * (scan[1] - scan[0]))
+    end = flat[0] if len(flat) else len(scan)
+    return angles[:end], scan[:end]
+
+
+@lru_cache(maxsize=16)
 def fold(camera: Camera) -> float:
     """The point at which the lens's radius stops rising, scanned: an angle for wide lenses, its tangent for radtan."""
     if camera.lens in WIDE:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug import Rig
+from arbiview_aug import Rig, load_rig
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from tests.datasets.nuscenes_root import Tables, streets, tables_of, write_root
 from tests.helpers import write_drive
@@ -18,6 +18,9 @@ from tests.helpers import write_drive
 SIZE = (32, 56)
 FRAMES = Rig(demo_source_rig(SIZE).cameras[:2], ground_z_m=-0.1, name="two")
 SURROUND = demo_source_rig(SIZE)
+TARGET_FILE = Path(__file__).with_name("small.json")
+"""Three cameras of argoverse2 and its scanners, with few beams and columns."""
+TARGET = load_rig(TARGET_FILE)
 SAME_FOR_ALL = ("report.html",)
 """Files that tell where they are: all others are the same bytes wherever they are written."""
 
@@ -77,7 +80,7 @@ def tree(root: Path) -> dict[str, bytes]:
 def command(source: str | Path, output: Path, *more: str) -> list[str]:
     """Arguments of ``main``, in one process without a report."""
     fixed = ["--size", "24x40", "--geometry", "street", "--workers", "1", "--report", "0"]
-    return ["convert", "--data", str(source), "--target", "argoverse2", "--output", str(output), *fixed, *more]
+    return ["convert", "--data", str(source), "--target", str(TARGET_FILE), "--output", str(output), *fixed, *more]
 
 
 def chained(rows: list[dict[str, Any]]) -> bool:

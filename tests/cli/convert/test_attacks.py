@@ -22,7 +22,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from torch.utils.data import DataLoader
 
-from arbiview_aug import RigRetarget, load_rig
+from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.convert import job, ray_runner
 from arbiview_aug.cli.convert.job import Jobs
@@ -30,7 +30,7 @@ from arbiview_aug.cli.convert.ray_runner import Actor
 from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.datasets import FrameFolder, NuScenesDataset, RetargetedDataset
 from arbiview_aug.errors import DataError
-from tests.cli.convert.drives import command, tree, write_frames, write_nuscenes
+from tests.cli.convert.drives import TARGET, command, tree, write_frames, write_nuscenes
 
 VICTIM = "years of work"
 
@@ -166,7 +166,7 @@ def test_frame_folders_refuse_names(key: str, name: Any, frames: Home) -> None:
     shutil.copy(original, frames.root / "in" / "secret.png")  # it could be read
     frames.calibrate(key, name.format(root=frames.root) if isinstance(name, str) else name)
     data = FrameFolder(frames.source)
-    wrapped = RetargetedDataset(data, RigRetarget(load_rig("argoverse2"), size=(24, 40), geometry="street"))
+    wrapped = RetargetedDataset(data, RigRetarget(TARGET, size=(24, 40), geometry="street"))
     assert {"points", "images"} < set(data[0])
     for of in (data, wrapped):
         with pytest.raises(ValueError, match=r"0001.*: expected") as caught:
@@ -198,7 +198,7 @@ def test_a_frame_shares_files_of_frames_beside_it(frames: Home) -> None:
 
 @pytest.mark.parametrize("name", ["..", "x" * 300])
 def test_cameras_whose_names_are_no_folders(name: str, tables: Home) -> None:
-    rig = load_rig("argoverse2").to_dict()
+    rig = TARGET.to_dict()
     rig["cameras"][0]["name"] = name
     (tables.root / "rig.json").write_text(json.dumps(rig))
     assert tables.convert("--target", str(tables.root / "rig.json")) == 2
@@ -335,7 +335,7 @@ def test_an_interrupt_is_no_samples_fault(frames: Home, monkeypatch: pytest.Monk
 def test_errors_that_nobody_expects_in_ray_actors(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     """An actor's work: Ray itself is started by the slow test."""
 
-    asked = Settings(root=frames.source, target=load_rig("argoverse2"), output=frames.output, size=(24, 40))
+    asked = Settings(root=frames.source, target=TARGET, output=frames.output, size=(24, 40))
     monkeypatch.setattr(FrameFolder, "__getitem__", lambda *_: raises(ZeroDivisionError("of \ud800")))
     monkeypatch.setattr(ray_runner, "optional_package", lambda *_: SimpleNamespace(get_gpu_ids=list))
     row = Actor(Jobs(asked, asked.open(), range(3), "skip"))({"id": 1})

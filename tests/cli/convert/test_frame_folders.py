@@ -22,7 +22,7 @@ from arbiview_aug.datasets import FrameFolder, WithDepth
 from arbiview_aug.datasets.depth_folder import DepthFolder
 from arbiview_aug.errors import DataError
 from arbiview_aug.temporal.motion_depth import MotionDepth
-from tests.cli.convert.drives import SIZE, command, tree, write_frames
+from tests.cli.convert.drives import SIZE, TARGET, command, tree, write_frames
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def test_fits_and_bars(source: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     for fit in ("pad", "stretch"):
         assert main(command(source, tmp_path / fit, "--images", "png", "--fit", fit)) == 0
         after = FrameFolder(tmp_path / fit)[0]
-        expected = load_rig("argoverse2").resized((24, 40), fit).in_frame_of(before["rig"])
+        expected = TARGET.resized((24, 40), fit).in_frame_of(before["rig"])
         assert np.allclose(after["rig"].K, expected.K) and after["rig"][0].size == (24, 40)
         if fit == "pad":
             for camera, image, wanted in zip(after["rig"], after["images"], expected, strict=True):
@@ -152,10 +152,8 @@ def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.
         rig = old[k]["rig"]
         depths.write(token, rig, MotionDepth(tuple(np.full(c.size, 6.0 + k, np.float32) for c in rig), "made"))
     assert main(asked) == 0
-    retarget = RigRetarget(
-        load_rig("argoverse2"), size=(24, 40), geometry="motion", keys=SampleKeys(extra=("confidence",))
-    )
-    static = RigRetarget(load_rig("argoverse2"), size=(24, 40), geometry="street")
+    retarget = RigRetarget(TARGET, size=(24, 40), geometry="motion", keys=SampleKeys(extra=("confidence",)))
+    static = RigRetarget(TARGET, size=(24, 40), geometry="street")
     new, samples = FrameFolder(tmp_path / "new"), WithDepth(old, depths.root)
     for k in range(len(old)):
         assert torch.equal(new[k]["images"], retarget(samples[k])["images"])

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, Rig, RigRetarget, load_rig
+from arbiview_aug import Camera, Rig, RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.convert.nuscenes_rows import level, token_of, view_stem, visible_shares
 from arbiview_aug.datasets import NuScenesDataset
-from tests.cli.convert.drives import SURROUND, chained, command, read_tables, tree, write_nuscenes
+from tests.cli.convert.drives import SURROUND, TARGET, chained, command, read_tables, tree, write_nuscenes
 
 LEFT_OUT = "goes-sample-1"
 
@@ -34,9 +34,9 @@ def output(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
     old, new = NuScenesDataset(source), NuScenesDataset(output)
-    assert new.tokens == old.tokens and new.channels == sorted(load_rig("argoverse2").names)
-    retarget = RigRetarget(load_rig("argoverse2"), size=(24, 40), geometry="street")
-    order = [load_rig("argoverse2").names.index(channel) for channel in new.channels]
+    assert new.tokens == old.tokens and new.channels == sorted(TARGET.names)
+    retarget = RigRetarget(TARGET, size=(24, 40), geometry="street")
+    order = [TARGET.names.index(channel) for channel in new.channels]
     for index in (0, 4):
         before, after = old[index], new[index]
         out = retarget(before)
@@ -90,13 +90,13 @@ def test_new_cameras_record_when_the_lidar_did(output: Path) -> None:
 
 def test_scans_are_the_targets(source: Path, output: Path) -> None:
     """One file for both scanners at each keyframe, in the first one's frame; no sweeps of the source's."""
-    tables, first = read_tables(output), load_rig("argoverse2").in_frame_of(SURROUND).lidars[0]
+    tables, first = read_tables(output), TARGET.in_frame_of(SURROUND).lidars[0]
     (sensor,) = (row["token"] for row in tables["sensor"] if row["channel"] == "LIDAR_TOP")
     (calibrated,) = (row for row in tables["calibrated_sensor"] if row["sensor_token"] == sensor)
     assert np.allclose(calibrated["translation"], first.center_m) and calibrated["camera_intrinsic"] == []
     rows = [row for row in tables["sample_data"] if row["calibrated_sensor_token"] == calibrated["token"]]
     assert len(rows) == 6 and all(row["is_key_frame"] for row in rows) and not (output / "sweeps/LIDAR_TOP").exists()
-    retarget, data = RigRetarget("argoverse2", geometry="street"), NuScenesDataset(source)
+    retarget, data = RigRetarget(TARGET, geometry="street"), NuScenesDataset(source)
     counts = {row["token"]: row["num_lidar_pts"] for row in tables["sample_annotation"]}
     for sample in (data[0], data[4]):
         expected = retarget(sample)["num_points"].tolist()
@@ -128,7 +128,7 @@ def test_other_sensors_are_linked(source: Path, output: Path, tmp_path: Path) ->
 
 def test_scans_without_a_return(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """No file of no bytes, which readers take for a truncated one."""
-    rig = load_rig("argoverse2")
+    rig = TARGET
     replace(rig, lidars=[replace(rig.lidars[0], range_m=(0.1, 0.2))]).save(tmp_path / "blind.json")
     assert main(command(source, tmp_path / "new", "--target", str(tmp_path / "blind.json"))) == 1
     assert "expected returns of the target's scanners, got none; --points source" in capsys.readouterr().err
@@ -249,7 +249,7 @@ def test_lenses_are_refused_by_name(source: Path, tmp_path: Path, capsys: pytest
 
 
 def test_names_of_other_sensors_are_refused(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig = load_rig("argoverse2").to_dict()
+    rig = TARGET.to_dict()
     rig["cameras"][0]["name"] = "LIDAR_TOP"
     (tmp_path / "rig.json").write_text(json.dumps(rig))
     assert main(command(source, tmp_path / "new", "--target", str(tmp_path / "rig.json"))) == 2
