@@ -135,9 +135,9 @@ class Lidar:
         local = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), up])
         return np.tensordot(self.lidar2ego[:3, :3], local, 1).astype(np.float32)
 
-    def moved(self, ego2ego: FloatArray) -> Lidar:
-        """The same scanner in another ego frame."""
-        return replace(self, lidar2ego=ego2ego @ self.lidar2ego)
+    def moved(self, ego2ego: Any) -> Lidar:
+        """The same scanner in another ego frame: ``lidar2ego`` becomes ``ego2ego @ lidar2ego``."""
+        return replace(self, lidar2ego=checked_pose(self.name, ego2ego, "ego2ego") @ self.lidar2ego)
 
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Lidar:
         """Moved along the ego's axes."""

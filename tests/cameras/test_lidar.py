@@ -75,6 +75,8 @@ def test_rigs_carry_scanners() -> None:
 def test_rigs_with_scanners_are_moved_by_numbers() -> None:
     with pytest.raises(CalibrationError, match="shift: expected finite"):
         replace(ring(1), lidars=[scanner()]).shifted("a")  # type: ignore[arg-type]
+    with pytest.raises(CalibrationError, match="ego2ego: expected shape"):
+        scanner().moved(np.eye(3))
 
 
 def test_rigs_refuse_scanners() -> None:
