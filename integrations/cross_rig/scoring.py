@@ -121,7 +121,7 @@ def iou_scores(counts: Mapping[str, Counts], drives: Sequence[int] | None = None
     return _scores(values, seeds, bootstrap_ious(counts, drives))
 
 
-def matches_for_json(matched: Floats) -> list[Any]:
+def matches_for_json(matched: npt.NDArray[np.floating]) -> list[Any]:
     """``boxes.match`` without NaN, which JSON has not: -1 does not count. ``matches_of`` reads it."""
     return list(np.nan_to_num(np.round(matched, 4), nan=-1).tolist())
 

@@ -18,6 +18,7 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli import evaluate as command
 from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import retargeting
@@ -196,8 +197,10 @@ def test_a_method_that_declines_a_frame_is_in_no_table(
 
 def test_rows_do_not_depend_on_other_rows(tmp_path: Path) -> None:
     """Motion needs neighbours, which must not fill the holes of other rows."""
-    chosen = (["street"], ["street", "motion"])
-    alone, beside = (run(["--size", "48x132", "--geometry", *names], tmp_path)["means"] for names in chosen)
+    target = tmp_path / "down.yaml"
+    demo_source_rig((48, 132)).turned(pitch_deg=-12).shifted(z_m=0.6).save(target)
+    given, chosen = ["--size", "48x132", "--target", str(target), "--geometry"], (["street"], ["street", "motion"])
+    alone, beside = (run([*given, *names], tmp_path)["means"] for names in chosen)
     assert list(beside) == ["fast, street", "fast, motion"] and beside["fast, street"] == alone["fast, street"]
 
 
