@@ -148,7 +148,7 @@ def _views(setup: Run, detector: Trained, change: str, variant: Variant, split: 
         # With the number of frames: those that fill the last chunk have the last one's boxes.
         "detections": [detector.key, LEAST_SCORE, count] if "boxes_3d" in variant.reads else None,
         "noise": code_hash("integrations.cross_rig.noise") if "depth_m" in variant.reads else None,
-        **_rendering_code(),
+        "code": _rendering_code(),
     }
     rendered = FrameStore(store.folder.parent, spec)
     for chunk in rendered.missing(count):
@@ -156,11 +156,9 @@ def _views(setup: Run, detector: Trained, change: str, variant: Variant, split: 
     return rendered
 
 
-def _rendering_code() -> dict[str, str]:
-    return {
-        "renderer": code_hash("arbiview_aug.transforms.rig_retarget"),
-        "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.variant",)),
-    }
+def _rendering_code() -> list[str]:
+    views = code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.variant",))
+    return [code_hash("arbiview_aug.transforms.rig_retarget"), views]
 
 
 @lru_cache(maxsize=2)
@@ -200,7 +198,7 @@ def _tests(setup: Run, job: Job) -> Iterator[tuple[str | None, str, Way, Path]]:
             "counts": [s.val_frames, s.test_frames],
             "noise": code_hash("integrations.cross_rig.noise"),
             "jitter": code_hash("arbiview_aug.transforms.jitter"),
-            **_rendering_code(),
+            "code": _rendering_code(),
         }
         for title, way in rows_of(setup, change).items():
             key = content_hash({**spec, "row": [asdict(way), LEAST_SCORE]})

@@ -112,6 +112,7 @@ def test_frames_of_longer_runs_have_their_own_boxes(tmp_path, monkeypatch):
         variant = ON_B["two passes"].variant
         views = deploy._views(setup, Trained(None, "weights", None), "up70", variant, "test")
         assert views.stacked("boxes", count)[:, 0, 0].tolist() == list(range(count))
+        assert views.spec["views"] == variant.views_spec()
 
 
 def test_command_takes_rows(capsys, tmp_path):
