@@ -64,10 +64,11 @@ def run(arguments: argparse.Namespace) -> None:
     assert done.first is not None
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
     names = [method.name for method in methods]
-    judged = {name: numbers(row) for name, row in panel.rows(names, list(done.targets)).items()}
     scored = evaluation_tables(done, names)
+    whole = [name for name in names if name not in done.declined]  # the others were judged on fewer frames
+    judged = {name: numbers(row) for name, row in panel.rows(whole, list(done.targets)).items()}
     tables = scored + judge_tables(judged)
-    notes.extend(panel.notes(names, arguments.detector_classes))
+    notes.extend(panel.notes(whole, arguments.detector_classes))
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
     title = f"{source}: {frames_text(len({view['frame'] for view in done.views}))}"
     settings = {key: value for key, value in vars(arguments).items() if key != "displaced"}
@@ -171,7 +172,9 @@ def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
     methods = []
     for quality, geometry, holes in product(arguments.quality, arguments.geometry, arguments.holes):
         extra = () if quality == "paper" else ("confidence",)
-        make = partial(retargeting, quality, geometry, keys=SampleKeys(extra=extra), **settings)
+        # Neighbours are opened for motion: where some row asks for it, the others must not read them.
+        reads = settings if GEOMETRIES[geometry].needs == "motion" else {"neighbours": None}
+        make = partial(retargeting, quality, geometry, keys=SampleKeys(extra=extra), **reads)
         if holes == "diffusion":
             methods += [make(holes=load_inpainter(arguments.generator, steps=steps)) for steps in arguments.steps]
         else:

@@ -7,6 +7,7 @@ are scored on the others.
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -84,7 +85,7 @@ def make_frame(
     """Split a sample into the part that methods get and the references.
 
     ``truth`` renders the true views of a rig; the last ones are cached. Without ``exposures`` points do not score. With
-    ``hand_over_points`` methods get the points of the sectors that do not score.
+    ``hand_over_points`` methods get the points of the sectors that do not score, and none of neighbours.
     """
     truth = None if truth is None else lru_cache(_CACHED_TRUTHS)(truth)
     inputs = {key: value for key, value in sample.items() if key != "points"}
@@ -93,6 +94,8 @@ def make_frame(
         return ScoredFrame(dict(sample) if hand_over_points else inputs, truth=truth, points=points_3d)
     rig, images = sample["rig"], as_arrays(sample["images"])
     cloud = points_3d.numpy().astype(np.float64)
+    if inputs.get("neighbours"):  # their points lie in the sectors that score, too; their images stay unread
+        inputs["neighbours"] = [ChainMap({"points": None}, frame) for frame in inputs["neighbours"]]
     if hand_over_points:
         inputs["points"] = points_3d[torch.from_numpy(lidar_split(cloud)[0])]
     lidar: dict[Exposure, LidarReference] = {}
@@ -228,5 +231,5 @@ def evaluate(
                     pairs = target_consistency(rig, views) if agreement else []
                     done.pairs += [{**row, "kind": "consistency", **pair._asdict()} for pair in pairs]
             except (CalibrationError, SampleError) as error:  # lenses, for a method of pinhole cameras
-                done.declined[method.name] = str(error)
+                done.declined[method.name] = f"frame {name}: {error}"
     return done

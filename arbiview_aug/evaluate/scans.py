@@ -52,7 +52,8 @@ def returns_of(lidar: Lidar, points: FloatArray) -> Returns:
     """
     beams, columns = lidar.shape
     elevation, azimuth, distance = _polar(lidar, points)
-    column = np.rint((azimuth - lidar.azimuth_deg[0]) % 360 / lidar.azimuth_step_deg).astype(int)
+    half = lidar.azimuth_step_deg / 2  # added before the turn: what lies just before the first column is its
+    column = np.floor((azimuth - lidar.azimuth_deg[0] + half) % 360 / lidar.azimuth_step_deg).astype(int)
     if columns * lidar.azimuth_step_deg > 360 - lidar.azimuth_step_deg:  # all around
         column %= columns
     order = np.argsort(lidar.elevations_deg)

@@ -158,7 +158,7 @@ class Panel:
         verdict, there = replace(verdict, detections=seen), [] if verdict.labels is None else [verdict.labels.boxes]
         if true is not None and true.detections is not None:
             seen = valid_detections(seen, true.valid)
-            there.append(true.detections.boxes)
+            there.append(true.detections.boxes[true.detections.scores >= CONFIDENCE])
             verdict = replace(verdict, true=valid_detections(true.detections, true.valid), scored=seen)
         if generated is None or not there:
             return verdict

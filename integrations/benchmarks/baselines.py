@@ -15,6 +15,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.displaced import own_index
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors, to_bytes
+from arbiview_aug.evaluate.methods import Method, Sample
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.view_planner import build_plan
 
@@ -116,3 +117,13 @@ def _split_points(K: FloatArray, cam2ego: FloatArray, size: tuple[int, int], gro
 
 
 BASELINES: dict[str, Renderer] = {"own camera": own_camera, "crop and slide": crop_and_slide, "row split": row_split}
+
+
+def method_of(name: str, renderer: Renderer) -> Method:
+    """Wrap a renderer as a method."""
+
+    def render(sample: Sample, target: Rig) -> list[RenderedView]:
+        rig: Rig = sample["rig"]
+        return renderer(rig, as_arrays(sample["images"]), target.in_frame_of(rig))
+
+    return Method(name, render)

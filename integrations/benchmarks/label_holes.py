@@ -27,6 +27,7 @@ from arbiview_aug.cli.arguments import add_output, command_parser, count, size, 
 from arbiview_aug.cli.bench.timing import benchmark, machine_line, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.datasets.synthetic.dataset import RenderedViews
+from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.sample.boxes_2d import project_boxes_3d
 
 Bools = npt.NDArray[np.bool_]
@@ -189,10 +190,6 @@ def probe(streets: Sequence[Street], views: Sequence[npt.NDArray[np.uint8]], see
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
-def _psnr_db(square: Floats) -> float:
-    return float(10 * np.log10(255**2 / max(float(square.mean()), 1e-9)))
-
-
 def figures(streets: Sequence[Street], surface: str, seed: int) -> dict[str, float]:
     """All columns of one surface over one target's streets."""
     retarget = RigRetarget(streets[0].rig, geometry=surface, neighbours=None)
@@ -212,7 +209,7 @@ def figures(streets: Sequence[Street], surface: str, seed: int) -> dict[str, flo
             for mask in (holes & street.holes, holes & ~street.holes, ~holes & street.holes, hidden, hidden & ~holes)
         ]
         square = np.square(image.astype(np.float32) - street.images).mean(-1)
-        errors.append([_psnr_db(square), _psnr_db(square[street.holes]), _psnr_db(square[~holes])])
+        errors.append([psnr_db(float(part.mean())) for part in (square, square[street.holes], square[~holes])])
     hit, wrong, missed, hidden_px, hidden_covered = found
     retargeted, true = probe(streets, views, seed)
     return {

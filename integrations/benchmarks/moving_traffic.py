@@ -23,6 +23,7 @@ from arbiview_aug.cli.arguments import add_output, command_parser, count, size, 
 from arbiview_aug.cli.bench.timing import benchmark, machine_line, show
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.sample.inputs import MOTION_KEY, read_frames
 from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.scene.depth_map import motion_camera
@@ -95,20 +96,16 @@ def synthetic_rows(drive: SyntheticDrive) -> dict[str, dict[str, float]]:
                     for shown in objects_seen(instances, true_m, rows):
                         around = cv2.dilate(shown.astype(np.uint8), np.ones((2 * AROUND_PX + 1,) * 2)) > 0
                         elsewhere[k] &= ~around
-                        levels[name].append([_decibels(square[k][around].mean())])
+                        levels[name].append([psnr_db(square[k][around].mean())])
                 still[name].append(square[elsewhere].mean())
     table = {
         f"distances, {part}": dict(zip(("known", "right"), np.mean(rows_of_part, axis=0).tolist(), strict=True))
         for part, rows_of_part in distances.items()
     }
     return table | {
-        name: {"around_moving_db": float(np.mean(levels[name])), "elsewhere_db": _decibels(float(np.mean(still[name])))}
+        name: {"around_moving_db": float(np.mean(levels[name])), "elsewhere_db": psnr_db(float(np.mean(still[name])))}
         for name in levels
     }
-
-
-def _decibels(square: float) -> float:
-    return float(10 * np.log10(255**2 / square))
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

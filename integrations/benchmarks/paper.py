@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import product
+from itertools import product, starmap
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import CalibrationError, DataError, SampleError, exit_status
 from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scores
-from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays
+from arbiview_aug.evaluate.images import Image, as_arrays
 from arbiview_aug.evaluate.methods import Method, Sample, retargeting
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.pictures import contact_sheet, left_to_right, save_picture
@@ -46,7 +46,7 @@ from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.generator import Diffusion, load_inpainter
 from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.inpaint.inpainter import Inpainter
-from integrations.benchmarks.baselines import BASELINES, Renderer
+from integrations.benchmarks.baselines import BASELINES, crop_and_slide, method_of, own_camera
 
 PROGRAM = "python -m integrations.benchmarks.paper"
 
@@ -263,8 +263,8 @@ FIGURES: dict[int, tuple[float, ...]] = {2: (0.5, -0.25), 3: (0.2,), 4: (-0.2,),
 def figure_methods(generator: Inpainter | None = None) -> dict[str, Method]:
     """The paper's rows and ours, by caption."""
     methods = {
-        "DriveSuprim: crop and slide": baseline("crop and slide"),
-        "geometric: own camera, no fusion": baseline("own camera"),
+        "DriveSuprim: crop and slide": method_of("crop and slide", crop_and_slide),
+        "geometric: own camera, no fusion": method_of("own camera", own_camera),
         "FAVS as published": retargeting("paper"),
         "fast, street": retargeting("fast", "street"),
     }
@@ -295,18 +295,6 @@ def draw_figures(sample: Mapping[str, Any], folder: Path, generator: Inpainter |
 
 
 # --- methods ----------------------------------------------------------------------------------------------------------
-def baseline(name: str) -> Method:
-    """Wrap one of ``baselines.BASELINES`` as a method."""
-    renderer: Renderer = BASELINES[name]
-
-    def render(sample: Sample, target: Rig) -> list[RenderedView]:
-        rig: Rig = sample["rig"]
-        images: list[Image] = as_arrays(sample["images"])
-        return renderer(rig, images, target.in_frame_of(rig))
-
-    return Method(name, render)
-
-
 def paper_stages() -> dict[str, PaperConfig]:
     """``paper``, and with each stage switched off.
 
@@ -335,7 +323,7 @@ def study_methods(generator: Inpainter | None = None) -> list[Method]:
     """
     published = [retargeting(config, "auto", name) for name, config in paper_stages().items()]
     return [
-        *map(baseline, BASELINES),
+        *starmap(method_of, BASELINES.items()),
         *published,
         *(retargeting(quality, "street", quality) for quality in OURS),
         retargeting("fast", "street", INPAINTED, holes="telea"),

@@ -18,7 +18,7 @@ from arbiview_aug.cli.bench.data import Recorded
 from arbiview_aug.cli.bench.timing import quartiles, timed_rounds
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.frames import scores
-from arbiview_aug.evaluate.images import RenderedView, as_arrays
+from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import markdown_table
@@ -28,7 +28,7 @@ from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.view_planner import build_plan
-from integrations.benchmarks.baselines import Renderer, row_split
+from integrations.benchmarks.baselines import method_of, row_split
 from integrations.benchmarks.opencv_stitching import opencv_stitching
 
 YAW_DEG = 22.0
@@ -103,16 +103,9 @@ def rivals() -> list[Method]:
     return [
         retargeting("fast", "street", OURS),
         retargeting("accurate", "street", "accurate, street"),
-        _renderer(ROW_SPLIT, row_split),
-        _renderer(STITCHING, opencv_stitching),
+        method_of(ROW_SPLIT, row_split),
+        method_of(STITCHING, opencv_stitching),
     ]
-
-
-def _renderer(name: str, renderer: Renderer) -> Method:
-    def render(sample: Mapping[str, Any], target: Rig) -> Any:
-        return renderer(sample["rig"], as_arrays(sample["images"]), target.in_frame_of(sample["rig"]))
-
-    return Method(name, render)
 
 
 def every_move(data: Recorded, frames: int, reduce: Reduce, moves: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -36,7 +37,7 @@ def study(
         if asked for), ``ms`` of every repeated call, and ``plan_ms``, the additional milliseconds of the first call.
     """
     rows: dict[str, dict[str, list[Any]]] = {m.name: {key: [] for key in (*targets, "ms", "plan_ms")} for m in methods}
-    pairs: dict[str, list[OverlapScore]] = {method.name: [] for method in methods}
+    pairs: dict[tuple[str, str], list[OverlapScore]] = defaultdict(list)  # by method and set
     work = list(itertools.product(((kind, rig) for kind, rigs in targets.items() for rig in rigs), frames))
     with tqdm(total=len(work) * len(methods), desc=label, unit="row", leave=False) as progress:
         for (kind, target), frame in work:
@@ -47,10 +48,10 @@ def study(
                 row["ms"] += times[1:] or times
                 row["plan_ms"].append(times[0] - times[-1])
                 if consistency:
-                    pairs[method.name] += target_consistency(target, views)
+                    pairs[method.name, kind] += target_consistency(target, views)
                 progress.update()
     return {
-        name: row | {kind: mean_of(row[kind]) | summary("consistency", pairs[name]) for kind in targets}
+        name: row | {kind: mean_of(row[kind]) | summary("consistency", pairs[name, kind]) for kind in targets}
         for name, row in rows.items()
     }
 

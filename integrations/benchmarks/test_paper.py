@@ -17,12 +17,11 @@ from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.generator.config import TrainedOn
 from integrations.benchmarks import paper
-from integrations.benchmarks.baselines import BASELINES, row_split
+from integrations.benchmarks.baselines import BASELINES, method_of, row_split
 from integrations.benchmarks.paper import (
     PROTOCOL,
     PUBLISHED,
     Study,
-    baseline,
     main,
     measure_paper,
     paper_report,
@@ -34,7 +33,7 @@ from tests.helpers import street_sample
 
 
 def methods() -> list[Method]:
-    return [baseline("own camera"), retargeting("fast", "street", "fast")]
+    return [method_of("own camera", BASELINES["own camera"]), retargeting("fast", "street", "fast")]
 
 
 @pytest.fixture
@@ -119,7 +118,9 @@ def test_real_frames(nuscenes_root: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_lenses_are_told(fisheye_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paper, "SETS", ("truck",))
     monkeypatch.setattr(paper, "REDUCE", 4)
-    study = measure_paper(fisheye_root, methods=[baseline("row split"), retargeting("draft", "infinity", "draft")])
+    study = measure_paper(
+        fisheye_root, methods=[method_of("row split", row_split), retargeting("draft", "infinity", "draft")]
+    )
     assert list(study.means["surround-fisheye"]) == ["draft"]
     assert "expected pinhole cameras" in study.declined["surround-fisheye, row split"]
     assert "surround-fisheye, row split: row_split: expected pinhole cameras" in paper_report(study)
@@ -187,7 +188,7 @@ def test_baselines_take_targets_in_their_own_frame() -> None:
     sample = street_sample((48, 132))
     rig: Rig = sample["rig"]
     target = Rig([c.shifted(z_m=0.3) for c in rig], ground_z_m=rig.ground_z_m + 0.3)  # the same place over the road
-    views = baseline("row split").render(sample, target)
+    views = method_of("row split", row_split).render(sample, target)
     for view, want in zip(views, row_split(rig, as_arrays(sample["images"]), rig), strict=True):
         np.testing.assert_array_equal(view.image, want.image)
 

@@ -26,12 +26,17 @@ def test_a_row_is_one_method() -> None:
     rig = frame.sample["rig"]
     toy = Method("toy", grey)
     found = study(
-        [retargeting("fast", "infinity", "far"), toy], [frame], {"same": [rig], "turned": [rig.turned(yaw_deg=5)]}
+        [retargeting("fast", "infinity", "far"), toy],
+        [frame],
+        {"same": [rig], "turned": [rig.turned(yaw_deg=5)]},
+        consistency=True,
     )
     assert list(found) == ["far", "toy"]
     for row in found.values():
         assert len(row["ms"]) == len(row["plan_ms"]) == 2 and min(row["ms"]) >= 0
     assert found["far"]["same"]["true_psnr_db"] > 40 > found["toy"]["same"]["true_psnr_db"] > 3
+    agree = [found["far"][kind]["consistency_raw_psnr_db"] for kind in ("same", "turned")]
+    assert agree[0] != agree[1], "each set has its own pairs"
     rows = [{"name": name, **row["turned"]} for name, row in found.items()]
     printed = metric_table(rows, [("seen", "{seen:.0%}"), ("dB", "{true_psnr_db:.1f}"), ("never", "{unknown:.1f}")])
     assert printed.splitlines()[-1].startswith("| toy | 100% |") and printed.endswith("    - |")

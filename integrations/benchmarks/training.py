@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from arbiview_aug.cli.parsers import train
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.conditioning import FrameGeometry
@@ -84,7 +85,9 @@ def ablate(config: TrainConfig, frames: Frames, output: Path, *, views: int = 64
     Each variant gets a folder in ``output`` and is scored on ``views`` held-out views.
     """
     split = frames.split(config.seed)
-    indices = (split.held_out or split.validation or split.training)[:views]
+    indices = (split.held_out or split.validation)[:views]
+    if not indices:
+        raise DataError(f"{frames.name}: expected two scenes or more, one of them to score on; found one")
     table: dict[str, dict[str, Any]] = {}
     for variant, settings in VARIANTS.items():
         changed = overridden(config, settings)

@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
-from arbiview_aug.cli.arguments import device_named
+from arbiview_aug.cli.arguments import count, device_named, seed
 from arbiview_aug.errors import ArbiviewError
 from integrations.cross_rig.deploy import ON_A, ON_B, deploy
 from integrations.cross_rig.experiment import Run, run
@@ -28,8 +28,8 @@ PRESETS = {"quick": quick, "small": small, "pilot": pilot, "full": full, "large"
 def main(argv: Sequence[str] | None = None) -> int:
     """Make what is missing and write the report; killed, the same command goes on where it was."""
     arguments = _parser().parse_args(argv)
-    settings = _settings(arguments)
     try:
+        settings = _settings(arguments)
         if not arguments.list:
             device_named(settings.schedule.device)  # before hours of rendering
         setup = _run(arguments, settings)
@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         preset.add_argument(f"--{name}", dest="preset", action="store_const", const=name, help=settings.__doc__)
     parser.add_argument("--output", type=Path, default=Path("output/cross_rig"), metavar="DIR", help="(%(default)s)")
     parser.add_argument(
-        "--workers", type=int, default=os.cpu_count() or 1, metavar="N", help="processes of one thread (%(default)s)"
+        "--workers", type=count, default=os.cpu_count() or 1, metavar="N", help="processes of one thread (%(default)s)"
     )
     parser.add_argument("--list", action="store_true", help="only say which trainings are done")
     parser.add_argument(
@@ -100,15 +100,13 @@ def _parser() -> argparse.ArgumentParser:
     lengths = get_args(Length)
     change.add_argument("--schedules", nargs="+", choices=lengths, help=f"long: {LONGER} times the steps")
     change.add_argument("--families", nargs="+", choices=FAMILIES, metavar="FAMILY", help=", ".join(FAMILIES))
-    change.add_argument("--seeds", nargs="+", type=int, metavar="SEED")
-    change.add_argument("--streets", type=int, metavar="N", help="another world of streets: 200, 300, …")
+    change.add_argument("--seeds", nargs="+", type=seed, metavar="SEED")
+    change.add_argument("--streets", type=count, metavar="N", help="another world of streets: 200, 300, …")
     change.add_argument(
         "--two-wheelers", action="store_const", const=True, help="streets with bicycles and motorcycles in them"
     )
-    change.add_argument("--train-frames", type=int, metavar="N")
-    change.add_argument("--val-frames", type=int, metavar="N")
-    change.add_argument("--test-frames", type=int, metavar="N")
-    change.add_argument("--steps", type=int, metavar="N")
+    for option in ("--train-frames", "--val-frames", "--test-frames", "--steps"):
+        change.add_argument(option, type=count, metavar="N")
     change.add_argument("--precision", choices=("bf16", "fp32"))
     change.add_argument("--device", help="of the trainings, cpu or cuda")
     return parser
@@ -124,7 +122,11 @@ def _run(arguments: argparse.Namespace, settings: Settings) -> Run:
 
 def _settings(arguments: argparse.Namespace) -> Settings:
     settings = PRESETS[arguments.preset]()
-    settings = real(settings) if arguments.real else settings
+    if arguments.real:
+        settings = real(settings)
+        for name in ("deploy", "changes", "world", "streets", "two_wheelers"):
+            if getattr(arguments, name) is not None:
+                raise ValueError(f"--{name.replace('_', '-')} is for synthetic streets: leave it out with --real")
     names = (
         *("changes", "variants", "families", "schedules", "seeds", "streets", "two_wheelers", "world"),
         *("train_frames", "val_frames", "test_frames"),
@@ -132,6 +134,9 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     of_schedule = {n: getattr(arguments, n) for n in ("steps", "precision", "device") if getattr(arguments, n)}
+    for name in given.get("changes", ()):
+        if CHANGES[name].has_lens and arguments.deploy is None:
+            raise ValueError(f"changes: {name} has a lens, and the detectors read K alone: add --deploy")
     return replace(settings, schedule=replace(settings.schedule, **of_schedule), **given)
 
 

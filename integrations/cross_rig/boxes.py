@@ -77,10 +77,6 @@ def box_loss(answer: Tensor, boxes: Tensor, state: Tensor, counts: Tensor, grid:
     )
 
 
-def _there(boxes: Tensor) -> Tensor:
-    return boxes[..., 0].isfinite()
-
-
 def _cells(boxes: Tensor, grid: Grid) -> Tensor:
     """(..., 2) int64 cell of each centre; 0 of padding."""
     return ((boxes[..., :2].nan_to_num() + grid.side_m / 2) / grid.cell_m).long().clamp(0, grid.cells - 1)
@@ -171,6 +167,8 @@ def average_precision(matched: Floats, positives: Floats, weights: Floats) -> Fl
     for column in range(1, 1 + len(MATCH_M)):
         right = matched[..., column].ravel()[order]
         use = np.isfinite(right)
+        if not use.any():  # no detection counts
+            continue
         hits, of = right[use], frame[use]
         for r, weight in enumerate(weights):
             true = np.cumsum(weight[of] * hits)

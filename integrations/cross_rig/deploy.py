@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
@@ -127,6 +127,7 @@ def _views(setup: Run, detector: Trained, change: str, variant: Variant, split: 
     """B's frames as A's cameras would have seen them, made unless they are there."""
     source, a = setup.source(split, change), setup.source(split).rig
     store, drive, views = source.store(), source.drive(source.rig), ViewMaker(variant, source.rig, a)
+    count = setup.settings.count(split)
 
     def make(index: int) -> Arrays:
         frame: dict[str, Any] = {"images": torch.from_numpy(store.read(index, "images").copy())}
@@ -144,13 +145,20 @@ def _views(setup: Run, detector: Trained, change: str, variant: Variant, split: 
         "frames": store.spec,
         "target": a.content_key.hex(),
         "views": variant.views_spec(),
-        "detections": [detector.key, LEAST_SCORE] if "boxes_3d" in variant.reads else None,
-        "renderer": code_hash("arbiview_aug.transforms.rig_retarget"),
+        # With the number of frames: those that fill the last chunk have the last one's boxes.
+        "detections": [detector.key, LEAST_SCORE, count] if "boxes_3d" in variant.reads else None,
+        "noise": code_hash("integrations.cross_rig.noise") if "depth_m" in variant.reads else None,
+        "code": _rendering_code(),
     }
     rendered = FrameStore(store.folder.parent, spec)
-    for chunk in rendered.missing(setup.settings.count(split)):
+    for chunk in rendered.missing(count):
         fill(rendered, make, chunk)
     return rendered
+
+
+def _rendering_code() -> list[str]:
+    views = code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.variant",))
+    return [code_hash("arbiview_aug.transforms.rig_retarget"), views]
 
 
 @lru_cache(maxsize=2)
@@ -188,10 +196,12 @@ def _tests(setup: Run, job: Job) -> Iterator[tuple[str | None, str, Way, Path]]:
             "training": setup.training_key(job),
             "frames": setup.source("test", change).store().spec,
             "counts": [s.val_frames, s.test_frames],
-            "code": [code_hash(f"integrations.cross_rig.{name}") for name in ("views", "noise")],
+            "noise": code_hash("integrations.cross_rig.noise"),
+            "jitter": code_hash("arbiview_aug.transforms.jitter"),
+            "code": _rendering_code(),
         }
         for title, way in rows_of(setup, change).items():
-            key = content_hash({**spec, "row": title})
+            key = content_hash({**spec, "row": [asdict(way), LEAST_SCORE]})
             yield change, title, way, setup.output / "deploy" / f"{job.name}-{change or 'A'}-{key}.json"
 
 

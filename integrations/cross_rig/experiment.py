@@ -20,6 +20,7 @@ from torch import nn
 from integrations.cross_rig.cache import FrameStore, code_hash, content_hash
 from integrations.cross_rig.frames import Source, box_store, make_boxes, make_frames, one_thread
 from integrations.cross_rig.labels import Grid, covered_cells
+from integrations.cross_rig.scoring import matches_for_json
 from integrations.cross_rig.settings import LONGER, Job, Length, Settings, jobs
 from integrations.cross_rig.training import Draws, FrameSet, Schedule, Tested, evaluate, train, untrained
 from integrations.cross_rig.variant import Variant
@@ -129,9 +130,12 @@ class Run:
         if job.variant.renders:
             # Without a mask, coverage has no part in the training.
             names = ("images", *(("coverage",) if job.variant.masked else ()), "K", "cam2ego")
+            names += ("state",) if job.variant.labels == "views" else ()
         raw = self._content(self.source("train"), count)
+        maps = {"maps": code_hash("arbiview_aug.transforms.camera_maps")} if job.variant.priors else {}
         return content_hash(
             {
+                **maps,
                 "frames": images.store().digest(names, count),
                 "rig": images.rig.content_key.hex(),
                 "raw": raw if job.variant.mixed or job.variant.labels_of_a else None,  # the labels are A's
@@ -227,8 +231,7 @@ def counts_of(job: Job, change: str, trained: dict[str, Any], tested: Tested) ->
         "fixed": tested.fixed.tolist(),
         "by_distance": tested.tally.by_distance.tolist(),
         "by_height": tested.tally.by_height.tolist(),
-        # No NaN in JSON: -1 does not count.
-        "matched": np.nan_to_num(np.round(tested.matched, 4), nan=-1).tolist(),
+        "matched": matches_for_json(tested.matched),
         "positives": tested.positives.tolist(),
     }
 

@@ -124,6 +124,7 @@ class RecordedSource(Source):
             "size": list(self.size),
             "grid": vars(Grid()),
             "real": code_hash("integrations.cross_rig.real"),
+            "readers": code_hash("arbiview_aug.datasets"),  # names them all; the registry has them as strings
             "renderer": code_hash("arbiview_aug.transforms.rig_retarget"),
         }
         if self.variant is not None:

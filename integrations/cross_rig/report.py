@@ -13,7 +13,7 @@ import numpy as np
 
 from integrations.cross_rig.cell_counts import DISTANCES_M, HEIGHTS_M, iou
 from integrations.cross_rig.experiment import Run, jobs_of, load_results, rendering_seconds, same_frames
-from integrations.cross_rig.scoring import ap_scores, iou_scores
+from integrations.cross_rig.scoring import ap_scores, iou_scores, matches_of
 from integrations.cross_rig.settings import jobs
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES
@@ -59,13 +59,7 @@ def _of_change(variants: Results, rendering: Mapping[str, float], drives: Sequen
         return {"seeds": [], "variants": {}}
     cells = {name: np.array([variants[name][s]["by_distance"] for s in seeds]) for name in variants}  # [S, F, bins, 3]
     scores = iou_scores({name: array.sum(2) for name, array in cells.items()}, drives)
-    told = {
-        name: tuple(np.array([variants[name][s][key] for s in seeds], float) for key in ("matched", "positives"))
-        for name in variants
-    }
-    precisions = ap_scores(
-        {name: (np.where(m < 0, np.nan, m), positives) for name, (m, positives) in told.items()}, drives
-    )
+    precisions = ap_scores({name: matches_of([variants[name][s] for s in seeds]) for name in variants}, drives)
     rows = {}
     for name in (n for n in VARIANTS if n in variants):
         heights = np.array([variants[name][s]["by_height"] for s in seeds]).sum((0, 1))

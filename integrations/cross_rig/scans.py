@@ -33,7 +33,7 @@ from integrations.cross_rig.cache import code_hash, content_hash
 from integrations.cross_rig.frames import one_thread
 from integrations.cross_rig.labels import Grid, box_cells
 from integrations.cross_rig.pillars import PointSet
-from integrations.cross_rig.scoring import VariantScore, ap_scores, iou_scores
+from integrations.cross_rig.scoring import VariantScore, ap_scores, iou_scores, matches_for_json, matches_of
 from integrations.cross_rig.training import Draws, Schedule, evaluate, train
 from integrations.cross_rig.worlds import Split, street_seed
 
@@ -148,13 +148,14 @@ def trained(scans: tuple[Lidar, Lidar, Kind], frames: int, schedule: Schedule, s
 def result(settings: Settings, change: str, kind: Kind, seed: int, output: Path) -> tuple[dict[str, Any], bool]:
     """A training's counts on B's test streets, and whether they were there."""
     (_, b), scans = CHANGES[change], scans_of(change, kind)
+    tested_on: tuple[Lidar, Lidar, Kind] = (b, scans[0], "dropped") if kind == "below" else (b, b, "raw")
     key = content_hash(
         {
             "scans": [*(lidar.content_key.hex() for lidar in (*scans[:2], b)), scans[2]],
             "settings": asdict(replace(settings, seeds=(seed,), changes=())),
             "code": code_hash("integrations.cross_rig.scans"),
             "streets": code_hash(_STREETS_CODE, within=_STREETS_CODE),
-            "points": code_hash(_POINTS_CODE[scans[2]]) if scans[2] in _POINTS_CODE else None,
+            "points": [code_hash(_POINTS_CODE[k]) for k in (scans[2], tested_on[2]) if k in _POINTS_CODE],
         }
     )
     path = output / f"{change}-{kind}-{seed}-{key}.json"
@@ -162,12 +163,11 @@ def result(settings: Settings, change: str, kind: Kind, seed: int, output: Path)
         return json.loads(path.read_text()), True
     start = time.process_time()
     model, losses = trained(scans, settings.train_frames, settings.schedule, seed)
-    tested_on: tuple[Lidar, Lidar, Kind] = (b, scans[0], "dropped") if kind == "below" else (b, b, "raw")
     val, test = (point_set(*tested_on, split, frames) for split, frames in _tested(settings))
     tested = evaluate(model, val, test, test.height_dm, settings.schedule)
     counts = {
         "by_distance": tested.tally.by_distance.tolist(),
-        "matched": np.nan_to_num(np.round(tested.matched, 4), nan=-1).tolist(),  # no NaN in JSON: -1 does not count
+        "matched": matches_for_json(tested.matched),
         "positives": tested.positives.tolist(),
         "losses": losses,
         "cpu_s": time.process_time() - start,
@@ -184,9 +184,7 @@ def scores(results: dict[Kind, list[dict[str, Any]]]) -> Iterator[dict[str, Vari
     """IoU and AP of a change's variants, of results by seed."""
     cells = {kind: np.array([one["by_distance"] for one in seeds]).sum(2) for kind, seeds in results.items()}
     yield iou_scores({str(kind): array for kind, array in cells.items()})
-    matched = {kind: np.array([one["matched"] for one in seeds], float) for kind, seeds in results.items()}
-    positives = {kind: np.array([one["positives"] for one in seeds], float) for kind, seeds in results.items()}
-    yield ap_scores({str(kind): (np.where(m < 0, np.nan, m), positives[kind]) for kind, m in matched.items()})
+    yield ap_scores({str(kind): matches_of(seeds) for kind, seeds in results.items()})
 
 
 def table(done: dict[str, dict[Kind, list[dict[str, Any]]]]) -> str:

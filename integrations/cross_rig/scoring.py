@@ -121,6 +121,17 @@ def iou_scores(counts: Mapping[str, Counts], drives: Sequence[int] | None = None
     return _scores(values, seeds, bootstrap_ious(counts, drives))
 
 
+def matches_for_json(matched: npt.NDArray[np.floating]) -> list[Any]:
+    """``boxes.match`` without NaN, which JSON has not: -1 does not count. ``matches_of`` reads it."""
+    return list(np.nan_to_num(np.round(matched, 4), nan=-1).tolist())
+
+
+def matches_of(results: Sequence[Mapping[str, Any]]) -> tuple[Floats, Floats]:
+    """``boxes.match`` (S, F, k, 5), and boxes that count (S, F), of the results of S seeds."""
+    matched, positives = (np.array([one[key] for one in results], float) for key in ("matched", "positives"))
+    return np.where(matched < 0, np.nan, matched), positives
+
+
 def ap_scores(
     detections: Mapping[str, tuple[Floats, Floats]], drives: Sequence[int] | None = None
 ) -> dict[str, VariantScore]:

@@ -174,9 +174,9 @@ def full() -> Settings:
 
 
 def real(base: Settings) -> Settings:
-    """A preset on recorded data: the variants that need nothing but points and boxes."""
+    """A preset on recorded data, not on streets: the variants that need nothing but points and boxes."""
     variants = ("raw", "scale_crop", "auto_fill", "auto_fill_mixed", "auto_fill_random", "oracle")
-    return replace(base, changes=(REAL,), variants=variants)
+    return replace(base, world="drive", two_wheelers=False, changes=(REAL,), variants=variants)
 
 
 def large() -> Settings:

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from arbiview_aug.__main__ import main
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli import evaluate as command
 from arbiview_aug.datasets import FrameFolder
-from arbiview_aug.evaluate.images import as_arrays, as_tensors
+from arbiview_aug.datasets.synthetic import demo_source_rig
+from arbiview_aug.errors import SampleError
+from arbiview_aug.evaluate.images import RenderedView, as_arrays, as_tensors
+from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.targets import YAWS_DEG
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
@@ -167,6 +175,33 @@ def test_judges_of_a_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     page = (tmp_path / "report.html").read_text()
     assert all(f">{name}: judged<" in page for name in ("nearest source camera", "fast, infinity, continue", "truth"))
     assert "Labelled objects that the detector finds" in page
+
+
+def test_a_method_that_declines_a_frame_is_in_no_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, first = retargeting("fast", "infinity", "own"), list[object]()
+
+    def render(sample: Mapping[str, Any], target: Rig) -> list[RenderedView]:
+        first[:] = first or [sample["boxes_3d"]]
+        if sample["boxes_3d"] is not first[0]:
+            raise SampleError("too dark")
+        return own.render(sample, target)
+
+    monkeypatch.setattr(command, "_methods", lambda _: [own, replace(own, name="picky", render=render)])
+    (tmp_path / "own.py").write_text(JUDGES)
+    report = run(["--size", "24x66", "--frames", "2", "--detector", f"{tmp_path}/own.py:detect"], tmp_path)
+    assert list(report["means"]) == ["own"] and list(report["judges"]) == ["sources", "own", "truth"]
+    assert "note: picky: frame synthetic-0-1: too dark" in capsys.readouterr().out
+
+
+def test_rows_do_not_depend_on_other_rows(tmp_path: Path) -> None:
+    """Motion needs neighbours, which must not fill the holes of other rows."""
+    target = tmp_path / "down.yaml"
+    demo_source_rig((48, 132)).turned(pitch_deg=-12).shifted(z_m=0.6).save(target)
+    given, chosen = ["--size", "48x132", "--target", str(target), "--geometry"], (["street"], ["street", "motion"])
+    alone, beside = (run([*given, *names], tmp_path)["means"] for names in chosen)
+    assert list(beside) == ["fast, street", "fast, motion"] and beside["fast, street"] == alone["fast, street"]
 
 
 def test_judges_are_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

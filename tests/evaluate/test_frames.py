@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets import LazyFrame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.frames import make_frame, regions, scores
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
@@ -59,6 +60,18 @@ def test_where_points_do_not_score_they_are_handed_over_whole(sample: dict) -> N
     assert "points" not in make_frame(sample, exposures=()).sample
     bare = {key: value for key, value in sample.items() if key != "points"}
     assert not make_frame(bare).lidar
+
+
+def test_neighbours_bring_no_points_where_points_score(sample: dict) -> None:
+    """Theirs lie in the sectors that score, too. Their images are not read for that."""
+    near = LazyFrame({"time_s": 0.5, "points": sample["points"]}, pytest.fail)
+    drive = {**sample, "neighbours": [near]}
+    for given in (True, False):
+        frame = make_frame(drive, hand_over_points=given)
+        for one in (frame.sample, frame.scored_sample):
+            (kept,) = one["neighbours"]
+            assert kept.get("points") is None and kept["time_s"] == 0.5 and "images" in list(kept)
+    assert make_frame(drive, exposures=()).sample["neighbours"] == [near]
 
 
 def test_even_exposures_reach_the_method(sample: dict) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug import Lidar
-from arbiview_aug.evaluate.scans import chamfer_m, measured_near, range_image, rings_dropped, scan_metrics
+from arbiview_aug.evaluate.scans import chamfer_m, measured_near, range_image, returns_of, rings_dropped, scan_metrics
 
 LIDAR = Lidar("top", np.eye(4), (10.0, -10.0, 0.0), 90.0, (1.0, 50.0))
 
@@ -24,6 +24,16 @@ def test_points_fall_onto_their_rays() -> None:
     expected = np.zeros((3, 4))
     expected[2, 2], expected[1, 3], expected[0, 0] = 4, 9, 7  # the nearest; past the edges and out of range are none
     np.testing.assert_allclose(image, expected, atol=1e-9)
+
+
+def test_points_just_before_the_first_column_are_its() -> None:
+    """Half a column on either side, as all around."""
+    front = replace(LIDAR, azimuth_step_deg=1.0, azimuth_deg=(-30.0, 30.0))
+    cloud = np.array([at(5, 0, azimuth) for azimuth in (-30.6, -30.4, -29.6, 29.4, 29.6)])
+    assert front.shape[1] == 60
+    assert returns_of(front, cloud).column.tolist() == [0, 0, 59]
+    around = np.array([at(5, 0, azimuth) for azimuth in (-136, -134, 134, 136, 180)])
+    assert returns_of(LIDAR, around).column.tolist() == [0, 1, 3, 0, 0]
 
 
 def test_metrics() -> None:

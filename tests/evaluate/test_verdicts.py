@@ -113,6 +113,13 @@ def test_false_alarms(labels: bool, truth: bool, alarms: int) -> None:
     assert panel.notes(["own"]) == panel.notes(["own"], ["car"])
 
 
+def test_unsure_detections_in_the_true_image_excuse_no_false_alarm() -> None:
+    seen = [[1.0, 1, 9, 9]]
+    sure, unsure = detector({VIEW: seen}), detector({TRUE: seen}, score=0.4)
+    panel = Panel(lambda image: (unsure if image[0, 0, 0] == TRUE else sure)(image))
+    assert looked(panel, frame(labels=False), generated=ALL)["own"]["false_alarms"] == 1
+
+
 def test_nothing_to_compare_with() -> None:
     panel = Panel(detector({VIEW: labelled().tolist()}))
     assert looked(panel, frame(labels=False, truth=False), generated=ALL) == {}

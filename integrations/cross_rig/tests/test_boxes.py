@@ -71,3 +71,5 @@ def test_average_precision_by_hand():
     both = average_precision(np.repeat(matched, 2, 0), np.array([2, 2]), np.array([[1.0, 1.0], [1.0, 0.0]]))
     assert both[1] == pytest.approx(expected, abs=1e-6)
     assert average_precision(matched, np.array([0]), np.ones((1, 1)))[0] >= 0
+    matched[..., 1:] = np.nan
+    assert average_precision(matched, np.array([1]), np.ones((1, 1))) == 0  # no detection counts

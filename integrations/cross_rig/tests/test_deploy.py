@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from integrations.cross_rig import __main__ as command
 from integrations.cross_rig import cache, deploy
@@ -76,6 +77,42 @@ def test_calibration_errs_the_same_each_time(done):
     cosines = np.einsum("nij,nij->n", a.cam2ego[:, :3, :3], poses[:, :3, :3]) / 2 - 0.5
     assert 0.2 < np.degrees(np.arccos(cosines)).mean() < 5
     np.testing.assert_allclose(poses[:, :3, 3], a.cam2ego[:, :3, 3], atol=1e-6)
+
+
+def test_results_follow_what_made_them(tmp_path, monkeypatch):
+    setup = Run(settings=TINY, output=tmp_path)
+    (job,) = jobs(TINY)
+    monkeypatch.setattr(Run, "training_key", lambda *_: "weights")
+
+    def paths(*changed: str) -> dict:
+        with monkeypatch.context() as patch:
+            patch.setattr(deploy, "code_hash", lambda name, **_: "new" if name in changed else name)
+            return {(change, title): path for change, title, _, path in deploy._tests(setup, job)}
+
+    before = paths()
+    assert len(set(before.values())) == len(before)
+    for module in ("arbiview_aug.transforms.rig_retarget", "arbiview_aug.transforms.jitter"):
+        assert not set(before.values()) & set(paths(module).values())
+    monkeypatch.setitem(ON_B, "street", ON_B["LiDAR"])
+    assert {key[1] for key, path in paths().items() if path != before[key]} == {"street"}
+    monkeypatch.setattr(deploy, "LEAST_SCORE", 0.9)
+    assert not set(before.values()) & set(paths().values())
+
+
+def test_frames_of_longer_runs_have_their_own_boxes(tmp_path, monkeypatch):
+    """A chunk of two frames, of which the first run detects one."""
+    monkeypatch.setattr(cache, "CHUNK_FRAMES", 2)
+    monkeypatch.setattr(deploy, "ViewMaker", lambda *_: lambda _, frame: {"boxes": frame["boxes_3d"].numpy()})
+    monkeypatch.setattr(
+        deploy, "_detections", lambda run, *_: [torch.full((1, 7), float(k)) for k in range(run.settings.test_frames)]
+    )
+    for count in (1, 2):
+        setup = Run(settings=replace(TINY, test_frames=count), output=tmp_path)
+        cache.fill(setup.source("test", "up70").store(), lambda _: {"images": np.zeros((1, 3, 8, 8), np.uint8)}, 0)
+        variant = ON_B["two passes"].variant
+        views = deploy._views(setup, Trained(None, "weights", None), "up70", variant, "test")
+        assert views.stacked("boxes", count)[:, 0, 0].tolist() == list(range(count))
+        assert views.spec["views"] == variant.views_spec()
 
 
 def test_command_takes_rows(capsys, tmp_path):

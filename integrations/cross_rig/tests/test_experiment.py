@@ -234,6 +234,49 @@ def test_keys_follow_what_matters(done):
     assert done.result_path(raw, "fov50") != longer.result_path(raw, "fov50")
 
 
+def test_trainings_are_named_after_all_that_they_use(tmp_path, monkeypatch):
+    """Labels of the rendered views, and the code of camera maps."""
+
+    def key(name: str, folder: str = "", hidden: int = 0) -> str:
+        setup = Run(settings=replace(TINY, changes=("up70",), variants=(name,)), output=tmp_path / folder)
+        (job,) = jobs(setup.settings)
+        frame = dict.fromkeys(("images", "state", "height_dm", "coverage", "K", "cam2ego"), np.zeros(4, np.uint8))
+        for source, state in ((setup.source("train"), 0), (setup.images(job), hidden)):
+            for chunk in source.store().missing(TINY.train_frames):
+                made = frame | {"state": frame["state"] + np.uint8(state)}
+                cache.fill(source.store(), lambda _, made=made: made, chunk)
+        return setup.training_key(job)
+
+    assert key("auto_fill_labels", "free") != key("auto_fill_labels", "hidden", HIDDEN)
+    before = key("raw"), key("raw_priors")
+    of_code = cache.code_hash
+    monkeypatch.setattr(experiment, "code_hash", lambda name: "" if name.endswith("camera_maps") else of_code(name))
+    assert key("raw") == before[0] and key("raw_priors") != before[1]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("--streets 150", "streets: expected a whole hundred"),
+        ("--changes up70 fisheye", "changes: fisheye has a lens, and the detectors read K alone: add --deploy"),
+        *(
+            (f"--real A B {option}", f"{option.split()[0]} is for synthetic streets: leave it out with --real")
+            for option in ("--deploy", "--world cuboids", "--two-wheelers", "--streets 200", "--changes up70")
+        ),
+    ],
+)
+def test_command_refuses_what_makes_no_sense(given, message, capsys, tmp_path):
+    assert command.main(["--quick", *given.split(), "--output", str(tmp_path)]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", ["--steps 0", "--steps -3", "--seeds -1", "--train-frames 0", "--workers 0"])
+def test_command_refuses_numbers(given, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        command.main(["--quick", *given.split()])
+    assert "error: argument" in capsys.readouterr().err
+
+
 def test_command_lists_and_refuses(capsys, tmp_path):
     assert command.main(["--pilot", "--seeds", "0", "--changes", "up70", "--list", "--output", str(tmp_path)]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -255,7 +298,8 @@ def test_command_chooses_world_and_schedules(tmp_path):
     steps = {job.length: setup.schedule(job).steps for job in jobs(setup.settings)}
     assert steps == {"short": 10, "long": 26}
     assert {job.name.endswith("-long") for job in jobs(setup.settings) if job.length == "long"} == {True}
-    assert command._settings(command._parser().parse_args(["--small"])).world == "drive"
+    for other in (["--small"], ["--quick", "--real", "A", "B"]):  # recorded data are of no streets
+        assert command._settings(command._parser().parse_args(other)).world == "drive"
     with pytest.raises(ValueError, match="world: expected drive, got cuboids with two-wheelers"):
         command._settings(command._parser().parse_args([*given, "--two-wheelers"]))
     with pytest.raises(ValueError, match="schedules: expected some of short, long, got longest"):

@@ -54,6 +54,16 @@ def test_sets_that_are_the_same_have_one_name():
     assert [change for change in CHANGES if "below" in kinds(change)] == ["sixteen"]
 
 
+def test_results_follow_the_code_of_all_their_points(tmp_path, monkeypatch):
+    """Those of the training, and ``below`` those of the test."""
+    specs = []
+    monkeypatch.setattr(scans, "content_hash", lambda spec: specs.append(spec) or "key")
+    for kind in kinds("sixteen"):
+        (tmp_path / f"sixteen-{kind}-0-key.json").write_text("{}")
+        assert scans.result(scans.Settings(), "sixteen", kind, 0, tmp_path) == ({}, True)
+    assert [len(spec["points"]) for spec in specs] == [0, 1, 1, 2, 0]
+
+
 def test_vehicles_count_by_their_points():
     """Labels are of the points that a detector gets: fewer vehicles where fewer were measured."""
     a, b = CHANGES["fewer"]

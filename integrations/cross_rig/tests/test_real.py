@@ -105,6 +105,15 @@ def test_drives_are_split_and_drawn_together(roots, tmp_path):
     assert len(drives) == run.settings.test_frames and len(set(drives)) == len(splits[2])
 
 
+def test_frames_are_made_anew_when_a_reader_changes(roots, tmp_path, monkeypatch):
+    read, source = set(), cache._source
+    monkeypatch.setattr(cache, "_source", lambda name: (read.add(name), source(name))[1])
+    cache.code_hash.cache_clear()
+    real.recorded_run(*roots, on_real(SMALL), tmp_path).source("train").store()
+    cache.code_hash.cache_clear()
+    assert {f"arbiview_aug.datasets.{name}" for name in ("nuscenes.reader", "frame_folder", "py123d")} <= read
+
+
 @pytest.mark.slow
 def test_the_command_runs_goes_on_and_reports(roots, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(command.PRESETS, "quick", lambda: SMALL)

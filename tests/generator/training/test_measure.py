@@ -11,7 +11,7 @@ import cv2
 import pytest
 import torch
 
-from arbiview_aug.errors import GeneratorError, TrainingError
+from arbiview_aug.errors import DataError, GeneratorError, TrainingError
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
@@ -169,6 +169,8 @@ def test_an_ablation_that_is_stopped_scores_nothing(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(training.Trainer, "train", lambda self: False)
     made = training.ablate(config(), frames(), tmp_path, show=False)
     assert made == {} and not (tmp_path / "ablation.json").exists()
+    with pytest.raises(DataError, match="expected two scenes or more, one of them to score on; found one"):
+        training.ablate(config(), frames(1), tmp_path, show=False)
 
 
 def test_holes_of_the_condition_as_they_were_in_training(batch: Batch) -> None:
