@@ -33,13 +33,8 @@ def static_image(planes: Any, P: Any, R: Any, kind: int, S: Any, q: Any) -> None
         q: (h, w) float32, written.
     """
     h, w = q.shape
-    rx, ry, rz = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
-    dx, dy, road, wall = (
-        np.empty(w, np.float32),
-        np.empty(w, np.float32),
-        np.empty(w, np.float32),
-        np.empty(w, np.float32),
-    )
+    work = np.empty((7, w), np.float32)
+    rx, ry, rz, dx, dy, road, wall = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
     per_height, ox, oy, c = S[0], S[3], S[4], S[5]
     for y in range(h):
         rays_row(planes, P, y, np.int64(0), rx, ry, rz)
