@@ -59,7 +59,7 @@ Curves = Sequence[npt.NDArray[np.float64]]
 
 
 def tone_curves(gains: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Curves of gains (...,): x times the gain up to ``KNEE``, then a straight line to (1, 1): saturated pixels stay so.
+    """Curves of gains (...,): x times the gain up to ``KNEE``, then a line to (1, 1): saturated pixels stay so.
 
     The knee lies on the brighter axis (the output of a gain above 1, the input of one below), so the curves of g and
     1 / g invert each other. (..., 2) are the slopes of both lines: the lower of them counts for a gain above 1, the
