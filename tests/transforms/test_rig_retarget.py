@@ -273,11 +273,10 @@ def test_label_maps_are_the_winning_sources(dtype: torch.dtype) -> None:
 
 
 def test_labels_of_pixels_that_were_filled_anew_are_ignored() -> None:
-    rig = ring(4, size=(64, 96))
-    sample = sample_of(rig, seg=torch.ones(4, 64, 96, dtype=torch.int64))
-    target = ring(2, size=(64, 96), radius_m=1.5, z_m=2.0, horizontal_fov_deg=100.0)
+    source = ring()
+    sample = sample_of(source, seg=torch.ones((4, *SIZE), dtype=torch.int64))
     keys = SampleKeys(labels=("seg",))
-    out = RigRetarget(target, holes=Telea(min_confidence=0.5), geometry="street", keys=keys)(sample)
+    out = RigRetarget(source.shifted(z_m=0.7), holes=Telea(min_confidence=0.5), geometry="street", keys=keys)(sample)
     assert torch.equal(out["seg"] == 1, out["coverage"]) and out["coverage"].any()
     assert (out["seg"][out["generated"]] == 255).all()
 
