@@ -236,7 +236,7 @@ def _warped(one: Camera, layer: Layer, two: Camera, interpolation: int, border: 
     if is_whole and interpolation == cv2.INTER_LINEAR:  # ten times as fast
         return np.asarray(cv2.resize(layer, two.size[::-1], interpolation=interpolation))
     flags = interpolation | cv2.WARP_INVERSE_MAP
-    warped = np.asarray(cv2.warpAffine(layer, to_one, two.size[::-1], flags=flags, borderMode=border))
+    warped = np.asarray(cv2.warpAffine(layer, to_one, two.size[::-1], flags=flags, borderMode=border), np.float32)
     for lines, at, size in zip((warped.T, warped), to_one, one.size[::-1], strict=True):
         place = at[:2].sum() * np.arange(len(lines)) + at[2]
         lines[np.abs(place - (size - 1) / 2) > size / 2 + 1] = 0
