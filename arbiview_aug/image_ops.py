@@ -119,12 +119,15 @@ class Scratch:
         self._local = threading.local()
 
     def get(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
-        """Return a buffer of this shape and type. Its content is arbitrary but finite: taps of weight 0 read it."""
-        buffers = self._local.__dict__
+        """Return a buffer of this shape and type, in the memory of the largest one of this name so far.
+
+        Its content is arbitrary but finite: taps of weight 0 read it.
+        """
+        buffers, size = self._local.__dict__, math.prod(shape)
         buffer = buffers.get(name)
-        if buffer is None or buffer.shape != shape or buffer.dtype != dtype:
-            buffers[name] = buffer = np.zeros(shape, dtype)
-        return buffer
+        if buffer is None or buffer.size < size or buffer.dtype != dtype:
+            buffers[name] = buffer = np.zeros(size, dtype)
+        return buffer[:size].reshape(shape)
 
     def __reduce__(self) -> tuple[type[Scratch], tuple[()]]:
         return Scratch, ()

@@ -15,7 +15,8 @@ class LRUCache(Generic[K, V]):
     """Thread-safe LRU cache bounded by total value size, with counts of ``hits`` and ``misses``.
 
     The last value always stays. Threads that miss the same key at once each make the value and all get the first one.
-    Pickles as empty. ``size`` of one value is picklable; None counts values.
+    Pickles as empty. ``size`` of one value is picklable; None counts values. Values may grow: all sizes are read again
+    after an eighth as many misses as there are values.
     """
 
     def __init__(self, limit: int, size: Callable[[V], int] | None = None) -> None:
@@ -23,6 +24,7 @@ class LRUCache(Generic[K, V]):
         self._size = size or _one
         self._values: OrderedDict[K, V] = OrderedDict()
         self._lock = threading.Lock()
+        self._total = self._next_count = 0
 
     def get(self, key: K, make: Callable[[], V]) -> V:
         with self._lock:
@@ -34,9 +36,12 @@ class LRUCache(Generic[K, V]):
         new = make()
         with self._lock:
             value = self._values.setdefault(key, new)
-            total = sum(map(self._size, self._values.values()))
-            while total > self.limit and len(self._values) > 1:
-                total -= self._size(self._values.popitem(last=False)[1])
+            self._total += self._size(value)
+            if self.misses >= self._next_count:
+                self._total = sum(map(self._size, self._values.values()))
+                self._next_count = self.misses + len(self._values) // 8
+            while self._total > self.limit and len(self._values) > 1:
+                self._total -= self._size(self._values.popitem(last=False)[1])
         return value
 
     @property

@@ -69,6 +69,9 @@ VIEW_SIZE = (450, 800)
 TILE_PX = 32
 """Side of the chessboard's tiles in that view."""
 
+HALF_VIEW_SIZE, HALF_TILE_PX = (225, 400), 16
+"""The same at half resolution, which exposure and depth from overlap read."""
+
 
 def adjacent_pairs(rig: Rig) -> list[tuple[int, int]]:
     """Pairs of cameras that are neighbours in azimuth and whose horizontal fields of view overlap."""

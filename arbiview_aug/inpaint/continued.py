@@ -95,6 +95,7 @@ class Mean(Continue):
     """Gives holes the mean colour of the frame's views."""
 
     outcome = "given the mean colour of the views"
+    needs_layers = False
     only_mean = True
 
 
@@ -130,7 +131,7 @@ def fill_holes(
     needs_mean = only_mean or not all(of_view.any() for of_view in seen)
     mean = mean_colour(arrays, seen) if needs_mean else np.zeros(3, np.float32)
     none = [None] * len(arrays)
-    colours = object_colours(arrays, paint or none)
+    colours = None if only_mean else object_colours(arrays, paint or none)
     of_views = zip(arrays, seen, layers or none, paint or none, road or none, cameras or none, strict=True)
     for view, known, layer, objects, on_road, camera in of_views:
         if known.all():

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import torch
 
 from arbiview_aug.errors import GeneratorError, SampleError
-from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
+from arbiview_aug.render.rendered import MAP_KEYS, LabelFill, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
 from arbiview_aug.sample.inputs import Frame, read_frames
 
@@ -58,11 +58,15 @@ class Inpainter(ABC):
             seeds: A seed for each view.
         """
 
+    def _inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int], counts: Sequence[int]) -> Any:
+        """``inpaint``; ``counts`` are how many views each frame has."""
+        return self.inpaint(views, holes, seeds)
+
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
         """Fill rendered ``frames``.
 
         Filled pixels are no longer covered: ``coverage`` False, ``confidence`` 0, ``source_camera`` and
-        ``source_frame`` -1. Gradients of the others stay.
+        ``source_frame`` -1, label maps as where nothing is covered. Gradients of the others stay.
         """
         parts = [holes_of(frame, self.min_confidence) for frame in rendered]
         unknown = [~seen if self.fills_own_car else hole for maps in parts for seen, hole in zip(*maps, strict=True)]
@@ -74,7 +78,7 @@ class Inpainter(ABC):
         ]
         views = [view for frame in rendered for view in frame.images]
         with torch.no_grad():
-            images = self.inpaint(views, unknown, seeds)
+            images = self._inpaint(views, unknown, seeds, [len(frame.rig) for frame in rendered])
         filled = iter(_checked(type(self).__name__, images, views, unknown))
         frames_and_holes = zip(rendered, parts, strict=True)
         return [put(frame, [next(filled) for _ in holes], holes) for frame, (_, holes) in frames_and_holes]
@@ -83,7 +87,8 @@ class Inpainter(ABC):
         """Fill collated samples, on the device of a network: DataLoader workers cannot use a GPU.
 
         The pixels are those of ``RigRetarget(holes=self)``, but for rounding: frames are computed together. Those of
-        ``Continue`` are not: batches do not say what holes lie behind.
+        ``Continue`` are not: batches do not say what holes lie behind. Nor do they say which keys are label maps: with
+        ``min_confidence``, ignore labels where ``generated`` is True.
 
         Args:
             batch: From ``RigRetarget(..., keys=SampleKeys(extra=("sources", "confidence")))``: a sample or a batch.
@@ -190,9 +195,14 @@ def put(rendered: RenderedFrame, images: Sequence[torch.Tensor], holes: Sequence
     def without_holes(maps: Sequence[torch.Tensor], empty: int) -> torch.Tensor | list[torch.Tensor]:
         return stacked([m.masked_fill(hole, empty) for m, hole in zip(maps, holes, strict=True)])
 
+    def labels(maps: Sequence[torch.Tensor], fill: LabelFill) -> list[torch.Tensor]:
+        assert rendered.labels is not None
+        views = zip(rendered.labels(maps, fill), holes, strict=True)
+        return [m.masked_fill(hole.to(m.device), fill(m.dtype)) if hole.any() else m for m, hole in views]
+
     pixels = zip(holes, images, rendered.images, strict=True)
     views = [torch.where(hole, filled, view) for hole, filled, view in pixels]
-    return replace(rendered.with_maps(without_holes), images=views, generated=stacked(list(holes)))
+    return replace(rendered.with_maps(without_holes), images=views, generated=stacked(list(holes)), labels=labels)
 
 
 def _without_own_car(frame: RenderedFrame) -> RenderedFrame:

@@ -18,7 +18,7 @@ import torch
 
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, GeneratorError, one_line
-from arbiview_aug.inpaint.crops import Canvas, drawn, packed, windows
+from arbiview_aug.inpaint.crops import Canvas, Window, drawn, packed, windows
 from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, check_device, checked_settings
 from arbiview_aug.inpaint.telea import telea
 
@@ -75,9 +75,14 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         """Inpaint images (B, 3, h, w) in [0, 1], black in their holes (B, h, w) bool; the same shape comes back."""
 
-    @torch.no_grad()
     def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
-        """Fill the holes of views in windows around them; pixels outside the holes do not change."""
+        """Fill the holes of one frame's views in windows around them; pixels outside the holes do not change."""
+        return self._inpaint(views, holes, seeds, [len(views)])
+
+    @torch.no_grad()
+    def _inpaint(
+        self, views: Tensors, holes: Tensors, seeds: Sequence[int], counts: Sequence[int]
+    ) -> list[torch.Tensor]:
         check_device(self)
         tops = [255.0 if view.dtype == torch.uint8 else 1.0 for view in views]
         # The network sees narrow holes inpainted, and they stay so.
@@ -85,10 +90,16 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         # Squares of NARROW_PX fit into what is left; the rest are cracks and edges.
         masks, square = [hole.cpu().numpy().astype(np.uint8) for hole in holes], np.ones((NARROW_PX,) * 2, np.uint8)
         left = [cv2.morphologyEx(mask, cv2.MORPH_OPEN, square).astype(bool) for mask in masks]
+        frame_of = np.repeat(np.arange(len(counts)), counts)
         for together in windows(left, self.size):
+            # Frames share calls, but no canvas: a network sees all of it.
+            of_frames: dict[int, list[Window]] = defaultdict(list)
+            for window in together:
+                of_frames[frame_of[window.view]].append(window)
             alike: dict[tuple[int, int], list[Canvas]] = defaultdict(list)
-            for canvas in packed(together, self.size, self.multiple):
-                alike[canvas.size].append(canvas)
+            for parts in of_frames.values():
+                for canvas in packed(parts, self.size, self.multiple):
+                    alike[canvas.size].append(canvas)
             for canvases in alike.values():
                 for start in range(0, len(canvases), self.batch):
                     self._fill(canvases[start : start + self.batch], pixels, left, seeds)
@@ -214,11 +225,13 @@ class TorchScriptInpainter(NetworkInpainter):
         size: Longest side of an image that it sees.
         multiple: Number that divides both sides.
         batch: Images that it sees at once.
-        min_confidence: As for every ``Inpainter``, like ``seed``.
+        min_confidence: As for every ``Inpainter``.
 
     Raises:
         GeneratorError: No such file, or no TorchScript.
     """
+
+    is_random = False
 
     def __init__(
         self,
@@ -228,10 +241,9 @@ class TorchScriptInpainter(NetworkInpainter):
         multiple: int = 8,
         batch: int = 4,
         min_confidence: float = 0.0,
-        seed: int = 0,
     ) -> None:
         network = load_torchscript(path, str(path), GeneratorError)
-        super().__init__(network, size, multiple, batch, min_confidence=min_confidence, seed=seed)
+        super().__init__(network, size, multiple, batch, min_confidence=min_confidence)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         try:

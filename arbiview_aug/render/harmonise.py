@@ -24,14 +24,21 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.rays import adjacent_pairs, ego_rays, half_way_view, odd_tiles, project_rays
+from arbiview_aug.cameras.rays import (
+    HALF_TILE_PX,
+    HALF_VIEW_SIZE,
+    adjacent_pairs,
+    ego_rays,
+    half_way_view,
+    odd_tiles,
+    project_rays,
+)
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.plan import SEAM_ROWS, RenderPlan
 from arbiview_aug.scene.surface import Street
 
-_VIEW_SIZE, _TILE_PX = (225, 400), 16  # the evaluation's views and tiles at half resolution
 _STEP_PX = 4  # every fourth pixel of each fourth row is read: medians need no more
 _Pixels = npt.NDArray[np.float32]
 
@@ -41,7 +48,7 @@ the greys above it, which shows in clouds."""
 
 
 LEVELS = np.float32(255), np.float32(0.5)
-"""The last two arguments of ``kernels.tone`` for uint8 images."""
+"""The last two arguments of ``photometry_kernels.tone`` for uint8 images."""
 
 SHARES = np.float32(1), np.float32(0)
 """Those for images in [0, 1]."""
@@ -51,15 +58,15 @@ Curves = Sequence[npt.NDArray[np.float64]]
 """Tone curves of each view for each of N sources: (N, h, 2), those of each row, or (N, 2) for all rows."""
 
 
-def tone_curves(gains: npt.ArrayLike, knee: float = KNEE) -> npt.NDArray[np.float64]:
-    """Curves of gains (...,): x times the gain up to a knee, then a straight line to (1, 1): saturated pixels stay so.
+def tone_curves(gains: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Curves of gains (...,): x times the gain up to ``KNEE``, then a line to (1, 1): saturated pixels stay so.
 
     The knee lies on the brighter axis (the output of a gain above 1, the input of one below), so the curves of g and
     1 / g invert each other. (..., 2) are the slopes of both lines: the lower of them counts for a gain above 1, the
     higher below 1.
     """
     gain = np.asarray(gains, np.float64)
-    above, below = (1 - knee) / (1 - knee / np.maximum(gain, 1)), (1 - gain * knee) / (1 - knee)
+    above, below = (1 - KNEE) / (1 - KNEE / np.maximum(gain, 1)), (1 - gain * KNEE) / (1 - KNEE)
     return np.stack([gain, np.where(gain > 1, above, below)], -1)
 
 
@@ -118,7 +125,7 @@ def find_overlaps(rig: Rig) -> Overlaps:
     surface = Street(ground_z_m=rig.ground_z_m)
     pairs, shared = [], []
     for pair in adjacent_pairs(rig):
-        view = half_way_view(rig[pair[0]], rig[pair[1]], _VIEW_SIZE)
+        view = half_way_view(rig[pair[0]], rig[pair[1]], HALF_VIEW_SIZE)
         rays, valid = ego_rays(view, lattice)
         q = surface.inverse_distance(view.center_m, rays)
         both, reads = np.flatnonzero(valid), list[npt.NDArray[np.int64]]()
@@ -152,9 +159,9 @@ def find_overlaps(rig: Rig) -> Overlaps:
 @cache
 def _lattice() -> tuple[FloatArray, BoolArray]:
     """The pixels (n, 2) of a half-way view that are read, and whether each is held out."""
-    y, x = np.mgrid[: _VIEW_SIZE[0] : _STEP_PX, : _VIEW_SIZE[1] : _STEP_PX]
-    even = ~odd_tiles(_VIEW_SIZE, _TILE_PX)[y, x]
-    return np.stack([x, y], -1)[even].astype(np.float64), odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[y, x][even]
+    y, x = np.mgrid[: HALF_VIEW_SIZE[0] : _STEP_PX, : HALF_VIEW_SIZE[1] : _STEP_PX]
+    even = ~odd_tiles(HALF_VIEW_SIZE, HALF_TILE_PX)[y, x]
+    return np.stack([x, y], -1)[even].astype(np.float64), odd_tiles(HALF_VIEW_SIZE, HALF_TILE_PX // 2)[y, x][even]
 
 
 def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overlaps | None = None) -> PhotometricReport:
@@ -175,7 +182,7 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
     limit, (number, ratio, spread) = np.log(MAX_GAIN), ratios[enough].T
     # Neighbouring pixels err together: a fitted tile (8 x 8) counts once.
-    tiles = number * (2 * _STEP_PX / _TILE_PX) ** 2
+    tiles = number * (2 * _STEP_PX / HALF_TILE_PX) ** 2
     variance = spread**2 / tiles + _PAIR_LOG_ERROR**2
     log_gains = np.clip(_solve(len(rig), overlaps.pairs[:, enough], ratio, variance), -limit, limit)
     if np.abs(log_gains).max() < _MIN_LOG_GAIN:

@@ -24,7 +24,16 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.rays import adjacent_pairs, edge_distance, ego_rays, half_way_view, odd_tiles, project_rays
+from arbiview_aug.cameras.rays import (
+    HALF_TILE_PX,
+    HALF_VIEW_SIZE,
+    adjacent_pairs,
+    edge_distance,
+    ego_rays,
+    half_way_view,
+    odd_tiles,
+    project_rays,
+)
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.errors import SampleError
@@ -46,7 +55,7 @@ _REPEATS = 0.7
 
 def why_ambiguous(one: npt.NDArray[np.float32], two: npt.NDArray[np.float32], both: BoolArray) -> str:
     """Why views (h, w, 3) in [0, 255] cannot be matched where both see (h, w); "" if they can."""
-    if min(float(view[both].std()) for view in (one, two)) < _BLANK_GREY:
+    if min(float(view[both].std(axis=0).max()) for view in (one, two)) < _BLANK_GREY:
         return "one of the images shows nothing"
     if max(_repetition(view, both) for view in (one, two)) > _REPEATS:
         return "the texture repeats itself: matches would be ambiguous"
@@ -102,7 +111,6 @@ def _repetition(image: npt.NDArray[np.float32], inside: BoolArray) -> float:
     return float(correlation[fallen[0] :].max()) if len(fallen) else 0.0
 
 
-_VIEW_SIZE, _TILE_PX = (225, 400), 16  # the evaluation's views and tiles at half resolution
 _SOURCE_WIDTH_PX = 400  # sources are halved down to no less: the view's own resolution
 
 MIN_PIXELS = 200
@@ -214,20 +222,20 @@ def _small(camera: Camera, image: torch.Tensor) -> _Small:
 
 def _strip(rig: Rig, a: int, b: int, surface: StaticSurface, boxes: FloatArray | None) -> _Strip | None:
     """The overlap of two cameras; None if they share too little."""
-    view = half_way_view(rig[a], rig[b], _VIEW_SIZE)
+    view = half_way_view(rig[a], rig[b], HALF_VIEW_SIZE)
     pixels = view.pixel_grid()
     coarse = _seen_by_both(rig, a, b, view, pixels[::8, ::8], surface)[2]
     if not coarse.any():
         return None
     rows, columns = (
         slice(max(int(at[0]) * 8 - _MARGIN_PX, 0), min(int(at[-1]) * 8 + _MARGIN_PX + 1, size))
-        for at, size in zip((np.flatnonzero(coarse.any(k)) for k in (1, 0)), _VIEW_SIZE, strict=True)
+        for at, size in zip((np.flatnonzero(coarse.any(k)) for k in (1, 0)), HALF_VIEW_SIZE, strict=True)
     )
     rays, q, both = _seen_by_both(rig, a, b, view, pixels[rows, columns], surface)
-    usable = ~odd_tiles(_VIEW_SIZE, _TILE_PX)
+    usable = ~odd_tiles(HALF_VIEW_SIZE, HALF_TILE_PX)
     if boxes is not None:
         usable[draw_boxes(view, boxes)[1] >= 0] = False
-    usable, held_out = usable[rows, columns] & both, odd_tiles(_VIEW_SIZE, _TILE_PX // 2)[rows, columns]
+    usable, held_out = usable[rows, columns] & both, odd_tiles(HALF_VIEW_SIZE, HALF_TILE_PX // 2)[rows, columns]
     fit, test = usable & ~held_out, usable & held_out
     few = min(np.count_nonzero(fit), np.count_nonzero(test)) < MIN_PIXELS
     return None if few else _Strip(view, rows, columns, rays, q, fit, test, both)
@@ -324,9 +332,9 @@ def _smoothed(along: FloatArray, squared: FloatArray, weight: npt.NDArray[np.flo
 
 def _extended(strip: _Strip, depth: _Depth) -> Correction:
     """Extend a strip's depth over the whole view: the nearest change fades to the background's, then to none."""
-    change = np.zeros(_VIEW_SIZE, np.float32)
+    change = np.zeros(HALF_VIEW_SIZE, np.float32)
     change[strip.rows, strip.columns] = depth.change
-    missing = np.ones(_VIEW_SIZE, np.uint8)
+    missing = np.ones(HALF_VIEW_SIZE, np.uint8)
     missing[strip.rows, strip.columns] = ~(depth.valid & strip.both)
     distance, nearest = cv2.distanceTransformWithLabels(missing, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     by_label = np.zeros(int(nearest.max()) + 1, np.float32)
@@ -334,7 +342,7 @@ def _extended(strip: _Strip, depth: _Depth) -> Correction:
     beside = np.where(missing == 0, change, cv2.GaussianBlur(by_label[nearest], (0, 0), _SMOOTHING_PX))
     weight = _fade(distance / _FADE_PX)
     change = beside * weight + _background(change, missing == 0)[:, None] * (1 - weight)
-    (h, w), x, y = _VIEW_SIZE, np.arange(_VIEW_SIZE[1]), np.arange(_VIEW_SIZE[0])[:, None]
+    (h, w), x, y = HALF_VIEW_SIZE, np.arange(HALF_VIEW_SIZE[1]), np.arange(HALF_VIEW_SIZE[0])[:, None]
     border_px = np.minimum(np.minimum(x, w - 1 - x), np.minimum(y, h - 1 - y))
     share = _fade(distance / _BACKGROUND_FADE_PX) * _fade(1 - border_px / _BORDER_PX)
     return Correction(strip.view, change.astype(np.float32), share.astype(np.float32))
@@ -392,7 +400,7 @@ def reduced(image: torch.Tensor, level: int) -> npt.NDArray[np.float32]:
 _OVERLAP_BYTES = 128 * 2**20  # about 4 MB each for six cameras
 
 OverlapCache = LRUCache[tuple[bytes, str | None], OverlapDepth]
-"""Depth from overlap by calibration, and name of what frames share."""
+"""Depth from overlap by calibration with names, which its reports show, and name of what frames share."""
 
 
 def overlap_cache(share: bool | str, config: Any) -> OverlapCache | None:
@@ -422,4 +430,4 @@ def estimate_overlap(
     if key is not None and key not in frame.sample:
         raise SampleError(f"PlanCache.share_overlap: expected {key!r} in the sample, to tell which frames share depth")
     name = None if key is None else frame.name(key)
-    return shared.get((frame.rig.content_key, name), lambda: overlap_depth(frame.rig, frame.images, boxes))
+    return shared.get((frame.rig.named_key, name), lambda: overlap_depth(frame.rig, frame.images, boxes))

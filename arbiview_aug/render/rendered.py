@@ -61,8 +61,7 @@ def render_opencv(
     rows_of_bytes = atlas.view(np.uint8).reshape(len(atlas), -1)
     views = _empty_views(plan, work)
     scale = LEVELS if work == torch.uint8 else SHARES
-    sizes = {target.source_camera.shape for target in plan.targets}
-    buffers = {size: scratch.get(f"view {size}", (*size, 3), atlas.dtype) for size in sizes}
+    pixels = scratch.get("view", (max(target.source_camera.size for target in plan.targets), 3), atlas.dtype)
     for number, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
         h, w = target.source_camera.shape
         if curves is not None:
@@ -74,7 +73,7 @@ def render_opencv(
         if not target.pairs:
             view.zero_()
             continue
-        buffer, at, winner = buffers[h, w], target.at, target.source_camera
+        buffer, at, winner = pixels[: h * w].reshape(h, w, 3), target.at, target.source_camera
         packed = at.xy.view(np.int32)[..., 0]
         for y in range(0, h, _STRIP_ROWS):
             rows = slice(y, y + _STRIP_ROWS)
@@ -140,7 +139,8 @@ def _stacked_block(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> np.nd
         return None
     step, storage = first.nbytes, images[0].untyped_storage()
     for k, image in enumerate(images):
-        if image.data_ptr() != images[0].data_ptr() + k * step or image.stride() != images[0].stride():
+        alike = image.shape == images[0].shape and image.stride() == images[0].stride()
+        if not alike or image.data_ptr() != images[0].data_ptr() + k * step:
             return None
         if image.untyped_storage().data_ptr() != storage.data_ptr():
             return None  # neighbours in memory by chance, or slices of one numpy array

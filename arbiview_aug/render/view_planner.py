@@ -380,7 +380,7 @@ class ViewPlanner:
                 upsample_where(region.certainty, self.step, winner, region.source, certain)
         interpolation = self._interpolation(won_px)
         if interpolation == "nearest":
-            fixed = fixed.rounded()
+            fixed, bands = fixed.rounded(), tuple(replace(band, at=band.at.rounded()) for band in bands)
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
         if not self.config.layers:
@@ -647,10 +647,12 @@ def _built(
 ) -> RenderPlan:
     counters: Counter[str] = Counter()
     order = content_order(source.cameras)
-    planners = [
-        ViewPlanner(source, order, camera, surface, scene, config, counters, maps, pixels)
-        for camera, pixels in zip(target, wanted, strict=True)
-    ]
+    # Targets at one centre share panoramas: their order must not tell which of them makes one.
+    by_target = {
+        k: ViewPlanner(source, order, target[k], surface, scene, config, counters, maps, wanted[k])
+        for k in content_order(target.cameras)
+    }
+    planners = [by_target[k] for k in range(len(target))]
     used = [(region.source, region.level) for planner in planners for region in planner.regions]
     layout = AtlasLayout.for_sources(source.sizes, used)
     targets = tuple(planner.finish(layout) for planner in planners)

@@ -105,7 +105,7 @@ class Neighbour:
 
 
 def read_neighbours(frame: Frame, warn: Warn) -> list[Neighbour]:
-    """Read the neighbours of a frame, nearest first.
+    """Read the neighbours of a frame, nearest first, of two at one distance the one behind.
 
     ``neighbours`` is a list of mappings, each another frame of the same rig (in a batch, a list of such lists):
     ``images``; ``ego2ego`` (4, 4), its ego frame to the current one, or ``ego2world`` as in the sample; optionally
@@ -142,7 +142,7 @@ def _read(frame: Frame, warn: Warn) -> list[Neighbour]:
             continue
         if neighbour is not None:
             neighbours.append(neighbour)
-    return sorted(neighbours, key=lambda neighbour: neighbour.travel_m)
+    return sorted(neighbours, key=lambda neighbour: (neighbour.travel_m, neighbour.ahead_m))
 
 
 def points_of_neighbours(frame: Frame, warn: Warn) -> list[FloatArray]:

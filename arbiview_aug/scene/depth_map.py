@@ -223,7 +223,10 @@ def hidden_by(maps: Sequence[DepthMap], camera: Camera) -> Layer | None:
 
 
 def _warped(one: Camera, layer: Layer, two: Camera, interpolation: int, border: int) -> Layer:
-    """A layer of a camera at the size of another one with the same rays."""
+    """A layer of a camera at the size of another one with the same rays; 0 over a pixel beyond its image.
+
+    So much a halved layer may lack at the far borders.
+    """
     if one.size == two.size and np.array_equal(one.K, two.K):
         return layer
     scale = one.K[[0, 1], [0, 1]] / two.K[[0, 1], [0, 1]]
@@ -233,4 +236,8 @@ def _warped(one: Camera, layer: Layer, two: Camera, interpolation: int, border: 
     if is_whole and interpolation == cv2.INTER_LINEAR:  # ten times as fast
         return np.asarray(cv2.resize(layer, two.size[::-1], interpolation=interpolation))
     flags = interpolation | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpAffine(layer, to_one, two.size[::-1], flags=flags, borderMode=border))
+    warped = np.asarray(cv2.warpAffine(layer, to_one, two.size[::-1], flags=flags, borderMode=border), np.float32)
+    for lines, at, size in zip((warped.T, warped), to_one, one.size[::-1], strict=True):
+        place = at[:2].sum() * np.arange(len(lines)) + at[2]
+        lines[np.abs(place - (size - 1) / 2) > size / 2 + 1] = 0
+    return warped

@@ -336,7 +336,7 @@ class PointCloudSurface(DenseSurface):
         from arbiview_aug.scene.completion import read_layer
 
         rays = np.moveaxis(directions.reshape(1, -1, 3), -1, 0).astype(np.float32, order="C")
-        view = self._latest.get(origin.tobytes()) or self.view(origin, directions)  # of a window, no more is open
+        view = self.view(origin, directions, latest=self._latest.get(origin.tobytes()))
         near = np.empty(rays.shape[2], np.float32)
         read_layer(*(cells[0] for cells in view.cells(rays, np.eye(3))), view.layers[3], near)
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
@@ -363,9 +363,17 @@ class PointCloudSurface(DenseSurface):
         return self._nodes[key]
 
     def view(
-        self, origin: FloatArray, directions: FloatArray, cells: Cells | None = None, memory: Memory = FRESH
+        self,
+        origin: FloatArray,
+        directions: FloatArray,
+        cells: Cells | None = None,
+        memory: Memory = FRESH,
+        latest: Panorama | None = None,
     ) -> Panorama:
-        """The panorama around a centre that holds rays (..., 3); without ``cells`` one that was made before will do."""
+        """The panorama around a centre that holds rays (..., 3); without ``cells`` one that was made before will do.
+
+        ``latest`` is asked first, and taken where none holds them: of a window, no more is open.
+        """
         from arbiview_aug.scene.completion import elevations
 
         origin = origin.copy()  # of one type, whoever asks: each other is compiled for again
@@ -376,8 +384,9 @@ class PointCloudSurface(DenseSurface):
         around = lambda of: Window.around(  # noqa: E731
             directions.reshape(-1, 3), of, (low - of.beyond, high + of.beyond)
         )
-        suitable = (p for p in held if cells in (None, p.window.cells) and p.window.holds(around(p.window.cells)))
-        panorama = next(suitable, None)
+        known = [latest, *held] if latest else held
+        suitable = (p for p in known if cells in (None, p.window.cells) and p.window.holds(around(p.window.cells)))
+        panorama = next(suitable, latest)
         if panorama is None:
             cells = cells or self._cells()
             points = self.points, self.street, self._cones

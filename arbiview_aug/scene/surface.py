@@ -358,6 +358,10 @@ class CorrectedSurface(StaticSurface):
             q = np.minimum(base * (1 + self._change(origin, directions, q)), MAX_INVERSE_DISTANCE)
         return q
 
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """The base's."""
+        return self.base.uncertainty(origin, directions, inverse_distance)
+
     def _change(self, origin: FloatArray, directions: FloatArray, q: FloatArray) -> FloatArray:
         """Relative change (...,) at the points on rays."""
         rays, inverse = np.moveaxis(directions, -1, 0).reshape(3, -1), q.reshape(-1)

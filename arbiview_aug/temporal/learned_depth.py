@@ -301,6 +301,8 @@ def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[
         if scale > 0:
             residual = float(np.median(np.abs(scale * x + shift - y) / limit))
             fits.append((residual, float(np.median(np.abs(np.median(y) - y) / limit)), _Line(form, scale, shift)))
+    if np.ptp(values) == 0:
+        return None, None, "its output is the same everywhere"
     if not fits:
         return None, None, "near and far are swapped: the scale is negative"
     residual, constant, line = min(fits)

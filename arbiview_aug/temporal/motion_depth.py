@@ -144,7 +144,7 @@ def motion_depth(
 def _sides(neighbours: Sequence[Neighbour], load: Load, ground_z_m: float) -> Iterator[_Side]:
     """A neighbour behind the vehicle and one ahead of it: those of the best travel that can be loaded."""
     usable = [one for one in neighbours if TRAVEL_M[0] <= one.travel_m <= TRAVEL_M[1]]
-    usable.sort(key=lambda one: (abs(one.travel_m - BEST_TRAVEL_M), one.number))
+    usable.sort(key=lambda one: abs(one.travel_m - BEST_TRAVEL_M))
     for is_ahead in (False, True):
         for one in usable:
             if (one.ahead_m > 0) == is_ahead and (images := load(one)) is not None:

@@ -254,10 +254,9 @@ def test_gains_at_the_clamp(
     assert views.isfinite().all() and views.min() >= 0 and views.max() <= 1
 
 
-@pytest.mark.parametrize("knee", [0.05, 0.9, 0.99])
 @pytest.mark.parametrize("gain", [1e-3, 1 / 16, 1 / 2.5, 2.5, 16.0, 1e3])
-def test_curves_stay_in_range_and_rise(gain: float, knee: float, worst: Worst) -> None:
-    curve = tone_curves(gain, knee)
+def test_curves_stay_in_range_and_rise(gain: float, worst: Worst) -> None:
+    curve = tone_curves(gain)
     x, levels = np.linspace(0, 1, 4097), np.arange(256, dtype=np.uint8).repeat(3)
     lines = x * curve[0], 1 - (1 - x) * curve[1]
     exact, triple = np.minimum(*lines) if gain > 1 else np.maximum(*lines), x.astype(np.float32).repeat(3)

@@ -73,6 +73,23 @@ def test_threads_do_not_disturb_each_other(settings: dict[str, Any]) -> None:
     assert retarget.plans.size <= retarget.cache.max_bytes or len(retarget.plans) == 1
 
 
+def test_a_cache_reads_few_sizes_for_each_value_and_sees_values_grow() -> None:
+    reads, grown = [], [0]
+
+    def size(value: int) -> int:
+        reads.append(value)
+        return 1 + grown[0]
+
+    cache: LRUCache[int, int] = LRUCache(300, size)
+    for k in range(1000):
+        cache.get(k, lambda k=k: k)
+    assert len(cache) == 300 and len(reads) < 20_000
+    grown[0] = 2
+    for k in range(1000, 1050):
+        cache.get(k, lambda k=k: k)
+    assert len(cache) == 100
+
+
 def test_caches_keep_count() -> None:
     cache: LRUCache[bytes, Any] = LRUCache(20, attrgetter("nbytes"))
 

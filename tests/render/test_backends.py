@@ -137,6 +137,38 @@ def test_slices_of_one_numpy_array_render_like_any_images() -> None:
     assert differences(expected, render_opencv(plan, slices)).max() == 0
 
 
+def test_slices_of_one_block_of_rows_may_differ_in_height() -> None:
+    cameras = zip(list(load_rig("nuscenes").resized((90, 160)))[:3], (90, 90, 45), strict=True)
+    low = [camera.crop(0, 0, (height, 160)) for camera, height in cameras]
+    rig, rows = Rig(low), torch.randint(256, (225, 160, 3), dtype=torch.uint8)
+    slices = [part.permute(2, 0, 1) for part in rows.split([90, 90, 45])]
+    plan = replace(build_plan(rig, Rig([low[0]])), layout=AtlasLayout.for_sources(rig.sizes, [(0, 0), (1, 0)]))
+    assert plan.layout.is_stack
+    expected = render_opencv(plan, [image.contiguous() for image in slices])
+    assert differences(expected, render_opencv(plan, slices)).max() == 0
+
+
+def test_views_of_any_sizes_share_one_buffer() -> None:
+    rig, scratch = load_rig("nuscenes").resized(0.1), Scratch()
+    for size in ((40, 60), (90, 160), (20, 90), (41, 60)):
+        plan = build_plan(rig, rig.resized(size))
+        assert (
+            differences(render_opencv(plan, noise_images(rig)), render_opencv(plan, noise_images(rig), scratch)).max()
+            == 0
+        )
+    held = vars(scratch._local)
+    assert set(held) == {"atlas", "view"} and held["view"].size == 3 * 90 * 160
+
+
+def test_nearest_pixels_are_whole_ones_in_seams_too() -> None:
+    rig = load_rig("nuscenes").resized(0.1)
+    plan = build_plan(rig, rig.turned(yaw_deg=20), config=RenderConfig(interpolation="nearest", seam_width=0.3))
+    assert any(view.bands for view in plan.targets)
+    assert not any(band.at.frac.any() for view in plan.targets for band in view.bands)
+    images = noise_images(rig)
+    assert differences(by("opencv", plan, images), by("torch", plan, images)).max() <= 1
+
+
 def test_no_view_depends_on_memory_that_no_image_fills(monkeypatch: pytest.MonkeyPatch) -> None:
     """Images of different widths leave gaps in the atlas; a bilinear tap of weight 0 there times NaN is NaN."""
     narrow, wide = load_rig("nuscenes").resized((45, 80)), load_rig("nuscenes").resized((90, 160))

@@ -8,7 +8,7 @@ from arbiview_aug import Rig, RigRetarget, SampleKeys
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.render.confidence import certainty, confidence
 from arbiview_aug.scene.boxes import BoxSurface, solids
-from arbiview_aug.scene.surface import Far, Street
+from arbiview_aug.scene.surface import CorrectedSurface, Far, Street
 from tests.helpers import street_sample
 from tests.scene.single_rays import inverse_distance
 
@@ -46,6 +46,7 @@ def test_near_road_is_surer_than_the_wall() -> None:
     aside = np.array([[0.0, 1.0, 0.0]])  # the wall is nearer there, and so are the objects before it
     assert street.uncertainty(eye, aside, street.inverse_distance(eye, aside))[0] > 1.5 * spread[4]
     assert np.all(Far().uncertainty(eye, rays, np.zeros(6)) == 1 / 20)
+    assert np.array_equal(CorrectedSurface(street, ()).uncertainty(eye, rays, q), spread)
 
 
 def test_boxes_make_the_street_surer() -> None:

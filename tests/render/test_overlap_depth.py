@@ -15,8 +15,17 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rays import ego_rays, half_way_view, project_rays
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.render.overlap_depth import LIMITS, MIN_RISE_DB, OverlapDepth, overlap_cache, overlap_depth
+from arbiview_aug.render.overlap_depth import (
+    LIMITS,
+    MIN_RISE_DB,
+    OverlapDepth,
+    estimate_overlap,
+    overlap_cache,
+    overlap_depth,
+    why_ambiguous,
+)
 from arbiview_aug.render.view_planner import build_plan
+from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import CorrectedSurface, Correction, StaticSurface, Street
@@ -132,6 +141,12 @@ def test_declines_what_says_nothing(name: str) -> None:
     assert torch.equal(refining(sample)["images"], plain(sample)["images"])
     (report,) = refining.explain(sample).planned.overlap.reports  # type: ignore[union-attr]
     assert not report.accepted and report.reason
+
+
+def test_one_plain_colour_shows_nothing() -> None:
+    plain = np.empty((40, 60, 3), np.float32)
+    plain[:] = 200, 40, 10
+    assert why_ambiguous(plain, plain, np.ones((40, 60), bool)) == "one of the images shows nothing"
 
 
 def test_one_colour_of_light_more_or_less_is_no_depth(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
@@ -272,6 +287,16 @@ def test_a_cache_computes_each_scene_once(nearer: tuple[torch.Tensor, OverlapDep
     with pytest.raises(SampleError, match="2 frames"):
         retarget({**batch, "token": "a"})
     assert pickle.loads(pickle.dumps(retarget)).cache.share_overlap == "token"
+
+
+def test_reports_of_shared_depth_name_the_cameras_of_the_sample(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
+    images, _ = nearer
+    cache = overlap_cache(True, render_config("accurate"))
+    for prefix in ("", "other "):
+        rig = RIG.with_cameras([replace(one, name=prefix + one.name) for one in RIG])
+        (frame,) = read_frames({"images": images, "rig": rig}, None)
+        depth = estimate_overlap(frame, Scene(), "street", True, cache)
+        assert depth is not None and {depth.reports[0].first, depth.reports[0].second} == {one.name for one in rig}
 
 
 def test_a_cache_forgets_the_oldest(nearer: tuple[torch.Tensor, OverlapDepth], monkeypatch: pytest.MonkeyPatch) -> None:

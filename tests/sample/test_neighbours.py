@@ -68,6 +68,10 @@ def test_the_nearest_comes_first_and_keeps_its_number(sample: dict[str, Any]) ->
     sample["neighbours"].reverse()
     neighbours, _ = read(sample)
     assert [n.number for n in neighbours] == [1, 0]
+    for ends in ((-1.0, 1.0), (1.0, -1.0)):  # of two at one distance the one behind
+        entries = [one | {"ego2ego": pose(x)} for one, x in zip(sample["neighbours"], ends, strict=True)]
+        entries = [{key: value for key, value in one.items() if key != "time_s"} for one in entries]
+        assert [n.ahead_m for n in read(sample | {"neighbours": entries})[0]] == [-1.0, 1.0]
 
 
 def test_velocities_stand_in_for_missing_boxes(sample: dict[str, Any]) -> None:

@@ -171,6 +171,16 @@ def test_a_map_hides_what_is_clearly_behind_it(camera: Camera) -> None:
     assert hidden_by([flat._replace(depth_m=np.zeros_like(flat.depth_m))], camera) is None
 
 
+@pytest.mark.parametrize("rows", [50, 51])
+def test_a_map_hides_nothing_outside_its_image(rows: int) -> None:
+    """A narrower camera at the same place knows nothing beyond a pixel; halving leaves out an odd row."""
+    narrow = SMALL.crop(8, 10, (rows, 60))
+    halved = narrow.crop(0, 0, (50, 60)).resize((25, 30))
+    hidden = hidden_by([DepthMap(halved, np.full(halved.size, 10.0, np.float32))], SMALL)
+    assert hidden is not None and (hidden[8 : 8 + min(rows, 40), 10:70] > 0).all()
+    assert not hidden[:5].any() and not hidden[:, :7].any() and not hidden[:, 73:].any()
+
+
 def test_gaps_of_a_map_are_closed_by_what_is_around_them() -> None:
     view = helpers.camera(size=(192, 320), position_m=EYE, horizontal_fov_deg=40.0)
     one = DepthMap(view, np.full(view.size, 20.0, np.float32))

@@ -9,6 +9,7 @@ import pytest
 from arbiview_aug import SampleError
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.completion import block_cones
@@ -200,6 +201,27 @@ def test_duplicates_and_order_change_nothing() -> None:
     once = inverse_distance(PointCloudSurface(Street(), points), EYE, rays)
     shuffled = rng.permutation(np.concatenate([points, points]))
     assert np.allclose(inverse_distance(PointCloudSurface(Street(), shuffled), EYE, rays), once, atol=1e-6)
+
+
+def test_the_order_of_targets_at_one_place_changes_nothing() -> None:
+    """Neither positions nor, when they are asked for again, how sure these are."""
+    source, scene = demo_source_rig((64, 128)), Scene(points=np.concatenate([NEAR, FAR]))
+    wide, narrow, back = (
+        helpers.camera(name, azimuth, size=(64, 128), position_m=tuple(EYE), horizontal_fov_deg=fov)
+        for name, azimuth, fov in (("wide", 0, 110.0), ("narrow", 12, 50.0), ("back", 180, 80.0))
+    )
+    plans = [
+        build_plan(source, Rig(cameras), geometry="lidar", scene=replace(scene))
+        for cameras in ([wide, narrow, back], [back, narrow, wide])
+    ]
+    for one, two in zip(plans[0].targets, plans[1].targets[::-1], strict=True):
+        assert np.array_equal(one.at.xy, two.at.xy) and np.array_equal(one.at.frac, two.at.frac)
+    surface = PointCloudSurface(Street(), scene.points)
+    rays, q = towards(NEAR[::50])
+    surface.image(narrow, pixel_rays(narrow))
+    before = surface.uncertainty(EYE, rays, q)
+    surface.image(back, pixel_rays(back))
+    assert np.array_equal(surface.uncertainty(EYE, rays, q), before) and (before < 0.06 * q).all()
 
 
 def test_parts_of_a_view_agree_with_the_whole() -> None:

@@ -121,6 +121,11 @@ def test_points_choose_among_profiles() -> None:
             planes = profile_planes(box[0], number)
             chosen, is_own = solids_among(box, surface_points(planes, box[0]))
             assert np.allclose(chosen[0], planes) and is_own.mean() > 0.9
+    one, two = (surface_points(profile_planes(CAR[0], number), CAR[0]) for number in OF_KIND[kinds(CAR)[0]][:2])
+    count = min(len(one), len(two) // 2, 300)
+    mixed = np.concatenate([one[:count, None], two[: 2 * count].reshape(count, 2, 3)], 1).reshape(-1, 3)
+    orders = mixed, mixed[1:], mixed[2:], np.random.default_rng(0).permutation(mixed)
+    assert len(mixed) > 512 and len({solids_among(CAR, points)[0].tobytes() for points in orders}) == 1
     assert len(PROFILES) > len(OF_KIND[0])
 
 

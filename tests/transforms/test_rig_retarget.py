@@ -16,6 +16,7 @@ from torch.utils.data import default_collate
 
 from arbiview_aug import RandomRig, Rig, RigRetarget, SampleError, SampleKeys, SampleTypeError, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.inpaint import Telea
 from arbiview_aug.render.plan import RenderConfig
 from tests import helpers
 from tests.helpers import same, sample_of, smooth_images
@@ -269,6 +270,15 @@ def test_label_maps_are_the_winning_sources(dtype: torch.dtype) -> None:
     assert out["classes"].dtype == dtype and out["classes"].shape == (4, *SIZE)
     expected = torch.where(out["coverage"], out["source_camera"].to(dtype), torch.tensor(77, dtype=dtype))
     assert torch.equal(out["classes"], expected)
+
+
+def test_labels_of_pixels_that_were_filled_anew_are_ignored() -> None:
+    source = ring()
+    sample = sample_of(source, seg=torch.ones((4, *SIZE), dtype=torch.int64))
+    keys = SampleKeys(labels=("seg",))
+    out = RigRetarget(source.shifted(z_m=0.7), holes=Telea(min_confidence=0.5), geometry="street", keys=keys)(sample)
+    assert torch.equal(out["seg"] == 1, out["coverage"]) and out["coverage"].any()
+    assert (out["seg"][out["generated"]] == 255).all()
 
 
 def test_bool_labels_are_false_where_uncovered() -> None:
