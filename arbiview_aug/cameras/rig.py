@@ -350,14 +350,14 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
 
 
 def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
-    """Refuse another name of an absent key, which would not be read; of numbers, text may be a note."""
+    """Refuse another name of a key that is absent or null, which would not be read; of numbers, text may be a note."""
     for wrong in misnamed(entries, (key,)):
         value = entries[wrong]
         is_zero = not any(value) if isinstance(value, list) else not value
         if (key == "mask" or isinstance(value, Mapping | list | int | float)) and not is_zero:
             raise CalibrationError(
-                f"{label}: {key!r} is absent, and {wrong!r} is not read: did you mean {key!r}? Rename it, or add "
-                f"{key!r} if it is something else"
+                f"{label}: {key!r} is absent or null, and {wrong!r} is not read: did you mean {key!r}? Rename it, or "
+                "remove it if it is something else"
             )
 
 

@@ -123,7 +123,7 @@ def _for_network(
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compute and write the depth of every frame that has none yet; return 1 if a frame failed, else 0."""
+    """Compute and write the depth of every frame that has none yet; return 1 if a frame failed or none has depth, else 0."""
     device = device_named(arguments.device)
     data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
     _, root = split_kind(arguments.data)
@@ -184,7 +184,7 @@ def _summary(done: Sequence[Done], depths: DepthFolder) -> int:
             print(f"  {one.token}: failed: {one.message}", file=sys.stderr)
         elif one.density == 0 and not one.existed:
             print(f"  {one.token}: {one.message}")
-    return 1 if failed else 0
+    return 1 if failed or not known else 0
 
 
 def _camera_lines(fits: Sequence[CameraFit]) -> Iterator[str]:

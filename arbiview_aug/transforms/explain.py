@@ -25,7 +25,7 @@ class Explanation:
 
     planned: FramePlan
     harmonisation: PhotometricReport | None = None  # the sources' gains and why, if they are harmonised
-    learned: str | None = None  # the model of learned depth and how it was fitted, if the surface is made of it
+    depth: str | None = None  # how depth on disk was found, if the surface may be made of it
     fills: Fills | None = None  # how other frames of the drive fill holes, if there are any
     points: str | None = None  # what the target's scanners measure, if it has any
 
@@ -71,8 +71,8 @@ class Explanation:
             lines.append(f"geometry: {geometry}; the street elsewhere")
         if self.planned.motion is not None:
             lines.append(str(self.planned.motion))
-        if self.learned is not None:
-            lines += self.learned.splitlines()
+        if self.depth is not None:
+            lines += self.depth.splitlines()
         if self.fills is not None:
             lines += self.fills.lines(self.plan)
         if self.points is not None:
