@@ -180,7 +180,7 @@ class FrameFolder(WritableRecording):
         return values | ({"time_s": self._times_s[frame.name]} if frame.name in self._times_s else {})
 
     def _find_drive(self, order: Sequence[str]) -> Drive:
-        """Read the poses of the frames of ``sequence.json``; broken frames give warnings."""
+        """Read the poses of the frames of ``sequence.json``; broken frames, and too few, give warnings."""
         positions_m = {}
         for name in order:
             frame = self._frames[self._index[name]]
@@ -190,6 +190,9 @@ class FrameFolder(WritableRecording):
             except ArbiviewError as error:
                 warn(f"{error}; this frame is no neighbour")
         names = self._drive_names = list(positions_m)
+        if len(names) < 2:
+            found = "one" if names else "none"
+            warn(f"{self.root}: neighbours: expected frames of a drive ({SEQUENCE_FILE} and ego2world), found {found}")
         times_s = self._times_s if all(name in self._times_s for name in names) else None
         parts = parts_of_clock(names, times_s, str(self.root / SEQUENCE_FILE))
         return Drive(np.array(list(positions_m.values())).reshape(-1, 3), parts)

@@ -154,6 +154,12 @@ def test_folders_fill_the_road(recorded: Path) -> None:
     assert gained.float().mean() > 0.03 and ((out["source_frame"] > 0) == gained).all()
 
 
+def test_a_folder_without_a_drive_says_so(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded / "0000", tmp_path / "0000")
+    with pytest.warns(UserWarning, match=r"expected frames of a drive \(sequence.json and ego2world\), found none"):
+        assert FrameFolder(tmp_path, neighbours=Neighbours())[0]["neighbours"] == []
+
+
 @pytest.mark.parametrize("broken", ["image", "corrupt", "calibration"])
 def test_a_broken_neighbour_is_named_and_left_out(recorded: Path, tmp_path: Path, broken: str) -> None:
     root = tmp_path / "drive"
