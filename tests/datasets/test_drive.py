@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import DataError, Rig, RigRetarget, SampleKeys
+from arbiview_aug import DataError, RandomRig, Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import FrameFolder, LazyFrame, Neighbours, NuScenesDataset
 from arbiview_aug.datasets.drive import Drive, parts_of_clock, travelled_m
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -157,7 +157,12 @@ def test_folders_fill_the_road(recorded: Path) -> None:
 def test_a_folder_without_a_drive_says_so(recorded: Path, tmp_path: Path) -> None:
     shutil.copytree(recorded / "0000", tmp_path / "0000")
     with pytest.warns(UserWarning, match=r"expected frames of a drive \(sequence.json and ego2world\), found none"):
-        assert FrameFolder(tmp_path, neighbours=Neighbours())[0]["neighbours"] == []
+        alone = FrameFolder(tmp_path, neighbours=Neighbours())[0]
+    assert alone["neighbours"] == [] and "scene_token" not in alone
+    sequence = FrameFolder(recorded)
+    assert sequence[0]["scene_token"] == recorded.name
+    random = RandomRig(sequence[0]["rig"], yaw_deg=3, per="sequence")
+    assert random.draw_for(sequence[0]) == random.draw_for(sequence[2])
 
 
 @pytest.mark.parametrize("broken", ["image", "corrupt", "calibration"])
