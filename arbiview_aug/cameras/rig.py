@@ -313,7 +313,7 @@ def save_rig(
         path: A file for ``rig``, a folder for the others, which ``load_rig`` reads.
         format: ``rig``: see ``Rig.save``. ``ros``: a CameraInfo YAML for each camera, and ``tf_static.yaml``.
             ``kalibr``: ``camchain.yaml``, whose cameras are cam0, cam1 and so on. ``colmap``: ``cameras.txt`` and
-            ``images.txt``. ``mounting.yaml`` beside them has the road and the ego frame.
+            ``images.txt``. ``mounting.yaml`` beside them has the road, the ego frame, names and order.
 
     Raises:
         CalibrationError: A lens or a skew that the format has not.
