@@ -425,13 +425,14 @@ class RigRetarget(torch.nn.Module):
         frame = read_frames(sample, self.source)[0]
         target, _, _ = self._make_params([frame], None)
         if self._is_paper:
-            return PaperExplanation(self._published(frame, target))
+            return PaperExplanation(self._published(frame, target), self.inpainter.outcome)
         planned = self.plan_frame(frame, target)
         gains = self.harmonisation(sample) if self.harmoniser.is_on else None
         keys = ("motion", MOTION_WORDS_KEY), (LEARNED_KEY, LEARNED_WORDS_KEY)
         words = [frame.name(key) for read, key in keys if read in self._row.reads and sample.get(key) is not None]
         points = [words_of(part, frame, target) for part in self._scanned([frame], target)]
-        return Explanation(planned, gains, "\n".join(words) or None, self.plan_fills(planned), *points)
+        depth, fills = "\n".join(words) or None, self.plan_fills(planned)
+        return Explanation(planned, self.inpainter.outcome, gains, depth, fills, *points)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; for a batch, its first frame's."""
