@@ -9,6 +9,7 @@ import runpy
 import shlex
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -24,6 +25,7 @@ from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.choices import GeometryName, Quality
 from arbiview_aug.cli.bench import pareto
 from arbiview_aug.datasets import registry
+from arbiview_aug.errors import MissingPackageError
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.generator.training import command as train_command
 from arbiview_aug.render.requirements import HELPFUL_DATA
@@ -322,7 +324,8 @@ def test_the_detectors_numbers_are_the_reports() -> None:
     first, second, third = (percent(depths[name]) for name in used)
     assert f"which win back {first}, {second} and {third} % in rows two to four" in readme
     assert f"| {percent(changes('fov')['fov50-depths']['auto_fill'])} % |" in readme
-    assert f"| {percent(changes('priors')['up70']['random_a'])} % |" in readme
+    (recipe,), (priors,) = changes("recipe").values(), changes("priors").values()
+    assert f"| {percent(recipe['auto_fill_random'])} %; {percent(priors['random_a'])} % |" in readme
     assert f"| {round(100 * changes('seeds')['up70']['recipe']['share_t']['value'])} % | `python -m" in readme
 
 
@@ -379,7 +382,8 @@ def test_the_reference_lists_what_is_public() -> None:
     listed = re.findall(r"^::: ([\w.]+)$", text_of(ROOT / "docs" / "api.md"), re.MULTILINE)
     for name in listed:
         module, _, attribute = name.rpartition(".")
-        assert getattr(import_module(module), attribute).__doc__, name
+        with suppress(MissingPackageError):  # a framework that is not here
+            assert getattr(import_module(module), attribute).__doc__, name
     assert {f"arbiview_aug.{name}" for name in arbiview_aug.__all__} <= set(listed)
 
 

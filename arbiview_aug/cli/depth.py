@@ -123,7 +123,7 @@ def _for_network(
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compute and write the depth of every frame that has none yet; return 1 if a frame failed or none has depth, else 0."""
+    """Compute and write the depth of every frame that has none yet; return 1 if one failed or none has depth."""
     device = device_named(arguments.device)
     _, root = split_kind(arguments.data)
     folder = Path(arguments.output or inside(root, LEARNED_FOLDER if arguments.model else FOLDER, "depth"))

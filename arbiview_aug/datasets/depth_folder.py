@@ -83,7 +83,7 @@ class DepthFolder:
     def _read(self, token: str, rig: Rig) -> tuple[MotionDepth, list[str]]:
         path = self.path(token)
         if not path.is_file():
-            fix = "make it with python -m arbiview_aug depth --data FOLDER"
+            fix = "make it with python -m arbiview_aug depth --data FOLDER, and --model MODEL for learned depth"
             raise DataError(f"{path}: expected depth of frame {token!r}, found none; {fix}")
         try:
             with np.load(path, allow_pickle=False) as file:
@@ -105,8 +105,8 @@ class WithDepth(Dataset[dict[str, Any]]):
     """A map-style dataset that adds the ``depth`` command's results to its samples.
 
     Depth from motion becomes ``motion_depth_m``, for ``RigRetarget(geometry="motion")``; learned depth becomes
-    ``learned_depth_m``, for ``geometry="learned"``; ``motion_depth_words`` and ``learned_depth_words`` tell how each was
-    found, or why not. Samples need a ``token`` and a ``rig`` (or ``source``).
+    ``learned_depth_m``, for ``geometry="learned"``. ``motion_depth_words`` and ``learned_depth_words`` tell how they
+    were found, or why not. Samples need a ``token`` and a ``rig`` (or ``source``).
 
     Args:
         dataset: Map-style dataset of samples.

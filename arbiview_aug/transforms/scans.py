@@ -57,8 +57,8 @@ def retarget_points(
         boxes_3d: (B, >= 7) labelled objects, to count the points in each; they change no point.
         ground_z_m: Height of the road in the frame's ego frame.
         skip: Leave the points as they are, and count those in boxes.
-        sweeps: Arrays or tensors of points (Q, C) of other frames in this frame's ego frame, with the same columns. They fill rays
-            that the frame's own do not support.
+        sweeps: Arrays or tensors of points (Q, C) of other frames in this frame's ego frame, with the same columns.
+            They fill rays that the frame's own do not support.
 
     Raises:
         SampleError: Points or boxes of another shape.
