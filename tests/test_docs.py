@@ -234,7 +234,8 @@ def test_the_commands_run(
         )
     if "truck.yaml" in arguments:
         run_page(ROOT / "docs" / "rigs.md", only_first=True)
-    assert main([*arguments, *TINY[command]]) == 0
+    finds_none = arguments[0] == "depth"  # one frame alone, or a model of random weights
+    assert main([*arguments, *TINY[command]]) == int(finds_none)
     assert any(path.is_file() and path.name != "truck.yaml" for path in tmp_path.rglob("*"))
 
 

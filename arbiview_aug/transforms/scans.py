@@ -19,6 +19,7 @@ from arbiview_aug.sample.neighbours import Warn, points_of_neighbours
 from arbiview_aug.scene.boxes import checked_boxes, points_by_box
 from arbiview_aug.scene.point_cloud import checked_points, finite_rows
 from arbiview_aug.scene.scan import scan
+from arbiview_aug.scene.surface import Points
 
 RINGS_KEY, COUNTS_KEY = "point_rings", "num_points"
 
@@ -95,7 +96,7 @@ def retarget_points(
     return RetargetedPoints(points, rings, counts, unsupported)
 
 
-def _joined(points: Any, sweeps: Sequence[FloatArray]) -> Any:
+def _joined(points: Any, sweeps: Sequence[Points]) -> Any:
     """Points (P, C), then those of sweeps (Q, C)."""
     for k, sweep in enumerate(sweeps):
         if points.ndim != 2 or sweep.ndim != 2 or sweep.shape[1] != points.shape[1]:
