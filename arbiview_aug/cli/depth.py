@@ -126,10 +126,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Compute and write the depth of every frame that has none yet; return 1 if one failed or none has depth."""
     device = device_named(arguments.device)
     _, root = split_kind(arguments.data)
-    folder = Path(arguments.output or inside(root, LEARNED_FOLDER if arguments.model else FOLDER, "depth"))
     warned: list[str] = []
     with gathered_warnings(warned):
         data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
+        folder = Path(arguments.output or inside(root, LEARNED_FOLDER if arguments.model else FOLDER, "depth"))
         model = TransformersDepth(arguments.model, device) if arguments.model else None  # before the folder is made
         depths = DepthFolder(writable_folder(folder, str(folder)))
         remove_parts(folder, lambda owner: False)
