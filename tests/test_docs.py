@@ -9,6 +9,7 @@ import runpy
 import shlex
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -24,6 +25,7 @@ from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.choices import GeometryName, Quality
 from arbiview_aug.cli.bench import pareto
 from arbiview_aug.datasets import registry
+from arbiview_aug.errors import MissingPackageError
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.generator.training import command as train_command
 from arbiview_aug.render.requirements import HELPFUL_DATA
@@ -233,7 +235,8 @@ def test_the_commands_run(
         )
     if "truck.yaml" in arguments:
         run_page(ROOT / "docs" / "rigs.md", only_first=True)
-    assert main([*arguments, *TINY[command]]) == 0
+    finds_none = arguments[0] == "depth"  # one frame alone, or a model of random weights
+    assert main([*arguments, *TINY[command]]) == int(finds_none)
     assert any(path.is_file() and path.name != "truck.yaml" for path in tmp_path.rglob("*"))
 
 
@@ -323,7 +326,8 @@ def test_the_detectors_numbers_are_the_reports() -> None:
     first, second, third = (percent(depths[name]) for name in used)
     assert f"which win back {first}, {second} and {third} % in rows two to four" in readme
     assert f"| {percent(changes('fov')['fov50-depths']['auto_fill'])} % |" in readme
-    assert f"| {percent(changes('priors')['up70']['random_a'])} % |" in readme
+    (recipe,), (priors,) = changes("recipe").values(), changes("priors").values()
+    assert f"| {percent(recipe['auto_fill_random'])} %; {percent(priors['random_a'])} % |" in readme
     assert f"| {round(100 * changes('seeds')['up70']['recipe']['share_t']['value'])} % | `python -m" in readme
 
 
@@ -380,7 +384,8 @@ def test_the_reference_lists_what_is_public() -> None:
     listed = re.findall(r"^::: ([\w.]+)$", text_of(ROOT / "docs" / "api.md"), re.MULTILINE)
     for name in listed:
         module, _, attribute = name.rpartition(".")
-        assert getattr(import_module(module), attribute).__doc__, name
+        with suppress(MissingPackageError):  # a framework that is not here
+            assert getattr(import_module(module), attribute).__doc__, name
     assert {f"arbiview_aug.{name}" for name in arbiview_aug.__all__} <= set(listed)
 
 

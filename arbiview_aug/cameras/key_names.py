@@ -37,10 +37,10 @@ _LIKENESS = 0.88
 
 
 def misnamed(entries: Mapping[Any, Any], read: Sequence[str]) -> dict[str, str]:
-    """The keys of ``entries`` that are likely meant as one of the keys that are ``read`` and absent."""
+    """The keys of ``entries`` that are likely meant as one of the keys that are ``read`` and absent or null."""
     names = tuple(read)
     meanings = ((key, meant_by(key, names)) for key in entries if isinstance(key, str))
-    return {k: meant for k, meant in meanings if meant and meant not in entries and _could_be(meant, entries[k])}
+    return {k: meant for k, meant in meanings if meant and entries.get(meant) is None and _could_be(meant, entries[k])}
 
 
 def hint(entries: Iterable[Any], wanted: Sequence[str]) -> str:

@@ -313,7 +313,7 @@ def save_rig(
         path: A file for ``rig``, a folder for the others, which ``load_rig`` reads.
         format: ``rig``: see ``Rig.save``. ``ros``: a CameraInfo YAML for each camera, and ``tf_static.yaml``.
             ``kalibr``: ``camchain.yaml``, whose cameras are cam0, cam1 and so on. ``colmap``: ``cameras.txt`` and
-            ``images.txt``. ``mounting.yaml`` beside them has the road and the ego frame.
+            ``images.txt``. ``mounting.yaml`` beside them has the road, the ego frame, names and order.
 
     Raises:
         CalibrationError: A lens or a skew that the format has not.
@@ -350,14 +350,14 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
 
 
 def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
-    """Refuse another name of an absent key, which would not be read; of numbers, text may be a note."""
+    """Refuse another name of a key that is absent or null, which would not be read; of numbers, text may be a note."""
     for wrong in misnamed(entries, (key,)):
         value = entries[wrong]
         is_zero = not any(value) if isinstance(value, list) else not value
         if (key == "mask" or isinstance(value, Mapping | list | int | float)) and not is_zero:
             raise CalibrationError(
-                f"{label}: {key!r} is absent, and {wrong!r} is not read: did you mean {key!r}? Rename it, or add "
-                f"{key!r} if it is something else"
+                f"{label}: {key!r} is absent or null, and {wrong!r} is not read: did you mean {key!r}? Rename it, or "
+                "remove it if it is something else"
             )
 
 

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
         planned = "nothing can be planned ahead."
     print(
         f"\n{frame_ms:.1f} ms a frame: {len(source)} source images to {len(target)} views of "
-        f"{target[0].width_px}x{target[0].height_px}, quality {arguments.quality}, {cv2.getNumThreads()} threads; "
+        f"{target[0].height_px}x{target[0].width_px}, quality {arguments.quality}, {cv2.getNumThreads()} threads; "
         f"{planned}"
     )
     truth = None if done.first is None else done.first.true_images(target)

@@ -123,13 +123,13 @@ def _for_network(
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Compute and write the depth of every frame that has none yet; return 1 if a frame failed, else 0."""
+    """Compute and write the depth of every frame that has none yet; return 1 if one failed or none has depth."""
     device = device_named(arguments.device)
-    data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
     _, root = split_kind(arguments.data)
-    folder = Path(arguments.output or inside(root, LEARNED_FOLDER if arguments.model else FOLDER, "depth"))
     warned: list[str] = []
     with gathered_warnings(warned):
+        data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
+        folder = Path(arguments.output or inside(root, LEARNED_FOLDER if arguments.model else FOLDER, "depth"))
         model = TransformersDepth(arguments.model, device) if arguments.model else None  # before the folder is made
         depths = DepthFolder(writable_folder(folder, str(folder)))
         remove_parts(folder, lambda owner: False)
@@ -184,7 +184,7 @@ def _summary(done: Sequence[Done], depths: DepthFolder) -> int:
             print(f"  {one.token}: failed: {one.message}", file=sys.stderr)
         elif one.density == 0 and not one.existed:
             print(f"  {one.token}: {one.message}")
-    return 1 if failed else 0
+    return 1 if failed or not known else 0
 
 
 def _camera_lines(fits: Sequence[CameraFit]) -> Iterator[str]:

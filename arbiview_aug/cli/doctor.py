@@ -114,7 +114,7 @@ def _frame(size: tuple[int, int]) -> Line:
         with one_thread():
             times += f"; on one thread {_times(calls)}"
     images = np.stack([image.numpy() for image in out["images"]])
-    text = f"a frame, {len(sample['rig'])} cameras to {len(images)} of {size[1]}x{size[0]}: {times}"
+    text = f"a frame, {len(sample['rig'])} cameras to {len(images)} of {size[0]}x{size[1]}: {times}"
     return bool(images.std() > 1 and out["coverage"].any()), text
 
 

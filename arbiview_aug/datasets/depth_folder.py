@@ -16,7 +16,7 @@ from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.errors import DataError, SampleError
 from arbiview_aug.sample.batching import stacked
-from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY
+from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.temporal.learned_depth import LearnedDepth
@@ -83,7 +83,7 @@ class DepthFolder:
     def _read(self, token: str, rig: Rig) -> tuple[MotionDepth, list[str]]:
         path = self.path(token)
         if not path.is_file():
-            fix = "make it with python -m arbiview_aug depth --data FOLDER"
+            fix = "make it with python -m arbiview_aug depth --data FOLDER, and --model MODEL for learned depth"
             raise DataError(f"{path}: expected depth of frame {token!r}, found none; {fix}")
         try:
             with np.load(path, allow_pickle=False) as file:
@@ -105,7 +105,8 @@ class WithDepth(Dataset[dict[str, Any]]):
     """A map-style dataset that adds the ``depth`` command's results to its samples.
 
     Depth from motion becomes ``motion_depth_m``, for ``RigRetarget(geometry="motion")``; learned depth becomes
-    ``learned_depth_m``, for ``geometry="learned"``. Samples need a ``token`` and a ``rig`` (or ``source``).
+    ``learned_depth_m``, for ``geometry="learned"``. ``motion_depth_words`` and ``learned_depth_words`` tell how they
+    were found, or why not. Samples need a ``token`` and a ``rig`` (or ``source``).
 
     Args:
         dataset: Map-style dataset of samples.
@@ -135,10 +136,9 @@ class WithDepth(Dataset[dict[str, Any]]):
         out = dict(sample)
         for folder in self.folders:
             depth = folder.read(str(token), rig)
-            is_learned = isinstance(depth, LearnedDepth)
-            out[LEARNED_KEY if is_learned else MOTION_KEY] = stacked([*map(torch.from_numpy, depth.depth_m)])
-            if is_learned:
-                out[LEARNED_WORDS_KEY] = str(depth)
+            learned, motion = (LEARNED_KEY, LEARNED_WORDS_KEY), (MOTION_KEY, MOTION_WORDS_KEY)
+            key, words = learned if isinstance(depth, LearnedDepth) else motion
+            out |= {key: stacked([*map(torch.from_numpy, depth.depth_m)]), words: str(depth)}
         return out
 
 

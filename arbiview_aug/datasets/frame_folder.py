@@ -96,7 +96,8 @@ class FrameFolder(WritableRecording):
 
     A sample is a dict: ``images`` (N, 3, h, w) uint8 RGB, or a list if sizes differ; ``rig`` (names, lenses, masks,
     ground); ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token`` (the folder's name); and, if the frame has
-    them, ``points`` (P, >=3) float32, ``boxes_3d`` (B, >=7) float32, ``ego2world`` (4, 4) float64 and ``time_s``.
+    them, ``points`` (P, >=3) float32, ``boxes_3d`` (B, >=7) float32, ``ego2world`` (4, 4) float64 and ``time_s``;
+    ``scene_token`` (the root's name) if ``sequence.json`` lists the frame.
     ``neighbours`` are frames of ``sequence.json`` with a pose. The numbers of points and boxes vary: batch with
     ``collate_fn=arbiview_aug.collate``.
 
@@ -130,9 +131,10 @@ class FrameFolder(WritableRecording):
         self._last_rig: tuple[str, Rig] | None = None
         self._rims: dict[tuple[Any, ...], BoolArray | None] = {}
         self._times_s, order = _read_sequence(self.root, self._index)
+        self._order = dict.fromkeys(order)
         self._warn = WarnOnce()
         self._drive_names: list[str] = []
-        self._drive = None if neighbours is None else self._find_drive(order)
+        self._drive = None if neighbours is None else self._find_drive()
 
     def files(self, index: int) -> list[Path]:
         """Source files of a frame: calibration, images, masks and points."""
@@ -155,6 +157,8 @@ class FrameFolder(WritableRecording):
         if self.load_points and (points := _read_points(calib, frame)) is not None:
             sample["points"] = points
         sample |= self._boxes_pose_time(calib, frame)
+        if frame.name in self._order:
+            sample["scene_token"] = self.root.resolve().name
         if self._drive is not None:
             names, name = self._drive_names, frame.name
             sample["neighbours"] = self._neighbours(self._drive, names.index(name)) if name in names else []
@@ -179,10 +183,10 @@ class FrameFolder(WritableRecording):
         values = {key: check(calib[key], frame.where) for key, check in checks.items() if calib.get(key) is not None}
         return values | ({"time_s": self._times_s[frame.name]} if frame.name in self._times_s else {})
 
-    def _find_drive(self, order: Sequence[str]) -> Drive:
-        """Read the poses of the frames of ``sequence.json``; broken frames give warnings."""
+    def _find_drive(self) -> Drive:
+        """Read the poses of the frames of ``sequence.json``; broken frames, and too few, give warnings."""
         positions_m = {}
-        for name in order:
+        for name in self._order:
             frame = self._frames[self._index[name]]
             try:
                 if (pose := _read_calibration(frame).get("ego2world")) is not None:
@@ -190,6 +194,9 @@ class FrameFolder(WritableRecording):
             except ArbiviewError as error:
                 warn(f"{error}; this frame is no neighbour")
         names = self._drive_names = list(positions_m)
+        if len(names) < 2:
+            found = "one" if names else "none"
+            warn(f"{self.root}: neighbours: expected frames of a drive ({SEQUENCE_FILE} and ego2world), found {found}")
         times_s = self._times_s if all(name in self._times_s for name in names) else None
         parts = parts_of_clock(names, times_s, str(self.root / SEQUENCE_FILE))
         return Drive(np.array(list(positions_m.values())).reshape(-1, 3), parts)

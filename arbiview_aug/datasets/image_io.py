@@ -132,6 +132,8 @@ def read_header(path: Path, label: str) -> tuple[str, tuple[int, int]]:
         return _header(path.read_bytes(), label)
     except FileNotFoundError:
         raise DataError(f"{label}: expected an image file, found none; check the path and the data root") from None
+    except DataError:
+        raise
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
         got = getattr(error, "strerror", None) or error
         raise DataError(f"{label}: expected a readable image file, got {got}") from None

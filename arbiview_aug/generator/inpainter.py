@@ -30,7 +30,7 @@ class Diffusion(Inpainter, torch.nn.Module):
 
     Args:
         generator: ``Generator.from_pretrained(DIR)``; None loads the shipped weights, trained on synthetic streets.
-        steps: Denoising steps: 1 (regression), 4, 10 or 50; the generator's default if None.
+        steps: Denoising steps, from 1 (regression) on; the generator's default if None.
         guidance: Classifier-free guidance, 1 for none; the generator's default if None.
         min_confidence: As for every ``Inpainter``, like ``seed``.
 

@@ -21,6 +21,7 @@ from arbiview_aug.datasets.image_io import decode_bytes, encoded, encoded_image
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError, SampleError, calibration_of
 from arbiview_aug.sample.batching import stacked
+from arbiview_aug.sample.inputs import read_frames
 
 ARRAYS = ("points", "boxes_3d", "ego2world")
 """Entries that are stored as .npy files."""
@@ -32,14 +33,15 @@ def to_entry(sample: Mapping[str, Any], key: str) -> Entry:
     """A sample's files by their endings, as WebDataset's writers take them.
 
     Args:
-        sample: With ``images``, uint8 (3, h, w) for each camera of ``rig``; ``ARRAYS`` and ``token`` where present.
+        sample: With ``images``, uint8 (3, h, w) for each camera of ``rig``, or of ``K`` and ``cam2ego``; ``ARRAYS`` and
+            ``token`` where present.
         key: Unique, without dots.
 
     Raises:
         SampleError: A key with dots, images of other sizes or of another number than the rig's cameras.
         SampleTypeError: Images of another type.
     """
-    rig: Rig = sample["rig"]
+    rig: Rig = read_frames(sample, None)[0].rig if sample.get("rig") is None else sample["rig"]
     if "." in key:
         raise SampleError(f"key: expected none of dots, at which WebDataset splits names, got {key!r}")
     shapes = [tuple(image.shape) for image in sample["images"]]
@@ -101,8 +103,9 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
     return sample
 
 
-def write_shard(path: Path, samples: Iterable[Mapping[str, Any]]) -> Path:
+def write_shard(path: str | Path, samples: Iterable[Mapping[str, Any]]) -> Path:
     """Write samples as one shard, at once or not at all; webdataset itself is not needed. Returns the path."""
+    path = Path(path)
     with whole_file(path) as file, tarfile.open(fileobj=file, mode="w") as tar:
         for k, sample in enumerate(samples):
             entry = to_entry(sample, f"{path.stem.replace('.', '-')}-{k:06}")

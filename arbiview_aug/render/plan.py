@@ -41,7 +41,7 @@ class RenderConfig:
         seam_width: Width of the blended band along a seam, as a fraction of the target's width; 0 switches blending
             off. Wider bands show double images of near objects, narrower ones the exposure step.
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
-        certainty: Store the geometry's accuracy in plans, one byte a pixel; ``outputs=("confidence",)`` needs it.
+        certainty: Store the geometry's accuracy in plans, one byte a pixel, for ``SampleKeys(extra=("confidence",))``.
         layers: Store what holes show (``ViewPlan.layers``, ``paint``, ``road``); ``RigRetarget`` sets it by ``holes``.
     """
 

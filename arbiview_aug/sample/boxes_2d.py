@@ -57,8 +57,8 @@ def project_boxes_3d(boxes_3d: Any, cameras: Rig | Mapping[str, Any]) -> list[Im
     Raises:
         SampleError: Boxes of another shape, not finite or without size; a batch of samples.
     """
-    boxes = checked_boxes(boxes_3d)
-    return [_of_camera(camera, boxes) for camera in rig_of(cameras)]
+    rig, boxes = rig_of(cameras), checked_boxes(boxes_3d)
+    return [_of_camera(camera, boxes) for camera in rig]
 
 
 def rig_of(cameras: Rig | Mapping[str, Any]) -> Rig:
@@ -71,7 +71,7 @@ def rig_of(cameras: Rig | Mapping[str, Any]) -> Rig:
         return cameras
     frames = read_frames(cameras, None)
     if lead := leading_shape(cameras["images"]):
-        raise SampleError(f"cameras: expected one sample, got a batch {lead}; project the boxes of each frame")
+        raise SampleError(f"cameras: expected one sample, got a batch {lead}; pass its frames one by one")
     return frames[0].rig
 
 

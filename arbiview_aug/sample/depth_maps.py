@@ -34,8 +34,8 @@ def depth_maps(points: Any, cameras: Rig | Mapping[str, Any]) -> torch.Tensor | 
     Raises:
         SampleError: Points of another shape; a batch of samples.
     """
-    array = checked_points(as_array("points", points))
-    return stacked([torch.from_numpy(_of_camera(camera, array)) for camera in rig_of(cameras)])
+    rig, array = rig_of(cameras), checked_points(as_array("points", points))
+    return stacked([torch.from_numpy(_of_camera(camera, array)) for camera in rig])
 
 
 def _of_camera(camera: Camera, points: Points) -> Layer:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, pairwise
+from itertools import chain, pairwise, zip_longest
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,8 @@ from arbiview_aug.scene.surface import Points
 MOTION_KEY, LEARNED_KEY = "motion_depth_m", "learned_depth_m"
 """(N, h, w) z-depth computed offline, at the size of ``motion_camera``."""
 
-LEARNED_WORDS_KEY = "learned_depth_words"  # the model and how it was fitted, for ``explain``
+MOTION_WORDS_KEY, LEARNED_WORDS_KEY = "motion_depth_words", "learned_depth_words"
+"""How they were made, or why they were declined, for ``explain`` and warnings."""
 
 CALIBRATION_KEYS = (
     "images",
@@ -43,10 +44,13 @@ CALIBRATION_KEYS = (
     "neighbours",
     MOTION_KEY,
     LEARNED_KEY,
+    MOTION_WORDS_KEY,
     LEARNED_WORDS_KEY,
     "retarget_params",
 )
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
+
+_CHECKED_KEYS = frozenset(("K", "cam2ego", "lens", "distortion", "ground_z_m"))  # against the transform's ``source``
 
 _MOST_FOCALS = 20  # of a side: 169 degrees of a pinhole image, and more than any lens sees
 _OFF_CENTER = 0.2  # a principal point is never off centre by this share of the image's size along both axes
@@ -143,8 +147,10 @@ def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
         frame_from(checked_images(frame), sample, source, lead, index)
         for frame, index in zip(split("images", images, lead), np.ndindex(*lead), strict=True)
     ]
-    if source is not None and sample.get("rig") is None and not (sample.get("K") is sample.get("cam2ego") is None):
-        _check_agrees(source, sample, lead)
+    if source is not None and sample.get("rig") is None and not _CHECKED_KEYS.isdisjoint(sample):
+        for key in _differing(source, sample, lead):
+            fix = f"drop source=, or {key} from the sample"
+            raise SampleError(f"{key}: expected the calibration of source=, got another; {fix}")
     return frames
 
 
@@ -244,14 +250,19 @@ def frame_from(
     return Frame(images, _with_masks(rig, sample, lead, index), sample, lead, index)
 
 
-def _check_agrees(source: Rig, sample: Mapping[str, Any], lead: tuple[int, ...]) -> None:
-    """Refuse a sample whose K or cam2ego is not that of the transform's ``source``, beyond rounding."""
-    for key, expected in (("K", source.K), ("cam2ego", source.cam2ego)):
+def _differing(source: Rig, sample: Mapping[str, Any], lead: tuple[int, ...]) -> Iterator[str]:
+    """Calibration keys of a sample that are not those of the transform's ``source``, beyond rounding."""
+    for key, expected in (("K", source.K), ("cam2ego", source.cam2ego), ("ground_z_m", np.array(source.ground_z_m))):
         got = expected if sample.get(key) is None else numbers(key, sample[key])
-        if got.shape not in (expected.shape, (*lead, *expected.shape)) or not np.allclose(got, expected, 1e-4, 1e-3):
-            raise SampleError(
-                f"{key}: expected the calibration of source=, got another; drop source=, or {key} from the sample"
-            )
+        is_shaped = expected.ndim == 0 or got.shape in (expected.shape, (*lead, *expected.shape))
+        if not is_shaped or not np.allclose(got, expected, 1e-4, 1e-3):
+            yield key
+    if sample.get("lens") is not None or sample.get("distortion") is not None:
+        for index in np.ndindex(*lead):
+            for camera, (lens, coefficients) in zip(source, _lenses(sample, len(source), index), strict=True):
+                pairs = zip_longest(camera.distortion, coefficients, fillvalue=0.0)
+                if lens != camera.lens or not all(math.isclose(*pair, rel_tol=1e-4, abs_tol=1e-6) for pair in pairs):
+                    yield "lens"
 
 
 def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], index: tuple[int, ...]) -> Rig:

@@ -37,7 +37,7 @@ def visible_boxes(sample: Mapping[str, Any], least: float = 0.1) -> BoolArray:
     """
     if sample.get("boxes_3d") is None:
         raise SampleError("visible_boxes: expected a sample with 'boxes_3d', got none")
-    boxes, cameras = checked_boxes(sample["boxes_3d"]), rig_of(sample)
+    cameras, boxes = rig_of(sample), checked_boxes(sample["boxes_3d"])
     visible = np.zeros(len(boxes), bool)
     for camera in cameras if len(boxes) else ():
         _, piece = draw_solids(camera, boxes, solids(boxes), faces=False)

@@ -25,7 +25,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.environment import compilation_announced
 from arbiview_aug.errors import SampleError, WarnOnce
-from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, Frame
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, MOTION_WORDS_KEY, Frame
 from arbiview_aug.sample.neighbours import BOX_MARGIN_M, Neighbour, neighbour_images
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_map import DepthMap, Maps, anchored_maps, motion_camera
@@ -264,6 +264,14 @@ def estimate_motion(frame: Frame, scene: Scene, neighbours: Sequence[Neighbour],
     if not motion.density:
         warn("motion", str(motion))
     return motion
+
+
+def warn_if_declined(frame: Frame, maps: Maps, warn: WarnOnce) -> None:
+    """Warn once if the depth that a sample brings is known nowhere."""
+    if not any(one.depth_m.any() for one in maps):
+        has_words = frame.sample.get(MOTION_WORDS_KEY) is not None
+        words = frame.name(MOTION_WORDS_KEY) if has_words else f"{MOTION_KEY}: 0 everywhere; the static street stands"
+        warn("motion", words)
 
 
 # --- errors of poses --------------------------------------------------------------------------------------------------

@@ -157,8 +157,14 @@ class CameraPriorStem(torch.nn.Module):
 
     def forward(self, features: torch.Tensor, camera_maps: torch.Tensor) -> torch.Tensor:
         """Features (..., F, h, w) with what the maps (..., C, h, w) add; leading dimensions are the same."""
-        if camera_maps.shape[-2:] != features.shape[-2:]:
-            expected, got = (tuple(x.shape[-2:]) for x in (features, camera_maps))
-            raise SampleError(f"camera_maps: expected the features' (h, w) = {expected}, got {got}; is stride= theirs?")
+        sides = (
+            ("features", features, self.stem[-1].out_channels),
+            ("camera_maps", camera_maps, self.stem[0].in_channels),
+        )
+        for name, got, channels in sides:
+            expected = channels, *features.shape[-2:]
+            if got.shape[-3:] != expected:
+                fix = "are stride= and the numbers of channels those of the features and maps?"
+                raise SampleError(f"{name}: expected (..., channels, h, w) = {expected}, got {tuple(got.shape)}; {fix}")
         maps = camera_maps.reshape(-1, *camera_maps.shape[-3:]).to(features)
         return features + self.stem(maps).reshape(features.shape)

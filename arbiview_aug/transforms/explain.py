@@ -24,8 +24,9 @@ class Explanation:
     """Why a frame is rendered as it is; ``str`` prints it, ``as_dict`` gives plain data."""
 
     planned: FramePlan
+    outcome: str  # of pixels that no camera saw
     harmonisation: PhotometricReport | None = None  # the sources' gains and why, if they are harmonised
-    learned: str | None = None  # the model of learned depth and how it was fitted, if the surface is made of it
+    depth: str | None = None  # how depth on disk was found, if the surface may be made of it
     fills: Fills | None = None  # how other frames of the drive fill holes, if there are any
     points: str | None = None  # what the target's scanners measure, if it has any
 
@@ -71,14 +72,14 @@ class Explanation:
             lines.append(f"geometry: {geometry}; the street elsewhere")
         if self.planned.motion is not None:
             lines.append(str(self.planned.motion))
-        if self.learned is not None:
-            lines += self.learned.splitlines()
+        if self.depth is not None:
+            lines += self.depth.splitlines()
         if self.fills is not None:
             lines += self.fills.lines(self.plan)
         if self.points is not None:
             lines.append(self.points)
         head = [_head(self.plan.source, self.plan.target), *(f"  {line}" for line in lines)]
-        return "\n".join([*head, *_lines(self.as_dict(), _source_line)])
+        return "\n".join([*head, *_lines(self.as_dict(), self.outcome, _source_line)])
 
     __repr__ = __str__
 
@@ -88,6 +89,7 @@ class PaperExplanation:
     """Record of what the published stages did to a frame; ``str`` prints it, ``as_dict`` gives plain data."""
 
     rendering: PaperRendering
+    outcome: str  # of pixels that no camera saw
 
     def as_dict(self) -> list[dict[str, Any]]:
         """One entry for each target camera: coverage, share to invent, and what each stage made of its sources."""
@@ -115,7 +117,7 @@ class PaperExplanation:
 
     def __str__(self) -> str:
         head = f"{_head(self.rendering.source, self.rendering.target)}, stages 1 to 4 as published, far surface"
-        return "\n".join([head, *_lines(self.as_dict(), _stages)])
+        return "\n".join([head, *_lines(self.as_dict(), self.outcome, _stages)])
 
     __repr__ = __str__
 
@@ -129,10 +131,10 @@ def _entry(camera: Camera, coverage: BoolArray, sources: list[dict[str, Any]]) -
     return {"camera": camera.name, "coverage": covered, "to_invent": 1 - covered, "sources": sources}
 
 
-def _lines(entries: list[dict[str, Any]], words: Callable[[dict[str, Any]], str]) -> Iterator[str]:
+def _lines(entries: list[dict[str, Any]], outcome: str, words: Callable[[dict[str, Any]], str]) -> Iterator[str]:
     for entry in entries:
         to_invent = entry["to_invent"]
-        note = f", {to_invent:.1%} that no camera saw: masked, or for a generator to invent" if to_invent else ""
+        note = f", {to_invent:.1%} that no camera saw, {outcome}" if to_invent else ""
         if entry.get("filled"):
             note = f", up to {entry['filled']:.1%} more by other frames of the drive{note}"
         yield f"  {entry['camera']}: {entry['coverage']:.1%} covered{note}"

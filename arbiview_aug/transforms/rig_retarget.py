@@ -36,6 +36,7 @@ from arbiview_aug.sample.detections import read_detections
 from arbiview_aug.sample.inputs import (
     LEARNED_KEY,
     LEARNED_WORDS_KEY,
+    MOTION_WORDS_KEY,
     Frame,
     check_other_keys,
     read_frames,
@@ -45,7 +46,7 @@ from arbiview_aug.sample.inputs import (
 )
 from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
-from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion
+from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion, warn_if_declined
 from arbiview_aug.transforms.camera_maps import CameraMaps
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
 from arbiview_aug.transforms.outputs import SampleWriter
@@ -291,6 +292,8 @@ class RigRetarget(torch.nn.Module):
             overlap = estimate_overlap(frame, scene, self.geometry, self.cache.share_overlap, self.overlaps)
         if from_motion:
             motion = estimate_motion(frame, scene, neighbours, self._warn)
+        elif self._row.needs == "motion" and pair.needs_geometry and scene.motion is not None:
+            warn_if_declined(frame, scene.motion, self._warn)
         if overlap is not None:
             scene = replace(scene, corrections=overlap.corrections)
         if fills and neighbours and scene.points is not None and pair.needs_geometry:
@@ -422,13 +425,14 @@ class RigRetarget(torch.nn.Module):
         frame = read_frames(sample, self.source)[0]
         target, _, _ = self._make_params([frame], None)
         if self._is_paper:
-            return PaperExplanation(self._published(frame, target))
+            return PaperExplanation(self._published(frame, target), self.inpainter.outcome)
         planned = self.plan_frame(frame, target)
         gains = self.harmonisation(sample) if self.harmoniser.is_on else None
-        words = sample.get(LEARNED_WORDS_KEY) if LEARNED_KEY in self._row.reads else None
-        learned = words if isinstance(words, str) or words is None else words[0]  # a batch has one for each frame
+        keys = ("motion", MOTION_WORDS_KEY), (LEARNED_KEY, LEARNED_WORDS_KEY)
+        words = [frame.name(key) for read, key in keys if read in self._row.reads and sample.get(key) is not None]
         points = [words_of(part, frame, target) for part in self._scanned([frame], target)]
-        return Explanation(planned, gains, learned, self.plan_fills(planned), *points)
+        depth, fills = "\n".join(words) or None, self.plan_fills(planned)
+        return Explanation(planned, self.inpainter.outcome, gains, depth, fills, *points)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; for a batch, its first frame's."""

@@ -19,6 +19,7 @@ from arbiview_aug.sample.neighbours import Warn, points_of_neighbours
 from arbiview_aug.scene.boxes import checked_boxes, points_by_box
 from arbiview_aug.scene.point_cloud import checked_points, finite_rows
 from arbiview_aug.scene.scan import scan
+from arbiview_aug.scene.surface import Points
 
 RINGS_KEY, COUNTS_KEY = "point_rings", "num_points"
 
@@ -46,7 +47,7 @@ def retarget_points(
     boxes_3d: Any = None,
     ground_z_m: float = 0.0,
     skip: bool = False,
-    sweeps: Sequence[FloatArray] = (),
+    sweeps: Sequence[Any] = (),
 ) -> RetargetedPoints:
     """Measure a frame's scene by a target's scanners, as ``RigRetarget`` does; no images are needed.
 
@@ -57,8 +58,8 @@ def retarget_points(
         boxes_3d: (B, >= 7) labelled objects, to count the points in each; they change no point.
         ground_z_m: Height of the road in the frame's ego frame.
         skip: Leave the points as they are, and count those in boxes.
-        sweeps: Points (Q, C) of other frames in this frame's ego frame, with the same columns. They fill rays
-            that the frame's own do not support.
+        sweeps: Arrays or tensors of points (Q, C) of other frames in this frame's ego frame, with the same columns.
+            They fill rays that the frame's own do not support.
 
     Raises:
         SampleError: Points or boxes of another shape.
@@ -77,11 +78,12 @@ def retarget_points(
     boxes = None if boxes_3d is None else checked_boxes(boxes_3d)
     unsupported, rings = 0.0, torch.full((len(array),), -1, dtype=torch.int32)
     if not skip:
+        ground_z_m = as_array("ground_z_m", ground_z_m).item()
         up = ground_z_m - target.ground_z_m  # scanners keep their rays where nothing moves
         lidars = [lidar.shifted(z_m=up) for lidar in target.lidars] if up else target.lidars
         own = len(measured)
         if len(sweeps):
-            points = _joined(points, sweeps)
+            points = _joined(points, [as_array(f"sweeps[{k}]", sweep) for k, sweep in enumerate(sweeps)])
             array = as_array("points", points)
             measured = checked_points(array)
         hits, nearest, rings_of, unsupported = scan(lidars, measured, ground_z_m, len(measured) - own)
@@ -94,7 +96,7 @@ def retarget_points(
     return RetargetedPoints(points, rings, counts, unsupported)
 
 
-def _joined(points: Any, sweeps: Sequence[FloatArray]) -> Any:
+def _joined(points: Any, sweeps: Sequence[Points]) -> Any:
     """Points (P, C), then those of sweeps (Q, C)."""
     for k, sweep in enumerate(sweeps):
         if points.ndim != 2 or sweep.ndim != 2 or sweep.shape[1] != points.shape[1]:

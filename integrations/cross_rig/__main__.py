@@ -93,9 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     change = parser.add_argument_group("instead of the preset's")
     change.add_argument("--changes", nargs="+", choices=CHANGES, metavar="CHANGE", help=", ".join(CHANGES))
-    change.add_argument(
-        "--variants", "--arms", nargs="+", choices=VARIANTS, metavar="VARIANT", help=", ".join(VARIANTS)
-    )
+    change.add_argument("--variants", nargs="+", choices=VARIANTS, metavar="VARIANT", help=", ".join(VARIANTS))
     change.add_argument("--world", choices=get_args(World), help="what makes the streets")
     lengths = get_args(Length)
     change.add_argument("--schedules", nargs="+", choices=lengths, help=f"long: {LONGER} times the steps")

@@ -585,7 +585,7 @@ def test_written_rigs_come_back(tmp_path: Path, name: Any, lenses: tuple[str, ..
     assert save_rig(rig, tmp_path / "new" / "rig", format=name) == tmp_path / "new" / "rig"
     again = load_rig(tmp_path / "new" / "rig")
     assert again.ground_z_m == rig.ground_z_m and again.sizes == rig.sizes
-    assert again.names == (rig.names if name != "kalibr" else [f"cam{k}" for k in range(5)])
+    assert again.names == rig.names
     points = np.random.default_rng(0).normal([8.0, 3.0, 1.0], 2.0, (50, 3))
     for before, after in zip(rig, again, strict=True):
         a, b = before.project(points), after.project(points)
@@ -609,7 +609,7 @@ def test_what_a_format_has_not_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     assert load_rig(save_rig("waymo", tmp_path / "zeros", format="kalibr")).sizes == load_rig("waymo").sizes
     assert load_rig(save_rig(skewed, tmp_path / "rig.yaml")) == skewed
-    named = Rig([camera("mounting"), camera("tf_static", 40.0)])
+    named = Rig([camera("tf_static"), camera("mounting", 40.0)])  # in no alphabetical order
     assert load_rig(save_rig(named, tmp_path / "names", format="ros")).names == named.names
 
 

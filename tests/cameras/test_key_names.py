@@ -175,6 +175,7 @@ def test_calibration_files_warn_once(calib: dict[str, Any], camera: dict[str, An
         ({}, {"cam2ego": "absent", "cam_to_ego": 1}, "missing cam2ego; found 'cam_to_ego': did you mean 'cam2ego'?"),
         ({}, {"file": "absent", "filename": "front.png"}, "found 'filename': did you mean 'file'?"),
         ({}, {"distortion": "absent", "distortions": [0.1, 0, 0, 0]}, "'distortions' is not read: did you mean"),
+        ({}, {"distortion": None, "dist_coeffs": [0.1, 0, 0, 0]}, "'dist_coeffs' is not read: did you mean"),
         ({}, {"distortion": "absent", "dist_coeffs": {"model": "radtan"}}, "'dist_coeffs' is not read: did you mean"),
         ({"ground_z_m": "absent", "ground_z": -0.3}, {}, "'ground_z' is not read: did you mean 'ground_z_m'?"),
         ({"cameras": "absent", "cams": []}, {}, "found 'cams': did you mean 'cameras'?"),
@@ -190,7 +191,7 @@ def test_notes_stay_notes(tmp_path: Path) -> None:
     calib = {"license": "as you like", "timestamp": 1, "labels": [1], "boxes_2d": [], "lidar_points": 1200}
     camera = {"timestamp": 1, "distortions": [0, 0, 0, 0], "lens": "6 mm", "cam2ego_static": RIG.cam2ego[0].tolist()}
     assert not read(write_frame(tmp_path / "a", calib, {**camera, "distortion": "absent"}))
-    both = {"distortion": None, "dist_coeffs": [0.1, 0, 0, 0]}  # null says it: a pinhole camera
+    both = {"distortion": {"model": "pinhole", "coeffs": []}, "dist_coeffs": [0.1, 0, 0, 0]}
     assert not read(write_frame(tmp_path / "b", {"ground_z": 3}, both))
 
 

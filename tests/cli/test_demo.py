@@ -21,7 +21,11 @@ def numbers(printed: str, surface: str) -> list[float]:
 def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["demo", "--size", "64x176", "--output", str(tmp_path), "--width", "900"]) == 0
     printed = capsys.readouterr().out
-    assert "sedan -> van: 6 cameras to 5" in printed and "over the boxes surface" in printed
+    assert (
+        "sedan -> van: 6 cameras to 5" in printed
+        and " 64x176, quality fast" in printed
+        and "over the boxes surface" in printed
+    )
     assert "Against the true views" in printed and "(5 cameras, 1 frame)" in printed and "ms a frame" in printed
     auto, far = numbers(printed, "auto"), numbers(printed, "infinity")
     seen, psnr, ground, _, _, mae, ssim, *_, whole = auto

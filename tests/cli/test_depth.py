@@ -95,6 +95,9 @@ def test_samples_carry_it(depth_root: Path, recorded: Path) -> None:
     both = (out["coverage"] & online["coverage"])[:, None].expand_as(out["images"])
     difference = (out["images"].float() - online["images"].float()).abs()[both]
     assert difference.mean() < 0.5  # half precision; the road is filled from other frames besides
+    assert sample["motion_depth_words"] in str(motion.explain(sample)) and "motion_depth_words" not in out
+    with pytest.warns(UserWarning, match="depth from motion: none, no frame 0.4 to 3 m before or after it"):
+        motion(data[3])
 
 
 def test_files_that_do_not_fit_are_named(depth_root: Path, recorded: Path, tmp_path: Path) -> None:
@@ -131,7 +134,7 @@ def test_what_was_found_from_less_is_found_again(recorded: Path, tmp_path: Path,
     leftover = root / "motion_depth" / f".000.npz.-{_host()}-{10**9}-01234567.part"
     leftover.parent.mkdir(exist_ok=True)
     leftover.write_bytes(b"of a killed run")
-    assert main(asked) == 0 and "0 of 4 frames have depth" in capsys.readouterr().out and not leftover.exists()
+    assert main(asked) == 1 and "0 of 4 frames have depth" in capsys.readouterr().out and not leftover.exists()
     (root / "sequence.json").write_text(sequence)
     image = sorted((root / "002").glob("*.jpg"))[0]
     sound = image.read_bytes()

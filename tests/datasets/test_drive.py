@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import DataError, Rig, RigRetarget, SampleKeys
+from arbiview_aug import DataError, RandomRig, Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import FrameFolder, LazyFrame, Neighbours, NuScenesDataset
 from arbiview_aug.datasets.drive import Drive, parts_of_clock, travelled_m
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -152,6 +152,17 @@ def test_folders_fill_the_road(recorded: Path) -> None:
     alone = RigRetarget(low(sample["rig"]), neighbours=None)(sample)
     gained = out["coverage"] & ~alone["coverage"]
     assert gained.float().mean() > 0.03 and ((out["source_frame"] > 0) == gained).all()
+
+
+def test_a_folder_without_a_drive_says_so(recorded: Path, tmp_path: Path) -> None:
+    shutil.copytree(recorded / "0000", tmp_path / "0000")
+    with pytest.warns(UserWarning, match=r"expected frames of a drive \(sequence.json and ego2world\), found none"):
+        alone = FrameFolder(tmp_path, neighbours=Neighbours())[0]
+    assert alone["neighbours"] == [] and "scene_token" not in alone
+    sequence = FrameFolder(recorded)
+    assert sequence[0]["scene_token"] == recorded.name
+    random = RandomRig(sequence[0]["rig"], yaw_deg=3, per="sequence")
+    assert random.draw_for(sequence[0]) == random.draw_for(sequence[2])
 
 
 @pytest.mark.parametrize("broken", ["image", "corrupt", "calibration"])

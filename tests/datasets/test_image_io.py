@@ -180,8 +180,9 @@ def test_bad_files(tmp_path: Path, suffix: str, damage: Callable[[Any], Any] | N
         damage(file)
     elif damage is not None:
         file.write_bytes(damage(write(file, ramp(90, 160)).read_bytes()))
-    with pytest.raises(DataError, match=rf"camera 'left': image .*left\{suffix}: .*{re.escape(message)}"):
+    with pytest.raises(DataError, match=rf"camera 'left': image .*left\{suffix}: .*{re.escape(message)}") as caught:
         decode_images([file], names=["left"])
+    assert str(caught.value).count("camera 'left'") == 1
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

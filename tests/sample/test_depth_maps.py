@@ -34,5 +34,8 @@ def test_sizes_that_differ_and_no_points() -> None:
     maps = depth_maps(np.zeros((0, 3)), rig)
     assert isinstance(maps, list) and [tuple(one.shape) for one in maps] == [(20, 30), (10, 12)]
     assert not any(one.any() for one in maps)
+    batch = {"images": torch.zeros((2, 3, 3, 30, 40)), "rig": ring(3, size=(30, 40))}
+    with pytest.raises(SampleError, match=r"got a batch \(2,\); pass its frames one by one"):
+        depth_maps([torch.zeros(5, 3)] * 2, batch)
     with pytest.raises(SampleError, match="points: expected shape"):
         depth_maps(np.zeros((4, 2)), rig)

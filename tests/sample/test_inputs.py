@@ -9,6 +9,7 @@ can bring of these is here as well.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -171,6 +172,17 @@ def test_the_source_of_a_transform_overrides_no_sample(key: str) -> None:
         with pytest.raises(SampleError, match=rf"{key}: expected the calibration of source=, got another; drop source"):
             read_frames(sample(**{key: torch.from_numpy(bad)}), source)
     assert read_frames(sample(**{key: torch.from_numpy(other)}, rig=source), rig(3))[0].rig is source
+
+
+@pytest.mark.parametrize("key", ["lens", "ground_z_m"])
+def test_lenses_and_road_of_a_sample_are_those_of_the_source(key: str) -> None:
+    bent = [replace(camera, lens="radtan", distortion=(0.1, 0.0, 0.0, 0.0)) for camera in rig()]
+    same = {"lens": ["radtan"] * 2, "distortion": torch.tensor([[0.1] + [0.0] * 7] * 2), "ground_z_m": -0.3}
+    source = Rig(bent, ground_z_m=-0.3)
+    assert read_frames(sample(**same, K=None, cam2ego=None), source)[0].rig is source
+    other = {"lens": same | {"distortion": torch.full((2, 4), 0.2)}, "ground_z_m": same | {"ground_z_m": 0.0}}[key]
+    with pytest.raises(SampleError, match=rf"{key}: expected the calibration of source=, got another; drop source"):
+        read_frames(sample(**other), source)
 
 
 def test_calibration_without_the_images_leading_dimensions() -> None:

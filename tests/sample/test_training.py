@@ -38,6 +38,8 @@ def test_boxes_are_seen_before_others_within_the_image_and_where_it_is_covered()
     assert not visible_boxes(out).any()
     with pytest.raises(SampleError, match="expected a sample with 'boxes_3d'"):
         visible_boxes({"images": None})
+    with pytest.raises(SampleError, match=r"expected one sample, got a batch \(2,\); pass its frames one by one"):
+        visible_boxes(collate([sample()] * 2))
 
 
 def test_of_a_near_box_few_pixels_suffice() -> None:

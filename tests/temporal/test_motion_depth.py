@@ -13,6 +13,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.sample.neighbours import Neighbour, read_neighbours
+from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
 from tests.helpers import Standing
 
@@ -140,6 +141,10 @@ def test_the_street_replaces_declined_depth_with_a_warning(sample: dict[str, Any
     with pytest.warns(UserWarning, match="depth from motion: none, no frame .* the static street stands"):
         out = motion({**sample, "neighbours": []})
     assert torch.equal(out["images"], RigRetarget(target, geometry="street")(sample | {"neighbours": []})["images"])
+    brought = {**sample, "motion_depth_m": [torch.zeros(motion_camera(camera).size) for camera in sample["rig"]]}
+    for words, extra in (("motion_depth_m: 0 every", {}), ("none, why", {"motion_depth_words": "none, why"})):
+        with pytest.warns(UserWarning, match=words):
+            RigRetarget(target, geometry="motion")(brought | extra)
 
 
 @pytest.mark.parametrize("size", [(1, 8), (8, 1)])

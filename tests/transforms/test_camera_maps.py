@@ -175,8 +175,13 @@ def test_the_stem_adds_nothing_at_first_and_learns() -> None:
     out = stem(features, read)
     assert torch.equal(out, features)
     assert torch.equal(stem(features[0], read[0]), features[0])
-    with pytest.raises(SampleError, match=r"camera_maps: expected the features' \(h, w\) = \(8, 12\), got \(12, 8\)"):
-        stem(features, read.mT)
+    for bad, expected in (
+        ((features, read.mT), r"camera_maps: .* = \(\d+, 8, 12\), got .*, 12, 8\)"),
+        ((features, read[:, 1:]), r"camera_maps: expected \(\.\.\., channels, h, w\) = "),
+        ((features[:, 1:], read), r"features: expected .* = \(5, 8, 12\), got \(2, 4, 8, 12\)"),
+    ):
+        with pytest.raises(SampleError, match=expected):
+            stem(*bad)
     (out * torch.rand_like(out)).sum().backward()
     assert stem.stem[-1].weight.grad.abs().sum() > 0
 

@@ -80,7 +80,10 @@ def test_what_has_to_be_invented() -> None:
     one = nuscenes().with_cameras([nuscenes()[0]])
     half = explained(one.turned(yaw_deg=20), one)
     assert 0 < half.as_dict()[0]["to_invent"] < 1
-    assert "that no camera saw: masked, or for a generator to invent" in str(half)
+    assert "that no camera saw, filled in from its surroundings" in str(half)
+    sample = {"images": torch.zeros((1, 3, *one[0].size), dtype=torch.uint8), "rig": one}
+    black = RigRetarget(one.turned(yaw_deg=20), holes="black").explain(sample)
+    assert "that no camera saw, black: train with 'coverage' as a mask" in str(black)
     behind = replace(one[0].turned(yaw_deg=180), name="behind")
     with pytest.warns(UserWarning, match="cannot be reached"):
         none = explained(one.with_cameras([one[0], behind]), one)

@@ -241,6 +241,8 @@ def test_sweeps_of_users() -> None:
     both = retarget_points(torch.cat([own, torch.from_numpy(other)]), target()).points
     assert torch.equal(retarget_points(own, target(), sweeps=[other[:50], other[50:]]).points, both)
     assert isinstance(retarget_points(own.numpy(), target(), sweeps=[other]).points, np.ndarray)
+    for sweep in (torch.from_numpy(other), other.tolist()):
+        assert torch.equal(retarget_points(own, target(), sweeps=[sweep]).points, both)
     with pytest.raises(SampleError, match=r"sweeps\[0\]: expected the columns of points .*, got \(5, 3\)"):
         retarget_points(own, target(), sweeps=[np.zeros((5, 3))])
 
@@ -291,6 +293,8 @@ def test_what_is_refused() -> None:
         retarget_points(torch.ones((5, 4), dtype=torch.int32), target())
     with pytest.raises(SampleTypeError, match="got list"):
         retarget_points([[1.0, 2.0, 3.0]], target())
+    with pytest.raises(SampleTypeError, match="ground_z_m: expected a tensor of numbers, got str"):
+        retarget_points(torch.ones((5, 4)), target(), ground_z_m="x")  # type: ignore[arg-type]
     with pytest.raises(SampleError, match="points: expected shape"):
         retarget_points(torch.ones((5, 2)), target())
     with pytest.raises(CalibrationError, match="rig 'lyft_l5': expected lidars, which measure the points, got none"):

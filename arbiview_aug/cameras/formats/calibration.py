@@ -101,7 +101,7 @@ def read_calibration(path: Path, where: str) -> Any:
     try:
         mounting = Mounting.read(folder)
         with np.errstate(all="ignore"):  # ``Camera`` refuses numbers that are not finite
-            cameras = form.read(path, mounting)
+            cameras = mounting.named(form.read(path, mounting))
     except ArbiviewError as error:
         raise type(error)(f"{where}: {form.tool}: {error}") from None
     except _BROKEN as error:  # readers take files apart as their tools write them

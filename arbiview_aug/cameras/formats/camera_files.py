@@ -174,7 +174,8 @@ def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
         transform = {"translation": dict(zip("xyz", at, strict=True)), "rotation": dict(zip("wxyz", wxyz, strict=True))}
         frames = {"header": {"frame_id": _EGO_FRAMES[0]}, "child_frame_id": f"{name}_optical_frame"}
         transforms.append({**frames, "transform": transform})
-    return files | {TF: {"transforms": transforms}, MOUNTING: {"ground_z_m": data["ground_z_m"]}}
+    names = {camera["name"]: camera["name"] for camera in data["cameras"]}  # files come in alphabetical order
+    return files | {TF: {"transforms": transforms}, MOUNTING: {"ground_z_m": data["ground_z_m"], "names": names}}
 
 
 def _node(values: Any) -> dict[str, Any]:

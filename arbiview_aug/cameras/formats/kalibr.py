@@ -66,7 +66,7 @@ def _camera(name: str, entry: Mapping[str, Any], cam2ego: FloatArray) -> dict[st
 
 
 def kalibr_files(data: Mapping[str, Any]) -> dict[str, Any]:
-    """``camchain.yaml``; its cameras are cam0, cam1 and so on."""
+    """``camchain.yaml``; its cameras are cam0, cam1 and so on, by their names in ``mounting.yaml``."""
     chain: dict[str, Any] = {}
     poses = [np.array(camera["cam2ego"]) for camera in data["cameras"]]
     for k, camera in enumerate(data["cameras"]):
@@ -80,5 +80,6 @@ def kalibr_files(data: Mapping[str, Any]) -> dict[str, Any]:
         }
         if k:
             chain[f"cam{k}"]["T_cn_cnm1"] = (np.linalg.inv(poses[k]) @ poses[k - 1]).tolist()
-    mounting = {"ground_z_m": data["ground_z_m"], "poses": {"cam0": poses[0].tolist()}}
+    names = {f"cam{k}": camera["name"] for k, camera in enumerate(data["cameras"])}
+    mounting = {"ground_z_m": data["ground_z_m"], "poses": {"cam0": poses[0].tolist()}, "names": names}
     return {"camchain.yaml": chain, MOUNTING: mounting}

@@ -29,6 +29,7 @@ class Mounting:
         metres_per_unit: Scale of a calibration without one (COLMAP).
         images: Image of each camera (COLMAP).
         sizes: ``{width, height}`` of all cameras, or by camera.
+        names: Names of the cameras by those in the files, in the rig's order; all others come after them.
         tokens: Rows of calibrated_sensor.json to read, all by default (nuScenes).
     """
 
@@ -37,6 +38,7 @@ class Mounting:
     metres_per_unit: float | None = None
     images: Mapping[str, str] = field(default_factory=dict)
     sizes: Mapping[str, Any] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
     tokens: Sequence[str] = ()
 
     @classmethod
@@ -51,7 +53,7 @@ class Mounting:
         keys = cls.__dataclass_fields__
         if not isinstance(data, Mapping) or not set(data) <= set(keys):
             raise CalibrationError(f"{MOUNTING}: expected the keys {', '.join(keys)}, got {shown(data)}")
-        for key in {"poses", "images", "sizes"} & set(data):
+        for key in {"poses", "images", "sizes", "names"} & set(data):
             if not isinstance(data[key], Mapping):
                 raise CalibrationError(f"{MOUNTING}: {key}: expected values by camera, got {shown(data[key])}")
         poses = {str(name): pose_of(str(name), value) for name, value in data.get("poses", {}).items()}
@@ -78,6 +80,12 @@ class Mounting:
                 f"sizes: {{{name}: {{width: 1600, height: 900}}}}, or sizes: {{width: 1600, height: 900}} for all"
             )
         return size["width"], size["height"]
+
+    def named(self, cameras: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """A rig file's cameras by their ``names``, and in that order."""
+        places = {str(name): place for place, name in enumerate(self.names)}
+        ordered = sorted(cameras, key=lambda camera: places.get(camera["name"], len(places)))
+        return [camera | {"name": self.names.get(camera["name"], camera["name"])} for camera in ordered]
 
     def mounted(self, relative: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """cam2ego of cameras whose poses (4, 4) in a common frame are known, by the pose of one of them."""

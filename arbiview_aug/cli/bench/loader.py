@@ -96,7 +96,7 @@ COLUMNS = (
 def table(report: Mapping[str, Any]) -> str:
     """Title and Markdown table of a report."""
     h, w = report["size"]
-    cameras = f"{len(report['sources'])} cameras to {report['target']} at {w}x{h}"
+    cameras = f"{len(report['sources'])} cameras to {report['target']} at {h}x{w}"
     head = f"{report['data']}, {cameras}, epochs of {report['frames']} frames; {machine_line(report)}"
     return f"{head}\n\n{metric_table(report['rates'], COLUMNS)}"
 

@@ -301,7 +301,7 @@ def table(report: Mapping[str, Any]) -> str:
     for row in shown:
         row["mark"] = "step" if row["name"] in steps else "front" if row["front"] else ""
     lines = [
-        f"{report['data']} to {report['target']}, views of {w}x{h}, against {report['against']}; "
+        f"{report['data']} to {report['target']}, views of {h}x{w}, against {report['against']}; "
         f"{machine_line(report)}. {NOTES}",
         "",
         metric_table(shown, COLUMNS, ("name", "mark")),

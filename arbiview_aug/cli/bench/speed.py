@@ -129,7 +129,7 @@ def measure(
             chosen = {name: calls[name] for name in (floor, *(name for name in others if only in name))}
             if len(chosen) == 1:
                 continue
-            times = timed_rounds(chosen, repeats, f"{w}x{h} {target}", enough_ms=_ENOUGH_MS, clock=clock_of(device))
+            times = timed_rounds(chosen, repeats, f"{h}x{w} {target}", enough_ms=_ENOUGH_MS, clock=clock_of(device))
             for name, taken in times.items():
                 ratio = statistics.median(a / b for a, b in zip(taken, times[floor], strict=False))
                 row = {"size": [h, w], "target": target, "name": name, **quartiles(taken)._asdict(), "ratio": ratio}
@@ -185,7 +185,7 @@ def table(report: Mapping[str, Any]) -> str:
         cells = {(m["name"], m["target"]): f"{m['median_ms']:.1f} ({m['ratio']:.2f})" for m in measures}
         bounds = {m["name"]: cell(m, "{bound:g}") for m in measures}
         rows = [[name, bounds[name], *(cells.get((name, target), "") for target in targets)] for name in names]
-        parts.append(markdown_table([f"{w}x{h}", "bound", *targets], rows))
+        parts.append(markdown_table([f"{h}x{w}", "bound", *targets], rows))
     return "\n\n".join(parts)
 
 

@@ -35,6 +35,14 @@ def test_there_and_back(sample: dict) -> None:
         assert torch.equal(again[key], sample[key])
 
 
+def test_retargeted_samples(sample: dict, tmp_path) -> None:
+    """They have no ``rig``."""
+    out = RigRetarget(sample["rig"].turned(yaw_deg=5))(sample)
+    again = to_sample(to_entry(out, "a"))
+    assert torch.allclose(again["cam2ego"], out["cam2ego"]) and torch.equal(again["points"], out["points"])
+    assert write_shard(str(tmp_path / "a.tar"), [out]) == tmp_path / "a.tar"
+
+
 def test_lenses_and_sizes() -> None:
     fisheye = Camera.looking(
         name="a",

@@ -275,7 +275,8 @@ def test_depth_is_not_written_elsewhere(frames: Home) -> None:
     assert "links must not leave the folder" in frames.said
     assert frames.convert("--geometry", "motion") == 2
     told = frames.root / "in" / "folder"
-    assert main(["depth", "--data", str(frames.source), "--output", str(told)]) == 0  # as it was told
+    assert main(["depth", "--data", str(frames.source), "--output", str(told)]) == 1  # no drive, so no depth
+    assert len(list(told.glob("*.npz"))) == 3  # as it was told
 
 
 # --- whatever a sample raises -----------------------------------------------------------------------------------------
