@@ -140,7 +140,7 @@ def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray) -> F
 
 def equalised(rig: Rig, images: Sequence[Image], points: FloatArray) -> list[npt.NDArray[np.uint8]]:
     gains = equalising_gains(rig, images, points)
-    return [np.clip(image * gain + 0.5, 0, 255).astype(np.uint8) for image, gain in zip(images, gains, strict=True)]
+    return [np.clip(image * gain, 0, 255).astype(np.uint8) for image, gain in zip(images, gains, strict=True)]
 
 
 def lidar_split(points: FloatArray) -> tuple[BoolArray, BoolArray]:

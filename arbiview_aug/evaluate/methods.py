@@ -92,7 +92,7 @@ def retargeting(
         )
         if depth is not None and retarget.overlaps is not None:
             known = depth
-            retarget.overlaps.get((alone["rig"].content_key, None), lambda: known)
+            retarget.overlaps.get((alone["rig"].named_key, None), lambda: known)
         (view,) = views_of(retarget(alone))
         return view
 

@@ -156,7 +156,6 @@ def test_gains_bring_shared_points_together() -> None:
     assert gains[0] * gains[1] == pytest.approx(1.0, rel=0.03), "the mean log-gain is zero"
     even = equalised(rig, images, wall())
     assert even[0].dtype == np.uint8
-    assert all(np.abs(one - image * gain).max() <= 0.5 for one, image, gain in zip(even, images, gains, strict=True))
     assert even[0].mean() / even[1].mean() == pytest.approx(1.0, rel=0.03)
 
 

@@ -8,7 +8,7 @@ from arbiview_aug import Camera, Rig
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.render.view_planner import build_plan
-from arbiview_aug.scene.boxes import KIND_M, OF_KIND, PROFILES, BoxSurface, kinds, points_in, solids, solids_among
+from arbiview_aug.scene.boxes import KIND_M, OF_KIND, PARTS, PROFILES, BoxSurface, kinds, points_in, solids, solids_among
 from arbiview_aug.scene.kernels import planes_of
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Street
@@ -152,7 +152,7 @@ def test_parts_tell_the_sides_of_the_body_from_the_cabin_and_the_tops() -> None:
     assert surface.face_parts.tolist() == [1, 2, 3, 4, 0, 5, 0, 0, 0, 0, 0, 5]
     person = boxes_of({"person": SIZES["person"]})  # one colour
     both = np.concatenate([CAR, person])
-    assert BoxSurface(Street(), both, solids(both)).face_parts[12:].tolist() == [6] * 12
+    assert BoxSurface(Street(), both, solids(both)).face_parts[12:].tolist() == [PARTS] * 12
 
 
 @pytest.mark.parametrize("surface", ["boxes", "lidar"])
