@@ -8,7 +8,17 @@ from arbiview_aug import Camera, Rig
 from arbiview_aug.cameras.rays import pixel_rays
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.render.view_planner import build_plan
-from arbiview_aug.scene.boxes import KIND_M, OF_KIND, PARTS, PROFILES, BoxSurface, kinds, points_in, solids, solids_among
+from arbiview_aug.scene.boxes import (
+    KIND_M,
+    OF_KIND,
+    PARTS,
+    PROFILES,
+    BoxSurface,
+    kinds,
+    points_in,
+    solids,
+    solids_among,
+)
 from arbiview_aug.scene.kernels import planes_of
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import Street
