@@ -57,7 +57,7 @@ def conversion(tmp_path: Path, sources: Any, undisturbed: Any, capsys: pytest.Ca
     return Conversion(tmp_path, sources, undisturbed, capsys)
 
 
-@pytest.mark.parametrize(("written", "kind"), sampled([0, 3, 40, 95], ["frames", "nuscenes"]))
+@pytest.mark.parametrize(("written", "kind"), sampled([0, 3, 40, 90], ["frames", "nuscenes"]))
 def test_a_full_disk(
     kind: str, written: int, conversion: Conversion, undisturbed: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
