@@ -727,13 +727,13 @@ def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table:
             if winner[y, x] < 0:
                 table[0, hidden], table[1, hidden] = y * w + x, part[number]
                 hidden += 1
-                of_object, below = part[number] // PARTS, face[min(y + 1, h - 1), x]
-                if part[number] % PARTS != TOP_PART or below < 0 or part[below] // PARTS != of_object:
-                    continue
-                for yy in range(y + 1, min(y + 1 + RIM_PX, h) if part[below] % PARTS != TOP_PART else 0):
+                first, below = part[number] - TOP_PART, face[min(y + 1, h - 1), x]
+                if first % PARTS or below < 0 or not first <= part[below] < part[number]:
+                    continue  # no top, or no side of the same object below it
+                for yy in range(y + 1, min(y + 1 + RIM_PX, h)):
                     if face[yy, x] != below or winner[yy, x] < 0:
                         break
-                    table[2, sampled], table[3, sampled] = yy * w + x, of_object * PARTS + RIM_PART
+                    table[2, sampled], table[3, sampled] = yy * w + x, first + RIM_PART
                     sampled += 1
             elif y % step == 0 and x % step == 0 and min(y, x, h - 1 - y, w - 1 - x) >= margin:
                 if (
