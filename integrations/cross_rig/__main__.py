@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 from arbiview_aug.cli.arguments import count, device_named, seed
 from arbiview_aug.errors import ArbiviewError
@@ -21,6 +21,9 @@ from integrations.cross_rig.report import markdown, write_report
 from integrations.cross_rig.settings import LONGER, Length, Settings, full, jobs, large, pilot, quick, real, small
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES, World
+
+_REPORT_S = 60.0
+"""Least seconds between reports of a run that goes on: a large one takes as long as a training on a GPU."""
 
 PRESETS = {"quick": quick, "small": small, "pilot": pilot, "full": full, "large": large}
 
@@ -54,11 +57,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(text)
         return 0
     log(f"{len(missing)} of {len(jobs(settings))} trainings to do, in {arguments.output}")
-    report: dict[str, Any] = {}
+    written = began
     for left in run(setup, arguments.workers, log):
-        report = write_report(setup)
+        if time.monotonic() - written > _REPORT_S:
+            write_report(setup)
+            written = time.monotonic()
         log(f"{left} trainings left")
-    print(markdown(report))
+    print(markdown(write_report(setup)))
     print(f"{arguments.output / 'report.json'}, report.md, report.png")
     return 0
 
