@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import nn
 
@@ -35,6 +36,8 @@ from integrations.cross_rig.worlds import OF_TESTS, Split
 
 LEAST_SCORE = 0.3
 """Score of the detections that become boxes of the second pass."""
+LEAST_APART_M = 2.0
+"""Distance of their centres: queries find a vehicle in several cells."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +149,7 @@ def _views(setup: Run, detector: Trained, change: str, variant: Variant, split: 
         "target": a.content_key.hex(),
         "views": variant.views_spec(),
         # With the number of frames: those that fill the last chunk have the last one's boxes.
-        "detections": [detector.key, LEAST_SCORE, count] if "boxes_3d" in variant.reads else None,
+        "detections": [detector.key, LEAST_SCORE, LEAST_APART_M, count] if "boxes_3d" in variant.reads else None,
         "noise": code_hash("integrations.cross_rig.noise") if "depth_m" in variant.reads else None,
         "code": _rendering_code(),
     }
@@ -166,7 +169,16 @@ def _detections(setup: Run, detector: Trained, change: str, split: Split) -> lis
     """Boxes (k, 7) that a detector finds in each of B's frames as they are."""
     frames = setup.true_set(split, change)
     _, found = answers(detector.model, frames, setup.settings.count(split), detector.schedule)
-    return [torch.from_numpy(boxes[boxes[:, 0] >= LEAST_SCORE, 1:]) for boxes in found]
+    return [distinct(boxes) for boxes in found]
+
+
+def distinct(detections: npt.NDArray[np.float32]) -> torch.Tensor:
+    """Boxes (k, 7) of the sure ones of a frame's detections (n, 8), strongest first; of near ones the strongest."""
+    kept: list[npt.NDArray[np.float32]] = []
+    for found in detections[detections[:, 0] >= LEAST_SCORE]:
+        if all(np.hypot(*(found[1:3] - stronger[1:3])) >= LEAST_APART_M for stronger in kept):
+            kept.append(found)
+    return torch.from_numpy(np.reshape(kept, (-1, 8))[:, 1:].astype(np.float32))
 
 
 # --- tests ------------------------------------------------------------------------------------------------------------
@@ -201,7 +213,7 @@ def _tests(setup: Run, job: Job) -> Iterator[tuple[str | None, str, Way, Path]]:
             "code": _rendering_code(),
         }
         for title, way in rows_of(setup, change).items():
-            key = content_hash({**spec, "row": [asdict(way), LEAST_SCORE]})
+            key = content_hash({**spec, "row": [asdict(way), LEAST_SCORE, LEAST_APART_M]})
             yield change, title, way, setup.output / "deploy" / f"{job.name}-{change or 'A'}-{key}.json"
 
 

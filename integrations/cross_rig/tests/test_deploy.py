@@ -119,3 +119,11 @@ def test_command_takes_rows(capsys, tmp_path):
     with pytest.raises(SystemExit):
         command.main(["--small", "--output", str(tmp_path), "--deploy", "nothing"])
     assert "learned depth" in capsys.readouterr().err
+
+
+def test_detections_of_one_vehicle_become_one_box():
+    """Queries say a vehicle in several cells."""
+    found = np.zeros((4, 8), np.float32)
+    found[:, 0], found[:, 1] = (0.9, 0.8, 0.7, 0.2), (0.0, 1.5, 3.0, 9.0)
+    assert deploy.distinct(found)[:, 0].tolist() == [0.0, 3.0]
+    assert deploy.distinct(found[3:]).shape == (0, 7)
