@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -244,6 +245,7 @@ def _fill(
     put_cells(sums, cell, (~seen).view(np.uint8), 0.5 if view.dtype == np.uint8 else 0.0, view)
 
 
+@lru_cache(32)  # of a rig, frame by frame
 def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
     """Directions (2, 2, n, n) in the image, x and y, of lines along the heading and vertical ones, as kernels read."""
     if camera is None:
