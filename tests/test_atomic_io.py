@@ -47,6 +47,14 @@ def test_links_and_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     (tmp_path / "c").write_bytes(b"cut")
     link_whole(tmp_path / "a", tmp_path / "c")
     assert (tmp_path / "c").read_bytes() == b"points" and not (tmp_path / "c").samefile(tmp_path / "a")
+    (tmp_path / "a").write_bytes(b"other!")  # of the same size
+    for how in ("hard", "copy"):
+        link_whole(tmp_path / "a", tmp_path / "c", how=how)
+        assert (tmp_path / "c").read_bytes() == b"other!"
+        kept = (tmp_path / "c").stat().st_ino
+        link_whole(tmp_path / "a", tmp_path / "c", how=how)
+        assert (tmp_path / "c").stat().st_ino == kept
+        (tmp_path / "c").write_bytes(b"points")
     with pytest.raises(FileNotFoundError):
         link_whole(tmp_path / "nothing", tmp_path / "d")
     assert names(tmp_path) == ["a", "b", "c"]

@@ -79,7 +79,7 @@ class Settings:
         return load_inpainter(self.generator, steps=self.steps)
 
     def rendering(self) -> dict[str, Any]:
-        """All settings that decide the pixels, as plain data."""
+        """All settings that decide the output, as plain data."""
         target = self.target.to_dict()
         for entry, camera in zip(target["cameras"], self.target, strict=True):
             entry["content"] = camera.content_key.hex()  # of its mask too
@@ -91,6 +91,7 @@ class Settings:
             **({} if self.size is None else {"fit": self.fit}),
             **({"clean_masks": True} if self.clean_masks else {}),
             **({"points": self.points} if self.target.lidars else {}),
+            **({} if self.link == "hard" else {"link": self.link}),  # files that are there stay as they are
             "motion_depth": self.motion_depth is not None,
             "generator": {
                 path.name if path == of else path.relative_to(of).as_posix(): checksum(path) for path in files

@@ -319,6 +319,26 @@ def test_a_source_that_changed_is_converted_again(
     assert tree(tmp_path / "new") == tree(tmp_path / "whole")
 
 
+def test_nothing_stays_of_what_the_source_had(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Points of another frame in as many bytes, an image that cannot be read any more, points that were taken out."""
+    drive = shutil.copytree(source, tmp_path / "drive")
+    asked = command(drive, tmp_path / "new", "--points", "source", "--on-error", "skip")
+    assert main(asked) == 0 and main([*asked, "--link", "copy"]) == 2
+    assert "settings.link 'copy' instead of None" in capsys.readouterr().err
+    for token in ("0000", "0002"):
+        (drive / token / "lidar.npy").unlink()
+    shutil.copy(source / "0001" / "lidar.npy", drive / "0000")
+    calib = drive / "0000" / "calib.json"
+    calib.write_text(calib.read_text().replace("-0.1", "-0.2"))
+    (drive / "0001" / "00.jpg").write_bytes(b"cut")
+    assert main(asked) == 0 and main([*asked, "--verify"]) == 0
+    assert main(command(drive, tmp_path / "whole", *asked[-4:])) == 0
+    assert tree(tmp_path / "new") == tree(tmp_path / "whole") and FrameFolder(tmp_path / "new").tokens == [
+        "0000",
+        "0002",
+    ]
+
+
 def test_a_neighbour_that_was_mended_fills_again(source: Path, tmp_path: Path) -> None:
     """A frame that could not be read is converted anew: the same bytes as undisturbed."""
     asked = ("--neighbours", "1", "--on-error", "skip")
