@@ -66,7 +66,7 @@ def read_camera_files(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
 
 def _ros(path: Path, mounting: Mounting, frames: Mapping[str, FloatArray]) -> dict[str, Any]:
     data = _messages(path)[0]
-    name, model = data.get("camera_name") or path.stem, data["distortion_model"]
+    name, model = str(data.get("camera_name") or path.stem), data["distortion_model"]
     if model not in _ROS_LENSES:
         raise CalibrationError(f"camera {name!r}: distortion_model: expected {', '.join(_ROS_LENSES)}, got {model!r}")
     optical = [name.strip("/") + end for end in _OPTICAL]
