@@ -316,7 +316,7 @@ def save_rig(
             ``images.txt``. ``mounting.yaml`` beside them has the road, the ego frame, names and order.
 
     Raises:
-        CalibrationError: A lens or a skew that the format has not.
+        CalibrationError: A lens or a skew that the format has not, or a folder with files of another calibration.
     """
     rig = load_rig(rig)
     if format == "rig":

@@ -81,7 +81,9 @@ def convert() -> argparse.ArgumentParser:
     add_reading(parser)
     neighbours = "let N frames of the drive before and after each fill holes (default: none)"
     add("--neighbours", type=seed, default=0, metavar="N", help=neighbours)
-    depth = "what the depth command wrote, for --geometry motion or learned (default: its folder in the data)"
+    depth = (
+        "what the depth command wrote, for --geometry auto, motion, fused or learned (default: its folder in the data)"
+    )
     add("--depth", dest="motion_depth", type=Path, metavar="DIR", help=depth)
     add("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
     add("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0")
