@@ -197,15 +197,15 @@ def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") ->
 def remove_parts(root: Path, owned: Callable[[str], bool]) -> None:
     """Remove files that killed processes left half-written below a folder.
 
-    ``owned`` tells whether this process alone writes an owner's files. Other files are removed if their process ran on
-    this machine and has ended.
+    Those of this machine are removed if their process has ended. ``owned`` tells whether this process alone writes an
+    owner's files, also those from other machines.
     """
     for folder, _, names in os.walk(root):
         for name in names:
             path = Path(folder, name)
             if is_part(path):
                 owner, host, pid, _ = name.removesuffix(_PART).rpartition(".")[2].split("-")
-                if (owner and owned(owner)) or (host == _host() and not _runs(int(pid))):
+                if not _runs(int(pid)) if host == _host() else owner and owned(owner):
                     path.unlink(missing_ok=True)
 
 

@@ -86,6 +86,7 @@ class Settings:
         names = ("holes", "steps", "quality", "geometry", "size", "reduce", "neighbours", "suffix")
         of = self.generator or Path()
         files = [] if self.generator is None else [of] if of.is_file() else sorted(filter(Path.is_file, of.rglob("*")))
+        sums = {path.name if path == of else path.relative_to(of).as_posix(): checksum(path) for path in files}
         return {
             **{name: getattr(self, name) for name in names},
             **({} if self.size is None else {"fit": self.fit}),
@@ -93,9 +94,7 @@ class Settings:
             **({"points": self.points} if self.target.lidars else {}),
             **({} if self.link == "hard" else {"link": self.link}),  # files that are there stay as they are
             "motion_depth": self.motion_depth is not None,
-            "generator": {
-                path.name if path == of else path.relative_to(of).as_posix(): checksum(path) for path in files
-            },
+            "generator": sums if sums or self.generator is None else str(self.generator),  # a hub id
             "target": target,
         }
 

@@ -16,6 +16,7 @@ import torch
 
 from arbiview_aug import Rig, RigRetarget, SampleKeys, load_rig
 from arbiview_aug.__main__ import main
+from arbiview_aug.cli import parsers
 from arbiview_aug.cli.convert import command as command_module
 from arbiview_aug.cli.convert.job import coverage_of
 from arbiview_aug.datasets import FrameFolder, WithDepth
@@ -177,6 +178,13 @@ def test_impossible_settings(source: Path, tmp_path: Path, capsys: pytest.Captur
         assert main(command(source, tmp_path / "new", *asked)) == 2
         assert "expected" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
+
+
+def test_generators_of_the_hub_keep_their_id(source: Path, tmp_path: Path) -> None:
+    """And record it."""
+    asked = command(source, tmp_path / "new", "--holes", "diffusion", "--generator", "owner/name")
+    settings = command_module._settings(parsers.convert().parse_args(asked[1:]))
+    assert settings.generator == Path("owner/name") and settings.rendering()["generator"] == "owner/name"
 
 
 def test_one_frame_alone(source: Path, tmp_path: Path) -> None:
