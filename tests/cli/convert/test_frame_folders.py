@@ -332,7 +332,7 @@ def test_nothing_stays_of_what_the_source_had(source: Path, tmp_path: Path, caps
     drive = shutil.copytree(source, tmp_path / "drive")
     asked = command(drive, tmp_path / "new", "--points", "source", "--on-error", "skip")
     assert main(asked) == 0 and main([*asked, "--link", "copy"]) == 2
-    assert "settings.link 'copy' instead of None" in capsys.readouterr().err
+    assert "settings.link 'copy' instead of 'hard'" in capsys.readouterr().err
     for token in ("0000", "0002"):
         (drive / token / "lidar.npy").unlink()
     shutil.copy(source / "0001" / "lidar.npy", drive / "0000")
