@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import filecmp
 import hashlib
 import os
 import re
@@ -171,7 +170,8 @@ def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") ->
         if path.samefile(source):
             is_same = how != "copy"
         else:
-            is_same = how != "symlink" and filecmp.cmp(source, path, shallow=False)
+            has_same_size = how != "symlink" and path.stat().st_size == status.st_size
+            is_same = has_same_size and checksum(path) == checksum(source)
         if is_same and path.is_symlink() == (how == "symlink"):
             return
     with writing(path):
