@@ -15,7 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 from urllib.parse import quote
@@ -151,7 +151,7 @@ def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
 def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") -> None:
     """Link a file, or copy it, also where its disk allows no such links; a source that is a link is followed.
 
-    An existing file of the same size stays, unless it is of another kind: a link instead of a copy.
+    An existing file of the same content stays, unless it is of another kind: a link instead of a copy.
 
     Raises:
         FileNotFoundError: There is no such source.
@@ -166,9 +166,13 @@ def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") ->
         raise DataError(f"{source}: expected a file that can be read, got {error.strerror}") from None
     if not stat.S_ISREG(status.st_mode):
         raise DataError(f"{source}: expected a regular file, got none: remove its row, or put the file there")
-    if path.is_file() and path.stat().st_size == status.st_size:
-        same, is_symlink = path.samefile(source), path.is_symlink()
-        if (same and is_symlink) if how == "symlink" else not (is_symlink or (same and how == "copy")):
+    with suppress(OSError):  # no such file yet, or one that cannot be read
+        if path.samefile(source):
+            is_same = how != "copy"
+        else:
+            has_same_size = how != "symlink" and path.stat().st_size == status.st_size
+            is_same = has_same_size and checksum(path) == checksum(source)
+        if is_same and path.is_symlink() == (how == "symlink"):
             return
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -193,15 +197,15 @@ def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") ->
 def remove_parts(root: Path, owned: Callable[[str], bool]) -> None:
     """Remove files that killed processes left half-written below a folder.
 
-    ``owned`` tells whether this process alone writes an owner's files. Other files are removed if their process ran on
-    this machine and has ended.
+    Those of this machine are removed if their process has ended. ``owned`` tells whether this process alone writes an
+    owner's files, also those from other machines.
     """
     for folder, _, names in os.walk(root):
         for name in names:
             path = Path(folder, name)
             if is_part(path):
                 owner, host, pid, _ = name.removesuffix(_PART).rpartition(".")[2].split("-")
-                if (owner and owned(owner)) or (host == _host() and not _runs(int(pid))):
+                if not _runs(int(pid)) if host == _host() else owner and owned(owner):
                     path.unlink(missing_ok=True)
 
 

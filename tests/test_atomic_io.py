@@ -47,6 +47,14 @@ def test_links_and_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     (tmp_path / "c").write_bytes(b"cut")
     link_whole(tmp_path / "a", tmp_path / "c")
     assert (tmp_path / "c").read_bytes() == b"points" and not (tmp_path / "c").samefile(tmp_path / "a")
+    (tmp_path / "a").write_bytes(b"other!")  # of the same size
+    for how in ("hard", "copy"):
+        link_whole(tmp_path / "a", tmp_path / "c", how=how)
+        assert (tmp_path / "c").read_bytes() == b"other!"
+        kept = (tmp_path / "c").stat().st_ino
+        link_whole(tmp_path / "a", tmp_path / "c", how=how)
+        assert (tmp_path / "c").stat().st_ino == kept
+        (tmp_path / "c").write_bytes(b"points")
     with pytest.raises(FileNotFoundError):
         link_whole(tmp_path / "nothing", tmp_path / "d")
     assert names(tmp_path) == ["a", "b", "c"]
@@ -60,18 +68,18 @@ def test_links_and_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_only_what_nobody_writes_is_removed(tmp_path: Path) -> None:
-    """A living process's files stay unless they are of an owner that is ours alone; a dead one's go."""
+    """A living process's files stay, a dead one's go; from elsewhere those of an owner that is ours alone."""
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
     host = atomic_io._host()
     mine, others, shared = (f".x.{owner}-{host}-{os.getpid()}-01234567.part" for owner in ("4", "5", ""))
     left = f".x.-{host}-{dead.pid}-01234567.part"
-    elsewhere = f".x.5-ffffffff-{dead.pid}-01234567.part"
+    elsewhere, left_there = (f".x.{owner}-ffffffff-{dead.pid}-01234567.part" for owner in ("5", "4"))
     impossible = f".x.-{host}-{10**30}-01234567.part"
-    for name in (mine, others, shared, left, impossible, elsewhere, ".hidden.part", "x"):
+    for name in (mine, others, shared, left, impossible, elsewhere, left_there, ".hidden.part", "x"):
         (tmp_path / name).write_bytes(b"")
     remove_parts(tmp_path, lambda owner: int(owner) % 2 == 0)
-    assert set(names(tmp_path)) == {others, shared, elsewhere, ".hidden.part", "x"}
+    assert set(names(tmp_path)) == {mine, others, shared, elsewhere, ".hidden.part", "x"}
 
 
 # --- names of a data set ----------------------------------------------------------------------------------------------

@@ -127,7 +127,8 @@ class RadTan(Lens):
                 ea, eb = fa - x_all[active], fb - y_all[active]
                 da, db = (bb * ea - ab * eb) / determinant, (aa * eb - ab * ea) / determinant
                 length = np.hypot(da, db)
-                damping = np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))
+                reach = 0.5 * np.maximum(1.0, np.hypot(a, b))
+                damping = np.minimum(1.0, reach / np.maximum(length, 1e-300))
                 a_all[active], b_all[active] = a - da * damping, b - db * damping
                 # Convergence is quadratic: a step of 1e-8 leaves an error near 1e-16.
                 active = active[~(length < 1e-8)]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -50,10 +51,8 @@ class Lidar:
         name = self.name
         if not isinstance(name, str) or not name:
             raise CalibrationError(f"lidar name: expected a non-empty string, got {shown(name)}")
-        try:
+        with _of_lidar():
             checked = self._checked()
-        except CalibrationError as error:  # the checks are those of cameras
-            raise CalibrationError(f"lidar{str(error).removeprefix('camera')}") from None
         self.__dict__.update(checked)
 
     def _checked(self) -> dict[str, Any]:
@@ -137,12 +136,14 @@ class Lidar:
 
     def moved(self, ego2ego: Any) -> Lidar:
         """The same scanner in another ego frame: ``lidar2ego`` becomes ``ego2ego @ lidar2ego``."""
-        return replace(self, lidar2ego=checked_pose(self.name, ego2ego, "ego2ego") @ self.lidar2ego)
+        with _of_lidar():
+            return replace(self, lidar2ego=checked_pose(self.name, ego2ego, "ego2ego") @ self.lidar2ego)
 
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Lidar:
         """Moved along the ego's axes."""
         T = np.eye(4)
-        T[:3, 3] = x_m, y_m, z_m
+        with _of_lidar():
+            T[:3, 3] = checked_numbers(self.name, "shift", (x_m, y_m, z_m), 3, "three finite numbers of metres")
         return self.moved(T)
 
     @classmethod
@@ -163,7 +164,8 @@ class Lidar:
         Raises:
             CalibrationError: Too few points, or no distinct beams.
         """
-        pose = checked_pose(name, lidar2ego, "lidar2ego")
+        with _of_lidar():
+            pose = checked_pose(name, lidar2ego, "lidar2ego")
         scans, numbers = checked_scans(name, points, rings)
         local = [(scan - pose[:3, 3]) @ pose[:3, :3] for scan in scans]
         return cls(name=name, lidar2ego=pose, **fitted_fields(name, local, numbers))
@@ -191,6 +193,15 @@ class Lidar:
             raise CalibrationError(f"{where}: {wrong!r} is not read: did you mean {meant!r}?")
         with calibration_of(where):
             return cls(**{key: entry[key] for key in (*_KEYS, "azimuth_deg") if key in entry})
+
+
+@contextmanager
+def _of_lidar() -> Iterator[None]:
+    """Name the scanner in errors of checks, which are those of cameras."""
+    try:
+        yield
+    except CalibrationError as error:
+        raise CalibrationError(f"lidar{str(error).removeprefix('camera').removeprefix('lidar')}") from None
 
 
 def hdl64e(lidar2ego: Any, name: str = "hdl64e") -> Lidar:

@@ -18,19 +18,27 @@ MOST_BYTES = 1 << 20
 _MOST_VALUES = 200_000
 
 
+_FLOAT = (
+    "tag:yaml.org,2002:float",
+    re.compile(r"^(?:[-+]?(?:[0-9]+\.[0-9]*|\.?[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf)|\.(?:nan|NaN))$"),
+    list("-+.0123456789"),
+)
+
+
 class _Loader(yaml.SafeLoader):
     """YAML 1.2's numbers and booleans: ``yes`` and ``1:30`` are text."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Text that the loader would take for a number is quoted, such as ``08`` and ``12e3``."""
 
 
 _Loader.yaml_implicit_resolvers = {"<": yaml.SafeLoader.yaml_implicit_resolvers["<"]}
 _Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""])
 _Loader.add_implicit_resolver("tag:yaml.org,2002:bool", re.compile(r"^(?:true|True|false|False)$"), list("tTfF"))
 _Loader.add_implicit_resolver("tag:yaml.org,2002:int", re.compile(r"^[-+]?(?:0|[1-9][0-9]*)$"), list("-+0123456789"))
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^(?:[-+]?(?:[0-9]+\.[0-9]*|\.?[0-9]+)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf)|\.(?:nan|NaN))$"),
-    list("-+.0123456789"),
-)
+_Loader.add_implicit_resolver(*_FLOAT)
+_Dumper.add_implicit_resolver(*_FLOAT)
 
 
 def read_plain(path: Path, where: str, most_bytes: int = MOST_BYTES) -> Any:
@@ -45,7 +53,7 @@ def read_plain(path: Path, where: str, most_bytes: int = MOST_BYTES) -> Any:
 
 def dump_yaml(data: Any) -> str:
     """Plain data as YAML, in its own order."""
-    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120)
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
 
 
 def file_stem(name: str, index: int) -> str:

@@ -26,8 +26,8 @@ import numpy as np
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.framing import Fit
-from arbiview_aug.cameras.key_names import hint, misnamed
-from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
+from arbiview_aug.cameras.lens import LENSES, FloatArray, canonical_name
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.plain_yaml import dump_yaml, file_stem, parse_yaml
 from arbiview_aug.cameras.shipped import shipped_rigs
@@ -316,7 +316,7 @@ def save_rig(
             ``images.txt``. ``mounting.yaml`` beside them has the road, the ego frame, names and order.
 
     Raises:
-        CalibrationError: A lens or a skew that the format has not.
+        CalibrationError: A lens or a skew that the format has not, or a folder with files of another calibration.
     """
     rig = load_rig(rig)
     if format == "rig":
@@ -338,12 +338,16 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
     _refuse_misnamed(entry, "mask", label)
     calibration = {key: entry[key] for key in ("name", "K", "cam2ego")}
     distortion = entry.get("distortion")
-    if distortion is None and entry.get("lens") not in (None, "pinhole"):
-        raise CalibrationError(f"{label}: 'lens' is not read: write distortion: {{model: LENS, coeffs: [...]}}")
     if distortion is not None:
         if not isinstance(distortion, Mapping) or not {"model", "coeffs"} <= distortion.keys():
             raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {shown(distortion)}")
         calibration |= {"lens": distortion["model"], "distortion": distortion["coeffs"]}
+    for key in ("lens", *USUAL_NAMES["lens"]):
+        lens = canonical_name(str(entry.get(key) or "pinhole"))
+        is_same = distortion is not None and (lens not in LENSES or lens == canonical_name(distortion["model"]))
+        if lens != "pinhole" and not is_same:
+            fix = "write distortion: {model: LENS, coeffs: [...]}, or remove it if it is something else"
+            raise CalibrationError(f"{label}: {key!r} is not read: {fix}; got {shown(entry[key])}")
     mask = None if entry.get("mask") is None else read_mask(entry["mask"], folder, label)
     with calibration_of(where):
         return Camera(width_px=entry["width"], height_px=entry["height"], mask=mask, **calibration)

@@ -116,7 +116,8 @@ def _displaced(arguments: argparse.Namespace, notes: list[str], look: Look | Non
     data, displaced = open_frames(arguments, ["motion", *arguments.geometry]), arguments.displaced
     count_of = min(arguments.frames or len(data), len(data))
     with named_steps(notes, count_of) as tick:
-        next_frame = FrameFolder(displaced, reduce=arguments.reduce)[0] if isinstance(displaced, str) else None
+        options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
+        next_frame = FrameFolder(displaced, **options)[0] if isinstance(displaced, str) else None
         frames = displaced_frames(data, count_of, next_frame)
         first = next(frames, None)
         if first is None:

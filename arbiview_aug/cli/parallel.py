@@ -13,6 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from arbiview_aug.environment import one_thread, working_s
+from arbiview_aug.errors import OutputError
 
 Result = TypeVar("Result")
 
@@ -23,7 +24,7 @@ def results(
     """Yield the items of ``jobs``, each of which does some work, in order; ``note`` is the text beside the bar.
 
     Several workers are one-thread processes, started by a fork server so that no thread or CUDA context is forked; the
-    jobs are pickled. 1 works in this process, on its own threads.
+    jobs are pickled. 1 works in this process, on its own threads. OutputError if a worker is killed.
     """
     context = None
     if workers > 1:
@@ -37,7 +38,13 @@ def results(
         multiprocessing_context=context,
         worker_init_fn=_begin,
     )
-    yield from with_progress(loader, len(jobs), label, note)  # type: ignore[arg-type]
+    try:
+        yield from with_progress(loader, len(jobs), label, note)  # type: ignore[arg-type]
+    except RuntimeError as error:
+        if not str(error).startswith("DataLoader worker (pid"):
+            raise
+        fix = "most often as memory ran out: run it again with fewer --workers"
+        raise OutputError(f"{label}: expected worker processes that live, got one that was killed, {fix}") from None
 
 
 def with_progress(

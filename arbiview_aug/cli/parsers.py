@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import get_args
 
@@ -39,8 +40,6 @@ SCORED = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3
 """Geometry that ``bench pareto`` scores, and the sample key that offers it."""
 
 _GENERATOR = "folder of a generator or of diffusers, TorchScript file, or OWNER/NAME on the Hugging Face Hub"
-
-_FIXED = ("target", "target_set", "seed", "size")  # by ``evaluate --displaced``
 
 
 def check() -> argparse.ArgumentParser:
@@ -81,7 +80,9 @@ def convert() -> argparse.ArgumentParser:
     add_reading(parser)
     neighbours = "let N frames of the drive before and after each fill holes (default: none)"
     add("--neighbours", type=seed, default=0, metavar="N", help=neighbours)
-    depth = "what the depth command wrote, for --geometry motion or learned (default: its folder in the data)"
+    depth = (
+        "what the depth command wrote, for --geometry auto, motion, fused or learned (default: its folder in the data)"
+    )
     add("--depth", dest="motion_depth", type=Path, metavar="DIR", help=depth)
     add("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
     add("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0")
@@ -318,31 +319,35 @@ def loader() -> argparse.ArgumentParser:
 # --- options that exclude each other ----------------------------------------------------------------------------------
 def check_together(name: str, parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Refuse options of a command that do not fit together, as argparse refuses others."""
+
+    def refuse(options: Iterable[str], why: str) -> None:
+        for option in options:
+            if getattr(arguments, option) != parser.get_default(option):
+                flag = "downscale" if option == "reduce" else option.replace("_", "-")
+                parser.error(f"argument --{flag}: {why}")
+
     if name == "convert" and arguments.shard_index >= arguments.num_shards:
         parser.error(f"argument --shard-index: expected less than {arguments.num_shards}, got {arguments.shard_index}")
     if name in ("convert", "demo", "evaluate", "view") and "paper" in arguments.quality:
         surfaces = arguments.geometry if isinstance(arguments.geometry, list) else [arguments.geometry]
         if {*surfaces} - {"auto", "infinity"}:
             parser.error(f"argument --geometry: quality paper knows infinity alone, got {', '.join(surfaces)}")
-    for option in ("device", "batch", "reference") if name == "depth" and not arguments.model else ():
-        if getattr(arguments, option) != parser.get_default(option):
-            parser.error(f"argument --{option}: expected it with --model alone: depth from motion needs no network")
+    if name == "depth" and not arguments.model:
+        refuse(("device", "batch", "reference"), "expected it with --model alone: depth from motion needs no network")
     if name == "evaluate":
-        for option in ("generator", "steps"):
-            if getattr(arguments, option) != parser.get_default(option) and "diffusion" not in arguments.holes:
-                parser.error(f"argument --{option}: expected it with --holes diffusion")
-        fixed = _FIXED if not arguments.lidar else [name for name in _FIXED if name != "target"]
-        for option in fixed if arguments.displaced else ():
-            if getattr(arguments, option) != parser.get_default(option):
-                parser.error(f"argument --{option.replace('_', '-')}: --displaced has its own; expected none")
-        if arguments.lidar and arguments.data is not None and not arguments.displaced:
-            parser.error("argument --lidar: expected --displaced with --data: a drive's truth is its next scan")
-        for option in ("detector_weights", "detector_classes"):
-            if getattr(arguments, option) and not arguments.detector:
-                parser.error(f"argument --{option.replace('_', '-')}: expected --detector with it, found none")
-        for option in ("detector", "segmenter") if arguments.lidar else ():
-            if getattr(arguments, option):
-                parser.error(f"argument --{option}: it judges images; expected no --lidar")
+        if "diffusion" not in arguments.holes:
+            refuse(("generator", "steps"), "expected it with --holes diffusion")
+        if arguments.displaced:
+            fixed = "target_set", "seed", "size", *(() if arguments.lidar else ("target",))
+            refuse(fixed, "--displaced has its own; expected none")
+        if arguments.lidar:
+            if arguments.data is not None and not arguments.displaced:
+                parser.error("argument --lidar: expected --displaced with --data: a drive's truth is its next scan")
+            of_drives = () if arguments.displaced else ("reduce", "clean_masks")
+            of_images = "detector", "segmenter", "target_set", "size", "quality", "geometry", "holes", *of_drives
+            refuse(of_images, "it is of images; expected no --lidar")
+        if not arguments.detector:
+            refuse(("detector_weights", "detector_classes"), "expected --detector with it, found none")
         if arguments.segmenter and arguments.data is not None and not arguments.displaced:
             parser.error("argument --segmenter: expected --displaced with --data: it compares with true images")
         if arguments.displaced and arguments.data is None:

@@ -122,6 +122,8 @@ def test_ros_camera_info_with_tf(tmp_path: Path) -> None:
     np.testing.assert_allclose(front.cam2ego, FORWARD, atol=1e-12)
     np.testing.assert_allclose(left.cam2ego, LEFT, atol=1e-12)
     assert load_rig(tmp_path / "front.yaml")[0] == front
+    zeros = FISHEYE_INFO.replace("0.0006", "0.0006, 0.0, 0.0, 0.0, 0.0")
+    assert load_rig(written(tmp_path, left__yaml=zeros))[1] == left
 
 
 CAMERA_INFO_MESSAGE = """\
@@ -210,6 +212,10 @@ def test_ros_questions(tmp_path: Path) -> None:
         ("metres_per_unit: -1", "metres_per_unit: expected a positive number, got -1"),
         (f"ground_z_m: low\nposes: {{front: {ROWS}}}", "ground_z_m: expected a finite height"),
         ("poses: !!python/name:os.system ''", "mounting.yaml: expected plain YAML"),
+        (f"poses: {{front: {ROWS}, frnt: {ROWS}}}", "poses: expected cameras of front, got frnt: rename or remove it"),
+        (f"poses: {{front: {ROWS}}}\nnames: {{0: left}}", "names: expected cameras of front, got 0: "),
+        (f"poses: {{front: {ROWS}}}\nsizes: {{left: {{width: 3}}}}", "sizes: expected cameras of front, got left: "),
+        ("tokens: c2", "mounting.yaml: tokens: expected a list, got 'c2'"),
     ],
 )
 def test_bad_mounting(tmp_path: Path, text: str, message: str) -> None:
@@ -594,6 +600,37 @@ def test_written_rigs_come_back(tmp_path: Path, name: Any, lenses: tuple[str, ..
     if name == "kalibr":
         chain = yaml.safe_load((tmp_path / "new" / "rig" / "camchain.yaml").read_text())
         assert chain["cam3"]["camera_model"] == "ds" and chain["cam3"]["intrinsics"][:2] == [-0.2, 0.6]
+
+
+@pytest.mark.parametrize("name", ["ros", "kalibr", "colmap"])
+def test_names_that_are_no_file_names_come_back(tmp_path: Path, name: Any) -> None:
+    """Nor words of a line; ``camchain`` is a name of Kalibr's files."""
+    rig = Rig(
+        [camera(text, 20.0 * k) for k, text in enumerate([" x", "/a/b", "a/", "front\nleft", "my_camchain", "08"])]
+    )
+    again = load_rig(save_rig(rig, tmp_path, format=name))
+    assert again.names == rig.names and np.allclose(again.cam2ego, rig.cam2ego)
+
+
+def test_cameras_of_one_frame_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        CalibrationError, match=r"camera 'a': expected a frame of its own .*, got a_optical_frame twice"
+    ):
+        save_rig(Rig([camera("/a"), camera("a", 40.0)]), tmp_path, format="ros")
+
+
+def test_an_earlier_calibration_is_not_mixed_with_a_new_one(tmp_path: Path) -> None:
+    """It was read with the new one, or in its place."""
+    both, one = Rig([camera("a"), camera("b", 40.0)]), Rig([camera("a")])
+    save_rig(both, save_rig(both, tmp_path / "ros", format="ros"), format="ros")
+    with pytest.raises(CalibrationError, match=r"ros: expected no other calibration, got b.yaml, which would be read"):
+        save_rig(one, tmp_path / "ros", format="ros")
+    save_rig(both, tmp_path / "kalibr", format="kalibr")
+    with pytest.raises(CalibrationError, match=r"expected no other calibration, got camchain.yaml"):
+        save_rig(both, tmp_path / "kalibr", format="ros")
+    (tmp_path / "images.bin").write_bytes(b"")
+    with pytest.raises(CalibrationError, match=r"expected no other calibration, got images.bin"):
+        save_rig(both, tmp_path, format="colmap")
 
 
 def test_what_a_format_has_not_is_refused(tmp_path: Path) -> None:

@@ -108,6 +108,16 @@ def test_unproject_round_trip(camera: Camera) -> None:
     assert np.abs(again.uv - grid).max() <= UNPROJECT_TOLERANCE_PX
 
 
+@pytest.mark.parametrize(("k1", "k2", "fov_deg"), [(0.1, 0.1, 140), (0.1, 0.1, 170), (0.5, 0.2, 150)])
+def test_wide_views_through_a_pincushion_have_rays(k1: float, k2: float, fov_deg: float) -> None:
+    """Newton's method has far to go: distorted coordinates are up to 20,000."""
+    wide = Camera.looking(
+        name="c", azimuth_deg=0, width_px=200, height_px=100, horizontal_fov_deg=fov_deg, lens="radtan",
+        distortion=(k1, k2, 0, 0),
+    )  # fmt: skip
+    assert wide.unproject(wide.pixel_grid()).valid.all() and wide.fov_deg[0] == pytest.approx(fov_deg)
+
+
 @pytest.mark.parametrize("shape", [(), (2,), (1, 2), (0,)])
 def test_leading_dimensions(camera: Camera, shape: tuple[int, ...]) -> None:
     points = np.broadcast_to([20.0, 9.0, 0.5], (*shape, 3))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,20 @@ def test_rigs_with_scanners_are_moved_by_numbers() -> None:
         replace(ring(1), lidars=[scanner()]).shifted("a")  # type: ignore[arg-type]
     with pytest.raises(CalibrationError, match="ego2ego: expected shape"):
         scanner().moved(np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: load_rig("waymo").lidars[0].moved(np.ones((4, 4))), "lidar 'TOP': ego2ego: expected last row"),
+        (lambda: load_rig("waymo").lidars[0].shifted("a"), "lidar 'TOP': shift: expected three finite numbers"),
+        (lambda: load_rig("waymo").lidars[0].shifted(np.nan), "lidar 'TOP': shift: expected three finite numbers"),
+        (lambda: Lidar.fitted(np.zeros((5, 3)), np.ones((4, 4))), "lidar 'fitted': lidar2ego: expected last row"),
+    ],
+)
+def test_scanners_are_moved_by_numbers(call: Callable[[], object], message: str) -> None:
+    with pytest.raises(CalibrationError, match=f"^{message}"):
+        call()
 
 
 def test_rigs_refuse_scanners() -> None:

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from arbiview_aug import load_rig
-from arbiview_aug.cameras.plain_yaml import parse_yaml
+from arbiview_aug.cameras.plain_yaml import dump_yaml, parse_yaml
 from arbiview_aug.errors import CalibrationError
 
 CAMERA = """
@@ -62,6 +62,12 @@ def test_numbers_are_numbers():
     assert parse_yaml(f"[{', '.join(texts)}]") == texts
     assert parse_yaml("[true, False, null, ~]") == [True, False, None, None]
     assert math.isinf(parse_yaml(".inf")) and math.isnan(parse_yaml(".nan")) and parse_yaml("") is None
+
+
+def test_text_stays_text():
+    texts = ["08", "12e3", "1e3", "1.", ".5", ".inf", "0x10", "1:30", "yes", "True", "null", "~", "=", "<<", "12"]
+    data = {text: [text, 1e30, 1e-7, -0.5, 3, None, True] for text in texts}
+    assert parse_yaml(dump_yaml(data)) == data
 
 
 @pytest.mark.parametrize(

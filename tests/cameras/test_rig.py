@@ -84,6 +84,9 @@ def test_files_are_written_whole(tmp_path: Path) -> None:
             write(tmp_path / "file")
 
 
+RADTAN = {"model": "radtan", "coeffs": [0.1, 0, 0, 0]}
+
+
 def entry(**changes: object) -> dict:
     data: dict = Rig([camera()]).to_dict()["cameras"][0]
     return {k: v for k, v in {**data, **changes}.items() if v != "missing"}
@@ -102,6 +105,11 @@ def entry(**changes: object) -> dict:
         ({"cameras": [entry(mask="nowhere.png")]}, r"camera 'front': mask: expected an image file .*nowhere.png"),
         ({"cameras": [entry(mask_file="nowhere.png")]}, r"'mask' is absent or null, and 'mask_file' is not read"),
         ({"cameras": [entry(lens="fisheye")]}, r"camera 'front': 'lens' is not read: write distortion: \{model: LENS"),
+        *(
+            ({"cameras": [entry(**{key: lens})]}, rf"camera 'front': '{key}' is not read: .* got '{lens}'")
+            for key, lens in (("lens_model", "fisheye"), ("camera_model", "ds"), ("distortion_model", "equidistant"))
+        ),
+        ({"cameras": [entry(lens="fisheye", distortion=RADTAN)]}, r"'lens' is not read: .* got 'fisheye'"),
         ({"cameras": [entry(width=48, height=64), entry()]}, r"different camera names"),
         ({"cameras": [entry()], "ground_z_m": None}, r"ground_z_m: expected a finite height"),
     ],
@@ -112,6 +120,12 @@ def test_bad_files(tmp_path: Path, data: object, message: str) -> None:
     with pytest.raises(CalibrationError, match=message) as caught:
         load_rig(path)
     assert "bad.json" in str(caught.value)
+
+
+def test_keys_that_say_no_other_lens() -> None:
+    notes = {"lens": "opencv_radtan", "camera_model": "pinhole", "distortion_model": "plumb_bob", "lenses": None}
+    assert Rig.from_dict({"cameras": [entry(distortion=RADTAN, **notes)]})[0].lens == "radtan"
+    assert Rig.from_dict({"cameras": [entry(camera_model="pinhole")]})[0].lens == "pinhole"
 
 
 @pytest.mark.parametrize(

@@ -12,16 +12,19 @@ import signal
 import subprocess
 import sys
 import warnings
+from collections.abc import Iterator
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
 from arbiview_aug import __main__, environment, load_rig
 from arbiview_aug.__main__ import BENCHMARKS, COMMANDS, Command, main
 from arbiview_aug.choices import TRAINING_PRESETS, GeometryName, Quality
+from arbiview_aug.cli import parallel
+from arbiview_aug.errors import OutputError
 from arbiview_aug.generator.training.config import CONFIGS
 from arbiview_aug.render.plan import PRESETS
 from arbiview_aug.scene.scene import GEOMETRIES
@@ -143,6 +146,15 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("evaluate --holes diffusion --generator no/no/no", "generator no/no/no: expected a folder of a generator"),
         ("evaluate --quality paper fast --geometry street", "quality paper knows infinity alone, got street"),
         ("evaluate --generator /nope", "argument --generator: expected it with --holes diffusion"),
+        *(
+            (f"evaluate --lidar --{option}", f"argument --{option.split()[0]}: it is of images; expected no --lidar")
+            for option in ("target-set truck", "size 8x8", "quality draft", "geometry street", "holes telea")
+        ),
+        *(
+            (f"evaluate --lidar --{option}", f"argument --{option.split()[0]}: it is of images; expected no --lidar")
+            for option in ("holes diffusion --generator no", "downscale 4", "clean-masks", "detector x.py:f")
+        ),
+        ("evaluate --lidar --displaced --data frame --size 8x8", "argument --size: --displaced has its own"),
         ("evaluate --steps 3", "argument --steps: expected it with --holes diffusion"),
         ("view --output a.mp4", r"expected a name ending in \.rrd, got 'a\.mp4'"),
         *(
@@ -162,6 +174,19 @@ def test_mistakes_are_one_line(command: str, message: str, capsys: pytest.Captur
     said = capsys.readouterr()
     assert re.search(message, said.err.splitlines()[-1]) and "Traceback" not in said.err
     assert said.err.startswith("usage") or len(said.err.splitlines()) == 1
+
+
+def test_killed_workers_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As torch tells them; its words for what a worker raised stay."""
+    for words, kind in (("(pid(s) 7) exited unexpectedly", OutputError), ("process 0.", RuntimeError)):
+
+        def killed(words: str = words, **_: Any) -> Iterator[int]:
+            yield 1
+            raise RuntimeError(f"DataLoader worker {words}")
+
+        monkeypatch.setattr(parallel, "DataLoader", lambda *_, **options: killed(**options))
+        with pytest.raises(kind, match="fewer --workers" if kind is OutputError else words):
+            list(parallel.results([1, 2], 2, "convert"))  # type: ignore[arg-type]
 
 
 def test_usage(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -18,7 +19,7 @@ from arbiview_aug.errors import CalibrationError
 from arbiview_aug.evaluate.displaced import displaced_frames
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from tests.helpers import camera
+from tests.helpers import camera, write_drive
 
 RIG = Rig([camera("front", 0)])
 SAME_DB = 138.1  # PSNR of equal images
@@ -112,3 +113,18 @@ def test_real_stereo_pairs(kitti_root: Path, referee: ModuleType, tmp_path: Path
     (row,) = (r for r in found["views"] if r["frame"] == "frame_010" and r["method"] == "fast, street")
     got = [row[key] for key in ("true_covered_psnr_db", "true_psnr_db", "seen")]
     assert got == pytest.approx(list(want.values()), abs=1e-3)
+
+
+def test_masks_of_the_next_frame_are_cleaned_too(tmp_path: Path) -> None:
+    sample = SyntheticDrive(RIG, num_frames=1, supersampling=1, neighbours=Neighbours(count=1, step_m=1.2))[0]
+    write_drive(tmp_path, [{k: one[k] for k in one if k != "neighbours"} for one in (sample, sample["neighbours"][1])])
+    later = tmp_path / "0001"
+    options = ["--displaced", str(later), "--geometry", "street", "--clean-masks"]
+    whole = run(tmp_path / "0000", tmp_path / "out", *options)
+    specks = np.full(RIG.sizes[0], 255, np.uint8)
+    specks[::7, ::7] = 0
+    cv2.imwrite(str(later / "mask.png"), specks)
+    calib = json.loads((later / "calib.json").read_text())
+    calib["cameras"][0]["mask"] = "mask.png"
+    (later / "calib.json").write_text(json.dumps(calib))
+    assert run(tmp_path / "0000", tmp_path / "out", *options)["means"] == whole["means"]

@@ -101,7 +101,10 @@ def read_calibration(path: Path, where: str) -> Any:
     try:
         mounting = Mounting.read(folder)
         with np.errstate(all="ignore"):  # ``Camera`` refuses numbers that are not finite
-            cameras = mounting.named(form.read(path, mounting))
+            cameras = form.read(path, mounting)
+            if folder == path:  # of a file alone it may name the others beside it
+                mounting.check([camera["name"] for camera in cameras])
+            cameras = mounting.named(cameras)
     except ArbiviewError as error:
         raise type(error)(f"{where}: {form.tool}: {error}") from None
     except _BROKEN as error:  # readers take files apart as their tools write them
@@ -144,6 +147,12 @@ def write_calibration(data: Mapping[str, Any], folder: Path, name: str) -> Path:
         known = ", ".join(key for key, form in FORMATS.items() if form.files_of)
         raise CalibrationError(f"save_rig: format: expected rig, {known}, got {name!r}")
     files = files_of(data)
+    there = {path for form in FORMATS.values() for pattern in form.files for path in folder.glob(pattern)}
+    if others := {path.name for path in (*there, *camera_files.camera_files(folder))} - files.keys():
+        fix = "which would be read with the new one or in its place: remove them, or name another folder"
+        raise CalibrationError(
+            f"save_rig: {folder}: expected no other calibration, got {', '.join(sorted(others))}, {fix}"
+        )
     texts = {folder / file: one if isinstance(one, str) else dump_yaml(one) for file, one in files.items()}
     write_whole({path: text.encode() for path, text in texts.items()})
     return folder

@@ -66,7 +66,7 @@ def read_camera_files(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
 
 def _ros(path: Path, mounting: Mounting, frames: Mapping[str, FloatArray]) -> dict[str, Any]:
     data = _messages(path)[0]
-    name, model = data.get("camera_name") or path.stem, data["distortion_model"]
+    name, model = str(data.get("camera_name") or path.stem), data["distortion_model"]
     if model not in _ROS_LENSES:
         raise CalibrationError(f"camera {name!r}: distortion_model: expected {', '.join(_ROS_LENSES)}, got {model!r}")
     optical = [name.strip("/") + end for end in _OPTICAL]
@@ -155,7 +155,7 @@ def _file_storage(path: Path) -> Mapping[str, Any]:
 
 def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
     """A CameraInfo YAML for each camera, as camera_calibration does, and the poses as a TFMessage."""
-    files, transforms = {}, []
+    files, transforms = {}, list[dict[str, Any]]()
     for k, camera in enumerate(data["cameras"]):
         name, K, pose = camera["name"], np.array(camera["K"]), np.array(camera["cam2ego"])
         lens, coefficients = lens_of(camera, "ROS", {"radtan": 8, "fisheye": 4})
@@ -163,7 +163,7 @@ def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
             coefficients += [0.0] * (5 - len(coefficients))
         model = "equidistant" if lens == "fisheye" else "plumb_bob" if len(coefficients) == 5 else "rational_polynomial"
         file = f"{file_stem(name, k)}.yaml"
-        files[f"camera {k}.yaml" if file in (MOUNTING, TF) else file] = {
+        files[f"camera {k}.yaml" if file in (MOUNTING, TF) or "camchain" in file else file] = {
             **{"image_width": camera["width"], "image_height": camera["height"], "camera_name": name},
             "camera_matrix": _node(K),
             **{"distortion_model": model, "distortion_coefficients": _node([coefficients])},
@@ -172,7 +172,12 @@ def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
         }
         at, wxyz = pose[:3, 3].tolist(), quaternion_from_rotation(pose[:3, :3]).tolist()
         transform = {"translation": dict(zip("xyz", at, strict=True)), "rotation": dict(zip("wxyz", wxyz, strict=True))}
-        frames = {"header": {"frame_id": _EGO_FRAMES[0]}, "child_frame_id": f"{name}_optical_frame"}
+        frame = f"{name.strip('/')}_optical_frame"
+        if any(one["child_frame_id"] == frame for one in transforms):
+            raise CalibrationError(
+                f"camera {name!r}: expected a frame of its own for {TF}, got {frame} twice: rename it"
+            )
+        frames = {"header": {"frame_id": _EGO_FRAMES[0]}, "child_frame_id": frame}
         transforms.append({**frames, "transform": transform})
     names = {camera["name"]: camera["name"] for camera in data["cameras"]}  # files come in alphabetical order
     return files | {TF: {"transforms": transforms}, MOUNTING: {"ground_z_m": data["ground_z_m"], "names": names}}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -135,7 +136,7 @@ def _image(name: str, camera: int, numbers: list[float]) -> _Image:
 
 def colmap_files(data: Mapping[str, Any]) -> dict[str, Any]:
     """``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``; the world is the ego frame, in metres."""
-    cameras, images, files = [], [], dict[str, Any]()
+    cameras, images, files, names = [], [], dict[str, Any](), dict[str, str]()
     for number, camera in enumerate(data["cameras"], 1):
         lens, coefficients = lens_of(camera, "COLMAP", {"radtan": 8, "fisheye": 4})
         if len(coefficients) == 5:
@@ -145,7 +146,9 @@ def colmap_files(data: Mapping[str, Any]) -> dict[str, Any]:
         cameras.append((number, model, camera["width"], camera["height"], fx, fy, cx + 0.5, cy + 0.5, *coefficients))
         world2cam = np.linalg.inv(np.array(camera["cam2ego"]))
         pose = *quaternion_from_rotation(world2cam[:3, :3]).tolist(), *world2cam[:3, 3].tolist()
-        images.append((number, *pose, number, f"{camera['name']}/0.png\n"))  # and no points
+        name = camera["name"] if re.fullmatch(r"\S*[^\s/]", camera["name"]) else f"camera{number}"
+        names[name] = camera["name"]
+        images.append((number, *pose, number, f"{name}/0.png\n"))  # and no points
     for file, head, rows in (
         ("cameras", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", cameras),
         ("images", "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)", images),
@@ -153,6 +156,6 @@ def colmap_files(data: Mapping[str, Any]) -> dict[str, Any]:
     ):
         lines = (" ".join(map(str, row)) for row in rows)
         files[f"{file}.txt"] = "\n".join([f"# {head}", *lines, ""])
-    first = data["cameras"][0]
-    mounting = {"metres_per_unit": 1.0, "poses": {first["name"]: first["cam2ego"]}}
+    poses = {next(iter(names)): data["cameras"][0]["cam2ego"]}
+    mounting = {"metres_per_unit": 1.0, "poses": poses, "names": names}
     return files | {MOUNTING: {"ground_z_m": data["ground_z_m"], **mounting}}

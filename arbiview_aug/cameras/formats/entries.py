@@ -16,8 +16,9 @@ def camera_entry(
 ) -> dict[str, Any]:
     """A camera as in a rig file, of (width, height); polynomials of zeros are no distortion."""
     coefficients = [float(k) for k in np.ravel(coefficients)]
-    if lens == "radtan" and not any(coefficients[8:]):
-        coefficients = coefficients[:8]  # the others are OpenCV's thin prism and tilt
+    most = {"radtan": 8, "fisheye": 4}.get(lens, len(coefficients))
+    if not any(coefficients[most:]):
+        coefficients = coefficients[:most]  # the others are OpenCV's thin prism and tilt, or fill a message up
     has_lens = lens != "pinhole" and (lens != "radtan" or any(coefficients))
     return {
         **{"name": name, "width": size[0], "height": size[1]},

@@ -53,14 +53,26 @@ class Mounting:
         keys = cls.__dataclass_fields__
         if not isinstance(data, Mapping) or not set(data) <= set(keys):
             raise CalibrationError(f"{MOUNTING}: expected the keys {', '.join(keys)}, got {shown(data)}")
+        data = dict(data)
         for key in {"poses", "images", "sizes", "names"} & set(data):
             if not isinstance(data[key], Mapping):
                 raise CalibrationError(f"{MOUNTING}: {key}: expected values by camera, got {shown(data[key])}")
-        poses = {str(name): pose_of(str(name), value) for name, value in data.get("poses", {}).items()}
+            data[key] = {str(name): value for name, value in data[key].items()}
+        if not isinstance(data.get("tokens", []), list):
+            raise CalibrationError(f"{MOUNTING}: tokens: expected a list, got {shown(data['tokens'])}")
+        poses = {name: pose_of(name, value) for name, value in data.get("poses", {}).items()}
         scale = data.get("metres_per_unit")
         if scale is not None and not (type(scale) in (int, float) and 0 < scale < math.inf):
             raise CalibrationError(f"{MOUNTING}: metres_per_unit: expected a positive number, got {shown(scale)}")
         return cls(**{**data, "poses": poses})
+
+    def check(self, cameras: Sequence[str]) -> None:
+        """Refuse values of other cameras than a folder's, which would not be read."""
+        sizes = {} if "width" in self.sizes else self.sizes
+        for key, values in (("poses", self.poses), ("sizes", sizes), ("names", self.names)):
+            if unknown := [name for name in values if name not in cameras]:
+                got = f"{', '.join(unknown)}: rename or remove it"
+                raise CalibrationError(f"{MOUNTING}: {key}: expected cameras of {', '.join(cameras)}, got {got}")
 
     def pose(self, name: str, instead: str = "") -> FloatArray:
         """A camera's pose, or CalibrationError with the question where it is."""
@@ -83,7 +95,7 @@ class Mounting:
 
     def named(self, cameras: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         """A rig file's cameras by their ``names``, and in that order."""
-        places = {str(name): place for place, name in enumerate(self.names)}
+        places = {name: place for place, name in enumerate(self.names)}
         ordered = sorted(cameras, key=lambda camera: places.get(camera["name"], len(places)))
         return [camera | {"name": self.names.get(camera["name"], camera["name"])} for camera in ordered]
 

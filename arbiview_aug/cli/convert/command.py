@@ -136,7 +136,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _settings(arguments: argparse.Namespace) -> Settings:
     kind, root = split_kind(arguments.data)
     root = root.absolute()  # Ray's actors have a working directory of their own
-    depth = arguments.motion_depth
+    depth, generator = arguments.motion_depth, arguments.generator
     needed = GEOMETRIES[arguments.geometry].needs
     if depth is None and needed in FOLDERS:
         default = inside(root, FOLDERS[needed], "depth")
@@ -152,7 +152,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         kind=kind,
         target=load_rig(arguments.target),
         output=Path(arguments.output).absolute(),
-        generator=None if arguments.generator is None else arguments.generator.absolute(),
+        generator=generator.absolute() if generator is not None and generator.exists() else generator,  # or a hub id
         motion_depth=None if depth is None else depth.absolute(),
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
         link=arguments.link,

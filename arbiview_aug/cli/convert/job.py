@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from arbiview_aug.atomic_io import checksum, inside, link_whole, write_whole
+from arbiview_aug.atomic_io import checksum, inside, link_whole, write_whole, writing
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import OnError
@@ -29,7 +29,7 @@ from arbiview_aug.datasets.drive import Recording, WritableRecording
 from arbiview_aug.datasets.image_io import encoded, encoded_image
 from arbiview_aug.datasets.registry import find_reader
 from arbiview_aug.environment import repeatable_opencv, working_s
-from arbiview_aug.errors import DataError, OutputError, described
+from arbiview_aug.errors import ArbiviewError, DataError, OutputError, described
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.scans import RINGS_KEY
 
@@ -144,10 +144,19 @@ class Jobs(Dataset[Done]):
         if self.on_error != "skip":
             return Done(token, "failed", messages=(message,))
         try:
+            self._remove_former(token)
             self.manifest.write({"token": token, "skipped": message}, owner=str(index))
-        except OutputError as error:
+        except ArbiviewError as error:
             return Done(token, "stopped", messages=(str(error),))
         return Done(token, "skipped", messages=(message,))
+
+    def _remove_former(self, token: str, now: Iterable[str] = ()) -> None:
+        """Remove files of the sample's last record, but for those that it has ``now``."""
+        record = self.manifest.record(token) or {}
+        for name in record.get("files", {}).keys() - now:
+            path = self.format.kept_path(name)
+            with writing(path):
+                path.unlink(missing_ok=True)
 
     def _write(self, index: int, sample: Mapping[str, Any], out: Mapping[str, Any]) -> float:
         """Write a sample's files, then its record; returns the share of pixels that some source saw."""
@@ -185,6 +194,7 @@ class Jobs(Dataset[Done]):
         without = [frame["token"] for frame in sample.get("neighbours", ()) if frame.is_broken]
         if without:
             record["without"] = without
+        self._remove_former(record["token"], record["files"])
         self.manifest.write(record, owner=str(index))
         return float(np.mean(coverage))
 

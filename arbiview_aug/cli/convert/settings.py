@@ -79,22 +79,21 @@ class Settings:
         return load_inpainter(self.generator, steps=self.steps)
 
     def rendering(self) -> dict[str, Any]:
-        """All settings that decide the pixels, as plain data."""
+        """All settings that decide the output, as plain data."""
         target = self.target.to_dict()
         for entry, camera in zip(target["cameras"], self.target, strict=True):
             entry["content"] = camera.content_key.hex()  # of its mask too
-        names = ("holes", "steps", "quality", "geometry", "size", "reduce", "neighbours", "suffix")
+        names = ("holes", "steps", "quality", "geometry", "size", "reduce", "neighbours", "suffix", "link")
         of = self.generator or Path()
         files = [] if self.generator is None else [of] if of.is_file() else sorted(filter(Path.is_file, of.rglob("*")))
+        sums = {path.name if path == of else path.relative_to(of).as_posix(): checksum(path) for path in files}
         return {
             **{name: getattr(self, name) for name in names},
             **({} if self.size is None else {"fit": self.fit}),
             **({"clean_masks": True} if self.clean_masks else {}),
             **({"points": self.points} if self.target.lidars else {}),
             "motion_depth": self.motion_depth is not None,
-            "generator": {
-                path.name if path == of else path.relative_to(of).as_posix(): checksum(path) for path in files
-            },
+            "generator": sums if sums or self.generator is None else str(self.generator),  # a hub id
             "target": target,
         }
 

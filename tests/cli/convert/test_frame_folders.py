@@ -16,6 +16,7 @@ import torch
 
 from arbiview_aug import Rig, RigRetarget, SampleKeys, load_rig
 from arbiview_aug.__main__ import main
+from arbiview_aug.cli import parsers
 from arbiview_aug.cli.convert import command as command_module
 from arbiview_aug.cli.convert.job import coverage_of
 from arbiview_aug.datasets import FrameFolder, WithDepth
@@ -179,6 +180,13 @@ def test_impossible_settings(source: Path, tmp_path: Path, capsys: pytest.Captur
     assert not (tmp_path / "new").exists()
 
 
+def test_generators_of_the_hub_keep_their_id(source: Path, tmp_path: Path) -> None:
+    """And record it."""
+    asked = command(source, tmp_path / "new", "--holes", "diffusion", "--generator", "owner/name")
+    settings = command_module._settings(parsers.convert().parse_args(asked[1:]))
+    assert settings.generator == Path("owner/name") and settings.rendering()["generator"] == "owner/name"
+
+
 def test_one_frame_alone(source: Path, tmp_path: Path) -> None:
     assert main(command(f"frames:{source / '0001'}", tmp_path / "new")) == 0
     assert FrameFolder(tmp_path / "new").tokens == ["0001"]
@@ -317,6 +325,26 @@ def test_a_source_that_changed_is_converted_again(
     assert "2 samples converted, 1 there before" in capsys.readouterr().out
     assert main(command(tmp_path / "drive", tmp_path / "whole")) == 0
     assert tree(tmp_path / "new") == tree(tmp_path / "whole")
+
+
+def test_nothing_stays_of_what_the_source_had(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Points of another frame in as many bytes, an image that cannot be read any more, points that were taken out."""
+    drive = shutil.copytree(source, tmp_path / "drive")
+    asked = command(drive, tmp_path / "new", "--points", "source", "--on-error", "skip")
+    assert main(asked) == 0 and main([*asked, "--link", "copy"]) == 2
+    assert "settings.link 'copy' instead of 'hard'" in capsys.readouterr().err
+    for token in ("0000", "0002"):
+        (drive / token / "lidar.npy").unlink()
+    shutil.copy(source / "0001" / "lidar.npy", drive / "0000")
+    calib = drive / "0000" / "calib.json"
+    calib.write_text(calib.read_text().replace("-0.1", "-0.2"))
+    (drive / "0001" / "00.jpg").write_bytes(b"cut")
+    assert main(asked) == 0 and main([*asked, "--verify"]) == 0
+    assert main(command(drive, tmp_path / "whole", *asked[-4:])) == 0
+    assert tree(tmp_path / "new") == tree(tmp_path / "whole") and FrameFolder(tmp_path / "new").tokens == [
+        "0000",
+        "0002",
+    ]
 
 
 def test_a_neighbour_that_was_mended_fills_again(source: Path, tmp_path: Path) -> None:
