@@ -85,7 +85,7 @@ def levels(key: str, images: torch.Tensor, norm: Norm) -> torch.Tensor:
     grey = images.double() * std + mean
     whole = grey.round()
     off = float((grey - whole).abs().max())
-    if off > _ROUNDING or whole.min() < 0 or whole.max() > 255:
+    if not (off <= _ROUNDING and whole.min() >= 0 and whole.max() <= 255):  # NaN too
         raise SampleError(
             f"{key}: expected 8 bit images normalised by mean and std {norm}, got grey levels {off:.2g} off whole "
             f"numbers, from {grey.min():.1f} to {grey.max():.1f}; pass img_norm=(mean, std), and retarget before "

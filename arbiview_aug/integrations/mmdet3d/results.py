@@ -25,6 +25,8 @@ from arbiview_aug.integrations.mmdet3d.matrices import (
     read_views,
     stacked,
 )
+from arbiview_aug.sample.inputs import as_array
+from arbiview_aug.scene.surface import Points
 from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
 Retarget = Callable[[dict[str, Any]], dict[str, Any]]
@@ -186,35 +188,48 @@ def source_rig(views: Views, images: Sequence[torch.Tensor], ground_z_m: float) 
 def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, torch.Tensor]:
     """The sample's ``points`` and ``boxes_3d`` in the ego frame, of what the results hold in the LiDAR's.
 
-    Boxes are taken by their corners: what their numbers mean differs between mmdet3d's versions. Those of a plain array
+    Boxes are taken by their corners: what their numbers mean differs between mmdet3d's versions. Those of plain numbers
     (Sparse4D) are gravity centre, length, width, height and yaw.
+
+    Raises:
+        SampleTypeError: No numbers.
+        SampleError: Numbers of another shape.
     """
     values = {}
     points = results.get("points")
-    points = getattr(points, "tensor", points)
-    if isinstance(points, torch.Tensor | np.ndarray) and points.ndim == 2:
-        values["points"] = moved_points(points, lidar2ego)
+    if points is not None:
+        values["points"] = moved_points(_rows("points", getattr(points, "tensor", points), 3), lidar2ego)
     annotated = results.get("ann_info")
     boxes = results.get("gt_bboxes_3d", annotated.get("gt_bboxes_3d") if isinstance(annotated, Mapping) else None)
     tensor, rotation = getattr(boxes, "tensor", None), lidar2ego[:3, :3]
+    if boxes is None:
+        return values
     if tensor is not None and not len(tensor):  # mmdet3d before 1.0 asserts that there are corners
         return values | {"boxes_3d": torch.zeros(0, 7)}
     corners = getattr(boxes, "corners", None)
-    if isinstance(boxes, np.ndarray) and boxes.ndim == 2 and boxes.shape[1] >= 7:
-        centres, sizes, yaw = boxes[:, :3], boxes[:, 3:6].T, boxes[:, 6]
+    if corners is None:
+        rows = _rows("gt_bboxes_3d", boxes, 7)
+        centres, sizes, yaw = rows[:, :3], rows[:, 3:6].T, rows[:, 6]
         along = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
-    elif corners is not None:
+    else:
         # In both conventions corner 1 is above 0. From 1.0 on corner 4 is ahead of 0, at the yaw, and 3 to its left.
         x = np.asarray(corners, np.float64).reshape(-1, 8, 3)
         centres, along, aside = x.mean(axis=1), x[:, 4] - x[:, 0], x[:, 3] - x[:, 0]
         if tensor is not None and _is_clockwise(np.asarray(tensor[:, 6], np.float64), along):
             along, aside = -aside, along
         sizes = np.linalg.norm([along, aside, x[:, 1] - x[:, 0]], axis=-1)
-    else:
-        return values
     along = along @ rotation.T
     columns = [*(centres @ rotation.T + lidar2ego[:3, 3]).T, *sizes, np.arctan2(along[:, 1], along[:, 0])]
     return values | {"boxes_3d": torch.from_numpy(np.stack(columns, axis=1)).float()}
+
+
+def _rows(key: str, value: Any, least: int) -> Points:
+    array = as_array(key, value)
+    if array.shape == (0,):
+        array = array.reshape(0, least)
+    if array.ndim != 2 or array.shape[1] < least:
+        raise SampleError(f"{key}: expected rows of at least {least} numbers, got shape {array.shape}")
+    return array
 
 
 def _is_clockwise(yaw: FloatArray, x_axes: FloatArray) -> bool:

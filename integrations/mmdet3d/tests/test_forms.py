@@ -216,6 +216,20 @@ def test_frames_without_boxes(is_old: bool) -> None:
     assert geometry({"gt_bboxes_3d": boxes}, LIDAR2EGO)["boxes_3d"].shape == (0, 7)
 
 
+def test_geometry_in_plain_numbers() -> None:
+    rows = np.float32([[8, 1, 0, 4, 2, 1.5, 0.3], [9, 1, 0, 4, 2, 1.5, 0]])
+    expected = geometry({"points": rows, "gt_bboxes_3d": rows}, LIDAR2EGO)
+    for form in (torch.from_numpy, np.ndarray.tolist):
+        same = geometry({"points": form(rows), "gt_bboxes_3d": form(rows)}, LIDAR2EGO)
+        assert all(torch.allclose(same[key], value) for key, value in expected.items()) and len(same) == 2
+    for key, shape in (("gt_bboxes_3d", (2, 6)), ("points", (5, 2)), ("points", (1, 5, 3))):
+        with pytest.raises(SampleError, match=rf"^{key}: expected rows of at least . numbers, got shape"):
+            geometry({key: np.ones(shape)}, LIDAR2EGO)
+    with pytest.raises(SampleTypeError, match="gt_bboxes_3d: expected a tensor of numbers"):
+        geometry({"gt_bboxes_3d": "boxes"}, LIDAR2EGO)
+    assert geometry({"gt_bboxes_3d": []}, LIDAR2EGO)["boxes_3d"].shape == (0, 7)
+
+
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_messages(given: Recording) -> None:
     results = FORMS["DETR3D"](given)
@@ -250,6 +264,8 @@ def test_messages(given: Recording) -> None:
     entries = FORMS["BEVDet"](given)["img_inputs"]
     with pytest.raises(SampleError, match=r"whole numbers.*img_norm"):
         step(img_norm=((0, 0, 0), (1, 1, 1)))({"img_inputs": entries})
+    with pytest.raises(SampleError, match="img_inputs: expected 8 bit images .* nan off whole numbers"):
+        step()({"img_inputs": (entries[0] * np.nan, *entries[1:])})
     with pytest.raises(SampleError, match=r"img_inputs: expected .* got 5 entries"):
         step()({"img_inputs": entries[:5]})
     several = (entries[0].repeat(2, 1, 1, 1), *entries[1:])
