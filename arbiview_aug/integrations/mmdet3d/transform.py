@@ -43,6 +43,8 @@ class RigRetargetMultiView:
         CalibrationError: A target with lenses, or that cannot be loaded; a pose of another shape.
     """
 
+    _is_pinhole = True  # of all frameworks that render images
+
     def __init__(
         self,
         target: str | Path | Rig | RandomRig,
@@ -60,7 +62,8 @@ class RigRetargetMultiView:
         self.retarget = RigRetarget(target, **settings)
         held = self.retarget.target
         rig = held.base if isinstance(held, RandomRig) else held
-        check_no_lenses([camera.lens for camera in rig])
+        if self._is_pinhole:
+            check_no_lenses([camera.lens for camera in rig])
         self.names = rig.names
         self.lidar2ego, self.ground_z_m, self.img_norm = lidar2ego, float(ground_z_m), img_norm
         by_target = held.sequence_key if isinstance(held, RandomRig) and held.per == "sequence" else None
