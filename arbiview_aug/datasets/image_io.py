@@ -158,6 +158,8 @@ def _header(data: bytes, label: str) -> tuple[str, tuple[int, int]]:
 
 def decode_bytes(data: bytes, label: str) -> ByteArray:
     """Decode the bytes of a JPEG or PNG file as (h, w, 3) RGB, as ``decode_images`` does; DataError by ``label``."""
+    if not isinstance(data, bytes | bytearray):
+        raise DataError(f"{label}: expected a file's bytes, got {type(data).__name__}; do not decode before")
     format, _ = _header(data, label)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS)
     if image is None:
