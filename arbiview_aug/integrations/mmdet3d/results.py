@@ -93,7 +93,7 @@ def retarget_results(
     camera_names = [*map(str, by_name)] or [f"camera {k}" for k in range(count)]
     source = read_views(_given(results, by_name), count, camera_names, _lidar2ego(results, lidar2ego))
     for k, info in enumerate(by_name.values()):  # mmdet3d pads images of several sizes to the largest
-        if isinstance(info, Mapping) and "height" in info and "width" in info:
+        if isinstance(info, Mapping) and info.get("height") and info.get("width"):
             images[k] = images[k][:, : int(info["height"]), : int(info["width"])]
     out = retarget(
         {"images": images, "rig": source_rig(source, images, ground_z_m), **geometry(results, source.lidar2ego)}
@@ -108,8 +108,9 @@ def retarget_results(
         if isinstance(kept.get(key), list | tuple):
             kept[key] = list(views.names)
     if np.ndim(kept.get("img_timestamp", 0.0)) == 1:  # PETR's: all views are of the LiDAR's time
-        time_s = float(kept.get("timestamp", np.mean(np.asarray(kept["img_timestamp"]))))
-        kept["img_timestamp"] = like_array(kept["img_timestamp"], [time_s] * len(views.names))
+        times_s, time_s = kept["img_timestamp"], kept.get("timestamp")
+        time_s = float(np.mean(np.asarray(times_s)) if time_s is None else time_s)
+        kept["img_timestamp"] = like_array(times_s, [time_s] * len(views.names))
     if "num_views" in kept:
         kept["num_views"] = len(views.names)
     return kept | scanned(kept, out, source.lidar2ego) | target_outputs([out])
@@ -168,7 +169,7 @@ def _recorded(results: Mapping[str, Any]) -> Any:
         cut = []
         for image, (h, w, *_) in zip(images, shapes, strict=True):
             sides = image.shape[1:] if isinstance(image, torch.Tensor) else np.shape(image)[:2]
-            is_padded = all(0 <= side - shape < _MAX_PADDING_PX for side, shape in zip(sides, (h, w), strict=True))
+            is_padded = len(sides) == 2 and all(0 <= side - shape < _MAX_PADDING_PX for side, shape in zip(sides, (h, w), strict=True))
             if is_padded:
                 image = image[:, :h, :w] if isinstance(image, torch.Tensor) else image[:h, :w]
             cut.append(image)
@@ -285,8 +286,8 @@ def scanned(results: Mapping[str, Any], out: Mapping[str, Any], lidar2ego: Float
     changed = {"points": given.new_point(points) if hasattr(given, "new_point") else like_array(given, points)}
     counts = out[COUNTS_KEY].numpy() if COUNTS_KEY in out else np.zeros(0, np.int64)
     if isinstance(annotated := results.get("ann_info"), Mapping):
-        given_counts = annotated.get("num_lidar_pts", ())
-        if len(given_counts) == len(counts) > 0:
+        given_counts = annotated.get("num_lidar_pts")
+        if given_counts is not None and len(given_counts) == len(counts) > 0:
             changed["ann_info"] = {**annotated, "num_lidar_pts": like_array(given_counts, counts)}
     instances = results.get("instances")
     if isinstance(instances, list) and len(instances) == len(counts):
@@ -329,14 +330,14 @@ def _write_numbers(out: dict[str, Any], views: Views, images: torch.Tensor) -> N
             if _is_per_camera(matrices):
                 out[key] = _as_written(matrices, views.matrices(kind))
     h, w = images.shape[-2:]
-    if "image_wh" in out:
+    if out.get("image_wh") is not None:
         out["image_wh"] = like_array(out["image_wh"], [(w, h)] * len(images))
-    if "focal" in out:
+    if out.get("focal") is not None:
         out["focal"] = like_array(out["focal"], np.sqrt(np.abs(np.linalg.det(views.K[:, :2, :2]))))
     # (h, w), (h, w, 3), (h, w, 3, views) as given; (w, h) where images are PIL's.
     full = (h, w, 3, len(images)) if isinstance(out["img"][0], np.ndarray | torch.Tensor) else (w, h)
     for key in SHAPE_KEYS:
-        if isinstance(shape := out.get(key), tuple | list):
+        if isinstance(shape := out.get(key), tuple | list) and shape:
             is_list = isinstance(shape[0], tuple | list)
             out[key] = [full[: len(shape[0])]] * len(images) if is_list else full[: len(shape)]
 
@@ -350,11 +351,11 @@ def _as_written(original: Any, matrices: FloatArray) -> Any:
 
 def _infos(infos: Mapping[str, Any], views: Views, images: torch.Tensor) -> dict[str, Any]:
     """``images``: an entry for each target camera with the keys of the source's that can be told of it."""
-    first: Mapping[str, Any] = next(iter(infos.values()), {})
+    first: Mapping[str, Any] = next((info for info in infos.values() if isinstance(info, Mapping)), {})
     columns = {
         key: _as_written([first[key]], views.matrices(kind))
         for key, kind in MATRICES.items()
-        if key in first and (kind != "cam2global" or views.ego2global is not None)
+        if first.get(key) is not None and (kind != "cam2global" or views.ego2global is not None)
     }
     by_camera = {}
     for k, name in enumerate(views.names):
