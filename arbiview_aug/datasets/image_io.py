@@ -150,7 +150,8 @@ def _header(data: bytes, label: str) -> tuple[str, tuple[int, int]]:
         raise DataError(f"{label}: expected a JPEG or PNG, got a file that begins with {data[:8]!r}")
     if not ended:
         raise DataError(f"{label}: expected a complete {format}, got a truncated file; copy it again")
-    if format == "PNG" and (depth := _number(data, 24, 1)) > 8:  # OpenCV keeps the upper 8, which are 0 where sensors fill fewer
+    # OpenCV keeps the upper 8 bits of 16, which are 0 where a sensor fills the lower ones.
+    if format == "PNG" and (depth := _number(data, 24, 1)) > 8:
         fix = "scale it to 8 bits by the sensor's range, such as (image >> 4).astype('uint8') from 12"
         raise DataError(f"{label}: expected 8 bits a channel, got a PNG of {depth}; {fix}")
     return format, size

@@ -47,16 +47,18 @@ class OnImages(torch.nn.Module):
         """
         images = sample.get("images")
         if not isinstance(images, torch.Tensor):
+            found = f"got a {type(images).__name__} in a sample of {', '.join(map(str, sample))}"
             fix = "; pass size=(h, w) to RigRetarget" if isinstance(images, list | tuple) else ""
-            got = f"a {type(images).__name__}{fix}" if "images" in sample else f"a sample of {', '.join(map(str, sample))}"
-            raise ValueError(f"OnImages: expected a tensor 'images', of one size, got {got}")
+            raise ValueError(f"OnImages: expected a tensor 'images', of one size, {found}{fix}")
         flat = images.reshape(-1, *images.shape[-3:])
         levels = flat.float() / 255 if flat.dtype == torch.uint8 else flat
         changed = self.module(levels)
         far = ((changed - 0.5).abs() > 1).float().mean()  # noise may reach out with some pixels
         if not changed.is_floating_point() or far > _FAR_SHARE:
-            got = f"{changed.dtype}, {far:.0%} of it below -0.5 or above 1.5"
-            raise ValueError(f"OnImages: expected floats in [0, 1] of its module, got {got}; normalise after OnImages")
+            found = f"{changed.dtype}, {far:.0%} of it below -0.5 or above 1.5"
+            raise ValueError(
+                f"OnImages: expected floats in [0, 1] of its module, got {found}; normalise after OnImages"
+            )
         changed = changed.clamp(0, 1)
         if flat.dtype == torch.uint8:
             changed = (changed * 255).round().to(torch.uint8)

@@ -20,7 +20,7 @@ from arbiview_aug.errors import CalibrationError, SampleError
 from arbiview_aug.integrations.mmdet3d.matrices import like_array, padded
 from arbiview_aug.integrations.mmdet3d.results import geometry, moved_points
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
-from arbiview_aug.scene.boxes import checked_boxes, points_by_box
+from arbiview_aug.scene.boxes import checked_boxes, moved_by, points_by_box
 from arbiview_aug.transforms.scans import retarget_points
 from arbiview_aug.transforms.settings import checked_probability
 
@@ -218,15 +218,10 @@ def _moved(out: DataDict, move: FloatArray) -> DataDict:
     """A ``data_dict`` in another frame: ``move`` (4, 4) leads from the old one to it."""
     if np.array_equal(move, np.eye(4)):
         return out
-    back, turn = np.linalg.inv(move), np.arctan2(move[1, 0], move[0, 0])
+    back = np.linalg.inv(move)
     changed: DataDict = {"points": moved_points(out["points"], move).numpy().astype(out["points"].dtype)}
     if (boxes := out.get("gt_boxes")) is not None:
-        boxes = np.array(boxes)
-        boxes[:, :3] = boxes[:, :3] @ move[:3, :3].T + move[:3, 3]
-        boxes[:, 6] += turn
-        if boxes.shape[1] >= 9:
-            boxes[:, 7:9] = boxes[:, 7:9] @ move[:2, :2].T
-        changed["gt_boxes"] = boxes
+        changed["gt_boxes"] = moved_by(boxes, move)
     for key in ("lidar2camera", "lidar2image", "trans_lidar_to_cam"):
         if key in out:
             changed[key] = _each(out[key], lambda matrix: matrix @ back)

@@ -169,8 +169,8 @@ def _recorded(results: Mapping[str, Any]) -> Any:
         cut = []
         for image, (h, w, *_) in zip(images, shapes, strict=True):
             sides = image.shape[1:] if isinstance(image, torch.Tensor) else np.shape(image)[:2]
-            is_padded = len(sides) == 2 and all(0 <= side - shape < _MAX_PADDING_PX for side, shape in zip(sides, (h, w), strict=True))
-            if is_padded:
+            rims = [side - shape for side, shape in zip(sides, (h, w), strict=False)]
+            if len(rims) == 2 and all(0 <= rim < _MAX_PADDING_PX for rim in rims):
                 image = image[:, :h, :w] if isinstance(image, torch.Tensor) else image[:h, :w]
             cut.append(image)
         images = cut

@@ -106,9 +106,9 @@ def test_images_keep_their_type_and_shape(sample: dict) -> None:
 
 
 def test_lists_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"got a list; pass size=\(h, w\)"):
+    with pytest.raises(ValueError, match=r"got a list in .*; pass size=\(h, w\)"):
         OnImages(K.ColorJiggle())({"images": [torch.zeros(3, 4, 4)]})
-    with pytest.raises(ValueError, match=r"expected a tensor 'images', of one size, got a sample of K"):
+    with pytest.raises(ValueError, match=r"expected a tensor 'images', of one size, got a NoneType in a sample of K"):
         OnImages(K.ColorJiggle())({"K": torch.eye(3)})
 
 
@@ -118,7 +118,7 @@ def test_lists_are_refused() -> None:
 )
 def test_what_leaves_0_to_1_is_refused(module: torch.nn.Module, type_: torch.dtype) -> None:
     images = v2.functional.to_dtype(torch.rand(2, 3, 8, 8), type_, scale=True)
-    with pytest.raises(ValueError, match=r"expected floats in \[0, 1\] of its module, got .*; normalise after OnImages"):
+    with pytest.raises(ValueError, match=r"expected floats in \[0, 1\] of its module, got .*; normalise after"):
         OnImages(module)({"images": images})
     noisy = OnImages(lambda images: images + 0.15 * torch.randn_like(images))({"images": images})["images"]
     assert noisy.dtype == type_

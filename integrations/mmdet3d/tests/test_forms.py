@@ -282,7 +282,7 @@ def test_messages(given: Recording) -> None:
     entries = FORMS["BEVDet"](given)["img_inputs"]
     with pytest.raises(SampleError, match=r"whole numbers.*img_norm"):
         step(img_norm=((0, 0, 0), (1, 1, 1)))({"img_inputs": entries})
-    with pytest.raises(SampleError, match="img_inputs: expected 8 bit images .* nan off whole numbers"):
+    with pytest.raises(SampleError, match=r"img_inputs: expected 8 bit images .* nan off whole numbers"):
         step()({"img_inputs": (entries[0] * np.nan, *entries[1:])})
     with pytest.raises(SampleError, match=r"img_inputs: expected .* got 5 entries"):
         step()({"img_inputs": entries[:5]})

@@ -218,7 +218,7 @@ def test_messages(given: Recording) -> None:
     with pytest.raises(SampleError, match="points: expected"):
         step()({"frame_id": "1"})
     for points in (data["points"].tolist(), torch.from_numpy(data["points"]), data["points"][:, :2]):
-        with pytest.raises(SampleError, match="^points: expected"):
+        with pytest.raises(SampleError, match=r"^points: expected"):
             step()(data | {"points": points})
     with pytest.raises(SampleError, match="lidar2image: expected beside camera_imgs, found none"):
         cameras = nuscenes(given)
