@@ -147,11 +147,10 @@ class Py123dDataset(WritableRecording):
         (log, iteration), token = self._at(index), self.tokens[index]
         with _reading(log.folder):
             fields = self._fields(index)
-            sample = fields | camera_fields(
-                fields["rig"], _images(log, iteration, fields["rig"].names, self.reduce), token
-            )
-            if self.load_points and (points := _points(log, iteration, token)) is not None:
-                sample["points"] = points
+        images = _images(log, iteration, fields["rig"].names, self.reduce)
+        sample = fields | camera_fields(fields["rig"], images, token)
+        if self.load_points and (points := _points(log, iteration, token)) is not None:
+            sample["points"] = points
         if self._drive is not None:
             sample["neighbours"] = self._neighbours(self._drive, self._posed.index(index))
         return sample

@@ -36,7 +36,7 @@ _LEAST_UP = 0.9  # z of the upward axis of a frame that boxes stand upright in
 
 
 class _Step(RigRetargetMultiView):
-    _is_pinhole = False  # points need no cameras; ``target_views`` refuses lenses where images are rendered
+    _refuses_lenses = False  # points need no cameras; ``target_views`` refuses lenses where images are rendered
 
 
 class RigRetargetDataDict:

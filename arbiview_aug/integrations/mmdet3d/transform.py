@@ -43,7 +43,7 @@ class RigRetargetMultiView:
         CalibrationError: A target with lenses, or that cannot be loaded; a pose of another shape.
     """
 
-    _is_pinhole = True  # of all frameworks that render images
+    _refuses_lenses = True  # at once, not with the first images
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class RigRetargetMultiView:
         self.retarget = RigRetarget(target, **settings)
         held = self.retarget.target
         rig = held.base if isinstance(held, RandomRig) else held
-        if self._is_pinhole:
+        if self._refuses_lenses:
             check_no_lenses([camera.lens for camera in rig])
         self.names = rig.names
         self.lidar2ego, self.ground_z_m, self.img_norm = lidar2ego, float(ground_z_m), img_norm
