@@ -33,7 +33,28 @@ def sequence_rng(name: object, epoch: int = 0, rng: torch.Generator | None = Non
     return torch.Generator().manual_seed(int.from_bytes(digest[:8], "little") >> 1)
 
 
-class RandomRig:
+class Epochs:
+    """The epoch that draws by sequence depend on: all copies of one object share it, in running workers too."""
+
+    def __init__(self) -> None:
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        if not self._epoch.is_shared():  # copied or unpickled
+            self._epoch.share_memory_()
+
+    def set_epoch(self, epoch: int) -> None:
+        """Change the draws by sequence, also in running workers."""
+        self._epoch.fill_(epoch)
+
+    @property
+    def epoch(self) -> int:
+        """The epoch that was set last, 0 before."""
+        return int(self._epoch)
+
+
+class RandomRig(Epochs):
     """Target rigs around ``base``: the whole rig turned, moved and zoomed by random amounts.
 
     Args:
@@ -65,6 +86,7 @@ class RandomRig:
         per: Literal["sample", "sequence"] = "sample",
         sequence_key: str = "scene_token",
     ) -> None:
+        super().__init__()
         self.base = load_rig(base)
         if per not in ("sample", "sequence"):
             raise CalibrationError(f"RandomRig: per: expected 'sample' or 'sequence', got {per!r}")
@@ -79,26 +101,11 @@ class RandomRig:
             "focal_scale": focal_scale,
         }
         self.ranges = {name: _range(name, value) for name, value in ranges.items()}
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        if not self._epoch.is_shared():  # copied or unpickled
-            self._epoch.share_memory_()
 
     def draw(self, rng: torch.Generator | None = None) -> dict[str, float]:
         """Random parameters, uniform in their ranges; from torch's global RNG unless ``rng`` is given."""
         u = torch.rand(len(self.ranges), generator=rng, dtype=torch.float64).tolist()
         return {name: low + (high - low) * x for (name, (low, high)), x in zip(self.ranges.items(), u, strict=True)}
-
-    def set_epoch(self, epoch: int) -> None:
-        """Change the draws of ``per="sequence"``, also in running workers."""
-        self._epoch.fill_(epoch)
-
-    @property
-    def epoch(self) -> int:
-        """The epoch that was set last, 0 before."""
-        return int(self._epoch)
 
     def draw_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> dict[str, float]:
         """Parameters for a sample, following ``per``.

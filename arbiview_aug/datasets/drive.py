@@ -221,6 +221,9 @@ class LazyFrame(Mapping[str, Any]):
                 raise
         return self._fields[key]
 
+    def __contains__(self, key: object) -> bool:
+        return key in self._loads or super().__contains__(key)  # the images need not be decoded
+
     def __iter__(self) -> Iterator[str]:
         return iter({**self._fields, **self._loads})
 

@@ -221,7 +221,7 @@ class FrameFolder(WritableRecording):
         bare = [_calibration_of(entry) for entry in calib["cameras"]]
         data = {"name": calib.get("name", calib.get("dataset", "")), "cameras": bare}
         data |= {key: calib[key] for key in ("ground_z_m", "lidars", *misnamed(calib, ("ground_z_m",))) if key in calib}
-        key = json.dumps([data, [mask and os.path.realpath(mask) for mask in masks]])
+        key = json.dumps([data, [mask and (os.path.realpath(mask), _modified_s(mask)) for mask in masks]])
         last = self._last_rig  # read once, for threads
         if last is None or last[0] != key:
             rig = Rig.from_dict(data, where=frame.where)
@@ -319,7 +319,7 @@ def _check_count(cameras: int, path: Path) -> None:
 def _calibration_of(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Entries of a camera that decide the rig, without timestamps and files."""
     read = ("name", "width", "height", "K", "cam2ego", "distortion")
-    return {key: entry[key] for key in (*read, *misnamed(entry, read)) if key in entry}
+    return {key: entry[key] for key in (*read, "lens", *misnamed(entry, read)) if key in entry}  # a lens is refused
 
 
 def _image_file(entry: Mapping[str, Any], frame: _Frame) -> Path:
@@ -340,9 +340,9 @@ def _mask_file(entry: Mapping[str, Any], frame: _Frame) -> Path | None:
 
 def _named(entry: Mapping[str, Any], key: str, frame: _Frame, error: type[ArbiviewError]) -> tuple[str, str]:
     """The file that a camera names under a key, and its description for messages."""
-    label, file = f"camera {entry.get('name')!r}: {key}", entry.get(key)
+    label, file = f"camera {shown(entry.get('name'))}: {key}", entry.get(key)
     if not isinstance(file, str) or not file:
-        raise error(f"{frame.where}: {label}: expected an image's file name, got {file!r}{hint(entry, (key,))}")
+        raise error(f"{frame.where}: {label}: expected an image's file name, got {shown(file)}{hint(entry, (key,))}")
     return file, label
 
 
@@ -351,11 +351,15 @@ def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) ->
         return camera
     try:
         file = os.path.realpath(path)
-        mask = _cached_mask(file, clean, os.path.getmtime(file) if os.path.isfile(file) else 0.0)
+        mask = _cached_mask(file, clean, _modified_s(path))
     except CalibrationError:
         mask = read_mask(str(path), path.parent, f"{frame.where}: camera {camera.name!r}")  # again, in its frame's name
     with calibration_of(frame.where):
         return replace(camera, mask=mask)
+
+
+def _modified_s(path: Path) -> float:
+    return os.path.getmtime(path) if os.path.isfile(path) else 0.0
 
 
 @lru_cache(maxsize=_CACHED_MASKS)
@@ -368,7 +372,7 @@ def _points_file(calib: Mapping[str, Any], frame: _Frame) -> Path | None:
     entry = calib.get("lidar")
     named = entry.get("file") if isinstance(entry, Mapping) else entry
     if named is not None and not isinstance(named, str):
-        raise DataError(f"{frame.where}: lidar: expected {{'file': name}}, got {entry!r}")
+        raise DataError(f"{frame.where}: lidar: expected {{'file': name}}, got {shown(entry)}")
     path = frame.file(named or POINTS_FILE, "lidar")
     if path.is_file():
         return path
@@ -419,7 +423,7 @@ def _pose(value: Any, where: str) -> torch.Tensor:
         pose = np.zeros(0)
     if not is_rigid(pose):
         expected = "4x4 finite numbers, a rotation beside a position over 0 0 0 1 (not transposed)"
-        raise DataError(f"{where}: ego2world: expected {expected}, got {value!r}")
+        raise DataError(f"{where}: ego2world: expected {expected}, got {shown(value)}")
     return torch.from_numpy(pose)
 
 

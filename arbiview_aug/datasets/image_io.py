@@ -150,11 +150,17 @@ def _header(data: bytes, label: str) -> tuple[str, tuple[int, int]]:
         raise DataError(f"{label}: expected a JPEG or PNG, got a file that begins with {data[:8]!r}")
     if not ended:
         raise DataError(f"{label}: expected a complete {format}, got a truncated file; copy it again")
+    # OpenCV keeps the upper 8 bits of 16, which are 0 where a sensor fills the lower ones.
+    if format == "PNG" and (depth := _number(data, 24, 1)) > 8:
+        fix = "scale it to 8 bits by the sensor's range, such as (image >> 4).astype('uint8') from 12"
+        raise DataError(f"{label}: expected 8 bits a channel, got a PNG of {depth}; {fix}")
     return format, size
 
 
 def decode_bytes(data: bytes, label: str) -> ByteArray:
     """Decode the bytes of a JPEG or PNG file as (h, w, 3) RGB, as ``decode_images`` does; DataError by ``label``."""
+    if not isinstance(data, bytes | bytearray):
+        raise DataError(f"{label}: expected a file's bytes, got {type(data).__name__}; do not decode before")
     format, _ = _header(data, label)
     image = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS)
     if image is None:

@@ -59,6 +59,10 @@ class _Log:
         pose = self.scene.get_modality_column_at_iteration(iteration, column, *modality)
         return None if pose is None else poses_from(np.array(pose, np.float64)[:7])
 
+    def ego2world(self, iteration: int) -> FloatArray | None:
+        """(4, 4); None where it was not recorded."""
+        return self.pose(iteration, "imu_se3", "ego_state_se3")
+
 
 class Py123dDataset(WritableRecording):
     """The iterations of py123d's logs, in the order of their folders and times.
@@ -78,7 +82,7 @@ class Py123dDataset(WritableRecording):
         reduce: Reduce the images to 1, 1/2 or 1/4 of their size.
         load_points: Whether to read the LiDARs' points.
         neighbours: Which other frames of the drive come with a sample; None for none.
-        cameras: Names of the cameras to read; None for all.
+        cameras: Names of the cameras to read, or one name; None for all.
 
     Raises:
         ImportError: py123d is not installed.
@@ -94,13 +98,14 @@ class Py123dDataset(WritableRecording):
         reduce: Reduce = 1,
         load_points: bool = True,
         neighbours: Neighbours | None = None,
-        cameras: Sequence[str] | None = None,
+        cameras: Sequence[str] | str | None = None,
     ) -> None:
         super().__init__(root, reduce, load_points, neighbours)
         scene_of = optional_package("py123d.api.scene.arrow.arrow_scene_api", "py123d").ArrowSceneAPI
         folders = log_folders(self.root)
         if not folders:
             raise DataError(f"py123d {root}: expected logs (folders with sync.arrow), found none")
+        cameras = [cameras] if isinstance(cameras, str) else cameras
         self._logs: list[_Log] = []
         frames: list[tuple[int, int, int]] = []
         for folder in folders:
@@ -109,6 +114,8 @@ class Py123dDataset(WritableRecording):
                 times_us = [int(time.time_us) for time in log.scene.get_all_iteration_timestamps()]
             frames += [(len(self._logs), k, time_us) for k, time_us in enumerate(times_us)]
             self._logs.append(log)
+        if unknown := {*(cameras or ())} - {camera.name for log in self._logs for camera in log.cameras.values()}:
+            raise DataError(f"py123d {root}: cameras: expected names of its cameras, got {', '.join(sorted(unknown))}")
         self._frames = frames
         self.tokens = [f"{self._logs[n].folder.parent.name}-{self._logs[n].folder.name}-{us}" for n, _, us in frames]
         self._drive = None if neighbours is None else self._find_drive()
@@ -140,19 +147,20 @@ class Py123dDataset(WritableRecording):
         (log, iteration), token = self._at(index), self.tokens[index]
         with _reading(log.folder):
             fields = self._fields(index)
-            sample = fields | camera_fields(
-                fields["rig"], _images(log, iteration, fields["rig"].names, self.reduce), token
-            )
-            if self.load_points and (points := _points(log, iteration, token)) is not None:
-                sample["points"] = points
+        images = _images(log, iteration, fields["rig"].names, self.reduce)
+        sample = fields | camera_fields(fields["rig"], images, token)
+        if self.load_points and (points := _points(log, iteration, token)) is not None:
+            sample["points"] = points
         if self._drive is not None:
-            sample["neighbours"] = self._neighbours(self._drive, index)
+            sample["neighbours"] = self._neighbours(self._drive, self._posed.index(index))
         return sample
 
     def _fields(self, index: int) -> dict[str, Any]:
         """Everything but the images and points."""
         log, iteration = self._at(index)
-        ego2world = self._ego2world(index)
+        ego2world = log.ego2world(iteration)
+        if ego2world is None:
+            raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected the ego's pose, got none")
         world2ego = np.linalg.inv(ego2world).astype(np.float64, copy=False)
         rig = []
         for identity, camera in log.cameras.items():
@@ -169,22 +177,23 @@ class Py123dDataset(WritableRecording):
             fields["box_names"] = [one.attributes.label.serialize() for one in detections]
         return fields
 
-    def _ego2world(self, index: int) -> FloatArray:
-        log, iteration = self._at(index)
-        pose = log.pose(iteration, "imu_se3", "ego_state_se3")
-        if pose is None:
-            raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected the ego's pose, got none")
-        return pose
-
     def _find_drive(self) -> Drive:
-        positions_m = []
+        """Read the poses of all iterations; those without are no neighbours."""
+        poses = {}
         for index in range(len(self)):
-            with _reading(self._at(index)[0].folder):
-                positions_m.append(self._ego2world(index)[:3, 3])
-        parts = np.array([number for number, _, _ in self._frames], np.int64)
-        return Drive(np.array(positions_m).reshape(-1, 3), parts)
+            log, iteration = self._at(index)
+            with _reading(log.folder):
+                if (pose := log.ego2world(iteration)) is not None:
+                    poses[index] = pose[:3, 3]
+        self._posed = list(poses)
+        parts = np.array([self._frames[index][0] for index in poses], np.int64)
+        return Drive(np.array(list(poses.values())).reshape(-1, 3), parts)
 
-    def _neighbour(self, index: int) -> LazyFrame:
+    def _token(self, place: int) -> str:
+        return self.tokens[self._posed[place]]
+
+    def _neighbour(self, place: int) -> LazyFrame:
+        index = self._posed[place]
         log, iteration = self._at(index)
         with _reading(log.folder):
             fields = self._fields(index)

@@ -118,7 +118,8 @@ def open_data(
 
     Args:
         data: ``PATH`` or ``KIND:PATH``, such as ``nuscenes:/data/nuscenes``: a frame folder, a folder of such folders,
-            or a nuScenes root. A bare path is opened by the first of ``READERS`` that recognises it.
+            a nuScenes root, or a folder of py123d's logs. A bare path is opened by the first of ``READERS`` that
+            recognises it.
         kind: A key of ``READERS``, instead of ``KIND:``.
         version: nuScenes' folder of tables; by default v1.0-mini or v1.0-trainval, else the first one.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size.

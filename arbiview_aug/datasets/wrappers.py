@@ -42,8 +42,11 @@ class RetargetedDataset(Dataset[Any]):
 
     def __getitems__(self, indices: Sequence[Any]) -> list[Any]:
         if callable(getattr(self.dataset, "__getitems__", None)):
-            samples = self.dataset.__getitems__(indices)
-            return [_retargeted(self.retarget, *pair) for pair in zip(samples, indices, strict=False)]
+            samples = list(self.dataset.__getitems__(indices))
+            if len(samples) != len(indices):
+                name = type(self.dataset).__name__
+                raise DataError(f"{name}.__getitems__: expected {len(indices)} samples, got {len(samples)}")
+            return [_retargeted(self.retarget, *pair) for pair in zip(samples, indices, strict=True)]
         return [self[index] for index in indices]
 
 
@@ -113,6 +116,9 @@ class RetargetedIterable(IterableDataset[Any]):
             )
         self.dataset = dataset
         self.retarget = _checked_retarget(retarget, name)
+
+    def __len__(self) -> int:
+        return len(self.dataset)  # TypeError without one, as of the dataset itself
 
     def __iter__(self) -> Iterator[Any]:
         for number, sample in enumerate(self.dataset):

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from arbiview_aug.errors import SampleError
-from arbiview_aug.integrations.mmdet3d.results import TARGET_OUTPUTS
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
 
 IMAGE_KEYS = ("camera_intrinsics", "lidar2cam", "lidar2img")
@@ -38,7 +37,8 @@ class RigRetargetMultiViewImages:
         """The entries that change: the pipeline merges them into the dict.
 
         Raises:
-            SampleError: Entries are missing, or images are not stacked (N, 3, H, W) in RGB of [0, 1] or [0, 255].
+            SampleError: Entries are missing, or images are not stacked (N, 3, H, W) in RGB of [0, 1] or [0, 255];
+                entries that speak of the source's pixels, which a transform cannot take out.
         """
         missing = [key for key in ("img", *IMAGE_KEYS) if input_dict.get(key) is None]
         if missing:
@@ -54,10 +54,11 @@ class RigRetargetMultiViewImages:
             "points": input_dict.get("points", input_dict.get("coord")),
         }
         out = self.step(results)
-        changed = {key: out[key] for key in (*IMAGE_KEYS, *TARGET_OUTPUTS) if key in out}
+        if dropped := ", ".join(key for key in results if key not in out):
+            raise SampleError(f"{dropped}: of the source's pixels; retarget before what makes them, or leave them out")
+        own = {key for key in ("gt_bboxes_3d", "points") if key not in input_dict}
+        changed = {key: value for key, value in out.items() if key not in own and value is not results.get(key)}
         changed["img"] = (out["img"].numpy() / scale).astype(images.dtype)
-        if "points" in input_dict:
-            changed["points"] = out["points"]
         if "camera_names" in input_dict:
             skipped = out.get("retarget_params", {}).get("skipped")
             changed["camera_names"] = list(input_dict["camera_names"] if skipped else self.step.names)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import torch
@@ -16,6 +16,9 @@ _MOVING = (
 )
 """Modules whose classes move pixels, or draw from some that do."""
 
+_FAR_SHARE = 0.01
+"""Largest share of values far outside [0, 1]: more are normalised, and would be cut."""
+
 
 class OnImages(torch.nn.Module):
     """Runs a photometric module on a sample's images alone, all cameras (of all frames) as one batch.
@@ -24,25 +27,39 @@ class OnImages(torch.nn.Module):
     saw and nothing filled stay black: changed with the rest, holes would look like something that was seen.
 
     Args:
-        module: An ``ImageSequential``, or any module from a batch of images to a batch of images.
+        module: An ``ImageSequential``, or anything from a batch of images to a batch of images in [0, 1]: normalise
+            and change types after it.
 
     Raises:
         ValueError: A module, or one in it, that moves pixels: K would be wrong from then on.
     """
 
-    def __init__(self, module: torch.nn.Module) -> None:
+    def __init__(self, module: Callable[[torch.Tensor], torch.Tensor]) -> None:
         super().__init__()
         check_photometric(module)
         self.module = module
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """The sample with other colours; a new dict."""
-        images = sample["images"]
-        if isinstance(images, list | tuple):
-            raise ValueError("OnImages: expected images of one size, got a list; pass size=(h, w) to RigRetarget")
+        """The sample with other colours; a new dict.
+
+        Raises:
+            ValueError: No images of one size; the module's result has another shape, or is not in [0, 1].
+        """
+        images = sample.get("images")
+        if not isinstance(images, torch.Tensor):
+            found = f"got a {type(images).__name__} in a sample of {', '.join(map(str, sample))}"
+            fix = "; pass size=(h, w) to RigRetarget" if isinstance(images, list | tuple) else ""
+            raise ValueError(f"OnImages: expected a tensor 'images', of one size, {found}{fix}")
         flat = images.reshape(-1, *images.shape[-3:])
         levels = flat.float() / 255 if flat.dtype == torch.uint8 else flat
-        changed = self.module(levels).clamp(0, 1)
+        changed = self.module(levels)
+        far = ((changed - 0.5).abs() > 1).float().mean()  # noise may reach out with some pixels
+        if not changed.is_floating_point() or far > _FAR_SHARE:
+            found = f"{changed.dtype}, {far:.0%} of it below -0.5 or above 1.5"
+            raise ValueError(
+                f"OnImages: expected floats in [0, 1] of its module, got {found}; normalise after OnImages"
+            )
+        changed = changed.clamp(0, 1)
         if flat.dtype == torch.uint8:
             changed = (changed * 255).round().to(torch.uint8)
         if changed.shape != flat.shape:
@@ -55,7 +72,7 @@ class OnImages(torch.nn.Module):
         return {**sample, "images": rewrapped(changed, images)}
 
 
-def check_photometric(module: torch.nn.Module) -> None:
+def check_photometric(module: Callable[[torch.Tensor], torch.Tensor]) -> None:
     """Refuse modules of kornia and torchvision that move pixels.
 
     Raises:
@@ -80,9 +97,9 @@ def _moves_pixels(kind: type) -> bool:
     return False
 
 
-def _parts(module: torch.nn.Module) -> Iterator[torch.nn.Module]:
-    """A module and all in it; ``v2.Compose`` and its like keep theirs in a plain list."""
-    for part in module.modules():
+def _parts(module: Any) -> Iterator[Any]:
+    """A module or function and all in it; ``Compose`` of both versions keeps its own in a plain list."""
+    for part in module.modules() if isinstance(module, torch.nn.Module) else [module]:
         yield part
         for held in getattr(part, "transforms", ()):
             yield from _parts(held)

@@ -17,10 +17,10 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.validation import checked_pose
 from arbiview_aug.errors import CalibrationError, SampleError
-from arbiview_aug.integrations.mmdet3d.matrices import padded
+from arbiview_aug.integrations.mmdet3d.matrices import like_array, padded
 from arbiview_aug.integrations.mmdet3d.results import geometry, moved_points
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
-from arbiview_aug.scene.boxes import checked_boxes, points_by_box
+from arbiview_aug.scene.boxes import checked_boxes, moved_by, points_by_box
 from arbiview_aug.transforms.scans import retarget_points
 from arbiview_aug.transforms.settings import checked_probability
 
@@ -33,6 +33,10 @@ _TURNED = ("flip_x", "flip_y", "noise_rot", "noise_translate", "lidar_aug_matrix
 """Keys that OpenPCDet sets when it augments the whole scene."""
 
 _LEAST_UP = 0.9  # z of the upward axis of a frame that boxes stand upright in
+
+
+class _Step(RigRetargetMultiView):
+    _refuses_lenses = False  # points need no cameras; ``target_views`` refuses lenses where images are rendered
 
 
 class RigRetargetDataDict:
@@ -50,10 +54,11 @@ class RigRetargetDataDict:
         min_points_in_gt: Boxes with fewer points after retargeting are left out: OpenPCDet's
             ``FILTER_MIN_POINTS_IN_GT``, which counts those before.
         p: Probability of retargeting; a skipped dict stays as it is.
-        settings: Further ones of ``RigRetargetMultiView``: ``size``, ``ground_z_m``, ``geometry``, ``keys``.
+        settings: Further ones of ``RigRetargetMultiView``: ``size``, ``ground_z_m``, ``geometry``, ``keys``,
+            ``sequence_key`` (frames of a drive share the draw of ``p`` too; ``self.step.set_epoch`` changes it).
 
     Raises:
-        CalibrationError: A target that cannot be loaded; with lenses; a frame that is not upright.
+        CalibrationError: A target that cannot be loaded; a frame that is not upright.
         ValueError: ``p`` is no probability.
     """
 
@@ -67,7 +72,7 @@ class RigRetargetDataDict:
         p: float = 1.0,
         **settings: Any,
     ) -> None:
-        self.step = RigRetargetMultiView(target, lidar2ego=lidar2ego, **settings)
+        self.step = _Step(target, lidar2ego=lidar2ego, **settings)
         self.lidar2ego = _upright_pose("lidar2ego", lidar2ego)
         to = self.lidar2ego if target_lidar2ego is None else _upright_pose("target_lidar2ego", target_lidar2ego)
         self.ego2lidar = np.asarray(np.linalg.inv(self.lidar2ego))
@@ -79,12 +84,14 @@ class RigRetargetDataDict:
 
         Raises:
             SampleError: A scene that is turned already, images without matrices, nothing to retarget.
+            CalibrationError: Images, and a target with lenses.
         """
-        if self.p < 1 and torch.rand(()).item() >= self.p:
+        if self.p < 1 and torch.rand((), generator=self.step.rng(data_dict, "p")).item() >= self.p:
             return dict(data_dict)
         _check_not_turned(data_dict)
-        if data_dict.get("points") is None:
-            raise SampleError(f"points: expected (N, >=3) in the LiDAR's frame, got {', '.join(map(str, data_dict))}")
+        if not isinstance(points := data_dict.get("points"), np.ndarray):
+            got = f"{type(points).__name__} among {', '.join(map(str, data_dict))}"
+            raise SampleError(f"points: expected an array (N, >=3) in the LiDAR's frame, got {got}")
         if "camera_imgs" in data_dict:
             out = self._with_cameras(data_dict)
         elif "images" in data_dict:
@@ -96,12 +103,12 @@ class RigRetargetDataDict:
     # --- points alone, nuScenes' cameras, KITTI's camera --------------------------------------------------------------
     def _points(self, data_dict: Mapping[str, Any]) -> Any:
         target = self.step.retarget.target
-        rig = target.rig(target.draw_for(data_dict)) if isinstance(target, RandomRig) else target
+        rig = target.rig(self.step.draw(data_dict)) if isinstance(target, RandomRig) else target
         if self.step.retarget.keys.points == "source":
             return data_dict["points"]
         if not rig.lidars:
             raise SampleError("target: expected scanners (Rig.lidars) for a data_dict without images, got none")
-        given = geometry(_labels(data_dict), self.lidar2ego)
+        given = geometry(self._labels(data_dict), self.lidar2ego)
         boxes, ground_z_m = given.get("boxes_3d"), self.step.ground_z_m
         scan = retarget_points(given["points"], rig, boxes_3d=boxes, ground_z_m=ground_z_m)
         return moved_points(scan.points, self.ego2lidar).numpy().astype(data_dict["points"].dtype)
@@ -119,7 +126,7 @@ class RigRetargetDataDict:
             ]
             pairs = zip(matrices["camera_intrinsics"], matrices["lidar2camera"], strict=True)
             matrices["lidar2image"] = [K @ pose for K, pose in pairs]
-        results = self.step({"img": data_dict["camera_imgs"], **matrices, **_labels(data_dict)})
+        results = self.step({"img": data_dict["camera_imgs"], **matrices, **self._labels(data_dict)})
         images = results["img"]
         out = {**data_dict, **{key: results[key] for key in (*MATRICES, "points")}, "camera_imgs": images}
         if "image_paths" in data_dict:
@@ -137,7 +144,7 @@ class RigRetargetDataDict:
             raise SampleError(f"images: expected one (H, W, 3) with its calib, as KittiDataset loads it, got {got}")
         P2, R0, V2C = (padded(np.asarray(matrix, np.float64)[None])[0] for matrix in (calib.P2, calib.R0, calib.V2C))
         levels = np.rint(image * 255).astype(np.uint8)
-        results = self.step({"img": [levels], "cam2img": [P2], "lidar2cam": [R0 @ V2C], **_labels(data_dict)})
+        results = self.step({"img": [levels], "cam2img": [P2], "lidar2cam": [R0 @ V2C], **self._labels(data_dict)})
         images = results["img"]
         if len(images) != 1 or images[0].shape != image.shape:
             got = f"{len(images)} of {images[0].shape}; pass size=(h, w)"
@@ -154,16 +161,26 @@ class RigRetargetDataDict:
         matrices = {"trans_lidar_to_cam": padded(lidar2cam[None])[0], "trans_cam_to_img": K}
         return out | {key: value.astype(out[key].dtype) for key, value in matrices.items() if key in out}
 
+    def _labels(self, data_dict: Mapping[str, Any]) -> DataDict:
+        """What the step reads besides cameras: the points, the boxes, and the name of the drive."""
+        named = {key: value for key, value in data_dict.items() if key == self.step.sequence_key}
+        return {**named, "points": data_dict["points"], "gt_bboxes_3d": data_dict.get("gt_boxes")}
+
     def _filtered(self, out: DataDict) -> DataDict:
-        """Leave boxes of fewer points out, by ``gt_boxes_mask`` where it is there."""
-        if self.min_points_in_gt < 1 or "gt_boxes" not in out:
+        """Count each box's points; leave boxes of fewer points out, by ``gt_boxes_mask`` where it is there."""
+        given = out.get("num_points_in_gt")  # Waymo's
+        if out.get("gt_boxes") is None or (self.min_points_in_gt < 1 and given is None):
             return out
         xyz = np.ascontiguousarray(out["points"][:, :3], np.float32)
-        _, ends = points_by_box(checked_boxes(out["gt_boxes"][:, :7]), xyz, 0.0)
-        enough: BoolArray = np.diff(ends, prepend=0) >= self.min_points_in_gt
+        _, ends = points_by_box(checked_boxes(out["gt_boxes"]), xyz, 0.0)
+        counts = np.diff(ends, prepend=0)
+        if given is not None:
+            out = {**out, "num_points_in_gt": like_array(given, counts)}
+        enough: BoolArray = counts >= self.min_points_in_gt
         if "gt_boxes_mask" in out:
             return {**out, "gt_boxes_mask": out["gt_boxes_mask"] & enough}
-        return {**out, **{key: out[key][enough] for key in ("gt_boxes", "gt_names") if key in out}}
+        labels = "gt_boxes", "gt_names", "num_points_in_gt"
+        return {**out, **{key: out[key][enough] for key in labels if out.get(key) is not None}}
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.step.retarget.extra_repr()}, p={self.p:g})"
@@ -179,10 +196,6 @@ def register(augmentor: Any) -> None:
         return RigRetargetDataDict(**{key.lower(): value for key, value in config.items() if key != "NAME"})
 
     augmentor.rig_retarget = rig_retarget
-
-
-def _labels(data_dict: Mapping[str, Any]) -> DataDict:
-    return {"points": data_dict["points"], "gt_bboxes_3d": data_dict.get("gt_boxes")}
 
 
 def _crop(resize: float, crop: Any, flip: bool, rotate: float) -> FloatArray:
@@ -205,15 +218,10 @@ def _moved(out: DataDict, move: FloatArray) -> DataDict:
     """A ``data_dict`` in another frame: ``move`` (4, 4) leads from the old one to it."""
     if np.array_equal(move, np.eye(4)):
         return out
-    back, turn = np.linalg.inv(move), np.arctan2(move[1, 0], move[0, 0])
+    back = np.linalg.inv(move)
     changed: DataDict = {"points": moved_points(out["points"], move).numpy().astype(out["points"].dtype)}
     if (boxes := out.get("gt_boxes")) is not None:
-        boxes = np.array(boxes)
-        boxes[:, :3] = boxes[:, :3] @ move[:3, :3].T + move[:3, 3]
-        boxes[:, 6] += turn
-        if boxes.shape[1] >= 9:
-            boxes[:, 7:9] = boxes[:, 7:9] @ move[:2, :2].T
-        changed["gt_boxes"] = boxes
+        changed["gt_boxes"] = moved_by(boxes, move)
     for key in ("lidar2camera", "lidar2image", "trans_lidar_to_cam"):
         if key in out:
             changed[key] = _each(out[key], lambda matrix: matrix @ back)

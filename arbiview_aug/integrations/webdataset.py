@@ -19,12 +19,15 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import camera_fields
 from arbiview_aug.datasets.image_io import decode_bytes, encoded, encoded_image
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import DataError, SampleError, calibration_of
+from arbiview_aug.errors import DataError, SampleError, calibration_of, shown
 from arbiview_aug.sample.batching import stacked
-from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.sample.inputs import as_array, read_frames
 
 ARRAYS = ("points", "boxes_3d", "ego2world")
 """Entries that are stored as .npy files."""
+
+NAMES = {"token": str, "scene_token": str, "time_s": float}
+"""Entries of ``rig.json`` besides the rig, and their types."""
 
 Entry = dict[str, Any]
 
@@ -34,28 +37,32 @@ def to_entry(sample: Mapping[str, Any], key: str) -> Entry:
 
     Args:
         sample: With ``images``, uint8 (3, h, w) for each camera of ``rig``, or of ``K`` and ``cam2ego``; ``ARRAYS`` and
-            ``token`` where present.
+            ``NAMES`` where present.
         key: Unique, without dots.
 
     Raises:
-        SampleError: A key with dots, images of other sizes or of another number than the rig's cameras.
+        SampleError: A key with dots, no images, or some of other sizes or of another number than the rig's cameras.
         SampleTypeError: Images of another type.
     """
+    if not isinstance(key, str) or "." in key:
+        raise SampleError(f"key: expected a text without dots, at which WebDataset splits names, got {shown(key)}")
+    if sample.get("images") is None:
+        raise SampleError(f"images: expected in the sample, found none beside {', '.join(map(str, sample))}")
     rig: Rig = read_frames(sample, None)[0].rig if sample.get("rig") is None else sample["rig"]
-    if "." in key:
-        raise SampleError(f"key: expected none of dots, at which WebDataset splits names, got {key!r}")
-    shapes = [tuple(image.shape) for image in sample["images"]]
+    images = [torch.as_tensor(image) for image in sample["images"]]
+    shapes = [tuple(image.shape) for image in images]
     if shapes != (expected := [(3, *size) for size in rig.sizes]):
         raise SampleError(f"images: expected {expected}, as the rig's cameras are, got {shapes}")
-    entry: Entry = {"__key__": key, "rig.json": json.dumps({**rig.to_dict(), "token": str(sample.get("token", key))})}
-    for k, (camera, image) in enumerate(zip(rig, sample["images"], strict=True)):
+    names = {name: type_(sample[name]) for name, type_ in NAMES.items() if sample.get(name) is not None}
+    entry: Entry = {"__key__": key, "rig.json": json.dumps({**rig.to_dict(), "token": key, **names})}
+    for k, (camera, image) in enumerate(zip(rig, images, strict=True)):
         entry[f"{k:02}.jpg"] = encoded_image(image)
         if camera.mask is not None:
             entry[f"{k:02}.mask.png"] = encoded(camera.mask.astype(np.uint8) * 255, ".png")
     for name in ARRAYS:
         if sample.get(name) is not None:
             file = io.BytesIO()
-            np.save(file, np.asarray(sample[name]))
+            np.save(file, as_array(name, sample[name]))
             entry[f"{name}.npy"] = file.getvalue()
     return entry
 
@@ -64,7 +71,7 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
     """The sample of an entry as WebDataset reads it, undecoded: bytes by their endings.
 
     Returns:
-        ``images`` (N, 3, h, w) uint8 (a list where sizes differ), ``rig``, ``K``, ``cam2ego``, ``token``, ``ARRAYS``.
+        ``images`` (N, 3, h, w) uint8 (a list where sizes differ), ``rig``, ``K``, ``cam2ego``, ``NAMES``, ``ARRAYS``.
 
     Raises:
         DataError: No ``rig.json``; that, an image or an array is missing or broken.
@@ -75,8 +82,9 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
         raise DataError(f"{where}: expected rig.json, got {', '.join(map(str, entry))}; write shards with to_entry")
     try:
         described = parse_json(entry["rig.json"])
-        token = described["token"]
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        names = {name: type_(described[name]) for name, type_ in NAMES.items() if name in described}
+        token = names["token"]
+    except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
         got = f"{type(error).__name__}: {error}"
         raise DataError(f"{where}: rig.json: expected a rig with its token, got {got}") from None
     rig = Rig.from_dict(described, where=where)
@@ -93,7 +101,7 @@ def to_sample(entry: Mapping[str, Any]) -> dict[str, Any]:
                 camera = replace(camera, mask=decode_bytes(entry[name], f"{where}: {name}")[..., 0] > 0)
         cameras.append(camera)
     rig = rig.with_cameras(cameras)
-    sample = camera_fields(rig, stacked(images), token)
+    sample = camera_fields(rig, stacked(images), token) | names
     for name in (name for name in ARRAYS if f"{name}.npy" in entry):
         try:
             sample[name] = torch.from_numpy(np.load(io.BytesIO(entry[f"{name}.npy"]), allow_pickle=False))

@@ -19,7 +19,7 @@ from arbiview_aug.cameras.validation import is_rigid
 from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError
 from arbiview_aug.sample.batching import check_container, checked_images
 from arbiview_aug.sample.inputs import Frame, as_array, frame_from, numbers
-from arbiview_aug.scene.boxes import carried, checked_boxes, moved_boxes, points_in
+from arbiview_aug.scene.boxes import carried, checked_boxes, moved_boxes, moved_by, points_in
 from arbiview_aug.scene.point_cloud import checked_points, finite_rows, own_car, seen_through
 from arbiview_aug.scene.surface import Points
 
@@ -282,10 +282,7 @@ def _boxes(
     """The labelled objects of the current frame and of the neighbour, in the current ego frame; None if unknown."""
     now = None if current is None else checked_boxes(current)
     if entry.get("boxes_3d") is not None:
-        then = checked_boxes(numbers("boxes_3d", entry["boxes_3d"])).copy()
-        then[:, :3] = then[:, :3] @ ego2ego[:3, :3].T + ego2ego[:3, 3]
-        then[:, 6] += np.arctan2(ego2ego[1, 0], ego2ego[0, 0])
-        return now, then
+        return now, moved_by(checked_boxes(numbers("boxes_3d", entry["boxes_3d"])), ego2ego)
     if now is None or current is None or seconds is None or current.shape[-1] < 9:
         return now, None
     velocity_mps = current.reshape(-1, current.shape[-1])[:, 7:9]

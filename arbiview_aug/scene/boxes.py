@@ -401,6 +401,16 @@ def checked_boxes(boxes: Any) -> FloatArray:
     return array
 
 
+def moved_by(boxes: Any, pose: FloatArray) -> Any:
+    """Boxes (B, >=7) in the upright frame that a pose (4, 4) leads to; columns 7 and 8, if there, are velocities."""
+    moved = np.array(boxes)
+    moved[:, :3] = moved[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    moved[:, 6] += np.arctan2(pose[1, 0], pose[0, 0])
+    if moved.shape[1] >= 9:
+        moved[:, 7:9] = moved[:, 7:9] @ pose[:2, :2].T
+    return moved
+
+
 STAYED_M = 0.4
 """Largest label motion of a parked vehicle: labels jitter by decimetres."""
 

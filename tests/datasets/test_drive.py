@@ -76,6 +76,7 @@ def test_a_lazy_frame_decodes_once_and_only_when_asked() -> None:
     calls = []
     frame = LazyFrame({"token": "a"}, lambda: calls.append(1) or "pixels")
     assert frame["token"] == "a" and set(frame) == {"token", "images"} and len(frame) == 2 and not calls
+    assert "images" in frame and "token" in frame and "points" not in frame and not calls
     assert frame["images"] == "pixels" == frame["images"] and len(calls) == 1
     with_points = LazyFrame({}, list, lambda: calls.append(2) or "points")
     assert set(with_points) == {"images", "points"} and calls == [1]

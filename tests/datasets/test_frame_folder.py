@@ -202,6 +202,10 @@ def edit(key: str, value: Any, camera: int | None = None) -> Change:
         (edit("ego2world", np.diag([1, -1, 1, 1]).tolist()), DataError, "ego2world: expected .* a rotation"),
         (edit("lidar", {"file": "gone.npy"}), DataError, r"lidar: expected the points .*gone\.npy, found no file"),
         (edit("lidar", 3), DataError, "lidar: expected {'file': name}, got 3"),
+        (edit("ego2world", [[0.0] * 500] * 500), DataError, "ego2world: expected 4x4 finite numbers"),
+        (edit("lidar", ["a"] * 999), DataError, "lidar: expected {'file': name}, got"),
+        (edit("file", ["a"] * 999, 0), DataError, "'front': file: expected an image's file name"),
+        (edit("lens", "fisheye", 0), CalibrationError, "'lens' is not read: write distortion: {model: LENS"),
         (edit("ground_z_m", "low"), CalibrationError, "ground_z_m: expected a finite height"),
     ],
 )
@@ -210,6 +214,7 @@ def test_bad_calibrations(tmp_path: Path, change: Change, error: type[Exception]
     with pytest.raises(error, match=message) as raised:
         dataset[0]
     assert "broken" in str(raised.value)  # the frame is named, whatever went wrong
+    assert len(str(raised.value)) < 1000
 
 
 def test_mask_of_another_size(tmp_path: Path) -> None:
@@ -222,10 +227,11 @@ def test_mask_of_another_size(tmp_path: Path) -> None:
 def test_a_mask_that_was_drawn_anew_is_read_again(tmp_path: Path) -> None:
     """In one process, as a notebook's, masks are held."""
     frame(tmp_path)
-    assert FrameFolder(tmp_path)[0]["rig"]["back"].mask[:40].all()
+    dataset = FrameFolder(tmp_path)
+    assert dataset[0]["rig"]["back"].mask[:40].all() and dataset[0]["rig"] is dataset[0]["rig"]
     cv2.imwrite(str(tmp_path / "mask.png"), np.zeros((48, 64), np.uint8))
     os.utime(tmp_path / "mask.png", (0, 0))  # another time, however coarse the clock
-    assert not FrameFolder(tmp_path)[0]["rig"]["back"].mask.any()
+    assert not FrameFolder(tmp_path)[0]["rig"]["back"].mask.any() and not dataset[0]["rig"]["back"].mask.any()
 
 
 def test_bad_points(tmp_path: Path) -> None:

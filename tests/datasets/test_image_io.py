@@ -158,6 +158,12 @@ def without_tables(data: bytes) -> bytes:
     return data[: table + 5] + b"\xff" * 16 + data[table + 21 :]
 
 
+def sixteen_bits(data: bytes) -> bytes:
+    """Ten of them, as sensors give: OpenCV would make it black."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    return cv2.imencode(".png", image.astype(np.uint16) * 4)[1].tobytes()
+
+
 @pytest.mark.parametrize(
     ("suffix", "damage", "message"),
     [
@@ -169,8 +175,9 @@ def without_tables(data: bytes) -> bytes:
         (".jpg", lambda data: half(data) + bytes(len(data) - len(half(data))), "truncated file"),
         (".jpg", without_tables, "got a JPEG that cannot be decoded"),
         (".png", one_byte_off, "got a PNG that cannot be decoded"),
+        (".png", sixteen_bits, "expected 8 bits a channel, got a PNG of 16; scale it to 8 bits"),
     ],
-    ids=["missing", "folder", "pipe", "empty", "HTML", "zeros", "no tables", "one byte"],
+    ids=["missing", "folder", "pipe", "empty", "HTML", "zeros", "no tables", "one byte", "16 bits"],
 )
 @pytest.mark.timeout(20)
 def test_bad_files(tmp_path: Path, suffix: str, damage: Callable[[Any], Any] | None, message: str) -> None:

@@ -192,7 +192,12 @@ def test_other_lenses_and_broken_logs_are_named(root: Path, tmp_path: Path) -> N
         Py123dDataset(tmp_path)
     with pytest.raises(DataError, match=r"expected cameras \['none'\], found none of them"):
         Py123dDataset(root, cameras=["none"])
-    assert Py123dDataset(root, cameras=["front"])[0]["rig"].names == ["front"]
+    with pytest.raises(DataError, match="cameras: expected names of its cameras, got lefft"):
+        Py123dDataset(root, cameras=["front", "lefft"])
+    with pytest.raises(DataError, match=r"expected cameras \['a front one'\], found none"):
+        Py123dDataset(root, cameras="a front one")
+    for one in ("front", ["front"]):
+        assert Py123dDataset(root, cameras=one)[0]["rig"].names == ["front"]
     metadata = SimpleNamespace(camera_name="wide", camera_model=d.CameraModel.FTHETA, intrinsics=None)
     with pytest.raises(CalibrationError, match=r"camera 'wide': expected a calibrated pinhole, .*, got ftheta"):
         logs._camera(metadata, "log")
@@ -205,6 +210,16 @@ def test_other_lenses_and_broken_logs_are_named(root: Path, tmp_path: Path) -> N
             with pytest.raises(DataError, match="py123d log"):
                 _ = Py123dDataset(tmp_path)[0]
         (folder / name).write_bytes(sound)
+
+
+def test_an_iteration_without_a_pose_is_no_neighbour(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ego2world = logs._Log.ego2world
+    monkeypatch.setattr(logs._Log, "ego2world", lambda log, k: None if k == 1 else ego2world(log, k))
+    dataset = Py123dDataset(root, neighbours=Neighbours())
+    assert [frame["token"] for frame in dataset[0]["neighbours"]] == [dataset.tokens[2]]
+    assert [frame["rig"].names for frame in dataset[2]["neighbours"]] == [dataset[0]["rig"].names]
+    with pytest.raises(DataError, match="iteration 1: expected the ego's pose, got none"):
+        dataset[1]
 
 
 def test_demo_loader_and_convert(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -226,7 +241,7 @@ def test_demo_loader_and_convert(root: Path, tmp_path: Path, capsys: pytest.Capt
     assert new.tokens == old.tokens
     for k in range(3):
         before, after = old[k], new[k]
-        assert after["images"].shape == (7, 3, 24, 40)
+        assert after["images"].shape == (3, 3, 24, 40)
         for key in ("points", "boxes_3d", "ego2world", "time_s"):
             assert np.array_equal(before[key], after[key])
         assert [one["token"] for one in before["neighbours"]] == [one["token"] for one in after["neighbours"]]

@@ -41,6 +41,11 @@ class Stream(IterableDataset[dict[str, Any]]):
             yield {"images": torch.tensor(k)}
 
 
+class StreamOfFour(Stream):
+    def __len__(self) -> int:
+        return 4
+
+
 def add_ten(sample: dict[str, Any]) -> dict[str, Any]:
     return {**sample, "images": sample["images"] + 10}
 
@@ -52,6 +57,10 @@ def test_map_style() -> None:
     with pytest.raises(DataError, match="image gone"):
         dataset[4]
     assert pickle.loads(pickle.dumps(dataset))[0]["images"] == 10
+    few = RetargetedDataset(BatchedNumbers(), add_ten)
+    few.dataset.__getitems__ = lambda indices: [Numbers()[k] for k in indices[1:]]
+    with pytest.raises(DataError, match=r"BatchedNumbers\.__getitems__: expected 3 samples, got 2"):
+        few.__getitems__([0, 1, 2])
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -69,6 +78,15 @@ def test_iterable_in_a_data_loader(workers: int) -> None:
     loader = DataLoader(RetargetedIterable(Stream(), add_ten), batch_size=None, num_workers=workers)
     for _ in range(2):
         assert sorted(int(sample["images"]) for sample in loader) == [10, 11, 12, 13, 14, 15]
+
+
+def test_length_of_a_stream() -> None:
+    """That of the dataset, if it has one."""
+    assert len(DataLoader(RetargetedIterable(StreamOfFour(), add_ten), batch_size=2)) == 2
+    endless = RetargetedIterable(Stream(), add_ten)
+    assert len(list(endless)) == 6
+    with pytest.raises(TypeError, match="has no len"):
+        len(endless)
 
 
 def refuse_three(sample: dict[str, Any]) -> dict[str, Any]:

@@ -70,10 +70,10 @@ def retarget_img_inputs(
     """
     inputs = results["img_inputs"]
     tensors = _checked(inputs)
-    infos = [results.get("curr"), *results.get("adjacent", ())]
+    infos = [results.get("curr"), *(results.get("adjacent") or ())]
     total = len(tensors[0])
-    in_source = list(results.get("cam_names", [f"camera {k}" for k in range(total // len(infos))]))
-    if not in_source or total % len(in_source):
+    in_source = list(results.get("cam_names") or [f"camera {k}" for k in range(total // len(infos))])
+    if not in_source or not total or total % len(in_source):
         raise SampleError(f"img_inputs: expected {len(in_source)} images a frame, as 'cam_names' says, got {total}")
     count = total // len(in_source)
     size = tensors[0].shape[-2], tensors[0].shape[-1]
@@ -86,7 +86,11 @@ def retarget_img_inputs(
         images, *frame = tensors[0][t::count], *(tensor[rows] for tensor in tensors[1:])
         info = infos[t] if t < len(infos) else None
         key2global = frame[1][key].double().numpy()
-        mirrored, source = _as_recorded(frame, in_source, key2global, size[1])
+        try:
+            mirrored, source = _as_recorded(frame, in_source, key2global, size[1])
+        except np.linalg.LinAlgError:
+            matrices = "sensor2egos, ego2globals, intrins and post_rots"
+            raise SampleError(f"img_inputs: expected {matrices} that can be inverted, got a singular one") from None
         grey = levels("img_inputs", images, mean_std)
         views = [image.flip(-1) if flip else image for image, flip in zip(grey, mirrored, strict=True)]
         sample = {"images": torch.stack(views), "rig": source_rig(source, views, ground_z_m)}

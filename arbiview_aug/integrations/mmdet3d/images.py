@@ -68,11 +68,19 @@ def like_given(original: Sequence[Any], images: torch.Tensor, norm: Norm | None 
 
 
 def norm_of(config: Any) -> Norm | None:
-    """mean and std of mmdet's ``img_norm_cfg``; None without one, and for that of images that are only loaded."""
+    """mean and std of mmdet's ``img_norm_cfg``; None without one, and for that of images that are only loaded.
+
+    Raises:
+        SampleError: Not three of each.
+    """
     if not isinstance(config, Mapping) or "mean" not in config or "std" not in config:
         return None
     mean, std = (np.asarray(config[key], np.float64).ravel() for key in ("mean", "std"))
-    return None if not mean.any() and (std == 1).all() else (mean.tolist(), std.tolist())
+    if not mean.any() and (std == 1).all():
+        return None
+    if mean.shape != (3,) or std.shape != (3,) or not (std > 0).all():
+        raise SampleError(f"img_norm_cfg: expected three means and three positive stds, got {mean} and {std}")
+    return mean.tolist(), std.tolist()
 
 
 def levels(key: str, images: torch.Tensor, norm: Norm) -> torch.Tensor:
@@ -85,7 +93,7 @@ def levels(key: str, images: torch.Tensor, norm: Norm) -> torch.Tensor:
     grey = images.double() * std + mean
     whole = grey.round()
     off = float((grey - whole).abs().max())
-    if off > _ROUNDING or whole.min() < 0 or whole.max() > 255:
+    if not (off <= _ROUNDING and whole.min() >= 0 and whole.max() <= 255):  # NaN too
         raise SampleError(
             f"{key}: expected 8 bit images normalised by mean and std {norm}, got grey levels {off:.2g} off whole "
             f"numbers, from {grey.min():.1f} to {grey.max():.1f}; pass img_norm=(mean, std), and retarget before "

@@ -25,6 +25,8 @@ from arbiview_aug.integrations.mmdet3d.matrices import (
     read_views,
     stacked,
 )
+from arbiview_aug.sample.inputs import as_array
+from arbiview_aug.scene.surface import Points
 from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
 Retarget = Callable[[dict[str, Any]], dict[str, Any]]
@@ -91,7 +93,7 @@ def retarget_results(
     camera_names = [*map(str, by_name)] or [f"camera {k}" for k in range(count)]
     source = read_views(_given(results, by_name), count, camera_names, _lidar2ego(results, lidar2ego))
     for k, info in enumerate(by_name.values()):  # mmdet3d pads images of several sizes to the largest
-        if isinstance(info, Mapping) and "height" in info and "width" in info:
+        if isinstance(info, Mapping) and info.get("height") and info.get("width"):
             images[k] = images[k][:, : int(info["height"]), : int(info["width"])]
     out = retarget(
         {"images": images, "rig": source_rig(source, images, ground_z_m), **geometry(results, source.lidar2ego)}
@@ -106,8 +108,9 @@ def retarget_results(
         if isinstance(kept.get(key), list | tuple):
             kept[key] = list(views.names)
     if np.ndim(kept.get("img_timestamp", 0.0)) == 1:  # PETR's: all views are of the LiDAR's time
-        time_s = float(kept.get("timestamp", np.mean(np.asarray(kept["img_timestamp"]))))
-        kept["img_timestamp"] = like_array(kept["img_timestamp"], [time_s] * len(views.names))
+        times_s, time_s = kept["img_timestamp"], kept.get("timestamp")
+        time_s = float(np.mean(np.asarray(times_s)) if time_s is None else time_s)
+        kept["img_timestamp"] = like_array(times_s, [time_s] * len(views.names))
     if "num_views" in kept:
         kept["num_views"] = len(views.names)
     return kept | scanned(kept, out, source.lidar2ego) | target_outputs([out])
@@ -166,8 +169,8 @@ def _recorded(results: Mapping[str, Any]) -> Any:
         cut = []
         for image, (h, w, *_) in zip(images, shapes, strict=True):
             sides = image.shape[1:] if isinstance(image, torch.Tensor) else np.shape(image)[:2]
-            is_padded = all(0 <= side - shape < _MAX_PADDING_PX for side, shape in zip(sides, (h, w), strict=True))
-            if is_padded:
+            rims = [side - shape for side, shape in zip(sides, (h, w), strict=False)]
+            if len(rims) == 2 and all(0 <= rim < _MAX_PADDING_PX for rim in rims):
                 image = image[:, :h, :w] if isinstance(image, torch.Tensor) else image[:h, :w]
             cut.append(image)
         images = cut
@@ -186,35 +189,48 @@ def source_rig(views: Views, images: Sequence[torch.Tensor], ground_z_m: float) 
 def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, torch.Tensor]:
     """The sample's ``points`` and ``boxes_3d`` in the ego frame, of what the results hold in the LiDAR's.
 
-    Boxes are taken by their corners: what their numbers mean differs between mmdet3d's versions. Those of a plain array
+    Boxes are taken by their corners: what their numbers mean differs between mmdet3d's versions. Those of plain numbers
     (Sparse4D) are gravity centre, length, width, height and yaw.
+
+    Raises:
+        SampleTypeError: No numbers.
+        SampleError: Numbers of another shape.
     """
     values = {}
     points = results.get("points")
-    points = getattr(points, "tensor", points)
-    if isinstance(points, torch.Tensor | np.ndarray) and points.ndim == 2:
-        values["points"] = moved_points(points, lidar2ego)
+    if points is not None:
+        values["points"] = moved_points(_rows("points", getattr(points, "tensor", points), 3), lidar2ego)
     annotated = results.get("ann_info")
     boxes = results.get("gt_bboxes_3d", annotated.get("gt_bboxes_3d") if isinstance(annotated, Mapping) else None)
     tensor, rotation = getattr(boxes, "tensor", None), lidar2ego[:3, :3]
+    if boxes is None:
+        return values
     if tensor is not None and not len(tensor):  # mmdet3d before 1.0 asserts that there are corners
         return values | {"boxes_3d": torch.zeros(0, 7)}
     corners = getattr(boxes, "corners", None)
-    if isinstance(boxes, np.ndarray) and boxes.ndim == 2 and boxes.shape[1] >= 7:
-        centres, sizes, yaw = boxes[:, :3], boxes[:, 3:6].T, boxes[:, 6]
+    if corners is None:
+        rows = _rows("gt_bboxes_3d", boxes, 7)
+        centres, sizes, yaw = rows[:, :3], rows[:, 3:6].T, rows[:, 6]
         along = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
-    elif corners is not None:
+    else:
         # In both conventions corner 1 is above 0. From 1.0 on corner 4 is ahead of 0, at the yaw, and 3 to its left.
         x = np.asarray(corners, np.float64).reshape(-1, 8, 3)
         centres, along, aside = x.mean(axis=1), x[:, 4] - x[:, 0], x[:, 3] - x[:, 0]
         if tensor is not None and _is_clockwise(np.asarray(tensor[:, 6], np.float64), along):
             along, aside = -aside, along
         sizes = np.linalg.norm([along, aside, x[:, 1] - x[:, 0]], axis=-1)
-    else:
-        return values
     along = along @ rotation.T
     columns = [*(centres @ rotation.T + lidar2ego[:3, 3]).T, *sizes, np.arctan2(along[:, 1], along[:, 0])]
     return values | {"boxes_3d": torch.from_numpy(np.stack(columns, axis=1)).float()}
+
+
+def _rows(key: str, value: Any, least: int) -> Points:
+    array = as_array(key, value)
+    if array.shape == (0,):
+        array = array.reshape(0, least)
+    if array.ndim != 2 or array.shape[1] < least:
+        raise SampleError(f"{key}: expected rows of at least {least} numbers, got shape {array.shape}")
+    return array
 
 
 def _is_clockwise(yaw: FloatArray, x_axes: FloatArray) -> bool:
@@ -270,8 +286,8 @@ def scanned(results: Mapping[str, Any], out: Mapping[str, Any], lidar2ego: Float
     changed = {"points": given.new_point(points) if hasattr(given, "new_point") else like_array(given, points)}
     counts = out[COUNTS_KEY].numpy() if COUNTS_KEY in out else np.zeros(0, np.int64)
     if isinstance(annotated := results.get("ann_info"), Mapping):
-        given_counts = annotated.get("num_lidar_pts", ())
-        if len(given_counts) == len(counts) > 0:
+        given_counts = annotated.get("num_lidar_pts")
+        if given_counts is not None and len(given_counts) == len(counts) > 0:
             changed["ann_info"] = {**annotated, "num_lidar_pts": like_array(given_counts, counts)}
     instances = results.get("instances")
     if isinstance(instances, list) and len(instances) == len(counts):
@@ -314,14 +330,14 @@ def _write_numbers(out: dict[str, Any], views: Views, images: torch.Tensor) -> N
             if _is_per_camera(matrices):
                 out[key] = _as_written(matrices, views.matrices(kind))
     h, w = images.shape[-2:]
-    if "image_wh" in out:
+    if out.get("image_wh") is not None:
         out["image_wh"] = like_array(out["image_wh"], [(w, h)] * len(images))
-    if "focal" in out:
+    if out.get("focal") is not None:
         out["focal"] = like_array(out["focal"], np.sqrt(np.abs(np.linalg.det(views.K[:, :2, :2]))))
     # (h, w), (h, w, 3), (h, w, 3, views) as given; (w, h) where images are PIL's.
     full = (h, w, 3, len(images)) if isinstance(out["img"][0], np.ndarray | torch.Tensor) else (w, h)
     for key in SHAPE_KEYS:
-        if isinstance(shape := out.get(key), tuple | list):
+        if isinstance(shape := out.get(key), tuple | list) and shape:
             is_list = isinstance(shape[0], tuple | list)
             out[key] = [full[: len(shape[0])]] * len(images) if is_list else full[: len(shape)]
 
@@ -335,11 +351,11 @@ def _as_written(original: Any, matrices: FloatArray) -> Any:
 
 def _infos(infos: Mapping[str, Any], views: Views, images: torch.Tensor) -> dict[str, Any]:
     """``images``: an entry for each target camera with the keys of the source's that can be told of it."""
-    first: Mapping[str, Any] = next(iter(infos.values()), {})
+    first: Mapping[str, Any] = next((info for info in infos.values() if isinstance(info, Mapping)), {})
     columns = {
         key: _as_written([first[key]], views.matrices(kind))
         for key, kind in MATRICES.items()
-        if key in first and (kind != "cam2global" or views.ego2global is not None)
+        if first.get(key) is not None and (kind != "cam2global" or views.ego2global is not None)
     }
     by_camera = {}
     for k, name in enumerate(views.names):

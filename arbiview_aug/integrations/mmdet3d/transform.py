@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from arbiview_aug import CalibrationError, RandomRig, Rig, RigRetarget, SampleError, SampleKeys
-from arbiview_aug.cameras.random_rig import sequence_rng
+from arbiview_aug.cameras.random_rig import Epochs, sequence_rng
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, retarget_img_inputs
 from arbiview_aug.integrations.mmdet3d.images import Norm
 from arbiview_aug.integrations.mmdet3d.queue import OneDraw, is_queue, retarget_queue
@@ -34,13 +34,16 @@ class RigRetargetMultiView:
         img_norm: Means and standard deviations (three each) of BEVDet's normalisation.
         sequence_key: Names the drive in the results (``scene_token``; Sparse4D: ``aug_config``): frames where it is
             equal share one draw, in all workers of a DataLoader's epoch. By default that of a
-            ``RandomRig(per="sequence")``; else each dict has a draw of its own.
+            ``RandomRig(per="sequence")``; else each dict has a draw of its own. The training loop calls ``set_epoch``
+            before each epoch without workers or with persistent ones: else every epoch repeats the draws.
         settings: Any of ``RigRetarget``'s: ``size``, ``geometry``, ``quality``, ``p``, ``match_exposure``,
             ``holes``, ``keys`` (a dict of ``SampleKeys``' values in a config file).
 
     Raises:
         CalibrationError: A target with lenses, or that cannot be loaded; a pose of another shape.
     """
+
+    _refuses_lenses = True  # at once, not with the first images
 
     def __init__(
         self,
@@ -59,18 +62,24 @@ class RigRetargetMultiView:
         self.retarget = RigRetarget(target, **settings)
         held = self.retarget.target
         rig = held.base if isinstance(held, RandomRig) else held
-        check_no_lenses([camera.lens for camera in rig])
+        if self._refuses_lenses:
+            check_no_lenses([camera.lens for camera in rig])
         self.names = rig.names
         self.lidar2ego, self.ground_z_m, self.img_norm = lidar2ego, float(ground_z_m), img_norm
         by_target = held.sequence_key if isinstance(held, RandomRig) and held.per == "sequence" else None
         self.sequence_key = sequence_key or by_target
+        self._epochs = held if isinstance(held, RandomRig) else Epochs()
+
+    def set_epoch(self, epoch: int) -> None:
+        """Change the draws by ``sequence_key``, also in running workers; as ``RandomRig.set_epoch``."""
+        self._epochs.set_epoch(epoch)
 
     def __call__(self, results: Mapping[str, Any]) -> dict[str, Any]:
         """A new ``results`` dict: see ``retarget_results``, ``retarget_queue`` and ``retarget_img_inputs``."""
         of_all = OneDraw(self.retarget)
 
         def of_frame(frame: Mapping[str, Any]) -> OneDraw:
-            return of_all if self.sequence_key is None else OneDraw(self.retarget, self._draw(frame))
+            return of_all if self.sequence_key is None else OneDraw(self.retarget, self.draw(frame))
 
         def retargeted(frame: Mapping[str, Any]) -> dict[str, Any]:
             return retarget_results(
@@ -84,17 +93,22 @@ class RigRetargetMultiView:
             )
         return retarget_queue(results, retargeted) if is_queue(results) else retargeted(results)
 
-    def _draw(self, frame: Mapping[str, Any]) -> dict[str, float]:
-        """``retarget_params`` that are the same for all frames of a sequence.
+    def rng(self, frame: Mapping[str, Any], use: str = "") -> torch.Generator | None:
+        """A generator that is the same for all frames of a sequence; None without ``sequence_key``.
 
         Raises:
             SampleError: The frame does not name its sequence.
         """
-        key = str(self.sequence_key)
+        key = self.sequence_key
+        if key is None:
+            return None
         if key not in frame:
             raise SampleError(f"sequence_key: expected {key!r} in the results, got {', '.join(map(str, frame))}")
-        target, p = self.retarget.target, self.retarget.p
-        rng = sequence_rng(frame[key], target.epoch if isinstance(target, RandomRig) else 0)
+        return sequence_rng(f"{frame[key]}{use}", self._epochs.epoch)
+
+    def draw(self, frame: Mapping[str, Any]) -> dict[str, float]:
+        """``retarget_params`` of a frame; those of all frames of its sequence with ``sequence_key``."""
+        target, p, rng = self.retarget.target, self.retarget.p, self.rng(frame)
         skipped = {"skipped": float(torch.rand((), generator=rng).item() >= p)} if p < 1 else {}
         return skipped | (target.draw(rng) if isinstance(target, RandomRig) else {})
 

@@ -74,6 +74,21 @@ def test_matrices_images_and_geometry(given: Recording) -> None:
     assert off.mean() < 0.2
 
 
+def test_other_entries_of_cameras(given: Recording) -> None:
+    """The step rewrites what it knows; none of it may stay the source's in the merged dict."""
+    sample = loaded(given)
+    sample |= {"cam2ego": given.mounted, "img_shape": [(64, 176)] * 6, "filename": ["a.jpg"] * 6, "num_views": 6}
+    transform = RigRetargetMultiViewImages(TARGET, lidar2ego=LIDAR2EGO, geometry="street")
+    merged = sample | transform(sample)
+    assert merged["num_views"] == 5 and merged["img_shape"] == [SIZE] * 5 and merged["filename"] == TARGET.names
+    np.testing.assert_allclose(merged["cam2ego"], TARGET.in_frame_of(SOURCE).cam2ego, atol=1e-5)
+    with (
+        pytest.raises(SampleError, match="depth_maps: of the source's pixels; retarget before"),
+        pytest.warns(UserWarning, match="drops depth_maps"),
+    ):
+        transform({**sample, "depth_maps": np.ones((6, 64, 176))})
+
+
 def test_levels_and_messages(given: Recording) -> None:
     sample = loaded(given)
     transform = RigRetargetMultiViewImages(TARGET, lidar2ego=LIDAR2EGO, geometry="street")

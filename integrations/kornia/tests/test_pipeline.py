@@ -83,6 +83,7 @@ def test_kornias_image_sequential(sample: dict) -> None:
         v2.RandomCrop(8),
         v2.RandAugment(),
         v2.Compose([v2.ColorJitter(), v2.Resize(8)]),
+        v1.Compose([v1.ColorJitter(), v1.CenterCrop(8)]),
     ],
     ids=lambda module: type(module).__name__,
 )
@@ -93,7 +94,8 @@ def test_what_moves_pixels_is_refused(module: torch.nn.Module) -> None:
 
 def test_photometric_ones_pass() -> None:
     kornias = K.ColorJiggle(), K.RandomGaussianBlur((3, 3), (0.1, 1.0)), K.RandomErasing()
-    for module in (*kornias, v1.ColorJitter(), v2.ColorJitter(), v2.GaussianBlur(3)):
+    composed = v1.Compose([v1.ColorJitter()]), v2.Compose([lambda images: images, v2.ColorJitter()])
+    for module in (*kornias, *composed, v1.ColorJitter(), v2.ColorJitter(), v2.GaussianBlur(3)):
         check_photometric(module)
 
 
@@ -104,8 +106,22 @@ def test_images_keep_their_type_and_shape(sample: dict) -> None:
 
 
 def test_lists_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"got a list; pass size=\(h, w\)"):
+    with pytest.raises(ValueError, match=r"got a list in .*; pass size=\(h, w\)"):
         OnImages(K.ColorJiggle())({"images": [torch.zeros(3, 4, 4)]})
+    with pytest.raises(ValueError, match=r"expected a tensor 'images', of one size, got a NoneType in a sample of K"):
+        OnImages(K.ColorJiggle())({"K": torch.eye(3)})
+
+
+@pytest.mark.parametrize("type_", [torch.uint8, torch.float32])
+@pytest.mark.parametrize(
+    "module", [v2.Normalize((0.48,) * 3, (0.23,) * 3), v2.ToDtype(torch.uint8, scale=True)], ids=["normalise", "bytes"]
+)
+def test_what_leaves_0_to_1_is_refused(module: torch.nn.Module, type_: torch.dtype) -> None:
+    images = v2.functional.to_dtype(torch.rand(2, 3, 8, 8), type_, scale=True)
+    with pytest.raises(ValueError, match=r"expected floats in \[0, 1\] of its module, got .*; normalise after"):
+        OnImages(module)({"images": images})
+    noisy = OnImages(lambda images: images + 0.15 * torch.randn_like(images))({"images": images})["images"]
+    assert noisy.dtype == type_
 
 
 def test_example(tmp_path, capsys) -> None:

@@ -14,6 +14,7 @@ import torch
 from arbiview_aug import (
     CalibrationError,
     CropRig,
+    Lidar,
     ResizeRig,
     Rig,
     RigRetarget,
@@ -206,6 +207,23 @@ def test_skipped_frames_keep_their_cameras(given: Recording) -> None:
     assert worst_error_px(after, SOURCE.resized(SIZE, "crop")) <= 1e-3
 
 
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+def test_entries_that_are_empty(given: Recording) -> None:
+    """Datasets leave them so."""
+    full = {"img_timestamp": [1.5] * 6, "image_wh": None, "focal": None, "img_shape": [], "timestamp": None}
+    full |= {"ann_info": {"num_lidar_pts": None}}
+    after = step(replace(TARGET, lidars=[Lidar("top", LIDAR2EGO, (-5.0, 0.0), 1.0, (1.0, 80.0))]))(
+        FORMS["mmdet3d"](given) | full
+    )
+    assert after["img_timestamp"] == [1.5] * 5 and after["img_shape"] == [] and len(after["points"])
+    results = FORMS["mmdet3d"](given)
+    results["images"] = {name: {**info, "height": None, "cam2img": None} for name, info in results["images"].items()}
+    assert "cam2img" not in step()(results)["images"][TARGET.names[0]]
+    assert step()(results | {"images": {"CAM_FRONT": None}})["images"][TARGET.names[0]] == {}
+    for key in ("cam_names", "adjacent"):
+        assert len(step()(FORMS["BEVDet"](given) | {key: None})["img_inputs"][0]) == 5
+
+
 def test_keys_of_a_config_file() -> None:
     assert RigRetargetMultiView(TARGET, keys={"labels": ["seg"]}).retarget.keys.labels == ("seg",)
 
@@ -214,6 +232,20 @@ def test_keys_of_a_config_file() -> None:
 def test_frames_without_boxes(is_old: bool) -> None:
     boxes = Boxes(np.zeros((0, 7)), is_old=is_old)
     assert geometry({"gt_bboxes_3d": boxes}, LIDAR2EGO)["boxes_3d"].shape == (0, 7)
+
+
+def test_geometry_in_plain_numbers() -> None:
+    rows = np.float32([[8, 1, 0, 4, 2, 1.5, 0.3], [9, 1, 0, 4, 2, 1.5, 0]])
+    expected = geometry({"points": rows, "gt_bboxes_3d": rows}, LIDAR2EGO)
+    for form in (torch.from_numpy, np.ndarray.tolist):
+        same = geometry({"points": form(rows), "gt_bboxes_3d": form(rows)}, LIDAR2EGO)
+        assert all(torch.allclose(same[key], value) for key, value in expected.items()) and len(same) == 2
+    for key, shape in (("gt_bboxes_3d", (2, 6)), ("points", (5, 2)), ("points", (1, 5, 3))):
+        with pytest.raises(SampleError, match=rf"^{key}: expected rows of at least . numbers, got shape"):
+            geometry({key: np.ones(shape)}, LIDAR2EGO)
+    with pytest.raises(SampleTypeError, match="gt_bboxes_3d: expected a tensor of numbers"):
+        geometry({"gt_bboxes_3d": "boxes"}, LIDAR2EGO)
+    assert geometry({"gt_bboxes_3d": []}, LIDAR2EGO)["boxes_3d"].shape == (0, 7)
 
 
 @pytest.mark.filterwarnings("ignore:retarget. drops")
@@ -250,8 +282,18 @@ def test_messages(given: Recording) -> None:
     entries = FORMS["BEVDet"](given)["img_inputs"]
     with pytest.raises(SampleError, match=r"whole numbers.*img_norm"):
         step(img_norm=((0, 0, 0), (1, 1, 1)))({"img_inputs": entries})
+    with pytest.raises(SampleError, match=r"img_inputs: expected 8 bit images .* nan off whole numbers"):
+        step()({"img_inputs": (entries[0] * np.nan, *entries[1:])})
     with pytest.raises(SampleError, match=r"img_inputs: expected .* got 5 entries"):
         step()({"img_inputs": entries[:5]})
+    with pytest.raises(SampleError, match="post_rots that can be inverted, got a singular one"):
+        step()({"img_inputs": (*entries[:4], entries[4] * 0, *entries[5:])})
+    with pytest.raises(SampleError, match="expected 6 images a frame, as 'cam_names' says, got 0"):
+        step()({"img_inputs": tuple(entry[:0] for entry in entries), "cam_names": SOURCE.names})
+    with pytest.raises(SampleError, match="img_norm_cfg: expected three means and three positive stds, got"):
+        step()({**results, "img_norm_cfg": {"mean": [1, 2], "std": [1, 1]}})
+    with pytest.raises(SampleTypeError, match=r"img\[0\]: expected \(H, W, 3\)"):
+        step()({**results, "img": [None, *results["img"][1:]]})
     several = (entries[0].repeat(2, 1, 1, 1), *entries[1:])
     with pytest.raises(SampleError, match=r"expected 12 cameras in each entry"):
         step()({"img_inputs": several})

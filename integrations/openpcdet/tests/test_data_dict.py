@@ -167,6 +167,10 @@ def test_boxes_without_points(given: Recording) -> None:
     out = step(min_points_in_gt=1)(data)
     assert 0 < len(out["gt_boxes"]) == len(out["gt_names"]) < len(data["gt_boxes"])
     assert out["gt_boxes"][:, 0].max() < 400
+    counted = step(min_points_in_gt=1)(data | {"num_points_in_gt": np.full(len(data["gt_boxes"]), 9)})
+    assert counted["num_points_in_gt"].min() > 0 and len(counted["num_points_in_gt"]) == len(out["gt_boxes"])
+    assert step()(data | {"num_points_in_gt": np.full(len(data["gt_boxes"]), 9)})["num_points_in_gt"][-1] == 0
+    assert step(min_points_in_gt=1)(data | {"gt_boxes": None})["gt_boxes"] is None
     masked = step(min_points_in_gt=1)(data | {"gt_boxes_mask": np.ones(len(data["gt_boxes"]), bool)})
     assert masked["gt_boxes_mask"].sum() == len(out["gt_boxes"]) and not masked["gt_boxes_mask"][-1]
 
@@ -176,6 +180,27 @@ def test_without_labels_and_with_a_drawn_rig(given: Recording) -> None:
     torch.manual_seed(0)
     lengths = {len(step(RandomRig(TARGET, height_m=1.0))(data)["points"]) for _ in range(3)}
     assert len(lengths) > 1 and min(lengths) > 200
+
+
+def test_frames_of_a_drive_share_a_draw(given: Recording) -> None:
+    """Of the rig and of ``p``, with images and without."""
+    random = RandomRig(TARGET, height_m=1.0, per="sequence")
+    for one, data in ((step(random), kitti(given)), (step(random, lidar2ego=LIDAR2EGO), nuscenes(given))):
+        a, again, b = (one(data | {"scene_token": name})["points"] for name in "aab")
+        assert np.array_equal(a, again) and not np.array_equal(a, b)
+    with pytest.raises(SampleError, match="sequence_key: expected 'scene_token' in the results"):
+        step(random)(kitti(given))
+    skipping, bare = step(p=0.5, sequence_key="scene_token"), {"points": np.zeros((0, 4), np.float32)}
+    skipping._points = lambda data_dict: None  # type: ignore[method-assign]
+    skips = [[skipping({**bare, "scene_token": name})["points"] is None for name in range(30)] for _ in range(2)]
+    assert skips[0] == skips[1] and {*skips[0]} == {False, True}
+
+
+def test_points_need_no_pinholes(given: Recording) -> None:
+    lenses = replace(load_rig("waymo"), lidars=[TOP])
+    assert np.array_equal(step(lenses)(kitti(given))["points"], step()(kitti(given))["points"])
+    with pytest.raises(CalibrationError, match="target: expected pinhole cameras"):
+        step(lenses, lidar2ego=LIDAR2EGO, size=SIZE)(nuscenes(given))
 
 
 def test_points_stay_on_demand(given: Recording) -> None:
@@ -192,6 +217,9 @@ def test_messages(given: Recording) -> None:
         step(replace(TARGET, lidars=()))(data)
     with pytest.raises(SampleError, match="points: expected"):
         step()({"frame_id": "1"})
+    for points in (data["points"].tolist(), torch.from_numpy(data["points"]), data["points"][:, :2]):
+        with pytest.raises(SampleError, match=r"^points: expected"):
+            step()(data | {"points": points})
     with pytest.raises(SampleError, match="lidar2image: expected beside camera_imgs, found none"):
         cameras = nuscenes(given)
         del cameras["lidar2image"]

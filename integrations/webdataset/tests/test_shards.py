@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import tarfile
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ def sample() -> dict:
     rig = demo_source_rig((64, 176))
     masked = replace(rig[0], mask=np.arange(64)[:, None].repeat(176, 1) < 60)
     drive = SyntheticDrive(rig.with_cameras([masked, *rig.cameras[1:]]), num_frames=1)
-    return {**drive[0], "ego2world": torch.eye(4, dtype=torch.float64)}
+    return {**drive[0], "ego2world": torch.eye(4, dtype=torch.float64), "time_s": 1.25, "scene_token": "drive"}
 
 
 def test_there_and_back(sample: dict) -> None:
@@ -33,6 +34,8 @@ def test_there_and_back(sample: dict) -> None:
     assert (again["images"].float() - sample["images"].float()).abs().mean() < 3
     for key in (*ARRAYS, "K", "cam2ego"):
         assert torch.equal(again[key], sample[key])
+    assert sample["time_s"] == again["time_s"] and again["scene_token"] == "drive"
+    assert to_entry({**sample, "images": sample["images"].numpy()}, "a") == to_entry(sample, "a")
 
 
 def test_retargeted_samples(sample: dict, tmp_path) -> None:
@@ -108,6 +111,8 @@ def test_messages(sample: dict, monkeypatch) -> None:
     [
         ("rig.json", "{", "rig.json: expected a rig with its token"),
         ("rig.json", "[]", "rig.json: expected a rig with its token"),
+        ("rig.json", '{"token": "a", "time_s": "noon"}', "rig.json: expected a rig with its token"),
+        pytest.param("00.jpg", np.zeros((64, 176, 3), np.uint8), "00.jpg: expected a file's bytes", id="decoded"),
         ("00.jpg", b"", "00.jpg: expected a JPEG or PNG, got an empty file"),
         ("00.mask.png", b"", "00.mask.png: expected a JPEG or PNG, got an empty file"),
         pytest.param("00.mask.png", SMALL, r"camera 'front': mask: expected shape \(64, 176\)", id="a smaller mask"),
@@ -115,7 +120,7 @@ def test_messages(sample: dict, monkeypatch) -> None:
         ("boxes_3d.npy", b"", "boxes_3d.npy: expected a .npy array of numbers"),
     ],
 )
-def test_what_is_broken_is_named(sample: dict, name: str, content: str | bytes, message: str) -> None:
+def test_what_is_broken_is_named(sample: dict, name: str, content: Any, message: str) -> None:
     with pytest.raises((DataError, CalibrationError), match=f"shard entry 'a': {message}"):
         to_sample({**to_entry(sample, "a"), name: content})
 
@@ -126,8 +131,9 @@ def test_shards_are_whole_and_keys_without_dots(sample: dict, tmp_path) -> None:
     with pytest.raises(SampleError, match=r"images: expected \[.*as the rig's cameras are, got"):
         write_shard(tmp_path / "half.tar", [sample, {**sample, "images": sample["images"][:5]}])
     assert [path.name for path in tmp_path.iterdir()] == ["train.v1.tar"]
-    with pytest.raises(SampleError, match=r"key: expected none of dots.*'a\.b'"):
-        to_entry(sample, "a.b")
+    for key in ("a.b", 5):
+        with pytest.raises(SampleError, match=f"key: expected a text without dots.*{key!r}"):
+            to_entry(sample, key)
 
 
 def test_orientations_are_ignored(sample: dict) -> None:
@@ -145,3 +151,7 @@ def test_images_of_another_type_are_refused(sample: dict) -> None:
     """Encoded as they are they would be black."""
     with pytest.raises(SampleTypeError, match=r"images: expected uint8 to write, got torch\.float32"):
         to_entry({**sample, "images": sample["images"] / 255}, "a")
+    with pytest.raises(SampleError, match="images: expected in the sample, found none beside rig"):
+        to_entry({"rig": sample["rig"]}, "a")
+    with pytest.raises(SampleTypeError, match="points: expected a tensor of numbers"):
+        to_entry({**sample, "points": [[1, 2, 3], [4, 5]]}, "a")
