@@ -124,7 +124,7 @@ class Trainer:
     def train(self) -> bool:
         """Train to the last step, or until SIGTERM or SIGINT, and save; returns whether all steps are done.
 
-        TrainingError if a loss is not finite, OutputError if the last state could not be saved.
+        TrainingError if a loss or gradient is not finite, OutputError if the last state could not be saved.
         """
         config = self.config
         writer = None
@@ -161,7 +161,7 @@ class Trainer:
         return self.done == config.steps
 
     def train_step(self, batch: Batch) -> dict[str, float]:
-        """Update the weights once; returns the loss terms, TrainingError if one is not finite."""
+        """Update the weights once; returns the loss terms, TrainingError if one or the gradient is not finite."""
         config = self.config
         number = self.done * self.accelerator.num_processes + self.accelerator.process_index
         rng = torch.Generator().manual_seed((10 * config.seed + _SEEDS["draws"]) * 2**32 + number)
@@ -173,19 +173,22 @@ class Trainer:
         total = self.step.total(terms)
         numbers = torch.stack([*terms.values(), total]).detach().tolist()  # one synchronisation with a GPU
         values = dict(zip((*terms, "total"), numbers, strict=True))
-        infinite = [name for name, value in values.items() if not math.isfinite(value)]
-        if infinite:
-            raise TrainingError(
-                f"step {self.done}: loss term {infinite[0]} is {values[infinite[0]]}; the batch: "
-                f"{', '.join(batch.tokens)}. The last saved state is from before; try a lower lr, or bf16 off"
-            )
+        self._check_finite({f"loss term {name}": value for name, value in values.items()}, batch)
         self.accelerator.backward(total)
-        if config.max_grad_norm:
-            self.accelerator.clip_grad_norm_(self.model.parameters(), config.max_grad_norm)
+        norm = self.accelerator.clip_grad_norm_(self.model.parameters(), config.max_grad_norm or math.inf)
+        self._check_finite({"the norm of the gradient": float(norm)}, batch)
         self._optimiser.step()
         self._optimiser.zero_grad(set_to_none=True)
         self.average.step(self.trained.values())
         return values
+
+    def _check_finite(self, values: dict[str, float], batch: Batch) -> None:
+        for name, value in values.items():
+            if not math.isfinite(value):
+                raise TrainingError(
+                    f"step {self.done}: {name} is {value}; the batch: {', '.join(batch.tokens)}. The last saved state "
+                    "is from before; try a lower lr, or bf16 off"
+                )
 
     def _batches(self) -> Iterator[Batch]:
         config, world = self.config, self.accelerator.num_processes

@@ -126,6 +126,17 @@ def test_a_loss_that_is_not_finite_names_the_term_and_the_batch(tmp_path: Path) 
     assert all(torch.equal(weights[name], value) for name, value in made.generator.denoiser.state_dict().items())
 
 
+@pytest.mark.parametrize("most", [0.0, 1.0])
+def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path: Path, most: float) -> None:
+    """Clipping would divide by its norm: all weights would be NaN, and saved over the last good state."""
+    made = run(tmp_path, max_grad_norm=most)
+    weights = {name: value.clone() for name, value in made.generator.denoiser.state_dict().items()}
+    next(made.generator.denoiser.context.mlp.parameters()).register_hook(lambda gradient: gradient * math.inf)
+    with pytest.raises(TrainingError, match=r"step 0: the norm of the gradient is (nan|inf); the batch: frame \d"):
+        made.train_step(next(made._batches()))
+    assert same(weights, made.generator.denoiser.state_dict())
+
+
 def test_a_state_of_other_settings_is_refused(tmp_path: Path) -> None:
     run(tmp_path, steps=2).train()
     with pytest.raises(TrainingError, match="other settings of steps, lr"):
