@@ -327,6 +327,10 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
     for option in ("device", "batch", "reference") if name == "depth" and not arguments.model else ():
         if getattr(arguments, option) != parser.get_default(option):
             parser.error(f"argument --{option}: expected it with --model alone: depth from motion needs no network")
+    if name == "train":
+        for option in ("views", "seeds", "steps") if arguments.command == "train" else ("weights", "vgg_weights"):
+            if getattr(arguments, option) != parser.get_default(option):
+                parser.error(f"argument --{option.replace('_', '-')}: {arguments.command} reads none")
     if name == "evaluate":
         for option in ("generator", "steps"):
             if getattr(arguments, option) != parser.get_default(option) and "diffusion" not in arguments.holes:
