@@ -253,7 +253,7 @@ def test_impossible_configurations_are_refused() -> None:
     for name in ("layers", "context_width", "norm_groups"):
         with pytest.raises(GeneratorError, match=f"UNetConfig.{name}: expected at least 1, got 0"):
             UNetConfig(**{"widths": (32,), "transformers": (True,), name: 0})
-    with pytest.raises(GeneratorError, match="AutoencoderConfig.norm_groups: expected at least 1, got 0"):
+    with pytest.raises(GeneratorError, match=r"AutoencoderConfig\.norm_groups: expected at least 1, got 0"):
         AutoencoderConfig(widths=(32,), norm_groups=0)
     with pytest.raises(GeneratorError, match=r"strength: expected a value in \(0, 1\], got 0.0"):
         small_config(strength=0.0)

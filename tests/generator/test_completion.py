@@ -155,7 +155,11 @@ def test_generated_pixels_that_are_not_finite_are_refused(generator: Generator) 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"guidance": float("nan")}, "guidance: expected a finite"), ({"steps": 10**6}, "up to 8192"), ({"steps": 1}, "2, got 1")],
+    [
+        ({"guidance": float("nan")}, "guidance: expected a finite"),
+        ({"steps": 10**6}, "up to 8192"),
+        ({"steps": 1}, "2, got 1"),
+    ],
 )
 def test_an_inpainter_refuses_what_its_generator_cannot_do(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(GeneratorError, match=message):

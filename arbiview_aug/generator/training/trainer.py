@@ -149,7 +149,8 @@ class Trainer:
         writer = None
         if self.is_main:
             tensorboard = optional_package("torch.utils.tensorboard", "generator")
-            writer = tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=self.done + 1 if self.done else None)
+            purged = self.done + 1 if self.done else None
+            writer = tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=purged)
         bar = tqdm(total=config.steps, initial=self.done, desc="train", unit="step", disable=not self.show)
         try:
             with stop_requests() as asked:

@@ -177,7 +177,9 @@ def test_a_state_that_is_no_state_is_refused(tmp_path: Path) -> None:
     changes: list[dict[str, Any]] = [{"step": step} for step in ("x", None, -5, True, 9)]
     for change in ({"format": 2}, {"training": [1]}, *changes):
         file.write_text(json.dumps({**sound, **change}))
-        with pytest.raises(TrainingError, match=r"expected the state of a training run: .*; delete it, or give another"):
+        with pytest.raises(
+            TrainingError, match=r"expected the state of a training run: .*; delete it, or give another"
+        ):
             run(tmp_path)
     file.write_text(json.dumps({**sound, "training": {**sound["training"], "clip": 1.0}}))
     with pytest.raises(TrainingError, match="state: a run with other clip; resume with the same ones, or give another"):
@@ -186,13 +188,15 @@ def test_a_state_that_is_no_state_is_refused(tmp_path: Path) -> None:
 
 def test_a_generator_that_is_frozen_is_refused(tmp_path: Path) -> None:
     generator = Generator.from_config(config().generator).requires_grad_(False)
-    with pytest.raises(TrainingError, match=r"got a generator that is frozen.*: call generator.denoiser.requires_grad_"):
+    with pytest.raises(
+        TrainingError, match=r"got a generator that is frozen.*: call generator.denoiser.requires_grad_"
+    ):
         Trainer(config(), frames(), generator, tmp_path, show=False)
 
 
 def test_another_precision_in_the_same_process_is_refused(tmp_path: Path) -> None:
     run(tmp_path / "no")
-    with pytest.raises(TrainingError, match="precision=bf16: .*a process keeps its first precision; start another"):
+    with pytest.raises(TrainingError, match=r"precision=bf16: .*a process keeps its first precision; start another"):
         run(tmp_path / "bf16", precision="bf16")
 
 
@@ -200,7 +204,9 @@ def test_what_was_logged_before_a_stop_is_kept(tmp_path: Path, monkeypatch: pyte
     made = run(tmp_path)
     made.done = 4
     purged = []
-    monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter.__init__", lambda *_, purge_step: purged.append(purge_step))
+    monkeypatch.setattr(
+        "torch.utils.tensorboard.SummaryWriter.__init__", lambda *_, purge_step: purged.append(purge_step)
+    )
     monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter.close", lambda *_: None)
     made.train()
     assert purged == [5]  # that step and later ones are deleted
