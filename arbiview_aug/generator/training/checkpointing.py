@@ -1,4 +1,4 @@
-"""State of a training run, which resumes as if it had never stopped: weights, averaged weights, optimiser, step.
+"""State of a training run, which resumes as if it had never stopped: weights and their averages, deviation, optimiser.
 
 Learning rates are functions of the step, and every draw comes from (seed, step), so nothing else is saved. Files are
 replaced atomically, as a generator's folder is: a full disk or a killed process leaves the last state.
