@@ -150,8 +150,8 @@ def complete_together(
                 for m, image in zip(draft.left, images, strict=True):
                     if not bool(image.isfinite().all()):
                         raise GeneratorError(
-                            f"frame {draft.name}, camera {draft.rig[m].name!r}: expected finite pixels from generator "
-                            f"{config.name!r}, got NaN: give it finite images, float32 or bfloat16, and less guidance"
+                            f"frame {draft.name:.40}, camera {draft.rig[m].name!r}: expected finite pixels from "
+                            f"generator {config.name!r}, got NaN: expected finite images, no float16, less guidance"
                         )
                     draft.images[m] = _paste(image, draft.images[m], draft.holes[m])
     return [Completed(stacked(draft.images), stacked(draft.holes), draft.left) for draft in drafts]
