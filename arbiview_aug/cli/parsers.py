@@ -334,6 +334,9 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
             parser.error(f"argument --geometry: quality paper knows infinity alone, got {', '.join(surfaces)}")
     if name == "depth" and not arguments.model:
         refuse(("device", "batch", "reference"), "expected it with --model alone: depth from motion needs no network")
+    if name == "train":
+        others = ("views", "seeds", "steps") if arguments.command == "train" else ("weights", "vgg_weights")
+        refuse(others, f"{arguments.command} reads none")
     if name == "evaluate":
         if "diffusion" not in arguments.holes:
             refuse(("generator", "steps"), "expected it with --holes diffusion")

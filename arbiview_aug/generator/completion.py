@@ -46,7 +46,7 @@ class Conditions(NamedTuple):
     prefilled: torch.Tensor  # (B, N, 3, H, W) in [0, 1], FAVS at the targets with holes inpainted
     known: torch.Tensor  # (B, N, H, W) bool, or shares in [0, 1]
     confidence: torch.Tensor  # (B, N, H, W) in [0, 1]
-    sources: torch.Tensor  # (B, S, 3, H, W) in [0, 1]
+    sources: torch.Tensor  # (B, S, 3, H, W) in [0, 1], read where they are seen
     seen: torch.Tensor  # (B, S, H, W) valid pixels of the sources, bool, or 0 and 1
 
     def encoded(
@@ -54,7 +54,7 @@ class Conditions(NamedTuple):
     ) -> tuple[Views, Views]:
         """The denoiser's conditions of the targets and of the sources."""
         latent = autoencoder.encode(shown_condition(config, self.prefilled, self.known)).float()
-        sources = autoencoder.encode(self.sources).float()
+        sources = autoencoder.encode(self.sources * self.seen[:, :, None]).float()
         targets = geometry.target_views(latent, self.known, self.confidence)
         return targets, geometry.source_views(sources, self.seen, self.seen)
 
@@ -128,17 +128,10 @@ def complete_together(
     Raises:
         SampleError: Images, maps and cameras that do not fit together.
         ValueError: Impossible ``min_confidence`` or ``seed``.
-        GeneratorError: Impossible settings, one step of a generator that was not trained for it, or a generator on a
-            GPU in a DataLoader worker.
+        GeneratorError: Impossible settings, one step of a generator that was not trained for it, a generator on a GPU
+            in a DataLoader worker, or generated pixels that are not finite.
     """
-    config = generator.config
-    steps, guidance = config.steps if steps is None else steps, config.guidance if guidance is None else guidance
-    config = replace(config, steps=steps, guidance=guidance)
-    if config.steps == 1 and not config.one_step:
-        raise GeneratorError(
-            f"complete: expected steps >= 2, got 1: the one-step regression of generator {config.name!r} was not "
-            "trained (loss.regression=0)"
-        )
+    config = with_sampling(generator.config, steps, guidance)
     check_device(generator)
     checked_settings(min_confidence, seed)
     drafts = [_draft(*frame, min_confidence) for frame in zip(rendered, sources, names, strict=True)]
@@ -155,8 +148,25 @@ def complete_together(
             done = denoised(generator, config, geometry, conditions, torch.cat(noise).to(generator.device))
             for draft, images in zip(together, done, strict=True):
                 for m, image in zip(draft.left, images, strict=True):
+                    if not bool(image.isfinite().all()):
+                        raise GeneratorError(
+                            f"frame {draft.name:.40}, camera {draft.rig[m].name!r}: expected finite pixels from "
+                            f"generator {config.name!r}, got NaN: expected finite images, no float16, less guidance"
+                        )
                     draft.images[m] = _paste(image, draft.images[m], draft.holes[m])
     return [Completed(stacked(draft.images), stacked(draft.holes), draft.left) for draft in drafts]
+
+
+def with_sampling(config: GeneratorConfig, steps: int | None, guidance: float | None) -> GeneratorConfig:
+    """The config with steps and guidance where given; GeneratorError where its generator cannot sample so."""
+    steps, guidance = config.steps if steps is None else steps, config.guidance if guidance is None else guidance
+    config = replace(config, steps=steps, guidance=guidance)
+    if config.steps == 1 and not config.one_step:
+        raise GeneratorError(
+            f"complete: expected steps >= 2, got 1: the one-step regression of generator {config.name!r} was not "
+            "trained (loss.regression=0)"
+        )
+    return config
 
 
 def _draft(rendered: RenderedFrame, source: Frame, name: str, min_confidence: float) -> _Draft:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from arbiview_aug.choices import setting_hint
 from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
@@ -48,7 +48,7 @@ _Config = TypeVar("_Config")
 def from_plain(kind: type[_Config], data: Any, where: str, error: type[ArbiviewError] = GeneratorError) -> _Config:
     """Build a dataclass, and those nested in it, from plain data; ``where`` comes first in errors.
 
-    ``error`` for unknown or missing keys; impossible values raise the dataclass's own.
+    ``error`` for unknown or missing keys, and values of another type; impossible values raise the dataclass's own.
     """
     if not isinstance(data, Mapping):
         raise error(f"{where}: expected a mapping, got {type(data).__name__}")
@@ -63,10 +63,20 @@ def from_plain(kind: type[_Config], data: Any, where: str, error: type[ArbiviewE
         if is_dataclass(hints[key]):
             value = from_plain(hints[key], value, f"{where}: {key}", error)
         values[key] = tuple(value) if isinstance(value, list) else value
+        if not _has_type(values[key], hints[key]):
+            expected = getattr(hints[key], "__name__", hints[key])
+            raise error(f"{where}: {key}: expected {expected}, got {shown(value)}")
     try:
         return kind(**values)
     except TypeError as missing:
         raise error(f"{where}: {missing}") from None
+
+
+def _has_type(value: Any, hint: Any) -> bool:
+    """Whether a value has a field's type; whole numbers are numbers too, and the fields' checks name literals."""
+    if isinstance(value, tuple) and get_origin(hint) is tuple:
+        return all(_has_type(part, get_args(hint)[0]) for part in value)
+    return get_origin(hint) is Literal or type(value) is hint or (hint is float and type(value) is int)
 
 
 # --- the settings -----------------------------------------------------------------------------------------------------
@@ -90,6 +100,7 @@ class UNetConfig:
         check_fields(self, f"{count} values", lambda t: len(t) == count, "transformers")
         expected = f"{count} values, one of them true"
         check_fields(self, expected, lambda c: not c or (len(c) == count and any(c)), "cross_view")
+        check_fields(self, "at least 1", lambda n: n >= 1, "layers", "context_width", "norm_groups")
         check_fields(self, f"{count} values above 0", lambda h: not h or (len(h) == count and all(h)), "heads")
         check_fields(self, f"a divisor of {widths}", lambda g: not any(w % g for w in widths), "norm_groups")
 
@@ -122,6 +133,7 @@ class AutoencoderConfig:
         check_sizes(self, _MOST_CHANNELS, "widths", "patch", "latent_channels", "norm_groups")
         check_sizes(self, _MOST_LAYERS, "layers")
         widths, pixels = self.widths, 3 * self.patch**2
+        check_fields(self, "at least 1", lambda n: n >= 1, "layers", "norm_groups")
         check_fields(self, "1, or more without widths", lambda p: p == 1 or (p > 1 and not widths), "patch")
         check_fields(self, f"{pixels}, 3 patch²", lambda c: bool(widths) or c == pixels, "latent_channels")
         check_fields(self, f"a divisor of {widths}", lambda g: not any(w % g for w in widths), "norm_groups")
@@ -179,6 +191,7 @@ class GeneratorConfig:
         expected = "False with prediction 'epsilon', or prediction 'v_prediction'"
         check_fields(self, expected, lambda used: not (used and epsilon), "zero_snr", "residual")
         check_fields(self, "at least 1", lambda n: n >= 1, "steps")
+        check_fields(self, "0 without frozen_unet", lambda rank: self.frozen_unet or not rank, "lora_rank")
         check_fields(self, "a value in (0, 1]", lambda s: 0 < s <= 1, "strength")
         check_fields(self, "a value in [0, 1]", lambda t: 0 <= t <= 1, "temperature")
         check_fields(self, "a finite number above 0", lambda x: 0 < x < math.inf, "facing_m")

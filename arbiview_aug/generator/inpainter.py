@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from arbiview_aug.errors import GeneratorError, WarnOnce
-from arbiview_aug.generator.completion import complete_together
+from arbiview_aug.generator.completion import complete_together, with_sampling
 from arbiview_aug.generator.denoiser import GeneratorNetworks
 from arbiview_aug.generator.generator import Generator
 from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, checked_settings, frame_names, put
@@ -36,6 +36,7 @@ class Diffusion(Inpainter, torch.nn.Module):
 
     Raises:
         ValueError: Impossible settings.
+        GeneratorError: Steps or guidance that the generator cannot sample with.
     """
 
     outcome = "made up by the generator"
@@ -57,6 +58,7 @@ class Diffusion(Inpainter, torch.nn.Module):
         self.generator = Generator.shipped() if generator is None else generator
         self.steps, self.guidance = steps, guidance
         config = self.generator.config
+        with_sampling(config, steps, guidance)
         if config.steps == 1 < (steps or 1):
             made_for = f"steps={steps}: generator {config.name!r} was trained for one step; more add noise"
             _warn(config.name, f"{made_for}. Pass steps=1, or a model made for more")

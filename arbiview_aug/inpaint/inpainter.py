@@ -216,13 +216,14 @@ def _without_own_car(frame: RenderedFrame) -> RenderedFrame:
 # --- randomness -------------------------------------------------------------------------------------------------------
 def frame_names(frames: Sequence[Frame]) -> list[str]:
     """Names of frames for seeds: their ``token``, else a digest of their images (33 ms for six of 1600 x 900)."""
-    return [f.name("token") if f.sample.get("token") is not None else _digest(f.images) for f in frames]
+    return [f.name("token") if f.sample.get("token") is not None else digest_of(f.images) for f in frames]
 
 
-def _digest(images: Sequence[torch.Tensor]) -> str:
+def digest_of(tensors: Iterable[torch.Tensor]) -> str:
+    """A digest of the values of tensors, on any device."""
     digest = hashlib.blake2b()
-    for image in images:
-        digest.update(image.detach().cpu().contiguous().view(torch.uint8).numpy().tobytes())  # bfloat16 too
+    for tensor in tensors:
+        digest.update(tensor.detach().cpu().contiguous().view(torch.uint8).numpy().tobytes())  # bfloat16 too
     return digest.hexdigest()
 
 

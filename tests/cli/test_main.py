@@ -156,6 +156,8 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ),
         ("evaluate --lidar --displaced --data frame --size 8x8", "argument --size: --displaced has its own"),
         ("evaluate --steps 3", "argument --steps: expected it with --holes diffusion"),
+        *((f"train --{option} 3", f"argument --{option}: train reads none") for option in ("views", "steps", "seeds")),
+        ("train evaluate --vgg-weights a", "argument --vgg-weights: evaluate reads none"),
         ("view --output a.mp4", r"expected a name ending in \.rrd, got 'a\.mp4'"),
         *(
             (f"depth --data frame --{option}", f"argument --{option.split()[0]}: expected it with --model alone")

@@ -15,6 +15,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import strategies as st
 
 from arbiview_aug.__main__ import main
@@ -22,7 +23,7 @@ from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.depth_folder import DepthFolder
 from arbiview_aug.errors import ArbiviewError, DataError, GeneratorError
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.training.checkpointing import saved_config
+from arbiview_aug.generator.training.checkpointing import load_state
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from arbiview_aug.transforms.warm_up import compile_kernels
@@ -50,8 +51,9 @@ class Target:
         Generator.from_config(small_config()).save_pretrained(self.generator)
         self.training = TrainConfig(generator=small_config(), steps=1, batch=1, lr=1e-3)
         config = json.loads((self.generator / "config.json").read_text())
-        config["training"] = asdict(self.training)  # as the state of a training run has it
+        config |= {"training": asdict(self.training), "step": 1}  # as the state of a training run has it
         (self.generator / "config.json").write_text(json.dumps(config))
+        self.optimiser = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))])
         (weights,) = self.generator.glob("*.safetensors")
         self.files: dict[str, tuple[list[Path], Callable[[], object]]] = {
             "sequence": ([self.drive / "sequence.json"], self._read_drive),
@@ -69,7 +71,7 @@ class Target:
 
     def _read_generator(self) -> None:
         with contextlib.suppress(ArbiviewError):
-            saved_config(self.generator)
+            load_state(self.generator, asdict(self.training), {}, {}, mock.Mock(shadow_params=[]), self.optimiser)
         Generator.from_pretrained(self.generator)
 
     def _go_on(self, *more: str) -> None:

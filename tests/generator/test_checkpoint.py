@@ -20,7 +20,7 @@ import torch
 
 from arbiview_aug.errors import GeneratorError, OutputError
 from arbiview_aug.generator import Generator, compact, paper, small, tiny
-from arbiview_aug.generator.config import AutoencoderConfig, GeneratorConfig, UNetConfig, from_plain
+from arbiview_aug.generator.config import AutoencoderConfig, GeneratorConfig, TrainedOn, UNetConfig, from_plain
 from tests.generator.small import small_config
 
 
@@ -154,7 +154,6 @@ def test_weights_elsewhere_are_refused(generator: Generator, tmp_path: Path, nam
     ("part", "key", "value"),
     [
         ("unet", "layers", 10**9),
-        ("unet", "layers", 2.5),
         ("unet", "widths", [32] * 1000),
         ("unet", "widths", [2**40, 32, 32]),
         ("unet", "context_width", 10**12),
@@ -174,6 +173,29 @@ def test_absurd_sizes_are_refused_before_they_are_built(
     with pytest.raises(GeneratorError, match=f"{key}: expected whole numbers up to") as error:
         Generator.from_pretrained(tmp_path)
     assert len(str(error.value)) < 300
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "value", "expected"),
+    [
+        ("unet", "layers", 2.5, "int"),
+        ("unet", "layers", [1], "int"),
+        ("unet", "context_width", [32], "int"),
+        (None, "prompt_tokens", [2], "int"),
+        (None, "one_step", "no", "bool"),
+        (None, "name", 7, "str"),
+        (None, "prediction", [7], "epsilon or v_prediction"),
+        (None, "image_size", [32, [56]], "tuple"),
+        (None, "strength", True, "float"),
+    ],
+)
+def test_values_of_another_type_are_refused(part: str | None, key: str, value: object, expected: str) -> None:
+    config = json.loads(json.dumps(asdict(small_config())))
+    (config if part is None else config[part])[key] = value
+    with pytest.raises(GeneratorError, match=f"{key}: expected {expected}, got"):
+        from_plain(GeneratorConfig, config, "x")
+    with pytest.raises(GeneratorError, match="x: data: expected str, got 5"):
+        from_plain(TrainedOn, {"data": 5, "seed": 0, "held_out": []}, "x")
 
 
 def test_broken_configurations_are_named(generator: Generator, tmp_path: Path) -> None:
@@ -226,6 +248,13 @@ def test_impossible_configurations_are_refused() -> None:
                 small_config(**{name: value})
     with pytest.raises(GeneratorError, match="prediction: expected epsilon or v_prediction, got 'sample'"):
         small_config(prediction="sample")
+    with pytest.raises(GeneratorError, match="lora_rank: expected 0 without frozen_unet, got 4"):
+        small_config(lora_rank=4)  # all but LoRA would stay random
+    for name in ("layers", "context_width", "norm_groups"):
+        with pytest.raises(GeneratorError, match=f"UNetConfig.{name}: expected at least 1, got 0"):
+            UNetConfig(**{"widths": (32,), "transformers": (True,), name: 0})
+    with pytest.raises(GeneratorError, match=r"AutoencoderConfig\.norm_groups: expected at least 1, got 0"):
+        AutoencoderConfig(widths=(32,), norm_groups=0)
     with pytest.raises(GeneratorError, match=r"strength: expected a value in \(0, 1\], got 0.0"):
         small_config(strength=0.0)
     with pytest.raises(GeneratorError, match="expected multiples of 32"):

@@ -6,6 +6,7 @@ import copy
 import pickle
 import sys
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.errors import GeneratorError, SampleError
-from arbiview_aug.generator import Generator
+from arbiview_aug.generator import Diffusion, Generator
 from arbiview_aug.generator.config import AutoencoderConfig
 from tests.generator.small import ring, small_config, stirred
 from tests.helpers import assert_same_to_a_level
@@ -130,6 +131,39 @@ def test_the_own_car_is_not_generated(generator: Generator) -> None:
     assert not out.generated[:, 40:].any() and out.generated[:, :40].any()
     assert torch.equal(out.images[:, :, 40:], torch.stack(views)[:, :, 40:])
     assert torch.equal(out.generated, ~torch.stack(coverage) & torch.from_numpy(mask))
+
+
+def test_what_a_source_shows_of_its_own_car_is_not_read(generator: Generator) -> None:
+    """Training has it black."""
+    mask = np.ones((48, 80), bool)
+    mask[32:] = False
+    sources = SOURCES.with_cameras([replace(c, mask=mask) for c in SOURCES])
+    views, coverage, images = frame()
+    first = generator.complete_views(views, coverage, TARGETS, images, sources, steps=2)
+    painted = [torch.where(torch.from_numpy(mask), image, 255 - image) for image in images]
+    other = generator.complete_views(views, coverage, TARGETS, painted, sources, steps=2)
+    assert torch.equal(first.images, other.images)
+
+
+def test_generated_pixels_that_are_not_finite_are_refused(generator: Generator) -> None:
+    """As bytes NaN would be 0: black, and marked as generated."""
+    views, coverage, images = frame()
+    broken = [torch.full_like(image, float("nan"), dtype=torch.float32) for image in images]
+    with pytest.raises(GeneratorError, match=r"frame 7, camera 't0': expected finite pixels from generator 'test'"):
+        generator.complete_views(views, coverage, TARGETS, broken, SOURCES, frame=7, steps=2)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"guidance": float("nan")}, "guidance: expected a finite"),
+        ({"steps": 10**6}, "up to 8192"),
+        ({"steps": 1}, "2, got 1"),
+    ],
+)
+def test_an_inpainter_refuses_what_its_generator_cannot_do(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(GeneratorError, match=message):
+        Diffusion(Generator.from_config(small_config(one_step=False)), **settings)
 
 
 def test_views_of_other_sizes_and_lenses(generator: Generator) -> None:

@@ -1,4 +1,4 @@
-"""State of a training run, which resumes as if it had never stopped: weights, averaged weights, optimiser, step.
+"""State of a training run, which resumes as if it had never stopped: weights and their averages, deviation, optimiser.
 
 Learning rates are functions of the step, and every draw comes from (seed, step), so nothing else is saved. Files are
 replaced atomically, as a generator's folder is: a full disk or a killed process leaves the last state.
@@ -6,20 +6,18 @@ replaced atomically, as a generator's folder is: a full disk or a killed process
 
 from __future__ import annotations
 
+import json
 import signal
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
-from arbiview_aug.errors import GeneratorError, TrainingError
-from arbiview_aug.generator.checkpoint import CONFIG_FILE, read_checkpoint, read_config, write_checkpoint
-from arbiview_aug.generator.config import from_plain
-from arbiview_aug.generator.training.config import TrainConfig
+from arbiview_aug.errors import GeneratorError, TrainingError, one_line, shown
+from arbiview_aug.generator.checkpoint import CONFIG_FILE, read_checkpoint, write_checkpoint
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 _MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")  # in a resumed run
@@ -39,21 +37,25 @@ def averaged(average: Any, parameters: Iterable[nn.Parameter]) -> Iterator[None]
 
 def save_state(
     folder: Path,
-    config: TrainConfig,
+    run: Mapping[str, Any],
     step: int,
     parameters: Mapping[str, nn.Parameter],
+    buffers: Mapping[str, torch.Tensor],
     average: Any,
     optimiser: torch.optim.Optimizer,
 ) -> None:
     """Write the state after ``step`` steps; OutputError if it fails, and the last state is unchanged.
 
+    ``run`` is plain data: the settings, and all else that must be the same in a resumed run.
+
     Not accelerate's ``save_state``: it pickles, and writes into the folder in place.
     """
     tensors = {f"weights.{name}": parameter.detach() for name, parameter in parameters.items()}
+    tensors |= {f"buffers.{name}": value for name, value in buffers.items()}
     tensors |= {f"average.{name}": value for name, value in zip(parameters, average.shadow_params, strict=True)}
     for k, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{k}.{key}": torch.as_tensor(value) for key, value in state.items()}
-    write_checkpoint(folder, {"step": step, "training": asdict(config)}, tensors)
+    write_checkpoint(folder, {"step": step, "training": run}, tensors)
 
 
 def has_state(folder: Path) -> bool:
@@ -61,41 +63,38 @@ def has_state(folder: Path) -> bool:
     return (folder / CONFIG_FILE).is_file()
 
 
-def saved_config(folder: Path) -> TrainConfig:
-    """The settings of the run whose state a folder holds; TrainingError without a state, or for a broken one."""
-    with _broken(folder):
-        return from_plain(TrainConfig, read_config(folder)[0]["training"], "config", TrainingError)
-
-
 def load_state(
     folder: Path,
-    config: TrainConfig,
+    run: Mapping[str, Any],
     parameters: Mapping[str, nn.Parameter],
+    buffers: Mapping[str, torch.Tensor],
     average: Any,
     optimiser: torch.optim.Optimizer,
 ) -> int:
-    """Load a saved state into a run; returns its steps. TrainingError for other settings, or a broken state."""
-    before, now = asdict(saved_config(folder)), asdict(config)
-    changed = [key for key in now if key not in _MAY_DIFFER and before[key] != now[key]]
-    if changed:
-        raise TrainingError(
-            f"{folder}: a run with other settings of {', '.join(changed)}; resume with the same ones, or give another "
-            "--output"
-        )
+    """Load a saved state into a run; returns its steps. TrainingError for another ``run``, or a broken state."""
     with _broken(folder):
         data, tensors = read_checkpoint(folder)
-        step = int(data["step"])
-        saved = [(tensors[f"weights.{name}"], tensors[f"average.{name}"]) for name in parameters]
-    for parameter, shadow, (weight, mean) in zip(parameters.values(), average.shadow_params, saved, strict=True):
-        parameter.data.copy_(weight)
-        shadow.copy_(mean)
-    average.optimization_step = step
-    state: dict[int, dict[str, torch.Tensor]] = {}
-    for name, value in tensors.items():
-        if name.startswith("optimiser."):
-            _, k, key = name.split(".")
-            state.setdefault(int(k), {})[key] = value
-    optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
+        before, now, step = dict(data["training"]), json.loads(json.dumps(run)), data["step"]
+    changed = [key for key in now | before if key not in _MAY_DIFFER and before.get(key) != now.get(key)]
+    if changed:
+        raise TrainingError(
+            f"{folder}: a run with other {', '.join(changed)}; resume with the same ones, or give another --output"
+        )
+    with _broken(folder):
+        if type(step) is not int or not 0 <= step <= now["steps"]:
+            raise ValueError(f"step: expected 0 to {now['steps']}, got {shown(step)}")
+        for (name, parameter), shadow in zip(parameters.items(), average.shadow_params, strict=True):
+            parameter.data.copy_(tensors[f"weights.{name}"])
+            shadow.copy_(tensors[f"average.{name}"])
+        for name, buffer in buffers.items():
+            buffer.copy_(tensors[f"buffers.{name}"])
+        average.optimization_step = step
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for name, value in tensors.items():
+            if name.startswith("optimiser."):
+                _, k, key = name.split(".")
+                state.setdefault(int(k), {})[key] = value
+        optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
     return step
 
 
@@ -103,8 +102,9 @@ def load_state(
 def _broken(folder: Path) -> Iterator[None]:
     try:
         yield
-    except (GeneratorError, KeyError) as error:
-        raise TrainingError(f"{folder}: expected the state of a training run: {error}") from None
+    except (GeneratorError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        text = f"{one_line(error)}; delete it, or give another --output"
+        raise TrainingError(f"{folder}: expected the state of a training run: {text}") from None
 
 
 @contextmanager

@@ -93,6 +93,9 @@ def check_weights(config: TrainConfig, weights: str | None) -> None:
         raise TrainingError(f"--config {name}: expected --weights, a folder or hub id of {model}, for its frozen U-Net")
     if not config.generator.frozen_unet and weights is not None:
         raise TrainingError(f"--weights: expected none for --config {name}, which is trained from scratch")
+    if not config.generator.frozen_unet and config.generator.autoencoder.widths:
+        fix = "generator.autoencoder.widths=[] (squares of pixels), or a --config of --weights"
+        raise TrainingError(f"--config {name}: an autoencoder is not trained: expected {fix}")
 
 
 def fresh(config: TrainConfig, weights: str | None) -> Generator:

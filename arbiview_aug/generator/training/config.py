@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -39,6 +40,7 @@ class PseudoViewConfig:
         _check(self, "a probability", lambda p: 0 <= p <= 1, "p_translate", "p_mask_transfer", "hidden")
         _check(self, "fast or paper", lambda q: q in ("fast", "paper"), "quality")
         _check(self, "at least 1", lambda n: n >= 1, "targets", "mask_bank")
+        _check(self, "a finite number from 0", lambda x: 0 <= x < math.inf, "pitch_deg", "lateral_m", "vertical_m")
         _check(self, "0 <= low <= high <= 90", lambda yaw: len(yaw) == 2 and 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
         _check(self, "0 < low <= high", lambda factor: len(factor) == 2 and 0 < factor[0] <= factor[1], "focal")
 
@@ -63,7 +65,8 @@ class LossConfig:
         _check(self, "at least 0", lambda w: w >= 0, "geo", "perceptual", "snr_limit", "snr_floor")
         _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "regression")
         _check(self, "a value in (0, 1]", lambda w: 0 < w <= 1, "known_weight")
-        _check(self, "at least 1", lambda n: n >= 1, "perceptual_every", "perceptual_crop")
+        _check(self, "at least 1", lambda n: n >= 1, "perceptual_every")
+        _check(self, "at least 8", lambda n: n >= 8, "perceptual_crop")  # VGG's layers halve three times
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,13 +144,14 @@ def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: st
 def paper() -> TrainConfig:
     """Algorithm 1 as published, on Stable Diffusion's frozen weights and the published stages' pseudo views.
 
-    See Sec. Training Parameters. Deviations: x0 is the real view's latent (``training.losses``). L_geo is normalised,
-    since as printed it outgrows L_main (``loss.geo_mode="frobenius_sum"``). L_perceptual compares crops at early times,
-    in every 4th step. The learning rate is warmed up for 100 steps, and guidance is rescaled.
+    See Sec. Training Parameters. Deviations: x0 is the real view's latent (``training.losses``). Pseudo poses are
+    turned but not moved: the published stages know rotations alone. L_geo is normalised, since as printed it outgrows
+    L_main (``loss.geo_mode="frobenius_sum"``). L_perceptual compares crops at early times, in every 4th step. The
+    learning rate is warmed up for 100 steps, and guidance is rescaled.
     """
     return TrainConfig(
         generator=generators.paper(),
-        pseudo_views=PseudoViewConfig(quality="paper", p_translate=1.0, p_mask_transfer=0.0),
+        pseudo_views=PseudoViewConfig(quality="paper", p_translate=0.0, p_mask_transfer=0.0),
         loss=LossConfig(snr_limit=0.0, known_weight=1.0, regression=0.0),
         steps=100_000,
         batch=8,

@@ -143,10 +143,12 @@ def open_frames(
         raise TrainingError(f"--data {data}: expected synthetic, {' or '.join(f'{name}:PATH' for name in READERS)}")
     dataset = open_data(data)
     dataset.load_points = points
+    is_drive, names = (dataset.root / SEQUENCE_FILE).is_file(), dataset.tokens
+    if kind == "py123d":
+        names = [token.rpartition("-")[0] for token in names]  # of the logs
+        is_drive = len(set(names)) == 1
     if isinstance(dataset, NuScenesDataset):
         names = dataset.scene_tokens
-    elif not (dataset.root / SEQUENCE_FILE).is_file():
-        names = dataset.tokens
-    else:  # a drive is cut into blocks: frames next to each other show the same street
+    elif is_drive:  # cut into blocks: frames next to each other show the same street
         names = [f"block {_BLOCKS * k // len(dataset)}" for k in range(len(dataset))]
     return Frames(dataset, size, names, f"{kind}:{Path(folder).resolve()}")

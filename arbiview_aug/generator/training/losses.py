@@ -27,8 +27,8 @@ VGG_LAYERS = (3, 8, 15, 22)  # relu1_2, 2_2, 3_3, 4_3 of torchvision's vgg16 (Jo
 LATENT_BYTES = 4 * 2**30  # memory for latents of real views: 190,000 of 224 x 400 pixels
 
 
-class Diffusion:
-    """The forward process x_t = a x0 + s ε, a = √ᾱ_t, s = √(1 − ᾱ_t), of a schedule's ᾱ (T,) float32."""
+class ForwardProcess:
+    """The noising x_t = a x0 + s ε, a = √ᾱ_t, s = √(1 − ᾱ_t), of a schedule's ᾱ (T,) float32."""
 
     def __init__(self, alphas_cumprod: torch.Tensor, prediction: Prediction) -> None:
         self.signal, self.noise = alphas_cumprod.double().sqrt().float(), (1 - alphas_cumprod.double()).sqrt().float()
@@ -176,7 +176,7 @@ class Step(nn.Module):
         self._frozen = (autoencoder, perceptual)  # a tuple: not among this module's parameters
         self._cache: dict[tuple[int, int], torch.Tensor] = {}  # x0 of real views, by frame and camera
         schedule = noise_schedule(prediction=config.generator.prediction, zero_snr=config.generator.zero_snr)
-        self.diffusion = Diffusion(schedule.alphas_cumprod, config.generator.prediction)
+        self.diffusion = ForwardProcess(schedule.alphas_cumprod, config.generator.prediction)
 
     def forward(self, batch: Batch, draws: Draws, perceptual: bool = False) -> dict[str, torch.Tensor]:
         """Compute ``main``, ``regression``, ``geo`` and, if asked for, ``perceptual``: without their weights."""

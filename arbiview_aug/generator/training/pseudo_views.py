@@ -195,9 +195,9 @@ class PseudoViews(Dataset[Batch]):
         shown, pseudo = [], []
         for target, mask in zip(targets, masks, strict=True):
             pair = self._pair(target, rng)
-            branches += pair
             pseudo.append(favs(frame.images, rig, pair, config.quality))
             masked = [replace(c, mask=seen.cpu().numpy()) for c, seen in zip(pair, pseudo[-1].covered, strict=True)]
+            branches += masked  # views must not read each other's holes
             at_target = favs(list(pseudo[-1].images), Rig(masked, ground_z_m=rig.ground_z_m), [target], config.quality)
             if is_transferred and not is_hidden:
                 at_target = at_target._replace(covered=at_target.covered & mask.to(at_target.covered.device))

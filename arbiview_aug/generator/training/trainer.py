@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import DataError, OutputError, TrainingError
+from arbiview_aug.errors import DataError, OutputError, TrainingError, one_line
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
@@ -25,6 +25,7 @@ from arbiview_aug.generator.training.data import Frames, item_workers
 from arbiview_aug.generator.training.held_out import mean_hole_psnr, picture, sampled
 from arbiview_aug.generator.training.losses import Perceptual, Step, draw
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate, mask_bank
+from arbiview_aug.inpaint.inpainter import digest_of
 
 _LOG_EVERY = 10
 _DEVIATION_ITEMS = 32
@@ -46,8 +47,8 @@ class Trainer:
         say: Called with messages.
 
     Raises:
-        TrainingError: The output holds a run with other settings, the generator has another configuration, or VGG16 is
-            missing.
+        TrainingError: The output holds a run with other settings, data, frozen weights or number of processes; the
+            generator is frozen or has another configuration; VGG16 is missing; the process has another precision.
         ImportError: accelerate or tensorboard is not installed.
     """
 
@@ -64,7 +65,12 @@ class Trainer:
     ) -> None:
         accelerate = optional_package("accelerate", "generator")
         self.config, self.frames, self.output = config, frames, Path(output)
-        self.accelerator = accelerate.Accelerator(mixed_precision=config.precision, cpu=not torch.cuda.is_available())
+        try:
+            options = {"mixed_precision": config.precision, "cpu": not torch.cuda.is_available()}
+            self.accelerator = accelerate.Accelerator(**options)
+        except ValueError as error:
+            fix = "a process keeps its first precision; start another one"
+            raise TrainingError(f"Trainer: precision={config.precision}: {one_line(error)}; {fix}") from None
         self.is_main: bool = self.accelerator.is_main_process
         self.show, self.say = show and self.is_main, say if self.is_main else silent
         self.device = self.accelerator.device
@@ -82,12 +88,25 @@ class Trainer:
         self.perceptual = perceptual.to(self.device) if config.loss.perceptual and perceptual is not None else None
         self.step = Step(config, generator.denoiser, generator.autoencoder, self.perceptual)
         self.trained = {n: p for n, p in generator.denoiser.named_parameters() if p.requires_grad}
+        if not self.trained:
+            raise TrainingError(
+                "Trainer: expected weights to train, got a generator that is frozen, as from_pretrained loads it: call "
+                "generator.denoiser.requires_grad_(True), with frozen_unet on each of own_parameters() alone"
+            )
         self.optimiser = torch.optim.AdamW(self.trained.values(), lr=config.lr, weight_decay=config.weight_decay)
         ema = optional_package("diffusers.training_utils", "generator").EMAModel
         self.average = ema(self.trained.values(), decay=config.ema, foreach=True)
+        self._run = {
+            **asdict(config),
+            "data": asdict(generator.trained_on),
+            "frozen weights": digest_of(p for p in generator.parameters() if not p.requires_grad),
+            "number of processes": self.accelerator.num_processes,
+        }
+        self._buffers = {"deviation": generator.denoiser.deviation} if config.generator.residual else {}
         self.done, state = 0, self.output / "state"
-        if has_state(state):
-            self.done = load_state(state, config, self.trained, self.average, self.optimiser)
+        is_resumed = has_state(state)
+        if is_resumed:
+            self.done = load_state(state, self._run, self.trained, self._buffers, self.average, self.optimiser)
             self.say(f"going on after step {self.done} of {state}")
         # The optimiser is not placed: AdamW's step counters on a GPU would synchronise one by one.
         self.model, self._optimiser = self.accelerator.prepare(
@@ -100,7 +119,7 @@ class Trainer:
         self.items = PseudoViews(frames, self.split.training, *shared, first + _SEEDS["items"], maker)
         validation = self.split.validation or self.split.training
         self.validation = PseudoViews(frames, validation, *shared, first + _SEEDS["validation"], maker)
-        if config.generator.residual:
+        if config.generator.residual and not is_resumed:
             self._measure_deviation()
         if not self.split.validation:
             self.say("too few scenes for a validation part: validating on training scenes, with other draws")
@@ -124,13 +143,14 @@ class Trainer:
     def train(self) -> bool:
         """Train to the last step, or until SIGTERM or SIGINT, and save; returns whether all steps are done.
 
-        TrainingError if a loss is not finite, OutputError if the last state could not be saved.
+        TrainingError if a loss or gradient is not finite, OutputError if the last state could not be saved.
         """
         config = self.config
         writer = None
         if self.is_main:
             tensorboard = optional_package("torch.utils.tensorboard", "generator")
-            writer = tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=self.done or None)
+            purged = self.done + 1 if self.done else None
+            writer = tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=purged)
         bar = tqdm(total=config.steps, initial=self.done, desc="train", unit="step", disable=not self.show)
         try:
             with stop_requests() as asked:
@@ -161,7 +181,7 @@ class Trainer:
         return self.done == config.steps
 
     def train_step(self, batch: Batch) -> dict[str, float]:
-        """Update the weights once; returns the loss terms, TrainingError if one is not finite."""
+        """Update the weights once; returns the loss terms, TrainingError if one or the gradient is not finite."""
         config = self.config
         number = self.done * self.accelerator.num_processes + self.accelerator.process_index
         rng = torch.Generator().manual_seed((10 * config.seed + _SEEDS["draws"]) * 2**32 + number)
@@ -173,19 +193,22 @@ class Trainer:
         total = self.step.total(terms)
         numbers = torch.stack([*terms.values(), total]).detach().tolist()  # one synchronisation with a GPU
         values = dict(zip((*terms, "total"), numbers, strict=True))
-        infinite = [name for name, value in values.items() if not math.isfinite(value)]
-        if infinite:
-            raise TrainingError(
-                f"step {self.done}: loss term {infinite[0]} is {values[infinite[0]]}; the batch: "
-                f"{', '.join(batch.tokens)}. The last saved state is from before; try a lower lr, or bf16 off"
-            )
+        self._check_finite({f"loss term {name}": value for name, value in values.items()}, batch)
         self.accelerator.backward(total)
-        if config.max_grad_norm:
-            self.accelerator.clip_grad_norm_(self.model.parameters(), config.max_grad_norm)
+        norm = self.accelerator.clip_grad_norm_(self.model.parameters(), config.max_grad_norm or math.inf)
+        self._check_finite({"the norm of the gradient": float(norm)}, batch)
         self._optimiser.step()
         self._optimiser.zero_grad(set_to_none=True)
         self.average.step(self.trained.values())
         return values
+
+    def _check_finite(self, values: dict[str, float], batch: Batch) -> None:
+        for name, value in values.items():
+            if not math.isfinite(value):
+                raise TrainingError(
+                    f"step {self.done}: {name} is {value}; the batch: {', '.join(batch.tokens)}. The last saved state "
+                    "is from before; try a lower lr, or bf16 off"
+                )
 
     def _batches(self) -> Iterator[Batch]:
         config, world = self.config, self.accelerator.num_processes
@@ -198,7 +221,8 @@ class Trainer:
         """Write the state, and the generator with averaged weights; after an OutputError the last is unchanged."""
         try:
             if self.is_main:
-                save_state(self.output / "state", self.config, self.done, self.trained, self.average, self.optimiser)
+                kept = self.trained, self._buffers, self.average, self.optimiser
+                save_state(self.output / "state", self._run, self.done, *kept)
                 with averaged(self.average, self.trained.values()):
                     self.generator.save_pretrained(self.output / "generator")
         finally:  # the other processes wait in any case

@@ -76,6 +76,10 @@ def test_train_and_evaluate_on_streets(tmp_path: Path, capsys: pytest.CaptureFix
         (["--data", "kitti"], "expected synthetic, frames:PATH or nuscenes:PATH"),
         (["--config", "paper"], "expected --weights"),
         (["--weights", "somewhere"], "expected none for --config tiny"),
+        (
+            [f"--set=generator.autoencoder.{of}" for of in ("widths=[16]", "patch=1", "latent_channels=4")],
+            "--config tiny: an autoencoder is not trained: expected generator.autoencoder.widths=[]",
+        ),
         (["evaluate"], "expected a generator's folder"),
     ],
 )

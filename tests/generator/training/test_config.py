@@ -23,7 +23,7 @@ def test_the_papers_settings() -> None:
     config = paper()
     assert (config.lr, config.batch, config.loss.geo, config.loss.perceptual) == (1e-4, 8, 0.1, 0.01)
     assert config.pseudo_views.quality == "paper" and config.pseudo_views.targets == 1
-    assert config.pseudo_views.p_mask_transfer == config.loss.regression == 0.0
+    assert config.pseudo_views.p_mask_transfer == config.loss.regression == config.pseudo_views.p_translate == 0.0
     assert config.generator.frozen_unet and config.generator.prediction == "epsilon"
 
 
@@ -57,6 +57,9 @@ def test_overrides() -> None:
         ("weight_decay=-1", "weight_decay: expected at least 0, got -1"),
         ("seed=-1", r"seed: expected a value from 0 to 2\*\*28, got -1"),
         ("seed=1234567890", r"seed: expected a value from 0 to 2\*\*28, got 1234567890"),
+        ("loss.perceptual_crop=4", "perceptual_crop: expected at least 8, got 4"),
+        ("pseudo_views.pitch_deg=NaN", "pitch_deg: expected a finite number from 0, got nan"),
+        ("pseudo_views.lateral_m=-1", "lateral_m: expected a finite number from 0, got -1"),
         ("loss.regression=1", r"LossConfig.regression: expected a value in \[0, 1\), got 1"),
     ],
 )

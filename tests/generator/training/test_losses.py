@@ -12,7 +12,7 @@ from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator.denoiser import Rows
 from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.training.losses import (
-    Diffusion,
+    ForwardProcess,
     Perceptual,
     geometric_loss,
     load_perceptual,
@@ -20,9 +20,9 @@ from arbiview_aug.generator.training.losses import (
 )
 
 
-def diffusion(prediction: str = "v_prediction", zero_snr: bool = True) -> Diffusion:
+def diffusion(prediction: str = "v_prediction", zero_snr: bool = True) -> ForwardProcess:
     schedule = noise_schedule(prediction=prediction, zero_snr=zero_snr)
-    return Diffusion(schedule.alphas_cumprod, prediction)  # type: ignore[arg-type]
+    return ForwardProcess(schedule.alphas_cumprod, prediction)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])

@@ -99,6 +99,16 @@ def test_hidden_holes_are_shown_nowhere(k: int) -> None:
     assert answer_is_shown(k, p_mask_transfer=1.0, hidden=1.0) == (False, False)
 
 
+@pytest.mark.parametrize("k", range(3))
+def test_views_read_nothing_where_a_branch_shows_nothing(k: int) -> None:
+    item = items(p_mask_transfer=1.0, hidden=1.0)[k]
+    neighbour, centre, valid = item.geometry.target_reads[0]
+    _, query, slot, *_ = places = valid.nonzero(as_tuple=True)
+    x, y = centre[places].round().long().unbind(-1)
+    seen = item.seen[0, neighbour[0, query, slot], y.clamp(max=SIZE[0] - 1), x.clamp(max=SIZE[1] - 1)]
+    assert len(seen) > 100 and bool(seen.all())
+
+
 @pytest.mark.parametrize("k", range(2))
 def test_no_target_shows_the_answer_of_another(k: int) -> None:
     assert answer_is_shown(k, targets=2, p_mask_transfer=1.0, hidden=1.0) == (False, False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import os
 import signal
@@ -34,12 +35,13 @@ def deviation_of_few_items(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trainer, "_DEVIATION_ITEMS", 4)
 
 
-def run(folder: Path, **changes: Any) -> Trainer:
-    """A trainer of a generator that starts from the same weights each time."""
-    settings = config(**changes)
-    torch.manual_seed(0)
+def run(folder: Path, data: str = "", seed: int = 0, **changes: Any) -> Trainer:
+    """A trainer of a generator that starts from the same weights for the same seed."""
+    settings, shown = config(**changes), frames()
+    torch.manual_seed(seed)
+    shown.name = data
     said: list[str] = []
-    made = Trainer(settings, frames(), Generator.from_config(settings.generator), folder, show=False, say=said.append)
+    made = Trainer(settings, shown, Generator.from_config(settings.generator), folder, show=False, say=said.append)
     made.said = said  # type: ignore[attr-defined]
     return made
 
@@ -77,6 +79,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(tmp_path: Path) -> None:
     torch.manual_seed(99)  # no draw comes from the global generator
     second = run(tmp_path / "parts")
     assert second.done == 3
+    assert torch.equal(second.generator.denoiser.deviation, first.generator.denoiser.deviation)
     assert second.train()
     assert same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))
     trained = Generator.from_pretrained(tmp_path / "parts" / "generator")
@@ -126,22 +129,87 @@ def test_a_loss_that_is_not_finite_names_the_term_and_the_batch(tmp_path: Path) 
     assert all(torch.equal(weights[name], value) for name, value in made.generator.denoiser.state_dict().items())
 
 
+@pytest.mark.parametrize("most", [0.0, 1.0])
+def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path: Path, most: float) -> None:
+    """Clipping would divide by its norm: all weights would be NaN, and saved over the last good state."""
+    made = run(tmp_path, max_grad_norm=most)
+    weights = {name: value.clone() for name, value in made.generator.denoiser.state_dict().items()}
+    next(made.generator.denoiser.context.mlp.parameters()).register_hook(lambda gradient: gradient * math.inf)
+    with pytest.raises(TrainingError, match=r"step 0: the norm of the gradient is (nan|inf); the batch: frame \d"):
+        made.train_step(next(made._batches()))
+    assert same(weights, made.generator.denoiser.state_dict())
+
+
 def test_a_state_of_other_settings_is_refused(tmp_path: Path) -> None:
     run(tmp_path, steps=2).train()
-    with pytest.raises(TrainingError, match="other settings of steps, lr"):
+    with pytest.raises(TrainingError, match="a run with other steps, lr; resume with the same"):
         run(tmp_path, lr=0.5)
-    with pytest.raises(TrainingError, match="other settings of loss"):
+    with pytest.raises(TrainingError, match="a run with other loss;"):
         run(tmp_path, steps=2, loss=replace(config().loss, known_weight=0.5))
     run(tmp_path, steps=2, workers=1, save_every=7)  # those may change
 
 
+def test_a_state_of_other_data_weights_or_processes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would go on without a word, and say that it was trained on the last data alone."""
+    frozen = replace(config().generator, frozen_unet=True)
+    run(tmp_path, generator=frozen).save()
+    with pytest.raises(TrainingError, match=r"state: a run with other data; .* or give another --output"):
+        run(tmp_path, generator=frozen, data="frames:/b")
+    with pytest.raises(TrainingError, match="a run with other frozen weights;"):
+        run(tmp_path, generator=frozen, seed=1)
+    monkeypatch.setattr("accelerate.Accelerator.num_processes", 2)
+    with pytest.raises(TrainingError, match="a run with other number of processes;"):
+        run(tmp_path, generator=frozen)
+
+
+def test_the_deviation_of_a_resumed_run_is_not_measured_again(tmp_path: Path) -> None:
+    made = run(tmp_path)
+    made.generator.denoiser.deviation.copy_(torch.tensor([0.7, 0.4]))
+    made.save()
+    assert torch.equal(run(tmp_path).generator.denoiser.deviation, torch.tensor([0.7, 0.4]))
+
+
 def test_a_state_that_is_no_state_is_refused(tmp_path: Path) -> None:
-    made = run(tmp_path, steps=2)
-    (tmp_path / "state").mkdir()
-    (tmp_path / "state" / "config.json").write_text("{}")
+    made, file = run(tmp_path), tmp_path / "state" / "config.json"
+    made.save()
     assert checkpointing.has_state(made.output / "state")
-    with pytest.raises(TrainingError, match="expected the state of a training run"):
-        run(tmp_path, steps=2)
+    sound = json.loads(file.read_text())
+    changes: list[dict[str, Any]] = [{"step": step} for step in ("x", None, -5, True, 9)]
+    for change in ({"format": 2}, {"training": [1]}, *changes):
+        file.write_text(json.dumps({**sound, **change}))
+        with pytest.raises(
+            TrainingError, match=r"expected the state of a training run: .*; delete it, or give another"
+        ):
+            run(tmp_path)
+    file.write_text(json.dumps({**sound, "training": {**sound["training"], "clip": 1.0}}))
+    with pytest.raises(TrainingError, match="state: a run with other clip; resume with the same ones, or give another"):
+        run(tmp_path)
+
+
+def test_a_generator_that_is_frozen_is_refused(tmp_path: Path) -> None:
+    generator = Generator.from_config(config().generator).requires_grad_(False)
+    with pytest.raises(
+        TrainingError, match=r"got a generator that is frozen.*: call generator.denoiser.requires_grad_"
+    ):
+        Trainer(config(), frames(), generator, tmp_path, show=False)
+
+
+def test_another_precision_in_the_same_process_is_refused(tmp_path: Path) -> None:
+    run(tmp_path / "no")
+    with pytest.raises(TrainingError, match=r"precision=bf16: .*a process keeps its first precision; start another"):
+        run(tmp_path / "bf16", precision="bf16")
+
+
+def test_what_was_logged_before_a_stop_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = run(tmp_path)
+    made.done = 4
+    purged = []
+    monkeypatch.setattr(
+        "torch.utils.tensorboard.SummaryWriter.__init__", lambda *_, purge_step: purged.append(purge_step)
+    )
+    monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter.close", lambda *_: None)
+    made.train()
+    assert purged == [5]  # that step and later ones are deleted
 
 
 def test_the_average_follows_what_is_trained(tmp_path: Path) -> None:
@@ -249,12 +317,6 @@ def test_a_perceptual_term_needs_its_network(tmp_path: Path) -> None:
     """Else a resumed run would train without a term that its settings have."""
     with pytest.raises(TrainingError, match=r"expected VGG16 for the perceptual term, or loss.perceptual=0"):
         run(tmp_path, loss=LossConfig(perceptual=0.01))
-
-
-def test_the_settings_of_a_run_are_found_again(tmp_path: Path) -> None:
-    made = run(tmp_path, seed=7)
-    made.save()
-    assert checkpointing.saved_config(tmp_path / "state") == made.config
 
 
 def test_others_are_not_left_waiting_where_saving_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
