@@ -17,7 +17,7 @@ import torch
 from arbiview_aug.atomic_io import BROKEN_ARRAY, check_name, inside
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import hint, misnamed
-from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.lens import LENSES, BoolArray, canonical_name
 from arbiview_aug.cameras.plain_yaml import parse_json
 from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig, read_mask
 from arbiview_aug.cameras.validation import is_rigid
@@ -319,7 +319,8 @@ def _check_count(cameras: int, path: Path) -> None:
 def _calibration_of(entry: Mapping[str, Any]) -> dict[str, Any]:
     """Entries of a camera that decide the rig, without timestamps and files."""
     read = ("name", "width", "height", "K", "cam2ego", "distortion")
-    return {key: entry[key] for key in (*read, "lens", *misnamed(entry, read)) if key in entry}  # a lens is refused
+    has_lens = canonical_name(str(entry.get("lens"))) in LENSES  # which is refused; other words are notes
+    return {key: entry[key] for key in (*read, *["lens"] * has_lens, *misnamed(entry, read)) if key in entry}
 
 
 def _image_file(entry: Mapping[str, Any], frame: _Frame) -> Path:

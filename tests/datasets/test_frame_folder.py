@@ -214,7 +214,7 @@ def test_bad_calibrations(tmp_path: Path, change: Change, error: type[Exception]
     with pytest.raises(error, match=message) as raised:
         dataset[0]
     assert "broken" in str(raised.value)  # the frame is named, whatever went wrong
-    assert len(str(raised.value)) < 1000
+    assert len(str(raised.value).replace(str(tmp_path), "")) < 1000
 
 
 def test_mask_of_another_size(tmp_path: Path) -> None:
