@@ -126,8 +126,7 @@ def match(detections: Floats, boxes: Floats, state: npt.NDArray[np.uint8], count
     grid = Grid(cells=state.shape[-1])
     boxes = boxes[np.isfinite(boxes[:, 0])]
     known = real_boxes(boxes, state, counts)
-    cell = np.clip((detections[:, 1:3] + grid.side_m / 2) // grid.cell_m, 0, grid.cells - 1).astype(int)
-    there = counts[cell[:, 0], cell[:, 1]]
+    there = counts[cells_at(grid, detections[:, 1:3])]
     away = np.linalg.norm(detections[:, None, 1:3] - boxes[None, :, :2], axis=-1)
     found = np.zeros((len(detections), 1 + len(MATCH_M)))
     found[:, 0] = detections[:, 0]
@@ -147,8 +146,14 @@ def real_boxes(boxes: Floats, state: npt.NDArray[np.uint8], counts: npt.NDArray[
     """(n,) boxes that count: a camera sees them, and their centre is where it counts."""
     grid = Grid(cells=state.shape[-1])
     there = np.isfinite(boxes[:, 0])
-    cell = np.clip((np.nan_to_num(boxes[:, :2]) + grid.side_m / 2) // grid.cell_m, 0, grid.cells - 1).astype(int)
-    return np.asarray(there & counts[cell[:, 0], cell[:, 1]] & (state[cell[:, 0], cell[:, 1]] != HIDDEN))
+    cells = cells_at(grid, np.nan_to_num(boxes[:, :2]))
+    return np.asarray(there & counts[cells] & (state[cells] != HIDDEN))
+
+
+def cells_at(grid: Grid, places: Floats) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Rows and columns (n,) of the cells at places (n, 2), the nearest beyond the grid."""
+    cells = np.clip((places + grid.side_m / 2) // grid.cell_m, 0, grid.cells - 1).astype(np.int64)
+    return cells[:, 0], cells[:, 1]
 
 
 def average_precision(matched: Floats, positives: Floats, weights: Floats) -> Floats:

@@ -22,9 +22,11 @@ from torch import nn
 
 from arbiview_aug import JitteredCalibration, Rig
 from arbiview_aug.evaluate.report.tables import markdown_table
+from integrations.cross_rig.boxes import cells_at
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, content_hash, fill
 from integrations.cross_rig.experiment import Log, Run, counts_of, load_results, write_file
 from integrations.cross_rig.frames import make_frames, one_thread
+from integrations.cross_rig.labels import Grid
 from integrations.cross_rig.noise import noisy_depth
 from integrations.cross_rig.scoring import iou_scores
 from integrations.cross_rig.settings import Job, jobs
@@ -38,6 +40,8 @@ LEAST_SCORE = 0.3
 """Score of the detections that become boxes of the second pass."""
 LEAST_APART_M = 2.0
 """Distance of their centres: queries find a vehicle in several cells."""
+_FOUND = (LEAST_SCORE, LEAST_APART_M, "where cells count")
+"""What detections become boxes; part of the names of results."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +153,7 @@ def _views(setup: Run, detector: Trained, change: str, variant: Variant, split: 
         "target": a.content_key.hex(),
         "views": variant.views_spec(),
         # With the number of frames: those that fill the last chunk have the last one's boxes.
-        "detections": [detector.key, LEAST_SCORE, LEAST_APART_M, count] if "boxes_3d" in variant.reads else None,
+        "detections": [detector.key, _FOUND, count] if "boxes_3d" in variant.reads else None,
         "noise": code_hash("integrations.cross_rig.noise") if "depth_m" in variant.reads else None,
         "code": _rendering_code(),
     }
@@ -169,13 +173,16 @@ def _detections(setup: Run, detector: Trained, change: str, split: Split) -> lis
     """Boxes (k, 7) that a detector finds in each of B's frames as they are."""
     frames = setup.true_set(split, change)
     _, found = answers(detector.model, frames, setup.settings.count(split), detector.schedule)
-    return [distinct(boxes) for boxes in found]
+    return [distinct(boxes, frames.counts) for boxes in found]
 
 
-def distinct(detections: npt.NDArray[np.float32]) -> torch.Tensor:
-    """Boxes (k, 7) of the sure ones of a frame's detections (n, 8), strongest first; of near ones the strongest."""
+def distinct(detections: npt.NDArray[np.float32], counts: npt.NDArray[np.bool_]) -> torch.Tensor:
+    """Boxes (k, 7) of the sure ones of a frame's detections (n, 8), strongest first; of near ones the strongest.
+
+    A detector learned nothing of cells (cells, cells) that do not count, such as those of the own car.
+    """
     kept: list[npt.NDArray[np.float32]] = []
-    for found in detections[detections[:, 0] >= LEAST_SCORE]:
+    for found in detections[(detections[:, 0] >= LEAST_SCORE) & counts[cells_at(Grid(), detections[:, 1:3])]]:
         if all(np.hypot(*(found[1:3] - stronger[1:3])) >= LEAST_APART_M for stronger in kept):
             kept.append(found)
     return torch.from_numpy(np.reshape(kept, (-1, 8))[:, 1:].astype(np.float32))
@@ -213,7 +220,8 @@ def _tests(setup: Run, job: Job) -> Iterator[tuple[str | None, str, Way, Path]]:
             "code": _rendering_code(),
         }
         for title, way in rows_of(setup, change).items():
-            key = content_hash({**spec, "row": [asdict(way), LEAST_SCORE, LEAST_APART_M]})
+            found = _FOUND if way.variant is not None and "boxes_3d" in way.variant.reads else None
+            key = content_hash({**spec, "row": [asdict(way), found]})
             yield change, title, way, setup.output / "deploy" / f"{job.name}-{change or 'A'}-{key}.json"
 
 

@@ -95,8 +95,9 @@ def test_results_follow_what_made_them(tmp_path, monkeypatch):
         assert not set(before.values()) & set(paths(module).values())
     monkeypatch.setitem(ON_B, "street", ON_B["LiDAR"])
     assert {key[1] for key, path in paths().items() if path != before[key]} == {"street"}
-    monkeypatch.setattr(deploy, "LEAST_SCORE", 0.9)
-    assert not set(before.values()) & set(paths().values())
+    monkeypatch.setattr(deploy, "_FOUND", (0.9,))
+    of_detections = {title for title in ON_B if title.startswith("two passes")}
+    assert {key[1] for key, path in paths().items() if path != before[key]} == {"street", *of_detections}
 
 
 def test_frames_of_longer_runs_have_their_own_boxes(tmp_path, monkeypatch):
@@ -123,7 +124,8 @@ def test_command_takes_rows(capsys, tmp_path):
 
 def test_detections_of_one_vehicle_become_one_box():
     """Queries say a vehicle in several cells."""
-    found = np.zeros((4, 8), np.float32)
-    found[:, 0], found[:, 1] = (0.9, 0.8, 0.7, 0.2), (0.0, 1.5, 3.0, 9.0)
-    assert deploy.distinct(found)[:, 0].tolist() == [0.0, 3.0]
-    assert deploy.distinct(found[3:]).shape == (0, 7)
+    found, counts = np.zeros((5, 8), np.float32), np.ones((100, 100), bool)
+    found[:, 0], found[:, 1] = (0.9, 0.8, 0.7, 0.6, 0.2), (0.0, 1.5, 3.0, 6.0, 9.0)
+    counts[62] = False  # x of 6 m: the own car
+    assert deploy.distinct(found, counts)[:, 0].tolist() == [0.0, 3.0]
+    assert deploy.distinct(found[4:], counts).shape == (0, 7)
