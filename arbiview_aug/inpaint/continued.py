@@ -211,11 +211,11 @@ def _top_colour(paint: Colour | None, tops: Colour, white: float) -> Colour:
 def _brightest(values: Colour) -> Colour:
     """Colour (3,) of the brightest samples (n, 3): windows are darker than the paint around them."""
     level = values.max(1)  # saturated paint has little luminance
-    return np.asarray(np.median(values[level >= np.quantile(level, _PAINT_SHARE)], 0), np.float32)
+    return _quantile(values[level >= _quantile(level, _PAINT_SHARE)], 0.5)
 
 
 def _quantile(values: Colour, share: float) -> Colour:
-    """A quantile of samples (n, 3), channel by channel."""
+    """A quantile of samples (n, ...) along the first axis; numpy's own interpolates, and takes three times as long."""
     return np.asarray(np.sort(values, 0)[int(share * len(values))])
 
 

@@ -330,9 +330,6 @@ def beside(planes: Any, point: Any) -> float:
     return nearest
 
 
-_SCATTER = np.float32(8191)  # per metre: fractions of a millimetre choose points as a draw would
-
-
 @compiled
 def fit_profiles(
     boxes: Any, profiles: Any, fitting: Any, points: Any, within: Any, ends: Any, least: int, air: float, planes: Any,
@@ -355,14 +352,13 @@ def fit_profiles(
     some = np.empty(planes.shape[1:])
     for k in range(boxes.shape[0]):
         own_points = within[ends[k - 1] if k else 0 : ends[k]]
-        best, chosen, apart = np.inf, fitting[k, 0], 1 + own_points.shape[0] // 256
+        best, chosen = np.inf, fitting[k, 0]
         if fitting[k, -1] > chosen and own_points.shape[0] >= least:
             for number in range(chosen, fitting[k, -1] + 1):
                 planes_of(boxes[k], profiles[number], some)
                 total = 0.0
-                for i in own_points:  # about 256 of them, chosen by their place: their order tells nothing
-                    if int((points[i, 0] + points[i, 1] + points[i, 2]) * _SCATTER) % apart == 0:
-                        total += min(abs(beside(some, points[i])), 1.5 * air)
+                for i in own_points:
+                    total += min(abs(beside(some, points[i])), 1.5 * air)
                 if total < best - 1e-9:
                     best, chosen = total, number
         planes_of(boxes[k], profiles[chosen], planes[k])
