@@ -73,11 +73,11 @@ def kinds_text() -> str:
     return "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
 
 
-def add_data(parser: argparse.ArgumentParser, without: str | None = None) -> None:
+def add_data(parser: argparse.ArgumentParser, without: str | None = None, **options: Any) -> None:
     """Add ``--data``; ``without`` describes the data used without it, None makes it required."""
     default = "" if without is None else f" (default: {without})"
     text = f"real frames, by their path alone or with their kind. {kinds_text()}{default}"
-    parser.add_argument("--data", type=data, metavar="[KIND:]PATH", required=without is None, help=text)
+    parser.add_argument("--data", type=data, metavar="[KIND:]PATH", required=without is None, help=text, **options)
 
 
 def add_target(group: argparse._ActionsContainer, *, required: bool = False) -> None:

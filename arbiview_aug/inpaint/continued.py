@@ -245,20 +245,29 @@ def _fill(
     put_cells(sums, cell, (~seen).view(np.uint8), 0.5 if view.dtype == np.uint8 else 0.0, view)
 
 
-@lru_cache(32)  # of a rig, frame by frame
 def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
     """Directions (2, 2, n, n) in the image, x and y, of lines along the heading and vertical ones, as kernels read."""
     if camera is None:
         return np.array([(0, 0), (0, 1)], np.float32)[..., None, None].repeat(2, 2).repeat(2, 3)
-    (h, w), n = camera.size, 2 if camera.is_rectilinear else _LENS_NODES
-    at = np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, n), np.linspace(-0.5, h - 0.5, n)), -1)
-    if camera.is_rectilinear:
-        ends = (camera.K @ camera.cam2ego[:3:2, :3].T).T  # vanishing points, homogeneous
-        return np.array([[end[axis] - end[2] * at[..., axis] for axis in (0, 1)] for end in ends], np.float32)
-    rays = camera.unproject_cam(at).directions
+    if not camera.is_rectilinear:
+        return _bent_directions(camera)
+    at = _places(camera.size, 2)
+    ends = (camera.K @ camera.cam2ego[:3:2, :3].T).T  # vanishing points, homogeneous
+    return np.array([[end[axis] - end[2] * at[..., axis] for axis in (0, 1)] for end in ends], np.float32)
+
+
+@lru_cache(32)  # of a rig, frame by frame: it takes a millisecond
+def _bent_directions(camera: Camera) -> npt.NDArray[np.float32]:
+    rays = camera.unproject_cam(_places(camera.size, _LENS_NODES)).directions
     start = camera.project_cam(rays).uv
     moved = [camera.project_cam(rays + _MOVE * axis).uv - start for axis in camera.cam2ego[:3:2, :3]]
     return np.nan_to_num(np.moveaxis(np.stack(moved), -1, 1) / _MOVE, posinf=0, neginf=0).astype(np.float32, "C")
+
+
+def _places(size: tuple[int, int], n: int) -> npt.NDArray[np.float64]:
+    """(n, n, 2) pixels from edge to edge of a view (h, w)."""
+    h, w = size
+    return np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, n), np.linspace(-0.5, h - 0.5, n)), -1)
 
 
 def _road_below_horizon(camera: Camera | None, size: tuple[int, ...]) -> BoolArray:
