@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from integrations.cross_rig.boxes import cells_at
 from integrations.cross_rig.encoders import Residual, conv
 from integrations.cross_rig.labels import Grid
 from integrations.cross_rig.model import Answer, Heads
@@ -79,10 +80,10 @@ class PointSet:
     @staticmethod
     def joined(frames: Sequence[PointFrame]) -> PointBatch:
         """Frames as one batch."""
-        grid, cells = Grid(), frames[0].state.shape[0]
+        cells = frames[0].state.shape[0]
         points = np.concatenate([frame.points for frame in frames]).astype(np.float32)
         frame = np.repeat(np.arange(len(frames)), [len(one.points) for one in frames])
-        row, column = np.clip((points[:, :2] + grid.side_m / 2) // grid.cell_m, 0, cells - 1).astype(int).T
+        row, column = cells_at(Grid(cells=cells), points[:, :2])
         pillar = (frame * cells + row) * cells + column
         order = np.argsort(pillar, kind="stable")
         count = np.bincount(pillar, minlength=len(frames) * cells * cells)
