@@ -250,6 +250,9 @@ def _runs(pid: int) -> bool:
         return True
     except (ProcessLookupError, OverflowError):  # OverflowError: no process has such a number
         return False
+    with suppress(OSError):  # no /proc, or it has ended since
+        state = Path("/proc", str(pid), "stat").read_text(errors="replace").rpartition(")")[2].split()
+        return state[:1] not in (["Z"], ["X"])  # zombies have ended: not every container's init reaps them
     return True
 
 

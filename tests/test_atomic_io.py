@@ -68,18 +68,23 @@ def test_links_and_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_only_what_nobody_writes_is_removed(tmp_path: Path) -> None:
-    """A living process's files stay, a dead one's go; from elsewhere those of an owner that is ours alone."""
-    dead = subprocess.Popen([sys.executable, "-c", ""])
+    """A living process's files stay, a dead one's go; from elsewhere those of an owner that is ours alone.
+
+    A zombie's go, too: a worker that was killed with its parent, where no init reaps it.
+    """
+    dead, zombie = (subprocess.Popen([sys.executable, "-c", ""]) for _ in range(2))
     dead.wait()
+    os.waitid(os.P_PID, zombie.pid, os.WEXITED | os.WNOWAIT)
     host = atomic_io._host()
     mine, others, shared = (f".x.{owner}-{host}-{os.getpid()}-01234567.part" for owner in ("4", "5", ""))
-    left = f".x.-{host}-{dead.pid}-01234567.part"
+    left, unreaped = (f".x.-{host}-{process.pid}-01234567.part" for process in (dead, zombie))
     elsewhere, left_there = (f".x.{owner}-ffffffff-{dead.pid}-01234567.part" for owner in ("5", "4"))
     impossible = f".x.-{host}-{10**30}-01234567.part"
-    for name in (mine, others, shared, left, impossible, elsewhere, left_there, ".hidden.part", "x"):
+    for name in (mine, others, shared, left, unreaped, impossible, elsewhere, left_there, ".hidden.part", "x"):
         (tmp_path / name).write_bytes(b"")
     remove_parts(tmp_path, lambda owner: int(owner) % 2 == 0)
     assert set(names(tmp_path)) == {mine, others, shared, elsewhere, ".hidden.part", "x"}
+    zombie.wait()
 
 
 # --- names of a data set ----------------------------------------------------------------------------------------------
