@@ -138,7 +138,7 @@ def summary(report: Mapping[str, Any]) -> str:
         named = [name for name in variants if lone or name not in ("raw", "oracle")]
         for name in named:
             row = variants[name]
-            shown = [row] if lone else [variants["raw"], row, variants["oracle"]]
+            shown = [row] if lone else [variants[one] for one in ("raw", name, "oracle") if one in variants]
             table.append([row["title"] if lone else title if len(named) == 1 else f"{title}; {row['title']}"])
             table[-1] += [str(_samples_seen(report, change_name))]
             table[-1] += [", ".join(f"{100 * one['iou']['value']:.1f}" for one in shown), _share(row)]
