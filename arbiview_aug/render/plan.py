@@ -284,11 +284,11 @@ class ViewPlan:
     # (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; on request
     certainty: npt.NDArray[np.uint8] | None = None
     edge: BilinearFallback | None = None  # pixels that must not be read by cubics
-    # (h, w) uint8 layer of each pixel, for fillers; None if no pixel in a source's image is occluded
+    # (h, w) uint8 layer of each pixel, for fillers; None if all are ``BACKGROUND``
     layers: npt.NDArray[np.uint8] | None = None
     paint: Paint | None = None  # unseen parts of objects; None without ``layers`` or objects
     # (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the planner's nodes: one a pixel in
-    # small views; None without holes, or with sources at its own centre alone
+    # small views; None without holes, or where all is infinitely far away
     road: BoolArray | None = None
 
     @property

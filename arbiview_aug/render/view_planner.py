@@ -146,7 +146,7 @@ class ViewPlanner:
         self.corner_rays, self.node_rays = maps.of_lens(
             camera, self.step, lambda: np.stack([continued(self.rays.at(*corners)), self.rays.at(y, x)])
         )
-        self._geometries: dict[str, _Geometry] = {}
+        self._geometries: dict[tuple[Any, ...], _Geometry] = {}  # by name and window
         # Cells that sources elsewhere may change: none without a ray.
         self._open = _whole_cells(self.corner_rays.any(axis=0))
         self._wanted = None if wanted is None else some_of_cells(wanted, self.step)
@@ -201,18 +201,20 @@ class ViewPlanner:
         rays = self.node_rays.astype(np.float64)
         return np.moveaxis((self.camera.cam2ego[:3, :3] @ rays.reshape(3, -1)).reshape(rays.shape), 0, -1)
 
-    def _geometry(self, name: str) -> _Geometry:
-        if name in self._geometries:
-            return self._geometries[name]
+    def _geometry(self, name: str, cells: BoolArray) -> _Geometry:
+        """A surface in the window of some cells (ny, nx); beyond it all is infinitely far away."""
+        size = np.repeat(self.camera.size, 2)
+        rows, columns = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
+        ends = np.array([rows[0], rows[-1] + 1, columns[0], columns[-1] + 1]) * self.step
+        y0, y1, x0, x1 = np.minimum(ends + np.array([0, 1, 0, 1]), size).tolist()  # with the last nodes
+        key = name, y0, y1, x0, x1
+        if key in self._geometries:
+            return self._geometries[key]
         from arbiview_aug.render.kernels import depth_range
 
         surface: Any = self.scene.surface(name, self.ground_z_m)
         background = surface.background
         center, memory = self.camera.center_m, self.maps.memory
-        size = np.repeat(self.camera.size, 2)
-        rows, columns = (np.flatnonzero(self._open.any(axis)) for axis in (1, 0))
-        cells = np.array([rows[0], rows[-1] + 1, columns[0], columns[-1] + 1])
-        y0, y1, x0, x1 = np.minimum(cells * self.step, size).tolist()
         window = y0, x0, (y1 - y0, x1 - x0)
         is_whole = window[2] == self.camera.size
         camera, rays = self.camera if is_whole else self.camera.crop(*window), self.rays.crop(*window)
@@ -241,8 +243,8 @@ class ViewPlanner:
         if is_whole and (surface.is_layered or surface.is_dense):
             self.scene.images[name, self.camera.content_key] = q
         measured = q, face, *at_nodes, behind, nearest, farthest, uncertainty
-        self._geometries[name] = _Geometry(surface, *measured, apart, background.is_guess)
-        return self._geometries[name]
+        self._geometries[key] = _Geometry(surface, *measured, apart, background.is_guess)
+        return self._geometries[key]
 
     def _projection(self, source: Camera) -> tuple[Any, ...]:
         """Relative pose (2 arrays), lens and parameters of a source, as kernels read them."""
@@ -270,7 +272,7 @@ class ViewPlanner:
         source = self.sources[index]
         baseline_m, focal_px = self.baselines_m[index], float(self.camera.K[0, 0])
         name, reason = self._choose_surface(index)
-        geometry = self._geometry(name)
+        geometry = self._geometry(name, self._open)
         if geometry.apart[index]:
             return None
         A, o, kind, P = projection = self._projection(source)
@@ -385,35 +387,31 @@ class ViewPlanner:
         reports = tuple(self._reports(winner, won_px))
         if not self.config.layers:
             return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
-        is_whole = sum(won_px.values()) == winner.size
-        road = None if is_whole else self._road()
-        layers = None if is_whole or not hides else ((winner < 0) & (in_image > 0)).view(np.uint8)
-        if layers is None or not layers.any():
-            return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, road=road)
-        paint = self._mark_objects(winner, layers)
-        return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, layers, paint, road)
+        if sum(won_px.values()) == winner.size:
+            return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
+        layers = ((winner < 0) & (in_image > 0)).view(np.uint8) if hides else np.zeros(size, np.uint8)
+        name = self.scene.best if self.surface == "auto" else self.surface
+        paint = road = None
+        if name != "infinity":
+            geometry = self._geometry(name, np.ones_like(self._open))  # holes may lie where no other source looks
+            road = self._road(geometry.behind)
+            if geometry.face.size or layers.any():
+                paint = self._mark_objects(geometry, winner, layers)
+        marked = layers if layers.any() else None
+        return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, marked, paint, road)
 
-    @property
-    def _near(self) -> _Region | None:
-        """The first source elsewhere."""
-        return next((region for region in self.regions if region.surface != "infinity"), None)
-
-    def _road(self) -> BoolArray | None:
-        """The nodes (ny + 1, nx + 1) behind which the road lies; None without sources elsewhere."""
-        if self._near is None:
-            return None
-        behind = self._near.geometry.behind
+    def _road(self, behind: npt.NDArray[np.float32]) -> BoolArray:
+        """The nodes (ny + 1, nx + 1) behind which the road lies, by inverse distances of the background."""
         down = self._directions[..., 2] / np.maximum(behind, np.float32(1e-9))
         height_m = self.camera.center_m[2] - self.ground_z_m + down
         return np.asarray((height_m < ROAD_M) & (behind > 0))
 
-    def _mark_objects(self, winner: npt.NDArray[np.int8], layers: npt.NDArray[np.uint8]) -> Paint | None:
-        """Complete a view's layers where sources elsewhere show what is near."""
+    def _mark_objects(
+        self, geometry: _Geometry, winner: npt.NDArray[np.int8], layers: npt.NDArray[np.uint8]
+    ) -> Paint | None:
+        """Complete a view's layers by what is near."""
         from arbiview_aug.render.kernels import farthest_occluded, mark_objects
 
-        if self._near is None:
-            return None
-        geometry = self._near.geometry
         farthest = np.empty(self._open.shape, np.float32)
         farthest_occluded(geometry.q, geometry.face, layers, self.step, farthest)
         side = 2 * nearer_cells(self.camera.size, self.step) + 1

@@ -22,6 +22,7 @@ from arbiview_aug.render.plan import BACKGROUND, OBJECT, OCCLUDED, Paint
 from arbiview_aug.render.view_planner import build_plan, find_paint
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.boxes import PARTS, RIM_PART, TOP_PART
+from arbiview_aug.scene.scene import Scene
 from arbiview_aug.transforms.resize import CropRig, ResizeRig
 from tests.helpers import camera, ring, street_sample
 
@@ -148,6 +149,23 @@ def test_what_objects_hide_is_occluded_and_what_nobody_looks_at_is_not(street: d
         occluded = [view.layers == OCCLUDED for view in plan.targets if view.layers is not None]
         assert sum(int(part.sum()) for part in occluded) > 300
         assert not any(part[0].mean() > 0.5 for part in occluded)  # over the top edge nobody looks
+
+
+def test_holes_where_no_other_source_looks_show_road_and_objects() -> None:
+    """As if the cameras stood 5 cm ahead, where no source is exact: the target alone decides."""
+    size = (96, 160)
+    source = Rig([camera("front", size=size), camera("left", 60, size=size, position_m=(0.0, 0.5, 1.5))])
+    target = Rig([camera("turned", -40, size=size).turned(pitch_deg=-8)])
+    scene = Scene(boxes=np.array([(6.0, -3.0, 0.8, 4.2, 1.8, 1.6, 0.3)]))
+    (exact,), (ahead,) = (
+        build_plan(rig, target, geometry="boxes", scene=scene).targets for rig in (source, source.shifted(0.05))
+    )
+    assert exact.road is not None and 0.2 < exact.road.mean() < 0.8
+    np.testing.assert_array_equal(exact.road, ahead.road)
+    holes = ~exact.coverage & ~ahead.coverage
+    assert exact.layers is not None and exact.paint is not None and (exact.layers == OBJECT)[holes].sum() > 100
+    np.testing.assert_array_equal((exact.layers == OBJECT)[holes], (ahead.layers == OBJECT)[holes])
+    assert np.isin(np.flatnonzero((exact.layers == OBJECT) & ~exact.coverage), exact.paint.pixel).all()
 
 
 def test_plans_without_holes_hold_no_map_of_them() -> None:
