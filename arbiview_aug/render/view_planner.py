@@ -146,7 +146,7 @@ class ViewPlanner:
         self.corner_rays, self.node_rays = maps.of_lens(
             camera, self.step, lambda: np.stack([continued(self.rays.at(*corners)), self.rays.at(y, x)])
         )
-        self._geometries: dict[tuple[Any, ...], _Geometry] = {}  # by name and window
+        self._geometries: dict[str, _Geometry] = {}
         # Cells that sources elsewhere may change: none without a ray.
         self._open = _whole_cells(self.corner_rays.any(axis=0))
         self._wanted = None if wanted is None else some_of_cells(wanted, self.step)
@@ -201,20 +201,19 @@ class ViewPlanner:
         rays = self.node_rays.astype(np.float64)
         return np.moveaxis((self.camera.cam2ego[:3, :3] @ rays.reshape(3, -1)).reshape(rays.shape), 0, -1)
 
-    def _geometry(self, name: str, cells: BoolArray) -> _Geometry:
-        """A surface in the window of some cells (ny, nx); beyond it all is infinitely far away."""
-        size = np.repeat(self.camera.size, 2)
-        rows, columns = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
-        ends = np.array([rows[0], rows[-1] + 1, columns[0], columns[-1] + 1]) * self.step
-        y0, y1, x0, x1 = np.minimum(ends + np.array([0, 1, 0, 1]), size).tolist()  # with the last nodes
-        key = name, y0, y1, x0, x1
-        if key in self._geometries:
-            return self._geometries[key]
+    def _geometry(self, name: str) -> _Geometry:
+        """A surface where sources elsewhere may matter, infinity beyond; all of it where holes show it."""
+        if name in self._geometries:
+            return self._geometries[name]
         from arbiview_aug.render.kernels import depth_range
 
         surface: Any = self.scene.surface(name, self.ground_z_m)
         background = surface.background
         center, memory = self.camera.center_m, self.maps.memory
+        size = np.repeat(self.camera.size, 2)
+        rows, columns = (np.flatnonzero((self._open | self.config.layers).any(axis)) for axis in (1, 0))
+        cells = np.array([rows[0], rows[-1] + 1, columns[0], columns[-1] + 1])
+        y0, y1, x0, x1 = np.minimum(cells * self.step + np.array([0, 1, 0, 1]), size).tolist()  # with the last nodes
         window = y0, x0, (y1 - y0, x1 - x0)
         is_whole = window[2] == self.camera.size
         camera, rays = self.camera if is_whole else self.camera.crop(*window), self.rays.crop(*window)
@@ -243,8 +242,8 @@ class ViewPlanner:
         if is_whole and (surface.is_layered or surface.is_dense):
             self.scene.images[name, self.camera.content_key] = q
         measured = q, face, *at_nodes, behind, nearest, farthest, uncertainty
-        self._geometries[key] = _Geometry(surface, *measured, apart, background.is_guess)
-        return self._geometries[key]
+        self._geometries[name] = _Geometry(surface, *measured, apart, background.is_guess)
+        return self._geometries[name]
 
     def _projection(self, source: Camera) -> tuple[Any, ...]:
         """Relative pose (2 arrays), lens and parameters of a source, as kernels read them."""
@@ -272,7 +271,7 @@ class ViewPlanner:
         source = self.sources[index]
         baseline_m, focal_px = self.baselines_m[index], float(self.camera.K[0, 0])
         name, reason = self._choose_surface(index)
-        geometry = self._geometry(name, self._open)
+        geometry = self._geometry(name)
         if geometry.apart[index]:
             return None
         A, o, kind, P = projection = self._projection(source)
@@ -385,15 +384,13 @@ class ViewPlanner:
             fixed, bands = fixed.rounded(), tuple(replace(band, at=band.at.rounded()) for band in bands)
         edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
         reports = tuple(self._reports(winner, won_px))
-        if not self.config.layers:
-            return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
-        if sum(won_px.values()) == winner.size:
+        if not self.config.layers or sum(won_px.values()) == winner.size:
             return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
         layers = ((winner < 0) & (in_image > 0)).view(np.uint8) if hides else np.zeros(size, np.uint8)
         name = self.scene.best if self.surface == "auto" else self.surface
         paint = road = None
         if name != "infinity":
-            geometry = self._geometry(name, np.ones_like(self._open))  # holes may lie where no other source looks
+            geometry = self._geometry(name)
             road = self._road(geometry.behind)
             if geometry.face.size or layers.any():
                 paint = self._mark_objects(geometry, winner, layers)
