@@ -129,6 +129,7 @@ def outputs(sample: dict[str, Any]) -> Iterator[tuple[str, Any]]:
         out = RigRetarget(lifted, **settings | {"keys": keys})(sample)
         yield name, {key: value for key, value in out.items() if key != "sources"}
     yield "words", str(RigRetarget(lifted).explain(sample))
+    yield "turned", RigRetarget(rig.turned(yaw_deg=11.0, pitch_deg=-5.0))(sample)  # at the centres of A's cameras
     yield "waymo", RigRetarget(load_rig("waymo").resized((64, 96)), keys=SampleKeys(labels=labels))(sample)
     lenses = load_rig("fisheye_surround").resized((64, 96))
     yield "fisheye", RigRetarget(lenses, keys=SampleKeys(extra=ALL, labels=labels))(sample)
