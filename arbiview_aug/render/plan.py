@@ -261,8 +261,8 @@ class ViewPlan:
     interpolation: str = "linear"  # ``nearest``, ``linear`` or ``cubic``
     # (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; on request
     certainty: npt.NDArray[np.uint8] | None = None
-    # (n,) int64 pixels of the flattened view, ascending, that cubics would read outside the source or its mask: they are
-    # read bilinearly; None unless the view is cubic
+    # (n,) int64 pixels of the flattened view, ascending, that are read bilinearly, since cubics would reach outside the
+    # source or onto its mask; None unless the view is cubic
     edge: npt.NDArray[np.int64] | None = None
     # (h, w) uint8 layer of each pixel, for fillers; None if all are ``BACKGROUND``
     layers: npt.NDArray[np.uint8] | None = None
