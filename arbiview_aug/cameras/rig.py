@@ -51,7 +51,7 @@ class Rig:
         lidars: Scanners with different names, in the same frame; none by default.
 
     Raises:
-        CalibrationError: No cameras, duplicate names, or a ground height that is not finite.
+        CalibrationError: No cameras or more than 128, duplicate names, or a ground height that is not finite.
     """
 
     cameras: Sequence[Camera]
@@ -62,8 +62,9 @@ class Rig:
     def __post_init__(self) -> None:
         cameras = tuple(self.cameras) if isinstance(self.cameras, Iterable) else (self.cameras,)
         where = f"rig {self.name!r}" if self.name else "rig"
-        if not cameras:
-            raise CalibrationError(f"{where}: expected at least one camera, got none")
+        if not 0 < len(cameras) <= MOST_CAMERAS:
+            expected = f"at most {MOST_CAMERAS} cameras" if cameras else "at least one camera"
+            raise CalibrationError(f"{where}: expected {expected}, got {len(cameras) or 'none'}")
         lidars = tuple(self.lidars) if isinstance(self.lidars, Sequence) else (self.lidars,)
         sensors: tuple[Any, ...]
         for kind, sensors in ((Camera, cameras), (Lidar, lidars)):
@@ -239,8 +240,6 @@ class Rig:
         """
         if not isinstance(data, Mapping) or not isinstance(data.get("cameras"), list):
             raise CalibrationError(f"{where}: expected a mapping with a list 'cameras', got {type(data).__name__}")
-        if len(data["cameras"]) > MOST_CAMERAS:
-            raise CalibrationError(f"{where}: expected at most {MOST_CAMERAS} cameras, got {len(data['cameras'])}")
         _refuse_misnamed(data, "ground_z_m", where)
         cameras = [_camera_from_dict(entry, k, folder, where) for k, entry in enumerate(data["cameras"])]
         entries = data.get("lidars") or []

@@ -14,7 +14,8 @@ from arbiview_aug.atomic_io import BROKEN_ARRAY, file_name, inside, whole_file
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.datasets.drive import Neighbours
-from arbiview_aug.errors import DataError, SampleError
+from arbiview_aug.datasets.wrappers import checked_map_style
+from arbiview_aug.errors import DataError, SampleError, SampleTypeError
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY
 from arbiview_aug.scene.depth_map import motion_camera
@@ -117,11 +118,12 @@ class WithDepth(Dataset[dict[str, Any]]):
     Raises:
         DataError: On access, a file that is missing, broken or of another calibration.
         SampleError: On access, a sample without a token or rig.
+        SampleTypeError: A dataset that is not map-style, or, on access, a sample that is no mapping.
     """
 
     def __init__(self, dataset: Any, folder: str | Path, *, source: Rig | None = None, **unknown: Any) -> None:
         refuse_old_options("WithDepth", unknown)
-        self.dataset, self.source = dataset, source
+        self.dataset, self.source = checked_map_style(dataset, "WithDepth", "pass the dataset first"), source
         below = [inside(Path(folder), name, "depth") for name in FOLDERS.values()]
         self.folders = [DepthFolder(one) for one in below if one.is_dir()] or [DepthFolder(folder)]
 
@@ -129,7 +131,9 @@ class WithDepth(Dataset[dict[str, Any]]):
         return len(self.dataset)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        sample: Mapping[str, Any] = self.dataset[index]
+        sample: Any = self.dataset[index]
+        if not isinstance(sample, Mapping):
+            raise SampleTypeError(f"WithDepth: expected samples that are mappings, got {type(sample).__name__}")
         rig, token = sample.get("rig", self.source), sample.get("token")
         if rig is None or token is None:
             raise SampleError("sample: expected 'rig' and 'token', to find its depth by; pass source=")

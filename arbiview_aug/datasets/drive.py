@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal
 
@@ -88,9 +89,10 @@ class Neighbours:
     direction: Direction = "both"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.count, int) or isinstance(self.count, bool) or self.count < 1:
+        if not isinstance(self.count, int | np.integer) or isinstance(self.count, bool) or self.count < 1:
             raise ValueError(f"neighbours: count: expected a whole number from 1, got {self.count!r}")
-        if not isinstance(self.step_m, int | float) or not 0 < self.step_m < float("inf"):
+        is_number = isinstance(self.step_m, Real) and not isinstance(self.step_m, bool)
+        if not is_number or not 0 < self.step_m < float("inf"):
             raise ValueError(f"neighbours: step_m: expected metres above 0, got {self.step_m!r}")
         if self.direction not in ("both", "past", "future"):
             raise ValueError(f"neighbours: direction: expected both, past or future, got {self.direction!r}")

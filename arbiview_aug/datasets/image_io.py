@@ -66,9 +66,13 @@ def decode_images(
 
     Raises:
         DataError: A file that is missing, empty, truncated, undecodable or of another size, by camera and file.
+        ValueError: Another ``reduce``, or not as many names or sizes as files.
     """
     check_reduce(reduce)
     files = [Path(path) for path in paths]
+    for argument, given in (("names", names), ("sizes", sizes)):
+        if given is not None and len(given) != len(files):
+            raise ValueError(f"{argument}: expected one for each of {len(files)} images, got {len(given)}")
     labels = [f"camera {(names[k] if names else file.stem)!r}: image {file}" for k, file in enumerate(files)]
     headers = [read_header(file, label) for file, label in zip(files, labels, strict=True)]
     for (_, (h, w)), label, size in zip(headers, labels, sizes, strict=True) if sizes is not None else ():
@@ -150,6 +154,8 @@ def _header(data: bytes, label: str) -> tuple[str, tuple[int, int]]:
         raise DataError(f"{label}: expected a JPEG or PNG, got a file that begins with {data[:8]!r}")
     if not ended:
         raise DataError(f"{label}: expected a complete {format}, got a truncated file; copy it again")
+    if 0 in size:
+        raise DataError(f"{label}: expected an image, got a {format} of {size[1]}x{size[0]} pixels; write it again")
     # OpenCV keeps the upper 8 bits of 16, which are 0 where a sensor fills the lower ones.
     if format == "PNG" and (depth := _number(data, 24, 1)) > 8:
         fix = "scale it to 8 bits by the sensor's range, such as (image >> 4).astype('uint8') from 12"

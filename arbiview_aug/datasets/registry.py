@@ -51,10 +51,10 @@ READERS = {
     "nuscenes": Reader(
         "nuScenes root (with a folder of tables such as v1.0-mini)",
         lambda root: bool(table_folders(root)),
-        lambda root, version=None, **options: imported("arbiview_aug.datasets.nuscenes.reader:NuScenesDataset")(
-            root, version or table_folders(root)[0], **options
-        ),
-        options=("version",),
+        lambda root, version=None, clean_masks=False, **options: imported(
+            "arbiview_aug.datasets.nuscenes.reader:NuScenesDataset"
+        )(root, version or table_folders(root)[0], **options),
+        options=("version", "clean_masks"),  # there are no masks to clean
         writer="arbiview_aug.cli.convert.nuscenes:NuScenes",
     ),
     "py123d": Reader(
@@ -124,14 +124,15 @@ def open_data(
         version: nuScenes' folder of tables; by default v1.0-mini or v1.0-trainval, else the first one.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size.
         neighbours: Which other frames of the drive come with a sample; None for none.
-        clean_masks: As for ``FrameFolder``; nuScenes has no masks.
+        clean_masks: As for ``FrameFolder``; nuScenes has no masks, and py123d's logs refuse it.
 
     Raises:
-        DataError: There is no such folder, no reader fits it, the version is not for this kind, or it is empty.
+        DataError: There is no such folder, no reader fits it, an option is not for this kind, or it is empty.
     """
     root, reader = find_reader(data, kind, version=version)
-    further = {"version": version, "clean_masks": clean_masks}
-    options = {name: value for name, value in further.items() if value and name in reader.options}
+    options = {name: value for name, value in (("version", version), ("clean_masks", clean_masks)) if value}
+    if not options.keys() <= {*reader.options}:  # the version is checked already
+        raise DataError(f"data {root}: expected no clean_masks (--clean-masks), which a {reader.description} has not")
     recording = reader.open(root, reduce=reduce, neighbours=neighbours, **options)
     if not recording.tokens:
         raise DataError(f"data {root}: expected samples, got none; check the copy of the data")

@@ -31,7 +31,7 @@ class RetargetedDataset(Dataset[Any]):
     def __init__(self, dataset: Any, retarget: Retarget) -> None:
         name = type(self).__name__
         fix = "use RetargetedIterable" if hasattr(dataset, "__iter__") else "pass the dataset first"
-        self.dataset = _checked_map_style(dataset, name, fix)
+        self.dataset = checked_map_style(dataset, name, fix)
         self.retarget = _checked_retarget(retarget, name)
 
     def __len__(self) -> int:
@@ -74,7 +74,7 @@ class MixedDataset(Dataset[Any]):
     def __init__(self, raw: Any, retargeted: Any, share: float = 0.5) -> None:
         name = type(self).__name__
         self.raw, self.retargeted = (
-            _checked_map_style(dataset, name, "pass two that have __getitem__") for dataset in (raw, retargeted)
+            checked_map_style(dataset, name, "pass two that have __getitem__") for dataset in (raw, retargeted)
         )
         if len(raw) != len(retargeted):
             got = f"got {len(raw)} and {len(retargeted)}; take those that both have with torch.utils.data.Subset"
@@ -133,7 +133,8 @@ def _retargeted(retarget: Retarget, sample: Any, index: Any) -> Any:
         raise type(error)(f"sample {index}: {error}") from None
 
 
-def _checked_map_style(dataset: Any, name: str, fix: str) -> Any:
+def checked_map_style(dataset: Any, name: str, fix: str) -> Any:
+    """The dataset; SampleTypeError unless it is map-style, with a length."""
     if isinstance(dataset, IterableDataset) or not hasattr(dataset, "__getitem__"):
         raise SampleTypeError(f"{name}: expected a map-style dataset, got {type(dataset).__name__}; {fix}")
     if not hasattr(dataset, "__len__"):

@@ -63,6 +63,12 @@ class Diffusion(Inpainter, torch.nn.Module):
             made_for = f"steps={steps}: generator {config.name!r} was trained for one step; more add noise"
             _warn(config.name, f"{made_for}. Pass steps=1, or a model made for more")
 
+    def train(self, mode: bool = True) -> Diffusion:
+        """Leave the generator in evaluation mode: a transform in a model that trains still fills holes."""
+        super().train(mode)
+        self.generator.eval()
+        return self
+
     @property
     def needs_confidence(self) -> bool:
         return True

@@ -179,6 +179,10 @@ class Black(Inpainter):
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
         return list(rendered)
 
+    def complete_batch(self, batch: Mapping[str, Any]) -> dict[str, Any]:
+        """The batch without ``sources`` and ``generated``; what another inpainter filled is black again."""
+        return {key: value for key, value in super().complete_batch(batch).items() if key != "generated"}
+
 
 # --- holes ------------------------------------------------------------------------------------------------------------
 def holes_of(frame: RenderedFrame, min_confidence: float) -> tuple[list[torch.Tensor], list[torch.Tensor]]:

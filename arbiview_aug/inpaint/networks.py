@@ -9,6 +9,7 @@ import warnings
 from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,12 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         self.size, self.multiple, self.batch = size, multiple, batch
         self.calls = self.pixels = 0
 
+    def train(self, mode: bool = True) -> NetworkInpainter:
+        """Leave the network in evaluation mode: a transform in a model that trains still inpaints."""
+        super().train(mode)
+        self.network.eval()
+        return self
+
     @property
     def device(self) -> torch.device:
         """Device of the network's weights."""
@@ -89,7 +96,8 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         pixels = [telea(v, hole).float().cpu().numpy() / top for v, hole, top in zip(views, holes, tops, strict=True)]
         # Squares of NARROW_PX fit into what is left; the rest are cracks and edges.
         masks, square = [hole.cpu().numpy().astype(np.uint8) for hole in holes], np.ones((NARROW_PX,) * 2, np.uint8)
-        left = [cv2.morphologyEx(mask, cv2.MORPH_OPEN, square).astype(bool) for mask in masks]
+        border: Any = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}  # by default all beyond a view is a hole
+        left = [cv2.morphologyEx(mask, cv2.MORPH_OPEN, square, **border).astype(bool) for mask in masks]
         frame_of = np.repeat(np.arange(len(counts)), counts)
         for together in windows(left, self.size):
             # Frames share calls, but no canvas: a network sees all of it.
@@ -244,6 +252,14 @@ class TorchScriptInpainter(NetworkInpainter):
     ) -> None:
         network = load_torchscript(path, str(path), GeneratorError)
         super().__init__(network, size, multiple, batch, min_confidence=min_confidence)
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        settings = {name: getattr(self, name) for name in ("size", "multiple", "batch", "min_confidence")}
+        return partial(type(self), self.path, **settings), (), self.device  # scripts do not pickle: the file is read
+
+    def __setstate__(self, device: torch.device) -> None:
+        self.to(device)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         try:

@@ -36,12 +36,14 @@ def export_plan(plan: RenderPlan, path: str | Path) -> None:
         path: The file; its folder is created.
 
     Raises:
-        ValueError: Another ending, or no plan.
+        ValueError: Another ending, no name, or no plan.
         ImportError: ``.onnx`` without the package onnx.
         OutputError: A file that cannot be written.
     """
     if not isinstance(plan, RenderPlan):
         raise ValueError(f"plan: expected what RigRetarget.prepare returns, got {type(plan).__name__}")
+    if not isinstance(path, str | Path):
+        raise ValueError(f"path: expected a file's name, got {type(path).__name__}")
     path = Path(path)
     write = _WRITERS.get(path.suffix)
     if write is None:
@@ -79,8 +81,7 @@ def _view_arrays(view: ViewPlan) -> dict[str, Any]:
         second[place][reads], weight[place][reads] = band.at.to_float()[reads], band.weight[reads]
         second_source[place][reads] = band.source
     if view.edge is not None:
-        first.reshape(-1, 2)[view.edge.pixel] = view.edge.at.to_float()[0]
-        is_linear.reshape(-1)[view.edge.pixel] = True
+        is_linear.reshape(-1)[view.edge] = True
     return {
         "map_x": first[..., 0],
         "map_y": first[..., 1],
@@ -125,7 +126,9 @@ def _write_torchscript(plan: RenderPlan, file: BinaryIO) -> None:
 
 def _write_onnx(plan: RenderPlan, file: BinaryIO) -> None:
     optional_package("onnx", "export")
-    module, graph = PlanModule(plan).eval(), BytesIO()
+    module, graph, ending = PlanModule(plan).eval(), BytesIO(), "_view"
+    while {f"{name}{ending}" for name in plan.target.names} & {*plan.source.names}:
+        ending += "_view"  # inputs and outputs share their names in a graph
     torch.onnx.export(
         module,
         module.example,
@@ -133,7 +136,7 @@ def _write_onnx(plan: RenderPlan, file: BinaryIO) -> None:
         dynamo=False,
         opset_version=_OPSET,
         input_names=list(plan.source.names),
-        output_names=[f"{name}_view" for name in plan.target.names],
+        output_names=[f"{name}{ending}" for name in plan.target.names],
     )
     file.write(graph.getbuffer())
 

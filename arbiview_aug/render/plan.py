@@ -100,10 +100,6 @@ class FixedMap:
         """A map (h, w) that reads nothing."""
         return cls(memory.full((*size, 2), OUTSIDE, np.int16), memory.full(size, 0, np.uint16))
 
-    def part(self, rows: slice, columns: slice) -> FixedMap:
-        """A rectangle of it, the same memory."""
-        return FixedMap(self.xy[rows, columns], self.frac[rows, columns])
-
     def rounded(self) -> FixedMap:
         """The same map at the nearest whole pixels."""
         nearest = np.stack([(self.frac & 31) >= 16, (self.frac >> 5) >= 16], -1).astype(np.int16)
@@ -221,24 +217,6 @@ class BlendRegion:
     weight: npt.NDArray[np.float32]  # (h, w) its share, at most 0.5
 
 
-@dataclass(frozen=True)
-class BilinearFallback:
-    """Pixels of a cubic view that are read bilinearly, because cubics would reach outside the source or its mask."""
-
-    pixel: npt.NDArray[np.int64]  # (n,) into the flattened view, ascending
-    at: FixedMap  # (1, n) positions in the atlas
-
-    def rows(self, y0: int, y1: int, width: int) -> BilinearFallback:
-        """The pixels of rows y0 to y1, numbered from y0."""
-        a, b = np.searchsorted(self.pixel, (y0 * width, y1 * width))
-        return BilinearFallback(self.pixel[a:b] - y0 * width, self.at.part(slice(None), slice(a, b)))
-
-    @property
-    def nbytes(self) -> int:
-        """Memory in bytes."""
-        return self.pixel.nbytes + self.at.nbytes
-
-
 BACKGROUND, OCCLUDED, OBJECT = range(3)
 """Layers of a view's pixels: background that is seen, or outside all images; background that something hides; objects,
 and what is nearer than occluded background beside it."""
@@ -283,7 +261,9 @@ class ViewPlan:
     interpolation: str = "linear"  # ``nearest``, ``linear`` or ``cubic``
     # (h, w) ``confidence.certainty`` of the winning source in 255ths, 0 where uncovered; on request
     certainty: npt.NDArray[np.uint8] | None = None
-    edge: BilinearFallback | None = None  # pixels that must not be read by cubics
+    # (n,) int64 pixels of the flattened view, ascending, that are read bilinearly, since cubics would reach outside the
+    # source or onto its mask; None unless the view is cubic
+    edge: npt.NDArray[np.int64] | None = None
     # (h, w) uint8 layer of each pixel, for fillers; None if all are ``BACKGROUND``
     layers: npt.NDArray[np.uint8] | None = None
     paint: Paint | None = None  # unseen parts of objects; None without ``layers`` or objects

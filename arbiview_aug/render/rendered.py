@@ -21,7 +21,7 @@ from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import Scratch, interleaved, nearest_resized, resized, write_halved
 from arbiview_aug.render.confidence import confidence
 from arbiview_aug.render.harmonise import LEVELS, SHARES, Curves
-from arbiview_aug.render.plan import AtlasLayout, BilinearFallback, Paint, RenderPlan
+from arbiview_aug.render.plan import AtlasLayout, FixedMap, Paint, RenderPlan
 from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.sample.batching import barred, covered, framed, stacked
 from arbiview_aug.sample.inputs import Frame
@@ -81,7 +81,8 @@ def render_opencv(
             read_ahead(rows_of_bytes, 3 * atlas.itemsize, packed[rows], winner[rows])
             _remap(atlas, at.xy[rows], at.frac[rows], target.interpolation, dst=strip)
             if target.edge is not None:
-                _put_edge(target.edge.rows(y, y + _STRIP_ROWS, w), atlas, strip)
+                first, end = np.searchsorted(target.edge, (y * w, (y + _STRIP_ROWS) * w))
+                _put_edge(target.edge[first:end], at, atlas, buffer, rows)
         # Tone the views, not the sources: these have more pixels, and would have to be copied.
         if curves is not None:
             tone(buffer.reshape(-1), target.runs, tones, *scale)
@@ -100,14 +101,14 @@ def render_opencv(
     return [view.to(dtype) for view in views]
 
 
-def _put_edge(edge: BilinearFallback, atlas: np.ndarray, strip: np.ndarray) -> None:
-    """Read bilinearly where cubics would reach too far, and clip what cubics overshot in float images."""
-    if strip.dtype != np.uint8:
-        np.clip(strip, 0, 1, out=strip)
-    flat = strip.reshape(-1, 3)
-    for first in range(0, len(edge.pixel), _REMAP_COLUMNS):
-        some = slice(first, first + _REMAP_COLUMNS)
-        flat[edge.pixel[some]] = _remap(atlas, edge.at.xy[:, some], edge.at.frac[:, some], "linear")[0]
+def _put_edge(edge: np.ndarray, at: FixedMap, atlas: np.ndarray, view: np.ndarray, rows: slice) -> None:
+    """Read pixels of a view's rows bilinearly where cubics would reach too far, and clip what overshot in floats."""
+    if view.dtype != np.uint8:
+        np.clip(view[rows], 0, 1, out=view[rows])
+    flat, xy, frac = view.reshape(-1, 3), at.xy.reshape(-1, 2), at.frac.reshape(-1)
+    for first in range(0, len(edge), _REMAP_COLUMNS):
+        some = edge[first : first + _REMAP_COLUMNS]
+        flat[some] = _remap(atlas, xy[None, some], frac[None, some], "linear")[0]
 
 
 def _empty_views(plan: RenderPlan, dtype: torch.dtype) -> list[torch.Tensor]:

@@ -38,15 +38,14 @@ class ViewMaps:
     grid: torch.Tensor  # (h, w, 2) float32 positions in the winning source; outside the atlas where none sees
     source: torch.Tensor  # (h, w) int8 index of the winning source, -1 where none sees
     blend: Blend | None
-    edge: tuple[torch.Tensor, torch.Tensor] | None  # the view's ``BilinearFallback``: (n,) int64 and (1, n, 2) float32
-    interpolation: str  # as in ``ViewPlan``, like the next one
+    edge: torch.Tensor | None  # (n,) int64 as in ``ViewPlan``, like the next one
     certainty: torch.Tensor | None  # (h, w) uint8
 
     @property
     def nbytes(self) -> int:
         """Memory in bytes."""
         blend = () if self.blend is None else vars(self.blend).values()
-        tensors = self.grid, self.source, self.certainty, *(self.edge or ()), *blend
+        tensors = self.grid, self.source, self.certainty, self.edge, *blend
         return sum(tensor.nbytes for tensor in tensors if tensor is not None)
 
 
@@ -62,12 +61,11 @@ def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
 def _view_maps(plan: RenderPlan, target: ViewPlan, device: torch.device) -> ViewMaps:
     atlas_size = plan.layout.size
     source = torch.from_numpy(target.source_camera).to(device)
-    certainty = None if target.certainty is None else torch.from_numpy(target.certainty).to(device)
-    edge = None
-    if target.edge is not None:
-        edge = torch.from_numpy(target.edge.pixel).to(device), _grid(target.edge.at.to_float(), atlas_size, device)
+    edge, certainty = (
+        None if one is None else torch.from_numpy(one).to(device) for one in (target.edge, target.certainty)
+    )
     grid, blend = _grid(target.at.to_float(), atlas_size, device), _blend(target, atlas_size, device)
-    return ViewMaps(grid, source, blend, edge, target.interpolation, certainty)
+    return ViewMaps(grid, source, blend, edge, certainty)
 
 
 def _blend(target: ViewPlan, atlas_size: tuple[int, int], device: torch.device) -> Blend | None:
@@ -104,7 +102,8 @@ def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
             pieces.append(_padded(image, right - left - slot.size[1], slot.y - y, 0))
             y = slot.y + slot.size[0]
         parts.append(_padded(torch.cat(pieces, 2), 0, 0, rows - y))
-    return (parts[0] if len(parts) == 1 else torch.cat(parts, 3)).float()
+    atlas = (parts[0] if len(parts) == 1 else torch.cat(parts, 3)).float()
+    return torch.nn.functional.pad(atlas, (edges[0], 0)) if edges[0] else atlas  # no view reads the first column
 
 
 def _padded(image: torch.Tensor, right: int, above: int, below: int) -> torch.Tensor:
@@ -155,24 +154,21 @@ def render_torch(
     tones: Callable[..., torch.Tensor] | None = None
     curved = next((of_frame for of_frame in curves or () if of_frame is not None), None)
     views = []
-    for number, maps in enumerate(maps_on(plan, device)):
+    for number, (target, maps) in enumerate(zip(plan.targets, maps_on(plan, device), strict=True)):
         if curves is not None and curved is not None:
             as_recorded = np.ones_like(curved[number])
             of_view = np.stack([as_recorded if of_frame is None else of_frame[number] for of_frame in curves])
             of_rows = of_view.reshape(len(curves), len(images), -1, 2)
             tones = partial(_toned, curves=torch.from_numpy(of_rows).float().to(device), top=top)
-        view = _sample(atlas, maps.grid, maps.interpolation)
+        view = _sample(atlas, maps.grid, target.interpolation)
         if maps.edge is not None:
-            pixel, grid = maps.edge
-            at_edge = _sample(atlas, grid, "linear")[:, :, 0]
-            view = view.clamp(0, top).flatten(2).index_copy(2, pixel, at_edge).view_as(view)
+            at_edge = _sample(atlas, maps.grid.view(-1, 2)[maps.edge][None], "linear")[:, :, 0]
+            view = view.clamp(0, top).flatten(2).index_copy(2, maps.edge, at_edge).view_as(view)
         if tones is not None:
             view = tones(view, maps.source.long(), torch.arange(len(maps.source), device=device)[:, None])
         change = view.new_zeros(view.shape[0], *view.shape[2:])
         if maps.blend is not None:
-            # Never by cubics: a mean of two sources is no sharper for it.
-            how = "linear" if maps.interpolation == "cubic" else maps.interpolation
-            view = _blended(view, atlas, maps.blend, how, tones, change)
+            view = _blended(view, atlas, maps.blend, target.seam_interpolation, tones, change)
         if seams is not None:
             seams.append(change)
         views.append(view.round().clamp(0, 255).to(dtype) if dtype == torch.uint8 else view.to(dtype))

@@ -37,7 +37,6 @@ from arbiview_aug.render.plan import (
     NEARER,
     ROAD_M,
     AtlasLayout,
-    BilinearFallback,
     FixedMap,
     Paint,
     RenderConfig,
@@ -448,7 +447,7 @@ class ViewPlanner:
         most = 2 * won > sum(won_px.values())
         return "cubic" if most and total <= MAGNIFIED * won else "linear"
 
-    def _edge(self, fixed: FixedMap, winner: npt.NDArray[np.int8], layout: AtlasLayout) -> BilinearFallback:
+    def _edge(self, fixed: FixedMap, winner: npt.NDArray[np.int8], layout: AtlasLayout) -> npt.NDArray[np.int64]:
         """The pixels whose cubics, 4 x 4 pixels from one before ``fixed.xy``, leave the source or touch its mask."""
         edge = np.zeros(winner.shape, np.uint8)
         for region in self.regions:
@@ -463,9 +462,7 @@ class ViewPlanner:
                 at = fixed.xy - np.array([slot.x, slot.y], np.int16)
                 inside &= cv2.remap(clean, at, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
             cv2.bitwise_or(edge, cv2.bitwise_and(own_pixels, cv2.bitwise_not(inside)), dst=edge)
-        y, x = np.nonzero(edge)
-        there = FixedMap(fixed.xy[y, x][None], fixed.frac[y, x][None])
-        return BilinearFallback(y.astype(np.int64) * winner.shape[1] + x, there)
+        return np.flatnonzero(edge)
 
     def _reports(self, winner: npt.NDArray[np.int8], won_px: Counter[int]) -> Iterator[SourceUse]:
         """Summaries of the sources that win any pixel, largest share first."""

@@ -14,7 +14,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
-from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import KEYS
 from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
@@ -237,8 +237,6 @@ def frame_from(
         rig = source if source is not None else _rig_from_tensors(images, sample, index)
     if not isinstance(rig, Rig):
         raise SampleTypeError(f"rig: expected an arbiview_aug.Rig, got {type(rig).__name__}; use load_rig(path)")
-    if len(rig) > MOST_CAMERAS:
-        raise SampleError(f"images: expected at most {MOST_CAMERAS} cameras, got {len(rig)}")
     if len(rig) != len(images):
         raise SampleError(f"images: expected {len(rig)} images for cameras {', '.join(rig.names)}, got {len(images)}")
     for camera, image in zip(rig, images, strict=True):

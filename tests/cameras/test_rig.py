@@ -37,6 +37,7 @@ def rig_with_everything() -> Rig:
     [
         ({"cameras": []}, r"rig 'b': expected at least one camera, got none"),
         ({"cameras": [camera(), camera()]}, r"rig 'b': expected different camera names, got front more than once"),
+        ({"cameras": [camera()] * 129}, r"rig 'b': expected at most 128 cameras, got 129"),  # winners are int8
         ({"cameras": 5}, r"rig 'b': expected Camera objects, got int"),
         ({"cameras": [np.eye(3)]}, r"rig 'b': expected Camera objects, got ndarray"),
         ({"cameras": [camera()], "ground_z_m": np.nan}, r"rig 'b': ground_z_m: expected a finite height in metres"),

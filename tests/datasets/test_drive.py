@@ -3,6 +3,7 @@
 import json
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -36,11 +37,17 @@ def test_frames_are_picked_by_distance(wanted: Neighbours, expected: list[int]) 
 
 
 @pytest.mark.parametrize(
-    "bad", [{"count": 0}, {"count": 1.5}, {"step_m": 0}, {"step_m": np.nan}, {"step_m": "1"}, {"direction": "up"}]
+    "bad",
+    [
+        *({"count": value} for value in (0, 1.5, True)),
+        *({"step_m": value} for value in (0, np.nan, "1", True)),
+        {"direction": "up"},
+    ],
 )
 def test_settings_are_checked(bad: dict) -> None:
     with pytest.raises(ValueError, match="neighbours: "):
         Neighbours(**bad)
+    assert Neighbours(count=np.int64(2), step_m=np.float32(1.5)).count == 2
 
 
 def test_standing_still_has_no_neighbours() -> None:
@@ -115,6 +122,17 @@ def test_a_synthetic_drive_has_points_of_its_neighbours() -> None:
     assert len(apart_m) > 50 and np.median(apart_m) < 0.25 and apart_m.min() > 0
     without = SyntheticDrive(drive.rig, num_frames=1, lidar=False, neighbours=drive.neighbours)[0]
     assert "points" not in without["neighbours"][0]
+
+
+def test_the_world_of_a_synthetic_drive_has_its_road_at_0() -> None:
+    """Rigs whose roads lie elsewhere in their ego frames agree in the world's."""
+    rig = replace(demo_source_rig(SIZE), ground_z_m=-0.33)
+    drive = SyntheticDrive(rig, num_frames=1, lidar=False, neighbours=Neighbours())
+    sample = drive[0]
+    pose = sample["ego2world"].numpy()
+    world = sample["boxes_3d"].numpy()[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    assert np.allclose(world, drive.scene(0).boxes[:, :3], atol=1e-4)
+    assert sample["neighbours"][0]["ego2world"][2, 3] == pose[2, 3]
 
 
 def test_neighbours_change_no_scene() -> None:

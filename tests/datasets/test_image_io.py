@@ -158,6 +158,12 @@ def without_tables(data: bytes) -> bytes:
     return data[: table + 5] + b"\xff" * 16 + data[table + 21 :]
 
 
+def without_rows(data: bytes) -> bytes:
+    """A JPEG may leave its height to a later marker, which OpenCV does not read."""
+    header = data.find(b"\xff\xc0")
+    return data[: header + 5] + bytes(2) + data[header + 7 :]
+
+
 def sixteen_bits(data: bytes) -> bytes:
     """Ten of them, as sensors give: OpenCV would make it black."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
@@ -173,11 +179,12 @@ def sixteen_bits(data: bytes) -> bytes:
         (".jpg", lambda data: b"", "got an empty file"),
         (".jpg", lambda data: b"<html>404</html>", "expected a JPEG or PNG, got a file that begins with b'<html>40'"),
         (".jpg", lambda data: half(data) + bytes(len(data) - len(half(data))), "truncated file"),
+        (".jpg", without_rows, "expected an image, got a JPEG of 160x0 pixels"),
         (".jpg", without_tables, "got a JPEG that cannot be decoded"),
         (".png", one_byte_off, "got a PNG that cannot be decoded"),
         (".png", sixteen_bits, "expected 8 bits a channel, got a PNG of 16; scale it to 8 bits"),
     ],
-    ids=["missing", "folder", "pipe", "empty", "HTML", "zeros", "no tables", "one byte", "16 bits"],
+    ids=["missing", "folder", "pipe", "empty", "HTML", "zeros", "no rows", "no tables", "one byte", "16 bits"],
 )
 @pytest.mark.timeout(20)
 def test_bad_files(tmp_path: Path, suffix: str, damage: Callable[[Any], Any] | None, message: str) -> None:
@@ -236,3 +243,9 @@ def test_size_that_is_not_the_calibrations(jpeg: Path) -> None:
         decode_images([jpeg], sizes=[(100, 200)])
     with pytest.raises(DataError, match="width and height look swapped"):
         decode_images([jpeg], sizes=[(160, 90)], reduce=2)
+
+
+@pytest.mark.parametrize("given", [{"names": ["front"]}, {"sizes": [(90, 160)]}])
+def test_names_and_sizes_are_one_for_each_image(jpeg: Path, given: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"{next(iter(given))}: expected one for each of 2 images, got 1"):
+        decode_images([jpeg, jpeg], **given)

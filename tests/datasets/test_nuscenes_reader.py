@@ -247,7 +247,9 @@ def test_broken_tables(tmp_path: Path, change: Change, message: str) -> None:
         ({"channels": ["CAM_FRONT"] * 2}, DataError, "channels: expected each once, got 'CAM_FRONT', 'CAM_FRONT'"),
         ({"channels": ["CAM_FRONT", "CAM_TOP"]}, DataError, "expected some of CAM_BACK, CAM_FRONT, got 'CAM_TOP'"),
         ({"split_scenes": ["scene-1", "scene-9"]}, DataError, "table scene: expected the scenes scene-9, got 2 others"),
-        ({"split_scenes": "scene-1"}, DataError, "split_scenes: expected a collection of scene names"),
+        ({"split_scenes": "scene-1"}, DataError, r"split_scenes: expected a collection of names such as \['scene-1'\]"),
+        ({"split_scenes": [3]}, DataError, "table scene: expected the scenes 3, got 2 others"),
+        ({"channels": "CAM_FRONT"}, DataError, r"channels: expected .* such as \['CAM_FRONT'\], got 'CAM_FRONT'"),
         ({"reduce": 3}, ValueError, "reduce: expected 1, 2 or 4"),
     ],
 )

@@ -117,3 +117,9 @@ def test_refused(data: str, kind: str | None, message: str, tmp_path: Path, monk
     monkeypatch.chdir(tmp_path)
     with pytest.raises(DataError, match=message):
         open_data(data, kind=kind)
+
+
+def test_masks_that_no_reader_cleans(tmp_path: Path) -> None:
+    (tmp_path / "sync.arrow").touch()
+    with pytest.raises(DataError, match=r"expected no clean_masks \(--clean-masks\), which a folder of py123d's logs"):
+        open_data(tmp_path, clean_masks=True)

@@ -86,7 +86,8 @@ def test_rays_drop_far_away_and_at_grazing_incidence() -> None:
 
 
 def test_scan_errors_are_checked() -> None:
-    for change in ({"noise_m": -1}, {"divergence_deg": 9}, {"echo": "all"}, {"reach_m": 0}, {"noise_m": float("nan")}):
+    wrong = {"noise_m": (-1, float("nan"), "0.02"), "divergence_deg": (9,), "echo": ("all",), "reach_m": (0, None)}
+    for change in ({name: value} for name, values in wrong.items() for value in values):
         with pytest.raises(ValueError, match=f"scan errors: {next(iter(change))}: expected"):
             ScanErrors(**change)
 

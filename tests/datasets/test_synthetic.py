@@ -1,6 +1,7 @@
 """SyntheticDrive: the sample's contract, determinism, lenses, antialiasing."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,9 @@ from torch.utils.data import DataLoader
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import (
+    BoxClass,
     SceneClass,
     SyntheticDrive,
     dataset,
@@ -18,6 +21,7 @@ from arbiview_aug.datasets.synthetic import (
     ground,
     make_scene,
     raycast,
+    render,
 )
 from arbiview_aug.datasets.synthetic.materials import MATERIALS, Surface, band, noise, pulses
 from arbiview_aug.datasets.synthetic.raycast import cast
@@ -153,6 +157,8 @@ def test_pickles_small(drive):
         ({"num_frames": 2.5}, ValueError, "num_frames"),
         ({"seed": -1}, ValueError, "seed: expected a whole number from 0"),
         ({"supersampling": 0}, ValueError, "supersampling"),
+        ({"lidar": "none"}, TypeError, r"lidar: expected True, False or ScanErrors\(...\), got 'none'"),
+        ({"device": "foo"}, ValueError, "device: expected cpu, cuda or cuda:1, got 'foo'"),
     ],
 )
 def test_bad_arguments_are_named(changes, error, message):
@@ -298,3 +304,28 @@ def test_tensors_are_made_on_the_device():
         surface = [scene, vector, vector, vector, row, vector, vector, number, number, vector, torch.zeros(n, 4), row]
         outs += [material(Surface(*surface)) for material in MATERIALS.values()]
     assert all(tensor.device.type == "meta" for tensor in outs)
+
+
+def test_another_default_device_changes_nothing(drive):
+    with torch.device("meta"):
+        sample = SyntheticDrive(drive.rig, num_frames=1, neighbours=Neighbours())[0]
+    assert torch.equal(sample["images"], drive[0]["images"]) and torch.equal(sample["points"], drive[0]["points"])
+    assert sample["ego2world"].device.type == "cpu"
+
+
+def test_large_rays_leave_the_cache():
+    """Rays are kept by their size: those of few large cameras, but of all small ones."""
+    renderer, large = Renderer(), render.CameraRays(*[torch.empty(1).expand(1 << 24)] * 6)
+    for k in range(3):
+        renderer._rays.get(bytes([k]), lambda: large)
+    assert len(renderer._rays) == 1
+
+
+@pytest.mark.parametrize("kind", BoxClass)
+def test_only_vehicles_close_off_the_ground(kind):
+    """Nearly no sky reaches the road in the middle of a vehicle; half does under people and two-wheelers."""
+    scene, box = make_scene(0, 0), np.array([[0.0, 0.0, 0.8, 4.0, 2.0, 1.6, 0.0]])
+    scene = replace(scene, boxes=box, box_classes=np.array([kind]), light=replace(scene.light, sun_strength=0.0))
+    sky = ground.light_map(scene)[0]
+    middle = sky[sky.shape[0] // 2, sky.shape[1] // 2]
+    assert middle == pytest.approx(0.14 if kind < BoxClass.PEDESTRIAN else 0.5, abs=0.01)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, IterableDataset, Subset, get_worker_info
 
-from arbiview_aug.datasets import MixedDataset, RetargetedDataset, RetargetedIterable
+from arbiview_aug.datasets import MixedDataset, RetargetedDataset, RetargetedIterable, WithDepth
 from arbiview_aug.errors import DataError, SampleError, SampleTypeError
 
 
@@ -113,6 +113,8 @@ UNSIZED = type("Unsized", (), {"__getitem__": lambda self, k: k})()
         (RetargetedDataset, add_ten, Numbers(), "expected a map-style dataset, got function; pass the dataset first"),
         (RetargetedDataset, Numbers(), "waymo", "expected a callable such as RigRetarget, got str"),
         (RetargetedDataset, UNSIZED, add_ten, "with __len__, got Unsized"),
+        (WithDepth, 5, "folder", "WithDepth: expected a map-style dataset, got int; pass the dataset first"),
+        (lambda *given: WithDepth(*given)[0], [1], "folder", "expected samples that are mappings, got int"),
         (RetargetedIterable, Numbers(), add_ten, "expected an iterable dataset, got Numbers; use RetargetedDataset"),
         (RetargetedIterable, iter([1]), add_ten, "iterated again, got list_iterator, which ends after one epoch"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, load_inpainter
-from arbiview_aug.inpaint import CompletedLoader, PipelineInpainter, TorchScriptInpainter
+from arbiview_aug.inpaint import Black, CompletedLoader, PipelineInpainter, TorchScriptInpainter
 from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.inputs import read_frames
@@ -142,9 +143,34 @@ def test_frames_share_calls_but_no_canvas(lama: Path) -> None:
 def test_cracks_cost_no_call(lama: Path) -> None:
     filler = TorchScriptInpainter(lama, size=64)
     view, hole = torch.rand(3, 64, 64), torch.zeros(64, 64, dtype=torch.bool)
-    hole[20:24], hole[:, 40:44] = True, True
+    hole[20:24], hole[:, 40:44], hole[:4], hole[:, -3:] = True, True, True, True  # at the view's edges too
     (done,) = filler.inpaint([view], [hole], [0])
     assert filler.calls == 0 and torch.equal(done, telea(view, hole))
+
+
+@pytest.mark.parametrize("kind", ["script", "diffusion"])
+def test_a_network_stays_in_evaluation_mode(lama: Path, kind: str) -> None:
+    filler = TorchScriptInpainter(lama, size=64) if kind == "script" else Diffusion()
+    model = nn.ModuleList([RigRetarget("waymo", holes=filler)]).train()
+    assert model[0].training
+    network = filler.network if kind == "script" else filler.generator
+    assert not any(part.training for part in network.modules())
+
+
+def test_a_script_can_be_sent_to_workers(lama: Path) -> None:
+    filler = TorchScriptInpainter(lama, size=32, batch=2, min_confidence=0.5)
+    again = pickle.loads(pickle.dumps(filler))
+    assert (again.size, again.multiple, again.batch, again.min_confidence) == (32, 8, 2, 0.5)
+    view, hole = torch.rand(3, 40, 40), torch.zeros(40, 40, dtype=torch.bool)
+    hole[10:20, 10:20] = True
+    assert torch.equal(again.inpaint([view], [hole], [0])[0], filler.inpaint([view], [hole], [0])[0])
+
+
+def test_black_holes_are_not_generated(drive: SyntheticDrive) -> None:
+    retarget = RigRetarget(drive.rig.shifted(z_m=0.5), holes="black", keys=SampleKeys(extra=("sources", "confidence")))
+    seen = retarget(drive[0])
+    done = Black().complete_batch(seen)
+    assert "generated" not in done and torch.equal(done["images"], seen["images"])
 
 
 @pytest.mark.slow

@@ -316,7 +316,7 @@ def test_cubics_do_not_reach_beyond_a_source_or_onto_its_mask(execution: str) ->
         image[:, torch.from_numpy(~mask)] = 255 - image[0, 0, 0]
     plan = build_plan(rig, zoomed(rig, 1.3).turned(yaw_deg=20), geometry="infinity", config=RenderConfig(seam_width=0))
     for view, target in zip(by(execution, plan, images), plan.targets, strict=True):
-        assert target.interpolation == "cubic" and target.edge is not None and len(target.edge.pixel) > 50
+        assert target.interpolation == "cubic" and target.edge is not None and len(target.edge) > 50
         assert len(target.sources) > 1 and not target.coverage.all()
         for source in target.sources:
             won = view[:, torch.from_numpy(target.source_camera == source)]

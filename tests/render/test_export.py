@@ -99,12 +99,25 @@ def test_readers_give_the_views(file: str, case: str, tmp_path: Path) -> None:
         assert np.abs(view.astype(int) - of_transform.numpy()).max() <= 1
 
 
+def test_a_source_named_like_a_view(tmp_path: Path) -> None:
+    """Names of inputs and outputs differ, also where a source is called as a target's output would be."""
+    onnx = pytest.importorskip("onnx")
+    source = rig((40, 70), (0.0,))
+    source = source.with_cameras([replace(source[0], name="front_view")])
+    target = source.with_cameras([replace(source[0], name="front")])
+    export_plan(RigRetarget(target, geometry="street").prepare(source), tmp_path / "plan.onnx")
+    graph = onnx.load(str(tmp_path / "plan.onnx")).graph
+    assert [entry.name for of in (graph.input, graph.output) for entry in of] == ["front_view", "front_view_view"]
+
+
 def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
     plan = RigRetarget(CASES["seams"][1], geometry="street").prepare(CASES["seams"][0])
     with pytest.raises(ValueError, match=r"plan\.txt: expected a name ending in \.npz, \.onnx, \.pt, got '\.txt'"):
         export_plan(plan, "plan.txt")
     with pytest.raises(ValueError, match=r"plan: expected what RigRetarget\.prepare returns, got RigRetarget"):
         export_plan(RigRetarget("waymo"), "plan.npz")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"path: expected a file's name, got NoneType"):
+        export_plan(plan, None)  # type: ignore[arg-type]
     (tmp_path / "file").touch()
     with pytest.raises(OutputError):
         export_plan(plan, tmp_path / "file" / "plan.npz")

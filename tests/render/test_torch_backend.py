@@ -37,6 +37,8 @@ def test_images_lie_in_their_slots_halved_as_asked(dtype: torch.dtype, halved: f
     assert atlas.dtype == torch.float32 and tuple(atlas.shape[2:]) == layout.size
     assert torch.equal(atlas[..., :4], image.float())
     assert (atlas[:, :, 0, 4:6] == halved).all() and not atlas[:, :, 1, 4:].any()
+    beside = _fill_atlas(AtlasLayout((Slot(1, 0, 0, 3, (2, 4)),)), [image, image])  # none is read at column 0
+    assert torch.equal(beside, torch.nn.functional.pad(image.float(), (3, 0)))
     assert _fill_atlas(AtlasLayout(()), [image]).tolist() == [[[[0]]] * 3]
 
 

@@ -222,14 +222,18 @@ def _chosen_samples(tables: Tables, split_scenes: Iterable[str] | None) -> list[
     tables.follow("sample", samples, "scene_token", "scene", scenes)
     if split_scenes is None:
         return samples
-    if isinstance(split_scenes, str):
-        raise DataError(f"split_scenes: expected a collection of scene names, got the string {split_scenes!r}")
+    _refuse_text("split_scenes", split_scenes)
     wanted = set(split_scenes)
     names = dict(zip(scenes, tables.column("scene", [*scenes.values()], "name", TEXTS), strict=True))
-    unknown = sorted(wanted - set(names) - set(names.values()))
+    unknown = sorted(map(str, wanted - set(names) - set(names.values())))
     if unknown:
         raise tables.error("scene", f"the scenes {', '.join(unknown[:5])}", f"{len(names)} others")
     return [row for row in samples if row["scene_token"] in wanted or names[row["scene_token"]] in wanted]
+
+
+def _refuse_text(option: str, names: Any) -> None:
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise DataError(f"{option}: expected a collection of names such as [{str(names)!r}], got {names!r}")
 
 
 def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str]:
@@ -243,6 +247,7 @@ def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str
         chosen = [channel for channel in CAMERA_RING if channel in cameras]
         chosen += sorted(cameras - set(CAMERA_RING))
     else:
+        _refuse_text("channels", channels)
         chosen = list(channels)
     unknown = [channel for channel in chosen if channel not in cameras]
     if len(set(chosen)) < len(chosen):

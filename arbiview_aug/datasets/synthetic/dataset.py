@@ -74,8 +74,8 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         device: Device to render on; samples lie on the CPU. Different kinds of device agree up to rounding.
 
     Raises:
-        TypeError: ``rig`` is no ``Rig``, or ``neighbours`` neither ``Neighbours`` nor None.
-        ValueError: A count or seed out of range.
+        TypeError: A ``rig``, ``lidar`` or ``neighbours`` of another type.
+        ValueError: A count or seed out of range, or an unknown device.
     """
 
     def __init__(
@@ -93,12 +93,18 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         self.rig = _checked_rig(rig)
         self.num_frames = _checked_count("num_frames", num_frames, 1, 1 << 40)
         self.seed = _checked_count("seed", seed, 0, 1 << 60)
+        if not isinstance(lidar, bool | ScanErrors):
+            raise TypeError(f"SyntheticDrive lidar: expected True, False or ScanErrors(...), got {lidar!r}")
         self.lidar = bool(lidar)
         self._errors = lidar if isinstance(lidar, ScanErrors) else ScanErrors()
         check_neighbours(neighbours)
         self.neighbours = neighbours
         self.two_wheelers = bool(two_wheelers)
-        self._renderer = Renderer(supersampling=_checked_count("supersampling", supersampling, 1, 8), device=device)
+        supersampling = _checked_count("supersampling", supersampling, 1, 8)
+        try:
+            self._renderer = Renderer(supersampling=supersampling, device=device)
+        except (RuntimeError, TypeError):
+            raise ValueError(f"SyntheticDrive device: expected cpu, cuda or cuda:1, got {device!r}") from None
 
     def __len__(self) -> int:
         return self.num_frames
@@ -118,7 +124,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         if self.lidar:
             sample["points"] = self.points(index)
         if self.neighbours is not None:
-            sample |= {"ego2world": torch.tensor(scene.ego2street), "time_s": 0.0}
+            sample |= {"ego2world": self._ego2world(scene), "time_s": 0.0}
             steps = [sign * k for sign in self.neighbours.signs for k in range(1, self.neighbours.count + 1)]
             moments = [step * self.neighbours.step_m / scene.speed_mps for step in steps]
             sample["neighbours"] = [
@@ -129,13 +135,19 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def _neighbour(self, scene: Scene, seconds: float, token: str, noise: tuple[int, ...]) -> LazyFrame:
         fields = {"rig": self.rig, "boxes_3d": self._boxes(scene), "token": f"{token}{seconds:+.3f}s"}
-        fields |= {"ego2world": torch.tensor(scene.ego2street), "time_s": seconds}
+        fields |= {"ego2world": self._ego2world(scene), "time_s": seconds}
         points = partial(self._points, scene, noise) if self.lidar else None
         return LazyFrame(fields, partial(self._images, scene), points)
 
     def _images(self, scene: Scene) -> Tensor | list[Tensor]:
         views = self._renderer.render(scene, self.rig.cameras, self.rig.ground_z_m)
         return stacked([view.image for view in views])
+
+    def _ego2world(self, scene: Scene) -> Tensor:
+        """(4, 4) pose of the rig's ego frame; the road is at z = 0 of the world, for every rig."""
+        ego2world = scene.ego2street.copy()
+        ego2world[2, 3] -= self.rig.ground_z_m
+        return torch.from_numpy(ego2world)
 
     def _boxes(self, scene: Scene) -> Tensor:
         return torch.from_numpy(scene.boxes_ego(self.rig.ground_z_m).astype(np.float32))

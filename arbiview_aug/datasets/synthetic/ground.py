@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from arbiview_aug.datasets.synthetic.materials import band, cell_hash, fade, mix, noise, octave, pulses, step
-from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, Scene, SceneClass, Street
+from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, BoxClass, Scene, SceneClass, Street
 
 FloatGrid = npt.NDArray[np.float32]
 _Window = Callable[[np.ndarray, np.ndarray], tuple[slice, slice]]
@@ -179,7 +179,8 @@ def light_map(scene: Scene) -> FloatGrid:
         return slice(a[1][0], a[1][1]), slice(a[0][0], a[0][1])
 
     for box, label in zip(scene.boxes, scene.box_classes, strict=True):
-        spread = 0.9 if label != 4 else 0.45
+        is_vehicle = label < BoxClass.PEDESTRIAN  # people and two-wheelers cover little ground
+        spread = 0.9 if is_vehicle else 0.45
         reach = np.hypot(box[3], box[4]) / 2 + spread
         rows, cols = window(box[:2] - reach, box[:2] + reach)
         dx, dy = xs[None, cols] - np.float32(box[0]), ys[rows, None] - np.float32(box[1])
@@ -189,7 +190,7 @@ def light_map(scene: Scene) -> FloatGrid:
         depth = np.minimum(np.maximum(u, v), 0)
         # Half the sky is occluded at the sill, nearly all of it deep underneath.
         shade = np.clip(1 - outside / spread, 0, 1) ** 3 * 0.5
-        if label != 4:
+        if is_vehicle:
             shade = shade + np.clip(-depth / 0.45, 0, 1) * 0.36
         sky[rows, cols] *= 1 - shade.astype(np.float32)
     if scene.light.sun_strength > 0:

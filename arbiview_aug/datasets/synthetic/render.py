@@ -38,7 +38,8 @@ _THIN_PX = 1.5
 """Primitives thinner than this are supersampled."""
 _BATCH_PX = 1_500_000
 """Maximum number of pixels shaded together, with 150 MB of intermediate results."""
-_CACHED_CAMERAS = 24
+_CACHED_BYTES = 512 << 20
+"""Memory of rays that are kept: six cameras of 1600x900 have 350 MB."""
 _TABLES: LRUCache[tuple[int, torch.device], SceneTables] = LRUCache(4)
 """Tables of the last scenes, which they keep, so that no other scene has the same id."""
 
@@ -125,6 +126,10 @@ def _from_tiles(a: Tensor, size: tuple[int, int]) -> Tensor:
     return a[: size[0], : size[1]]
 
 
+def _nbytes(rays: CameraRays) -> int:
+    return sum(tensor.nbytes for tensor in rays)
+
+
 class Renderer:
     """Renders scenes; keeps the rays of the last cameras."""
 
@@ -133,7 +138,7 @@ class Renderer:
 
     def __init__(self, *, supersampling: int = 2, device: torch.device | str = "cpu") -> None:
         self.supersampling, self.device = supersampling, torch.device(device)
-        self._rays: LRUCache[bytes, CameraRays] = LRUCache(_CACHED_CAMERAS)
+        self._rays: LRUCache[bytes, CameraRays] = LRUCache(_CACHED_BYTES, _nbytes)
 
     def __reduce__(self) -> tuple[Any, tuple[()]]:
         return partial(type(self), supersampling=self.supersampling, device=self.device), ()  # without the caches
@@ -141,7 +146,8 @@ class Renderer:
     @contextmanager
     def run(self) -> Iterator[None]:
         """Make new tensors on the device, without gradients, on one thread: most steps are too small for more."""
-        with torch.no_grad(), one_thread(), nullcontext() if self.device.type == "cpu" else self.device:
+        is_default = torch.empty(0).device == self.device  # a device's context would slow every step down
+        with torch.no_grad(), one_thread(), nullcontext() if is_default else self.device:
             yield
 
     def render(self, scene: Scene, cameras: Sequence[Camera], ground_z_m: float) -> list[CameraView]:

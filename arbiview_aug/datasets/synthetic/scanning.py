@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from numbers import Real
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -44,14 +46,16 @@ class ScanErrors:
     reach_m: float = math.inf
 
     def __post_init__(self) -> None:
-        for field, is_valid, expected in (
-            ("noise_m", 0 <= self.noise_m < math.inf, "metres from 0"),
-            ("divergence_deg", 0 <= self.divergence_deg <= 5, "0 to 5 degrees"),
-            ("echo", self.echo in get_args(Echo), "first or last"),
-            ("reach_m", self.reach_m > 0, "metres above 0, or infinity"),
-        ):
-            if not is_valid:
-                raise ValueError(f"scan errors: {field}: expected {expected}, got {getattr(self, field)!r}")
+        checks: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
+            ("noise_m", lambda value: 0 <= value < math.inf, "metres from 0"),
+            ("divergence_deg", lambda value: 0 <= value <= 5, "0 to 5 degrees"),
+            ("echo", lambda value: value in get_args(Echo), "first or last"),
+            ("reach_m", lambda value: value > 0, "metres above 0, or infinity"),
+        )
+        for field, is_valid, expected in checks:
+            value = getattr(self, field)
+            if (field != "echo" and not isinstance(value, Real)) or not is_valid(value):
+                raise ValueError(f"scan errors: {field}: expected {expected}, got {value!r}")
 
 
 def scan_scene(
