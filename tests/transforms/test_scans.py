@@ -245,6 +245,10 @@ def test_sweeps_of_users() -> None:
         assert torch.equal(retarget_points(own, target(), sweeps=[sweep]).points, both)
     with pytest.raises(SampleError, match=r"sweeps\[0\]: expected the columns of points .*, got \(5, 3\)"):
         retarget_points(own, target(), sweeps=[np.zeros((5, 3))])
+    with pytest.raises(SampleTypeError, match=r"sweeps: expected a list of points \(Q, C\), got int"):
+        retarget_points(own, target(), sweeps=3)  # type: ignore[arg-type]
+    with pytest.raises(SampleError, match=r"ground_z_m: expected one height, got shape \(2,\)"):
+        retarget_points(own, target(), ground_z_m=[0.0, 1.0])  # type: ignore[arg-type]
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
