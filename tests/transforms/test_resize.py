@@ -86,11 +86,10 @@ def test_sides_that_do_not_halve_evenly_are_antialiased(size: tuple[int, int], d
         assert small.std() / (255 if dtype == torch.uint8 else 1) < 0.07
 
 
-@pytest.mark.parametrize(("size", "to"), [((64, 512), (64, 65)), ((1280, 960), (256, 352)), ((400, 700), (250, 430))])
+@pytest.mark.parametrize(("size", "to"), [((64, 512), (64, 65)), ((401, 701), (250, 430))])
 def test_stripes_are_antialiased_where_one_side_or_both_are_not_halved(size: Any, to: Any) -> None:
-    y, x = torch.arange(size[0])[:, None], torch.arange(size[1])
-    stripes = (((x if size[0] == to[0] else y) % 2 if size[0] != 1280 else y // 2 % 2) * 255).to(torch.uint8)
-    image = stripes.expand(3, *size).contiguous()
+    stripes = torch.arange(size[1]) % 2 * 255
+    image = stripes.to(torch.uint8).expand(3, *size).contiguous()
     linear = torch.nn.functional.interpolate(image[None].float(), to, mode="bilinear")
     for one in (image, image.permute(1, 2, 0).contiguous().permute(2, 0, 1)):
         assert resized(one, to).double().std() < 0.6 * linear.std()
