@@ -114,7 +114,8 @@ def _at(points: Any, rows: Any, hits: Any) -> Any:
     """The rows (n,) of points (P, C), with places (n, 3)."""
     if isinstance(points, np.ndarray):
         out = points[rows]
-        out[:, :3] = hits
+        if out.ndim == 2:
+            out[:, :3] = hits
         return out
     out = points.detach()[torch.from_numpy(rows).to(points.device, torch.int64)]
     if out.ndim == 2:

@@ -173,8 +173,9 @@ def test_both_roads_coincide(sample: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("shape", [(0,), (0, 4), (0, 3)])
 def test_no_points(sample: dict[str, Any], shape: tuple[int, ...]) -> None:
-    out = RigRetarget(target(), geometry="street")(sample | {"points": torch.zeros(shape)})
-    assert out["points"].shape == shape and len(out["point_rings"]) == 0 and out["num_points"].sum() == 0
+    for points in (torch.zeros(shape), np.zeros(shape, np.float32)):
+        out = RigRetarget(target(), geometry="street")(sample | {"points": points})
+        assert out["points"].shape == shape and len(out["point_rings"]) == 0 and out["num_points"].sum() == 0
 
 
 def test_missing_returns_are_left_out() -> None:
