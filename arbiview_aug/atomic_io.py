@@ -13,7 +13,7 @@ import stat
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -37,6 +37,7 @@ _LONGEST_TOKEN = 200  # characters of an escaped token: the names of half-writte
 
 _PART = ".part"
 _IS_PART = re.compile(r"\..+\.\w*-[0-9a-f]{8}-\d+-[0-9a-f]{8}\.part")
+_OF_DISKS = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 _FLUSHES = 16  # files flushed in parallel: 3 ms for 16 files of 100 kB on ext4, instead of 60 ms
 
 
@@ -111,18 +112,23 @@ def whole_file(path: Path, owner: str = "") -> Iterator[BinaryIO]:
     """Open a binary file that replaces ``path`` when the block ends, and is removed if the block fails.
 
     ``owner``, letters or digits, is part of the temporary file's name, for ``remove_parts``. The folder is created.
-    OutputError if it cannot be written: a full disk, no permission.
+    OutputError if it cannot be written: a full disk, no permission. Other errors of the block pass.
     """
-    with writing(path):
-        part = _part(path, owner)
+    with writing(path, _OF_DISKS):
+        with writing(path):
+            part = _part(path, owner)
+            file = part.open("xb")
         try:
-            with part.open("xb") as file:
+            with file:
                 yield file
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(part, path)
+                with writing(path):
+                    file.flush()
+                    os.fsync(file.fileno())
+            with writing(path):
+                os.replace(part, path)
         finally:
-            part.unlink(missing_ok=True)
+            with suppress(OSError):
+                part.unlink()
 
 
 def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
@@ -145,13 +151,15 @@ def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
                 os.replace(parts[path], path)
     finally:
         for part in parts.values():
-            part.unlink(missing_ok=True)
+            with suppress(OSError):
+                part.unlink()
 
 
 def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") -> None:
     """Link a file, or copy it, also where its disk allows no such links; a source that is a link is followed.
 
-    An existing file of the same content stays, unless it is of another kind: a link instead of a copy.
+    An existing file of the same content stays, unless it is of another kind: a link instead of a copy. So does the
+    source itself.
 
     Raises:
         FileNotFoundError: There is no such source.
@@ -167,6 +175,8 @@ def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") ->
     if not stat.S_ISREG(status.st_mode):
         raise DataError(f"{source}: expected a regular file, got none: remove its row, or put the file there")
     with suppress(OSError):  # no such file yet, or one that cannot be read
+        if path.name == source.name and path.parent.samefile(source.parent):
+            return
         if path.samefile(source):
             is_same = how != "copy"
         else:
@@ -224,11 +234,13 @@ def checksum(path: Path) -> str:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turn operating system errors into ``OutputError`` with the file's name."""
+def writing(path: Path, only: Collection[int] | None = None) -> Iterator[None]:
+    """Turn operating system errors, or those with ``only`` these numbers, into ``OutputError`` with the file's name."""
     try:
         yield
     except OSError as error:
+        if only is not None and error.errno not in only:
+            raise
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         fix = "; free some space and run it again: it goes on where it was" if full else ""
         raise OutputError(f"{path}: expected a file that can be written, got {error.strerror or error}{fix}") from None
@@ -236,7 +248,8 @@ def writing(path: Path) -> Iterator[None]:
 
 def _part(path: Path, owner: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    return path.with_name(f".{path.name}.{owner}-{_host()}-{os.getpid()}-{secrets.token_hex(4)}{_PART}")
+    name = os.fsencode(path.name)[:_LONGEST_TOKEN].decode(errors="ignore")
+    return path.with_name(f".{name}.{owner}-{_host()}-{os.getpid()}-{secrets.token_hex(4)}{_PART}")
 
 
 def _host() -> str:

@@ -1,12 +1,13 @@
 """Names that options take, and names that version 0.3 changed.
 
-There are no other imports: command lines show the names before anything is loaded. The tables of old names stand behind
-the errors that they raise, and are those of the CHANGELOG.
+Nothing else of the package is imported: command lines show the names before anything is loaded. The tables of old
+names stand behind the errors that they raise, and are those of the CHANGELOG.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from numbers import Integral
 from typing import Any, Literal
 
 GeometryName = Literal["auto", "infinity", "ground", "street", "boxes", "lidar", "motion", "fused", "learned"]
@@ -133,9 +134,9 @@ def choice(option: str, value: object, choices: Iterable[str]) -> Any:
 
 def checked_stride(name: str, value: Any) -> int:
     """A whole number of pixels from 1; ValueError for anything else."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
         raise ValueError(f"{name}: expected a number of pixels from 1, got {value!r}")
-    return value
+    return int(value)
 
 
 def removed_name(module: str, name: str) -> AttributeError:

@@ -52,8 +52,8 @@ def write_halved(image: torch.Tensor, level: int, dst: np.ndarray) -> None:
 def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     """Resize a (3, H, W) image to (h, w), antialiased; a copy if it has that size.
 
-    On the CPU by halving and then bilinearly, as target views are read, or by means of areas where an odd side cannot
-    be halved: a tenth of torch's time. Torch resizes images that need gradients or lie on other devices.
+    On the CPU by halving and then by means of areas, or bilinearly where a side grows: a fraction of torch's time.
+    Torch resizes images that need gradients or lie on other devices.
     """
     if image.device.type != "cpu" or image.requires_grad:
         if tuple(image.shape[-2:]) == size:
@@ -64,9 +64,9 @@ def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     level, sides = 0, list(zip(image.shape[1:], size, strict=True))
     while all(n % (2 << level) == 0 and 1.02 * n / (2 << level) >= to for n, to in sides):
         level += 1  # halving an odd side would lose the last row
-    is_odd = all(1.02 * n / (2 << level) >= to for n, to in sides)
-    how = cv2.INTER_AREA if is_odd else cv2.INTER_LINEAR
-    out = torch.empty((3, *size), dtype=work.dtype)
+    scales = [(n >> level) / to for n, to in sides]
+    how = cv2.INTER_AREA if min(scales) >= 1 and max(scales) > 1.02 else cv2.INTER_LINEAR
+    out = torch.empty((3, *size), dtype=work.dtype, device="cpu")  # whatever the default device
     array = interleaved(work)
     if array is not None:
         small = halved(array, level)
@@ -82,8 +82,7 @@ def resized(image: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
 def nearest_resized(label: torch.Tensor, size: tuple[int, int]) -> torch.Tensor:
     """A (..., H, W) label map at (h, w): the label at each new pixel's centre."""
     h, w = label.shape[-2:]
-    y = ((torch.arange(size[0], device=label.device) + 0.5) * h / size[0]).long().clamp(max=h - 1)
-    x = ((torch.arange(size[1], device=label.device) + 0.5) * w / size[1]).long().clamp(max=w - 1)
+    y, x = ((2 * torch.arange(to, device=label.device) + 1) * n // (2 * to) for n, to in zip((h, w), size, strict=True))
     return label[..., y[:, None], x]
 
 

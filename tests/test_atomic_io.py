@@ -30,6 +30,35 @@ def test_nothing_is_left_of_what_fails(tmp_path: Path) -> None:
     assert names(tmp_path) == ["a"]
 
 
+def test_errors_of_the_block_are_its_own_unless_the_disk_is_full(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="absent"), whole_file(tmp_path / "a"):
+        open("absent")
+    with pytest.raises(OutputError, match=r"a: .*, got full; free some"), whole_file(tmp_path / "a"):
+        raise OSError(atomic_io.errno.ENOSPC, "full")
+    with pytest.raises(OutputError, match="a: expected a file that can be written, got"), whole_file(tmp_path / "a"):
+        (tmp_path / "a").mkdir()
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["b" * 255, "é" * 127])
+def test_long_names_are_written(tmp_path: Path, name: str) -> None:
+    write_whole({tmp_path / name: b"1"}, owner="7")
+    with whole_file(tmp_path / name) as file:
+        (part,) = (path for path in tmp_path.iterdir() if path.name != name)
+        assert atomic_io.is_part(part)
+        file.write(b"2")
+    assert names(tmp_path) == [name] and (tmp_path / name).read_bytes() == b"2"
+
+
+@pytest.mark.parametrize("how", ["hard", "copy", "symlink"])
+def test_a_file_linked_to_itself_stays(tmp_path: Path, how: atomic_io.Link) -> None:
+    (tmp_path / "a").write_bytes(b"only")
+    (tmp_path / "folder").symlink_to(tmp_path)
+    for path in (tmp_path / "a", tmp_path / "folder" / "a"):
+        link_whole(tmp_path / "a", path, how=how)
+        assert (tmp_path / "a").read_bytes() == b"only" and not (tmp_path / "a").is_symlink()
+
+
 def test_what_is_written_is_there(tmp_path: Path) -> None:
     write_whole({tmp_path / "deep" / "a": b"1", tmp_path / "b": b"2"}, owner="7")
     assert (tmp_path / "deep" / "a").read_bytes() == b"1" and names(tmp_path) == ["a", "b"]

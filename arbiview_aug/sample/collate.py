@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.batching import lens_names, rewrapped
 from arbiview_aug.sample.inputs import DEPTH_KEYS
 
-STACKED = ("images", "K", "cam2ego", "coverage", "ego_mask", "distortion", "ego2world", *DEPTH_KEYS)
+STACKED = (
+    *("images", "K", "cam2ego", "coverage", "ego_mask", "distortion", "ego2world", "ego2ego"),
+    *("camera_maps", "camera_maps_coverage", *DEPTH_KEYS),
+)
 """Keys of one shape in all frames of a rig; so have maps over the images. All else is a list: of points and boxes
 each frame has its own number."""
 
@@ -40,10 +44,12 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     batch: dict[str, Any] = {}
     for key in sorted(first, key=lambda key: key == "rig"):  # last, as a rig wins over K and cam2ego
         values = [sample[key] for sample in samples]
-        if key == "rig":
-            batch |= _rigs(values)
-        elif key in (*STACKED, "lens", "ground_z_m") and all(value is None for value in values):
+        if key in (*STACKED, "rig", "lens", "ground_z_m") and any(value is None for value in values):
+            if any(value is not None for value in values):
+                raise SampleError(f"collate: {key}: expected a value in all samples or in none, got None in some")
             batch[key] = None
+        elif key == "rig":
+            batch |= _rigs(values)
         elif key in STACKED or are_maps(values, first["images"]):
             batch[key] = _stacked(key, values)
         elif isinstance(values[0], Mapping) and "images" in values[0]:  # the ``sources`` of a view
@@ -63,6 +69,7 @@ def are_maps(values: Sequence[Any], images: Any) -> bool:
     return all(
         isinstance(value, list | tuple | torch.Tensor)
         and (not isinstance(value, torch.Tensor) or value.ndim > 0)
+        and len(value) == len(sizes)  # points have many rows
         and [tuple(m.shape[-2:]) if isinstance(m, torch.Tensor) else None for m in value] == sizes
         for value in values
     )
@@ -71,6 +78,7 @@ def are_maps(values: Sequence[Any], images: Any) -> bool:
 def _stacked(key: str, values: Sequence[Any]) -> Any:
     """One tensor, or where cameras have tensors of their own a list of one for each camera; tv_tensors stay such."""
     try:
+        values = [torch.as_tensor(value) if isinstance(value, np.ndarray) else value for value in values]
         if all(isinstance(value, torch.Tensor) for value in values):
             return rewrapped(torch.stack(list(values)), values[0])
         cameras = [torch.stack(list(of_camera)) for of_camera in zip(*values, strict=True)]

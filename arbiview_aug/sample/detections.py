@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -38,19 +37,14 @@ def read_detections(frame: Frame) -> OfCameras:
     """
     sample = frame.sample
     if sample.get("detections") is not None:
-        return _of_cameras(_of_frame("detections", frame), frame)
+        return _of_cameras(frame.entry("detections"), frame)
     if (array := frame.array("boxes_3d")) is None:
         return {}
     boxes = checked_boxes(array)
     names = [UNNAMED_TYPE] * len(boxes)
     if sample.get("box_names") is not None:
-        names = _names("box_names", _of_frame("box_names", frame), len(boxes))
+        names = _names("box_names", frame.entry("box_names"), len(boxes))
     return {k: _projected(camera, boxes, names) for k, camera in enumerate(frame.rig)}
-
-
-def _of_frame(key: str, frame: Frame) -> Any:
-    value = frame.sample[key]
-    return _entries(key, value, math.prod(frame.lead), "frames")[frame.number] if frame.lead else value
 
 
 def _of_cameras(detections: Any, frame: Frame) -> OfCameras:
@@ -73,7 +67,9 @@ def _of_cameras(detections: Any, frame: Frame) -> OfCameras:
 
 def _entries(key: str, value: Any, count: int, of_what: str) -> list[Any]:
     if not isinstance(value, list | tuple):
-        raise SampleTypeError(f"{key}: expected a list of {count}, one for each of the {of_what}, got {type(value)}")
+        raise SampleTypeError(
+            f"{key}: expected a list of {count}, one for each of the {of_what}, got {type(value).__name__}"
+        )
     if len(value) != count:
         raise SampleError(f"{key}: expected one for each of the {count} {of_what}, got {len(value)}")
     return list(value)

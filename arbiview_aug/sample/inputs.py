@@ -54,6 +54,7 @@ _CHECKED_KEYS = frozenset(("K", "cam2ego", "lens", "distortion", "ground_z_m")) 
 
 _MOST_FOCALS = 20  # of a side: 169 degrees of a pinhole image, and more than any lens sees
 _OFF_CENTER = 0.2  # a principal point is never off centre by this share of the image's size along both axes
+_ON_CENTER = 0.05  # with K of another image size it is farther off along both axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,7 +270,7 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
     if missing:
         raise SampleError(
             f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', missing {', '.join(missing)}"
-            f"{hint(sample, missing)}; or pass source= to RigRetarget"
+            f"{hint(sample, missing)}; or give RigRetarget the rig as source="
         )
     K, cam2ego = (numbers(key, sample[key], index) for key in ("K", "cam2ego"))
     for key, array, expected in (("K", K, (len(images), 3, 3)), ("cam2ego", cam2ego, (len(images), 4, 4))):
@@ -281,10 +282,12 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
     cameras = []
     for k, (image, (lens, distortion)) in enumerate(zip(images, _lenses(sample, len(images), index), strict=True)):
         h, w = image.shape[-2:]
-        _check_principal_point(k, K[k], (h, w))
+        if sample.get("coverage") is None:  # rendered views are cropped as their target asks
+            _check_principal_point(k, K[k], (h, w))
         calibration: dict[str, Any] = {"K": K[k], "cam2ego": cam2ego[k], "lens": lens, "distortion": distortion}
         cameras.append(Camera(name=f"camera {k}", width_px=w, height_px=h, **calibration))
-    ground_z_m = numbers("ground_z_m", sample.get("ground_z_m", 0.0), index)
+    given = sample.get("ground_z_m")
+    ground_z_m = numbers("ground_z_m", 0.0 if given is None else given, index)
     if ground_z_m.size != 1:
         raise SampleError(f"ground_z_m: expected one height for each frame, got shape {ground_z_m.shape}")
     return Rig(cameras, ground_z_m=float(ground_z_m.item()))
@@ -295,7 +298,7 @@ def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None
     h, w = size
     x, y = (K[0, 2] + 0.5) / w - 0.5, (K[1, 2] + 0.5) / h - 0.5  # from the image's centre, as a share of its size
     off_swapped = max(abs((K[0, 2] + 0.5) / h - 0.5), abs((K[1, 2] + 0.5) / w - 0.5))
-    outside = max(abs(x), abs(y)) > 0.5
+    outside = max(abs(x), abs(y)) > 0.5 and min(abs(x), abs(y)) > _ON_CENTER  # crops may leave it out on one side
     scaled = max(x, y) < -_OFF_CENTER or min(x, y) > _OFF_CENTER
     swapped = max(abs(x), abs(y)) > 0.12 and off_swapped < 0.05
     if not (outside or scaled or swapped):

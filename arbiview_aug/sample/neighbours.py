@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -88,7 +87,7 @@ class Neighbour:
         array = as_array("points", value)
         own_points = checked_points(array)
         kept = ~own_car(own_points)
-        points = np.array(array[finite_rows(array)][kept] if len(own_points) else own_points, np.float64)
+        points = np.array(array[finite_rows(array)][kept] if array.ndim == 2 else own_points, np.float64)
         points[:, :3] = own_points[kept] @ self.ego2ego[:3, :3].T + self.ego2ego[:3, 3]
         return points if self.boxes is None or self.boxes_now is None else carried(points, self.boxes, self.boxes_now)
 
@@ -121,14 +120,12 @@ def read_neighbours(frame: Frame, warn: Warn) -> list[Neighbour]:
 
 
 def _read(frame: Frame, warn: Warn) -> list[Neighbour]:
-    value, count = frame.sample.get("neighbours"), math.prod(frame.lead)
-    if value is None:
+    entries = frame.entry("neighbours")
+    if entries is None:
         return []
-    lists = list(value) if frame.lead and isinstance(value, list | tuple) else [value]
-    if len(lists) != count or not all(isinstance(entries, list | tuple) for entries in lists):
-        expected = f"a list of {count} lists, one for each frame of the batch" if frame.lead else "a list of frames"
-        raise SampleTypeError(f"neighbours: expected {expected}, got {type(value).__name__}")
-    entries = lists[frame.number]
+    if not isinstance(entries, list | tuple):
+        expected = f"a list of frames{' for each frame of the batch' if frame.lead else ''}"
+        raise SampleTypeError(f"neighbours: expected {expected}, got {type(entries).__name__}")
     if len(entries) > MAX_NEIGHBOURS:
         raise SampleError(f"neighbours: expected at most {MAX_NEIGHBOURS} for a frame, got {len(entries)}")
     boxes, neighbours = frame.array("boxes_3d"), []
@@ -206,8 +203,10 @@ def _neighbour(frame: Frame, current: Points | None, entry: Any, number: int, na
 
 def _own_rig(frame: Frame, entry: Mapping[str, Any]) -> Rig:
     """Its cameras in its own ego frame; the current images stand for its own, which are read lazily."""
-    if entry.get("rig") is not None or entry.get("K") is None:
+    if entry.get("rig") is not None or (entry.get("K") is None and entry.get("cam2ego") is None):
         return frame_from(frame.images, entry, frame.rig).rig
+    if entry.get("K") is None:
+        entry = {**entry, "K": frame.rig.K}
     cameras = []
     for camera, now in zip(frame_from(frame.images, entry, None).rig, frame.rig, strict=True):
         of_lens = camera if entry.get("lens") is not None else now

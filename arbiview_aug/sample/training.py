@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.choices import checked_stride
-from arbiview_aug.errors import SampleError
+from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.sample.boxes_2d import rig_of
 from arbiview_aug.scene.boxes import PIECES, checked_boxes, draw_solids, silhouette_sums, solids
 
@@ -35,6 +36,7 @@ def visible_boxes(sample: Mapping[str, Any], least: float = 0.1) -> BoolArray:
     Raises:
         SampleError: No boxes, or a batch.
     """
+    _check("visible_boxes", sample, least)
     if sample.get("boxes_3d") is None:
         raise SampleError("visible_boxes: expected a sample with 'boxes_3d', got none")
     cameras, boxes = rig_of(sample), checked_boxes(sample["boxes_3d"])
@@ -63,7 +65,8 @@ def lift_mask(sample: Mapping[str, Any], stride: int, least: float = 0.5) -> tor
         SampleError: No ``coverage``.
         ValueError: ``stride`` is no whole number from 1.
     """
-    checked_stride("stride", stride)
+    stride = checked_stride("stride", stride)
+    _check("lift_mask", sample, least)
     if sample.get("coverage") is None:
         raise SampleError("lift_mask: expected an output of RigRetarget with 'coverage', got none")
     coverage, ignore = sample["coverage"], sample.get("ego_mask")
@@ -71,6 +74,13 @@ def lift_mask(sample: Mapping[str, Any], stride: int, least: float = 0.5) -> tor
         masks = [None] * len(coverage) if ignore is None else ignore
         return [_pooled(*of_camera, stride, least) for of_camera in zip(coverage, masks, strict=True)]
     return _pooled(coverage, ignore, stride, least)
+
+
+def _check(function: str, sample: Any, least: Any) -> None:
+    if not isinstance(sample, Mapping):
+        raise SampleTypeError(f"{function}: expected an output of RigRetarget, got {type(sample).__name__}")
+    if not isinstance(least, Real):
+        raise ValueError(f"least: expected a share from 0 to 1, got {least!r}")
 
 
 def _pooled(seen: torch.Tensor, ignore: torch.Tensor | None, stride: int, least: float) -> torch.Tensor:

@@ -163,8 +163,8 @@ class CameraPriorStem(torch.nn.Module):
         )
         for name, got, channels in sides:
             expected = channels, *features.shape[-2:]
-            if got.shape[-3:] != expected:
-                fix = "are stride= and the numbers of channels those of the features and maps?"
+            if got.shape[-3:] != expected or got.shape[:-3].numel() != features.shape[:-3].numel():
+                fix = "are stride=, the numbers of channels and of images those of the features and maps?"
                 raise SampleError(f"{name}: expected (..., channels, h, w) = {expected}, got {tuple(got.shape)}; {fix}")
         maps = camera_maps.reshape(-1, *camera_maps.shape[-3:]).to(features)
         return features + self.stem(maps).reshape(features.shape)

@@ -64,7 +64,7 @@ class JitteredCalibration(torch.nn.Module):
     def _jittered(self, poses: Any) -> Any:
         """Poses (..., 4, 4) moved by noise."""
         flat = np.array(poses, np.float64).reshape(-1, 4, 4)
-        noise = torch.randn(len(flat), 2, 3, dtype=torch.float64).numpy()
+        noise = torch.randn(len(flat), 2, 3, dtype=torch.float64, device="cpu").numpy()
         for pose, (turn, shift) in zip(flat, noise, strict=True):
             pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(np.radians(self.angle_deg) * turn)[0]
             pose[:3, 3] += self.position_m * shift

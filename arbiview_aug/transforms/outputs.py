@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -85,7 +86,8 @@ class SampleWriter:
             message = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels or cameras{meant}"
             self.warn(f"dropped {dropped}", message)
         replaced = ("images", "K", "cam2ego")  # these keep their places in the dict
-        return {k: v for k, v in sample.items() if k in replaced or k not in (*CALIBRATION_KEYS, *stale)}
+        kept = (*replaced, *named)
+        return {k: v for k, v in sample.items() if k in kept or k not in (*CALIBRATION_KEYS, *stale)}
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
@@ -121,25 +123,36 @@ def target_labels(
 
     SampleError for maps that do not fit the images, or a fill value that their type cannot hold.
     """
-    if not all(map(is_readable, value if isinstance(value, list | tuple) else [value])):
-        got = type(value).__name__
-        raise SampleTypeError(f"{key}: expected label maps as tensors, got {got}; use torch.as_tensor")
-    if isinstance(value, torch.Tensor) and value.ndim < len(lead) + 3:
-        raise SampleError(f"{key}: expected label maps of shape (..., N, H, W), got {tuple(value.shape)}")
     views = []
-    for frame, of_frame, maps in zip(frames, rendered, split(key, value, lead), strict=True):
-        _check_maps(key, maps, frame)
+    for of_frame, maps in zip(rendered, label_maps(key, value, frames), strict=True):
         assert of_frame.labels is not None
+        if (dtype := maps[0].dtype) in (torch.uint16, torch.uint32, torch.uint64):  # torch cannot index them by masks
+            raise SampleTypeError(f"{key}: expected uint8 or signed label maps, got {dtype}; use .to(torch.int32)")
         plain = [label.as_subclass(torch.Tensor) for label in maps]
         views.append(stacked(of_frame.labels(plain, partial(_checked_fill, key, fill))))
     return rewrapped(gathered(views, lead), value)
 
 
+def label_maps(key: str, value: Any, frames: Sequence[Frame]) -> list[Any]:
+    """The maps of each frame, from (*lead, N, ..., H, W) or a list of (*lead, ..., Hi, Wi).
+
+    SampleError for maps that do not fit the images.
+    """
+    lead = frames[0].lead
+    if not all(map(is_readable, value if isinstance(value, list | tuple) else [value])):
+        got = type(value).__name__
+        raise SampleTypeError(f"{key}: expected label maps as tensors, got {got}; use torch.as_tensor")
+    if isinstance(value, torch.Tensor) and value.ndim < len(lead) + 3:
+        raise SampleError(f"{key}: expected label maps of shape (..., N, H, W), got {tuple(value.shape)}")
+    of_frames = split(key, value, lead)
+    for frame, maps in zip(frames, of_frames, strict=True):
+        _check_maps(key, maps, frame)
+    return of_frames
+
+
 def _check_maps(key: str, maps: Any, frame: Frame) -> None:
     if len(maps) != len(frame.images):
         raise SampleError(f"{key}: expected {len(frame.images)} label maps, one an image, got {len(maps)}")
-    if maps[0].dtype in (torch.uint16, torch.uint32, torch.uint64):  # torch cannot index them
-        raise SampleTypeError(f"{key}: expected uint8 or signed label maps, got {maps[0].dtype}; use .to(torch.int32)")
     for camera, label in zip(frame.rig, maps, strict=True):
         size = tuple(label.shape[-2:])
         if size != camera.size:
@@ -153,10 +166,10 @@ def _check_maps(key: str, maps: Any, frame: Frame) -> None:
 def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
     if dtype == torch.bool:
         return False
-    if not dtype.is_floating_point:
-        limits = torch.iinfo(dtype)
-        if not limits.min <= fill <= limits.max or fill != int(fill):  # NaN fails the first
-            raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {fill!r}")
+    limits: Any = torch.finfo(dtype) if dtype.is_floating_point else torch.iinfo(dtype)
+    fits = limits.min <= fill <= limits.max  # NaN does not
+    if not (fits or not math.isfinite(fill) if dtype.is_floating_point else fits and fill == int(fill)):
+        raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {fill!r}")
     return fill
 
 
@@ -206,7 +219,8 @@ def _translated(key: str, value: Any, offset_m: torch.Tensor, lead: tuple[int, .
             raise SampleError(f"{key}: expected {len(offsets)} entries, one a frame, got {len(value)}")
         return [_translated(key, v, o, ()) for v, o in zip(value, offsets, strict=True)]
     if isinstance(value, np.ndarray) and value.dtype.kind == "f":
-        return _translated(key, torch.tensor(value), offset_m, lead).numpy()
+        native = value.astype(value.dtype.newbyteorder("="))  # torch reads no other byte order
+        return _translated(key, torch.from_numpy(native), offset_m, lead).numpy()
     if not is_readable(value) or not value.is_floating_point():
         kind = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
         raise SampleTypeError(f"{key}: SampleKeys.frame='target': expected a float tensor, got {kind}")

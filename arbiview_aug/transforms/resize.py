@@ -8,7 +8,7 @@ Lenses use normalised coordinates and stay as they are.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,9 +19,10 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.image_ops import nearest_resized, resized
-from arbiview_aug.sample.batching import is_readable, like, rewrapped
+from arbiview_aug.sample.batching import like, rewrapped
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, PIXEL_BOUND_KEYS, check_other_keys, read_frames
-from arbiview_aug.transforms.settings import SampleKeys, checked_pixels
+from arbiview_aug.transforms.outputs import label_maps
+from arbiview_aug.transforms.settings import SampleKeys, checked_instance, checked_pixels
 
 _MAPS = ("coverage", "ego_mask", "source_camera", "source_frame", "confidence", "generated", "depth", "depth_m")
 """Keys of maps (..., N, H, W) over the images' pixels, which are resized by the nearest pixel."""
@@ -33,7 +34,7 @@ class _PixelTransform(torch.nn.Module, ABC):
     def __init__(self, keys: SampleKeys, unknown: Mapping[str, Any]) -> None:
         super().__init__()
         refuse_old_options(type(self).__name__, unknown)
-        self.keys = keys
+        self.keys = checked_instance("keys", keys, SampleKeys)
         self._warn = WarnOnce()
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
@@ -50,7 +51,7 @@ class _PixelTransform(torch.nn.Module, ABC):
             SampleError: As ``RigRetarget`` raises; ``CropRig``: a window that leaves an image.
         """
         frames = read_frames(sample, None)
-        images = sample["images"]
+        images, lead = sample["images"], frames[0].lead
         sizes = [tuple(image.shape[-2:]) for image in frames[0].images]
         labels = check_other_keys(sample, sizes, self.keys.labels, self.keys.keep)
         out = dict(sample)
@@ -58,22 +59,17 @@ class _PixelTransform(torch.nn.Module, ABC):
             if key in out and key not in (*_MAPS, *labels, *self.keys.keep):
                 del out[key]
                 self._warn(key, f"{type(self).__name__} drops {key}: it speaks of pixels that have moved")
-        out["images"] = rewrapped(_each(images, self._image, 3), images)
+        out["images"] = rewrapped(_each([frame.images for frame in frames], self._image, lead), images)
         for key in {*_MAPS, *labels} & out.keys() - {*self.keys.keep}:
             maps = out[key]
             if maps is None and key in _MAPS:
                 continue
-            parts = maps if isinstance(maps, list | tuple) else [maps]
-            if not (parts and all(map(is_readable, parts))):
-                raise SampleError(f"{key}: expected maps over the images' pixels as tensors, got {type(maps).__name__}")
-            if other := [tuple(one.shape[-2:]) for one in parts if tuple(one.shape[-2:]) not in sizes]:
-                raise SampleError(f"{key}: expected maps of the images' (h, w) = {sizes[0]}, got {other[0]}")
-            out[key] = rewrapped(_each(maps, self._map, 2), maps)
+            out[key] = rewrapped(_each(label_maps(key, maps, frames), self._map, lead), maps)
         if isinstance(sample.get("rig"), Rig):
             out["rig"] = sample["rig"].with_cameras([self._camera(camera) for camera in sample["rig"]])
         if sample.get("K") is not None:
             K = np.stack([self._camera(camera).K for frame in frames for camera in frame.rig])
-            out["K"] = like(torch.from_numpy(K.reshape(*frames[0].lead, -1, 3, 3)), sample["K"])
+            out["K"] = like(torch.from_numpy(K.reshape(*lead, -1, 3, 3)), sample["K"])
         return out
 
     @abstractmethod
@@ -82,7 +78,7 @@ class _PixelTransform(torch.nn.Module, ABC):
 
     @abstractmethod
     def _map(self, image: torch.Tensor) -> torch.Tensor:
-        """Change a (H, W) map."""
+        """Change a (..., H, W) map."""
 
     @abstractmethod
     def _camera(self, camera: Camera) -> Camera:
@@ -155,12 +151,9 @@ class CropRig(_PixelTransform):
         return camera.crop(self.top, self.left, self.size)
 
 
-def _each(value: Any, change: Callable[[torch.Tensor], torch.Tensor], dims: int) -> torch.Tensor:
-    """The images (dims dimensions) of a (..., N, *image) tensor, or of a list of (..., *image) ones, changed."""
-    if isinstance(value, list | tuple):
-        changed = [_each(v, change, dims) for v in value]
-        return torch.stack(changed, dim=changed[0].ndim - dims)
-    plain = value.as_subclass(torch.Tensor)
-    lead = plain.shape[: plain.ndim - dims]
-    parts = [change(image) for image in plain.reshape(-1, *plain.shape[plain.ndim - dims :])]
-    return torch.stack(parts).reshape(*lead, *parts[0].shape)
+def _each(
+    frames: Sequence[Sequence[torch.Tensor]], change: Callable[[torch.Tensor], torch.Tensor], lead: tuple[int, ...]
+) -> torch.Tensor:
+    """The images or maps of frames' cameras, changed to one size: (*lead, N, ...)."""
+    changed = [torch.stack([change(one.as_subclass(torch.Tensor)) for one in of_frame]) for of_frame in frames]
+    return torch.stack(changed).reshape(*lead, *changed[0].shape)

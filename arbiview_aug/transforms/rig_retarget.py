@@ -154,7 +154,7 @@ class RigRetarget(torch.nn.Module):
         self._check_reach = partial(check_reach, unseen=unseen_note(self.inpainter), warn=self._warn)
         self._plans = self._empty_plans()
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
-        self._checked: dict[str, type] = {}  # keys and types of the sample that was last checked for misnamed keys
+        self._checked: set[frozenset[Any]] = set()  # keys and types of samples that were checked for misnamed keys
         self._limited_process: int | None = None
 
     def _empty_plans(self) -> Plans:
@@ -268,14 +268,14 @@ class RigRetarget(torch.nn.Module):
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
         """Check the sample's further keys, and return those that hold label maps."""
         sizes = {tuple(image.shape[-2:]) for frame in frames for image in frame.images}
-        types = {key: type(value) for key, value in sample.items()}
-        if types != self._checked:
+        types = frozenset([(key, type(value)) for key, value in sample.items()])
+        if types not in self._checked:
             calibrated = sample.get("rig") is not None or self.source is not None
             named = (*self.keys.labels, *self.keys.keep)
             reads_ego_frame = not self._row.is_static or self.keys.frame == "target"
             warn_of_misnamed(sample, calibrated, not reads_ego_frame, named, self._warn)
             warn_of_cameras(frames, self._warn)
-            self._checked = types
+            self._checked.add(types)
         return check_other_keys(sample, list(sizes), self.keys.labels, self.keys.keep)
 
     # --- stages -------------------------------------------------------------------------------------------------------
@@ -386,13 +386,13 @@ class RigRetarget(torch.nn.Module):
     def _row(self) -> GeometryRow:
         return GEOMETRIES[self.geometry]
 
-    def plan(self, source: Rig, target: Rig, scene: Scene | None = None) -> RenderPlan:
+    def plan(self, source: Rig | str | Path, target: Rig | str | Path, scene: Scene | None = None) -> RenderPlan:
         """The cached render plan of a pair of rigs in a scene.
 
         Raises:
             ValueError: With ``quality="paper"``.
         """
-        return self._plans.plan(self._plans.pair(source, target), scene or Scene())
+        return self._plans.plan(self._plans.pair(load_rig(source), load_rig(target)), scene or Scene())
 
     def prepare(self, source: Rig | str | Path | None = None) -> RenderPlan:
         """Build the plan for a source rig before DataLoader workers fork: they share its memory.
@@ -427,7 +427,7 @@ class RigRetarget(torch.nn.Module):
         if self._is_paper:
             return PaperExplanation(self._published(frame, target), self.inpainter.outcome)
         planned = self.plan_frame(frame, target)
-        gains = self.harmonisation(sample) if self.harmoniser.is_on else None
+        gains = self.harmoniser.report(frame.rig, frame.images) if self.harmoniser.is_on else None
         keys = ("motion", MOTION_WORDS_KEY), (LEARNED_KEY, LEARNED_WORDS_KEY)
         words = [frame.name(key) for read, key in keys if read in self._row.reads and sample.get(key) is not None]
         points = [words_of(part, frame, target) for part in self._scanned([frame], target)]

@@ -78,10 +78,14 @@ def retarget_points(
     boxes = None if boxes_3d is None else checked_boxes(boxes_3d)
     unsupported, rings = 0.0, torch.full((len(array),), -1, dtype=torch.int32)
     if not skip:
-        ground_z_m = as_array("ground_z_m", ground_z_m).item()
+        if (ground := as_array("ground_z_m", ground_z_m)).size != 1:
+            raise SampleError(f"ground_z_m: expected one height, got shape {ground.shape}")
+        ground_z_m = ground.item()
         up = ground_z_m - target.ground_z_m  # scanners keep their rays where nothing moves
         lidars = [lidar.shifted(z_m=up) for lidar in target.lidars] if up else target.lidars
         own = len(measured)
+        if not isinstance(sweeps, Sequence | np.ndarray | torch.Tensor):
+            raise SampleTypeError(f"sweeps: expected a list of points (Q, C), got {type(sweeps).__name__}")
         if len(sweeps):
             points = _joined(points, [as_array(f"sweeps[{k}]", sweep) for k, sweep in enumerate(sweeps)])
             array = as_array("points", points)
@@ -110,7 +114,8 @@ def _at(points: Any, rows: Any, hits: Any) -> Any:
     """The rows (n,) of points (P, C), with places (n, 3)."""
     if isinstance(points, np.ndarray):
         out = points[rows]
-        out[:, :3] = hits
+        if out.ndim == 2:
+            out[:, :3] = hits
         return out
     out = points.detach()[torch.from_numpy(rows).to(points.device, torch.int64)]
     if out.ndim == 2:
@@ -144,7 +149,7 @@ def _sweeps(frame: Frame, warn: Warn) -> list[FloatArray]:
     """Points (Q, C) of a frame's neighbours with the columns of its own."""
     points, parts = frame.array("points"), points_of_neighbours(frame, warn)
     columns = [part.shape[1] for part in parts]
-    if points is None or not parts:
+    if points is None:
         return []
     if any(count != points.shape[-1] for count in columns):
         warn("columns of points", f"points of neighbours: expected {points.shape[-1]} columns, got {columns}")
@@ -152,11 +157,11 @@ def _sweeps(frame: Frame, warn: Warn) -> list[FloatArray]:
 
 
 def entries_of(parts: Sequence[RetargetedPoints], lead: tuple[int, ...]) -> dict[str, Any]:
-    """Entries of the output sample: with leading dimensions, a list with an entry for each frame."""
+    """Entries of the output sample of one frame or more: with leading dimensions, a list over the frames."""
     keys = {"points": [p.points for p in parts], RINGS_KEY: [p.rings for p in parts]}
-    if parts and parts[0].counts is not None:
+    if parts[0].counts is not None:
         keys[COUNTS_KEY] = [p.counts for p in parts]
-    return {key: values if lead else values[0] for key, values in keys.items() if values}
+    return {key: values if lead else values[0] for key, values in keys.items()}
 
 
 def words_of(part: RetargetedPoints, frame: Frame, target: Rig) -> str:

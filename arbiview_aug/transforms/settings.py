@@ -15,6 +15,7 @@ from arbiview_aug.inpaint.continued import Continue, Mean
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY, Black, Inpainter
 from arbiview_aug.inpaint.telea import Telea
 from arbiview_aug.render.plan import PRESETS, RenderConfig
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS
 
 T = TypeVar("T")
 
@@ -28,7 +29,7 @@ class SampleKeys:
     Attributes:
         labels: Keys of label maps (..., N, H, W), or lists of them, to render besides ``tv_tensors.Mask``.
         ignore_index: Value of label pixels that no source sees (False for bool maps).
-        keep: Keys to keep although they look bound to the source's pixels.
+        keep: Keys to keep although they look bound to the source's pixels; those that the output has anew are replaced.
         extra: Further maps (..., M, h, w) of the output: ``source_camera`` int8, -1 where uncovered; ``source_frame``
             int8, 0 for the current frame, n + 1 for number n of the neighbours; ``confidence`` float32 in [0, 1],
             exp(-e / 10) for an expected error of e grey levels of 255 (``arbiview_aug.render.confidence``). Also
@@ -56,6 +57,8 @@ class SampleKeys:
             if not isinstance(value, list | tuple) or not all(isinstance(key, str) for key in value):
                 raise ValueError(f"SampleKeys.{name}: expected names in a list or tuple, got {value!r}")
             object.__setattr__(self, name, tuple(value))
+        if own := {*self.labels} & {*CALIBRATION_KEYS}:
+            raise ValueError(f"SampleKeys.labels: expected keys of label maps, got {', '.join(sorted(own))}")
         for key in self.extra:
             choice("SampleKeys.extra", key, EXTRA_KEYS)
         if self.camera_maps is not None:

@@ -11,6 +11,7 @@ import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget, SampleError
 from arbiview_aug.datasets import FrameFolder, cleaned_rig
+from arbiview_aug.sample import inputs
 from arbiview_aug.sample.masks import image_circle, without_specks
 from tests.helpers import camera
 
@@ -60,7 +61,7 @@ def test_a_scene_without_rim_has_none(gain: float) -> None:
     assert image_circle(camera(size=(160, 240)), vignetted(fish)) is None, "not for lenses without a circle"
 
 
-def test_a_rim_is_warned_of_once_and_masked() -> None:
+def test_a_rim_is_warned_of_once_and_masked(monkeypatch: pytest.MonkeyPatch) -> None:
     fish = fisheye()
     rig, image = Rig([fish]), vignetted(fish)[None]
     retarget = RigRetarget(Rig([camera("t", 0.0)]))
@@ -70,9 +71,14 @@ def test_a_rim_is_warned_of_once_and_masked() -> None:
     assert cleaned[0].mask is not None and cleaned_rig(cleaned, image)[0] is cleaned[0]
     with pytest.raises(SampleError, match="images: expected 1 for cameras fish, got 2"):
         cleaned_rig(rig, [image[0], image[0]])
+    with warnings.catch_warnings(), monkeypatch.context() as unsearched:
+        warnings.simplefilter("error")
+        retarget({"images": image, "rig": rig, "token": "a"})
+        unsearched.setattr(inputs, "dark_rims", None)  # types of samples that alternate are known
+        retarget({"images": image, "rig": rig})
+        retarget({"images": image, "rig": rig, "token": "a"})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        retarget({"images": image, "rig": rig})
         after = RigRetarget(Rig([camera("t", 0.0)]))({"images": image, "rig": cleaned})
     assert after["coverage"].sum() <= before["coverage"].sum()
 

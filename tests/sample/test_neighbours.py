@@ -159,8 +159,18 @@ def test_a_batch_has_a_list_for_each_frame(sample: dict[str, Any]) -> None:
     for key in ("images", "coverage", "source_frame"):
         assert torch.equal(both[key], torch.stack([one[key], alone[key]]))
     assert (one["source_frame"] > 0).any()
-    with pytest.raises(SampleTypeError, match="a list of 2 lists"):
+    with pytest.raises(SampleTypeError, match="a list of frames for each frame of the batch, got dict"):
         retarget(batch | {"neighbours": sample["neighbours"]})
+
+
+def test_poses_of_its_own_are_read_without_a_K(sample: dict[str, Any]) -> None:
+    near = sample["neighbours"][0]
+    near |= {"rig": None, "K": None, "cam2ego": RIG.shifted(x_m=0.2).cam2ego}
+    (neighbour, _), _ = read(sample)
+    np.testing.assert_allclose(neighbour.rig.cam2ego, neighbour.ego2ego @ near["cam2ego"], atol=1e-6)
+    near["points"] = np.zeros((0, 4), np.float32)
+    (neighbour, _), _ = read(sample)
+    assert neighbour.points().shape == (0, 4)
 
 
 def test_lenses_and_masks_of_the_rig_that_all_samples_share(sample: dict[str, Any]) -> None:

@@ -15,6 +15,8 @@ from arbiview_aug import (
     Rig,
     RigRetarget,
     SampleError,
+    SampleKeys,
+    SampleTypeError,
     collate,
     lift_mask,
     project_boxes_3d,
@@ -67,6 +69,15 @@ def test_cells_are_lifted_that_are_covered_and_no_own_car() -> None:
     for stride in (0, 4.0, "4", True):
         with pytest.raises(ValueError, match="stride: expected a number of pixels from 1, got"):
             lift_mask({"coverage": coverage}, stride)  # type: ignore[arg-type]
+    assert torch.equal(lift_mask({"coverage": coverage}, np.int64(4)), expected)  # type: ignore[arg-type]
+
+
+def test_what_is_no_sample_or_share_is_named() -> None:
+    for function in (lambda *a: lift_mask(a[0], 4, *a[1:]), visible_boxes):
+        with pytest.raises(SampleTypeError, match="expected an output of RigRetarget, got list"):
+            function([1])  # type: ignore[arg-type]
+        with pytest.raises(ValueError, match="least: expected a share from 0 to 1, got 'a'"):
+            function(sample(coverage=torch.ones(1, 64, 96) > 0), "a")  # type: ignore[arg-type]
 
 
 # --- batches in a DataLoader; of source samples: the tests of the Lightning adapter -----------------------------------
@@ -94,6 +105,19 @@ def test_what_is_absent_or_overruled_by_a_rig_stays_so() -> None:
     nothing = dict.fromkeys(("lens", "ground_z_m", "coverage"))
     batch = collate([{**sample, **nothing}] * 2)
     assert {key: batch[key] for key in nothing} == nothing
+    for key, value in (("lens", ["pinhole"] * len(rig)), ("ground_z_m", 0.0), ("rig", rig), ("coverage", sample["K"])):
+        with pytest.raises(SampleError, match=f"collate: {key}: expected a value in all samples or in none"):
+            collate([{**sample, key: None}, {**sample, key: value}])
+
+
+def test_calibration_is_stacked_as_arrays_and_as_maps() -> None:
+    rig = demo_source_rig((36, 64))
+    sample = {"images": torch.zeros(len(rig), 3, 36, 64), "K": rig.K, "cam2ego": rig.cam2ego, "ego2world": np.eye(4)}
+    assert torch.equal(collate([sample] * 2)["K"], torch.from_numpy(np.stack([rig.K] * 2)))
+    step = RigRetarget(rig, size=(36, 64), keys=SampleKeys(frame="target", camera_maps=8))
+    batch, alone = collate([step(sample)] * 2), step(collate([sample] * 2))
+    for key in ("ego2ego", "ego2world", "camera_maps", "camera_maps_coverage"):
+        assert batch[key].shape == alone[key].shape and torch.equal(batch[key], alone[key].to(batch[key]))
 
 
 def test_lenses_of_a_batch() -> None:

@@ -178,6 +178,7 @@ def test_the_stem_adds_nothing_at_first_and_learns() -> None:
     for bad, expected in (
         ((features, read.mT), r"camera_maps: .* = \(\d+, 8, 12\), got .*, 12, 8\)"),
         ((features, read[:, 1:]), r"camera_maps: expected \(\.\.\., channels, h, w\) = "),
+        ((features, read[:1]), r"camera_maps: .* got \(1, .* of images those"),
         ((features[:, 1:], read), r"features: expected .* = \(5, 8, 12\), got \(2, 4, 8, 12\)"),
     ):
         with pytest.raises(SampleError, match=expected):
@@ -200,6 +201,7 @@ def test_the_stem_adds_nothing_at_first_and_learns() -> None:
 def test_impossible_settings(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         CameraMaps(**arguments)  # type: ignore[arg-type]
+    assert CameraMaps(stride=np.int64(8)).stride == 8  # type: ignore[arg-type]
 
 
 def test_cameras_in_the_road_are_named() -> None:

@@ -27,6 +27,12 @@ def turns_deg(before: Any, after: Any) -> Any:
     return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
 
 
+def test_another_default_device_changes_nothing() -> None:
+    plain = {"images": torch.zeros(40, 3, 6, 8), "K": rig_sample()["rig"].K, "cam2ego": rig_sample()["rig"].cam2ego}
+    with torch.device("meta"):
+        assert JitteredCalibration(1.0)(plain)["cam2ego"].device.type == "cpu"
+
+
 def test_noise_has_the_stated_spread() -> None:
     torch.manual_seed(0)
     sample = rig_sample(100)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
 from arbiview_aug import CropRig, ResizeRig, Rig, RigRetarget, SampleError, SampleKeys, SampleTypeError
-from arbiview_aug.image_ops import resized
+from arbiview_aug.image_ops import nearest_resized, resized
 from tests.helpers import camera
 
 SIZE = (60, 100)
@@ -85,6 +86,44 @@ def test_sides_that_do_not_halve_evenly_are_antialiased(size: tuple[int, int], d
         assert small.std() / (255 if dtype == torch.uint8 else 1) < 0.07
 
 
+@pytest.mark.parametrize(("size", "to"), [((64, 512), (64, 65)), ((401, 701), (250, 430))])
+def test_stripes_are_antialiased_where_one_side_or_both_are_not_halved(size: Any, to: Any) -> None:
+    stripes = torch.arange(size[1]) % 2 * 255
+    image = stripes.to(torch.uint8).expand(3, *size).contiguous()
+    linear = torch.nn.functional.interpolate(image[None].float(), to, mode="bilinear")
+    for one in (image, image.permute(1, 2, 0).contiguous().permute(2, 0, 1)):
+        assert resized(one, to).double().std() < 0.6 * linear.std()
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_labels_are_those_of_the_nearest_pixels_whatever_the_default_dtype_and_device(dtype: torch.dtype) -> None:
+    columns = torch.arange(1600)[None]
+    torch.set_default_dtype(dtype)
+    try:
+        assert torch.equal(nearest_resized(columns, (1, 1600)), columns)
+        assert torch.equal(nearest_resized(columns, (1, 800)), columns[:, 1::2])
+    finally:
+        torch.set_default_dtype(torch.float32)
+    sample = blobs()
+    with torch.device("meta"):
+        assert ResizeRig((30, 50))(sample)["images"].device.type == "cpu"
+
+
+def test_label_maps_are_checked_and_keep_their_channels() -> None:
+    resize = ResizeRig((30, 50), keys=SampleKeys(labels=("seg",)))
+    for maps in (torch.zeros(2, 3, *SIZE), [torch.zeros(3, *SIZE)] * 2):
+        assert resize(blobs(seg=maps))["seg"].shape == (2, 3, 30, 50)
+    mixed = Rig([RIG["a"], RIG["b"].resize((30, 50))])
+    parts = {"images": [torch.rand(3, 60, 100), torch.rand(3, 30, 50)], "rig": mixed}
+    assert resize({**parts, "seg": [torch.zeros(60, 100), torch.zeros(30, 50)]})["seg"].shape == (2, 30, 50)
+    with pytest.raises(SampleError, match=r"seg: camera 'a': expected a map of \(h, w\) = \(60, 100\), got \(30, 50\)"):
+        resize({**parts, "seg": [torch.zeros(30, 50), torch.zeros(60, 100)]})
+    with pytest.raises(SampleError, match="seg: expected 2 label maps, one an image, got 1"):
+        resize(blobs(seg=torch.zeros(1, *SIZE)))
+    with pytest.raises(ValueError, match="keys: expected a SampleKeys, got tuple"):
+        ResizeRig((30, 50), keys=("seg",))  # type: ignore[arg-type]
+
+
 def test_batches_lists_and_other_types() -> None:
     sample = blobs()
     batch = {"images": sample["images"].expand(3, -1, -1, -1, -1), "rig": RIG, "coverage": torch.ones(3, 2, *SIZE) > 0}
@@ -110,10 +149,10 @@ def test_what_cannot_follow_is_dropped_and_misuse_is_named() -> None:
         ResizeRig((30, 50))(blobs(classes=torch.zeros(2, *SIZE)))
     with pytest.raises(SampleError, match="missing K, cam2ego"):
         ResizeRig((30, 50))({"images": torch.zeros(1, 3, 4, 4)})
-    with pytest.raises(SampleError, match="seg: expected maps over the images' pixels as tensors, got NoneType"):
+    with pytest.raises(SampleTypeError, match="seg: expected label maps as tensors, got NoneType"):
         ResizeRig((30, 50), keys=SampleKeys(labels=("seg",)))(blobs(seg=None))
     for transform in (ResizeRig((30, 50)), CropRig(0, 0, (30, 50))):
-        with pytest.raises(SampleError, match=r"depth_m: expected maps of .* = \(60, 100\), got \(30"):
+        with pytest.raises(SampleError, match=r"depth_m: .* expected a map of .* = \(60, 100\), got \(30"):
             transform(blobs(depth_m=torch.zeros(2, 30, 50)))
         with pytest.raises(SampleTypeError, match="sample: expected a dict, got list"):
             transform([1, 2])

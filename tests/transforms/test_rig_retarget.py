@@ -236,6 +236,12 @@ def test_pixel_bound_keys_can_be_kept_or_rendered() -> None:
     sample = sample_of(source, boxes_2d=torch.rand(3, 4), depth=torch.rand(4, *SIZE))
     out = RigRetarget(source, keys=SampleKeys(keep=["boxes_2d"], labels=["depth"], ignore_index=0))(sample)
     assert out["boxes_2d"] is sample["boxes_2d"]
+    used = {"neighbours": [], "motion_depth_words": "none", "coverage": torch.ones((4, *SIZE)) > 0}
+    kept = RigRetarget(source.turned(yaw_deg=5), keys=SampleKeys(keep=tuple(used)))(sample_of(source, **used))
+    assert kept["neighbours"] == [] and kept["motion_depth_words"] == "none"
+    assert not kept["coverage"].all()  # the output's own
+    with pytest.raises(ValueError, match=r"SampleKeys.labels: expected keys of label maps, got coverage, images"):
+        SampleKeys(labels=("images", "seg", "coverage"))
     inner = (slice(None), slice(2, -2), slice(2, -2))
     assert torch.equal(out["depth"][inner], sample["depth"][inner])
 
@@ -304,6 +310,9 @@ def test_label_maps_that_do_not_fit() -> None:
         labels(torch.tensor(3))
     with pytest.raises(SampleError, match=r"'camera 1': expected .*torch.bool', 1, 'H', .*, got .*2, .*; merge masks"):
         labels([torch.zeros((k, *SIZE), dtype=torch.bool) for k in range(1, 5)])
+    with pytest.raises(SampleError, match=r"classes: SampleKeys.ignore_index: expected .* torch.float16, got 100000"):
+        labels(torch.zeros((4, *SIZE), dtype=torch.float16), ignore_index=1e5)
+    labels(torch.zeros((4, *SIZE), dtype=torch.float16), ignore_index=float("nan"))
     labels(torch.zeros((4, *SIZE), dtype=torch.int8), ignore_index=-1)
     with pytest.raises(SampleTypeError, match="classes: expected label maps as tensors, got ndarray"):
         labels(np.zeros((4, *SIZE)))
@@ -552,7 +561,7 @@ def test_the_roads_height_survives_a_second_retargeting() -> None:
     np.testing.assert_allclose(second["cam2ego"], first["cam2ego"])
 
 
-@pytest.mark.parametrize("container", ["list", "array"])
+@pytest.mark.parametrize("container", ["list", "array", "big-endian array"])
 def test_points_in_lists_and_arrays_move_too(container: str) -> None:
     source, retarget = ring(), RigRetarget(ring(ground_z_m=-0.5), keys=SampleKeys(frame="target"))
     points = torch.rand(6, 3)
@@ -560,6 +569,9 @@ def test_points_in_lists_and_arrays_move_too(container: str) -> None:
     sample = default_collate([sample_of(source)] * 2) if container == "list" else sample_of(source)
     out = retarget({**sample, "points": moving})["points"]
     moved = points - torch.tensor([0, 0, 0.5])
+    if container == "big-endian array":
+        swapped = retarget({**sample, "points": points.numpy().astype(">f4")})["points"]
+        np.testing.assert_array_equal(swapped, out)
     if container == "list":
         assert len(out) == 2 and torch.equal(out[0], moved) and torch.equal(out[1], moved[:2])
     else:
@@ -588,6 +600,7 @@ def test_copies_and_pickles() -> None:
     torch.manual_seed(1)
     expected = copy.deepcopy(retarget)(sample)
     retarget.plan(ring(), ring())
+    assert retarget.plan("nuscenes", "waymo") is retarget.plan(load_rig("nuscenes"), load_rig("waymo"))
     for other in (copy.deepcopy(retarget), pickle.loads(pickle.dumps(retarget))):
         assert len(other.plans) == 0
         torch.manual_seed(1)

@@ -173,8 +173,9 @@ def test_both_roads_coincide(sample: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("shape", [(0,), (0, 4), (0, 3)])
 def test_no_points(sample: dict[str, Any], shape: tuple[int, ...]) -> None:
-    out = RigRetarget(target(), geometry="street")(sample | {"points": torch.zeros(shape)})
-    assert out["points"].shape == shape and len(out["point_rings"]) == 0 and out["num_points"].sum() == 0
+    for points in (torch.zeros(shape), np.zeros(shape, np.float32)):
+        out = RigRetarget(target(), geometry="street")(sample | {"points": points})
+        assert out["points"].shape == shape and len(out["point_rings"]) == 0 and out["num_points"].sum() == 0
 
 
 def test_missing_returns_are_left_out() -> None:
@@ -245,6 +246,10 @@ def test_sweeps_of_users() -> None:
         assert torch.equal(retarget_points(own, target(), sweeps=[sweep]).points, both)
     with pytest.raises(SampleError, match=r"sweeps\[0\]: expected the columns of points .*, got \(5, 3\)"):
         retarget_points(own, target(), sweeps=[np.zeros((5, 3))])
+    with pytest.raises(SampleTypeError, match=r"sweeps: expected a list of points \(Q, C\), got int"):
+        retarget_points(own, target(), sweeps=3)  # type: ignore[arg-type]
+    with pytest.raises(SampleError, match=r"ground_z_m: expected one height, got shape \(2,\)"):
+        retarget_points(own, target(), ground_z_m=[0.0, 1.0])  # type: ignore[arg-type]
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
