@@ -44,7 +44,13 @@ def test_names_and_points() -> None:
 
 def test_one_camera_keeps_what_the_ego_frame_holds(sample: dict) -> None:
     maps = torch.arange(len(sample["rig"])).float()[:, None, None].expand(-1, 48, 132)
-    of_all = {"detections": [], "neighbours": [], "learned_depth_m": maps, "motion_depth_m": list(maps), "depth_m": None}
+    of_all = {
+        "detections": [],
+        "neighbours": [],
+        "learned_depth_m": maps,
+        "motion_depth_m": list(maps),
+        "depth_m": None,
+    }
     alone = one_camera({**sample, **of_all}, 2)
     assert alone["rig"].names == [sample["rig"].names[2]] and len(alone["images"]) == 1
     assert alone["boxes_3d"] is sample["boxes_3d"] and not {"K", "cam2ego", "detections", "neighbours"} & set(alone)
