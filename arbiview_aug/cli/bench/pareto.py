@@ -28,7 +28,7 @@ from arbiview_aug import PlanCache
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Quality, Reduce
 from arbiview_aug.cli.arguments import writable_folder
-from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, as_of_another_frame, recorded
+from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
 from arbiview_aug.cli.bench.speed import remap_floor
 from arbiview_aug.cli.bench.timing import Quartiles, benchmark, machine_line, peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.cli.parsers import EXECUTIONS, SCORED
@@ -79,17 +79,16 @@ class Setting:
             return retarget
         return lambda sample: retarget({**sample, "images": [image.to("cuda") for image in sample["images"]]})
 
-    def alternating(self, target: Rig, sample: Sample) -> Callable[[], Any]:
-        """Create a transform and alternate it between two frames of one calibration."""
-        retarget, samples = self.call(target), [sample, as_of_another_frame(sample)]
-        if self.execution == "cuda":
-            samples = [{**one, "images": [image.to("cuda") for image in one["images"]]} for one in samples]
-        frames = itertools.cycle(samples)
+    def repeated(self, target: Rig, sample: Sample) -> Callable[[], Any]:
+        """Create a transform and call it on a sample, whose images lie where it renders."""
+        retarget = self.call(target)
+        if self.execution != "cuda":
+            return partial(retarget, sample)
+        there = {**sample, "images": [image.to("cuda") for image in sample["images"]]}
 
         def run() -> None:
-            retarget(next(frames))
-            if self.execution == "cuda":
-                torch.cuda.synchronize()
+            retarget(there)
+            torch.cuda.synchronize()
 
         return run
 
@@ -148,8 +147,8 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     def frame(index: int, reduce: Reduce) -> ScoredFrame:
         return data.frame(index, reduce, REFERENCE)
 
-    def alternating(one: Setting) -> Callable[[], Any]:
-        return one.alternating(target, frame(0, one.reduce).scored_sample)
+    def repeated(one: Setting) -> Callable[[], Any]:
+        return one.repeated(target, frame(0, one.reduce).scored_sample)
 
     num_frames = min(arguments.frames, len(open_data(data.root)))
     h, w = target.sizes[0]
@@ -173,7 +172,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         raise DataError(f"{wanted}: expected geometry of {expected}")
     prefix, rows = "even" if data.truth is None else "true", []
     for name, one in tqdm(by_name.items(), desc="accuracy", unit="setting", leave=False):
-        memory = peak_mib(alternating(one))
+        memory = peak_mib(repeated(one))
         frames = [frame(index, one.reduce) for index in range(num_frames)]
         render = partial(_render, one.call(target))
         means = mean_of(row for each in frames for row in scores(each, render, target, ("even",))[1])
@@ -185,7 +184,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         row |= {"quality": one.quality, "surface": one.surface, "reduce": one.reduce, "execution": one.execution}
         rows.append(row | {"harm": static_harm(source, target, one.surface, RenderConfig())})
     timed = {"floor": floor} | {f"decode 1/{reduce}": data.reader(reduce) for reduce in {row["reduce"] for row in rows}}
-    timed |= {name: alternating(one) for name, one in by_name.items()}
+    timed |= {name: repeated(one) for name, one in by_name.items()}
     times = timed_rounds(timed, arguments.repeats, "times", enough_ms=_ENOUGH_MS)
     for row in rows:
         own_times, decode = times[row["name"]], quartiles(times[f"decode 1/{row['reduce']}"]).median_ms
@@ -195,7 +194,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
 
     def again(row: Row) -> Quartiles:
         name = row["name"]
-        return quartiles(timed_rounds({name: alternating(by_name[name])}, arguments.repeats, "again")[name])
+        return quartiles(timed_rounds({name: repeated(by_name[name])}, arguments.repeats, "again")[name])
 
     recommended = advice(rows, again, budget_ms=arguments.budget_ms, min_psnr_db=arguments.min_psnr)
     front = {row["name"] for row in pareto_front(rows)}

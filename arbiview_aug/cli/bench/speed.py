@@ -26,7 +26,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from itertools import chain, count, cycle, islice
+from itertools import chain, cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ from arbiview_aug.cameras.lens import Pinhole, intrinsics_for_fov
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Reduce
 from arbiview_aug.cli.arguments import device_named, output_file
-from arbiview_aug.cli.bench.data import Recorded, lidar_maps, lifted, recorded
+from arbiview_aug.cli.bench.data import Recorded, lidar_maps, recorded
 from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, show, timed_rounds
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.datasets import Neighbours
@@ -297,11 +297,10 @@ def _held(sample: Sample, target: Rig, holes: Holes = "black", harmonise: Harmon
 
 
 def _anew(sample: Sample, target: Rig, surface: GeometryName) -> Callable[[], Any]:
-    """Call with the geometry, over the street the rig, always a little elsewhere, so that no plan comes back."""
+    """Call with the rig, over the street, always a little elsewhere; plans over a frame's geometry never come back."""
     retarget = RigRetarget(target, geometry=surface, match_exposure=False, holes="black", cache=PlanCache(max_bytes=0))
-    ways_m = count(_STEP_M, _STEP_M)
     rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(_STEPS if surface == "street" else 1)])
-    return lambda: retarget(lifted({**sample, "rig": next(rigs)}, next(ways_m)))
+    return lambda: retarget({**sample, "rig": next(rigs)})
 
 
 def boxes_around(number: int) -> torch.Tensor:
