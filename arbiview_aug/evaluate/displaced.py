@@ -47,7 +47,7 @@ def displaced_frames(data: Any, count: int, next_frame: Mapping[str, Any] | None
             moved = later.labelled if later.moved is None else later.moved
             rig = later.rig.with_cameras([without_objects(camera, moved) for camera in later.rig])
             photographs = _photographs(rig, later.images(frame.images))
-            sample = frame.sample | ({"neighbours": others} if others else {})
+            sample = {**frame.sample, **({"neighbours": others} if others else {})}
         points, rig = sample.get("points"), photographs.rig
         yield str(sample.get("token", index)), ScoredFrame(sample, truth=photographs.of_rig, target=rig, points=points)
         found += 1
