@@ -59,11 +59,11 @@ def run(arguments: argparse.Namespace) -> None:
         methods = _methods(arguments)
         data = open_frames(arguments, arguments.geometry)
         done = measured(arguments, data, methods, notes, look=look)
-    if not done.views:
+    names = [method.name for method in methods]
+    if done.declined.keys() >= {*names}:
         raise DataError("; ".join(done.declined.values()))
     assert done.first is not None
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
-    names = [method.name for method in methods]
     scored = evaluation_tables(done, names)
     whole = [name for name in names if name not in done.declined]  # the others were judged on fewer frames
     judged = {name: numbers(row) for name, row in panel.rows(whole, list(done.targets)).items()}
@@ -71,8 +71,7 @@ def run(arguments: argparse.Namespace) -> None:
     notes.extend(panel.notes(whole, arguments.detector_classes))
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
     title = f"{source}: {frames_text(len({view['frame'] for view in done.views}))}"
-    settings = {key: value for key, value in vars(arguments).items() if key != "displaced"}
-    report: dict[str, Any] = {"arguments": settings, "scored_on_other_points": done.first.held_out}
+    report: dict[str, Any] = {"arguments": vars(arguments), "scored_on_other_points": done.first.held_out}
     report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in scored), strict=False))
     report |= {"views": done.views, "pairs": done.pairs} | ({"judges": judged} if judged else {})
     (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
@@ -113,7 +112,8 @@ def _panel(arguments: argparse.Namespace) -> Panel:
 
 def _displaced(arguments: argparse.Namespace, notes: list[str], look: Look | None) -> tuple[list[Method], Evaluation]:
     """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
-    data, displaced = open_frames(arguments, ["motion", *arguments.geometry]), arguments.displaced
+    everything: GeometryName = "fused" if arguments.geometry == ["auto"] else "motion"
+    data, displaced = open_frames(arguments, [everything, *arguments.geometry]), arguments.displaced
     count_of = min(arguments.frames or len(data), len(data))
     with named_steps(notes, count_of) as tick:
         options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
@@ -180,7 +180,7 @@ def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
             methods += [make(holes=load_inpainter(arguments.generator, steps=steps)) for steps in arguments.steps]
         else:
             methods.append(make(holes=holes))
-    return methods
+    return [*{method.name: method for method in methods}.values()]  # a name given twice is one row
 
 
 def measured(

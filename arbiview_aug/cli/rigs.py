@@ -9,6 +9,7 @@ import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.formats.calibration import read_calibration, recognised
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig, shipped_rigs
 from arbiview_aug.cli.arguments import data
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
@@ -43,8 +44,8 @@ def differences(source: Rig, target: Rig) -> str:
         nearest = source[int(np.argmax(cosine))]
         turned = float(np.degrees(np.arccos(np.clip(cosine.max(), -1, 1))))
         away_m = camera.center_m - nearest.center_m
-        is_noise &= turned < NOISE_DEG and bool(np.linalg.norm(away_m) < NOISE_M)
-        is_noise &= float(np.abs(np.subtract(camera.fov_deg, nearest.fov_deg)).max()) < NOISE_DEG
+        off = np.nan_to_num(_corners(camera)) - np.nan_to_num(_corners(nearest))  # outside a lens both may be NaN
+        is_noise &= bool(np.linalg.norm(off, axis=1).max() < np.radians(NOISE_DEG) and np.linalg.norm(away_m) < NOISE_M)
         density = [_pixels_per_deg(c) for c in (nearest, camera)]
         rows.append(
             [
@@ -58,6 +59,12 @@ def differences(source: Rig, target: Rig) -> str:
     title = f"From {source.name or 'the first rig'} to {target.name or 'the other rig'}:"
     note = f"\n\nAll within {NOISE_DEG:g} deg and {100 * NOISE_M:g} cm, as much as calibrations err: do not retarget."
     return f"{title}\n\n{markdown_table(head, rows, left=2)}{note if is_noise else ''}"
+
+
+def _corners(camera: Camera) -> FloatArray:
+    """(4, 3) directions of the image's corners in the ego frame: other lenses, K and rotations have others."""
+    w, h = camera.width_px - 0.5, camera.height_px - 0.5
+    return camera.unproject([[-0.5, -0.5], [w, -0.5], [-0.5, h], [w, h]]).directions
 
 
 def _pixels_per_deg(camera: Camera) -> float:

@@ -21,13 +21,12 @@ from arbiview_aug.datasets.depth_folder import WANTED
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.synthetic.dataset import LIDAR_BEAMS_DEG, LIDAR_COLUMNS, LIDAR_POSITION_M, LIDAR_RANGE_M
 from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.displaced import later_neighbour
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.evaluate.report.scan_pictures import scan_sheet
 from arbiview_aug.evaluate.report.tables import SCAN_COLUMNS, SCAN_NOTES, text_table
 from arbiview_aug.evaluate.scans import measured_near, rings_dropped, scan_metrics
-from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.scene.point_cloud import own_car
 from arbiview_aug.transforms.scans import retarget_points
 
@@ -123,12 +122,14 @@ def _displaced(arguments: argparse.Namespace, data: Any) -> Iterator[TrueScan]:
     from sklearn.neighbors import KDTree
 
     chosen = None if arguments.target is None else load_rig(arguments.target)
+    next_frame = FrameFolder(arguments.displaced)[0] if isinstance(arguments.displaced, str) else None
+    problems, found = list[str](), False
     for index in range(len(data)):
         sample = data[index]
-        later = FrameFolder(arguments.displaced)[0] if isinstance(arguments.displaced, str) else _next_frame(sample)
-        if later is None or "points" not in later or "points" not in sample:
+        found_later = later_neighbour(sample, next_frame, problems)
+        if found_later is None or "points" not in (later := found_later[1].given) or "points" not in sample:
             continue
-        move = np.linalg.inv(np.asarray(later["ego2world"])) @ np.asarray(sample["ego2world"])
+        found, move = True, np.linalg.inv(found_later[1].ego2ego)
         points, boxes = sample["points"].double().numpy(), np.zeros((0, 7))
         points[:, :3] = points[:, :3] @ move[:3, :3].T + move[:3, 3]
         if "boxes_3d" in later and "boxes_3d" in sample:
@@ -139,6 +140,8 @@ def _displaced(arguments: argparse.Namespace, data: Any) -> Iterator[TrueScan]:
         truth = truth[KDTree(points[:, :3]).query(truth[:, :3])[0][:, 0] <= _STATIC_M]
         rig = _with_scanners(later["rig"], chosen, str(arguments.data))
         yield TrueScan(str(sample["token"]), rig, points, boxes, truth)
+    if problems and not found:
+        raise DataError(problems[0])
 
 
 def _with_scanners(rig: Rig, chosen: Rig | None, where: str) -> Rig:
@@ -148,9 +151,3 @@ def _with_scanners(rig: Rig, chosen: Rig | None, where: str) -> Rig:
         fix = "lidars in calib.json, or --target with a rig file that has them"
         raise DataError(f"--lidar: {where}: expected {fix}, found none; see docs/lidar.md")
     return replace(rig, lidars=lidars, name=rig.name if chosen is None else chosen.name)
-
-
-def _next_frame(sample: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """The nearest neighbour recorded later."""
-    (frame,) = read_frames(sample, None)
-    return next((one.given for one in read_neighbours(frame, lambda *_: None) if one.is_later), None)

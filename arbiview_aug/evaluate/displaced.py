@@ -18,8 +18,8 @@ from arbiview_aug.evaluate.frames import Photographs, ScoredFrame
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.targets import without_masks
-from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.neighbours import read_neighbours
+from arbiview_aug.sample.inputs import LEARNED_KEY, Frame, read_frames
+from arbiview_aug.sample.neighbours import STILL_M, Neighbour, read_neighbours
 from arbiview_aug.temporal.motion_depth import without_objects
 
 
@@ -27,9 +27,11 @@ def displaced_frames(data: Any, count: int, next_frame: Mapping[str, Any] | None
     """Name and frame of the first ``count`` samples with photographs; methods get all that a sample has.
 
     The truth is a ``FrameFolder``'s ``truth`` camera; else ``next_frame``, or the nearest neighbour recorded later.
+    Samples without one are left out; DataError says why if there is no other.
     """
+    problems, found = list[str](), 0
     for index in range(len(data)):
-        if count == 0:
+        if found == count:
             return
         sample, truth = data[index], None
         recorded = data.dataset if isinstance(data, WithDepth) else data
@@ -38,31 +40,36 @@ def displaced_frames(data: Any, count: int, next_frame: Mapping[str, Any] | None
         if truth is not None:
             photographs = _photographs(truth["rig"], truth["images"])
         else:
-            if next_frame is not None:
-                sample = {**sample, "neighbours": [next_frame]}
-            later = _next_frame(sample)
-            if later is None:
+            found_later = later_neighbour(sample, next_frame, problems)
+            if found_later is None:
                 continue
-            photographs, sample = later
+            frame, later, others = found_later
+            moved = later.labelled if later.moved is None else later.moved
+            rig = later.rig.with_cameras([without_objects(camera, moved) for camera in later.rig])
+            photographs = _photographs(rig, later.images(frame.images))
+            sample = {**frame.sample, **({"neighbours": others} if others else {})}
         points, rig = sample.get("points"), photographs.rig
         yield str(sample.get("token", index)), ScoredFrame(sample, truth=photographs.of_rig, target=rig, points=points)
-        count -= 1
+        found += 1
+    if problems and not found:
+        raise DataError(problems[0])
 
 
-def _next_frame(sample: dict[str, Any]) -> tuple[Photographs, dict[str, Any]] | None:
-    """Photographs of the nearest later neighbour, and the sample with the other neighbours, if there are others."""
-    problems: list[str] = []
-    (frame,) = read_frames(sample, None)
+def later_neighbour(
+    sample: Mapping[str, Any], next_frame: Mapping[str, Any] | None, problems: list[str]
+) -> tuple[Frame, Neighbour, list[Any]] | None:
+    """A sample's frame, ``next_frame`` or else the nearest neighbour recorded later, and the neighbours elsewhere.
+
+    None if there is no such frame; what was wrong with neighbours goes to ``problems``.
+    """
+    entries = [*([] if next_frame is None else [next_frame]), *(sample.get("neighbours") or [])]
+    (frame,) = read_frames({**sample, "neighbours": entries}, None)
     neighbours = read_neighbours(frame, lambda _, message: problems.append(message))
-    later = next((one for one in neighbours if one.is_later), None)
+    later = next((one for one in neighbours if one.is_later and (next_frame is None or one.number == 0)), None)
     if later is None:
-        if problems:
-            raise DataError(problems[0])
         return None
-    moved = later.labelled if later.moved is None else later.moved
-    rig = later.rig.with_cameras([without_objects(camera, moved) for camera in later.rig])
-    others = [entry for k, entry in enumerate(sample["neighbours"]) if k != later.number]
-    return _photographs(rig, later.images(frame.images)), sample | ({"neighbours": others} if others else {})
+    apart_m = {one.number: np.linalg.norm((one.ego2ego - later.ego2ego)[:3, 3]) for one in neighbours}
+    return frame, later, [entry for k, entry in enumerate(entries) if apart_m.get(k, np.inf) > STILL_M]
 
 
 def _photographs(rig: Rig, images: Any) -> Photographs:
@@ -95,5 +102,6 @@ def surfaces_for(sample: Mapping[str, Any]) -> list[GeometryName]:
     """Surfaces that a sample has the geometry for, from the least to the most."""
     names: list[GeometryName] = ["ground", "street"]
     names += ["boxes"] if sample.get("boxes_3d") is not None else []
+    names += ["learned"] if sample.get(LEARNED_KEY) is not None else []
     measured: list[GeometryName] = ["lidar"] if sample.get("points") is not None else []
     return names + measured + ((["motion", "fused"] if measured else ["motion"]) if sample.get("neighbours") else [])

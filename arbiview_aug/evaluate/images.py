@@ -31,11 +31,10 @@ def as_arrays(images: torch.Tensor | Sequence[torch.Tensor]) -> list[Image]:
     """Convert images (N, 3, h, w) or a list of (3, h, w), uint8 or float in [0, 1], to (h, w, 3) on the scale 0-255."""
     arrays: list[Image] = []
     for image in images:
-        array = image.detach().cpu().numpy()
+        image = image.detach().cpu()
+        array = image.numpy() if image.dtype == torch.uint8 else image.float().numpy() * 255
         if array.ndim != 3 or array.shape[0] != 3:
             raise SampleError(f"images: expected (3, h, w) each, got {tuple(array.shape)}")
-        if array.dtype != np.uint8:
-            array = array.astype(np.float32) * 255
         arrays.append(np.ascontiguousarray(array.transpose(1, 2, 0)))
     return arrays
 

@@ -52,18 +52,21 @@ SEGMENTED = (360, 640)
 """(h, w) of the 16:9 crop that a TorchScript segmenter sees: TwinLiteNet's."""
 
 LEAST_SCORE = 0.05
-"""Detections below it are left out: torchvision's default of Faster R-CNN."""
+"""Detections below it are left out: torchvision's default of Faster R-CNN, whatever the detector's."""
 
 _WORDS = (
     *("person", "people", "pedestrian", "human", "rider", "cyclist", "bicyclist", "motorcyclist"),
     *("bicycle", "bike", "motorcycle", "motorbike", "vehicle", "car", "van", "truck", "lorry", "bus", "trailer"),
+    *("wheelchair", "stroller", "signaler"),
 )
+_NO_ROAD_USERS = "static", "sign", "rack", "stop", "ego"
+"""Words of names such as ``static_object.bicycle_rack``, ``bus stop`` and ``vehicle.ego``."""
 
 
 def is_road_user(name: str) -> bool:
     """Whether a class name is of vehicles or people: COCO's ``car``, nuScenes' ``vehicle.car``, ``BOX_TRUCK``."""
     words = re.split(r"[^a-z]+", name.lower())
-    return "static" not in words and not {*words}.isdisjoint(_WORDS)  # static_object.bicycle_rack
+    return {*words}.isdisjoint(_NO_ROAD_USERS) and not {*words}.isdisjoint(_WORDS)
 
 
 # --- detectors --------------------------------------------------------------------------------------------------------
@@ -99,7 +102,7 @@ def load_detector(
     def detector(image: Picture) -> Detections:
         found = checked_detections(option, _called(option, detect, image), image)
         counts = [label in classes if classes else label.isdecimal() or is_road_user(label) for label in found.labels]
-        return found.subset(np.array(counts, bool))
+        return found.subset(np.array(counts, bool) & (found.scores >= LEAST_SCORE))
 
     return detector
 
@@ -126,7 +129,8 @@ def checked_detections(option: str, output: Any, image: Picture) -> Detections:
     try:
         boxes, scores = (np.asarray(_host(part), np.float64) for part in output[:2])
         labels = np.asarray(_host(output[2])).reshape(-1)
-    except (TypeError, ValueError) as error:
+        texts = [str(int(one)) if np.issubdtype(labels.dtype, np.number) else str(one) for one in labels]
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise DataError(f"{expected}, got other values: {error}") from None
     boxes = boxes.reshape(0, 4) if boxes.size == 0 else boxes
     if boxes.ndim != 2 or boxes.shape[1] != 4 or scores.shape != (len(boxes),) or len(labels) != len(boxes):
@@ -137,7 +141,6 @@ def checked_detections(option: str, output: Any, image: Picture) -> Detections:
     if not ((scores >= 0) & (scores <= 1)).all():
         raise DataError(f"{expected}: scores from 0 to 1, got {shown(scores.tolist())}")
     h, w = image.shape[:2]
-    texts = [str(int(one)) if np.issubdtype(labels.dtype, np.number) else str(one) for one in labels]
     return Detections(boxes.clip(0, (w, h, w, h)), scores, texts)
 
 
@@ -173,6 +176,7 @@ def _of_torchvision(
         fix = f"expected weights of torchvision's {name} for its {len(names)} classes (others: FILE.py:function)"
         raise DataError(f"{file}: {fix}: {one_line(error)}") from None
     model.eval().to(device)
+    getattr(model, "roi_heads", model).score_thresh = LEAST_SCORE  # some ask for more: FCOS for 0.2
 
     @torch.inference_mode()
     def detect(image: Picture) -> Any:
@@ -228,7 +232,7 @@ def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
         masks = _called(option, segment, image)
         try:
             array = np.asarray(_host(masks))
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, RuntimeError):
             array = np.zeros(0)
         expected = (2, *image.shape[:2])
         if array.shape != expected or not np.isin(array, (0, 1)).all():

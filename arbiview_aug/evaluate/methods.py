@@ -7,16 +7,21 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
+import torch
+
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Holes, Quality
+from arbiview_aug.errors import WarnOnce
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.plan import RenderConfig
-from arbiview_aug.sample.inputs import read_frames, read_scene
+from arbiview_aug.sample.inputs import DEPTH_KEYS, MOTION_KEY, read_frames, read_scene
+from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
+from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion
 from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys, inpainter_of, render_config
@@ -77,10 +82,12 @@ def retargeting(
         return views_of(transform(target)(sample))
 
     def render_alone(sample: Sample, camera: int, target: Rig) -> RenderedView:
-        """Render with the depth and the gain estimated from all cameras' overlaps."""
+        """Render with the depth and the gain estimated from all cameras, their overlaps and their neighbours."""
         if not estimates or estimates[0][0] is not sample:  # several views of a sample are rendered in a row
-            estimates[:] = [(sample, *_overlap_estimates(sample, corrected, harmoniser))]
-        alone, (_, depth, gains) = one_camera(sample, camera), estimates[0]
+            known = _with_motion(sample, geometry) if from_motion else sample
+            estimates[:] = [(sample, known, *_overlap_estimates(sample, corrected, harmoniser))]
+        _, known, depth, gains = estimates[0]
+        alone = one_camera(known, camera)
         retarget = RigRetarget(
             target,
             quality=quality,
@@ -91,8 +98,7 @@ def retargeting(
             keys=SampleKeys(points="source"),
         )
         if depth is not None and retarget.overlaps is not None:
-            known = depth
-            retarget.overlaps.get((alone["rig"].named_key, None), lambda: known)
+            retarget.overlaps.get((alone["rig"].named_key, None), lambda: depth)
         (view,) = views_of(retarget(alone))
         return view
 
@@ -104,9 +110,10 @@ def retargeting(
     is_paper = not isinstance(config, RenderConfig)
     learns = not is_paper and config.overlap_depth
     corrected, harmoniser = geometry if learns else None, Harmoniser(match_exposure)
-    estimates: list[tuple[Sample, OverlapDepth | None, Sequence[float] | None]] = []
+    from_motion = not is_paper and GEOMETRIES[geometry].needs == "motion"
+    estimates: list[tuple[Sample, Sample, OverlapDepth | None, Sequence[float] | None]] = []
     reads_points = "points" in GEOMETRIES[geometry].reads and not is_paper
-    alone = render_alone if learns or harmoniser.is_on or fills else None
+    alone = render_alone if learns or from_motion or harmoniser.is_on or fills else None
     return Method(label, render, reads_points, alone, plans=not is_paper)
 
 
@@ -124,10 +131,21 @@ def _overlap_estimates(
     return overlap_depth(rig, images, boxes), gains  # as ``estimate_overlap`` measures it
 
 
+def _with_motion(sample: Sample, surface: GeometryName) -> Sample:
+    """The sample with its depth from motion, where that must be estimated."""
+    frame, warn = read_frames(sample, None)[0], WarnOnce()
+    if not estimates_motion(frame, surface):
+        return sample
+    scene = read_scene(frame, surface) or Scene()
+    motion = estimate_motion(frame, scene, read_neighbours(frame, warn), warn)
+    return {**sample, MOTION_KEY: list(map(torch.from_numpy, motion.depth_m))}
+
+
 def one_camera(sample: Sample, camera: int) -> dict[str, Any]:
-    """Reduce a sample to one camera; geometry in the ego frame stays."""
+    """Reduce a sample to one camera and its depth maps; geometry in the ego frame stays, neighbours do not."""
     rig: Rig = sample["rig"]
-    kept = {key: value for key, value in sample.items() if key not in ("K", "cam2ego", "detections")}
+    kept = {key: value for key, value in sample.items() if key not in ("K", "cam2ego", "detections", "neighbours")}
+    kept |= {key: kept[key][camera : camera + 1] for key in DEPTH_KEYS if kept.get(key) is not None}
     return {**kept, "images": [sample["images"][camera]], "rig": rig.with_cameras([rig[camera]])}
 
 

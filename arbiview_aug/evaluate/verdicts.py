@@ -69,10 +69,11 @@ class Verdict:
     road: Integers | None = None  # (2, 2) intersection and union, pixels, of drivable area and lanes with the truth's
 
     def objects(self, which: BoolArray) -> FloatArray:
-        """(n,) ``nta_ious`` of those of the labels."""
+        """(n,) ``nta_ious`` of those of the whole labels."""
         assert self.detections is not None and self.labels is not None
         confident = self.detections.boxes[self.detections.scores > CONFIDENCE]
-        return nta_ious(self.labels.boxes[which], confident, self.size)
+        whole = self.labels.whole  # all of them, so that each detection belongs to the nearest
+        return nta_ious(self.labels.boxes[whole], confident, self.size)[which[whole]]
 
 
 def valid_detections(detections: Detections, valid: BoolArray) -> Detections:

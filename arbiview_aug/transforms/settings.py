@@ -59,6 +59,8 @@ class SampleKeys:
             object.__setattr__(self, name, tuple(value))
         if own := {*self.labels} & {*CALIBRATION_KEYS}:
             raise ValueError(f"SampleKeys.labels: expected keys of label maps, got {', '.join(sorted(own))}")
+        if own := {*self.keep} & {"rig", "lens", "distortion"}:
+            raise ValueError(f"SampleKeys.keep: expected no calibration of the source's, got {', '.join(sorted(own))}")
         for key in self.extra:
             choice("SampleKeys.extra", key, EXTRA_KEYS)
         if self.camera_maps is not None:

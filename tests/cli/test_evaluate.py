@@ -193,6 +193,17 @@ def test_a_method_that_declines_a_frame_is_in_no_table(
     report = run(["--size", "24x66", "--frames", "2", "--detector", f"{tmp_path}/own.py:detect"], tmp_path)
     assert list(report["means"]) == ["own"] and list(report["judges"]) == ["sources", "own", "truth"]
     assert "note: picky: frame synthetic-0-1: too dark" in capsys.readouterr().out
+    first.clear()
+    monkeypatch.setattr(command, "_methods", lambda _: [replace(own, name="picky", render=render)])
+    assert main(["evaluate", "--size", "24x66", "--frames", "2", "--output", str(tmp_path)]) == 2
+    assert "frame synthetic-0-1: too dark" in capsys.readouterr().err
+
+
+def test_a_name_given_twice_is_one_row(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(JUDGES)
+    asked = ["--size", "24x66", "--detector", f"{tmp_path}/own.py:detect", "--geometry", "infinity"]
+    once, twice = (run([*asked, *more], tmp_path)["judges"] for more in ([], ["infinity"]))
+    assert once == twice
 
 
 def test_rows_do_not_depend_on_other_rows(tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def test_from_the_command_to_views(recorded: Path, knowing: Path, street: Synthe
     psnr = [float(-10 * ((one["images"].float() - wanted)[both] ** 2).mean().log10()) for one in (views, flat)]
     assert psnr[0] > psnr[1] + 2, psnr
     report = ["--data", str(recorded), "--geometry", "learned", "street", "--output", str(recorded / "report")]
-    assert main(["evaluate", *report, "--target-set", "truck"]) == 0 and "learned" in capsys.readouterr().out
+    assert main(["evaluate", *report, "--target-set", "truck"]) == 0 and "| fast, learned |" in capsys.readouterr().out
     converted = ["--target", "waymo", "--size", "32x48", "--workers", "1", "--output", str(recorded.parent / "new")]
     assert main(["convert", "--data", str(recorded), *converted, "--geometry", "learned"]) == 0
     before = {path: path.stat().st_mtime_ns for path in (recorded / LEARNED_FOLDER).iterdir()}

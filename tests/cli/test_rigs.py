@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from arbiview_aug.__main__ import main
-from arbiview_aug.cameras.rig import load_rig, save_rig
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rig import Rig, load_rig, save_rig
 from arbiview_aug.cli import rigs
 from arbiview_aug.cli.rigs import differences
 
@@ -41,11 +45,24 @@ def test_same_rig_has_no_differences() -> None:
         assert row[:6] == [camera.name, camera.name, "0.0 deg", "+0.00", "+0.00", "+0.00"]
 
 
+PRINCIPAL_PX = np.array([[0, 0, 0], [0, 0, 30.0], [0, 0, 0]])
+
+
+def of_each(rig: Rig, changed: Callable[[Camera], Camera]) -> Rig:
+    return rig.with_cameras([changed(camera) for camera in rig])
+
+
 def test_differences_within_the_noise_of_calibration_are_named() -> None:
     rig = load_rig("nuscenes")
-    others = (rig.shifted(z_m=0.01), True), (rig.shifted(z_m=0.03), False), (rig.turned(yaw_deg=0.3), False)
-    for other, is_noise in others:
-        assert ("do not retarget" in differences(rig, other)) == is_noise
+    fisheye = load_rig("fisheye_surround")
+    pairs = [
+        *((rig, rig.shifted(z_m=0.01), True), (rig, rig.shifted(z_m=0.03), False)),
+        *((rig, rig.turned(yaw_deg=0.3), False), (rig, rig.resized(0.5), True)),
+        *((rig, of_each(rig, lambda c: c.turned(roll_deg=10)), False), (fisheye, fisheye.resized(0.5), True)),
+        *((one, of_each(one, lambda c: replace(c, K=c.K + PRINCIPAL_PX)), False) for one in (rig, fisheye)),
+    ]
+    for one, other, is_noise in pairs:
+        assert ("do not retarget" in differences(one, other)) == is_noise, other
 
 
 def test_files_and_folders(tmp_path: Path) -> None:

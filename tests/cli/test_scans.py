@@ -13,6 +13,7 @@ import pytest
 from arbiview_aug import Lidar
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from tests.helpers import write_drive
 
@@ -53,12 +54,18 @@ def test_the_next_frame_of_a_drive(tmp_path: Path, capsys: pytest.CaptureFixture
     assert len({row["frame"] for row in report["rows"]}) == 2
     assert list(scans) == ["as they are", "scanned"] and scans["scanned"]["recall"] > scans["as they are"]["recall"]
     assert scans["scanned"]["precision"] > 0.7
+    again = run(["--data", str(tmp_path / "drive"), "--displaced", str(tmp_path / "drive" / "0001")], tmp_path)
+    assert again["rows"] == report["rows"][: len(again["rows"])] and len({row["frame"] for row in again["rows"]}) == 1
+    write_frame(tmp_path / "lost", {key: value for key, value in frames[1].items() if key != "ego2world"})
+    lost = ["--displaced", str(tmp_path / "lost"), "--output", str(tmp_path / "out")]
+    assert main(["evaluate", "--lidar", "--data", str(tmp_path / "drive"), *lost]) == 2
+    assert "expected ego2ego (4, 4), or ego2world here and in the sample; it has none" in capsys.readouterr().err
     bare = [{**one, "rig": replace(RIG, lidars=())} for one in frames]
     write_drive(tmp_path / "bare", bare)
     asked = ["evaluate", "--lidar", "--displaced", "--data", str(tmp_path / "bare"), "--output", str(tmp_path / "out")]
     assert main(asked) == 2 and "expected lidars in calib.json, or --target" in capsys.readouterr().err
-    again = run([*asked[2:5], "--target", str(RIG.save(tmp_path / "rig.json"))], tmp_path / "out")["scans"]
-    assert again["scanned"] == pytest.approx(scans["scanned"])
+    alike = run([*asked[2:5], "--target", str(RIG.save(tmp_path / "rig.json"))], tmp_path / "out")["scans"]
+    assert alike["scanned"] == pytest.approx(scans["scanned"])
 
 
 def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,8 +15,8 @@ from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.image_io import encoded_image
 from arbiview_aug.datasets.synthetic import SyntheticDrive
-from arbiview_aug.errors import CalibrationError
-from arbiview_aug.evaluate.displaced import displaced_frames
+from arbiview_aug.errors import CalibrationError, DataError
+from arbiview_aug.evaluate.displaced import displaced_frames, surfaces_for
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import camera, write_drive
@@ -52,6 +52,7 @@ def test_a_camera_that_is_the_source_itself(tmp_path: Path) -> None:
         assert row["true_covered_psnr_db"] == pytest.approx(SAME_DB, abs=0.1) and row["spread_db"] == 0
     (tmp_path / "own.py").write_text("def detect(rgb):\n    return [[0, 0, 9, 9]], [0.6], ['car']\n")
     judged = run(tmp_path / "data", tmp_path / "out", "--geometry", "street", "--detector", f"{tmp_path}/own.py:detect")
+    assert judged["arguments"]["displaced"] is True
     assert "copy" in judged["judges"] and "agreement" not in judged, "photographs have no table of agreement"
 
 
@@ -86,6 +87,25 @@ def test_the_next_frame_without_what_moved() -> None:
     np.testing.assert_array_equal(as_arrays(photographs.images)[0], as_arrays(after["images"])[0])
     np.testing.assert_allclose(frame.target[0].center_m - RIG[0].center_m, (1.2, 0, 0), atol=0.01)
     assert 0.5 < photographs.valid[0].mean() < 1, "traffic does not score"
+
+
+def test_a_given_next_frame_is_not_read_and_far_frames_are_left_out() -> None:
+    sample = SyntheticDrive(RIG, num_frames=1, supersampling=1, neighbours=Neighbours(count=1, step_m=1.2))[0]
+    before, after = sample["neighbours"]
+    far = sample | {"ego2world": sample["ego2world"].clone()}
+    far["ego2world"][0, 3] += 500
+    for own in ([before], [before, after]):
+        given = [far, sample | {"neighbours": own}]
+        ((_, frame),) = displaced_frames(given, 2, {**after, "token": "again"})
+        assert [entry["token"] for entry in frame.sample["neighbours"]] == [before["token"]]
+    with pytest.raises(DataError, match="neighbour 'next' is left out: ego2ego: expected at most 60 m of travel"):
+        next(displaced_frames([far], 1, {**after, "token": "next"}))
+
+
+def test_surfaces_are_all_that_a_sample_has_geometry_for() -> None:
+    known = {"boxes_3d": 0, "learned_depth_m": 0, "points": 0, "neighbours": [0]}
+    assert surfaces_for({}) == ["ground", "street"]
+    assert surfaces_for(known) == ["ground", "street", "boxes", "learned", "lidar", "motion", "fused"]
 
 
 def test_folders_without_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

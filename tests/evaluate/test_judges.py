@@ -30,8 +30,10 @@ def file(tmp_path: Path) -> Callable[[str], str]:
 
 def test_road_users() -> None:
     yes = ("car", "vehicle.car", "human.pedestrian.adult", "BOX_TRUCK", "TYPE_CYCLIST", "Person_sitting", "Van")
+    walking = ("WHEELCHAIR", "STROLLER", "OFFICIAL_SIGNALER")
     no = ("static_object.bicycle_rack", "movable_object.trafficcone", "traffic light", "cat", "carpet", "LABEL_0")
-    assert all(map(is_road_user, yes)) and not any(map(is_road_user, no))
+    still = ("MOBILE_PEDESTRIAN_CROSSING_SIGN", "bus stop", "vehicle.ego", "bicycle_rack")
+    assert all(map(is_road_user, yes + walking)) and not any(map(is_road_user, no + still))
 
 
 # --- functions --------------------------------------------------------------------------------------------------------
@@ -49,6 +51,7 @@ def test_a_function_is_asked_for_all_detections_that_ap_counts(file: Callable[[s
     path = Path(name.removesuffix(":judge"))
     path.write_text(path.read_text().replace("judge(rgb)", "judge(rgb, score=0.3)"))
     assert load_detector(name)(IMAGE).scores.tolist() == [LEAST_SCORE]
+    assert load_detector(file("[[1, 2, 3, 4]] * 2, [0.04, 0.06], [0, 0]"))(IMAGE).scores.tolist() == [0.06]
 
 
 def test_classes_that_count(file: Callable[[str], str]) -> None:
@@ -69,6 +72,9 @@ def test_classes_that_count(file: Callable[[str], str]) -> None:
         ("[[9, 2, 3, 4]], [0.5], [0]", "finite, with x0 <= x1 and y0 <= y1, got [9.0, 2.0, 3.0, 4.0]"),
         ("[[1, 2, 3, 4]], [50], [0]", "scores from 0 to 1, got [50.0]"),
         ("'abc', [0.5], [0]", "got other values"),
+        ("[[1, 2, 3, 4]], [0.5], [float('nan')]", "got other values"),
+        ("[[1, 2, 3, 4]], [0.5], [float('inf')]", "got other values"),
+        ("[torch.ones(4, requires_grad=True)], [0.5], [0]", "got other values"),
         ("rgb.missing", "raised AttributeError: 'numpy.ndarray' object has no attribute 'missing' for an image"),
     ],
 )
@@ -150,14 +156,18 @@ def test_torchscript_of_another_kind(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_torchvisions_detectors(tmp_path: Path, file: Callable[[str], str]) -> None:
+def test_torchvisions_detectors(tmp_path: Path, file: Callable[[str], str], monkeypatch: pytest.MonkeyPatch) -> None:
+    from torchvision import models
     from torchvision.models.detection import ssdlite320_mobilenet_v3_large as ssdlite
 
     name, weights = "ssdlite320_mobilenet_v3_large", tmp_path / "weights.pth"
     torch.manual_seed(0)
     state = ssdlite(weights=None, weights_backbone=None).state_dict()
     torch.save({"model": state}, weights)
+    built, get_model = [], models.get_model
+    monkeypatch.setattr(models, "get_model", lambda *of, **kind: built.append(get_model(*of, **kind)) or built[-1])
     found = load_detector(name, str(weights), classes=["car", "person", "bus"])(IMAGE)
+    assert built[0].score_thresh == LEAST_SCORE, "asked for no more and no less"
     assert found.boxes.shape == (len(found.labels), 4) and {*found.labels} <= {"car", "person", "bus"}
     with pytest.raises(DataError, match=r"--detector-classes: expected names that .* has, .*got \['horse-cart'\]"):
         load_detector(name, str(weights), classes=["horse-cart"])

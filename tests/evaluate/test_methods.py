@@ -8,6 +8,8 @@ import torch
 
 from arbiview_aug.cameras.rays import half_way_view
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import GeometryName
+from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate import methods
 from arbiview_aug.evaluate.images import as_arrays
@@ -41,9 +43,31 @@ def test_names_and_points() -> None:
 
 
 def test_one_camera_keeps_what_the_ego_frame_holds(sample: dict) -> None:
-    alone = one_camera({**sample, "detections": []}, 2)
+    maps = torch.arange(len(sample["rig"])).float()[:, None, None].expand(-1, 48, 132)
+    of_all = {
+        "detections": [],
+        "neighbours": [],
+        "learned_depth_m": maps,
+        "motion_depth_m": list(maps),
+        "depth_m": None,
+    }
+    alone = one_camera({**sample, **of_all}, 2)
     assert alone["rig"].names == [sample["rig"].names[2]] and len(alone["images"]) == 1
-    assert alone["boxes_3d"] is sample["boxes_3d"] and not {"K", "cam2ego", "detections"} & set(alone)
+    assert alone["boxes_3d"] is sample["boxes_3d"] and not {"K", "cam2ego", "detections", "neighbours"} & set(alone)
+    for key in ("learned_depth_m", "motion_depth_m"):
+        assert len(alone[key]) == 1 and (alone[key][0] == 2).all(), key
+
+
+@pytest.mark.filterwarnings("ignore:the target rig")
+@pytest.mark.parametrize("surface", ["motion", "fused"])
+def test_a_camera_alone_has_the_motion_of_all(surface: GeometryName) -> None:
+    neighbours = Neighbours(count=1, step_m=1.0)
+    drive = SyntheticDrive(demo_source_rig((96, 264)), num_frames=1, lidar=False, neighbours=neighbours)
+    sample = drive[0]
+    rig: Rig = sample["rig"]
+    view = rig.with_cameras([half_way_view(rig[0], rig[1], (56, 100))])
+    moving, still = (retargeting("fast", name).alone(sample, 0, view) for name in (surface, "boxes"))
+    assert (moving.image != still.image).mean() > 0.1
 
 
 @pytest.mark.filterwarnings("ignore:the target rig")

@@ -25,6 +25,13 @@ def test_images_are_drawn_with_boxes_under_their_cameras_names() -> None:
     assert figure._repr_png_().startswith(b"\x89PNG")
 
 
+def test_bfloat16_images() -> None:
+    sample = street_sample()
+    halves = sample | {"images": (sample["images"].float() / 255).to(torch.bfloat16)}
+    for one, other in zip(pictures(sample), pictures(halves), strict=True):
+        assert np.abs(one.astype(float) - other).max() <= 1
+
+
 def test_what_no_camera_saw_is_dimmed() -> None:
     sample = street_sample()
     del sample["boxes_3d"]

@@ -89,6 +89,14 @@ def test_several_targets_and_methods_share_the_truth() -> None:
     assert counts["own: all"] == counts[f"{TRUTH}: all"] == 8
 
 
+def test_a_clear_object_does_not_take_the_detection_of_a_hidden_neighbour() -> None:
+    clear_and_hidden, yes = np.array([[100.0, 100, 140, 140], [108, 100, 148, 140]]), np.ones(2, bool)
+    seen = Detections(clear_and_hidden[1:], np.array([0.9]), ["car"])
+    labels = Labels(np.arange(2), clear_and_hidden, yes, np.array([True, False]))
+    row = numbers(figures([Verdict("0", "own", "van", (900, 1600), seen, labels)]))
+    assert (row["recall"], row["clear_recall"], row["clear_iou"]) == (0.5, 0, 0)
+
+
 def test_unsure_detections() -> None:
     boxes = labelled().tolist()
     rows = looked(Panel(detector({VIEW: boxes, TRUE: boxes}, score=0.4)), frame())

@@ -242,6 +242,8 @@ def test_pixel_bound_keys_can_be_kept_or_rendered() -> None:
     assert not kept["coverage"].all()  # the output's own
     with pytest.raises(ValueError, match=r"SampleKeys.labels: expected keys of label maps, got coverage, images"):
         SampleKeys(labels=("images", "seg", "coverage"))
+    with pytest.raises(ValueError, match=r"SampleKeys.keep: expected no calibration of the source's, got lens, rig"):
+        SampleKeys(keep=("rig", "lens"))
     inner = (slice(None), slice(2, -2), slice(2, -2))
     assert torch.equal(out["depth"][inner], sample["depth"][inner])
 

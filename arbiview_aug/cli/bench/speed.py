@@ -7,14 +7,14 @@ outputs, with float32 maps that read a source of the view's own size at
 
 A time is the median over the rounds; a ratio is the median of call / floor within a round.
 
-The targets are Waymo's five cameras without and with their lenses, four fisheye cameras, and the source's own, turned
-or lowered, all without scanners. *Motion estimate*: nuScenes' six cameras in a synthetic drive. *Depth maps* from
-motion and from a network cost the same; these say at every pixel the depth of the nearest LiDAR point. *Fused* is LiDAR
-with two maps. *Held*: the calibration comes back, and with it the plan; every other call plans anew. Images are decoded
-at half size where they are then still larger than the views. They lie channels-last in one block, as this package's
-readers give them; contiguous ones are planes, torch's usual layout. Holes stay black unless they are *filled*. *Points
-by rays*: ``retarget_points`` alone. With ``--device`` the floor is a copy there of as many bytes as rendering must
-move; the clock of a GPU is its events.
+The targets are Waymo's five cameras without and with their lenses, four fisheye cameras, and the source's own, turned,
+or raised and pitched down, all without scanners. *Motion estimate*: nuScenes' six cameras in a synthetic drive. *Depth
+maps* from motion and from a network cost the same; these say at every pixel the depth of the nearest LiDAR point.
+*Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it the plan; every other call plans anew.
+Images are decoded at half size where they are then still larger than the views. They lie channels-last in one block, as
+this package's readers give them; contiguous ones are planes, torch's usual layout. Holes stay black unless they are
+*filled*. *Points by rays*: ``retarget_points`` alone. With ``--device`` the floor is a copy there of as many bytes as
+rendering must move; the clock of a GPU is its events.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from itertools import chain, count, cycle, islice
+from itertools import chain, cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ from arbiview_aug.cameras.lens import Pinhole, intrinsics_for_fov
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Reduce
 from arbiview_aug.cli.arguments import device_named, output_file
-from arbiview_aug.cli.bench.data import Recorded, lidar_maps, lifted, recorded
+from arbiview_aug.cli.bench.data import Recorded, lidar_maps, recorded
 from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, show, timed_rounds
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.datasets import Neighbours
@@ -234,9 +234,9 @@ def _motion() -> Calls:
 
 
 def _own(sample: Sample, views: tuple[int, int]) -> Calls:
-    """Turned cameras, which have holes, and lowered ones, which neighbouring frames fill."""
+    """Turned cameras, which have holes, and raised ones that look down, which neighbouring frames fill."""
     rig, boxes = sample["rig"], {"boxes_3d": boxes_around(75)}
-    turned, low = rig.turned(yaw_deg=YAW_DEG).resized(views), lowered(rig, views)
+    turned, low = rig.turned(yaw_deg=YAW_DEG).resized(views), looking_down(rig, views)
     poses = torch.eye(4, dtype=torch.float64).repeat(1 + _MOST_NEIGHBOURS, 1, 1)
     poses[1:, 0, 3] = torch.tensor([_TRAVEL_M * (1 + k // 2) * (-1) ** k for k in range(_MOST_NEIGHBOURS)])
     frame, *others = ({**sample, "ego2world": pose} for pose in poses)
@@ -253,12 +253,12 @@ def _own(sample: Sample, views: tuple[int, int]) -> Calls:
     }
 
 
-def lowered(rig: Rig, size: tuple[int, int]) -> Rig:
+def looking_down(rig: Rig, size: tuple[int, int]) -> Rig:
     """Raise a rig by 0.6 m, pitch it down by 15 degrees and widen it to 100: it sees road that no camera sees."""
-    (h, w), K = size, intrinsics_for_fov("lowered", 100.0, size, Pinhole())
+    (h, w), K = size, intrinsics_for_fov("looking down", 100.0, size, Pinhole())
     poses = {c.name: c.turned(pitch_deg=-15.0).shifted(z_m=0.6).cam2ego for c in rig}
     cameras = [Camera(name=name, width_px=w, height_px=h, K=K, cam2ego=pose) for name, pose in poses.items()]
-    return Rig(cameras, ground_z_m=rig.ground_z_m, name="lowered")
+    return Rig(cameras, ground_z_m=rig.ground_z_m, name="looking down")
 
 
 def _batches(sample: Sample, size: tuple[int, int], device: torch.device) -> Iterator[tuple[str, Calls]]:
@@ -297,11 +297,10 @@ def _held(sample: Sample, target: Rig, holes: Holes = "black", harmonise: Harmon
 
 
 def _anew(sample: Sample, target: Rig, surface: GeometryName) -> Callable[[], Any]:
-    """Call with the geometry, over the street the rig, always a little elsewhere, so that no plan comes back."""
+    """Call with the rig, over the street, always a little elsewhere; plans over a frame's geometry never come back."""
     retarget = RigRetarget(target, geometry=surface, match_exposure=False, holes="black", cache=PlanCache(max_bytes=0))
-    ways_m = count(_STEP_M, _STEP_M)
     rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(_STEPS if surface == "street" else 1)])
-    return lambda: retarget(lifted({**sample, "rig": next(rigs)}, next(ways_m)))
+    return lambda: retarget({**sample, "rig": next(rigs)})
 
 
 def boxes_around(number: int) -> torch.Tensor:

@@ -40,8 +40,9 @@ PHOTOGRAPH_COLUMNS = (
 )
 PHOTOGRAPH_NOTES = (
     "seen: share of the pixels that the method covers. PSNR, MAE, SSIM: of those, means over all cameras and frames. "
-    "spread: standard deviation of the frames' PSNR. whole view: PSNR of all pixels, holes black. copy: the source "
-    "image as it is. The photographed vehicle itself and labelled objects that moved do not score."
+    "spread: standard deviation of the frames' PSNR. whole view: PSNR of all pixels; holes are black unless they are "
+    "filled. copy: the source image as it is. The photographed vehicle itself and labelled objects that moved do not "
+    "score."
 )
 SPARSE_COLUMNS = (
     SEEN,

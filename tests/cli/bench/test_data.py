@@ -1,4 +1,4 @@
-"""Frames to measure on: another frame is new in all that is measured, and lies in memory as the first."""
+"""Frames to measure on: each call plans anew over their geometry."""
 
 from __future__ import annotations
 
@@ -7,31 +7,29 @@ import pytest
 import torch
 
 from arbiview_aug import RigRetarget
-from arbiview_aug.cli.bench.data import as_of_another_frame, recorded
+from arbiview_aug.choices import GeometryName
+from arbiview_aug.cli.bench.data import lidar_maps, recorded
 from arbiview_aug.datasets import WithDepth, open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.scene.depth_map import motion_camera
 
 
-def test_another_frame() -> None:
+@pytest.mark.parametrize("surface", ["boxes", "lidar", "motion", "learned", "fused", "auto"])
+def test_plans_over_a_frames_own_geometry_never_come_back(surface: GeometryName) -> None:
     sample = SyntheticDrive(demo_source_rig((64, 176)), num_frames=1)[0]
-    images = sample["images"].contiguous(memory_format=torch.channels_last)
-    for kind in (images, list(images)):
-        first = sample | {"images": kind}
-        second = as_of_another_frame(first)
-        for key in ("points", "boxes_3d"):
-            assert second[key].shape == sample[key].shape and not torch.equal(second[key], sample[key])
-        for one, two in zip(kind, second["images"], strict=True):
-            assert one.stride() == two.stride() and not torch.equal(one, two)
-            assert torch.equal(two[..., 1:], one[..., :-1])
+    maps = [*map(torch.from_numpy, lidar_maps(sample))]
+    sample |= {"motion_depth_m": maps, "learned_depth_m": maps}
+    retarget = RigRetarget(sample["rig"].shifted(z_m=0.5), geometry=surface, neighbours=None)
+    one, again = (retarget.explain(sample).planned.plan for _ in range(2))
+    assert one is not again
 
 
 @pytest.mark.slow
-def test_nothing_estimated_for_one_frame_serves_another() -> None:
+def test_nothing_estimated_from_images_serves_again() -> None:
     sample = SyntheticDrive(demo_source_rig((64, 176)), num_frames=1, lidar=False)[0]
     retarget = RigRetarget(sample["rig"].shifted(z_m=0.5), quality="accurate", geometry="street")
-    one, two, again = (retarget.explain(frame) for frame in (sample, as_of_another_frame(sample), sample))
-    assert one.planned.overlap.corrections and one.planned.plan is not two.planned.plan is not again.planned.plan
+    one, two = (retarget.explain(sample) for _ in range(2))
+    assert one.planned.overlap.corrections and one.planned.plan is not two.planned.plan
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from arbiview_aug import RigRetarget, SampleKeys
-from arbiview_aug.cli.bench.speed import lowered
+from arbiview_aug.cli.bench.speed import looking_down
 from arbiview_aug.inpaint import neighbours as fill
 from arbiview_aug.transforms import rig_retarget
 from tests.helpers import street_sample
@@ -24,7 +24,7 @@ def test_without_neighbours_nothing_of_fills_is_built_or_called(
     sample: dict[str, Any], surface: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither where a sample has none, nor where they are not wanted, nor where a list of them is empty."""
-    target = lowered(sample["rig"], (32, 88))
+    target = looking_down(sample["rig"], (32, 88))
     expected = RigRetarget(target, geometry=surface, neighbours=None)(sample)
     for module, names in ((rig_retarget, ("plan_fills",)), (fill, ("build_plan", "merged"))):
         for name in names:

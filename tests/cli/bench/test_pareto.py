@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from arbiview_aug.__main__ import main
+from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.cli.bench.data import recorded
 from arbiview_aug.cli.bench.pareto import Setting, settings, table
 from arbiview_aug.cli.bench.timing import timed_rounds
-from arbiview_aug.datasets.synthetic import demo_source_rig
+from arbiview_aug.datasets.frame_folder import write_frame
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 
 SIZE = (64, 176)
 
@@ -134,6 +137,26 @@ def test_fewer_frames_and_rounds_than_asked_for(
 def test_real_frames_need_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "--data", str(fisheye_root), "--output", str(tmp_path)]) == 2
     assert "expected LiDAR points to score by, got none" in capsys.readouterr().err
+
+
+SMALLEST = ["--size", "16x24", "--repeats", "1", "--geometry", "infinity", "--downscale", "4", "--execution", "opencv"]
+
+
+def test_points_that_no_camera_sees(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sample = SyntheticDrive(demo_source_rig((64, 176)), num_frames=1)[0]
+    write_frame(tmp_path / "0", sample | {"points": torch.zeros(0, 4)})
+    data = ["--data", str(tmp_path / "0"), "--target", "ddad", "--quality", "draft", "--output", str(tmp_path)]
+    assert main(["bench", *data, *SMALLEST]) == 2
+    assert "expected LiDAR points in views of ddad that source cameras see" in capsys.readouterr().err
+
+
+def test_paper_is_left_out_of_other_lenses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_frame(tmp_path / "0", SyntheticDrive(load_rig("fisheye_surround").resized((64, 96)), num_frames=1)[0])
+    command = ["bench", "--data", str(tmp_path / "0"), "--target", "ddad", "--output", str(tmp_path), *SMALLEST]
+    assert main([*command, "--quality", "paper", "draft"]) == 0
+    assert "note: left out, --quality paper: expected pinhole cameras, camera 'Front'" in capsys.readouterr().err
+    assert [row["quality"] for row in json.loads((tmp_path / "pareto.json").read_text())["settings"]] == ["draft"]
+    assert main([*command, "--quality", "paper"]) == 2 and "--quality paper: expected" in capsys.readouterr().err
 
 
 def test_geometry_that_is_not_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
