@@ -292,8 +292,8 @@ class RigRetarget(torch.nn.Module):
             overlap = estimate_overlap(frame, scene, self.geometry, self.cache.share_overlap, self.overlaps)
         if from_motion:
             motion = estimate_motion(frame, scene, neighbours, self._warn)
-        elif self._row.needs == "motion" and pair.needs_geometry and scene.motion is not None:
-            warn_if_declined(frame, scene.motion, self._warn)
+        elif self._row.needs in ("motion", LEARNED_KEY) and pair.needs_geometry:
+            warn_if_declined(frame, scene, self._row.needs, self._warn)
         if overlap is not None:
             scene = replace(scene, corrections=overlap.corrections)
         if fills and neighbours and scene.points is not None and pair.needs_geometry:
