@@ -266,14 +266,12 @@ def estimate_motion(frame: Frame, scene: Scene, neighbours: Sequence[Neighbour],
     return motion
 
 
-def warn_if_declined(frame: Frame, scene: Scene, needs: str, warn: WarnOnce) -> None:
-    """Warn once if a sample brings the depth that its geometry ``needs``, and this is known nowhere."""
-    from_motion = needs == "motion"
+def warn_of_declined(frame: Frame, from_motion: bool, warn: WarnOnce) -> None:
+    """Warn once that the depth that a sample brings, from motion or learned, is known nowhere."""
     key, words_key = (MOTION_KEY, MOTION_WORDS_KEY) if from_motion else (LEARNED_KEY, LEARNED_WORDS_KEY)
-    if (scene.motion if from_motion else scene.further.get(key)) == ():
-        has_words = frame.sample.get(words_key) is not None
-        words = frame.name(words_key) if has_words else f"{key}: 0 everywhere; what else the sample offers stands"
-        warn(needs, words)
+    has_words = frame.sample.get(words_key) is not None
+    words = frame.name(words_key) if has_words else f"{key}: 0 everywhere; what else the sample offers stands"
+    warn("motion", words)
 
 
 # --- errors of poses --------------------------------------------------------------------------------------------------
