@@ -4,10 +4,10 @@ Equations of the paper's section "Feature-Aware Adaptive View Synthesis (FAVS) A
 Generation":
 
 - I_warped⁽ⁱ⁾ = warp_perspective(I_source⁽ⁱ⁾, H_final⁽ⁱ⁾): ``warp_perspective``.
-- w⁽ⁱ⁾ = w_distance⁽ⁱ⁾ · w_gradient⁽ⁱ⁾ · w_quality⁽ⁱ⁾ · w_primary⁽ⁱ⁾: ``fusion_weight``, a function per factor.
+- w⁽ⁱ⁾ = w_distance⁽ⁱ⁾ · w_gradient⁽ⁱ⁾ · w_quality⁽ⁱ⁾ · w_primary⁽ⁱ⁾: ``fusion_weight``.
 - I_target = Σ w⁽ⁱ⁾ I_warped⁽ⁱ⁾ / Σ w⁽ⁱ⁾: ``fuse``.
 
-The weights that do not depend on image content are those of render plans (``arbiview_aug.render.weights``).
+w_distance is that of render plans (``arbiview_aug.render.weights``).
 """
 
 from __future__ import annotations
@@ -92,7 +92,8 @@ def fusion_weight(
     weight = coverage.astype(np.float64)
     if config.use_distance_weight and not coverage.all():  # without a border there is no distance to it
         distance = cv2.distanceTransform(coverage.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        weight = weight * distance_weight(distance.astype(np.float64), float(distance.max())) ** config.distance_gamma
+        d_max_px = max(float(distance.max()), 1.0)  # 1 is that of one covered pixel
+        weight = weight * distance_weight(distance.astype(np.float64), d_max_px) ** config.distance_gamma
     if config.use_gradient_weight:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         gradient = [cv2.Sobel(grey, cv2.CV_32F, dx, dy, scale=1 / 8) for dx, dy in ((1, 0), (0, 1))]

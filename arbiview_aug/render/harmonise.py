@@ -13,7 +13,7 @@ view's seams, so a sample of these says what the gain of each part of the view's
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cache
 from statistics import median
@@ -82,7 +82,7 @@ _PAIR_LOG_ERROR = 0.03
 DARK, BRIGHT = 0.03, 0.92
 """Shares of the scale: darker pixels are noise and black level, those with a brighter channel may be saturated."""
 
-_MIN_PIXELS = 200
+MIN_PIXELS = 200
 """Pixels that both the fit and the gate need in a pair, in a half-way view of 225 x 400."""
 
 MIN_RISE_DB = 0.1
@@ -138,7 +138,7 @@ def find_overlaps(rig: Rig) -> Overlaps:
                 seen &= camera.mask[tuple(at.clip(0, last).T)]
             both, reads = both[seen], [one[seen] for one in (*reads, at)]
         kinds = ~held_out[both], held_out[both]
-        if _STEP_PX**2 * min(kind.sum() for kind in kinds) >= _MIN_PIXELS:
+        if _STEP_PX**2 * min(kind.sum() for kind in kinds) >= MIN_PIXELS:
             pairs.append(pair)
             shared.append([[at[kind] for kind in kinds] for at in reads])
     longest = max((len(at) for of_pair in shared for at in of_pair[0]), default=0)
@@ -177,7 +177,7 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
         return PhotometricReport(none, False, "no two cameras overlap enough")
     pixels = _read([images[k] for k in overlaps.order], overlaps.at, overlaps.runs)
     ratios = pair_ratios(pixels, overlaps.fitted, DARK, BRIGHT)
-    enough = _STEP_PX**2 * ratios[:, 0] >= _MIN_PIXELS
+    enough = _STEP_PX**2 * ratios[:, 0] >= MIN_PIXELS
     if not enough.any():
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
     limit, (number, ratio, spread) = np.log(MAX_GAIN), ratios[enough].T
@@ -360,8 +360,9 @@ _CACHED_RIGS = 8  # about 0.2 MB each; every frame of a drive may have its own c
 
 def _checked_gains(choice: object) -> tuple[float, ...]:
     try:
-        gains = () if isinstance(choice, str) else tuple(float(gain) for gain in choice)  # type: ignore[attr-defined]
-    except (TypeError, ValueError):
+        is_ordered = not isinstance(choice, str | Set | Mapping)
+        gains = tuple(float(gain) for gain in choice) if is_ordered else ()  # type: ignore[attr-defined]
+    except (TypeError, ValueError, OverflowError):
         gains = ()
     if not gains or not all(1 / _MAX_GIVEN_GAIN <= gain <= _MAX_GIVEN_GAIN for gain in gains):  # NaN fails too
         raise ValueError(

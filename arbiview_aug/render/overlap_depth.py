@@ -39,6 +39,7 @@ from arbiview_aug.choices import GeometryName
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import at_level, level_size, write_halved
 from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.render.harmonise import MIN_PIXELS
 from arbiview_aug.sample.inputs import Frame
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
@@ -112,9 +113,6 @@ def _repetition(image: npt.NDArray[np.float32], inside: BoolArray) -> float:
 
 
 _SOURCE_WIDTH_PX = 400  # sources are halved down to no less: the view's own resolution
-
-MIN_PIXELS = 200
-"""Pixels that the fit and the decision need in a pair, as for harmonisation."""
 
 MIN_RISE_DB = 0.2
 """Least rise of the fitted overlap PSNR on held-out tiles: less is noise on real frames."""
@@ -205,6 +203,7 @@ def overlap_depth(rig: Rig, images: Sequence[torch.Tensor], boxes: FloatArray | 
         reports.append(report)
         if correction is not None:
             corrections.append(correction)
+    reports.sort(key=attrgetter("first", "second"))
     return OverlapDepth(tuple(corrections), tuple(reports), matched)
 
 

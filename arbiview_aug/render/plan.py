@@ -67,7 +67,8 @@ def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
             raise ValueError(f"{type(config).__name__}.{flag}: expected True or False, got {value!r}")
     for name, (low, high) in ranges.items():
         value = getattr(config, name)
-        if not isinstance(value, Real) or not low <= float(value) <= high:
+        is_number = isinstance(value, Real) and not isinstance(value, bool)
+        if not is_number or not low <= value <= high:
             raise ValueError(f"{type(config).__name__}.{name}: expected {low:g} to {high:g}, got {value!r}")
 
 
@@ -173,7 +174,7 @@ class AtlasLayout:
         if layout.size[1] > MAX_SIZE_PX:
             raise CalibrationError(
                 f"rig: expected source images that fit {_MAX_ROWS} rows and {MAX_SIZE_PX} columns together, got "
-                f"{len(slots)} to read at once, up to {max(h for h, _ in sizes)}x{max(w for _, w in sizes)}; resize "
+                f"{len(slots)} to read at once, up to {max(w for _, w in sizes)}x{max(h for h, _ in sizes)}; resize "
                 "them, and their cameras by Rig.resized"
             )
         return layout

@@ -47,6 +47,7 @@ from arbiview_aug.render.plan import (
 )
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.weights import SecondBest, seam_weights, source_weight
+from arbiview_aug.scene.boxes import BOX_ERROR
 from arbiview_aug.scene.point_cloud import occlusion_level, seen_through
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.scene.surface import FAR_PARALLAX_PX, OcclusionMap, is_within_wall, worst_parallax_px
@@ -235,6 +236,8 @@ class ViewPlanner:
             face = face if shown.any() else np.zeros((0, 0), np.int32)
         at_nodes = q[self.at_nodes], face[self.at_nodes] if face.size else face
         uncertainty = surface.uncertainty(center, self._directions, at_nodes[0])
+        if face.size:
+            uncertainty = np.where(at_nodes[1] >= 0, BOX_ERROR * at_nodes[0], uncertainty)
         nearest, farthest = np.empty((2, *self._open.shape), np.float32)
         depth_range(q, self.step, nearest, farthest)
         apart = look_apart(self.camera, self.sources, float(nearest.max()))

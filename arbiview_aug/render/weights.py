@@ -28,7 +28,7 @@ def distance_weight(distance_px: FloatArray, d_max_px: float) -> FloatArray:
 
 
 def quality_weight(parallax_px: FloatArray, resolution: FloatArray) -> FloatArray:
-    """w_quality in (0, 1] from calibration alone; ``favs.stage4_fusion`` has that of matched images.
+    """w_quality in (0, 1] from calibration alone; ``favs.stage4_fusion.fusion_weight`` takes that of matched images.
 
     ``parallax_px`` is the displacement in target pixels that unknown depth may cause, ``resolution`` source pixels per
     target pixel along the worse axis.

@@ -22,7 +22,7 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
 from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.image_ops import FRESH, Memory
-from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, StaticSurface, Surface
+from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, Surface
 
 PIECES = 2
 """Pieces of an object."""
@@ -191,7 +191,6 @@ PARTS, TOP_PART, RIM_PART = 7, 5, 6
 """Parts of an object; those that are its tops, and what lies just below their edges: samples of paint alone."""
 
 _WIDER = np.array([1, 1, 1, 1, 0, 1])  # all planes of a piece but its floor
-_ROUNDING = 1e-4  # of float32 images against float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,11 +280,8 @@ class BoxSurface(LayeredSurface):
         return boxes, planes
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
-        """Expected error (...,) in 1/m of boxes, and of the street because of unlabelled objects."""
-        assert isinstance(self.street, StaticSurface)
-        on_street = inverse_distance <= (1 + _ROUNDING) * self.street.inverse_distance(origin, directions)
-        street = UNLABELLED * self.street.uncertainty(origin, directions, inverse_distance)
-        return np.where(on_street, street, BOX_ERROR * inverse_distance)
+        """Expected error (...,) in 1/m of the street because of unlabelled objects; faces have ``BOX_ERROR``."""
+        return UNLABELLED * self.street.uncertainty(origin, directions, inverse_distance)
 
 
 def solid_rows(
@@ -369,9 +365,9 @@ def points_in(boxes: FloatArray, points: Points, air_m: float = 0.0) -> list[npt
     return [point[end - count : end] for end, count in zip(ends, np.diff(ends, prepend=0), strict=True)]
 
 
-def is_over(box: FloatArray, point: FloatArray, air_m: float = 0.0) -> bool:
-    """Whether a point (3,) is within the footprint of a box (7,), widened by ``air_m``."""
-    return bool((np.abs(_in_box_frame(box, point - box[:3]))[:2] <= box[3:5] / 2 + air_m).all())
+def is_over(box: FloatArray, point: FloatArray) -> bool:
+    """Whether a point (3,) is within the footprint of a box (7,)."""
+    return bool((np.abs(_in_box_frame(box, point - box[:3]))[:2] <= box[3:5] / 2).all())
 
 
 def _in_box_frame(box: FloatArray, vectors: FloatArray) -> FloatArray:
@@ -387,7 +383,7 @@ def checked_boxes(boxes: Any) -> FloatArray:
     except (TypeError, ValueError) as error:
         got = f"{type(boxes).__name__} ({one_line(error, 120)})"
         raise SampleTypeError(f"boxes_3d: expected rows of numbers, of one frame, got {got}") from None
-    if array.size == 0:
+    if array.shape == (0,):
         return np.zeros((0, 7))
     if array.ndim != 2 or array.shape[1] < 7:
         raise SampleError(f"boxes_3d: expected shape (B, >= 7): x y z, length, width, height, yaw, got {array.shape}")
@@ -418,19 +414,27 @@ STAYED_M = 0.4
 SAME_SIZE_M = 0.2
 """Largest difference of one object's labelled sizes from frame to frame."""
 
+MOST_MOVED_M = 40.0
+"""Largest way of one object from frame to frame: that of a car in a second."""
+
 
 def carried(points: Points, one: FloatArray, two: FloatArray) -> FloatArray:
     """The points (P, >= 3), those in boxes ``one`` (B, 7) moved to where the same objects are in ``two`` (C, 7).
 
-    The same are boxes of one size that are each other's nearest. Points in other boxes are left out.
+    The same are boxes of one size within ``MOST_MOVED_M`` that are each other's nearest. Points that are in other boxes
+    alone are left out.
     """
     moved, kept = points.astype(np.float64), np.ones(len(points), bool)
     apart = np.linalg.norm(one[:, None, :3] - two[None, :, :3], axis=-1)
-    apart[np.abs(one[:, None, 3:6] - two[None, :, 3:6]).max(axis=-1) > SAME_SIZE_M] = np.inf
-    for k, rows in enumerate(points_in(one, points, AIR_M)):
-        match = int(apart[k].argmin()) if len(two) else -1
-        kept[rows] = is_same = match >= 0 and apart[k, match] < np.inf and apart[:, match].argmin() == k
-        if is_same:
+    differs = np.abs(one[:, None, 3:6] - two[None, :, 3:6]).max(axis=-1) > SAME_SIZE_M
+    apart[differs | (apart > MOST_MOVED_M)] = np.inf
+    within = points_in(one, points, AIR_M)
+    for rows in within:
+        kept[rows] = False
+    for k, rows in enumerate(within if len(two) else ()):
+        match = int(apart[k].argmin())
+        if apart[k, match] < np.inf and apart[:, match].argmin() == k:
+            kept[rows] = True
             c, s = np.cos(two[match, 6]), np.sin(two[match, 6])
             to_ego = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
             moved[rows, :3] = _in_box_frame(one[k], points[rows, :3] - one[k, :3]) @ to_ego + two[match, :3]

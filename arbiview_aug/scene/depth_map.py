@@ -63,7 +63,7 @@ class DepthMap(NamedTuple):
         known = (depth_m > 0) & (depth_m <= MOST_M)
         if camera.mask is not None:
             known &= camera.mask
-        return cls(camera, np.where(known, depth_m, 0).astype(np.float32, copy=False))
+        return cls(camera, np.ascontiguousarray(np.where(known, depth_m, 0), np.float32))  # kernels know no other order
 
     def is_of(self, camera: Camera) -> bool:
         """Whether it is of a camera, of whatever size."""
@@ -156,8 +156,6 @@ def anchored_maps(maps: Iterable[DepthMap], before: Iterable[Points | Maps]) -> 
 def believed(one: DepthMap, network: DepthMap) -> DepthMap:
     """Depth from motion, unknown where a network's depth contradicts it: moving things have wrong distances."""
     depth_m, network_m = one.depth_m, network.depth_m
-    if depth_m.shape != network_m.shape:
-        return one
     least = np.float32(1 - ANCHOR_SHARE)
     wrong = (network_m > 0) & ((depth_m < least * network_m) | (least * depth_m > network_m))
     return one._replace(depth_m=np.where(wrong, np.float32(0), depth_m))

@@ -141,7 +141,7 @@ class Window(NamedTuple):
         turn = self.cells.turn
         row, top = max(self.row - ROOM_CELLS, -turn // 4), min(self.row + self.rows + ROOM_CELLS, turn // 4)
         columns = self.columns + 2 * ROOM_CELLS
-        place = (self.column - ROOM_CELLS, columns) if columns <= turn - 2 * ROOM_CELLS else (0, turn)
+        place = (self.column - ROOM_CELLS, columns) if columns + self.cells.halo <= turn else (0, turn)
         return Window(row, place[0], top - row, place[1], self.cells)
 
     def holds(self, other: Window) -> bool:
@@ -506,7 +506,7 @@ def returns(points: Points) -> Points:
 
 def checked_points(points: Points) -> Points:
     """(P, 3) ``returns`` of a sample's points (P, >= 3); SampleError for another shape."""
-    if points.size == 0:
+    if points.shape == (0,):
         return np.zeros((0, 3))
     if mistake := shape_mistake(points.shape):
         raise SampleError(f"points: {mistake}")

@@ -22,6 +22,7 @@ from arbiview_aug.choices import Reference
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.scene.surface import plane_inverse_distance
 from arbiview_aug.temporal.motion_depth import FARTHEST_M, MotionDepth
 
 LEAST_POINTS = 50
@@ -208,16 +209,15 @@ def _references(frame: DepthInputs, k: int, view: View, seen: BoolArray) -> Iter
     road_m = _road_depth(camera, frame.rig.ground_z_m)
     near = seen & (road_m > _NEAREST_M) & (road_m < _ROAD_M)
     if frame.boxes is not None and len(frame.boxes):
-        near &= draw_boxes(camera, frame.boxes[:, :7])[1] < 0
+        near &= draw_boxes(camera, frame.boxes)[1] < 0
     yield "road", np.nonzero(near), road_m[near]
 
 
 def _road_depth(camera: Camera, ground_z_m: float) -> FloatArray:
     """z-depth (h, w) of the road's plane, inf above the horizon."""
     rays, _ = camera.unproject(camera.pixel_grid())
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = (ground_z_m - camera.center_m[2]) / rays[..., 2]
-        return np.where(along > 0, along * (rays @ camera.cam2ego[:3, 2]), np.inf)
+    q = plane_inverse_distance(camera.center_m, rays, ground_z_m)
+    return np.divide(rays @ camera.cam2ego[:3, 2], q, out=np.full(q.shape, np.inf), where=q > 0)
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------
@@ -304,7 +304,7 @@ def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[
     if np.ptp(values) == 0:
         return None, None, "its output is the same everywhere"
     if not fits:
-        return None, None, "near and far are swapped: the scale is negative"
+        return None, None, "near and far are swapped, or look alike: the scale is not positive"
     residual, constant, line = min(fits)
     if residual > MAX_RESIDUAL:
         return line, residual, f"it errs by more than {MAX_RESIDUAL:.0%}"

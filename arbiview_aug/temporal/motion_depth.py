@@ -25,7 +25,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.environment import compilation_announced
 from arbiview_aug.errors import SampleError, WarnOnce
-from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, MOTION_WORDS_KEY, Frame
+from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY, Frame
 from arbiview_aug.sample.neighbours import BOX_MARGIN_M, Neighbour, neighbour_images
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_map import DepthMap, Maps, anchored_maps, motion_camera
@@ -74,7 +74,7 @@ class MotionDepth:
 
     def __str__(self) -> str:
         if self.density == 0:
-            return f"depth from motion: none, {self.words}; the static street stands"
+            return f"depth from motion: none, {self.words}; what else the sample offers stands"
         return f"depth from motion: {self.density:.0%} of the pixels, {self.words}"
 
 
@@ -250,8 +250,8 @@ def estimates_motion(frame: Frame, surface: GeometryName) -> bool:
         return False
     if frame.sample.get("neighbours") is None:
         raise SampleError(
-            f"geometry={surface!r}: expected 'neighbours' in the sample, or {MOTION_KEY!r} from the depth command, "
-            "got neither"
+            f"geometry={surface!r}: expected 'neighbours' in the sample, or {' or '.join(map(repr, keys))} from the "
+            "depth command, got none"
         )
     return True
 
@@ -266,12 +266,12 @@ def estimate_motion(frame: Frame, scene: Scene, neighbours: Sequence[Neighbour],
     return motion
 
 
-def warn_if_declined(frame: Frame, maps: Maps, warn: WarnOnce) -> None:
-    """Warn once if the depth that a sample brings is known nowhere."""
-    if not any(one.depth_m.any() for one in maps):
-        has_words = frame.sample.get(MOTION_WORDS_KEY) is not None
-        words = frame.name(MOTION_WORDS_KEY) if has_words else f"{MOTION_KEY}: 0 everywhere; the static street stands"
-        warn("motion", words)
+def warn_of_declined(frame: Frame, from_motion: bool, warn: WarnOnce) -> None:
+    """Warn once that the depth that a sample brings, from motion or learned, is known nowhere."""
+    key, words_key = (MOTION_KEY, MOTION_WORDS_KEY) if from_motion else (LEARNED_KEY, LEARNED_WORDS_KEY)
+    has_words = frame.sample.get(words_key) is not None
+    words = frame.name(words_key) if has_words else f"{key}: 0 everywhere; what else the sample offers stands"
+    warn("motion", words)
 
 
 # --- errors of poses --------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -84,7 +85,10 @@ class TransformersDepth:
         output, is_metric = self._output, self._is_metric
         if self.takes_prompt and not prompts:  # then it puts out something relative
             output, is_metric = None, False
-        seen = inputs["pixel_values"].shape[-1] / size[1]  # pixels of the network's for one of the image's
+        width = size[1]
+        if self.kind == "zoedepth" and self._processor.do_pad:
+            width += 2 * int(math.sqrt(width / 2) * 3)
+        seen = inputs["pixel_values"].shape[-1] / width  # pixels of the network's for one of the image's
         return [
             Prediction(values, output, view.focal_px * seen if is_metric else None)
             for values, view in zip(predicted.float().cpu().numpy(), views, strict=True)

@@ -46,7 +46,7 @@ from arbiview_aug.sample.inputs import (
 )
 from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
-from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion, warn_if_declined
+from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion, warn_of_declined
 from arbiview_aug.transforms.camera_maps import CameraMaps
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
 from arbiview_aug.transforms.outputs import SampleWriter
@@ -292,8 +292,9 @@ class RigRetarget(torch.nn.Module):
             overlap = estimate_overlap(frame, scene, self.geometry, self.cache.share_overlap, self.overlaps)
         if from_motion:
             motion = estimate_motion(frame, scene, neighbours, self._warn)
-        elif self._row.needs == "motion" and pair.needs_geometry and scene.motion is not None:
-            warn_if_declined(frame, scene.motion, self._warn)
+        elif pair.needs_geometry and self._row.needs in ("motion", LEARNED_KEY):
+            if scene.geometry(self._row.needs) == ():
+                warn_of_declined(frame, scene.motion is not None, self._warn)
         if overlap is not None:
             scene = replace(scene, corrections=overlap.corrections)
         if fills and neighbours and scene.points is not None and pair.needs_geometry:

@@ -114,12 +114,11 @@ def _at(points: Any, rows: Any, hits: Any) -> Any:
     """The rows (n,) of points (P, C), with places (n, 3)."""
     if isinstance(points, np.ndarray):
         out = points[rows]
-        if out.ndim == 2:
-            out[:, :3] = hits
-        return out
-    out = points.detach()[torch.from_numpy(rows).to(points.device, torch.int64)]
-    if out.ndim == 2:
-        out[:, :3] = torch.from_numpy(hits).to(out)
+    else:
+        out = points.detach()[torch.from_numpy(rows).to(points.device, torch.int64)]
+        hits = torch.from_numpy(hits).to(out)
+    if out.ndim == 2:  # an empty list is points too
+        out[:, :3] = hits
     return out
 
 

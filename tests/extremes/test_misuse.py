@@ -119,8 +119,9 @@ def test_configs_refuse_by_name() -> None:
         PlanCache(max_bytes=None)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"PlanCache\.share_overlap"):
         PlanCache(share_overlap=3)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"RenderConfig\.seam_width"):
-        RenderConfig(seam_width="a")  # type: ignore[arg-type]
+    for wrong in ("a", 10**400, False):
+        with pytest.raises(ValueError, match=r"RenderConfig\.seam_width"):
+            RenderConfig(seam_width=wrong)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"PaperConfig\.beta"):
         PaperConfig(beta=None)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"PaperConfig\.type_weights: expected pairs"):

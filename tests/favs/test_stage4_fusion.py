@@ -41,6 +41,8 @@ def test_the_product_of_weights_by_hand() -> None:
     assert np.allclose(only(use_distance_weight=True, distance_gamma=2.0)[2], (np.arange(9) / 8) ** 2)
     assert np.allclose(only(use_distance_weight=True, distance_gamma=0.0), seen)  # γ = 0 switches it off
     assert np.allclose(fusion_weight(image, seen, 1.0, False, OFF), seen)
+    with np.errstate(invalid="raise"):
+        assert not fusion_weight(image, seen & False, 1.0, False, replace(OFF, use_distance_weight=True)).any()
 
 
 def test_fuse_is_the_weighted_average() -> None:

@@ -330,7 +330,7 @@ def test_each_view_keeps_the_exposure_of_its_main_source(street, execution: str,
 
 def test_messages(street) -> None:
     rig, images = street
-    for wrong in ("yes", "111111", [], [1, -1], [float("nan")], 1.3):
+    for wrong in ("yes", "111111", [], [1, -1], [float("nan")], 1.3, {1.0, 1.1}, {1.0: 2}, [10**400]):
         with pytest.raises(ValueError, match="match_exposure: expected a bool"):
             RigRetarget(rig, match_exposure=wrong)
     with pytest.raises(SampleError, match="a gain for each of 6 cameras, got 2"):

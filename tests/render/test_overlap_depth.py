@@ -183,6 +183,7 @@ def test_the_order_of_cameras_does_not_matter(nearer: tuple[torch.Tensor, Overla
     images, depth = nearer
     turned = overlap_depth(RIG.with_cameras([RIG[1], RIG[0]]), images.flip(0))
     assert [c.key for c in turned.corrections] == [c.key for c in depth.corrections]
+    assert turned.reports == depth.reports
     assert overlap_depth(RIG, images).corrections[0].key == depth.corrections[0].key
 
 

@@ -235,6 +235,12 @@ def test_points_come_where_they_and_their_objects_are_now(sample: dict[str, Any]
     for then, here in ((np.zeros((0, 7)), now), (first["boxes_3d"], now[:0])):
         ((nearest, *_), _) = read(sample | {"neighbours": [first | {"boxes_3d": then}], "boxes_3d": here})
         assert len(nearest.points()) == (3 if len(here) else 1)
+    # A trailer without a counterpart reaches over the car; and a car is not the same one 50 m on.
+    both = {"boxes_3d": np.array([car, [11.0, 0.5, 0.8, 6, 2.5, 3, 0]])}
+    ((nearest, *_), _) = read(sample | {"neighbours": [first | both], "boxes_3d": now})
+    np.testing.assert_allclose(nearest.points(), [[18.8, 3, 1], [10.5, 1.5, 1], [28.8, 5, 1]], atol=1e-5)
+    ((nearest, *_), _) = read(sample | {"neighbours": [first], "boxes_3d": now + np.array([50, 0, 0, 0, 0, 0, 0])})
+    assert len(nearest.points()) == 1
     del first["boxes_3d"]
     ((nearest, *_), _) = read(sample | {"neighbours": [first], "boxes_3d": now})
     np.testing.assert_allclose(nearest.points(), first["points"][:3] - [1.2, 0, 0], atol=1e-5)

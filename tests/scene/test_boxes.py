@@ -207,8 +207,9 @@ def test_in_a_sample() -> None:
     assert torch.equal(retarget(batch)["images"][1], with_car["images"])
     with pytest.raises(SampleError, match=r"geometry='boxes': expected 'boxes_3d'"):
         retarget({"images": images, "rig": rig})
-    with pytest.raises(SampleError, match=r"boxes_3d: expected shape \(B, >= 7\)"):
-        retarget(sample | {"boxes_3d": torch.zeros(2, 5)})
+    for shape in ((2, 5), (0, 5), (2, 0)):
+        with pytest.raises(SampleError, match=r"boxes_3d: expected shape \(B, >= 7\)"):
+            retarget(sample | {"boxes_3d": torch.zeros(shape)})
     with pytest.raises(SampleError, match=r"boxes_3d\[0\]: expected finite numbers and positive sizes"):
         retarget(sample | {"boxes_3d": torch.full((1, 7), float("nan"))})
     with pytest.raises(SampleError, match=r"boxes_3d\[0\]: .*; leave out rows that pad: a batch takes a list of boxes"):

@@ -140,6 +140,11 @@ def test_a_map_follows_the_other_map_of_its_camera() -> None:
     assert anchored_maps([one._replace(depth_m=np.zeros_like(one.depth_m))], []) == ()
 
 
+def test_kernels_read_maps_of_any_order() -> None:
+    of_columns = np.asfortranarray(np.ones(SMALL.size, np.float32))
+    assert DepthMap.of(SMALL, of_columns).depth_m.flags.c_contiguous
+
+
 def test_the_nearest_of_what_maps_know_is_joined() -> None:
     network = DepthMap(SMALL, np.full(SMALL.size, 10.0, np.float32))
     motion = DepthMap(SMALL, np.full(SMALL.size, 9.0, np.float32))

@@ -212,6 +212,17 @@ def test_extreme_scanners(beams: int) -> None:
     assert np.isfinite(result.points).all() and result.rings.max(initial=0) < beams
 
 
+@pytest.mark.parametrize("half_deg", [177.0, 177.5, 178.0, 180.0])
+def test_a_near_wall_hides_a_far_one_all_around(half_deg: float) -> None:
+    azimuth, up = (np.radians(at).astype(float) for at in (np.arange(-180, 180, 0.2), np.arange(-8, 8, 0.4)))
+    a, e = np.meshgrid(azimuth, up)
+    ring = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], -1).reshape(-1, 3)
+    points = np.concatenate([6 * ring, 20 * ring + [0, 0, 0.05]]).astype(np.float32) + at()[:3, 3].astype(np.float32)
+    lidar = Lidar("top", at(), tuple(np.arange(-5.5, 6)), 0.5, (0.5, 100.0), (-half_deg, half_deg))
+    away = np.linalg.norm(scan([lidar], points, 0.0).points - lidar.center_m, axis=1)
+    assert len(away) > 1000 and away.max() < 10
+
+
 def test_upside_down() -> None:
     a = scanner(32, at())
     turned = at() @ np.diag([1.0, -1, -1, 1])

@@ -86,7 +86,7 @@ def test_wrong_poses_are_corrected_or_declined(
     density, share = right(drive, corrected)
     assert density > right(drive, exact)[0] - 0.05 and share > 0.9
     lost = depth_of(turned(sample, 4.0))
-    assert lost.density == 0 and "the static street stands" in str(lost)
+    assert lost.density == 0 and "what else the sample offers stands" in str(lost)
     assert "the pose of frame" in lost.words or "too little of frame" in lost.words
 
 
@@ -138,13 +138,15 @@ def test_as_a_surface(drive: SyntheticDrive, sample: dict[str, Any], exact: Moti
 def test_the_street_replaces_declined_depth_with_a_warning(sample: dict[str, Any]) -> None:
     target = SIDE.shifted(y_m=0.5)
     motion = RigRetarget(target, geometry="motion")
-    with pytest.warns(UserWarning, match="depth from motion: none, no frame .* the static street stands"):
+    with pytest.warns(UserWarning, match="depth from motion: none, no frame .* what else the sample offers stands"):
         out = motion({**sample, "neighbours": []})
     assert torch.equal(out["images"], RigRetarget(target, geometry="street")(sample | {"neighbours": []})["images"])
-    brought = {**sample, "motion_depth_m": [torch.zeros(motion_camera(camera).size) for camera in sample["rig"]]}
-    for words, extra in (("motion_depth_m: 0 every", {}), ("none, why", {"motion_depth_words": "none, why"})):
-        with pytest.warns(UserWarning, match=words):
-            RigRetarget(target, geometry="motion")(brought | extra)
+    nothing: Any = [torch.zeros(motion_camera(camera).size) for camera in sample["rig"]]
+    for geometry in ("motion", "learned"):
+        brought = {**sample, f"{geometry}_depth_m": nothing}
+        for words, extra in (("depth_m: 0 every", {}), ("none, why", {f"{geometry}_depth_words": "none, why"})):
+            with pytest.warns(UserWarning, match=words):
+                RigRetarget(target, geometry=geometry)(brought | extra)
 
 
 @pytest.mark.parametrize("size", [(1, 8), (8, 1)])

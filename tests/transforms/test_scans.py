@@ -171,11 +171,11 @@ def test_both_roads_coincide(sample: dict[str, Any]) -> None:
     torch.testing.assert_close(moved[:, 2], two[:, 2] - 0.3, atol=1e-4, rtol=0)
 
 
+@pytest.mark.parametrize("zeros", [torch.zeros, np.zeros])
 @pytest.mark.parametrize("shape", [(0,), (0, 4), (0, 3)])
-def test_no_points(sample: dict[str, Any], shape: tuple[int, ...]) -> None:
-    for points in (torch.zeros(shape), np.zeros(shape, np.float32)):
-        out = RigRetarget(target(), geometry="street")(sample | {"points": points})
-        assert out["points"].shape == shape and len(out["point_rings"]) == 0 and out["num_points"].sum() == 0
+def test_no_points(sample: dict[str, Any], shape: tuple[int, ...], zeros: Any) -> None:
+    out = RigRetarget(target(), geometry="street")(sample | {"points": zeros(shape)})
+    assert out["points"].shape == shape and len(out["point_rings"]) == 0 and out["num_points"].sum() == 0
 
 
 def test_missing_returns_are_left_out() -> None:
