@@ -139,7 +139,7 @@ COLUMNS = (
     ("agree dB", "{consistency_fitted_psnr_db:.2f}"),
 )
 NOTES = (
-    "ms a frame with its plan cached; holes dB, MAE: against the truth, where no source sees; texture: distance of the "
+    "ms a frame with its plan; holes dB, MAE: against the truth, where no source sees; texture: distance of the "
     "radial power spectrum there to the truth's, 0 is the truth's; agree dB: of neighbouring views, what is made up "
     "included."
 )
