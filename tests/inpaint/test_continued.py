@@ -168,6 +168,14 @@ def test_holes_where_no_other_source_looks_show_road_and_objects() -> None:
     assert np.isin(np.flatnonzero((exact.layers == OBJECT) & ~exact.coverage), exact.paint.pixel).all()
 
 
+@pytest.mark.parametrize("surface", ["boxes", "ground", "infinity"])
+def test_holes_of_one_camera_that_turns_need_no_geometry(surface: str) -> None:
+    rig = Rig([camera(size=(64, 64))])
+    sample = {"images": gradient(64, 64), "rig": rig, "boxes_3d": torch.tensor([[7.0, -5.0, 0.9, 4.5, 2.0, 1.8, 0.0]])}
+    out = RigRetarget(rig.turned(yaw_deg=-45), geometry=surface)(sample)  # type: ignore[arg-type]
+    assert out["generated"].any() and torch.equal(out["generated"], ~out["coverage"])
+
+
 def test_plans_without_holes_hold_no_map_of_them() -> None:
     source = ring()
     assert all(view.layers is view.paint is None for view in build_plan(source, source).targets)
