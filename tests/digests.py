@@ -129,7 +129,8 @@ def outputs(sample: dict[str, Any]) -> Iterator[tuple[str, Any]]:
         out = RigRetarget(lifted, **settings | {"keys": keys})(sample)
         yield name, {key: value for key, value in out.items() if key != "sources"}
     yield "words", str(RigRetarget(lifted).explain(sample))
-    yield "turned", RigRetarget(rig.turned(yaw_deg=11.0, pitch_deg=-5.0))(sample)  # at the centres of A's cameras
+    turned = rig.turned(yaw_deg=11.0, pitch_deg=-5.0)  # at the centres of A's cameras
+    yield "turned", RigRetarget(turned, keys=SampleKeys(labels=labels))(sample)
     yield "waymo", RigRetarget(load_rig("waymo").resized((64, 96)), keys=SampleKeys(labels=labels))(sample)
     lenses = load_rig("fisheye_surround").resized((64, 96))
     yield "fisheye", RigRetarget(lenses, keys=SampleKeys(extra=ALL, labels=labels))(sample)
