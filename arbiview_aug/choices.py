@@ -7,7 +7,7 @@ names stand behind the errors that they raise, and are those of the CHANGELOG.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any, Literal
 
 GeometryName = Literal["auto", "infinity", "ground", "street", "boxes", "lidar", "motion", "fused", "learned"]
@@ -130,6 +130,11 @@ def choice(option: str, value: object, choices: Iterable[str]) -> Any:
     new = VALUES.get((option, value)) if isinstance(value, str) else None
     hint = f"; since 0.3 it is {new!r}" if new else ""
     raise ValueError(f"{option}: expected one of {', '.join(allowed)}, got {value!r}{hint}")
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a real number, and not a bool."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def checked_stride(name: str, value: Any) -> int:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from numbers import Real
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +19,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import Reduce
+from arbiview_aug.choices import Reduce, is_number
 from arbiview_aug.datasets.image_io import check_reduce
 from arbiview_aug.errors import ArbiviewError, DataError, warn
 from arbiview_aug.sample.neighbours import STILL_M
@@ -91,8 +90,7 @@ class Neighbours:
     def __post_init__(self) -> None:
         if not isinstance(self.count, int | np.integer) or isinstance(self.count, bool) or self.count < 1:
             raise ValueError(f"neighbours: count: expected a whole number from 1, got {self.count!r}")
-        is_number = isinstance(self.step_m, Real) and not isinstance(self.step_m, bool)
-        if not is_number or not 0 < self.step_m < float("inf"):
+        if not is_number(self.step_m) or not 0 < self.step_m < float("inf"):
             raise ValueError(f"neighbours: step_m: expected metres above 0, got {self.step_m!r}")
         if self.direction not in ("both", "past", "future"):
             raise ValueError(f"neighbours: direction: expected both, past or future, got {self.direction!r}")

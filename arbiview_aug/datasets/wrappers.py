@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset, IterableDataset
 
+from arbiview_aug.choices import is_number
 from arbiview_aug.errors import ArbiviewError, DataError, SampleTypeError
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from arbiview_aug.transforms.settings import is_number
 from arbiview_aug.transforms.warm_up import compile_kernels
 
 Retarget = Callable[[Any], Any]

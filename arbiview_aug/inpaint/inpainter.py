@@ -6,11 +6,11 @@ import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from numbers import Real
 from typing import Any, ClassVar
 
 import torch
 
+from arbiview_aug.choices import is_number
 from arbiview_aug.errors import GeneratorError, SampleError
 from arbiview_aug.render.rendered import MAP_KEYS, LabelFill, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
@@ -244,10 +244,9 @@ def checked_settings(
     """Check settings of an inpainter; ValueError for impossible ones."""
     if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool) or steps < 1):
         raise ValueError(f"steps: expected a whole number from 1, got {steps!r}")
-    if guidance is not None and (not isinstance(guidance, Real) or isinstance(guidance, bool)):
+    if guidance is not None and not is_number(guidance):
         raise ValueError(f"guidance: expected a number, got {guidance!r}")
-    is_number = isinstance(min_confidence, Real) and not isinstance(min_confidence, bool)
-    if not is_number or not 0 <= min_confidence <= 1:
+    if not is_number(min_confidence) or not 0 <= min_confidence <= 1:
         raise ValueError(f"min_confidence: expected a number from 0 to 1, got {min_confidence!r}")
     if not isinstance(seed, int) or isinstance(seed, bool):
         raise ValueError(f"seed: expected a whole number, got {seed!r}")

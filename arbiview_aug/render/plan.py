@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -26,6 +25,7 @@ import numpy.typing as npt
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
+from arbiview_aug.choices import is_number
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.image_ops import FRESH, Memory, level_size
 
@@ -67,8 +67,7 @@ def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
             raise ValueError(f"{type(config).__name__}.{flag}: expected True or False, got {value!r}")
     for name, (low, high) in ranges.items():
         value = getattr(config, name)
-        is_number = isinstance(value, Real) and not isinstance(value, bool)
-        if not is_number or not low <= value <= high:
+        if not is_number(value) or not low <= value <= high:
             raise ValueError(f"{type(config).__name__}.{name}: expected {low:g} to {high:g}, got {value!r}")
 
 

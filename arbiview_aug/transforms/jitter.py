@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import is_number
 from arbiview_aug.errors import WarnOnce
 from arbiview_aug.sample.batching import like
 from arbiview_aug.sample.inputs import POSE_KEYS, PROJECTION_KEYS, numbers, read_frames
-from arbiview_aug.transforms.settings import is_number
 
 
 class JitteredCalibration(torch.nn.Module):

@@ -167,8 +167,12 @@ def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
     if dtype == torch.bool:
         return False
     limits: Any = torch.finfo(dtype) if dtype.is_floating_point else torch.iinfo(dtype)
-    fits = limits.min <= fill <= limits.max  # NaN does not
-    if not (fits or not math.isfinite(fill) if dtype.is_floating_point else fits and fill == int(fill)):
+    is_held = limits.min <= fill <= limits.max  # not NaN
+    if dtype.is_floating_point:
+        is_held |= not math.isfinite(fill)
+    else:
+        is_held = is_held and fill == int(fill)
+    if not is_held:
         raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {fill!r}")
     return fill
 

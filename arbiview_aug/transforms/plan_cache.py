@@ -13,7 +13,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rays import RayCache
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import pose_mistake
-from arbiview_aug.choices import GeometryName
+from arbiview_aug.choices import GeometryName, is_number
 from arbiview_aug.errors import GeometryWarning, UnreachableError, WarnOnce
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.overlap_depth import OverlapDepth
@@ -24,7 +24,6 @@ from arbiview_aug.sample.inputs import Frame
 from arbiview_aug.sample.neighbours import Neighbour
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.temporal.motion_depth import MotionDepth
-from arbiview_aug.transforms.settings import is_number
 
 Coverages = Sequence[BoolArray]
 """Coverage (h, w) of each target camera."""

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import operator
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, Literal, TypeVar
 
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
-from arbiview_aug.choices import checked_stride, choice
+from arbiview_aug.choices import checked_stride, choice, is_number
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.inpaint.continued import Continue, Mean
@@ -107,11 +106,6 @@ def unseen_note(inpainter: Inpainter) -> str:
     if isinstance(inpainter, Black):
         return f"The rest is {inpainter.outcome}."
     return f"The rest is {inpainter.outcome} and marked in 'generated': leave it out of losses that compare pixels."
-
-
-def is_number(value: Any) -> bool:
-    """Whether it is a real number, and not a bool."""
-    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def checked_instance(name: str, value: Any, kind: type[T]) -> T:
