@@ -28,9 +28,9 @@ BOUNDS = {
     "LiDAR + boxes": (25, 600),
     "LiDAR + boxes, points scanned": (31, 650),
     "learned depth": (27, 600),
-    "generated": (27, 1500),
-    "neighbours, all": (32, 2500),
-    "motion": (40, 2600),
+    "generated": (28, 1500),
+    "neighbours, all": (33, 2500),
+    "motion": (41, 2600),
     "paper": (19, 180),
 }
 """Most files and crossings that a call may have."""
