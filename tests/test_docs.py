@@ -195,6 +195,7 @@ CHECKS: dict[str, Callable[[dict[str, Any]], None]] = {
 """Values that a page's code must leave in its names."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in DOCS if "```python" in text_of(p)], ids=name_of)
 def test_the_code_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

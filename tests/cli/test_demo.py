@@ -85,6 +85,7 @@ def test_lenses_without_points(fisheye_root: Path, tmp_path: Path, capsys: pytes
     assert numbers(printed, "infinity")[0] > 80 and numbers(printed, "ground")[0] > 80
 
 
+@pytest.mark.slow
 def test_geometry_that_the_sample_has_and_one_that_it_lacks(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     options = ["--size", "16x44", "--output", str(tmp_path), "--geometry"]
     assert main(["demo", *options, "lidar"]) == 0

@@ -206,6 +206,7 @@ def test_a_name_given_twice_is_one_row(tmp_path: Path) -> None:
     assert once == twice
 
 
+@pytest.mark.slow
 def test_rows_do_not_depend_on_other_rows(tmp_path: Path) -> None:
     """Motion needs neighbours, which must not fill the holes of other rows."""
     target = tmp_path / "down.yaml"

@@ -42,6 +42,7 @@ def test_synthetic_streets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     assert picture is not None and picture.shape[1] == 1800 and picture.std() > 20
 
 
+@pytest.mark.slow
 def test_the_next_frame_of_a_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Its scan is the truth, of all frames that have a next one; the scanner is that of calib.json."""
     drive = SyntheticDrive(RIG, num_frames=1, neighbours=Neighbours(count=2, step_m=1.5, direction="future"))

@@ -291,6 +291,7 @@ def test_scene_is_plain_data():
             shared.boxes[:, 0] += 100
 
 
+@pytest.mark.slow
 def test_tensors_are_made_on_the_device():
     """On the device "meta", which refuses operations with tensors of another one."""
     scene, camera, n = make_scene(0, 0), demo_source_rig(SIZE)[0], 7

@@ -56,6 +56,7 @@ def naive_hit(scene, origin, direction):
     return best, row
 
 
+@pytest.mark.slow
 def test_vectorised_cast_equals_a_naive_loop():
     rng = np.random.default_rng(0)
     for index in range(2):
@@ -190,6 +191,7 @@ def test_isolated_vehicles_outlines_agree_with_their_boxes():
     assert np.max(errors) <= 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cls", list(BoxClass))
 def test_every_object_touches_the_six_sides_of_its_box(cls):
     checked = 0
@@ -218,6 +220,7 @@ def test_every_object_touches_the_six_sides_of_its_box(cls):
     assert checked > 2
 
 
+@pytest.mark.slow
 def test_two_wheelers_join_the_same_street():
     for index in range(4):
         plain, joined = make_scene(3, index), make_scene(3, index, two_wheelers=True)

@@ -51,6 +51,7 @@ def referee_targets(rig: Rig) -> list[tuple]:
     return [(c.name, c.K, c.cam2ego, c.size) for c in rig]
 
 
+@pytest.mark.slow
 def test_sparse_metrics_agree(referee: ModuleType, frame: Frame) -> None:
     cameras = referee.equalised(frame.cameras, frame.points)
     images = equalised(frame.rig, frame.images, frame.points)
@@ -76,6 +77,7 @@ def test_sparse_metrics_agree(referee: ModuleType, frame: Frame) -> None:
         assert got["ssim"] == pytest.approx(want["ssim"], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_mean_score_agrees(referee: ModuleType, frame: Frame) -> None:
     """The whole protocol on one cheap target: each camera alone, on the far surface."""
     render = referee.reference_renderer(frame.cameras, "far", own_camera_only=True)

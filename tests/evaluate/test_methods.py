@@ -58,6 +58,7 @@ def test_one_camera_keeps_what_the_ego_frame_holds(sample: dict) -> None:
         assert len(alone[key]) == 1 and (alone[key][0] == 2).all(), key
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the target rig")
 @pytest.mark.parametrize("surface", ["motion", "fused"])
 def test_a_camera_alone_has_the_motion_of_all(surface: GeometryName) -> None:

@@ -64,7 +64,7 @@ def frame_folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@examples(120, 1100, 5500, share=(0.2, 0.8), data=st.data())
+@examples(60, 1100, 5500, share=(0.2, 0.8), data=st.data())
 def test_mutated_samples_and_settings(worst: Worst, data: st.DataObject) -> bool:
     sample = data.draw(misuse.samples())
     if data.draw(st.sampled_from(["sample", "sample", "sample", "settings"])) == "settings":
@@ -83,7 +83,7 @@ def test_mutated_samples_and_settings(worst: Worst, data: st.DataObject) -> bool
         return works(render)
 
 
-@examples(100, 900, 4500, share=(0.05, 0.8), text=mutated_json(misuse.calibration()), yaml=st.integers(0, 7))
+@examples(50, 900, 4500, share=(0.05, 0.8), text=mutated_json(misuse.calibration()), yaml=st.integers(0, 7))
 def test_mutated_calibrations(frame_folder: Path, worst: Worst, text: bytes, yaml: int) -> bool:
     for name in ("calib.json", "rig.yaml"):
         (frame_folder / name).write_bytes(text)
@@ -92,7 +92,7 @@ def test_mutated_calibrations(frame_folder: Path, worst: Worst, text: bytes, yam
         return works(lambda: FrameFolder(frame_folder)[0]) & works(lambda: repr(load_rig(frame_folder / readable)))
 
 
-@examples(100, 500, sample=misuse.wrong_samples())
+@examples(50, 500, sample=misuse.wrong_samples())
 def test_mutated_samples_are_checked(sample: dict[str, Any]) -> None:
     works(lambda: str(find_mistakes(sample)))
 

@@ -45,6 +45,7 @@ def test_what_is_saved_is_loaded(generator: Generator, tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "a" / "b").iterdir()) == ["config.json", weights(tmp_path / "a/b").name]
 
 
+@pytest.mark.slow
 def test_with_an_autoencoder_frozen_or_in_half_precision(tmp_path: Path) -> None:
     vae = AutoencoderConfig(widths=(16, 16), layers=1, latent_channels=4, norm_groups=8, scale=0.7)
     made = Generator.from_config(small_config(autoencoder=vae, frozen_unet=True, prompt_tokens=3))

@@ -105,6 +105,7 @@ def folder(tmp_path: Path) -> Path:
     return saved(tmp_path, config())
 
 
+@pytest.mark.slow
 def test_an_inpainting_unet_computes_what_it_did(tmp_path: Path) -> None:
     """Its 9 channels come first and in its own order; attention, LoRA and the other channels change nothing yet."""
     settings = replace(config(), inpainting=True, lora_rank=4)

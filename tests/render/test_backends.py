@@ -18,6 +18,7 @@ from arbiview_aug.render.rendered import render_labels, render_opencv
 from arbiview_aug.render.torch_backend import maps_on, render_torch
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.transforms.settings import render_config
+from tests.helpers import sampled
 
 GEOMETRIES = ["infinity", "ground", "street", "auto"]
 
@@ -44,8 +45,7 @@ def differences(a: list[torch.Tensor], b: list[torch.Tensor]) -> np.ndarray:
     return np.concatenate([(x.int() - y.int()).abs().flatten().numpy() for x, y in zip(a, b, strict=True)])
 
 
-@pytest.mark.parametrize("name", ["nuscenes", "waymo", "fisheye_surround"])
-@pytest.mark.parametrize("surface", GEOMETRIES)
+@pytest.mark.parametrize(("name", "surface"), sampled(["nuscenes", "waymo", "fisheye_surround"], GEOMETRIES))
 def test_target_equal_to_source_gives_the_source_back(name: str, surface: str) -> None:
     rig = load_rig(name).resized(0.25)
     images = noise_images(rig)

@@ -104,6 +104,7 @@ def test_sides_and_yaw_that_are_both_swapped_are_the_same_boxes(street: Sample) 
     assert check(swapped).ok
 
 
+@pytest.mark.slow
 def test_given_frames_have_no_false_finding(data_root: Path) -> None:
     """Specks in DDAD's masks are there, and so is the rim of three of four fisheye images."""
     for name in ("nuscenes-one", "ddad-one", "kitti-stereo", "surround-fisheye"):

@@ -124,6 +124,7 @@ def test_people_in_loose_boxes_barriers_and_two_wheelers_leave_room() -> None:
         assert (beside(solids(boxes)[row], point[None])[0] <= 0) == inside
 
 
+@pytest.mark.slow
 def test_points_choose_among_profiles() -> None:
     pick_up = np.array([[12.0, 0.5, 0.98, 5.3, 1.93, 1.96, np.pi]])  # as high as a van
     for box in (CAR, pick_up):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 import torch
 
 from arbiview_aug.cameras.camera import Camera
@@ -46,6 +47,7 @@ def lens_ignored(rig: Rig) -> Rig:
     return rig.with_cameras([replace(camera, lens="pinhole", distortion=()) for camera in rig])
 
 
+@pytest.mark.slow
 def test_synthetic_fisheyes_give_the_true_pinhole_views() -> None:
     """Measured on seeds 0-2: 32.9 to 38.9 dB a view, the same at twice the source's size; 16 with the lens ignored."""
     source, target = surround((240, 320), 180, "fisheye", COEFFICIENTS, -10), surround((96, 160), 90, "pinhole", (), 0)

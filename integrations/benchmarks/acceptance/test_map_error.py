@@ -146,6 +146,7 @@ def test_placeholders_of_rays_that_are_none_reach_no_pixel() -> None:
     assert errors(build_plan(source, target, geometry="street"), "street", Scene(), 10**6).px.max() <= TOLERANCE_PX
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "boxes", [pytest.param(None, id="points"), pytest.param(BOXES, marks=pytest.mark.slow, id="points and boxes")]
 )

@@ -19,6 +19,7 @@ from arbiview_aug.scene.scene import Scene
 from tests.render.test_backends import zoomed
 
 
+@pytest.mark.slow
 def test_halving_when_minifying_beats_direct_sampling(nuscenes_root: Path) -> None:
     """Truth: rendered at four times the size and averaged."""
     sample = FrameFolder(nuscenes_root)[0]

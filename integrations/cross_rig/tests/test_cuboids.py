@@ -40,6 +40,7 @@ def test_objects_fill_their_boxes(index):
         np.testing.assert_allclose([local[:, 2].min(), local[:, 2].max()], [-box[5] / 2, box[5] / 2], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_vehicles_leave_the_rigs_place_free_and_fit_the_labels():
     for scene in (make_scene(5, k) for k in range(20)):
         assert np.isfinite(vehicle_boxes(Grid(), scene, 0.0)[:, 0]).sum() < MAX_BOXES
@@ -51,6 +52,7 @@ def test_vehicles_leave_the_rigs_place_free_and_fit_the_labels():
             assert outside.all()
 
 
+@pytest.mark.slow
 def test_views_have_the_truth_of_the_other_world_in_other_colours(drive):
     views = drive.render(0)
     other = SyntheticDrive(drive.rig, num_frames=1, seed=3, lidar=False).render(0)

@@ -105,6 +105,7 @@ def test_drives_are_split_and_drawn_together(roots, tmp_path):
     assert len(drives) == run.settings.test_frames and len(set(drives)) == len(splits[2])
 
 
+@pytest.mark.slow
 def test_frames_are_made_anew_when_a_reader_changes(roots, tmp_path, monkeypatch):
     read, source = set(), cache._source
     monkeypatch.setattr(cache, "_source", lambda name: (read.add(name), source(name))[1])

@@ -58,6 +58,7 @@ def test_projections_of_three_frames_are_the_new_rigs(drive: list[Recording], fo
         assert max(worst_error_px(frame, SOURCE) for frame in frames_of(results)) <= 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 @pytest.mark.parametrize("form", QUEUES)
 def test_one_draw_for_all_frames(drive: list[Recording], form: str) -> None:

@@ -360,6 +360,7 @@ TARGETS = st.sampled_from(["secret", "in/folder", "in/secret.png", "in", "."])
 PLACES = st.sampled_from(["sample_data", "camera", "lidarseg", "panoptic", "map", "file", "mask", "lidar", "sequence"])
 
 
+@pytest.mark.slow
 @settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(place=PLACES, name=DRAWN, absolute=st.booleans(), target=st.none() | TARGETS, skip=st.booleans())
 @example(place="sample_data", name="../.bashrc", absolute=False, target=None, skip=False)

@@ -354,7 +354,7 @@ def rows_elsewhere(draw: st.DrawFn, tables: dict[str, Rows], table: str, root: P
     return json.dumps(rows).encode()
 
 
-@examples(24, 200, 3000, data=st.data())
+@examples(10, 200, 3000, data=st.data())
 def test_damaged_tables(tried: Range, data: st.DataObject) -> None:
     """5 minutes of CPU a thousand."""
     table = data.draw(st.sampled_from(sorted(tried.tables)))

@@ -296,6 +296,7 @@ def test_points_that_are_links_are_followed(source: Path, tmp_path: Path) -> Non
     assert not linked.is_symlink() and linked.samefile(tmp_path / "drive" / "blobs" / "0001")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", ["lidar", "motion"])
 def test_a_report_of_surfaces_that_read_what_scores(source: Path, tmp_path: Path, surface: str) -> None:
     shutil.copytree(source, tmp_path / "drive")

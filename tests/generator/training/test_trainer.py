@@ -97,6 +97,7 @@ def test_workers_change_nothing(tmp_path: Path) -> None:
     assert same(tensors(tmp_path / "0"), tensors(tmp_path / "2"))
 
 
+@pytest.mark.slow
 def test_a_full_disk_leaves_the_last_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = run(tmp_path, steps=2)
     made.train()
@@ -261,6 +262,7 @@ def test_a_frozen_unet_stays_as_it_is(tmp_path: Path) -> None:
     assert run(tmp_path, generator=frozen, steps=2).done == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("checkpointing", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_bfloat16_and_recomputed_blocks_train(tmp_path: Path, checkpointing: bool) -> None:
     from accelerate.state import AcceleratorState  # one precision a process, but for this
