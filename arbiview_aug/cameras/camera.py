@@ -131,7 +131,8 @@ class Camera:
             roll_deg: 0 for an upright image.
             position_m: Optical centre in the ego frame.
             horizontal_fov_deg: Angle between the outer edges of the image, measured along the row of the principal
-                point; gives a K with square pixels and a central principal point. Either this or ``K``.
+                point; gives a K with square pixels and a principal point in the middle, or where a tangential
+                distortion makes both halves of the angle equal. Either this or ``K``.
 
         Raises:
             CalibrationError: On impossible values, or when both or none of K and horizontal_fov_deg are given.
@@ -181,11 +182,16 @@ class Camera:
 
     @property
     def fov_deg(self) -> tuple[float, float]:
-        """(horizontal, vertical) angle between the image's outer edges, through the principal point."""
+        """(horizontal, vertical) angle between the image's outer edges, through the principal point.
+
+        Edges beyond the lens's image circle are counted at the circle.
+        """
         cx, cy = self.K[0, 2], self.K[1, 2]
         edges = np.array([[-0.5, cy], [self.width_px - 0.5, cy], [cx, -0.5], [cx, self.height_px - 0.5]])
-        d = self.unproject_cam(edges).directions
+        d, valid = self.unproject_cam(edges)
         theta = np.arctan2(np.stack([d[:2, 0], d[2:, 1]]), np.stack([d[:2, 2], d[2:, 2]]))  # [axis, edge]
+        fold = self.lens_model.fold_rad
+        theta = np.where(valid.reshape(2, 2), theta, [-fold, fold])
         return tuple(float(x) for x in np.degrees(theta[:, 1] - theta[:, 0]))  # type: ignore[return-value]
 
     @cached_property
@@ -356,11 +362,14 @@ class Camera:
         return replace(self, cam2ego=cam2ego)
 
     def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Camera:
-        """Turned about its own centre: yaw about the ego's z (left), pitch about its own x (up), roll about its z."""
+        """Turned about its own centre: yaw about the ego's z (left), pitch about its own x (up), roll about its z.
+
+        The mask stays on the own car: it is re-sampled, and pixels that the old image did not show are not masked.
+        """
         yaw, pitch, roll = checked_numbers(self.name, "yaw, pitch, roll", (yaw_deg, pitch_deg, roll_deg), 3, _ANGLES)
         cam2ego = self.cam2ego.copy()
         cam2ego[:3, :3] = rotation_z(yaw) @ cam2ego[:3, :3] @ rotation_x(pitch) @ rotation_z(roll)
-        return replace(self, cam2ego=cam2ego)
+        return with_mask_of(self, replace(self, cam2ego=cam2ego, mask=None), outside=True)
 
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Camera:
         """Moved along the ego's axes."""
@@ -373,12 +382,29 @@ class Camera:
         if self.is_rectilinear:
             return self
         pinhole = replace(self, lens="pinhole", distortion=(), mask=None)
-        if self.mask is None:
-            return pinhole
-        uv, _, valid = self.project_cam(pinhole.unproject_cam(pinhole.pixel_grid()).directions)
-        pixel = np.round(uv).clip(0, [self.width_px - 1, self.height_px - 1]).astype(int)
-        seen = valid & self.contains(uv)
-        return replace(pinhole, mask=self.mask[pixel[..., 1], pixel[..., 0]] & seen)
+        return with_mask_of(self, pinhole, outside=False)
+
+
+def with_mask_of(seen: Camera, camera: Camera, *, outside: bool) -> Camera:
+    """``camera`` with the mask of one at the same centre, and ``outside`` in pixels that the other's image lacks."""
+    if seen.mask is None:
+        return camera
+    views = ((c.lens, c.distortion, c.K.tobytes(), c.cam2ego[:3, :3].tobytes()) for c in (seen, camera))
+    if len({*views}) == 1:
+        return replace(camera, mask=seen.mask)
+    to_seen = seen.cam2ego[:3, :3].T @ camera.cam2ego[:3, :3]
+    mask: Any = seen.mask.astype(np.uint8)
+    border: Any = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": int(outside)}
+    (h, w), H = camera.size, seen.K @ to_seen @ np.linalg.inv(camera.K)
+    is_in_front = (H[2] @ [[0, w, 0, w], [0, 0, h, h], [1, 1, 1, 1]] > 0).all()
+    if seen.is_rectilinear and camera.is_rectilinear and is_in_front:  # a homography, 30 times as fast
+        mask = cv2.warpPerspective(mask, H, (w, h), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP, **border)
+    else:
+        directions, has_ray = camera.unproject_cam(camera.pixel_grid())
+        uv, _, valid = seen.project_cam(directions @ to_seen.T)
+        uv = np.where((has_ray & valid)[..., None], uv, -9.0).astype(np.float32)
+        mask = cv2.remap(mask, uv, None, cv2.INTER_NEAREST, **border)  # type: ignore[call-overload]
+    return replace(camera, mask=mask.astype(bool))
 
 
 @lru_cache(256)  # from frame to frame cameras move, and their lenses stay

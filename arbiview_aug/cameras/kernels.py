@@ -238,16 +238,14 @@ def _sphere_row(x: Row, y: Row, z: Row, P: Row, scale: Row) -> None:
 
 
 @compiled
-def project_image(rays: Row, q: Row, A: Row, o: Row, kind: int, P: Row, u: Row, v: Row, nearness: Row) -> None:
-    """Source pixels (h, w) of points on rays (3, h, w) at inverse distances (h, w), and theirs from the source."""
+def project_image(rays: Row, q: Row, A: Row, o: Row, kind: int, P: Row, u: Row, v: Row) -> None:
+    """Source pixels (h, w) of points on rays (3, h, w) at inverse distances (h, w)."""
     h, w = q.shape
     rows = np.empty((5, w), np.float32)
     x, y, z, a, b = rows[0], rows[1], rows[2], rows[3], rows[4]
     for j in range(h):
         turn_row(rays[0, j], rays[1, j], rays[2, j], q[j], A, o, x, y, z)
         project_row(x, y, z, kind, P, a, b, u[j], v[j])
-        for i in range(w):
-            nearness[j, i] = q[j, i] / max(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i]), _TINY)
 
 
 @compiled

@@ -288,11 +288,11 @@ class FThetaBackward(FTheta):
     def _largest_radius(self) -> float:
         """The radius at which the polynomial gives 180 degrees, or rises a tenth as fast as on the axis.
 
-        Where it stops rising, a radian is infinitely many pixels: no image reaches that far.
+        Where it stops rising, a radian is infinitely many pixels: no image reaches that far. ``_inverse`` reaches 10.
         """
         flat, behind = self._slope_polynomial, -np.array([*self.distortion[::-1], 1.0, -math.pi]) / math.pi
         flat[-1] -= 0.1
-        return min(_smallest_positive_root(flat / flat[-1]), _smallest_positive_root(behind), 1e3)
+        return min(_smallest_positive_root(flat / flat[-1]), _smallest_positive_root(behind), 10.0)
 
     @cached_property
     def kernel_coefficients(self) -> tuple[float, ...]:
@@ -429,16 +429,20 @@ def _smallest_positive_root(polynomial: FloatArray) -> float:
 
 
 def intrinsics_for_fov(name: str, fov_deg: float, size: tuple[int, int], lens: Lens) -> FloatArray:
-    """Square-pixel K with a central principal point whose outer image edges span ``fov_deg``."""
+    """Square-pixel K whose outer image edges span ``fov_deg``, half to each side of the principal point.
+
+    It is in the middle of the image, but for a tangential distortion, which makes the sides unequal.
+    """
     largest = 360.0 if lens.sees_behind else 180.0
     if not isinstance(fov_deg, Real) or not 0 < fov_deg < largest:
         expected = f"expected between 0 and {largest:g} for a {lens.name} lens"
         raise CalibrationError(f"camera {name!r}: horizontal_fov_deg: {expected}, got {fov_deg!r}")
-    half = np.array(math.radians(fov_deg) / 2)
-    x, _, valid = lens.distort(np.sin(half), np.array(0.0), np.cos(half))
-    if not valid or x <= 0:
+    half = np.radians([-fov_deg / 2, fov_deg / 2])
+    (left, right), _, valid = lens.distort(np.sin(half), np.zeros(2), np.cos(half))
+    if not valid.all() or not left < 0 < right:
         expected = "expected an angle inside the lens's unfolded branch"
         raise CalibrationError(f"camera {name!r}: horizontal_fov_deg: {expected}, got {fov_deg:g}")
     h, w = size
-    focal = w / 2 / float(x)
-    return np.array([[focal, 0, (w - 1) / 2], [0, focal, (h - 1) / 2], [0, 0, 1.0]])
+    focal = w / float(right - left)
+    cx = (w - 1) / 2 - focal * float(left + right) / 2
+    return np.array([[focal, 0, cx], [0, focal, (h - 1) / 2], [0, 0, 1.0]])

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import length_hint
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ class Lidar:
 
     def _checked(self) -> dict[str, Any]:
         name, elevations = self.name, self.elevations_deg
-        count = len(elevations) if hasattr(elevations, "__len__") else 0
+        count = length_hint(elevations)
         beams = f"1 to {MOST_BEAMS} elevations from -90 to 90 degrees"
         table = checked_numbers(name, "elevations_deg", elevations, max(count, 1), beams)
         if count > MOST_BEAMS or max(map(abs, table)) > 90:
@@ -77,6 +78,7 @@ class Lidar:
             if not is_valid:
                 raise CalibrationError(f"camera {shown(name)}: {field}: expected {expected}, got {got}")
         return {
+            "name": str(name),  # numpy's text is no plain YAML
             "lidar2ego": pose,
             "elevations_deg": table,
             "azimuth_step_deg": step,

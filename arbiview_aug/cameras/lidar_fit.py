@@ -38,14 +38,17 @@ def checked_scans(name: str, points: Any, rings: Any) -> tuple[list[FloatArray],
     except (TypeError, ValueError, RuntimeError) as error:  # of words, and of tensors elsewhere or with gradients
         raise _error(name, f"arrays or CPU tensors of numbers, got {shown(points)} ({error})") from None
     if not scans or any(scan.ndim != 2 or scan.shape[1] < 3 for scan in scans):
-        raise _error(name, f"scans of shape (P, >= 3), got {[scan.shape for scan in scans]}")
+        raise _error(name, f"scans of shape (P, >= 3), got {shown([scan.shape for scan in scans])}")
     scans = [scan[:, :3] for scan in scans]
     if rings is None:
         return scans, None
-    numbers = [np.asarray(part) for part in (rings if isinstance(rings, list | tuple) else [rings])]
+    expected = f"lidar {name!r}: rings: expected the ring of each point, {shown([(len(scan),) for scan in scans])}"
+    try:
+        numbers = [np.asarray(part) for part in (rings if isinstance(rings, list | tuple) else [rings])]
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise CalibrationError(f"{expected}, got {shown(rings)} ({error})") from None
     if [part.shape for part in numbers] != [(len(scan),) for scan in scans]:
-        shapes = f"{[(len(scan),) for scan in scans]}, got {[part.shape for part in numbers]}"
-        raise CalibrationError(f"lidar {name!r}: rings: expected the ring of each point, {shapes}")
+        raise CalibrationError(f"{expected}, got {shown([part.shape for part in numbers])}")
     return scans, numbers
 
 

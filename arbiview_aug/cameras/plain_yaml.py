@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from arbiview_aug.errors import CalibrationError, one_line
+from arbiview_aug.errors import CalibrationError, described, one_line
 
 MOST_BYTES = 1 << 20
 """Largest calibration file: 8 KiB a camera. It is counted before it is read: YAML takes seconds a megabyte."""
@@ -76,7 +77,7 @@ def parse_json(text: str | bytes) -> Any:
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     data = dict(pairs)
     if len(data) < len(pairs):
-        key = next(key for k, (key, _) in enumerate(pairs) if key in (name for name, _ in pairs[:k]))
+        key = Counter(key for key, _ in pairs).most_common(1)[0][0]
         raise ValueError(f"the key {key[:80]!r} stands twice")
     return data
 
@@ -85,7 +86,7 @@ def parse_yaml(text: str) -> Any:
     """Plain data of a YAML document.
 
     Raises:
-        ValueError: A key that stands twice, aliases that lead back or multiply to too many values.
+        ValueError: A key that stands twice, aliases that lead back or multiply to too many values, a wrong tag.
         yaml.YAMLError: Anything else that is no plain YAML.
     """
     loader = _Loader(text)
@@ -96,6 +97,8 @@ def parse_yaml(text: str) -> Any:
         if _size(node, {}) > _MOST_VALUES:
             raise ValueError(f"more than {_MOST_VALUES} values once its aliases are written out")
         return loader.construct_document(node)
+    except (AttributeError, LookupError) as error:  # of PyYAML's own constructors
+        raise ValueError(f"a value that is not what its tag says ({described(error)})") from None
     finally:
         loader.dispose()  # type: ignore[no-untyped-call]
 

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from arbiview_aug.cameras.camera import with_mask_of
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.errors import CalibrationError, SampleError, shown
 
@@ -55,7 +56,7 @@ class Epochs:
 
 
 class RandomRig(Epochs):
-    """Target rigs around ``base``: the whole rig turned, moved and zoomed by random amounts.
+    """Target rigs around ``base``: the whole rig turned, moved and zoomed by random amounts; masks follow the own car.
 
     Args:
         base: A rig, the name of a shipped one, or a rig file.
@@ -88,6 +89,7 @@ class RandomRig(Epochs):
     ) -> None:
         super().__init__()
         self.base = load_rig(base)
+        self._unmasked = self.base.with_cameras([replace(camera, mask=None) for camera in self.base])
         if per not in ("sample", "sequence"):
             raise CalibrationError(f"RandomRig: per: expected 'sample' or 'sequence', got {per!r}")
         self.per, self.sequence_key = per, sequence_key
@@ -116,10 +118,11 @@ class RandomRig(Epochs):
         if self.per == "sample":
             return self.draw(rng)
         key = self.sequence_key
-        if key not in sample:
+        leaves = list(_leaves(sample.get(key)))
+        if None in leaves:
             keys = ", ".join(map(str, sample))
-            raise SampleError(f"RandomRig(per='sequence'): expected {key!r} in the sample, got {keys}")
-        names = set(map(str, _leaves(sample[key])))
+            raise SampleError(f"RandomRig(per='sequence'): expected {key!r} in the sample, not None, got {keys}")
+        names = set(map(str, leaves))
         if len(names) != 1:
             raise SampleError(f"RandomRig(per='sequence'): {key}: expected one sequence a batch, got {len(names)}")
         return self.draw(sequence_rng(names.pop(), self.epoch, rng))
@@ -135,11 +138,13 @@ class RandomRig(Epochs):
                 f"RandomRig: expected the parameters {', '.join(self.ranges)}, got {', '.join(map(str, params))}"
             )
         p = {name: float(value) for name, value in params.items()}
-        rig = self.base.turned(yaw_deg=p["yaw_deg"], pitch_deg=p["pitch_deg"], roll_deg=p["roll_deg"])
+        rig = self._unmasked.turned(yaw_deg=p["yaw_deg"], pitch_deg=p["pitch_deg"], roll_deg=p["roll_deg"])
         rig = rig.shifted(p["forward_m"], p["lateral_m"], p["height_m"])
         scale = np.ones((3, 3))
         scale[:2, :2] = p["focal_scale"]
-        return rig.with_cameras([replace(camera, K=camera.K * scale) for camera in rig])
+        zoomed = [replace(camera, K=camera.K * scale) for camera in rig]
+        pairs = zip(self.base, zoomed, strict=True)
+        return rig.with_cameras([with_mask_of(base, camera, outside=True) for base, camera in pairs])
 
     def __repr__(self) -> str:
         moving = ", ".join(f"{n} {lo:g}..{hi:g}" for n, (lo, hi) in self.ranges.items() if hi > lo)

@@ -140,8 +140,9 @@ class PixelRays:
 
     @property
     def nbytes(self) -> int:
-        """Memory in bytes, with the cones."""
-        return self.planes.nbytes + 16 * math.prod(-(-n // CELL_PX) for n in self.size)
+        """Memory in bytes, with the cones and the nodes so far."""
+        nodes = sum(nodes.nbytes for nodes in list(self._nodes.values()))
+        return self.planes.nbytes + 16 * math.prod(-(-n // CELL_PX) for n in self.size) + nodes
 
     def crop(self, top: int, left: int, size: tuple[int, int]) -> PixelRays:
         """The rays of a window of (h, w) pixels."""
@@ -238,30 +239,28 @@ def relative_pose(target: Camera, source: Camera) -> tuple[Planes, Planes]:
     return A.astype(np.float32), o.astype(np.float32)
 
 
-def source_pixels(
-    target: Camera, rays: Planes, inverse_distance: Planes, source: Camera
-) -> tuple[Planes, Planes, Planes]:
+def source_pixels(target: Camera, rays: Planes, inverse_distance: Planes, source: Camera) -> tuple[Planes, Planes]:
     """Pixels of a source for scene points on a target's rays; both cameras are in one ego frame.
 
     ``rays`` are (3, h, w) unit rays in the target's frame, ``inverse_distance`` (h, w) is along them, 1/m. Returns u
-    and v (h, w), ``kernels.FAR_AWAY_PX`` where there is no pixel, and inverse distances from the source (h, w), 1/m.
+    and v (h, w), ``kernels.FAR_AWAY_PX`` where there is no pixel.
     """
     return pixels_of(rays, inverse_distance, *relative_pose(target, source), source)
 
 
-def pixels_of(rays: Planes, inverse_distance: Planes, A: Any, o: Any, source: Camera) -> tuple[Planes, Planes, Planes]:
+def pixels_of(rays: Planes, inverse_distance: Planes, A: Any, o: Any, source: Camera) -> tuple[Planes, Planes]:
     """As ``source_pixels``, by the rotation (3, 3) to the source's frame, and the rays' start (3,) there."""
     from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, project_image
 
     rays, A, o = (np.ascontiguousarray(part, np.float32) for part in (rays, A, o))
-    u, v, nearness = (np.empty(inverse_distance.shape, np.float32) for _ in range(3))
+    u, v = (np.empty(inverse_distance.shape, np.float32) for _ in range(2))
     kind = LENS_CODES.get(source.lens, 0)
-    project_image(rays, inverse_distance, A, o, kind, source.parameters, u, v, nearness)
+    project_image(rays, inverse_distance, A, o, kind, source.parameters, u, v)
     if source.lens not in LENS_CODES:
         points = np.tensordot(A, rays, 1) + o[:, None, None] * inverse_distance
         uv, _, valid = source.project_cam(np.moveaxis(points, 0, -1).astype(np.float64))
         u, v = (np.where(valid, uv[..., k], FAR_AWAY_PX).astype(np.float32) for k in range(2))
-    return u, v, nearness
+    return u, v
 
 
 def edge_distance(camera: Camera, uv: FloatArray) -> FloatArray:

@@ -31,7 +31,7 @@ from arbiview_aug.cameras.lens import LENSES, FloatArray, canonical_name
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.plain_yaml import dump_yaml, file_stem, parse_yaml
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.cameras.validation import MOST_M
+from arbiview_aug.cameras.validation import MAX_SIZE_PX, MOST_M
 from arbiview_aug.errors import CalibrationError, calibration_of, shown
 
 MOST_CAMERAS, MOST_LIDARS = 128, 32
@@ -84,6 +84,7 @@ class Rig:
                 f"{where}: ground_z_m: expected a finite height in metres, got {shown(self.ground_z_m)}; at "
                 f"most {MOST_M:g} m"
             )
+        object.__setattr__(self, "name", str(self.name or ""))  # numpy's text is no plain YAML
         object.__setattr__(self, "cameras", cameras)
         object.__setattr__(self, "lidars", lidars)
         object.__setattr__(self, "ground_z_m", ground)
@@ -173,8 +174,9 @@ class Rig:
         """All cameras resized to (h, w), see ``Camera.resize``, or by a scale."""
         if not isinstance(size, int | float | np.number):
             return self.with_cameras([c.resize(size, fit) for c in self])
-        if not 0 < size < math.inf:
-            raise CalibrationError(f"rig {self.name!r}: size: expected (h, w) or a positive scale, got {size}")
+        if not 0 < size <= MAX_SIZE_PX:
+            expected = f"(h, w) or a positive scale up to {MAX_SIZE_PX}"
+            raise CalibrationError(f"rig {self.name!r}: size: expected {expected}, got {size}")
         sizes = [(max(1, round(h * size)), max(1, round(w * size))) for h, w in self.sizes]
         return self.with_cameras([c.resize(to, fit) for c, to in zip(self, sizes, strict=True)])
 
@@ -264,7 +266,7 @@ class Rig:
         data, files = self.to_dict(), dict[Path, bytes]()
         for k, (entry, camera) in enumerate(zip(data["cameras"], self.cameras, strict=True)):
             if camera.mask is not None:
-                file = path.with_name(f"{path.stem}.{file_stem(camera.name, k)}.mask.png")
+                file = path.with_name(f"{path.name}.{file_stem(camera.name, k)}.mask.png")
                 files[file] = cv2.imencode(".png", camera.mask.astype(np.uint8) * 255)[1].tobytes()
                 entry["mask"] = file.name
         text = json.dumps(data, indent=1) if path.suffix == ".json" else dump_yaml(data)

@@ -283,7 +283,7 @@ class ViewPlanner:
         uv, rounded = np.empty((2, 2, *geometry.behind.shape), np.float32)
         u, v = uv
         if kind < 0:
-            u, v, _ = source_pixels(self.camera, self.node_rays, geometry.behind, source)
+            u, v = source_pixels(self.camera, self.node_rays, geometry.behind, source)
         measured = np.empty((3, *u.shape))
         resolution, edge_px, parallax = measured
         offset_m = (self.camera.center_m - source.center_m) @ self.camera.cam2ego[:3, :3]
@@ -327,7 +327,7 @@ class ViewPlanner:
         kind, surface = LENS_CODES.get(source.lens, -1), geometry.surface
         positions = np.zeros((2, 0, 0), np.float32)
         if kind < 0:
-            u, v, _ = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), geometry.q, source)
+            u, v = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), geometry.q, source)
             positions = at_level(np.stack([u, v]), level).astype(np.float32)
         occluders = OcclusionMap(np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32))
         shadow_scale = 1.0

@@ -127,7 +127,7 @@ def anchored(one: DepthMap, points: Points, others: Sequence[DepthMap] = ()) -> 
     if len(points):
         R, shift = camera.cam2ego[:3, :3].T, -camera.cam2ego[:3, :3].T @ camera.center_m
         rows = np.ascontiguousarray(points.T, np.float32)[:, None]
-        u, v, _ = pixels_of(rows, np.ones((1, len(points)), np.float32), R, shift, camera)
+        u, v = pixels_of(rows, np.ones((1, len(points)), np.float32), R, shift, camera)
         z = R[2].astype(np.float32) @ rows[:, 0] + np.float32(shift[2])
         compare_points(u[0], v[0], z, depth_m, side, ANCHOR_SHARE, sums)
     for other in others:

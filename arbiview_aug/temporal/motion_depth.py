@@ -382,7 +382,7 @@ def _motion(sample: PoseSamples, use: npt.NDArray[np.int64], at: Layer) -> Float
     columns = []
     for step in np.diag([_TURN_DEG] * 3 + [_SHIFT_M] * 2):
         to_source = np.linalg.inv(_pose(step) @ source.cam2ego) @ image.camera.cam2ego
-        uv = pixels_of(rays, q, to_source[:3, :3], to_source[:3, 3], source)[:2]
+        uv = pixels_of(rays, q, to_source[:3, :3], to_source[:3, 3], source)
         columns.append((np.concatenate(uv) - at).T / step.sum())
     return np.stack(columns, -1)
 

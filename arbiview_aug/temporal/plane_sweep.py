@@ -89,7 +89,7 @@ class SweptImage:
 
     def positions(self, other: Camera, inverse_distance: Layer) -> Layer:
         """(2, h, w) pixels of another camera, u and v, for points on the rays."""
-        return np.stack(source_pixels(self.camera, self.rays, inverse_distance, other)[:2])
+        return np.stack(source_pixels(self.camera, self.rays, inverse_distance, other))
 
     @cached_property
     def unmasked(self) -> npt.NDArray[np.uint8]:

@@ -17,7 +17,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.choices import checked_stride, choice
-from arbiview_aug.errors import SampleError
+from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.sample.batching import gathered, stacked
 from arbiview_aug.sample.inputs import Frame, read_frames
@@ -111,7 +111,7 @@ def camera_maps(
         where = f"a camera {_NEAREST_ROAD_M:g} m or more over the road at z = {ground_z_m:g} m"
         raise SampleError(f"camera {camera.name!r}: map 'road': expected {where}, got z = {camera.center_m[2]:g} m")
     rays, is_valid = _rays(camera, stride, 0, 0)
-    right, down = (_slope(camera, stride, axis) for axis in (0, 1))
+    right, down = (_slope(camera, rays, stride, axis) for axis in (0, 1))
     road = -rays[2] / max(height_m, _NEAREST_ROAD_M)
     by_name = {
         "rays": rays,
@@ -132,11 +132,12 @@ def _rays(camera: Camera, stride: int, right: float, down: float) -> tuple[Float
     return np.moveaxis(np.where(is_valid[..., None], directions, 0), -1, 0), is_valid
 
 
-def _slope(camera: Camera, stride: int, axis: int) -> FloatArray:
-    """Derivative (3, ny, nx) of the rays to the right (axis 0) or down (1), for each cell."""
+def _slope(camera: Camera, rays: FloatArray, stride: int, axis: int) -> FloatArray:
+    """Derivative (3, ny, nx) of rays to the right (axis 0) or down (1), for each cell; one-sided at an image circle."""
     step = _STEP_PX * (1 - axis), _STEP_PX * axis
     (ahead, is_ahead), (behind, is_behind) = _rays(camera, stride, *step), _rays(camera, stride, *(-x for x in step))
-    return np.where(is_ahead & is_behind, (ahead - behind) * (stride / (2 * _STEP_PX)), 0)
+    apart = np.where(is_ahead, ahead, rays) - np.where(is_behind, behind, rays)
+    return apart * (stride / _STEP_PX) / np.maximum(is_ahead.astype(int) + is_behind, 1)
 
 
 class CameraPriorStem(torch.nn.Module):
@@ -162,6 +163,9 @@ class CameraPriorStem(torch.nn.Module):
             ("camera_maps", camera_maps, self.stem[0].in_channels),
         )
         for name, got, channels in sides:
+            if not isinstance(got, torch.Tensor):  # ``CameraMaps`` gives a list for images of several sizes
+                fix = "torch.stack the cameras of one size"
+                raise SampleTypeError(f"{name}: expected a tensor, got {type(got).__name__}; {fix}")
             expected = channels, *features.shape[-2:]
             if got.shape[-3:] != expected or got.shape[:-3].numel() != features.shape[:-3].numel():
                 fix = "are stride=, the numbers of channels and of images those of the features and maps?"

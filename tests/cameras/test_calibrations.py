@@ -376,6 +376,18 @@ def test_kalibr_camchain(tmp_path: Path) -> None:
         written(tmp_path, camchain__yaml=CAMCHAIN.replace(f"  {key}:", f"  other_{key}:"))
         with pytest.raises(CalibrationError, match=rf"camera 'cam[01]': expected intrinsics, .*, missing {key}"):
             load_rig(path)
+    for old, new, message in (
+        ("  distortion_coeffs: [-0.0132, 0.0501, -0.0451, 0.0124]\n", "", "'cam2': .*, missing distortion_coeffs"),
+        (
+            "distortion_coeffs: []",
+            "distortion_coeffs: [0.1, 0.0]",
+            r"'cam0': expected no distortion_coeffs .* \[0.1, 0.0",
+        ),
+    ):
+        assert old in CAMCHAIN
+        written(tmp_path, camchain__yaml=CAMCHAIN.replace(old, new, 1))
+        with pytest.raises(CalibrationError, match=message):
+            load_rig(path)
     written(tmp_path, camchain__yaml=CAMCHAIN.replace("ds", "omni"))
     with pytest.raises(CalibrationError, match=r"'cam0': camera_model-distortion_model: expected .*, got omni-none"):
         load_rig(path)
@@ -472,6 +484,29 @@ def test_colmap_asks_which_images_are_of_one_moment(tmp_path: Path) -> None:
         load_rig(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("cameras", " 240 -0.05", " 240", r"camera 'left': expected 4 parameters of SIMPLE_RADIAL, got 3"),
+        ("cameras", "0.00372", "0.1 0.00372", r"camera 'front': expected 8 parameters of OPENCV_FISHEYE, got 9"),
+        (
+            "images",
+            "2362.39 248.498 58396 1784.7 268.254 59027\n",
+            "",
+            r"images.txt: expected two lines for each image",
+        ),
+        ("images", "1 1 0 0", "\n1 1 0 0", r"images.txt: expected two lines for each image"),
+        ("images", "left/", "front/", r"images.txt: expected images with different .* 'front/0001.jpg' 2 times"),
+    ],
+)
+def test_colmap_files_are_checked(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
+    written(tmp_path, cameras__txt=CAMERAS_TXT, images__txt=IMAGES_TXT, mounting__yaml=COLMAP_MOUNTING)
+    path = tmp_path / f"{file}.txt"
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(CalibrationError, match=message):
+        load_rig(tmp_path)
+
+
 # --- data sets --------------------------------------------------------------------------------------------------------
 def calibrated(token: str, sensor: str, pose: list[float], intrinsic: list[Any]) -> dict[str, Any]:
     return {"token": token, "sensor_token": sensor, "translation": pose[:3], "rotation": pose[3:],
@@ -553,6 +588,9 @@ def test_waymo(tmp_path: Path, key: str | None, intrinsic: Any) -> None:
     rig = load_rig(tmp_path / "calibration.json")
     assert rig.names == ["FRONT"] and rig[0].distortion == tuple(INTRINSIC[4:])
     np.testing.assert_array_equal(rig[0].cam2ego, FORWARD)
+    (tmp_path / "calibration.json").write_text(json.dumps([{**entry, "name": -1}]))
+    with pytest.raises(CalibrationError, match=r"expected a calibration as Waymo writes it, got KeyError: -1"):
+        load_rig(tmp_path / "calibration.json")
     # Waymo's formula: u = c_u - f_u y / x for a point (x, y, z) in its camera frame, without distortion.
     x, y, z = 400.0, -0.3, 0.2  # nearly on the axis, where the lens hardly bends
     uv = rig.undistorted()[0].project(np.array([x + 1.5, y + 0.2, z + 1.6])).uv
@@ -606,7 +644,10 @@ def test_written_rigs_come_back(tmp_path: Path, name: Any, lenses: tuple[str, ..
 def test_names_that_are_no_file_names_come_back(tmp_path: Path, name: Any) -> None:
     """Nor words of a line; ``camchain`` is a name of Kalibr's files."""
     rig = Rig(
-        [camera(text, 20.0 * k) for k, text in enumerate([" x", "/a/b", "a/", "front\nleft", "my_camchain", "08"])]
+        [
+            camera(text, 20.0 * k)
+            for k, text in enumerate([" x", "/a/b", "a/", "front\nleft", "camera5", "my_camchain", "08", "camera1"])
+        ]
     )
     again = load_rig(save_rig(rig, tmp_path, format=name))
     assert again.names == rig.names and np.allclose(again.cam2ego, rig.cam2ego)
@@ -643,6 +684,8 @@ def test_what_a_format_has_not_is_refused(tmp_path: Path) -> None:
         save_rig(skewed, tmp_path / "colmap", format="colmap")
     with pytest.raises(CalibrationError, match=r"format: expected rig, colmap, kalibr, ros, got 'waymo'"):
         save_rig(skewed, tmp_path / "waymo", format="waymo")  # type: ignore[arg-type]
+    with pytest.raises(CalibrationError, match=r"format: expected rig, colmap, kalibr, ros, got \['ros'\]"):
+        save_rig(skewed, tmp_path / "waymo", format=["ros"])  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
     assert load_rig(save_rig("waymo", tmp_path / "zeros", format="kalibr")).sizes == load_rig("waymo").sizes
     assert load_rig(save_rig(skewed, tmp_path / "rig.yaml")) == skewed

@@ -207,6 +207,7 @@ def test_words_and_wrong_shapes_are_refused_by_name(case: str) -> None:
         ("ftheta_backward", (0.03, -0.08, 0.12, -0.04), 130.0),
         ("double_sphere", (-0.2, 0.6), 200.0),
         ("eucm", (0.6, 1.1), 195.0),
+        ("radtan", (0.0, 0.0, 0.0, 0.02), 90.0),
     ],
 )
 def test_field_of_view_round_trip(lens: str, distortion: tuple, fov: float) -> None:
@@ -214,6 +215,15 @@ def test_field_of_view_round_trip(lens: str, distortion: tuple, fov: float) -> N
         name="a", azimuth_deg=0, width_px=640, height_px=480, horizontal_fov_deg=fov, lens=lens, distortion=distortion
     )
     assert camera.fov_deg[0] == pytest.approx(fov, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("lens", "distortion"),
+    [("double_sphere", (-0.2, 0.9)), ("radtan", (-0.3, 0.0, 0.0, 0.0))],
+)
+def test_field_of_view_ends_at_the_image_circle(lens: str, distortion: tuple) -> None:
+    camera = make(lens=lens, distortion=distortion, K=[[50, 0, 319.5], [0, 50, 239.5], [0, 0, 1]])
+    assert camera.fov_deg == pytest.approx([2 * np.degrees(camera.lens_model.fold_rad)] * 2)
 
 
 def test_resize_and_crop_carry_the_mask() -> None:
@@ -252,6 +262,24 @@ def test_undistorted_keeps_pose_and_intrinsics_and_moves_the_mask() -> None:
         assert pinhole.mask is not None
         assert pinhole.mask[y, x] == bool(inside and mask[round(uv[1]), round(uv[0])])
     assert make().undistorted().lens == "pinhole"
+
+
+@pytest.mark.parametrize("lens", [{}, {"lens": "fisheye", "distortion": (-0.02, 0.001, 0.0, 0.0)}])
+def test_masks_stay_on_the_own_car_as_cameras_turn(lens: dict) -> None:
+    mask = np.ones((480, 640), bool)
+    mask[400:, 200:500] = False
+    camera = make(mask=mask, **lens)
+    turned = camera.turned(yaw_deg=9.0, pitch_deg=-4.0, roll_deg=2.0)
+    assert turned.mask is not None and not turned.mask.all()
+    pixels = np.random.default_rng(0).integers(0, (640, 480), (2000, 2))
+    uv = camera.project(camera.center_m + turned.unproject(pixels).directions).uv
+    known = (np.abs(uv - np.round(uv)) < 0.49).all(-1)  # in no pixel's border
+    x, y = np.round(uv).astype(int).clip(0, (639, 479)).T
+    expected = ~camera.contains(uv, 0.5) | mask[y, x]
+    np.testing.assert_array_equal(turned.mask[pixels[:, 1], pixels[:, 0]][known], expected[known])
+    np.testing.assert_array_equal(camera.turned().mask, mask)
+    away = camera.turned(yaw_deg=180.0).mask
+    assert away is not None and away.all() and make().turned(yaw_deg=9.0).mask is None
 
 
 def test_content_key_is_about_pixels_not_names() -> None:

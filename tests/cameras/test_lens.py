@@ -269,7 +269,7 @@ def test_kernels_project_as_classes(name: str) -> None:
     rays = rng.normal(size=(3, 60, 80)).astype(np.float32)
     rays /= np.linalg.norm(rays, axis=0)
     assert LENS_CODES.keys() == lens_module.LENSES.keys()
-    u, v, _ = source_pixels(same, rays, np.zeros((60, 80), np.float32), camera)
+    u, v = source_pixels(same, rays, np.zeros((60, 80), np.float32), camera)
     directions = np.moveaxis(rays, 0, -1) @ same.cam2ego[:3, :3].T
     want = camera.project(directions)
     inside = want.valid & camera.contains(want.uv, 500)
@@ -277,6 +277,18 @@ def test_kernels_project_as_classes(name: str) -> None:
     sure = np.abs(np.arccos(directions @ camera.cam2ego[:3, 2]) - camera.lens_model.fold_rad) > 1e-2
     np.testing.assert_array_equal(u[sure] != FAR_AWAY_PX, want.valid[sure])
     np.testing.assert_allclose(camera.parameters_at(0.5), camera.resize((240, 320)).parameters, rtol=1e-6)
+
+
+def test_the_longest_backward_polynomials_are_inverted() -> None:
+    """Nearly flat up to 12 focal lengths off the axis, where Newton's bounded steps do not reach."""
+    lens = lens_module.FThetaBackward(
+        (-0.29996666666666666, 0.04721697530864197, -0.0034718364197530863, 9.643990054869684e-05)
+    )
+    radius = np.linspace(0, lens._largest_radius, 200)[:-1]
+    angle = lens._polynomial(radius)
+    got, _, valid = lens.distort(np.sin(angle), np.zeros(199), np.cos(angle))
+    assert valid.all() and lens._largest_radius == 10
+    np.testing.assert_allclose(got, radius, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -294,6 +306,8 @@ def test_cones_hold_the_rays_of_their_cells_and_are_narrow_at_the_border_of_the_
         K=np.array([[20.0, 0.0, 64.5], [0.0, 20.0, 44.5], [0.0, 0.0, 1.0]]), cam2ego=np.eye(4),
     )  # fmt: skip
     rays = pixel_rays(lens)
+    before = rays.nbytes
+    assert rays.nodes(2).nbytes == rays.nbytes - before > 0  # caches count all that rays keep
     cones = rays.cones.repeat(CELL_PX, 1).repeat(CELL_PX, 2)[:, :90, :130]
     valid = rays.planes.any(axis=0)
     assert not valid.all() and (rays.cones[3] < 0).any()

@@ -46,6 +46,7 @@ def test_a_sector_has_no_column_at_its_end() -> None:
         ({"elevations_deg": (0.0, float("nan"))}, "elevations_deg: expected 1 to 1024"),
         ({"elevations_deg": (95.0,)}, "elevations_deg: expected 1 to 1024 elevations from -90 to 90"),
         ({"elevations_deg": 3}, "elevations_deg"),
+        ({"elevations_deg": np.array(5.0)}, "elevations_deg: expected 1 to 1024"),
         ({"azimuth_step_deg": 0.0}, "azimuth_step_deg: expected more than"),
         ({"azimuth_step_deg": 1e-9}, "azimuth_step_deg: expected more than"),
         ({"azimuth_step_deg": "wide"}, "azimuth_step_deg: expected a number of degrees"),

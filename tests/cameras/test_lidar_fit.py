@@ -77,12 +77,16 @@ def _random(count: int) -> np.ndarray:
         ([], {}, "expected scans of shape"),
         ("scan.npy", {}, r"expected arrays or CPU tensors of numbers, got 'scan\.npy'"),
         (_random(200), {"rings": np.zeros(100)}, r"rings: expected the ring of each point, \[\(200,\)\], got"),
+        (_random(200), {"rings": [[0, [1, 2]]]}, r"rings: expected the ring of each point, .* got \[\[0, \[1, 2\]\]\]"),
+        (_random(9000).tolist(), {}, r"expected scans of shape .*, \.\.\.\]$"),
+        ([_random(2)] * 9000, {"rings": [np.zeros(1)] * 9000}, r"rings: .*, \.\.\.\]$"),
         (_random(200), {"lidar2ego": np.zeros((4, 4))}, "lidar2ego"),
     ],
 )
 def test_what_is_refused(points: Any, more: dict[str, Any], message: str) -> None:
-    with pytest.raises(CalibrationError, match=message):
+    with pytest.raises(CalibrationError, match=message) as caught:
         Lidar.fitted(points, **({"lidar2ego": UP.lidar2ego} | more))
+    assert len(str(caught.value)) < 1000
 
 
 def test_nuscenes_scanner(nuscenes_root: Path) -> None:

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from arbiview_aug import load_rig
-from arbiview_aug.cameras.plain_yaml import dump_yaml, parse_yaml
+from arbiview_aug.cameras.plain_yaml import dump_yaml, parse_json, parse_yaml
 from arbiview_aug.errors import CalibrationError
 
 CAMERA = """
@@ -36,6 +36,9 @@ MERGES = "\n".join(
         ("cameras: &a [1, *a]", "an alias within the value"),
         ("cameras: []\ncameras: []", "the key 'cameras' stands twice"),
         ("[" * 5000, "expected plain YAML"),
+        ('name: !!timestamp "x"\ncameras: []', "expected plain YAML .* not what its tag says"),
+        ('name: !!int ""\ncameras: []', "not what its tag says"),
+        ('name: !!bool "maybe"\ncameras: []', "not what its tag says"),
         (f"cameras:{''.join(CAMERA.replace('front', f'c{k}') for k in range(129))}", "at most 128 cameras, got 129"),
         (f"cameras:{CAMERA.replace('64', str([list(range(50))] * 50))}", "camera 'front': width_px"),
     ],
@@ -47,6 +50,13 @@ def test_bombs_and_doubles_are_refused(tmp_path, text, message):
     with pytest.raises(CalibrationError, match=message) as error:
         load_rig(path)
     assert len(str(error.value)) < 1000
+
+
+@pytest.mark.timeout(20)
+def test_a_double_in_large_json_is_found_soon():
+    keys = [*range(100_000), 99_999]
+    with pytest.raises(ValueError, match="the key 'a99999' stands twice"):
+        parse_json("{" + ", ".join(f'"a{k}": 0' for k in keys) + "}")
 
 
 def test_aliases_of_a_real_file_stay(tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import CalibrationError, RandomRig, SampleError, load_rig
+from arbiview_aug import CalibrationError, Camera, RandomRig, Rig, SampleError, load_rig
 
 NEUTRAL = {
     "yaw_deg": 0.0,
@@ -63,6 +63,21 @@ def test_convention_each_parameter_does_what_its_name_says(name: str) -> None:
         np.testing.assert_allclose(after.K[:2, :2], before.K[:2, :2] * scale)
         np.testing.assert_array_equal(after.K[:2, 2], before.K[:2, 2])
     assert rig.ground_z_m == base.ground_z_m and rig.names == base.names
+
+
+def test_masks_follow_turned_and_zoomed_cameras() -> None:
+    mask = np.ones((100, 200), bool)
+    mask[80:, 50:150] = False  # a block in the middle, of 30 rows and 100 columns from the principal point on
+    usual = {"width_px": 200, "height_px": 100, "horizontal_fov_deg": 60.0}
+    rig = Rig([Camera.looking(name=n, azimuth_deg=0, **usual, mask=m) for n, m in (("a", mask), ("b", None))])
+    random_rig = RandomRig(rig)
+    zoomed, without = random_rig.rig({**NEUTRAL, "focal_scale": 0.5, "height_m": 1.0})
+    want = np.ones((100, 200), bool)
+    want[65:75, 75:125] = False  # lower than 100 rows the base shows nothing
+    np.testing.assert_array_equal(zoomed.mask, want)
+    assert without.mask is None and random_rig.rig(NEUTRAL) == rig
+    turned = random_rig.rig({**NEUTRAL, "yaw_deg": 5.0})[0]
+    assert turned == rig[0].turned(yaw_deg=5.0) and (turned.mask != mask).any()
 
 
 def test_numbers_are_plain_and_replay() -> None:
@@ -130,8 +145,9 @@ def test_batches_of_sequences() -> None:
     for other in (["a", "b"], tensor([3, 4]), [("a", "b"), ("a", "b")], np.array([3, 4])):
         with pytest.raises(SampleError, match="scene_token: expected one sequence a batch, got 2"):
             random_rig.draw_for({"scene_token": other})
-    with pytest.raises(SampleError, match="expected 'scene_token' in the sample, got images, token"):
-        random_rig.draw_for({"images": 0, "token": 0})
+    for more in ({}, {"scene_token": None}, {"scene_token": ["a", None]}):
+        with pytest.raises(SampleError, match=r"expected 'scene_token' in the sample, .*, got images, token"):
+            random_rig.draw_for({"images": 0, "token": 0} | more)
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,14 @@ def test_round_trip_is_exact(tmp_path: Path, suffix: str) -> None:
         np.testing.assert_array_equal(a.K, b.K)
         np.testing.assert_array_equal(a.cam2ego, b.cam2ego)
         assert a.distortion == b.distortion
-    assert (tmp_path / "rig.front.mask.png").is_file()
+    assert (tmp_path / f"rig{suffix}.front.mask.png").is_file()  # no other file's of this folder
+
+
+def test_numpys_text_is_written_as_text(tmp_path: Path) -> None:
+    usual = load_rig("waymo").lidars[0]
+    rig = Rig([camera()], name=np.str_("b"), lidars=[replace(usual, name=np.str_("top"))])
+    again = load_rig(rig.save(tmp_path / "rig.yaml"))
+    assert again == rig and again.name == "b" and again.lidars[0].name == "top"
 
 
 def test_other_suffixes_are_refused(tmp_path: Path) -> None:
@@ -228,8 +235,10 @@ def test_changed_copies() -> None:
     rig = rig_with_everything()
     assert rig.resized(0.5).sizes == [(24, 32)] * 3 == rig.resized((24, 32)).sizes
     assert rig.resized([24, 32]).sizes == [(24, 32)] * 3  # type: ignore[arg-type]
-    for scale in (-1.0, 0, np.nan):
-        with pytest.raises(CalibrationError, match=r"rig 'everything': size: expected .* or a positive scale, got"):
+    for scale in (-1.0, 0, np.nan, 1e306):
+        with pytest.raises(
+            CalibrationError, match=r"rig 'everything': size: expected .* or a positive scale up to 32766, got"
+        ):
             rig.resized(scale)
     assert Rig.from_dict({**rig.to_dict(), "name": None}).name == ""
     assert rig.turned(yaw_deg=10.0)["left"].azimuth_deg == pytest.approx(87.7)

@@ -19,6 +19,7 @@ from arbiview_aug import (
     RigRetarget,
     SampleError,
     SampleKeys,
+    SampleTypeError,
     collate,
 )
 from arbiview_aug.cameras.camera import Camera
@@ -111,6 +112,8 @@ def test_cells_outside_the_image_circle_are_zero() -> None:
     maps = camera_maps(wide.resize((80, 200)).crop(0, 0, (80, 400)), 0.0)
     corners = maps[:, ::79, -1]
     assert np.isfinite(maps).all() and (corners == 0).all() and (maps[:3, 40, 100] != 0).any()
+    angles, has_ray = maps[8], (maps[:3] != 0).any(axis=0)
+    assert (angles[has_ray] > 0).all()  # also where a neighbour has none
 
 
 def test_every_lens_has_a_case() -> None:
@@ -179,9 +182,10 @@ def test_the_stem_adds_nothing_at_first_and_learns() -> None:
         ((features, read.mT), r"camera_maps: .* = \(\d+, 8, 12\), got .*, 12, 8\)"),
         ((features, read[:, 1:]), r"camera_maps: expected \(\.\.\., channels, h, w\) = "),
         ((features, read[:1]), r"camera_maps: .* got \(1, .* of images those"),
+        ((features, [read[0], read[1]]), "camera_maps: expected a tensor, got list; torch.stack"),
         ((features[:, 1:], read), r"features: expected .* = \(5, 8, 12\), got \(2, 4, 8, 12\)"),
     ):
-        with pytest.raises(SampleError, match=expected):
+        with pytest.raises((SampleError, SampleTypeError), match=expected):
             stem(*bad)
     (out * torch.rand_like(out)).sum().backward()
     assert stem.stem[-1].weight.grad.abs().sum() > 0

@@ -15,7 +15,7 @@ from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.formats import camera_files, colmap, datasets, kalibr
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.plain_yaml import dump_yaml, read_plain
-from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line
+from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line, shown
 
 
 class Format(NamedTuple):
@@ -142,10 +142,10 @@ def _by_content(data: Any) -> str | None:
 
 def write_calibration(data: Mapping[str, Any], folder: Path, name: str) -> Path:
     """Write the plain data of a rig file to a folder, in the format of another tool. Returns the folder."""
-    files_of = FORMATS[name].files_of if name in FORMATS else None
+    files_of = FORMATS[name].files_of if isinstance(name, str) and name in FORMATS else None
     if files_of is None:
         known = ", ".join(key for key, form in FORMATS.items() if form.files_of)
-        raise CalibrationError(f"save_rig: format: expected rig, {known}, got {name!r}")
+        raise CalibrationError(f"save_rig: format: expected rig, {known}, got {shown(name)}")
     files = files_of(data)
     there = {path for form in FORMATS.values() for pattern in form.files for path in folder.glob(pattern)}
     if others := {path.name for path in (*there, *camera_files.camera_files(folder))} - files.keys():

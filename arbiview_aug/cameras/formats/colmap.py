@@ -7,6 +7,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,12 +50,15 @@ def read_colmap(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     refuse_large(folder / f"images{end}", f"images{end}", _MOST_BYTES)
     models, images = dict(cameras_of(folder / f"cameras{end}")), list(images_of(folder / f"images{end}"))
     if not mounting.images and len({image.camera for image in images}) < len(images):
-        camera, count = Counter(image.camera for image in images).most_common(1)[0]
+        camera, times = Counter(image.camera for image in images).most_common(1)[0]
         raise CalibrationError(
-            f"camera {camera} has {count} images: which were taken at one moment? Write one for each camera of the rig "
+            f"camera {camera} has {times} images: which were taken at one moment? Write one for each camera of the rig "
             f"to {MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
         )
     by_file = {image.name: image for image in images}
+    if len(by_file) < len(images):
+        (file, times), *_ = Counter(image.name for image in images).most_common(1)
+        raise CalibrationError(f"images{end}: expected images with different names, got {shown(file)} {times} times")
     for file in mounting.images.values():
         if file not in by_file:
             expected = f"files that images{end} has, such as {images[0].name}"
@@ -81,7 +85,9 @@ def read_colmap(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
 
 def _camera(name: str, camera: tuple[Any, int, int, list[float]], cam2ego: FloatArray) -> dict[str, Any]:
     key, width, height, numbers = camera
-    focals, lens = _model(key)[2], _model(key)[4]
+    _, model, focals, bends, lens = _model(key)
+    if len(numbers) != (expected := focals + 2 + bends):
+        raise CalibrationError(f"camera {name!r}: expected {expected} parameters of {model}, got {len(numbers)}")
     cx, cy, *coefficients = numbers[focals:]
     if lens != "pinhole":
         coefficients += [0.0] * (4 - len(coefficients))
@@ -105,7 +111,11 @@ def _text_cameras(path: Path) -> Iterator[tuple[int, tuple[Any, int, int, list[f
 
 def _text_images(path: Path) -> Iterator[_Image]:
     lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
-    for line in filter(str.strip, lines[::2]):  # the other lines are the images' points, and may be empty
+    for points in filter(str.strip, lines[1::2]):  # X, Y and a number of each point
+        if len(points.split()) % 3 or not re.search(r"\s-?\d+\s*$", points):
+            expected = "two lines for each image, the second with its points or empty"
+            raise CalibrationError(f"{path.name}: expected {expected}, got {shown(points)}")
+    for line in filter(str.strip, lines[::2]):
         _, *numbers, camera, name = line.split(maxsplit=9)
         yield _image(name, int(camera), list(map(float, numbers)))
 
@@ -114,9 +124,9 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, tuple[Any, int, int, list
     data, at = path.read_bytes(), 8
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, key, width, height = struct.unpack_from("<iiQQ", data, at)
-        count = _model(key)[2] + 2 + _model(key)[3]
-        yield number, (key, width, height, list(struct.unpack_from(f"<{count}d", data, at + 24)))
-        at += 24 + 8 * count
+        length = _model(key)[2] + 2 + _model(key)[3]
+        yield number, (key, width, height, list(struct.unpack_from(f"<{length}d", data, at + 24)))
+        at += 24 + 8 * length
 
 
 def _binary_images(path: Path) -> Iterator[_Image]:
@@ -137,6 +147,7 @@ def _image(name: str, camera: int, numbers: list[float]) -> _Image:
 def colmap_files(data: Mapping[str, Any]) -> dict[str, Any]:
     """``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``; the world is the ego frame, in metres."""
     cameras, images, files, names = [], [], dict[str, Any](), dict[str, str]()
+    taken = {camera["name"] for camera in data["cameras"]}
     for number, camera in enumerate(data["cameras"], 1):
         lens, coefficients = lens_of(camera, "COLMAP", {"radtan": 8, "fisheye": 4})
         if len(coefficients) == 5:
@@ -146,7 +157,9 @@ def colmap_files(data: Mapping[str, Any]) -> dict[str, Any]:
         cameras.append((number, model, camera["width"], camera["height"], fx, fy, cx + 0.5, cy + 0.5, *coefficients))
         world2cam = np.linalg.inv(np.array(camera["cam2ego"]))
         pose = *quaternion_from_rotation(world2cam[:3, :3]).tolist(), *world2cam[:3, 3].tolist()
-        name = camera["name"] if re.fullmatch(r"\S*[^\s/]", camera["name"]) else f"camera{number}"
+        free = (one for k in count(number) if (one := f"camera{k}") not in taken)
+        name = camera["name"] if re.fullmatch(r"\S*[^\s/]", camera["name"]) else next(free)
+        taken.add(name)
         names[name] = camera["name"]
         images.append((number, *pose, number, f"{name}/0.png\n"))  # and no points
     for file, head, rows in (

@@ -19,7 +19,7 @@ CALIBRATED_SENSOR = "calibrated_sensor.json"
 
 _MOST_BYTES = 64 << 20  # of nuScenes' tables: those of v1.0-trainval have 4 MB, but sample_data 1.2 GB
 _AV2_POSE = "tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz"
-_WAYMO_NAMES = ("UNKNOWN", "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")  # CameraName.Name
+_WAYMO_NAMES = dict(enumerate(("UNKNOWN", "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")))
 
 
 def read_nuscenes(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
@@ -106,7 +106,7 @@ def read_waymo(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
         if isinstance(intrinsic, Mapping):
             intrinsic = [intrinsic[key] for key in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")]
         cam2ego = np.reshape(np.asarray(entry["extrinsic"]["transform"], float), (4, 4)) @ axes
-        name = _WAYMO_NAMES[name] if isinstance(name, int) else name
+        name = _WAYMO_NAMES[name] if isinstance(name, int) else name  # CameraName.Name
         size = entry["width"], entry["height"]
         cameras.append(camera_entry(name, size, matrix(*intrinsic[:4]), cam2ego, "radtan", intrinsic[4:]))
     return cameras

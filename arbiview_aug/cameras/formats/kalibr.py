@@ -14,7 +14,7 @@ from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import read_plain
 from arbiview_aug.cameras.validation import checked_pose
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.errors import CalibrationError, shown
 
 # By camera_model and distortion_model: our lens, and how many of its coefficients lead ``intrinsics``.
 _LENSES = {
@@ -44,7 +44,8 @@ def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     relative: dict[str, FloatArray] = {}  # poses in the first camera's frame
     pose: FloatArray = np.eye(4)
     for name, entry in chain.items():
-        keys = ("intrinsics", "resolution", "T_cn_cnm1")[: 3 if relative else 2]
+        is_bent = entry.get("distortion_model", "none") != "none"
+        keys = ["intrinsics", "resolution", *["T_cn_cnm1"] * bool(relative), *["distortion_coeffs"] * is_bent]
         if missing := [key for key in keys if entry.get(key) is None]:
             raise CalibrationError(f"camera {name!r}: expected {', '.join(keys)}, missing {', '.join(missing)}")
         if not relative and entry.get("T_cn_cnm1") is not None:
@@ -61,7 +62,12 @@ def _camera(name: str, entry: Mapping[str, Any], cam2ego: FloatArray) -> dict[st
         known, got = (", ".join("-".join(pair) for pair in pairs) for pairs in (_LENSES, (models,)))
         raise CalibrationError(f"camera {name!r}: camera_model-distortion_model: expected {known}, got {got}")
     (lens, leading), numbers, (width, height) = _LENSES[models], entry["intrinsics"], entry["resolution"]
-    coefficients = numbers[:leading] or entry.get("distortion_coeffs", ())
+    coefficients = entry.get("distortion_coeffs") or ()
+    if models[1] == "none" and any(coefficients):
+        fix = "name its model, radtan or equidistant"
+        expected = f"no distortion_coeffs with distortion_model none, got {shown(coefficients)}"
+        raise CalibrationError(f"camera {name!r}: expected {expected}; {fix}")
+    coefficients = numbers[:leading] or coefficients
     return camera_entry(name, (width, height), matrix(*numbers[leading:]), cam2ego, lens, coefficients)
 
 
