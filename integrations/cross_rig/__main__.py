@@ -81,7 +81,11 @@ def _parser() -> argparse.ArgumentParser:
         preset.add_argument(f"--{name}", dest="preset", action="store_const", const=name, help=settings.__doc__)
     parser.add_argument("--output", type=Path, default=Path("output/cross_rig"), metavar="DIR", help="(%(default)s)")
     parser.add_argument(
-        "--workers", type=count, default=os.cpu_count() or 1, metavar="N", help="processes of one thread (%(default)s); --deploy has one"
+        "--workers",
+        type=count,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="processes of one thread (%(default)s); --deploy has one",
     )
     parser.add_argument("--list", action="store_true", help="only say which trainings are done")
     parser.add_argument(

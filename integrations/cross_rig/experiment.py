@@ -154,7 +154,10 @@ class Run:
 
     def _content(self, source: Source, count: int) -> str:
         """Key of a rig's true frames."""
-        return source.store().digest(("images", "state", "height_dm", *self.calibration), count) + source.rig.content_key.hex()
+        return (
+            source.store().digest(("images", "state", "height_dm", *self.calibration), count)
+            + source.rig.content_key.hex()
+        )
 
     def result_path(self, job: Job, change: str) -> Path:
         """File of a test's counts; the frames must be there."""
