@@ -30,7 +30,7 @@ resize by 1 % is 1e-2."""
 
 @contextmanager
 def entry(key: str, expected: str) -> Iterator[None]:
-    """Name the entry that is read in place of errors of other packages: ``SampleError``."""
+    """Turn other packages' errors over an entry into ``SampleError`` with its key."""
     try:
         yield
     except ArbiviewError:

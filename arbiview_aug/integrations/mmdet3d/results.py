@@ -171,7 +171,7 @@ def check_as_recorded(results: Mapping[str, Any]) -> None:
     for key, neutral in _AS_RECORDED.items():
         if results.get(key) is None:
             continue
-        with entry(key, f"numbers of shape {np.shape(neutral)}"):
+        with entry(key, f"numbers of shape {neutral.shape}" if isinstance(neutral, np.ndarray) else "numbers"):
             off = np.abs(np.asarray(results[key], np.float64) - neutral).max()
         if not off <= 1e-6:  # NaN too
             fix = "retarget right after loading, before augmentations"

@@ -94,7 +94,7 @@ def real_jobs(run):
     return jobs(run.settings)
 
 
-def test_drives_are_split_and_drawn_together(roots, tmp_path):
+def test_drives_are_split_and_drawn_together(roots, tmp_path, monkeypatch):
     run = real.recorded_run(*roots, on_real(SMALL), tmp_path)
     names = real.drives_of(roots[1])
     splits = [{names[k] for k in real.frames_of(roots[1], split)} for split in ("train", "val", "test")]
@@ -106,6 +106,12 @@ def test_drives_are_split_and_drawn_together(roots, tmp_path):
     assert tested and trained and not tested & trained and set(itself.source("train").frames) == trained
     # The first frames are of all drives.
     assert {names[k] for k in real.frames_of(roots[1], None)[:4]} == set(names)
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(DataError, match="drives that are not of B's validation or test"),
+    ):
+        patch.setattr(real, "drives_of", lambda data: names if data == roots[1] else [names[k] for k in tested])
+        real.frames_of_a("a", roots[1])
     drives = run.drives(REAL)
     assert len(drives) == run.settings.test_frames and len(set(drives)) == len(splits[2])
 
