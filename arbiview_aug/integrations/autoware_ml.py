@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.errors import SampleError
+from arbiview_aug.integrations.mmdet3d.matrices import entry
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
 
 IMAGE_KEYS = ("camera_intrinsics", "lidar2cam", "lidar2img")
@@ -43,8 +44,9 @@ class RigRetargetMultiViewImages:
         missing = [key for key in ("img", *IMAGE_KEYS) if input_dict.get(key) is None]
         if missing:
             raise SampleError(f"{', '.join(missing)}: expected after LoadMultiViewImagesFromFiles, found none")
-        images = np.asarray(input_dict["img"])
-        if images.ndim != 4 or images.shape[1] != 3:
+        with entry("img", "(N, 3, H, W)"):
+            images = np.asarray(input_dict["img"])
+        if images.ndim != 4 or images.shape[1] != 3 or not images.size:
             raise SampleError(f"img: expected (N, 3, H, W), got {images.shape}")
         scale = 255 if images.dtype.kind == "f" and images.max() <= 1 else 1
         results = {

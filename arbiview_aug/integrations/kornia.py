@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from arbiview_aug.sample.batching import rewrapped
+from arbiview_aug.sample.batching import checked_images, rewrapped
 
 _MOVING = (
     *("kornia.augmentation._2d.geometric", "kornia.augmentation._2d.mix", "kornia.augmentation.auto"),
@@ -43,6 +43,7 @@ class OnImages(torch.nn.Module):
         """The sample with other colours; a new dict.
 
         Raises:
+            SampleError: Float images that are not in [0, 1].
             ValueError: No images of one size; the module's result has another shape, or is not in [0, 1].
         """
         images = sample.get("images")
@@ -51,6 +52,7 @@ class OnImages(torch.nn.Module):
             fix = "; pass size=(h, w) to RigRetarget" if isinstance(images, list | tuple) else ""
             raise ValueError(f"OnImages: expected a tensor 'images', of one size, {found}{fix}")
         flat = images.reshape(-1, *images.shape[-3:])
+        checked_images(tuple(flat))
         levels = flat.float() / 255 if flat.dtype == torch.uint8 else flat
         changed = self.module(levels)
         far = ((changed - 0.5).abs() > 1).float().mean()  # noise may reach out with some pixels

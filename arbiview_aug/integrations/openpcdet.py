@@ -7,7 +7,6 @@ both in the LiDAR's frame.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from copy import copy
 from typing import Any
 
 import numpy as np
@@ -16,9 +15,10 @@ import torch
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.validation import checked_pose
+from arbiview_aug.choices import is_number
 from arbiview_aug.errors import CalibrationError, SampleError
-from arbiview_aug.integrations.mmdet3d.matrices import like_array, padded
-from arbiview_aug.integrations.mmdet3d.results import geometry, moved_points
+from arbiview_aug.integrations.mmdet3d.matrices import entry, like_array, padded
+from arbiview_aug.integrations.mmdet3d.results import check_as_recorded, geometry, moved_points
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
 from arbiview_aug.scene.boxes import checked_boxes, moved_by, points_by_box
 from arbiview_aug.transforms.scans import retarget_points
@@ -28,9 +28,6 @@ DataDict = dict[str, Any]
 
 MATRICES = ("camera_intrinsics", "camera2ego", "camera2lidar", "lidar2camera", "lidar2image")
 """Lists of (4, 4) that ``NuScenesDataset.load_camera_info`` writes beside ``camera_imgs``."""
-
-_TURNED = ("flip_x", "flip_y", "noise_rot", "noise_translate", "lidar_aug_matrix")
-"""Keys that OpenPCDet sets when it augments the whole scene."""
 
 _LEAST_UP = 0.9  # z of the upward axis of a frame that boxes stand upright in
 
@@ -59,7 +56,7 @@ class RigRetargetDataDict:
 
     Raises:
         CalibrationError: A target that cannot be loaded; a frame that is not upright.
-        ValueError: ``p`` is no probability.
+        ValueError: ``p`` is no probability, ``min_points_in_gt`` no number.
     """
 
     def __init__(
@@ -77,10 +74,14 @@ class RigRetargetDataDict:
         to = self.lidar2ego if target_lidar2ego is None else _upright_pose("target_lidar2ego", target_lidar2ego)
         self.ego2lidar = np.asarray(np.linalg.inv(self.lidar2ego))
         self.move = np.linalg.inv(to) @ self.lidar2ego  # to the frame of what comes out
+        if not is_number(min_points_in_gt):
+            raise ValueError(f"min_points_in_gt: expected a number of points, got {min_points_in_gt!r}")
         self.p, self.min_points_in_gt = checked_probability(p), int(min_points_in_gt)
 
     def __call__(self, data_dict: Mapping[str, Any]) -> DataDict:
-        """A new ``data_dict``.
+        """A new ``data_dict``; ``calib`` is the given object, which becomes that of the new camera and frame.
+
+        ``DatasetTemplate.prepare_data`` puts the object that it was given back after all augmentors.
 
         Raises:
             SampleError: A scene that is turned already, images without matrices, nothing to retarget.
@@ -88,7 +89,7 @@ class RigRetargetDataDict:
         """
         if self.p < 1 and torch.rand((), generator=self.step.rng(data_dict, "p")).item() >= self.p:
             return dict(data_dict)
-        _check_not_turned(data_dict)
+        check_as_recorded(data_dict)
         if not isinstance(points := data_dict.get("points"), np.ndarray):
             got = f"{type(points).__name__} among {', '.join(map(str, data_dict))}"
             raise SampleError(f"points: expected an array (N, >=3) in the LiDAR's frame, got {got}")
@@ -120,10 +121,11 @@ class RigRetargetDataDict:
         matrices = {key: [np.asarray(matrix) for matrix in data_dict[key]] for key in MATRICES}
         infos = data_dict.get("img_process_infos")
         if infos is not None:
-            crops = [_crop(*info) for info in infos]
-            matrices["camera_intrinsics"] = [
-                (crop @ K).astype(K.dtype) for crop, K in zip(crops, matrices["camera_intrinsics"], strict=True)
-            ]
+            with entry("img_process_infos", "(resize, crop, flip, rotate) of each image"):
+                matrices["camera_intrinsics"] = [
+                    (_crop(*info) @ K).astype(K.dtype)
+                    for info, K in zip(infos, matrices["camera_intrinsics"], strict=True)
+                ]
             pairs = zip(matrices["camera_intrinsics"], matrices["lidar2camera"], strict=True)
             matrices["lidar2image"] = [K @ pose for K, pose in pairs]
         results = self.step({"img": data_dict["camera_imgs"], **matrices, **self._labels(data_dict)})
@@ -149,10 +151,9 @@ class RigRetargetDataDict:
         if len(images) != 1 or images[0].shape != image.shape:
             got = f"{len(images)} of {images[0].shape}; pass size=(h, w)"
             raise SampleError(f"target: expected one image of {image.shape}, as KITTI's is, got {got}")
-        new = copy(calib)
         K, lidar2cam = (np.asarray(results[key][0])[:3] for key in ("cam2img", "lidar2cam"))
-        _write_calib(new, K.astype(calib.P2.dtype), lidar2cam.astype(calib.V2C.dtype))
-        out = {**data_dict, "images": (images[0] / 255).astype(image.dtype), "calib": new, "points": results["points"]}
+        _write_calib(calib, K.astype(calib.P2.dtype), lidar2cam.astype(calib.V2C.dtype))
+        out = {**data_dict, "images": (images[0] / 255).astype(image.dtype), "points": results["points"]}
         if "road_plane" in out:  # in the rectified camera's frame
             plane = np.asarray(out["road_plane"], np.float64) @ R0 @ V2C @ np.linalg.inv(padded(lidar2cam[None])[0])
             out["road_plane"] = plane.astype(np.asarray(out["road_plane"]).dtype)
@@ -179,8 +180,12 @@ class RigRetargetDataDict:
         enough: BoolArray = counts >= self.min_points_in_gt
         if "gt_boxes_mask" in out:
             return {**out, "gt_boxes_mask": out["gt_boxes_mask"] & enough}
-        labels = "gt_boxes", "gt_names", "num_points_in_gt"
-        return {**out, **{key: out[key][enough] for key in labels if out.get(key) is not None}}
+        kept = {}
+        for key in ("gt_boxes", "gt_names", "num_points_in_gt"):
+            if out.get(key) is not None:
+                with entry(key, f"one of each of the {len(enough)} boxes"):
+                    kept[key] = out[key][enough]
+        return out | kept
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.step.retarget.extra_repr()}, p={self.p:g})"
@@ -228,8 +233,7 @@ def _moved(out: DataDict, move: FloatArray) -> DataDict:
     if "camera2lidar" in out:
         changed["camera2lidar"] = _each(out["camera2lidar"], lambda matrix: move @ matrix)
     if (calib := out.get("calib")) is not None:
-        new = changed["calib"] = copy(calib)
-        new.V2C = (np.asarray(calib.V2C, np.float64) @ back).astype(calib.V2C.dtype)
+        calib.V2C = (np.asarray(calib.V2C, np.float64) @ back).astype(calib.V2C.dtype)
     return out | changed
 
 
@@ -238,15 +242,6 @@ def _each(matrices: Any, change: Callable[[FloatArray], FloatArray]) -> Any:
     if isinstance(matrices, list):
         return [change(matrix).astype(matrix.dtype) for matrix in matrices]
     return change(matrices).astype(matrices.dtype)
-
-
-def _check_not_turned(data_dict: Mapping[str, Any]) -> None:
-    for key in (*_TURNED, "noise_scale"):
-        value = data_dict.get(key)
-        still = np.eye(4) if key == "lidar_aug_matrix" else 1.0 if key == "noise_scale" else 0.0
-        if value is not None and np.abs(np.asarray(value, np.float64) - still).max() > 1e-6:
-            fix = "stand before what turns it"
-            raise SampleError(f"{key}: expected a scene as it was recorded, got a turned one; {fix}")
 
 
 def _upright_pose(name: str, value: Any) -> FloatArray:

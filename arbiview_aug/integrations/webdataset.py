@@ -19,7 +19,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import camera_fields
 from arbiview_aug.datasets.image_io import decode_bytes, encoded, encoded_image
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import DataError, SampleError, calibration_of, shown
+from arbiview_aug.errors import DataError, SampleError, SampleTypeError, calibration_of, one_line, shown
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import as_array, read_frames
 
@@ -42,18 +42,26 @@ def to_entry(sample: Mapping[str, Any], key: str) -> Entry:
 
     Raises:
         SampleError: A key with dots, no images, or some of other sizes or of another number than the rig's cameras.
-        SampleTypeError: Images of another type.
+        SampleTypeError: Images, a rig or ``NAMES`` of another type.
     """
     if not isinstance(key, str) or "." in key:
         raise SampleError(f"key: expected a text without dots, at which WebDataset splits names, got {shown(key)}")
     if sample.get("images") is None:
         raise SampleError(f"images: expected in the sample, found none beside {', '.join(map(str, sample))}")
     rig: Rig = read_frames(sample, None)[0].rig if sample.get("rig") is None else sample["rig"]
-    images = [torch.as_tensor(image) for image in sample["images"]]
+    if not isinstance(rig, Rig):
+        raise SampleTypeError(f"rig: expected a Rig, got {shown(rig)}")
+    try:
+        images = [torch.as_tensor(image) for image in sample["images"]]
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise SampleTypeError(f"images: expected a tensor of each camera, got {one_line(error)}") from None
     shapes = [tuple(image.shape) for image in images]
     if shapes != (expected := [(3, *size) for size in rig.sizes]):
         raise SampleError(f"images: expected {expected}, as the rig's cameras are, got {shapes}")
-    names = {name: type_(sample[name]) for name, type_ in NAMES.items() if sample.get(name) is not None}
+    try:
+        names = {name: type_(sample[name]) for name, type_ in NAMES.items() if sample.get(name) is not None}
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise SampleTypeError(f"time_s: expected seconds, got {one_line(error)}") from None
     entry: Entry = {"__key__": key, "rig.json": json.dumps({**rig.to_dict(), "token": key, **names})}
     for k, (camera, image) in enumerate(zip(rig, images, strict=True)):
         entry[f"{k:02}.jpg"] = encoded_image(image)

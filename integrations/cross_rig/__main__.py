@@ -33,6 +33,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     try:
         settings = _settings(arguments)
+        if arguments.output.exists() and not arguments.output.is_dir():
+            raise ValueError(f"--output: expected a folder, got the file {arguments.output}")
         if not arguments.list:
             device_named(settings.schedule.device)  # before hours of rendering
         setup = _run(arguments, settings)
@@ -79,7 +81,11 @@ def _parser() -> argparse.ArgumentParser:
         preset.add_argument(f"--{name}", dest="preset", action="store_const", const=name, help=settings.__doc__)
     parser.add_argument("--output", type=Path, default=Path("output/cross_rig"), metavar="DIR", help="(%(default)s)")
     parser.add_argument(
-        "--workers", type=count, default=os.cpu_count() or 1, metavar="N", help="processes of one thread (%(default)s)"
+        "--workers",
+        type=count,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="processes of one thread (%(default)s); --deploy has one",
     )
     parser.add_argument("--list", action="store_true", help="only say which trainings are done")
     parser.add_argument(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -21,14 +21,15 @@ import torch
 from torch import nn
 
 from arbiview_aug import JitteredCalibration, Rig
+from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.evaluate.report.tables import markdown_table
 from integrations.cross_rig.boxes import cells_at
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, content_hash, fill
-from integrations.cross_rig.experiment import Log, Run, counts_of, load_results, write_file
+from integrations.cross_rig.experiment import Log, Run, counts_of, load_results
 from integrations.cross_rig.frames import make_frames, one_thread
 from integrations.cross_rig.labels import Grid
 from integrations.cross_rig.noise import noisy_depth
-from integrations.cross_rig.scoring import iou_scores
+from integrations.cross_rig.scoring import iou_scores, percent
 from integrations.cross_rig.settings import Job, jobs
 from integrations.cross_rig.training import FrameSet, Schedule, answers, evaluate
 from integrations.cross_rig.variant import Variant
@@ -247,8 +248,7 @@ def deploy(setup: Run, titles: list[str] | None, log: Log) -> str:
             val, test = (frames_of(setup, detector, change, way, split) for split in OF_TESTS)
             height = setup.source("test", change).store().stacked("height_dm", setup.settings.test_frames)
             tested = evaluate(model, val, test, height, detector.schedule)
-            text = json.dumps(counts_of(job, change or "A", trained, tested))
-            write_file(path, partial(Path.write_text, data=text))
+            write_whole({path: json.dumps(counts_of(job, change or "A", trained, tested)).encode()})
             log(f"{job.name}, {change or 'A'}, {title}: val {100 * tested.val_iou:.1f}")
     return tables(setup)
 
@@ -260,7 +260,7 @@ def tables(setup: Run) -> str:
     groups = list(product(s.families, s.schedules))
     oracles = replace(setup, settings=replace(s, variants=("oracle",)))
     for change in (*s.changes, None):
-        columns = []
+        columns, titles = [], [*rows_of(setup, change), *(["B's own detector"] if change else [])]
         for family, length in groups:
             of_group = [job for job in jobs(s) if (job.family, job.length) == (family, length)]
             done: dict[str, dict[int, Any]] = {}
@@ -270,17 +270,16 @@ def tables(setup: Run) -> str:
                         done.setdefault(title, {})[job.seed] = json.loads(path.read_text())
             if change is not None and (own := load_results(oracles, family, length).get(change)):
                 done["B's own detector"] = own["oracle"]
-            columns.append(_cells(done))
-        titles = [*rows_of(setup, change), *(["B's own detector"] if change else [])]
+            columns.append(_cells(done, titles[0]))
         rows = [[title, *(column.get(title, "-") for column in columns)] for title in titles]
         head = [setup.title(change) if change else "A, calibration that errs", *(f"{f}, {n}" for f, n in groups)]
         out.append(markdown_table(head, [row for row in rows if set(row[1:]) != {"-"}], left=1))
     return "\n\n".join(out) + "\n"
 
 
-def _cells(done: dict[str, dict[int, Any]]) -> dict[str, str]:
-    """The first row's IoU, and each other one's difference from it over the seeds that both have."""
-    first, cells = next(iter(done.values()), {}), {}
+def _cells(done: dict[str, dict[int, Any]], baseline: str) -> dict[str, str]:
+    """The baseline's IoU, and each other row's difference from it over the seeds that both have."""
+    first, cells = done.get(baseline, {}), {}
     for title, seeds in done.items():
         common = sorted(seeds.keys() & first.keys())
         if not common:
@@ -291,5 +290,5 @@ def _cells(done: dict[str, dict[int, Any]]) -> dict[str, str]:
         if seeds is first or over is None:
             cells[title] = f"{100 * score.value.value:.1f} {of}"
         else:
-            cells[title] = f"{100 * over.value:+.1f} [{100 * over.low:+.1f}, {100 * over.high:+.1f}] {of}"
+            cells[title] = f"{percent(**vars(over), sign='+')} {of}"
     return cells

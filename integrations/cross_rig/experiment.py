@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import nn
 
+from arbiview_aug.atomic_io import whole_file, write_whole
 from integrations.cross_rig.cache import FrameStore, code_hash, content_hash
 from integrations.cross_rig.frames import Source, box_store, make_boxes, make_frames, one_thread
 from integrations.cross_rig.labels import Grid, covered_cells
@@ -32,6 +31,9 @@ Log = Callable[[str], None]
 @dataclass(frozen=True, kw_only=True)
 class Run:
     """A run and its folder: ``frames/``, ``models/`` and ``results/`` below ``output``."""
+
+    calibration: ClassVar[tuple[str, ...]] = ()
+    """Arrays that pose the cameras of each frame; those of streets are the rig's throughout."""
 
     settings: Settings
     output: Path
@@ -126,7 +128,7 @@ class Run:
         The frames must be there.
         """
         count, images = self.settings.train_frames, self.images(job)
-        names: tuple[str, ...] = ("images", "state")
+        names: tuple[str, ...] = ("images", "state", *self.calibration)
         if job.variant.renders:
             # Without a mask, coverage has no part in the training.
             names = ("images", *(("coverage",) if job.variant.masked else ()), "K", "cam2ego")
@@ -152,7 +154,10 @@ class Run:
 
     def _content(self, source: Source, count: int) -> str:
         """Key of a rig's true frames."""
-        return source.store().digest(("images", "state", "height_dm"), count) + source.rig.content_key.hex()
+        return (
+            source.store().digest(("images", "state", "height_dm", *self.calibration), count)
+            + source.rig.content_key.hex()
+        )
 
     def result_path(self, job: Job, change: str) -> Path:
         """File of a test's counts; the frames must be there."""
@@ -191,8 +196,7 @@ class Run:
                 val, test = (self.true_set(split, change) for split in OF_TESTS)
                 height = test.store.stacked("height_dm", self.settings.test_frames)
                 tested = evaluate(model, val, test, height, self.schedule(job))
-                text = json.dumps(counts_of(job, change, trained, tested))
-                write_file(path, partial(Path.write_text, data=text))
+                write_whole({path: json.dumps(counts_of(job, change, trained, tested)).encode()})
                 lines.append(f"{change} val {100 * tested.val_iou:.1f}")
         return f"{job.name}: {trained['cpu_s']:.0f} s of training, {', '.join(lines)}"
 
@@ -215,7 +219,8 @@ class Run:
             "losses": losses,
             "torch": str(torch.__version__),
         }
-        write_file(path, lambda part: torch.save({"weights": model.state_dict(), "trained": trained}, part))
+        with whole_file(path) as file:
+            torch.save({"weights": model.state_dict(), "trained": trained}, file)
         return model, trained
 
 
@@ -234,14 +239,6 @@ def counts_of(job: Job, change: str, trained: dict[str, Any], tested: Tested) ->
         "matched": matches_for_json(tested.matched),
         "positives": tested.positives.tolist(),
     }
-
-
-def write_file(path: Path, write: Callable[[Path], object]) -> None:
-    """All of a file or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{os.getpid()}-{path.name}")
-    write(part)
-    part.replace(path)
 
 
 def run(setup: Run, workers: int, log: Log) -> Iterator[int]:

@@ -12,12 +12,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from arbiview_aug import Rig, RigRetarget
+from arbiview_aug.atomic_io import checksum
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.synthetic import BoxClass
@@ -44,7 +46,7 @@ LEAST_POINTS = 5
 """nuScenes and Waymo leave out boxes with fewer LiDAR points, or mark them as hard."""
 
 _SHARES = {"val": 0.15, "test": 0.35}
-"""Shares of B's drives, at least one each; the others and all of A's are for training."""
+"""Shares of B's drives, at least one each; the others are for training, and A's that are not among these shares."""
 
 
 @lru_cache(maxsize=4)
@@ -62,9 +64,16 @@ def recording(data: str) -> Recording:
 
 @lru_cache(maxsize=4)
 def first_rig(data: str) -> Rig:
-    """The rig of the first drive's first sample, whose images are read for it."""
-    rig: Rig = recording(data)[frames_of(data, None)[0]]["rig"]
+    """The rig of the first sample, whose images are read for it."""
+    rig: Rig = recording(data)[0]["rig"]
     return rig
+
+
+@lru_cache(maxsize=4)
+def calibration_hash(data: str) -> str:
+    """SHA-256 of the table of calibrations."""
+    opened: Any = recording(data)
+    return checksum(opened.root / opened.version / "calibrated_sensor.json")
 
 
 def drives_of(data: str) -> list[str]:
@@ -73,7 +82,10 @@ def drives_of(data: str) -> list[str]:
 
 
 def frames_of(data: str, split: Split | None) -> list[int]:
-    """Samples of a split in the order of their drives; None: of all drives."""
+    """Samples of a split, or of all drives (None): one of each drive in turn, so that the first ones are of all drives.
+
+    Those of a drive come in a random order that is always the same.
+    """
     drives = drives_of(data)
     names = sorted(set(drives))
     if split is not None:
@@ -82,7 +94,25 @@ def frames_of(data: str, split: Split | None) -> list[int]:
         shuffled = np.random.default_rng(0).permutation(names).tolist()
         val, test = (max(1, round(_SHARES[s] * len(names))) for s in ("val", "test"))
         names = {"val": shuffled[:val], "test": shuffled[val : val + test], "train": shuffled[val + test :]}[split]
-    return [k for name in names for k, drive in enumerate(drives) if drive == name]
+    of_drive: dict[str, list[int]] = {name: [] for name in names}
+    for k in np.random.default_rng(0).permutation(len(drives)).tolist():
+        if drives[k] in of_drive:
+            of_drive[drives[k]].append(k)
+    return [k for turn in zip_longest(*of_drive.values()) for k in turn if k is not None]
+
+
+def frames_of_a(a: str, b: str) -> list[int]:
+    """A's samples, without drives that B's thresholds or tests are of: two vehicles may have driven the same ones.
+
+    Raises:
+        DataError: None are left.
+    """
+    drives, drives_of_b = drives_of(a), drives_of(b)
+    held_out = {drives_of_b[k] for split in OF_TESTS for k in frames_of(b, split)}
+    frames = [k for k in frames_of(a, None) if drives[k] not in held_out]
+    if not frames:
+        raise DataError(f"data {a}: expected drives that are not of B's validation or test, found none")
+    return frames
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +139,7 @@ class RecordedSource(Source):
     @cached_property
     def frames(self) -> list[int]:
         """Its samples."""
-        return frames_of(self.data, None if self.is_of_a else self.split)
+        return frames_of_a(self.a, self.b) if self.is_of_a else frames_of(self.b, self.split)
 
     @cached_property
     def rig(self) -> Rig:
@@ -120,6 +150,7 @@ class RecordedSource(Source):
         """Folder of the frames: named after the data set, its samples, the code, and the variant."""
         spec: dict[str, Any] = {
             "data": str(Path(self.data).resolve()),
+            "calibration": calibration_hash(self.data),
             "samples": [recording(self.data).tokens[k] for k in self.frames],
             "size": list(self.size),
             "grid": vars(Grid()),
@@ -208,6 +239,8 @@ class RecordedRun(Run):
         a, b: ``open_data``'s names of the data sets of both vehicles.
     """
 
+    calibration: ClassVar[tuple[str, ...]] = ("K", "cam2ego")
+
     a: str
     b: str
 
@@ -250,7 +283,7 @@ def recorded_run(a: str, b: str, settings: Settings, output: Path) -> RecordedRu
         DataError: A data set cannot be read, has no labels, or too few drives.
     """
     check_variants(named_rows("variants", settings.variants, VARIANTS))
-    train = min(len(frames_of(a, None)), len(frames_of(b, "train")), settings.train_frames)
+    train = min(len(frames_of_a(a, b)), len(frames_of(b, "train")), settings.train_frames)
     counts: dict[str, Any] = {f"{s}_frames": min(len(frames_of(b, s)), settings.count(s)) for s in OF_TESTS}
     for data in (a, b):
         vehicles_of(recording(data)[0], data)

@@ -13,7 +13,7 @@ import numpy as np
 
 from integrations.cross_rig.cell_counts import DISTANCES_M, HEIGHTS_M, iou
 from integrations.cross_rig.experiment import Run, jobs_of, load_results, rendering_seconds, same_frames
-from integrations.cross_rig.scoring import ap_scores, iou_scores, matches_of
+from integrations.cross_rig.scoring import ap_scores, iou_scores, matches_of, percent
 from integrations.cross_rig.settings import jobs
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES
@@ -114,7 +114,7 @@ def markdown(report: Mapping[str, Any]) -> str:
         for variant, row in change["variants"].items():
             same = change["same_frames"].get(variant)
             title = row["title"] + (f" (the frames of {change['variants'][same]['title']})" if same else "")
-            cells = [title, _text(row["iou"], 1), _text(row["over_raw"], 1, sign=True)]
+            cells = [title, _text(row["iou"], 1), _text(row["over_raw"], 1, "+")]
             cells.append(_text(row["share"], 0))
             if scored:
                 cells += [f"{100 * row['fixed_iou']:.1f}", _text(row["ap"]["value"], 1), _text(row["ap"]["share"], 0)]
@@ -156,11 +156,8 @@ def _share(score: Mapping[str, Any]) -> str:
     return _text(score.get("share_t") or score["share"], 0)
 
 
-def _text(value: Mapping[str, float] | None, digits: int, *, sign: bool = False) -> str:
-    if value is None:
-        return "–"
-    form = f"{'+' if sign else ''}.{digits}f"
-    return f"{100 * value['value']:{form}} [{100 * value['low']:{form}}, {100 * value['high']:{form}}]"
+def _text(value: Mapping[str, float] | None, digits: int, sign: str = "") -> str:
+    return "–" if value is None else percent(value["value"], value["low"], value["high"], digits, sign)
 
 
 def save_plot(report: Mapping[str, Any], path: Path) -> None:

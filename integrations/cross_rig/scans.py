@@ -33,7 +33,7 @@ from integrations.cross_rig.cache import code_hash, content_hash
 from integrations.cross_rig.frames import one_thread
 from integrations.cross_rig.labels import Grid, box_cells
 from integrations.cross_rig.pillars import PointSet
-from integrations.cross_rig.scoring import VariantScore, ap_scores, iou_scores, matches_for_json, matches_of
+from integrations.cross_rig.scoring import VariantScore, ap_scores, iou_scores, matches_for_json, matches_of, percent
 from integrations.cross_rig.training import Draws, Schedule, evaluate, train
 from integrations.cross_rig.worlds import Split, street_seed
 
@@ -139,7 +139,7 @@ def scans_of(change: str, kind: Kind) -> tuple[Lidar, Lidar, Kind]:
     return (a, a, "raw") if is_as_recorded else (a, b, "retargeted" if kind == "below" else kind)
 
 
-@lru_cache(maxsize=16)  # raw sets serve several changes
+@lru_cache(maxsize=64)  # raw sets serve several changes: all of the default settings stay
 def trained(scans: tuple[Lidar, Lidar, Kind], frames: int, schedule: Schedule, seed: int) -> tuple[Any, list[float]]:
     """A detector and its losses."""
     return train(Draws(point_set(*scans, "train", frames), None, frames, seed), schedule, seed)
@@ -201,8 +201,7 @@ def table(done: dict[str, dict[Kind, list[dict[str, Any]]]]) -> str:
 
 def _text(score: VariantScore) -> tuple[str, str]:
     share = score.share_t or score.share
-    closed = "-" if share is None else f"{100 * share.value:.0f} [{100 * share.low:.0f}, {100 * share.high:.0f}]"
-    return f"{100 * score.value.value:.1f}", closed
+    return f"{100 * score.value.value:.1f}", "-" if share is None else percent(**vars(share), digits=0)
 
 
 def main(argv: list[str] | None = None) -> int:

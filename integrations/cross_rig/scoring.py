@@ -44,18 +44,22 @@ class Resampled(NamedTuple):
     frames: Floats
 
 
-def resampled(num_seeds: int, num_frames: int, draws: int, seed: int = 0) -> Resampled:
+def percent(value: float, low: float, high: float, digits: int = 1, sign: str = "") -> str:
+    """A figure and its interval in %, as tables show them; ``sign`` "+" also of positive ones."""
+    form = f"{sign}.{digits}f"
+    return f"{100 * value:{form}} [{100 * low:{form}}, {100 * high:{form}}]"
+
+
+def resampled(num_seeds: int, num_frames: int, draws: int) -> Resampled:
     """Draws of seeds and frames."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     alike = [rng.multinomial(n, np.full(n, 1 / n), size=draws).astype(np.float64) for n in (num_seeds, num_frames)]
     return Resampled(*alike)
 
 
-def bootstrap_ious(
-    counts: Mapping[str, Counts], drives: Sequence[int] | None = None, *, draws: int = _DRAWS
-) -> dict[str, Floats]:
+def bootstrap_ious(counts: Mapping[str, Counts], drives: Sequence[int] | None = None) -> dict[str, Floats]:
     """IoUs (draws,) of resampled experiments by variant, from (S, F, 3) counts; the same S and F throughout."""
-    seeds, frames = _drawn(*_one_shape(counts), draws, drives)
+    seeds, frames = _drawn(*_one_shape(counts), _DRAWS, drives)
     of_seeds = {name: np.einsum("rf,sfc->rsc", frames, array, optimize=True) for name, array in counts.items()}
     return {name: iou(np.einsum("rs,rsc->rc", seeds, sums)) for name, sums in of_seeds.items()}
 

@@ -120,12 +120,12 @@ def recording(sample: dict[str, Any]) -> Recording:
     return Recording(sample, moved)
 
 
-def recorded_drive(samples: Sequence[dict[str, Any]], step_s: float = 0.5) -> list[Recording]:
-    """Frames of one drive, the current one last, straight ahead at ``SPEED_MPS``."""
+def recorded_drive(samples: Sequence[dict[str, Any]]) -> list[Recording]:
+    """Frames of one drive every 0.5 s, the current one last, straight ahead at ``SPEED_MPS``."""
     drive = []
     for t, sample in enumerate(samples):
         ahead = np.eye(4)
-        ahead[0, 3] = SPEED_MPS * step_s * t
+        ahead[0, 3] = SPEED_MPS * 0.5 * t
         drive.append(replace(recording(sample), ego2global=EGO2GLOBAL @ ahead))
     return drive
 

@@ -30,7 +30,7 @@ def frames_of(results: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> list[
     ]
 
 
-def lidar2img_of(results: Mapping[str, Any], lidar2ego: FloatArray = LIDAR2EGO) -> FloatArray:
+def lidar2img_of(results: Mapping[str, Any]) -> FloatArray:
     """(M, 4, 4) float64: ``lidar2img`` as the dict holds it, or as BEVDet's view transform puts it together."""
     for key, kind in MATRICES.items():
         if kind == "lidar2img" and key in results:
@@ -42,24 +42,24 @@ def lidar2img_of(results: Mapping[str, Any], lidar2ego: FloatArray = LIDAR2EGO) 
     image = np.tile(np.eye(4), (len(intrins), 1, 1))
     image[:, :3, :3] = post_rots @ intrins
     image[:, :2, 2] += post_trans[:, :2]
-    return image @ np.linalg.inv(sensor2key) @ lidar2ego
+    return image @ np.linalg.inv(sensor2key) @ LIDAR2EGO
 
 
-def worst_error_px(results: Mapping[str, Any], rig: Rig, lidar2ego: FloatArray = LIDAR2EGO, seed: int = 0) -> float:
-    """Largest distance between where ``lidar2img`` and where the rig projects random points, over its images.
+def worst_error_px(results: Mapping[str, Any], rig: Rig) -> float:
+    """Largest distance between where ``lidar2img`` and where the rig projects 20,000 random points, over its images.
+
+    The points lie up to 60 m around the vehicle; those count that are in an image.
 
     Args:
         results: A dict of one of the forms.
-        rig: Its cameras, in the ego frame of ``lidar2ego``.
-        lidar2ego: (4, 4).
-        seed: Seed of the points: 20,000, up to 60 m around the vehicle, of which those count that are in an image.
+        rig: Its cameras, in the ego frame of ``LIDAR2EGO``.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     points = rng.uniform((-60, -60, -3, 1), (60, 60, 6, 1), (20_000, 4))
     points[:, 3] = 1
     worst, seen = 0.0, 0
-    for camera, lidar2img in zip(rig, lidar2img_of(results, lidar2ego), strict=True):
-        uv, depth_m, valid = camera.project((points @ lidar2ego.T)[:, :3])
+    for camera, lidar2img in zip(rig, lidar2img_of(results), strict=True):
+        uv, depth_m, valid = camera.project((points @ LIDAR2EGO.T)[:, :3])
         inside = valid & (depth_m > 1) & camera.contains(uv)
         x = points[inside] @ lidar2img.T
         worst = max(worst, float(np.abs(x[:, :2] / x[:, 2:3] - uv[inside]).max(initial=0)))

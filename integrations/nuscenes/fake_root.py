@@ -14,24 +14,19 @@ from tests.datasets.nuscenes_root import VERSION, Tables, streets, tables_of, wr
 
 SPEED_MPS = 9.0
 _MAP_FILE = "maps/fake.png"
+_SIZE = (72, 128)
 
 
-def fake_root(root: Path, size: tuple[int, int] = (72, 128), keyframes: int = 2) -> Path:
-    """Write a drive of some keyframes at ``SPEED_MPS``; its sweeps are grey.
+def fake_root(root: Path) -> Path:
+    """Write a drive of two keyframes at ``SPEED_MPS`` into a new folder; its sweeps are grey.
 
-    Args:
-        root: A folder that does not exist.
-        size: (h, w) of the images.
-        keyframes: Two a second.
-
-    Returns:
-        The root; its tables are of ``VERSION``.
+    Returns the root; its tables are of ``VERSION``.
     """
-    rig = demo_source_rig(size)
-    scenes = streets(keyframes, made=lambda seconds: SPEED_MPS * seconds)
+    rig = demo_source_rig(_SIZE)
+    scenes = streets(2, made=lambda seconds: SPEED_MPS * seconds)
     data = tables_of(rig, scenes)
     complete(data)
-    write_root(root, data, size)
+    write_root(root, data, _SIZE)
     (root / "maps").mkdir()
     cv2.imwrite(str(root / _MAP_FILE), np.zeros((8, 8), np.uint8))
     write_views(root, rig, scenes[0], {row["filename"] for row in data["sample_data"] if row["is_key_frame"]})

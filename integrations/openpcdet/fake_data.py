@@ -95,6 +95,6 @@ def nuscenes(given: Recording) -> dict[str, Any]:
     }
 
 
-def one_camera(rig: Rig, name: str = "CAM_FRONT") -> Rig:
-    """A rig's camera of this name alone, with its scanners."""
-    return rig.with_cameras([rig[name]])
+def one_camera(rig: Rig) -> Rig:
+    """A rig's ``CAM_FRONT`` alone, with its scanners."""
+    return rig.with_cameras([rig["CAM_FRONT"]])

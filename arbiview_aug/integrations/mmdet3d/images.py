@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.errors import SampleError, SampleTypeError, shown
 
 Norm = tuple[Sequence[float], Sequence[float]]
 """Three means and three standard deviations: normalised images are (grey level − mean) / std."""
@@ -75,12 +75,20 @@ def norm_of(config: Any) -> Norm | None:
     """
     if not isinstance(config, Mapping) or "mean" not in config or "std" not in config:
         return None
-    mean, std = (np.asarray(config[key], np.float64).ravel() for key in ("mean", "std"))
-    if not mean.any() and (std == 1).all():
-        return None
-    if mean.shape != (3,) or std.shape != (3,) or not (std > 0).all():
-        raise SampleError(f"img_norm_cfg: expected three means and three positive stds, got {mean} and {std}")
-    return mean.tolist(), std.tolist()
+    mean, std = norm = checked_norm("img_norm_cfg", (config["mean"], config["std"]))
+    return None if not any(mean) and set(std) == {1.0} else norm
+
+
+def checked_norm(name: str, norm: Any) -> Norm:
+    """Three means and three standard deviations above 0; SampleError for anything else."""
+    try:
+        mean, std = (np.asarray(numbers, np.float64).ravel().tolist() for numbers in norm)
+        valid = len(mean) == len(std) == 3 and min(std) > 0
+    except (TypeError, ValueError):
+        valid = False
+    if not valid:
+        raise SampleError(f"{name}: expected three means and three positive stds, got {shown(norm)}")
+    return mean, std
 
 
 def levels(key: str, images: torch.Tensor, norm: Norm) -> torch.Tensor:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.errors import SampleError
+from arbiview_aug.errors import ArbiviewError, SampleError, one_line
 
 MATRICES = {
     **dict.fromkeys(("cam2img", "cam_intrinsic", "intrinsics", "camera_intrinsics", "ori_cam2img"), "K"),
@@ -25,6 +26,18 @@ MATRICES = {
 _TOLERANCE = 1e-3
 """Largest difference between ``lidar2img`` and K @ lidar2cam, as a share of their largest entry: float32 leaves 1e-6, a
 resize by 1 % is 1e-2."""
+
+
+@contextmanager
+def entry(key: str, expected: str) -> Iterator[None]:
+    """Turn other packages' errors over an entry into ``SampleError`` with its key."""
+    try:
+        yield
+    except ArbiviewError:
+        raise
+    except (TypeError, ValueError, LookupError, AttributeError, OverflowError, RuntimeError) as error:
+        got = f"{type(error).__name__}: {one_line(error, 120)}"
+        raise SampleError(f"{key}: expected {expected}, got {got}") from None
 
 
 @dataclass(frozen=True)
@@ -82,11 +95,12 @@ def read_views(matrices: Mapping[str, Any], count: int, names: Sequence[str], li
             stack = stacked(key, matrices[key], count)
             of[kind] = stack.transpose(0, 2, 1) if is_transposed(stack) else stack
     if "cam2lidar" in of and "lidar2cam" not in of:
-        of["lidar2cam"] = np.asarray(np.linalg.inv(of["cam2lidar"]), np.float64)
+        with entry("cam2lidar", "matrices that can be inverted"):
+            of["lidar2cam"] = np.asarray(np.linalg.inv(of["cam2lidar"]), np.float64)
     if "K" in of and "lidar2cam" in of:
         lidar2img = of["K"] @ of["lidar2cam"]
-        off = np.abs(of.get("lidar2img", lidar2img) - lidar2img).max() / np.abs(lidar2img).max()
-        if off > _TOLERANCE:
+        off = np.abs(of.get("lidar2img", lidar2img) - lidar2img).max() / np.abs(lidar2img).max(initial=1e-9)
+        if not off <= _TOLERANCE:  # NaN too
             raise SampleError(
                 f"lidar2img: expected K @ lidar2cam, got matrices that differ by {off:.1%}; retarget right after "
                 "loading, before the images or the points are resized, cropped, flipped or turned"
@@ -99,10 +113,12 @@ def read_views(matrices: Mapping[str, Any], count: int, names: Sequence[str], li
             f"their names ({', '.join(MATRICES)}), got {', '.join(matrices) or 'none'}"
         )
     if "K" not in of or "lidar2cam" not in of or np.any(of["K"][:, :3, 3]):  # P2 of KITTI: a place in its last column
-        K, lidar2cam = decomposed(lidar2img)
+        with entry("lidar2img", "matrices that can be decomposed"):
+            K, lidar2cam = decomposed(lidar2img)
     else:
         K, lidar2cam = of["K"][:, :3, :3], of["lidar2cam"]
-    cam2ego = lidar2ego @ np.linalg.inv(lidar2cam)
+    with entry("lidar2cam", "matrices that can be inverted"):
+        cam2ego = lidar2ego @ np.linalg.inv(lidar2cam)
     ego2global = of["cam2global"][0] @ np.linalg.inv(cam2ego[0]) if "cam2global" in of else None
     return Views(names, K, cam2ego, lidar2ego, ego2global)
 

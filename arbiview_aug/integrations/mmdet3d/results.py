@@ -18,6 +18,7 @@ from arbiview_aug.integrations.mmdet3d.images import norm_of, to_tensors
 from arbiview_aug.integrations.mmdet3d.matrices import (
     MATRICES,
     Views,
+    entry,
     is_transposed,
     like_array,
     like_given,
@@ -46,12 +47,14 @@ _MAX_PADDING_PX = 64
 """Images are padded at the right and below to multiples of 32 or 64."""
 
 _AS_RECORDED: dict[str, Any] = {
-    **dict.fromkeys(("img_aug_matrix", "lidar_aug_matrix"), np.eye(4)),
+    **dict.fromkeys(("img_aug_matrix", "lidar_aug_matrix", "global_aug_matrix", "bev_flip_matrix"), np.eye(4)),
     **dict.fromkeys(("flip", "pcd_horizontal_flip", "pcd_vertical_flip", "pcd_trans"), 0.0),
-    **dict.fromkeys(("scale_factor", "pcd_scale_factor"), 1.0),
+    **dict.fromkeys(("flip_x", "flip_y", "noise_rot", "noise_translate"), 0.0),
+    **dict.fromkeys(("scale_factor", "pcd_scale_factor", "noise_scale"), 1.0),
     "pcd_rotation": np.eye(3),
 }
-"""Keys that augmentations write, and what they hold where nothing was augmented: loading steps write that too."""
+"""Keys that augmentations write (mmdet3d's, Autoware-ML's, OpenPCDet's), and what they hold where nothing was
+augmented: loading steps write that too."""
 
 TARGET_OUTPUTS = ("coverage", "ego_mask", "confidence", "generated", "source_camera", "source_frame", "retarget_params")
 """Entries of a retargeted sample that the results get besides, as arrays."""
@@ -87,14 +90,15 @@ def retarget_results(
         raise SampleError(f"results: expected 'img', loaded images, got {', '.join(map(str, results))}")
     norm = norm_of(results.get("img_norm_cfg"))
     images = to_tensors(_recorded(results), norm)
-    _check_not_augmented(results)
+    check_as_recorded(results)
     count, infos = len(images), results.get("images")
     by_name: Mapping[str, Any] = infos if isinstance(infos, Mapping) and len(infos) == count else {}
     camera_names = [*map(str, by_name)] or [f"camera {k}" for k in range(count)]
     source = read_views(_given(results, by_name), count, camera_names, _lidar2ego(results, lidar2ego))
     for k, info in enumerate(by_name.values()):  # mmdet3d pads images of several sizes to the largest
         if isinstance(info, Mapping) and info.get("height") and info.get("width"):
-            images[k] = images[k][:, : int(info["height"]), : int(info["width"])]
+            with entry("images", "height and width in pixels"):
+                images[k] = images[k][:, : int(info["height"]), : int(info["width"])]
     out = retarget(
         {"images": images, "rig": source_rig(source, images, ground_z_m), **geometry(results, source.lidar2ego)}
     )
@@ -104,13 +108,17 @@ def retarget_results(
     _write_numbers(kept, views, out["images"])
     if isinstance(infos, Mapping):
         kept["images"] = _infos(infos, views, out["images"])
-    for key in FILE_KEYS:
+        for name, info in by_name.items() if _is_skipped(out) else ():
+            if isinstance(info, Mapping):
+                kept["images"][str(name)] |= {key: info[key] for key in FILE_KEYS if key in info}
+    for key in () if _is_skipped(out) else FILE_KEYS:
         if isinstance(kept.get(key), list | tuple):
             kept[key] = list(views.names)
     if np.ndim(kept.get("img_timestamp", 0.0)) == 1:  # PETR's: all views are of the LiDAR's time
         times_s, time_s = kept["img_timestamp"], kept.get("timestamp")
-        time_s = float(np.mean(np.asarray(times_s)) if time_s is None else time_s)
-        kept["img_timestamp"] = like_array(times_s, [time_s] * len(views.names))
+        with entry("img_timestamp", "seconds"):
+            time_s = float(np.mean(np.asarray(times_s)) if time_s is None else time_s)
+            kept["img_timestamp"] = like_array(times_s, [time_s] * len(views.names))
     if "num_views" in kept:
         kept["num_views"] = len(views.names)
     return kept | scanned(kept, out, source.lidar2ego) | target_outputs([out])
@@ -126,12 +134,14 @@ def _given(results: Mapping[str, Any], by_name: Mapping[str, Any]) -> dict[str, 
         if infos and all(isinstance(info, Mapping) and key in info for info in infos)
     }
     at_top = {key: results[key] for key in MATRICES if results.get(key) is not None}
-    return gathered | {key: value for key, value in at_top.items() if _is_per_camera(value)}
+    return gathered | {key: value for key, value in at_top.items() if not _is_of_one(value)}
 
 
-def _is_per_camera(value: Any) -> bool:
-    """Not the one matrix that mmdet3d's datasets keep of their ``default_cam_key``."""
-    return len(value) > 0 and np.ndim(value[0]) == 2
+def _is_of_one(value: Any) -> bool:
+    """Whether it is the one matrix that mmdet3d's datasets keep of their ``default_cam_key``."""
+    if isinstance(value, list | tuple):
+        return len(value) in (3, 4) and np.ndim(value[0]) == 1
+    return getattr(value, "ndim", None) == 2
 
 
 def _lidar2ego(results: Mapping[str, Any], matrix: Any) -> FloatArray:
@@ -139,9 +149,10 @@ def _lidar2ego(results: Mapping[str, Any], matrix: Any) -> FloatArray:
         if isinstance(holder, Mapping) and holder.get("lidar2ego") is not None:
             return stacked("lidar2ego", [holder["lidar2ego"]], 1)[0]
     if "lidar2ego_rotation" in results and "lidar2ego_translation" in results:  # BEVFormer, Sparse4D
-        rotation = np.asarray(results["lidar2ego_rotation"], np.float64)
-        lidar2ego = padded((rotation_from_quaternion(rotation) if rotation.shape == (4,) else rotation)[None])[0]
-        lidar2ego[:3, 3] = results["lidar2ego_translation"]
+        with entry("lidar2ego_rotation, lidar2ego_translation", "a quaternion or (3, 3), and x y z"):
+            rotation = np.asarray(results["lidar2ego_rotation"], np.float64)
+            lidar2ego = padded((rotation_from_quaternion(rotation) if rotation.shape == (4,) else rotation)[None])[0]
+            lidar2ego[:3, 3] = results["lidar2ego_translation"]
         return lidar2ego
     if matrix is None:
         raise SampleError(
@@ -151,10 +162,18 @@ def _lidar2ego(results: Mapping[str, Any], matrix: Any) -> FloatArray:
     return stacked("lidar2ego", [matrix], 1)[0]
 
 
-def _check_not_augmented(results: Mapping[str, Any]) -> None:
+def check_as_recorded(results: Mapping[str, Any]) -> None:
+    """Refuse frames that are augmented already.
+
+    Raises:
+        SampleError: With the key that says so.
+    """
     for key, neutral in _AS_RECORDED.items():
-        value = results.get(key)
-        if value is not None and np.abs(np.asarray(value, np.float64) - neutral).max() > 1e-6:
+        if results.get(key) is None:
+            continue
+        with entry(key, f"numbers of shape {neutral.shape}" if isinstance(neutral, np.ndarray) else "numbers"):
+            off = np.abs(np.asarray(results[key], np.float64) - neutral).max()
+        if not off <= 1e-6:  # NaN too
             fix = "retarget right after loading, before augmentations"
             raise SampleError(f"{key}: expected a frame as it was recorded, got an augmented one; {fix}")
 
@@ -167,12 +186,13 @@ def _recorded(results: Mapping[str, Any]) -> Any:
         if not isinstance(shapes, list) or len(shapes) != len(images) or not isinstance(shapes[0], tuple | list):
             continue
         cut = []
-        for image, (h, w, *_) in zip(images, shapes, strict=True):
-            sides = image.shape[1:] if isinstance(image, torch.Tensor) else np.shape(image)[:2]
-            rims = [side - shape for side, shape in zip(sides, (h, w), strict=False)]
-            if len(rims) == 2 and all(0 <= rim < _MAX_PADDING_PX for rim in rims):
-                image = image[:, :h, :w] if isinstance(image, torch.Tensor) else image[:h, :w]
-            cut.append(image)
+        with entry(key, "(h, w) of each image"):
+            for image, (h, w, *_) in zip(images, shapes, strict=True):
+                sides = image.shape[1:] if isinstance(image, torch.Tensor) else np.shape(image)[:2]
+                rims = [side - shape for side, shape in zip(sides, (h, w), strict=False)]
+                if len(rims) == 2 and all(0 <= rim < _MAX_PADDING_PX for rim in rims):
+                    image = image[:, :h, :w] if isinstance(image, torch.Tensor) else image[:h, :w]
+                cut.append(image)
         images = cut
     return images
 
@@ -259,14 +279,17 @@ def target_views(out: Mapping[str, Any], source: Views, names: Sequence[str]) ->
     if "ego2ego" in out:
         raise SampleError("SampleKeys.frame: expected 'source', since points and boxes stay in the LiDAR's frame")
     check_no_lenses(out.get("lens", ()))
-    skipped = out.get("retarget_params", {}).get("skipped")
     return Views(
-        list(source.names if skipped else names),
+        list(source.names if _is_skipped(out) else names),
         out["K"].double().numpy(),
         out["cam2ego"].double().numpy(),
         source.lidar2ego,
         source.ego2global,
     )
+
+
+def _is_skipped(out: Mapping[str, Any]) -> bool:
+    return bool(out.get("retarget_params", {}).get("skipped"))
 
 
 def scanned(results: Mapping[str, Any], out: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, Any]:
@@ -280,7 +303,7 @@ def scanned(results: Mapping[str, Any], out: Mapping[str, Any], lidar2ego: Float
         out: The retargeted sample.
         lidar2ego: (4, 4) to the frame of the sample's points.
     """
-    if RINGS_KEY not in out or out.get("retarget_params", {}).get("skipped"):
+    if RINGS_KEY not in out or _is_skipped(out):
         return {}
     given, points = results["points"], moved_points(out["points"], np.asarray(np.linalg.inv(lidar2ego)))
     changed = {"points": given.new_point(points) if hasattr(given, "new_point") else like_array(given, points)}
@@ -327,13 +350,15 @@ def _write_numbers(out: dict[str, Any], views: Views, images: torch.Tensor) -> N
     for key, kind in MATRICES.items():
         if out.get(key) is not None:
             matrices = out.pop(key)
-            if _is_per_camera(matrices):
-                out[key] = _as_written(matrices, views.matrices(kind))
+            if not _is_of_one(matrices):
+                with entry(key, "a matrix of each image"):
+                    out[key] = _as_written(matrices, views.matrices(kind))
     h, w = images.shape[-2:]
-    if out.get("image_wh") is not None:
-        out["image_wh"] = like_array(out["image_wh"], [(w, h)] * len(images))
-    if out.get("focal") is not None:
-        out["focal"] = like_array(out["focal"], np.sqrt(np.abs(np.linalg.det(views.K[:, :2, :2]))))
+    columns = {"image_wh": [(w, h)] * len(images), "focal": np.sqrt(np.abs(np.linalg.det(views.K[:, :2, :2])))}
+    for key, values in columns.items():
+        if out.get(key) is not None:
+            with entry(key, "numbers of each image"):
+                out[key] = like_array(out[key], values)
     # (h, w), (h, w, 3), (h, w, 3, views) as given; (w, h) where images are PIL's.
     full = (h, w, 3, len(images)) if isinstance(out["img"][0], np.ndarray | torch.Tensor) else (w, h)
     for key in SHAPE_KEYS:

@@ -11,8 +11,9 @@ import torch
 
 from arbiview_aug import CalibrationError, RandomRig, Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.cameras.random_rig import Epochs, sequence_rng
+from arbiview_aug.choices import is_number
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, retarget_img_inputs
-from arbiview_aug.integrations.mmdet3d.images import Norm
+from arbiview_aug.integrations.mmdet3d.images import Norm, checked_norm
 from arbiview_aug.integrations.mmdet3d.queue import OneDraw, is_queue, retarget_queue
 from arbiview_aug.integrations.mmdet3d.results import check_no_lenses, retarget_results
 
@@ -41,6 +42,7 @@ class RigRetargetMultiView:
 
     Raises:
         CalibrationError: A target with lenses, or that cannot be loaded; a pose of another shape.
+        ValueError: Numbers or keys that are none.
     """
 
     _refuses_lenses = True  # at once, not with the first images
@@ -56,7 +58,11 @@ class RigRetargetMultiView:
         **settings: Any,
     ) -> None:
         if isinstance(keys := settings.get("keys"), Mapping):
+            if unknown := {*keys} - {*SampleKeys.__dataclass_fields__}:
+                raise ValueError(f"keys: expected values of SampleKeys, got {', '.join(map(str, unknown))}")
             settings["keys"] = SampleKeys(**keys)
+        if not is_number(ground_z_m):
+            raise ValueError(f"ground_z_m: expected a height in metres, got {ground_z_m!r}")
         if lidar2ego is not None and np.shape(lidar2ego) != (4, 4):
             raise CalibrationError(f"lidar2ego: expected a pose (4, 4), got shape {np.shape(lidar2ego)}")
         self.retarget = RigRetarget(target, **settings)
@@ -65,7 +71,11 @@ class RigRetargetMultiView:
         if self._refuses_lenses:
             check_no_lenses([camera.lens for camera in rig])
         self.names = rig.names
-        self.lidar2ego, self.ground_z_m, self.img_norm = lidar2ego, float(ground_z_m), img_norm
+        self.lidar2ego, self.ground_z_m, self.img_norm = (
+            lidar2ego,
+            float(ground_z_m),
+            checked_norm("img_norm", img_norm),
+        )
         by_target = held.sequence_key if isinstance(held, RandomRig) and held.per == "sequence" else None
         self.sequence_key = sequence_key or by_target
         self._epochs = held if isinstance(held, RandomRig) else Epochs()

@@ -96,8 +96,9 @@ def test_levels_and_messages(given: Recording) -> None:
     assert np.abs(transform(whole)["img"] / 255.0 - transform(sample)["img"]).max() < 1e-6
     with pytest.raises(SampleError, match="lidar2cam: expected after LoadMultiViewImagesFromFiles, found none"):
         transform({key: value for key, value in sample.items() if key != "lidar2cam"})
-    with pytest.raises(SampleError, match=r"img: expected \(N, 3, H, W\)"):
-        transform({**sample, "img": sample["img"][0]})
+    for images in (sample["img"][0], sample["img"][:0], [np.zeros((3, 8, 8)), np.zeros((3, 9, 8))]):
+        with pytest.raises(SampleError, match=r"img: expected \(N, 3, H, W\)"):
+            transform({**sample, "img": images})
 
 
 def test_config_of_the_readme(given: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,6 +116,17 @@ def test_frames_of_longer_runs_have_their_own_boxes(tmp_path, monkeypatch):
         assert views.spec["views"] == variant.views_spec()
 
 
+def test_rows_are_differences_from_the_first():
+    """Also where another row was tested before it, with another seed."""
+
+    def of(hits: int) -> dict:
+        return {"by_distance": np.tile([hits, 50, 50], (5, 3, 1)).tolist()}
+
+    done = {"street": {0: of(80), 1: of(80)}, "as is": {1: of(60)}, "infinity": {0: of(90)}}
+    cells = deploy._cells(done, "as is")
+    assert cells == {"street": "+6.9 [+6.9, +6.9] (1)", "as is": "37.5 (1)"}
+
+
 def test_command_takes_rows(capsys, tmp_path):
     with pytest.raises(SystemExit):
         command.main(["--small", "--output", str(tmp_path), "--deploy", "nothing"])

@@ -1,6 +1,7 @@
 """The protocol between two recorded data sets: made-up nuScenes roots of two vehicles, end to end."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from integrations.cross_rig.labels import FREE, HIDDEN, VEHICLE
 from integrations.cross_rig.settings import REAL, Settings
 from integrations.cross_rig.settings import real as on_real
 from integrations.cross_rig.training import Schedule
+from integrations.cross_rig.worlds import OF_TESTS
 from tests.datasets.nuscenes_root import START_US, Street, streets, tables_of, write_root
 
 SIZE = (24, 64)
@@ -27,9 +29,9 @@ def _short_chunks(monkeypatch):
     monkeypatch.setattr(cache, "CHUNK_FRAMES", 2)
 
 
-def _root(path: Path, rig: Rig, drives: int) -> Path:
+def _root(path: Path, rig: Rig, drives: range) -> Path:
     """A root whose even boxes hold ten points each, the odd ones none; every category is a car."""
-    scenes = streets(2, **{f"drive-{k}": (lambda time_s: 5 * time_s) for k in range(drives)})
+    scenes = streets(2, **{f"drive-{k}": (lambda time_s: 5 * time_s) for k in drives})
     data = tables_of(rig, scenes)
     data["category"][0]["name"] = "vehicle.car"
     write_root(path, data, rig.sizes[0])
@@ -51,8 +53,8 @@ def _write_points(path: Path, data: dict, street: Street) -> None:
 def roots(tmp_path_factory) -> tuple[str, str]:
     folder = tmp_path_factory.mktemp("roots")
     rig = demo_source_rig((48, 128))
-    a = _root(folder / "A", rig, 2)
-    return str(a), str(_root(folder / "B", rig.shifted(z_m=0.7), 4))
+    a = _root(folder / "A", rig, range(4, 6))
+    return str(a), str(_root(folder / "B", rig.shifted(z_m=0.7), range(4)))
 
 
 @pytest.mark.slow
@@ -92,15 +94,24 @@ def real_jobs(run):
     return jobs(run.settings)
 
 
-def test_drives_are_split_and_drawn_together(roots, tmp_path):
+def test_drives_are_split_and_drawn_together(roots, tmp_path, monkeypatch):
     run = real.recorded_run(*roots, on_real(SMALL), tmp_path)
     names = real.drives_of(roots[1])
     splits = [{names[k] for k in real.frames_of(roots[1], split)} for split in ("train", "val", "test")]
     assert all(splits) and sum(map(len, splits)) == len(set(names)) == len(set.union(*splits))
     # A data set against itself: what tests is no less apart from what trains the oracle.
     itself = real.recorded_run(roots[1], roots[1], on_real(SMALL), tmp_path)
-    tested, trained = (set(itself.source(split, REAL).frames) for split in ("test", "train"))
-    assert tested and trained and not tested & trained
+    tested = {k for split in OF_TESTS for k in itself.source(split, REAL).frames}
+    trained = set(itself.source("train", REAL).frames)
+    assert tested and trained and not tested & trained and set(itself.source("train").frames) == trained
+    # The first frames are of all drives.
+    assert {names[k] for k in real.frames_of(roots[1], None)[:4]} == set(names)
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(DataError, match="drives that are not of B's validation or test"),
+    ):
+        patch.setattr(real, "drives_of", lambda data: names if data == roots[1] else [names[k] for k in tested])
+        real.frames_of_a("a", roots[1])
     drives = run.drives(REAL)
     assert len(drives) == run.settings.test_frames and len(set(drives)) == len(splits[2])
 
@@ -113,6 +124,23 @@ def test_frames_are_made_anew_when_a_reader_changes(roots, tmp_path, monkeypatch
     real.recorded_run(*roots, on_real(SMALL), tmp_path).source("train").store()
     cache.code_hash.cache_clear()
     assert {f"arbiview_aug.datasets.{name}" for name in ("nuscenes.reader", "frame_folder", "py123d")} <= read
+
+
+def test_frames_and_trainings_follow_the_calibration(roots, tmp_path, monkeypatch):
+    def paths(output: str, turn_deg: float) -> list[str]:
+        run = real.recorded_run(*roots, replace(on_real(SMALL), variants=("raw", "oracle")), tmp_path / output)
+        for source, count in run.sources():
+            rig = source.rig.turned(yaw_deg=turn_deg)
+            names = ("images", "coverage", "state", "height_dm", "boxes")
+            frame = dict.fromkeys(names, np.zeros(1)) | {"K": rig.K, "cam2ego": rig.cam2ego}
+            for chunk in source.store().missing(count):
+                source.store().write(chunk, [frame] * 2)
+        return [run.result_path(job, REAL).name for job in real_jobs(run)]
+
+    before, store = paths("a", 0), real.recorded_run(*roots, on_real(SMALL), tmp_path).source("train").store()
+    assert before == paths("b", 0) and not set(before) & set(paths("c", 20))
+    monkeypatch.setattr(real, "calibration_hash", lambda data: "another")
+    assert real.recorded_run(*roots, on_real(SMALL), tmp_path).source("train").store().key != store.key
 
 
 @pytest.mark.slow
@@ -137,6 +165,8 @@ def test_what_cannot_be_run_is_refused(roots, tmp_path, capsys):
     assert "learned needs the streets' truth" in said("--real", *roots, "--variants", "raw", "learned")
     assert "expected 3 drives or more to split, found 2" in said("--real", roots[1], roots[0])
     assert "expected a folder, found none" in said("--real", roots[0], str(tmp_path / "nothing"))
+    (tmp_path / "file").touch()
+    assert "--output: expected a folder, got the file" in said("--output", str(tmp_path / "file"))
     sample = {"token": "t", "boxes_3d": torch.zeros(0, 7)}
     with pytest.raises(DataError, match="sample t: expected boxes_3d and box_names"):
         real.vehicles_of(sample, "X")

@@ -124,6 +124,13 @@ def test_what_leaves_0_to_1_is_refused(module: torch.nn.Module, type_: torch.dty
     assert noisy.dtype == type_
 
 
+def test_floats_of_another_range_are_refused() -> None:
+    """Modules that cut at 1 would make them white."""
+    for images, fix in ((torch.rand(2, 3, 8, 8) * 255, "divide by 255"), (torch.randn(2, 3, 8, 8), "normalise after")):
+        with pytest.raises(ValueError, match=rf"images\[0\]: expected floats in \[0, 1\], got .*; {fix}"):
+            OnImages(K.ColorJiggle(0.2, 0.2, 0.2, 0.02, p=1.0))({"images": images})
+
+
 def test_example(tmp_path, capsys) -> None:
     assert main(["--output", str(tmp_path / "out.png")]) == 0
     assert "(5, 3, 128, 352) torch.float32" in capsys.readouterr().out and (tmp_path / "out.png").is_file()

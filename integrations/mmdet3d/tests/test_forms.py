@@ -202,8 +202,11 @@ def test_skipped_frames_keep_their_cameras(given: Recording) -> None:
     target = SOURCE.turned(yaw_deg=10)
     skipping = step(target, p=0.01, size=SIZE, keys=SampleKeys(extra=("confidence",)))
     torch.manual_seed(1)
-    after = skipping(FORMS["mmdet3d"](given))
-    assert after["retarget_params"]["skipped"] and after["filename"] == SOURCE.names and after["confidence"].all()
+    results = FORMS["mmdet3d"](given)
+    after = skipping(results)
+    assert after["retarget_params"]["skipped"] and after["confidence"].all()
+    assert after["filename"] == results["filename"]  # as where no step stood
+    assert all(after["images"][name]["img_path"] == info["img_path"] for name, info in results["images"].items())
     assert worst_error_px(after, SOURCE.resized(SIZE, "crop")) <= 1e-3
 
 
@@ -267,6 +270,11 @@ def test_messages(given: Recording) -> None:
         step()({"filename": []})
     augmented = {"img_aug_matrix": [np.diag([0.5, 0.5, 1, 1])] * 6, "pcd_rotation": -torch.eye(3)}
     augmented |= {"pcd_trans": np.ones(3), "flip": True, "pcd_horizontal_flip": True, "scale_factor": np.full(4, 0.5)}
+    augmented |= {
+        "global_aug_matrix": 2 * np.eye(4),
+        "bev_flip_matrix": np.diag([1, -1, 1, 1]),
+        "pcd_scale_factor": np.nan,
+    }
     for key, value in augmented.items():
         with pytest.raises(SampleError, match=f"{key}: expected a frame as it was recorded, got an augmented one"):
             step()({**results, key: value})
@@ -297,6 +305,49 @@ def test_messages(given: Recording) -> None:
     several = (entries[0].repeat(2, 1, 1, 1), *entries[1:])
     with pytest.raises(SampleError, match=r"expected 12 cameras in each entry"):
         step()({"img_inputs": several})
+
+
+@pytest.mark.parametrize(
+    ("form", "entries", "message"),
+    [
+        ("DETR3D", {"lidar2img": 3.0}, "lidar2img: expected 6 matrices, 3×3 or 4×4, one for each image, got float"),
+        ("DETR3D", {"lidar2img": []}, "lidar2img: expected 6 matrices"),
+        ("DETR3D", {"lidar2cam": [1] * 6}, "lidar2cam: expected 6 matrices"),
+        ("DETR3D", {"lidar2img": np.full((6, 4, 4), np.nan)}, "lidar2img: expected K @ lidar2cam, got .* nan%"),
+        ("DETR3D", dict.fromkeys(("lidar2cam", "lidar2img"), np.zeros((6, 4, 4))), "lidar2cam: .* can be inverted"),
+        ("DETR3D", {"lidar2img": np.zeros((6, 4, 4)), "lidar2cam": None}, "lidar2img: .* can be decomposed"),
+        ("DETR3D", {"ori_lidar2img": 3.0}, "ori_lidar2img: expected a matrix of each image"),
+        (
+            "Sparse4D",
+            {"lidar2ego_rotation": [1, 0]},
+            "lidar2ego_rotation, lidar2ego_translation: expected a quaternion",
+        ),
+        ("Sparse4D", {"lidar2ego_translation": [1, 0]}, "lidar2ego_rotation, lidar2ego_translation: expected a quat"),
+        ("mmdet3d", {"flip": "no"}, "flip: expected numbers"),
+        ("mmdet3d", {"pcd_rotation": np.eye(2)}, r"pcd_rotation: expected numbers of shape \(3, 3\)"),
+        ("Sparse4D", {"img_shape": [(64,)] * 6}, r"img_shape: expected \(h, w\) of each image"),
+        (
+            "mmdet3d",
+            {"images": {name: {"height": "x", "width": 3} for name in SOURCE.names}},
+            "images: expected height",
+        ),
+        ("Sparse4D", {"image_wh": 3.0}, "image_wh: expected numbers of each image"),
+        ("PETR", {"img_timestamp": ["a"] * 6, "timestamp": None}, "img_timestamp: expected seconds"),
+        ("mmdet3d", {"img_norm_cfg": {"mean": [1, 2, 3], "std": ["a"]}}, "img_norm_cfg: expected three means"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+def test_malformed_entries_are_named(given: Recording, form: str, entries: dict[str, Any], message: str) -> None:
+    with pytest.raises(SampleError, match=message):
+        step()(FORMS[form](given) | entries)
+
+
+@pytest.mark.parametrize(
+    "settings", [{"img_norm": (1, 2)}, {"keys": {"nonsense": 1}}, {"ground_z_m": "x"}, {"ground_z_m": None}]
+)
+def test_malformed_settings_are_named(settings: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=rf"^{next(iter(settings))}: expected"):
+        step(**settings)
 
 
 def test_upper_triangular_times_rotation() -> None:

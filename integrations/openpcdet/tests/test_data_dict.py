@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import re
 import sys
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -53,6 +54,12 @@ class DataAugmentor:
             data_dict = augmentor(data_dict=data_dict)
         mask = data_dict.pop("gt_boxes_mask")
         return data_dict | {key: data_dict[key][mask] for key in ("gt_boxes", "gt_names")}
+
+
+def prepare_data(augmentor: DataAugmentor, data_dict: dict[str, Any]) -> dict[str, Any]:
+    """``DatasetTemplate.prepare_data``, restated: puts the calibration back that it was given."""
+    kept = {"calib": data_dict["calib"]} if "calib" in data_dict else {}
+    return augmentor.forward({**data_dict, "gt_boxes_mask": np.ones(len(data_dict["gt_boxes"]), bool)}) | kept
 
 
 @pytest.mark.parametrize("columns", [4, 5])
@@ -115,16 +122,22 @@ def test_cameras_of_nuscenes(given: Recording) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:the target rig")
-def test_the_camera_of_kitti(given: Recording) -> None:
+@pytest.mark.parametrize("to", [KITTI_LIDAR2EGO, POSE], ids=["A's frame", "B's frame"])
+def test_the_camera_of_kitti(given: Recording, to: np.ndarray) -> None:
     data, front = kitti(given, image=True), one_camera(replace(SOURCE.shifted(z_m=0.4), lidars=[TOP]))
-    out = step(front)(data)
+    DataAugmentor.in_frame = lambda _, config: step(front, target_lidar2ego=to)  # type: ignore[attr-defined]
+    before, out = deepcopy(data), prepare_data(DataAugmentor([{"NAME": "in_frame"}]), data)
+    data = before
     assert out["images"].shape == data["images"].shape and 0 <= out["images"].min() <= out["images"].max() <= 1
     assert "depth_maps" not in out and data["calib"].P2[0, 3] > 0
-    planes = [one["road_plane"] @ np.vstack([one["calib"].V2C, [0, 0, 0, 1]]) for one in (data, out)]
-    np.testing.assert_allclose(*planes, atol=1e-4)  # in the LiDAR's frame the same
+    planes = [
+        one["road_plane"] @ np.vstack([one["calib"].V2C, [0, 0, 0, 1]]) @ np.linalg.inv(pose)
+        for one, pose in ((data, KITTI_LIDAR2EGO), (out, to))
+    ]
+    np.testing.assert_allclose(*planes, atol=1e-4)  # in the ego frame the same
     points = out["points"][:, :3].astype(float)
     uv, depth_m = out["calib"].lidar_to_img(points)
-    expected, true_m, valid = front[0].project(in_ego(out["points"], KITTI_LIDAR2EGO))
+    expected, true_m, valid = front[0].project(in_ego(out["points"], to))
     seen = valid & (true_m > 1) & front[0].contains(expected)
     assert seen.sum() > 50
     np.testing.assert_allclose(uv[seen], expected[seen], atol=0.02)
@@ -154,7 +167,7 @@ def test_in_the_augmentors_of_a_config(given: Recording, tmp_path: Path, monkeyp
     torch.manual_seed(0)
     kept = set()
     for _ in range(6):
-        out = pickle.loads(pickle.dumps(augmentor)).forward(data | {"gt_boxes_mask": np.ones(count, bool)})
+        out = prepare_data(pickle.loads(pickle.dumps(augmentor)), data)
         assert len(out["gt_boxes"]) == len(out["gt_names"])
         kept.add((len(out["points"]), len(out["gt_boxes"])))
     assert len(kept) == 2 and (len(data["points"]), count) in kept  # skipped, and retargeted with fewer boxes
@@ -210,7 +223,7 @@ def test_points_stay_on_demand(given: Recording) -> None:
 
 def test_messages(given: Recording) -> None:
     data = kitti(given)
-    with pytest.raises(SampleError, match="noise_rot: expected a scene as it was recorded, got a turned one"):
+    with pytest.raises(SampleError, match="noise_rot: expected a frame as it was recorded, got an augmented one"):
         step()(data | {"noise_rot": np.float32(0.3)})
     assert len(step()(data | {"noise_scale": 1.0, "flip_x": False})["points"])
     with pytest.raises(SampleError, match="target: expected scanners"):
@@ -226,6 +239,16 @@ def test_messages(given: Recording) -> None:
         step(lidar2ego=LIDAR2EGO)(cameras)
     with pytest.raises(SampleError, match="stand before imgaug"):
         step(lidar2ego=LIDAR2EGO)(nuscenes(given) | {"img_process_infos": [[1, (0, 0, 9, 9), True, 0]] * 6})
+    for entries, message in (
+        ({"img_process_infos": [(1.0,)] * 6}, r"img_process_infos: expected \(resize, crop, flip, rotate\) of each"),
+        ({"img_process_infos": [[1.0, (0, 0, 9, 9), False, 0]] * 5}, r"img_process_infos: expected"),
+        ({"lidar_aug_matrix": np.eye(3)}, r"lidar_aug_matrix: expected numbers of shape \(4, 4\)"),
+        ({"gt_names": np.array(["car"])}, "gt_names: expected one of each of the"),
+    ):
+        with pytest.raises(SampleError, match=message):
+            step(lidar2ego=LIDAR2EGO, min_points_in_gt=1)(nuscenes(given) | entries)
+    with pytest.raises(ValueError, match="min_points_in_gt: expected a number of points, got 'x'"):
+        step(min_points_in_gt="x")
     with pytest.raises(CalibrationError, match="target_lidar2ego: expected a frame whose z points up"):
         step(target_lidar2ego=np.diag([1.0, -1.0, -1.0, 1.0]))
     with pytest.raises(CalibrationError, match=r"^lidar2ego: expected"):

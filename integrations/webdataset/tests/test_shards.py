@@ -155,3 +155,11 @@ def test_images_of_another_type_are_refused(sample: dict) -> None:
         to_entry({"rig": sample["rig"]}, "a")
     with pytest.raises(SampleTypeError, match="points: expected a tensor of numbers"):
         to_entry({**sample, "points": [[1, 2, 3], [4, 5]]}, "a")
+    for entries, message in (
+        ({"time_s": "x"}, "time_s: expected seconds"),
+        ({"rig": "x"}, "rig: expected a Rig, got 'x'"),
+        ({"images": 3}, "images: expected a tensor of each camera"),
+        ({"images": ["a"] * 6}, "images: expected a tensor of each camera"),
+    ):
+        with pytest.raises(SampleTypeError, match=message):
+            to_entry({**sample, **entries}, "a")
