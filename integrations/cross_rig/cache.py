@@ -10,6 +10,7 @@ import ast
 import hashlib
 import json
 import shutil
+import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib.util import find_spec
@@ -98,9 +99,8 @@ class FrameStore:
     def write(self, chunk: int, frames: Iterable[Arrays]) -> None:
         """Make a chunk of its ``CHUNK_FRAMES`` frames: all of it or nothing."""
         rows = list(frames)
-        part = self.folder / f".part-{chunk}"
-        shutil.rmtree(part, ignore_errors=True)  # left by a process that died
-        part.mkdir(parents=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(prefix=f".part-{chunk}-", dir=self.folder))  # each process has its own
         digests = {}
         for name in rows[0]:
             array = np.stack([row[name] for row in rows])

@@ -34,7 +34,7 @@ def test_resumed_equals_uninterrupted(tmp_path):
         fill(store, dying, 1)
     assert store.missing(9) == [1, 2]
     # A process that dies while it writes leaves a part.
-    part = store.folder / ".part-1"
+    part = store.folder / ".part-1-died"
     part.mkdir(parents=True)
     (part / "images.npy").write_bytes(b"half")
     again = FrameStore(tmp_path / "killed", {"a": 1})
@@ -45,7 +45,21 @@ def test_resumed_equals_uninterrupted(tmp_path):
     for index in range(9):
         np.testing.assert_array_equal(again.read(index, "images"), whole.read(index, "images"))
     np.testing.assert_array_equal(again.stacked("cpu_s", 9), np.arange(9, dtype=np.float32))
-    assert not list(again.folder.glob(".part*"))
+    assert list(again.folder.glob(".part*")) == [part]
+
+
+def test_two_processes_make_one_chunk(tmp_path, monkeypatch):
+    one, two, save = FrameStore(tmp_path, {"a": 1}), FrameStore(tmp_path, {"a": 1}), np.save
+
+    def beside(path, array):
+        monkeypatch.setattr(np, "save", save)
+        save(path, array)
+        fill(two, make, 0)
+
+    monkeypatch.setattr(np, "save", beside)
+    fill(one, make, 0)
+    assert one.missing(4) == [] and not list(one.folder.glob(".part*"))
+    np.testing.assert_array_equal(one.stacked("cpu_s", 4), np.arange(4))
 
 
 def test_a_set_grows_and_images_are_mapped(tmp_path):
