@@ -200,7 +200,7 @@ def test_a_method_that_declines_a_frame_is_in_no_table(
 
 
 def test_pictures_of_targets_with_long_names(tmp_path: Path) -> None:
-    replace(demo_source_rig((16, 44)), name="车" * 90).save(tmp_path / "rig.json")
+    replace(demo_source_rig((16, 44)), name="é" * 150).save(tmp_path / "rig.json")
     run(["--size", "16x44", "--geometry", "infinity", "--target", str(tmp_path / "rig.json")], tmp_path)
     assert len([*tmp_path.glob("*.png")]) == 1
 
