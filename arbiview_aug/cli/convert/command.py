@@ -245,9 +245,11 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: in
     settings, tokens = jobs.settings, jobs.data.tokens
     converted, left_out = [], set()
     for record in jobs.manifest.records(tokens):
+        if "failed" in record:
+            continue
         if "skipped" in record:
             left_out.add(record["token"])
-        elif "failed" not in record:
+        else:
             converted.append(record["token"])
     missing = len(tokens) - len(converted) - len(left_out)
     if missing and shards == 1:
