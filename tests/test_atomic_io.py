@@ -40,7 +40,7 @@ def test_errors_of_the_block_are_its_own_unless_the_disk_is_full(tmp_path: Path)
     assert names(tmp_path) == []
 
 
-@pytest.mark.parametrize("name", ["b" * 255, "é" * 127])
+@pytest.mark.parametrize("name", ["b" * 255, "é" * 127, "a\nb"])
 def test_long_names_are_written(tmp_path: Path, name: str) -> None:
     write_whole({tmp_path / name: b"1"}, owner="7")
     with whole_file(tmp_path / name) as file:
@@ -64,13 +64,14 @@ def test_what_is_written_is_there(tmp_path: Path) -> None:
     assert (tmp_path / "deep" / "a").read_bytes() == b"1" and names(tmp_path) == ["a", "b"]
 
 
-def test_links_and_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("code", ["EXDEV", "ENOSYS", "EOPNOTSUPP"])
+def test_links_and_copies(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a").write_bytes(b"points")
     link_whole(tmp_path / "a", tmp_path / "b")
     assert (tmp_path / "b").samefile(tmp_path / "a")
 
     def other_disk(*_: object) -> None:
-        raise OSError(atomic_io.errno.EXDEV, "Invalid cross-device link")
+        raise OSError(getattr(atomic_io.errno, code), "no link")
 
     monkeypatch.setattr(os, "link", other_disk)
     (tmp_path / "c").write_bytes(b"cut")
@@ -88,12 +89,28 @@ def test_links_and_copies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         link_whole(tmp_path / "nothing", tmp_path / "d")
     assert names(tmp_path) == ["a", "b", "c"]
 
-    def forbidden(*_: object) -> None:
-        raise PermissionError(13, "Permission denied")
+    def broken(*_: object) -> None:
+        raise OSError(atomic_io.errno.EIO, "Input/output error")
 
-    monkeypatch.setattr(Path, "open", forbidden)  # root may read everything
-    with pytest.raises(DataError, match="a: expected a file that can be read, got Permission denied"):
+    monkeypatch.setattr(atomic_io, "_blocks", broken)  # not the disk that is written to
+    with pytest.raises(DataError, match="a: expected a file that can be read, got Input/output error"):
         link_whole(tmp_path / "a", tmp_path / "d", how="copy")
+
+
+@pytest.mark.parametrize("code", [0, atomic_io.errno.EPERM])
+def test_a_file_that_is_there_stays(code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two processes that write it at once: one of them; where there are no hard links, the last one."""
+    link = os.link
+
+    def beaten(part: Path, path: Path) -> None:
+        path.write_bytes(b"another's")
+        if code:
+            raise OSError(code, os.strerror(code))
+        link(part, path)
+
+    monkeypatch.setattr(os, "link", beaten)
+    atomic_io.write_new(tmp_path / "new" / "a", b"mine")
+    assert (tmp_path / "new" / "a").read_bytes() == (b"mine" if code else b"another's") and names(tmp_path) == ["a"]
 
 
 def test_only_what_nobody_writes_is_removed(tmp_path: Path) -> None:

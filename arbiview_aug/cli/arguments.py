@@ -6,6 +6,7 @@ import argparse
 import math
 import re
 import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -63,8 +64,8 @@ def data(text: str) -> str:
     kind, root = split_kind(text)
     kinds = kinds_of(root) if kind is None else [kind]
     if len(kinds) > 1:
-        others = " or ".join(f"--data {other}:{text}" for other in kinds[1:])
-        print(f"--data {text}: taken as a {READERS[kinds[0]].description}; otherwise: {others}", file=sys.stderr)
+        others = " or ".join(f"{other}:{text}" for other in kinds[1:])
+        print(f"{text}: taken as a {READERS[kinds[0]].description}; otherwise: {others}", file=sys.stderr)
     return text
 
 
@@ -146,8 +147,8 @@ def positive(text: str) -> float:
 
 def _integer(text: str, least: int, expected: str) -> int:
     value = int(text)
-    if value < least:
-        raise argparse.ArgumentTypeError(f"expected a whole number {expected}, got {text!r}")
+    if not least <= value <= 1 << 60:
+        raise argparse.ArgumentTypeError(f"expected a whole number {expected}, at most 2**60, got {text!r}")
     return value
 
 
@@ -183,6 +184,7 @@ def writable_folder(path: Path, asked: str) -> Path:
     """Create a folder before any work starts; DataError names ``asked``, the value of ``--output``."""
     try:
         path.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=path).close()
     except OSError as error:
         raise DataError(f"--output {asked}: expected a folder that can be written to, got {error.strerror}") from None
     return path

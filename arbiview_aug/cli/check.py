@@ -30,7 +30,8 @@ def run(arguments: argparse.Namespace) -> int:
     notes: list[str] = []
     with gathered_warnings(notes):
         samples = open_data(data(arguments.data), reduce=arguments.reduce, clean_masks=arguments.clean_masks)
-        chosen = np.unique(np.linspace(0, len(samples) - 1, arguments.frames).round().astype(int)).tolist()
+        count = min(arguments.frames, len(samples))
+        chosen = np.unique(np.linspace(0, len(samples) - 1, count).round().astype(int)).tolist()
         lines: dict[tuple[str, str], list[str]] = {}
         for index in chosen:
             sample = samples[index]

@@ -18,6 +18,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Quality
 from arbiview_aug.cli.arguments import frames_text, gathered_warnings, writable_folder
 from arbiview_aug.cli.evaluate import measured, open_frames
+from arbiview_aug.cli.parsers import SIZE
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.environment import working_s
 from arbiview_aug.evaluate.images import as_arrays
@@ -32,7 +33,6 @@ from arbiview_aug.transforms.scans import retarget_points
 PICTURE_FILE = "demo.png"
 _COMPARED: tuple[GeometryName, ...] = ("street", "ground", "infinity")
 _TIMED_CALLS = 5
-_SYNTHETIC_SIZE = (256, 704)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> None:
         path = path / PICTURE_FILE
     writable_folder(path.parent, arguments.output)
     if arguments.size is None and arguments.data is None:
-        arguments.size = _SYNTHETIC_SIZE
+        arguments.size = SIZE
     if arguments.target is not None:
         load_rig(arguments.target)  # refused before a street is drawn
     data = open_frames(arguments, [arguments.geometry], lidar=arguments.geometry == "lidar")

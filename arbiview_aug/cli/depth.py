@@ -26,7 +26,7 @@ from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.environment import compilation_announced
-from arbiview_aug.errors import WarnOnce, described
+from arbiview_aug.errors import OutputError, WarnOnce, described
 from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.sample.neighbours import Neighbour, neighbour_images, read_neighbours
 from arbiview_aug.scene.depth_map import points_of
@@ -45,6 +45,7 @@ class Done(NamedTuple):
     failed: bool = False  # whether the frame could not be read
     existed: bool = False  # whether its file existed before
     fits: Sequence[CameraFit] = ()  # of a network's depth
+    is_last: bool = False  # whether the other frames would fail alike
 
 
 class _Loaded(NamedTuple):
@@ -68,6 +69,8 @@ class _Frames(Dataset[Any]):
         token = self.data.tokens[index]
         try:
             return self.work(token, self.data[index])
+        except OutputError as error:  # a full disk
+            return Done(token, 0.0, str(error), failed=True, is_last=True)
         except Exception as error:  # the other frames go on
             return Done(token, 0.0, described(error), failed=True)
 
@@ -139,7 +142,11 @@ def run(arguments: argparse.Namespace) -> int:
             with compilation_announced():
                 warm_up()  # here, once, and not in every worker
             frames = _Frames(data, partial(_from_motion, depths))
-            done = list(results(frames, arguments.workers, "depth from motion"))
+            done = []
+            for one in results(frames, arguments.workers, "depth from motion"):
+                done.append(one)
+                if one.is_last:
+                    break
     for line in warned:
         print(line, file=sys.stderr)
     return _summary(done, depths)

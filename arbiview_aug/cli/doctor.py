@@ -61,7 +61,7 @@ def _lines(size: tuple[int, int]) -> Iterator[Line]:
     yield True, f"threads: {os.cpu_count()} cores; {threads}"
     gpus = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
     yield True, f"GPUs: {', '.join(gpus) or 'none that torch can use'}"
-    yield _kernels(Path(project_image._cache.cache_path))
+    yield _kernels(project_image._cache.cache_path)
     free_mb = shutil.disk_usage(".").free / 1e6
     frames = f"about {free_mb / _FRAME_MB:,.0f} converted frames of five views of 704x256"
     yield free_mb > 1000, f"free disk here: {free_mb / 1000:.1f} GB, {frames}"
@@ -76,8 +76,11 @@ def _opencv() -> Line:
     return True, f"OpenCV: {wheels[0] if wheels else f'{cv2.__version__}, not from a wheel: {cv2.__file__}'}"
 
 
-def _kernels(folder: Path) -> Line:
-    """The compiled kernels in the folder of one room and in those of the others."""
+def _kernels(path: str | None) -> Line:
+    """The compiled kernels in the folder of one room and in those of the others; None if numba found none to write."""
+    if path is None:
+        return False, "compiled kernels: not kept; set NUMBA_CACHE_DIR to a writable folder"
+    folder = Path(path)
     root = folder.parent.parent if folder.name == "__pycache__" else folder.parent
     files = list(root.rglob("*.sha256*.nb[ic]"))
     damaged = sum(not is_intact(path) for path in files)  # which deletes them
@@ -92,6 +95,8 @@ def _kernels(folder: Path) -> Line:
 
 def _extras() -> list[str]:
     """Each extra, and what it lacks."""
+    if installed_version("arbiview_aug") is None:
+        return ["unknown, since arbiview_aug is not installed"]
     lacking: dict[str, set[str]] = {}
     for requirement in metadata.requires("arbiview_aug") or []:
         name, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)

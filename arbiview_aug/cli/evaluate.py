@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.atomic_io import inside
+from arbiview_aug.atomic_io import file_name, inside
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.arguments import REAL_TARGET, device_named, frames_text, named_steps, writable_folder
@@ -71,6 +71,9 @@ def run(arguments: argparse.Namespace) -> None:
     notes.extend(panel.notes(whole, arguments.detector_classes))
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
     title = f"{source}: {frames_text(len({view['frame'] for view in done.views}))}"
+    for note in notes:
+        print(f"note: {note}\n")
+    print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
     report: dict[str, Any] = {"arguments": vars(arguments), "scored_on_other_points": done.first.held_out}
     report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in scored), strict=False))
     report |= {"views": done.views, "pairs": done.pairs} | ({"judges": judged} if judged else {})
@@ -78,9 +81,6 @@ def run(arguments: argparse.Namespace) -> None:
     _save_pictures(folder, done, panel)
     page = html_report(title, done, names, tables, notes, panel.pictures)
     (folder / "report.html").write_text(page, encoding="utf-8")
-    for note in notes:
-        print(f"note: {note}\n")
-    print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
     print(f"report: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}")
 
 
@@ -91,6 +91,7 @@ def _save_pictures(folder: Path, done: Evaluation, panel: Panel) -> None:
     for (target, method), views in done.pictures.items():
         rig = done.targets[target]
         file = re.sub(r"[^\w+-]+", "-", f"{target}-{method}")
+        file = file if len(file.encode()) <= 200 else file_name(file)
         sheet = frame_sheet(sample["rig"], as_arrays(sample["images"]), rig, views, done.first.true_images(rig))
         save_picture(folder / f"{file}.png", sheet)
         if (target, method) in panel.pictures:

@@ -28,7 +28,7 @@ from arbiview_aug.cli.arguments import (
     seed,
     size,
 )
-from arbiview_aug.datasets.registry import READERS
+from arbiview_aug.datasets.registry import READERS, split_kind
 
 SIZE, FULL_SIZE = (256, 704), (900, 1600)
 """Sizes (h, w) of the views that benchmarks render."""
@@ -81,7 +81,8 @@ def convert() -> argparse.ArgumentParser:
     neighbours = "let N frames of the drive before and after each fill holes (default: none)"
     add("--neighbours", type=seed, default=0, metavar="N", help=neighbours)
     depth = (
-        "what the depth command wrote, for --geometry auto, motion, fused or learned (default: its folder in the data)"
+        "what the depth command wrote, for --geometry auto, motion, fused or learned (default: its folder in the data; "
+        "auto: none)"
     )
     add("--depth", dest="motion_depth", type=Path, metavar="DIR", help=depth)
     add("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
@@ -337,9 +338,14 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
     if name == "train":
         others = ("views", "seeds", "steps") if arguments.command == "train" else ("weights", "vgg_weights")
         refuse(others, f"{arguments.command} reads none")
+    if name == "check" and split_kind(arguments.data)[0] is None:
+        if arguments.data in shipped_rigs() or os.path.isfile(arguments.data):
+            refuse(("frames", "reduce", "clean_masks"), "expected frames with it, got a rig file")
+    if name == "convert" and arguments.size is None:
+        refuse(("fit",), "expected --size with it, found none")
+    if name in ("convert", "evaluate") and "diffusion" not in arguments.holes:
+        refuse(("generator", "steps"), "expected it with --holes diffusion")
     if name == "evaluate":
-        if "diffusion" not in arguments.holes:
-            refuse(("generator", "steps"), "expected it with --holes diffusion")
         if arguments.displaced:
             fixed = "target_set", "seed", "size", *(() if arguments.lidar else ("target",))
             refuse(fixed, "--displaced has its own; expected none")

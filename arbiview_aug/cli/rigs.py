@@ -88,6 +88,8 @@ def _load(name: str) -> tuple[Rig, str]:
     try:
         recording = open_data(data(name))
     except DataError as error:
+        if kind is not None:
+            raise
         raise DataError(f"{error}; nor is it a folder of another tool's calibration (docs/rigs.md)") from None
     recording.load_points = False
     return recording[0]["rig"], ""

@@ -18,6 +18,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import frames_text, named_steps, output_file
 from arbiview_aug.cli.evaluate import open_frames, target_rigs
+from arbiview_aug.cli.parsers import SIZE
 from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.datasets.image_io import encoded_image
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -31,7 +32,6 @@ from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys
 
-_SYNTHETIC_SIZE = (256, 704)
 _STEP_M = 1.2  # between frames of the synthetic street
 _FRUSTUM_M = 0.8  # from a camera to its image in 3D
 _PIXEL_CENTER = 0.5  # Rerun counts pixels from the image's corner
@@ -86,7 +86,7 @@ def _frames(arguments: argparse.Namespace) -> Iterator[Mapping[str, Any]]:
         data = open_frames(arguments, [arguments.geometry])
         yield from (data[k] for k in range(min(arguments.frames, len(data))))
         return
-    rig = demo_source_rig(arguments.size or _SYNTHETIC_SIZE)
+    rig = demo_source_rig(arguments.size or SIZE)
     ahead = Neighbours(count=max(1, arguments.frames - 1), step_m=_STEP_M, direction="future")
     sample = SyntheticDrive(rig, num_frames=1, seed=arguments.seed, lidar=True, neighbours=ahead)[0]
     frames = [sample, *sample.pop("neighbours")]

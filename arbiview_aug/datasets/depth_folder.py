@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,14 @@ class DepthFolder:
     def path(self, token: str) -> Path:
         """Path of a frame's file, its token escaped; DataError for a link that leaves the folder."""
         return inside(self.root, f"{file_name(token)}.npz", f"depth of frame {token!r}")
+
+    def needed_by(self) -> str | None:
+        """The key of ``FOLDERS`` that its depth is for, by its first file; None if that does not tell."""
+        for path in filter(Path.is_file, self.root.glob("*.npz")):
+            with suppress(*BROKEN_ARRAY, KeyError), np.load(path, allow_pickle=False) as file:
+                return LEARNED_KEY if str(file["kind"]) == "learned" else "motion"
+            break
+        return None
 
     def write(self, token: str, rig: Rig, depth: MotionDepth, origin: Sequence[str] = ()) -> None:
         """Write a frame's depth atomically, with its token, rig and origin: its neighbours, or a model.

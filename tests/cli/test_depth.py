@@ -15,7 +15,7 @@ from arbiview_aug.datasets import FrameFolder, Neighbours, WithDepth, WithMotion
 from arbiview_aug.datasets.depth_folder import FOLDER, DepthFolder
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.errors import SampleError
+from arbiview_aug.errors import OutputError, SampleError
 
 RIG = demo_source_rig((64, 176))
 RIG = RIG.with_cameras([RIG[0], RIG[1]])
@@ -79,6 +79,16 @@ def test_what_cannot_be_read_is_named(recorded: Path, tmp_path: Path, capsys) ->
     assert main(["depth", "--data", str(root)]) == 1
     assert "a: failed: " in capsys.readouterr().err
     assert main(["depth", "--data", str(tmp_path / "nowhere")]) == 2
+
+
+def test_a_full_disk_ends_it(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def full(*_: object) -> None:
+        raise OutputError("a.npz: expected a file that can be written, got No space left on device")
+
+    monkeypatch.setattr(DepthFolder, "write", full)
+    assert main(["depth", "--data", str(recorded), "--output", str(tmp_path)]) == 1
+    said = capsys.readouterr()
+    assert said.err.count("No space left on device") == 1 and "0 of 1 frames" in said.out
 
 
 def test_samples_carry_it(depth_root: Path, recorded: Path) -> None:

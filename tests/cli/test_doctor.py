@@ -41,13 +41,19 @@ def test_wheels_of_opencv(wheels: dict[str, str], is_fine: bool, text: str, monk
 def test_kernels_that_are_whole_damaged_and_missing(tmp_path: Path) -> None:
     folder = tmp_path / "room" / "__pycache__"
     folder.mkdir(parents=True)
-    is_fine, text = doctor._kernels(folder)
+    assert doctor._kernels(None) == (False, "compiled kernels: not kept; set NUMBA_CACHE_DIR to a writable folder")
+    is_fine, text = doctor._kernels(str(folder))
     assert is_fine and text.startswith(f"compiled kernels: none in {tmp_path}; ")
     (folder / "kernels.sha256.nbi").write_bytes(b"index" + sha256(b"index").digest())
     (folder / "kernels.sha256.1.nbc").write_bytes(b"code" + sha256(b"other").digest())
-    is_fine, text = doctor._kernels(folder)
+    is_fine, text = doctor._kernels(str(folder))
     assert not is_fine and "1 files" in text and "1 damaged files are deleted" in text
-    assert [path.name for path in folder.iterdir()] == ["kernels.sha256.nbi"] and doctor._kernels(folder)[0]
+    assert [path.name for path in folder.iterdir()] == ["kernels.sha256.nbi"] and doctor._kernels(str(folder))[0]
+
+
+def test_a_package_without_metadata(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor.metadata, "version", lambda name: doctor.metadata.distribution("none"))
+    assert doctor._extras() == ["unknown, since arbiview_aug is not installed"]
 
 
 def test_a_problem_is_marked_and_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -199,6 +199,12 @@ def test_a_method_that_declines_a_frame_is_in_no_table(
     assert "frame synthetic-0-1: too dark" in capsys.readouterr().err
 
 
+def test_pictures_of_targets_with_long_names(tmp_path: Path) -> None:
+    replace(demo_source_rig((16, 44)), name="é" * 150).save(tmp_path / "rig.json")
+    run(["--size", "16x44", "--geometry", "infinity", "--target", str(tmp_path / "rig.json")], tmp_path)
+    assert len([*tmp_path.glob("*.png")]) == 1
+
+
 def test_a_name_given_twice_is_one_row(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text(JUDGES)
     asked = ["--size", "24x66", "--detector", f"{tmp_path}/own.py:detect", "--geometry", "infinity"]

@@ -81,6 +81,7 @@ def test_the_command_line_warns(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
         (["--data", "."], "expected a frame folder"),
         (["--target", "tesla"], "expected a file or one of the shipped rigs"),
         (["--output", "file/below"], "--output file/below: expected a folder that can be written to"),
+        (["--output", "/proc"], "--output /proc: expected a folder that can be written to"),
     ],
 )
 def test_errors_are_one_line(
@@ -163,6 +164,13 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             (f"depth --data frame --{option}", f"argument --{option.split()[0]}: expected it with --model alone")
             for option in ("device nope", "batch 4", "reference road")
         ),
+        *(
+            (f"check waymo --{option}", f"argument --{option.split()[0]}: expected frames with it, got a rig file")
+            for option in ("frames 5", "downscale 2", "clean-masks")
+        ),
+        ("convert --data frame --target waymo --output o --fit pad", "argument --fit: expected --size with it"),
+        ("convert --data frame --target waymo --output o --steps 3", "argument --steps: expected it with --holes diff"),
+        ("demo --seed 1000000000000000000000", r"expected a whole number from 0, at most 2\*\*60, got"),
         ("depth --data frame --model m --device nope", "expected cpu, cuda, cuda:1, ..., got 'nope'"),
     ],
 )

@@ -74,6 +74,9 @@ def test_files_and_folders(tmp_path: Path) -> None:
 
 
 def test_unknown_rig_and_unwritable_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for kind in ("nuscenes:", ""):
+        assert main(["inspect", f"{kind}{tmp_path}"]) == 2
+        assert ("another tool's calibration" in capsys.readouterr().err) == (not kind)
     assert main(["inspect", "tesla"]) == 2
     assert "expected a file or one of the shipped rigs" in capsys.readouterr().err
     assert main(["inspect", "waymo", "--output", str(tmp_path / "rig.words")]) == 2

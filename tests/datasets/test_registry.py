@@ -90,8 +90,8 @@ def test_a_folder_of_two_kinds(nuscenes_root: Path, tmp_path: Path, capsys: pyte
         assert not capsys.readouterr().err
     options = ["--target", "argoverse2", "--size", "32x40", "--geometry", "infinity", "--downscale", "4"]
     assert main(["evaluate", "--data", str(nuscenes_root), *options, "--output", str(tmp_path)]) == 0
-    note = f"--data {nuscenes_root}: taken as a frame folder (calib.json in it or in its folders); otherwise: "
-    assert f"{note}--data nuscenes:{nuscenes_root}\n" in capsys.readouterr().err
+    note = f"{nuscenes_root}: taken as a frame folder (calib.json in it or in its folders); otherwise: "
+    assert f"{note}nuscenes:{nuscenes_root}\n" in capsys.readouterr().err
 
 
 def test_frame_folders_win_over_tables(tmp_path: Path) -> None:

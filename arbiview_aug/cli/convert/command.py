@@ -20,11 +20,11 @@ from arbiview_aug.atomic_io import checksum, inside, remove_parts, write_whole
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import gathered_warnings, writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, State, checksum_once, coverage_of
-from arbiview_aug.cli.convert.manifest import Manifest
+from arbiview_aug.cli.convert.manifest import Manifest, differences
 from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.settings import FOLDER, RETARGET_OPTIONS, Settings, check_output
 from arbiview_aug.cli.parallel import results
-from arbiview_aug.datasets.depth_folder import FOLDERS
+from arbiview_aug.datasets.depth_folder import FOLDERS, WithDepth
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.registry import kinds_of, open_data, split_kind
 from arbiview_aug.environment import one_thread, versions, working_s
@@ -80,6 +80,8 @@ def differences_of_all(jobs: Jobs) -> Iterator[str]:
         if provenance is None:
             yield f"{jobs.settings.output}: expected a finished conversion, got none; run it without --verify"
             return
+        for line in differences(provenance["source"], jobs.format.facts(), "source"):
+            yield f"{jobs.settings.root}: expected what was converted, got {line}; put the former files back"
         for name in jobs.format.finished():
             sums = provenance.get("files", {})
             yield from _difference(jobs.settings.output / name, sums.get(name), "remove it and run convert again")
@@ -105,11 +107,8 @@ def run(arguments: argparse.Namespace) -> int:
     Returns:
         0; 1 if samples could not be read or rendered (unless skipped), or files could not be written.
     """
-    if arguments.motion_depth is not None and not FOLDERS.keys() & GEOMETRIES[arguments.geometry].reads:
-        fitting = "auto, motion, fused or learned"
-        raise DataError(f"--depth: expected it with --geometry {fitting}, got {arguments.geometry}")
-    if arguments.motion_depth is not None and not arguments.motion_depth.is_dir():
-        raise DataError(f"--depth {arguments.motion_depth}: expected a folder that the depth command wrote, found none")
+    if arguments.motion_depth is not None:
+        _check_depth(arguments.motion_depth, arguments.geometry)
     settings = _settings(arguments)
     check_output(settings)
     if arguments.verify:
@@ -133,18 +132,29 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _check_depth(folder: Path, geometry: str) -> None:
+    """Refuse a folder of ``--depth`` that the geometry would not read."""
+    if not folder.is_dir():
+        raise DataError(f"--depth {folder}: expected a folder that the depth command wrote, found none")
+    there = {key for one in WithDepth([], folder).folders if (key := one.needed_by())} or {*FOLDERS}
+    fitting = [name for name, row in GEOMETRIES.items() if there & {*row.reads}]
+    if geometry not in fitting:
+        raise DataError(f"--depth {folder}: expected it with --geometry {', '.join(fitting)}, got {geometry}")
+
+
 def _settings(arguments: argparse.Namespace) -> Settings:
     kind, root = split_kind(arguments.data)
     root = root.absolute()  # Ray's actors have a working directory of their own
     depth, generator = arguments.motion_depth, arguments.generator
-    needed = GEOMETRIES[arguments.geometry].needs
+    needed, reads = GEOMETRIES[arguments.geometry].needs, GEOMETRIES[arguments.geometry].reads
     if depth is None and needed in FOLDERS:
-        default = inside(root, FOLDERS[needed], "depth")
-        depth = default if default.is_dir() else None
+        defaults = [inside(root, name, "depth") for key, name in FOLDERS.items() if key in reads]
+        there = [folder for folder in defaults if folder.is_dir()]
+        depth = None if not there else there[0] if len(there) == 1 else root  # with both kinds in it
         if depth is None and not (needed == "motion" and arguments.neighbours):
             model, motion = (" --model MODEL", "") if needed != "motion" else ("", ", or estimate it (--neighbours 2)")
             raise DataError(
-                f"--geometry {arguments.geometry}: expected depth in {default}, found none; make it with "
+                f"--geometry {arguments.geometry}: expected depth in {defaults[0]}, found none; make it with "
                 f"python -m arbiview_aug depth --data DIR{model}, or name its folder (--depth){motion}"
             )
     return Settings(
@@ -235,6 +245,8 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: in
     settings, tokens = jobs.settings, jobs.data.tokens
     converted, left_out = [], set()
     for record in jobs.manifest.records(tokens):
+        if "failed" in record:
+            continue
         if "skipped" in record:
             left_out.add(record["token"])
         else:
@@ -268,6 +280,7 @@ def converted(settings: Settings) -> Method:
     )
     manifest, target = Manifest(settings.output), settings.sized_target
     kind = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
+    kind = "nuscenes" if settings.version else kind  # its tables may have any name
     written = open_data(settings.output, kind=kind, version=settings.version)
     written.load_points = False  # they may be links that leave the output
 

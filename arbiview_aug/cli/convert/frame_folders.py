@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.atomic_io import file_name, write_whole
+from arbiview_aug.atomic_io import file_name, write_whole, writing
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
@@ -55,6 +55,7 @@ class FrameFolders(Writer):
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
         """Write the frames' sequence, without those that were left out."""
+        self._remove(left_out)
         path = self.data.root / SEQUENCE_FILE
         if path.is_file():
             sequence = json.loads(path.read_text(encoding="utf-8"))
@@ -62,6 +63,13 @@ class FrameFolders(Writer):
             sequence["frames"] = [frame for frame in frames if entry_name(frame) not in left_out]
             write_whole({self.output / SEQUENCE_FILE: json.dumps(sequence, indent=1).encode()})
         return []
+
+    def _remove(self, left_out: set[str]) -> None:
+        """Remove the calibrations that make frames of folders: a killed run may have written them without a record."""
+        for token in left_out:
+            path = self.kept_path(f"{token}/{CALIBRATION_FILE}")
+            with writing(path):
+                path.unlink(missing_ok=True)
 
     def finished(self) -> list[str]:
         return [SEQUENCE_FILE] if (self.data.root / SEQUENCE_FILE).is_file() else []
@@ -95,6 +103,7 @@ class LogFrames(FrameFolders):
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
         """Write the sequence of a single drive."""
+        self._remove(left_out)
         if not self.data.is_one_drive:
             return [f"no {SEQUENCE_FILE}, which holds one drive: convert each log alone for neighbours"]
         frames = [

@@ -80,7 +80,7 @@ State = Literal["made", "kept", "skipped", "failed", "stopped"]  # kept: made by
 class Done(NamedTuple):
     token: str
     state: State
-    coverage: float = 0.0  # share of its pixels that some source saw
+    coverage: float = 0.0  # share of pixels that some source saw: the mean of its cameras
     seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)  # to read, retarget and write
     messages: tuple[str, ...] = ()  # warnings, or the error
 
@@ -128,6 +128,8 @@ class Jobs(Dataset[Done]):
     def _done(self, token: str, index: int) -> Done:
         record = self.manifest.complete_record(token)
         if record is not None and self._is_current(index, record):
+            if "failed" in record:
+                self.manifest.write({key: record[key] for key in record if key != "failed"}, owner=str(index))
             return Done(token, "kept", float(np.mean(record["coverage"])))
         warned: list[str] = []
         started_s = working_s()
@@ -141,14 +143,17 @@ class Jobs(Dataset[Done]):
         return Done(token, "made", coverage, seconds, tuple(warned))
 
     def _failed(self, token: str, index: int, message: str) -> Done:
-        if self.on_error != "skip":
-            return Done(token, "failed", messages=(message,))
+        is_skipped = self.on_error == "skip"
         try:
-            self._remove_former(token)
-            self.manifest.write({"token": token, "skipped": message}, owner=str(index))
+            if is_skipped:
+                self._remove_former(token)
+                self.manifest.write({"token": token, "skipped": message}, owner=str(index))
+            elif record := self.manifest.record(token):  # no shard may finish the output by an older record
+                self.manifest.write({**record, "failed": message}, owner=str(index))
         except ArbiviewError as error:
-            return Done(token, "stopped", messages=(str(error),))
-        return Done(token, "skipped", messages=(message,))
+            if is_skipped or isinstance(error, OutputError):
+                return Done(token, "stopped", messages=(str(error),))
+        return Done(token, "skipped" if is_skipped else "failed", messages=(message,))
 
     def _remove_former(self, token: str, now: Iterable[str] = ()) -> None:
         """Remove files of the sample's last record, but for those that it has ``now``."""
@@ -159,7 +164,7 @@ class Jobs(Dataset[Done]):
                 path.unlink(missing_ok=True)
 
     def _write(self, index: int, sample: Mapping[str, Any], out: Mapping[str, Any]) -> float:
-        """Write a sample's files, then its record; returns the share of pixels that some source saw."""
+        """Write a sample's files, then its record; returns the mean of its cameras' shares of seen pixels."""
         output, rig = self.settings.output, rig_of(self.settings.sized_target, out, sample["rig"])
         files: dict[str, bytes] = {}
         names: list[dict[str, str]] = []
@@ -188,7 +193,7 @@ class Jobs(Dataset[Done]):
             "checksums": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
             | {name: sums[source] for name, source in kept.items()},
             "sources": {name: sums[path] for name, path in sources.items()},
-            "source_bytes": _total_bytes(sources.values()),
+            "source_bytes": _sizes(sources),
             **facts,
         }
         without = [frame["token"] for frame in sample.get("neighbours", ()) if frame.is_broken]
@@ -207,8 +212,7 @@ class Jobs(Dataset[Done]):
             sources = self.source_files(index)
             return (
                 not record.get("without")
-                and sources.keys() == record["sources"].keys()
-                and _total_bytes(sources.values()) == record["source_bytes"]
+                and _sizes(sources) == record["source_bytes"]
                 and all(checksum(path) == record["sources"][n] for n, path in sources.items() if path.suffix == ".json")
             )
         except Exception:  # reported when the sample is read
@@ -240,5 +244,5 @@ def _checksum_of(path: Path, size: int, time_ns: int) -> str:
     return checksum(path)
 
 
-def _total_bytes(files: Iterable[Path]) -> int:
-    return sum(path.stat().st_size for path in files)
+def _sizes(files: Mapping[str, Path]) -> dict[str, int]:
+    return {name: path.stat().st_size for name, path in files.items()}

@@ -12,14 +12,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from arbiview_aug.atomic_io import checksum, file_name, write_whole
+from arbiview_aug.atomic_io import checksum, file_name, write_new, write_whole
 from arbiview_aug.cli.convert.settings import FOLDER
 from arbiview_aug.errors import DataError, shown
 
 Record = Mapping[str, Any]
 """``token``; for a converted sample ``cameras``, ``ground_z_m``, ``files`` (bytes by path), ``checksums`` and
-``sources`` (SHA-256 by path), ``source_bytes``, ``coverage``, ``without`` (unreadable neighbours, if any) and entries
-of the format; or, if left out, ``skipped``: the reason."""
+``sources`` (SHA-256 by path), ``source_bytes`` (by path), ``coverage``, ``without`` (unreadable neighbours, if any) and
+entries of the format; or, if left out, ``skipped``: the reason. ``failed``: why a later run could not convert it."""
 
 
 class Manifest:
@@ -30,9 +30,8 @@ class Manifest:
         """Write versions, settings and source of the output; DataError if it was begun with others."""
         path, text = self.folder / "settings.json", _text(facts)
         if not path.is_file():
-            write_whole({path: text})
-            return
-        differ = list(_differences(_read(path), json.loads(text)))
+            write_new(path, text)
+        differ = list(differences(_read(path), json.loads(text)))
         if differ:
             raise DataError(
                 f"--output {self.output}: expected what it was begun with, got {'; '.join(differ[:3])}; "
@@ -117,11 +116,11 @@ def _read(path: Path) -> dict[str, Any]:
     raise DataError(f"{path}: expected what the conversion wrote, got {got}; remove this file")
 
 
-def _differences(recorded: Any, asked: Any, where: str = "") -> Iterator[str]:
+def differences(recorded: Any, asked: Any, where: str = "") -> Iterator[str]:
     """Describe where two pieces of plain data differ."""
     if isinstance(recorded, Mapping) and isinstance(asked, Mapping):
         for key in dict.fromkeys([*recorded, *asked]):
-            yield from _differences(recorded.get(key), asked.get(key), f"{where}.{key}" if where else key)
+            yield from differences(recorded.get(key), asked.get(key), f"{where}.{key}" if where else key)
     elif recorded != asked:
         one, two = shown(asked), shown(recorded)
         yield f"another {where}" if max(len(one), len(two)) > 40 else f"{where} {one} instead of {two}"

@@ -13,6 +13,7 @@ from typing import Any
 from arbiview_aug.cli.convert.job import Done, Jobs
 from arbiview_aug.cli.parallel import with_progress
 from arbiview_aug.environment import one_thread, optional_package
+from arbiview_aug.errors import DataError
 
 
 class Actor:
@@ -33,7 +34,10 @@ def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str
     """As ``cli.parallel.results``, in any order, by actors of the cluster at ``RAY_ADDRESS``, or of this machine."""
     ray = optional_package("ray", "distributed")
     data = optional_package("ray.data", "distributed")
-    ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False)
+    try:
+        ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False)
+    except (ValueError, ConnectionError) as error:
+        raise DataError(f"--runner ray: expected a cluster (RAY_ADDRESS) that can be reached, got {error}") from None
     data.DataContext.get_current().enable_progress_bars = False
     gpus = float(ray.cluster_resources().get("GPU", 0)) if jobs.settings.holes == "diffusion" else 0.0
     rows = data.range(len(jobs), override_num_blocks=max(1, min(len(jobs), 4 * workers)))

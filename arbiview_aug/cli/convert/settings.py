@@ -73,8 +73,6 @@ class Settings:
 
     def _inpainter(self) -> Holes | Inpainter:
         if self.holes != "diffusion":
-            if self.generator is not None or self.steps is not None:
-                raise ValueError(f"--generator, --steps: they are for --holes diffusion, got --holes {self.holes}")
             return self.holes
         return load_inpainter(self.generator, steps=self.steps)
 
@@ -104,6 +102,10 @@ def check_output(settings: Settings) -> None:
     if source == output or source in output.parents or output in source.parents:
         where = "the source itself" if source == output else "in it" if source in output.parents else "around it"
         raise DataError(f"--output {settings.output}: expected a folder apart from the source {source}, got {where}")
+    try:
+        str(output).encode()
+    except UnicodeEncodeError:
+        raise DataError(f"--output: expected a folder whose name is UTF-8, got {str(output)!a}") from None
     if not os.path.lexists(output):
         return
     if not output.is_dir():

@@ -307,6 +307,13 @@ def raises(error: BaseException | None = None) -> Any:
     raise error or ZeroDivisionError("of something")
 
 
+def test_a_cluster_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    ray = SimpleNamespace(init=lambda **_: raises(ValueError("Malformed address nonsense")))
+    monkeypatch.setattr(ray_runner, "optional_package", lambda *_: ray)
+    with pytest.raises(DataError, match=r"expected a cluster \(RAY_ADDRESS\) that can be reached, got Malformed"):
+        next(ray_runner.ray_results(SimpleNamespace(), 1, "convert", str))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("step", ["read", "retarget", "write"])
 @pytest.mark.parametrize("on_error", ["report", "skip", "fatal"])
 def test_errors_that_nobody_expects(step: str, on_error: str, frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -140,6 +140,25 @@ def test_shards_write_the_same_bytes(kind: str, conversion: Conversion) -> None:
         conversion.run(kind, "--num-shards", "3", "--shard-index", "3")
 
 
+@pytest.mark.parametrize("on_error", ["report", "skip"])
+def test_a_sample_that_broke_since(on_error: str, conversion: Conversion, sources: dict[str, Path]) -> None:
+    """Its source, after its shard was killed between the files and the record; or complete before another finishes."""
+    output, source = conversion.root / "new", Path(shutil.copytree(sources["frames"], conversion.root / "frames"))
+    assert conversion.run("frames", source=source) == 0 and conversion.is_whole("frames")
+    image, record = source / "0001" / "00.jpg", output / "conversion" / "samples" / "0001.json"
+    sound = image.read_bytes()
+    image.write_bytes(b"cut")
+    for path in (output / "conversion" / "provenance.json", *([record] if on_error == "skip" else ())):
+        path.unlink()
+    shards = ("--on-error", on_error, "--num-shards", "2", "--shard-index")
+    one, other = (conversion.run("frames", *shards, k, source=source) for k in ("1", "0"))
+    finished = (output / "conversion" / "provenance.json").is_file()
+    assert other == 0 and (one, finished) == ((0, True) if on_error == "skip" else (1, False))
+    assert (output / "0001" / "calib.json").is_file() != finished
+    image.write_bytes(sound)
+    assert conversion.run("frames", *shards, "1", source=source) == 0 and conversion.is_whole("frames")
+
+
 @pytest.mark.slow
 def test_processes_write_the_same_bytes(conversion: Conversion) -> None:
     assert conversion.run("nuscenes", "--workers", "2") == 0 and conversion.is_whole("nuscenes")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import warnings
 from dataclasses import replace
@@ -19,9 +20,11 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.cli import parsers
 from arbiview_aug.cli.convert import command as command_module
 from arbiview_aug.cli.convert.job import coverage_of
+from arbiview_aug.cli.convert.manifest import Manifest
 from arbiview_aug.datasets import FrameFolder, WithDepth
 from arbiview_aug.datasets.depth_folder import DepthFolder
 from arbiview_aug.errors import DataError
+from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from tests.cli.convert.drives import SIZE, TARGET, command, tree, write_frames
 
@@ -169,7 +172,23 @@ def test_depth_from_motion_is_read(source: Path, tmp_path: Path, capsys: pytest.
     assert (
         main(command(source, tmp_path / "other", "--geometry", "street", "--depth", str(tmp_path / "elsewhere"))) == 2
     )
-    assert "expected it with --geometry auto, motion, fused or learned" in capsys.readouterr().err
+    assert "expected it with --geometry auto, motion, fused, got street" in capsys.readouterr().err
+
+
+def test_learned_depth_where_it_is_read(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """``auto`` was given it and did not read it; ``fused`` did not find it; with depth from motion it takes both."""
+    drive, sources = shutil.copytree(source / "0000", tmp_path / "drive" / "0000").parent, {}
+    rig = FrameFolder(drive)[0]["rig"]
+    maps = tuple(np.full(c.size, 6.0, np.float32) for c in rig)
+    for kind, folder in ((LearnedDepth, "learned_depth"), (MotionDepth, "motion_depth")):
+        DepthFolder(drive / folder).write("0000", rig, kind(maps, "made"))
+        assert main(command(drive, tmp_path / folder, "--geometry", "fused")) == 0
+        sources[folder] = json.loads((tmp_path / folder / "conversion/samples/0000.json").read_text())["sources"]
+    assert "learned_depth/0000.npz" in sources["learned_depth"] and "motion_depth/0000.npz" in sources["motion_depth"]
+    assert "learned_depth/0000.npz" in sources["motion_depth"]
+    for geometry in ("auto", "motion"):
+        asked = command(drive, tmp_path / "new", "--geometry", geometry, "--depth", str(drive / "learned_depth"))
+        assert main(asked) == 2 and f"--geometry fused, learned, got {geometry}" in capsys.readouterr().err
 
 
 def test_impossible_settings(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -275,6 +294,26 @@ def test_it_does_not_write_into_somebody_elses(
     assert tree(output) == before
 
 
+def test_shards_that_begin_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With other settings: the later one is refused, although it saw none."""
+    link = os.link
+
+    def slow(*paths: Path) -> None:
+        monkeypatch.setattr(os, "link", link)
+        Manifest(tmp_path).begin({"settings": {"size": 256}})
+        link(*paths)
+
+    monkeypatch.setattr(os, "link", slow)
+    with pytest.raises(DataError, match=r"got settings\.size 512 instead of 256"):
+        Manifest(tmp_path).begin({"settings": {"size": 512}})
+    assert json.loads((tmp_path / "conversion" / "settings.json").read_text())["settings"] == {"size": 256}
+
+
+def test_a_folder_whose_name_is_no_text(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command(source, Path(f"{tmp_path}/\udcff"))) == 2
+    assert "expected a folder whose name is UTF-8" in capsys.readouterr().err and not [*tmp_path.iterdir()]
+
+
 def test_a_frame_must_not_be_called_as_the_conversions_folder(source: Path, tmp_path: Path) -> None:
     (tmp_path / "drive").mkdir()
     (tmp_path / "drive" / "conversion").symlink_to(source / "0000")
@@ -318,9 +357,13 @@ def test_a_source_that_changed_is_converted_again(
     shutil.copytree(source, tmp_path / "drive")
     asked = command(tmp_path / "drive", tmp_path / "new")
     assert main(asked) == 0
-    calib = tmp_path / "drive" / "0000" / "calib.json"
+    calib = tmp_path / "drive" / "0001" / "calib.json"
     calib.write_text(calib.read_text().replace('"cam2ego": [', '"cam2ego":  [', 1))
-    shutil.copy(source / "0000" / "00.jpg", tmp_path / "drive" / "0001" / "00.jpg")
+    front, left = (tmp_path / "drive" / "0000" / f"{k:02}.jpg" for k in range(2))  # swapped: the sum stays
+    front.rename(tmp_path / "swap")
+    left.rename(front)
+    (tmp_path / "swap").rename(left)
+    assert front.stat().st_size != left.stat().st_size
     capsys.readouterr()
     assert main(asked) == 0
     assert "2 samples converted, 1 there before" in capsys.readouterr().out

@@ -147,6 +147,19 @@ def test_kept_files_are_verified(source: Path, tmp_path: Path, capsys: pytest.Ca
     assert "2 differences" in said.out and f"{sweep}: expected the SHA-256" in said.err and "ego_pose.json" in said.err
 
 
+def test_tables_of_any_name(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """In the report too; and one that changed since is found."""
+    root = shutil.copytree(source, tmp_path / "source")
+    (root / "v1.0-mini").rename(root / "simulated")
+    asked = command(f"nuscenes:{root}", tmp_path / "new", "--version", "simulated", "--report", "1")
+    assert main(asked) == 0 and main([*asked, "--verify"]) == 0
+    table = root / "simulated" / "calibrated_sensor.json"
+    table.write_text(table.read_text() + " ")
+    capsys.readouterr()
+    assert main([*asked, "--verify"]) == 1
+    assert "got another source.tables.calibrated_sensor; put the former files back" in capsys.readouterr().err
+
+
 def test_visibility_is_at_most_what_people_saw(source: Path, output: Path) -> None:
     old, new = (read_tables(root)["sample_annotation"] for root in (source, output))
     levels = [(a["visibility_token"], b["visibility_token"]) for a, b in zip(old, new, strict=True)]
