@@ -42,7 +42,7 @@ class PseudoViewConfig:
         _check(self, "at least 1", lambda n: n >= 1, "targets", "mask_bank")
         _check(self, "a finite number from 0", lambda x: 0 <= x < math.inf, "pitch_deg", "lateral_m", "vertical_m")
         _check(self, "0 <= low <= high <= 90", lambda yaw: len(yaw) == 2 and 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
-        _check(self, "0 < low <= high", lambda f: len(f) == 2 and 0 < f[0] <= f[1] < math.inf, "focal")
+        _check(self, "0 < low <= high, both finite", lambda f: len(f) == 2 and 0 < f[0] <= f[1] < math.inf, "focal")
 
 
 @dataclass(frozen=True, kw_only=True)
