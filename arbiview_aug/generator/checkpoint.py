@@ -45,20 +45,11 @@ def write_checkpoint(folder: Path, config: Mapping[str, Any], tensors: Mapping[s
 
 
 def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
-    """Read a checkpoint's configuration, and its tensors on the CPU; GeneratorError for none, or a broken one."""
-    safetensors = optional_package("safetensors.torch", "generator")
-    config, weights = read_config(folder)
-    try:
-        return config, safetensors.load_file(folder / weights)
-    except Exception as error:  # safetensors has its own errors
-        raise GeneratorError(f"{folder}: expected readable weights in {weights}: {error}") from None
+    """Read a checkpoint's configuration, and its tensors on the CPU.
 
-
-def read_config(folder: Path) -> tuple[dict[str, Any], str]:
-    """Read a checkpoint's configuration and the name of its weights, which contains their checksum.
-
-    GeneratorError for no checkpoint, or one of another format.
+    GeneratorError for no checkpoint, one of another format, or weights that are not those of their name's checksum.
     """
+    safetensors = optional_package("safetensors.torch", "generator")
     path = folder / CONFIG_FILE
     if not path.is_file():
         raise GeneratorError(f"{folder}: expected a generator's folder with {CONFIG_FILE}, found none")
@@ -71,7 +62,16 @@ def read_config(folder: Path) -> tuple[dict[str, Any], str]:
         raise GeneratorError(f"{path}: expected format {FORMAT}, got {shown(version)}")
     if not isinstance(weights, str) or not _NAME.fullmatch(weights):
         raise GeneratorError(f"{path}: weights: expected the name of a file beside it, got {shown(weights)}")
-    return config, weights
+    try:
+        found = checksum(folder / weights)[:_DIGITS]
+        tensors = safetensors.load_file(folder / weights)
+    except Exception as error:  # safetensors has its own errors
+        raise GeneratorError(f"{folder}: expected readable weights in {weights}: {error}") from None
+    if found not in weights:
+        raise GeneratorError(
+            f"{folder}/{weights}: expected the checksum in its name, got {found}: copy or save it anew"
+        )
+    return config, tensors
 
 
 def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder: Path, assign: bool = False) -> None:

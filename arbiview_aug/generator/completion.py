@@ -151,21 +151,25 @@ def complete_together(
                     if not bool(image.isfinite().all()):
                         raise GeneratorError(
                             f"frame {draft.name:.40}, camera {draft.rig[m].name!r}: expected finite pixels from "
-                            f"generator {config.name!r}, got NaN: expected finite images, no float16, less guidance"
+                            f"generator {config.name!r}, got NaN or infinity: pass finite images, no float16, less "
+                            "guidance"
                         )
-                    draft.images[m] = _paste(image, draft.images[m], draft.holes[m])
+                    draft.images[m] = _paste(image.clamp(0, 1), draft.images[m], draft.holes[m])
     return [Completed(stacked(draft.images), stacked(draft.holes), draft.left) for draft in drafts]
 
 
 def with_sampling(config: GeneratorConfig, steps: int | None, guidance: float | None) -> GeneratorConfig:
     """The config with steps and guidance where given; GeneratorError where its generator cannot sample so."""
-    steps, guidance = config.steps if steps is None else steps, config.guidance if guidance is None else guidance
+    own = config.guidance
+    steps, guidance = config.steps if steps is None else steps, own if guidance is None else guidance
     config = replace(config, steps=steps, guidance=guidance)
     if config.steps == 1 and not config.one_step:
         raise GeneratorError(
             f"complete: expected steps >= 2, got 1: the one-step regression of generator {config.name!r} was not "
             "trained (loss.regression=0)"
         )
+    if config.steps == 1 and guidance not in (1, own):
+        raise GeneratorError(f"complete: expected no guidance with one step, which it cannot change, got {guidance}")
     return config
 
 
@@ -175,6 +179,9 @@ def _draft(rendered: RenderedFrame, source: Frame, name: str, min_confidence: fl
     if len(source.images) != len(source.rig):
         raise SampleError(f"complete: expected {len(source.rig)} source images, got {len(source.images)}")
     trust = rendered.coverage if rendered.confidence is None else rendered.confidence
+    for one in (*images, *rendered.coverage, *trust, *source.images):
+        if not isinstance(one, torch.Tensor):
+            raise SampleError(f"complete: expected tensors, got {type(one).__name__}; pass torch.as_tensor(...)")
     _check_sizes(images, rendered.coverage, trust, rig)
     for camera, image in zip(source.rig, source.images, strict=True):
         if tuple(image.shape) != (3, *camera.size):
@@ -214,7 +221,7 @@ def denoised(
     conditions: Conditions,
     noise: torch.Tensor,
 ) -> torch.Tensor:
-    """Sample the N targets of B frames from noise (B, N, C, h, w): (B, N, 3, H, W) float32 in [0, 1].
+    """Sample the N targets of B frames from noise (B, N, C, h, w): (B, N, 3, H, W) float32, not yet cut to [0, 1].
 
     ``config`` may differ from the generator's in ``steps`` and ``guidance``.
     """
@@ -247,7 +254,7 @@ def denoised(
         temperature=config.temperature,
         warm_start=config.residual,
     )
-    return autoencoder.decode(x0).float().clamp(0, 1)
+    return autoencoder.decode(x0).float()
 
 
 def shown_condition(config: GeneratorConfig, prefilled: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
@@ -303,3 +310,6 @@ def _check_sizes(views: Maps, coverage: Maps, trust: Maps, targets: Rig) -> None
             raise SampleError(f"camera {camera.name!r}: expected {expected}, got {got[0]}, {got[1]} and {got[2]}")
         if seen.dtype != torch.bool:
             raise SampleError(f"camera {camera.name!r}: coverage: expected bool, got {seen.dtype}; pass coverage > 0")
+        low, high = float(maps[2].min()), float(maps[2].max())
+        if not -0.01 < low <= high < 1.01:  # rounding aside
+            raise SampleError(f"camera {camera.name!r}: confidence: expected 0 to 1, got {low:g} to {high:g}")

@@ -14,6 +14,8 @@ from arbiview_aug.generator.correspondence import FACING_M
 
 _MOST_LEVELS, _MOST_LAYERS, _MOST_CHANNELS, _MOST_PIXELS = 8, 16, 8192, 8192
 
+TIMESTEPS = 1000  # diffusion steps in training (Sec. Training Parameters)
+
 Prediction = Literal["epsilon", "v_prediction"]
 
 
@@ -182,7 +184,7 @@ class GeneratorConfig:
     temperature: float = 0.5  # deviation of the initial noise; at 1 a sample is 3 dB below the posterior's mean
 
     def __post_init__(self) -> None:
-        check_sizes(self, _MOST_PIXELS, "image_size", "prompt_tokens", "steps", "lora_rank")
+        check_sizes(self, _MOST_PIXELS, "image_size", "prompt_tokens", "lora_rank")
         factor, epsilon = self.autoencoder.factor, self.prediction == "epsilon"
         expected = f"two multiples of {factor}"
         check_fields(self, expected, lambda size: isinstance(size, tuple) and len(size) == 2, "image_size")
@@ -190,7 +192,8 @@ class GeneratorConfig:
         check_fields(self, " or ".join(get_args(Prediction)), lambda p: p in get_args(Prediction), "prediction")
         expected = "False with prediction 'epsilon', or prediction 'v_prediction'"
         check_fields(self, expected, lambda used: not (used and epsilon), "zero_snr", "residual")
-        check_fields(self, "at least 1", lambda n: n >= 1, "steps")
+        expected = f"a whole number from 1 to {TIMESTEPS}"
+        check_fields(self, expected, lambda n: type(n) is int and 1 <= n <= TIMESTEPS, "steps")
         check_fields(self, "0 without frozen_unet", lambda rank: self.frozen_unet or not rank, "lora_rank")
         check_fields(self, "a value in (0, 1]", lambda s: 0 < s <= 1, "strength")
         check_fields(self, "a value in [0, 1]", lambda t: 0 <= t <= 1, "temperature")

@@ -23,10 +23,9 @@ from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator.attention import CrossViewAttention
 from arbiview_aug.generator.conditioning import PoseContext, Views, input_channels
-from arbiview_aug.generator.config import GeneratorConfig, TrainedOn
+from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig, TrainedOn
 from arbiview_aug.generator.correspondence import LEVELS, TokenWindow
 
-TIMESTEPS = 1000  # diffusion steps in training (Sec. Training Parameters)
 REGRESSION = TIMESTEPS  # predicts x0 in one step, from the pre-filled latent instead of a noisy one
 _LORA_LAYERS = ("to_q", "to_k", "to_v", "to_out.0")  # of the U-Net's self- and cross-attention
 

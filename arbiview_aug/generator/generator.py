@@ -10,8 +10,9 @@ from typing import Any
 
 import torch
 
+from arbiview_aug.choices import is_number
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import GeneratorError
+from arbiview_aug.errors import GeneratorError, one_line, shown
 from arbiview_aug.generator.checkpoint import load_weights, read_checkpoint, write_checkpoint
 from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
@@ -21,15 +22,7 @@ from arbiview_aug.generator.sampler import noise_schedule
 
 _SHIPPED = Path(__file__).with_name("weights")
 _EMPTY_PROMPT = [49406, *[49407] * 76]  # CLIP's tokens of "": start of text, then end of text up to 77
-_PLAIN_UNET = {  # entries of Stable Diffusion 1.5's configuration on which ``Denoiser`` relies
-    "mid_block_type": "UNetMidBlock2DCrossAttn",
-    "class_embed_type": None,
-    "addition_embed_type": None,
-    "encoder_hid_dim": None,
-    "time_cond_proj_dim": None,
-    "time_embedding_act_fn": None,
-    "center_input_sample": False,
-}
+_FREE = ("sample_size", "upcast_attention", "force_upcast", "scaling_factor")  # not compared: they change no layer
 
 
 def _networks() -> tuple[Any, Any]:
@@ -66,7 +59,9 @@ class Generator(GeneratorNetworks):
         *,
         empty_prompt: torch.Tensor | None = None,
     ) -> Generator:
-        """Create an untrained generator with Stable Diffusion's weights, whose output it has at first.
+        """Create an untrained generator with Stable Diffusion's weights.
+
+        At first it has the output of Stable Diffusion for a context of the empty prompt and one more token, the pose's.
 
         Args:
             where: A folder or hub id in diffusers' layout.
@@ -75,18 +70,21 @@ class Generator(GeneratorNetworks):
                 folder's text encoder, which needs transformers.
 
         Raises:
-            GeneratorError: Weights that are missing, extra, or of another architecture.
+            GeneratorError: Weights that are missing, extra, of another architecture, or trained for another prediction.
         """
         config = config or paper()
         latent = config.autoencoder.latent_channels
         if not config.autoencoder.widths:
             raise GeneratorError("from_stable_diffusion: expected a config with an autoencoder, got one on pixels")
-        expected_unet = config.unet.arguments(config.unet_channels, latent) | _PLAIN_UNET
-        unet = load_part("UNet2DConditionModel", where, "unet", expected_unet)
-        shape = config.autoencoder.arguments()
-        del shape["scaling_factor"]  # the file's own is used
-        vae = load_part("AutoencoderKL", where, "vae", shape)
-        config = replace(config, autoencoder=replace(config.autoencoder, scale=float(vae.config.scaling_factor)))
+        unet = load_part("UNet2DConditionModel", where, "unet", config.unet.arguments(config.unet_channels, latent))
+        vae = load_part("AutoencoderKL", where, "vae", config.autoencoder.arguments())
+        scale, prediction = vae.config.scaling_factor, trained_prediction(where)
+        if not is_number(scale):
+            raise GeneratorError(f"{where}/vae: expected a number as scaling_factor, got {shown(scale)}")
+        if prediction not in (None, config.prediction):
+            needed = f"prediction_type {config.prediction!r}, as of config {config.name!r}"
+            raise GeneratorError(f"{where}/scheduler: expected {needed}, got {shown(prediction)}")
+        config = replace(config, autoencoder=replace(config.autoencoder, scale=float(scale)))
         if empty_prompt is None and config.prompt_tokens:
             empty_prompt = embedded_empty_prompt(where)
         generator = cls(config, unet, vae).eval()
@@ -144,11 +142,11 @@ class Generator(GeneratorNetworks):
 
 
 # --- Stable Diffusion's weights ---------------------------------------------------------------------------------------
-def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[str, Any]) -> Any:
-    """Load a diffusers model (class ``kind``) whose configuration must have the ``expected`` entries.
+def load_part(kind: str, where: str | Path, subfolder: str, arguments: Mapping[str, Any]) -> Any:
+    """Load a diffusers model (class ``kind``) that must be as its class makes it from the ``arguments``.
 
     ``where`` is a folder or hub id in diffusers' layout; from a hub id, safetensors are downloaded. GeneratorError if
-    anything does not fit.
+    anything does not fit: the arguments are all that a generator's own folder keeps.
     """
     cls = getattr(optional_package("diffusers", "generator"), kind)
     label = f"{where}/{subfolder}"
@@ -156,11 +154,11 @@ def load_part(kind: str, where: str | Path, subfolder: str, expected: Mapping[st
         config = cls.load_config(where, subfolder=subfolder)
     except (OSError, ValueError) as error:
         raise GeneratorError(f"{label}: expected a diffusers folder or hub id with a {kind}: {error}") from None
-    defaults = inspect.signature(cls.__init__).parameters
-    for name, value in expected.items():
-        wanted, got = _plain(value), _plain(config.get(name, defaults[name].default))
-        if got != wanted:
-            raise GeneratorError(f"{label}: expected {name} {wanted}, got {got}")
+    levels = len(arguments["block_out_channels"])
+    for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:  # without self
+        expected, got = arguments.get(name, parameter.default), config.get(name, parameter.default)
+        if name not in _FREE and _by_level(got, levels) != _by_level(expected, levels):
+            raise GeneratorError(f"{label}: expected {name} {expected}, got {shown(got)}")
     return _complete_model(cls, where, subfolder, low_cpu_mem_usage=False)
 
 
@@ -171,7 +169,7 @@ def _complete_model(cls: Any, where: str | Path, subfolder: str, **options: Any)
         model, report = cls.from_pretrained(
             where, subfolder=subfolder, use_safetensors=True, output_loading_info=True, **options
         )
-    except (OSError, ValueError, RuntimeError) as error:  # no safetensors; shapes that do not fit
+    except (OSError, TypeError, ValueError, RuntimeError) as error:  # no safetensors; shapes that do not fit
         raise GeneratorError(f"{label} the weights of this {cls.__name__} as safetensors: {error}") from None
     kinds = ("missing", report["missing_keys"]), ("that do not belong", report["unexpected_keys"])
     wrong = [f"{len(keys)} {what}: {', '.join(sorted(map(str, keys))[:4])}" for what, keys in kinds if keys]
@@ -186,12 +184,23 @@ def embedded_empty_prompt(where: str | Path) -> torch.Tensor:
     GeneratorError for weights that are missing, extra or of another shape.
     """
     encoder = _complete_model(optional_package("transformers", "generator").CLIPTextModel, where, "text_encoder")
-    with torch.no_grad():
-        return encoder(torch.tensor([_EMPTY_PROMPT])).last_hidden_state[0]
+    try:
+        with torch.no_grad():
+            return encoder(torch.tensor([_EMPTY_PROMPT])).last_hidden_state[0]
+    except (IndexError, RuntimeError, ValueError) as error:
+        expected = "CLIP's, which reads 77 of 49408 tokens"
+        raise GeneratorError(f"{where}/text_encoder: expected {expected}: {one_line(error)}") from None
 
 
-def _plain(value: Any) -> Any:
-    """Lists as tuples, and tuples of one repeated value as that value: diffusers takes all of them."""
-    if isinstance(value, list | tuple):
-        return value[0] if len(set(value)) == 1 else tuple(value)
-    return value
+def trained_prediction(where: str | Path) -> Any:
+    """What the U-Net of a folder or hub id was trained to predict; None without a scheduler that says so."""
+    scheduler = optional_package("diffusers", "generator").DPMSolverMultistepScheduler
+    try:
+        return scheduler.load_config(where, subfolder="scheduler").get("prediction_type", "epsilon")
+    except (OSError, ValueError):
+        return None
+
+
+def _by_level(value: Any, levels: int) -> list[Any]:
+    """A value of each level: diffusers takes one for all."""
+    return list(value) if isinstance(value, list | tuple) else [value] * levels

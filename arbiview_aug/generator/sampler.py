@@ -13,7 +13,8 @@ from typing import Any
 import torch
 
 from arbiview_aug.environment import optional_package
-from arbiview_aug.generator.denoiser import REGRESSION, TIMESTEPS
+from arbiview_aug.generator.config import TIMESTEPS
+from arbiview_aug.generator.denoiser import REGRESSION
 
 Predict = Callable[[torch.Tensor, int], torch.Tensor]  # maps (x_t, t) to the prediction, or to x0 at ``REGRESSION``
 

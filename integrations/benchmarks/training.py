@@ -23,7 +23,7 @@ from arbiview_aug.generator.denoiser import REGRESSION, Rows
 from arbiview_aug.generator.training.command import fresh
 from arbiview_aug.generator.training.config import CONFIGS, PseudoViewConfig, TrainConfig, overridden
 from arbiview_aug.generator.training.data import Frames, open_frames
-from arbiview_aug.generator.training.held_out import gains, held_out_scores, mean_hole_psnr, sampled
+from arbiview_aug.generator.training.held_out import gains, held_out_scores, mean_hole_psnr, sampled, spread
 from arbiview_aug.generator.training.losses import without_attention
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.trainer import Trainer
@@ -85,7 +85,7 @@ def ablate(config: TrainConfig, frames: Frames, output: Path, *, views: int = 64
     Each variant gets a folder in ``output`` and is scored on ``views`` held-out views.
     """
     split = frames.split(config.seed)
-    indices = (split.held_out or split.validation)[:views]
+    indices = spread(split.held_out or split.validation, views)
     if not indices:
         raise DataError(f"{frames.name}: expected two scenes or more, one of them to score on; found one")
     table: dict[str, dict[str, Any]] = {}
@@ -98,8 +98,9 @@ def ablate(config: TrainConfig, frames: Frames, output: Path, *, views: int = 64
         generator = Generator.from_pretrained(folder / "generator").to(trainer.device)
         batch = seen_batch(frames, indices, changed, trainer.items.masks).to(trainer.device)
         scores = held_out_scores(generator, frames, indices, steps=config.generator.steps, mean_of=0, show=show)
+        gain = gains(scores, [frames.scenes[index] for index in indices])
         table[variant] = {
-            "against Telea": {name: gain._asdict() for name, gain in gains(scores).items()},
+            "against Telea": {name: interval._asdict() for name, interval in gain.items()},
             "seen by a source": seen_scores(generator, batch),
             "top-1": correct_correspondences(generator, batch),
         }
@@ -112,7 +113,8 @@ def text_of(table: dict[str, dict[str, Any]]) -> str:
     """Format the scores: gains over Telea on held-out targets, then PSNR where a source sees the hole, in one step."""
     rows = []
     for variant, row in table.items():
-        cells = [f"{row['against Telea'][method]['mean']:+.2f}" for method in ("one_step", "sample")]
+        gain = row["against Telea"]  # of the methods that the settings train
+        cells = [f"{gain[method]['mean']:+.2f}" if method in gain else "" for method in ("one_step", "sample")]
         cells += [f"{psnr:.2f}" for psnr in row["seen by a source"].values()]
         rows.append([variant, *cells, f"{row['top-1']:.0%}"])
     return markdown_table(("dB in the holes", "one step", "sample", "seen", "without", "wrong rig", "top-1"), rows)

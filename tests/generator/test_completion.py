@@ -81,9 +81,7 @@ def test_complete_and_almost_complete_views_need_no_denoiser(generator: Generato
     assert generator.calls == 4 and out.denoised == [1]
 
 
-@pytest.mark.parametrize(
-    ("steps", "guidance", "calls"), [(1, 1.0, 1), (4, 1.0, 4), (10, 1.0, 10), (4, 7.5, 7), (1, 7.5, 1)]
-)
+@pytest.mark.parametrize(("steps", "guidance", "calls"), [(1, 1.0, 1), (4, 1.0, 4), (10, 1.0, 10), (4, 7.5, 7)])
 def test_calls_of_the_denoiser(generator: Generator, steps: int, guidance: float, calls: int) -> None:
     """All views together: as many calls as steps, twice with guidance, but the regression, which is the first."""
     before = generator.calls
@@ -151,19 +149,33 @@ def test_generated_pixels_that_are_not_finite_are_refused(generator: Generator) 
     broken = [torch.full_like(image, float("nan"), dtype=torch.float32) for image in images]
     with pytest.raises(GeneratorError, match=r"frame 7, camera 't0': expected finite pixels from generator 'test'"):
         generator.complete_views(views, coverage, TARGETS, broken, SOURCES, frame=7, steps=2)
+    infinite = copy.deepcopy(generator)
+    with torch.no_grad():
+        infinite.denoiser.regression.bias.fill_(torch.inf)
+    with pytest.raises(GeneratorError, match="got NaN or infinity"):
+        completed(infinite, steps=1)
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"guidance": float("nan")}, "guidance: expected a finite"),
-        ({"steps": 10**6}, "up to 8192"),
+        ({"steps": 9000}, "GeneratorConfig.steps: expected a whole number from 1 to 1000, got 9000"),
         ({"steps": 1}, "2, got 1"),
     ],
 )
 def test_an_inpainter_refuses_what_its_generator_cannot_do(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(GeneratorError, match=message):
         Diffusion(Generator.from_config(small_config(one_step=False)), **settings)
+
+
+def test_guidance_of_one_step_is_refused() -> None:
+    """It would change nothing."""
+    made = Generator.from_config(small_config(steps=1, guidance=2.0))
+    with pytest.raises(GeneratorError, match="expected no guidance with one step, which it cannot change, got 50"):
+        Diffusion(made, guidance=50.0)
+    for guidance in (None, 1, 2.0):
+        Diffusion(made, guidance=guidance)
 
 
 def test_views_of_other_sizes_and_lenses(generator: Generator) -> None:
@@ -210,7 +222,7 @@ def test_messages(generator: Generator) -> None:
         generator.complete_views([views[0], views[1][:, 1:], views[2]], coverage, TARGETS, images, SOURCES)
     with pytest.raises(SampleError, match=r"camera 't0': coverage: expected bool.*pass coverage > 0"):
         generator.complete_views(views, [c.float() for c in coverage], TARGETS, images, SOURCES)
-    with pytest.raises(GeneratorError, match="steps: expected at least 1, got 0"):
+    with pytest.raises(GeneratorError, match="steps: expected a whole number from 1 to 1000, got 0"):
         generator.complete_views(views, coverage, TARGETS, images, SOURCES, steps=0)
     small, permuted = [image[:, :32, :50] for image in images], [image.permute(1, 2, 0) for image in images]
     for maps, message in (
@@ -219,6 +231,10 @@ def test_messages(generator: Generator) -> None:
         ({"views": [view.int() for view in views]}, r"expected images of uint8, or of floats in \[0, 1\], got"),
         ({"confidence": torch.ones(3, 10, 10)}, r"camera 't0': .*, got .* and \(10, 10\)"),
         ({"confidence": torch.ones(2, 48, 80)}, "'confidence': 2"),
+        ({"confidence": torch.full((3, 48, 80), 255.0)}, r"camera 't0': confidence: expected 0 to 1, got 255 to 255"),
+        ({"confidence": torch.full((3, 48, 80), torch.nan)}, "confidence: expected 0 to 1, got nan to nan"),
+        ({"views": [view.numpy() for view in views]}, "complete: expected tensors, got ndarray; pass torch.as_tensor"),
+        ({"source_images": [image.numpy() for image in images]}, "expected tensors, got ndarray"),
         ({"min_confidence": "a"}, "min_confidence: expected a number from 0 to 1, got 'a'"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -6,6 +6,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import safetensors.torch
@@ -40,6 +41,23 @@ UNET_15 = {
     "up_block_types": ["UpBlock2D", "CrossAttnUpBlock2D", "CrossAttnUpBlock2D", "CrossAttnUpBlock2D"],
 }
 """unet/config.json of Stable Diffusion 1.5 as published, without its version entries."""
+
+LATER_15 = {
+    "class_embed_type": None,
+    "conv_in_kernel": 3,
+    "cross_attention_norm": None,
+    "dual_cross_attention": False,
+    "mid_block_only_cross_attention": None,
+    "mid_block_type": "UNetMidBlock2DCrossAttn",
+    "num_class_embeds": None,
+    "only_cross_attention": False,
+    "resnet_time_scale_shift": "default",
+    "time_embedding_type": "positional",
+    "transformer_layers_per_block": 1,
+    "upcast_attention": None,
+    "use_linear_projection": False,
+}
+"""Entries that later versions of diffusers write for the same U-Net."""
 
 VAE_15 = {
     "act_fn": "silu",
@@ -186,9 +204,22 @@ def test_weights_that_do_not_fit_are_named(folder: Path) -> None:
     [
         ("unet", "in_channels", 9, "unet: expected in_channels 4, got 9"),
         ("unet", "cross_attention_dim", 1024, "unet: expected cross_attention_dim 24, got 1024"),
-        ("unet", "block_out_channels", [32, 32], r"expected block_out_channels \(32, 32, 64, 64\), got 32"),
-        ("unet", "down_block_types", ["AttnDownBlock2D"] * 4, r"expected down_block_types \(.*got AttnDownBlock2D"),
-        ("unet", "class_embed_type", "timestep", "unet: expected class_embed_type None, got timestep"),
+        ("unet", "block_out_channels", [32, 32], r"expected block_out_channels \(32, 32, 64, 64\), got \[32, 32\]"),
+        ("unet", "down_block_types", ["AttnDownBlock2D"] * 4, r"expected down_block_types \(.*got \['AttnDownBlock2D"),
+        ("unet", "use_linear_projection", True, "unet: expected use_linear_projection False, got True"),
+        ("unet", "transformer_layers_per_block", 2, "expected transformer_layers_per_block 1, got 2"),
+        ("unet", "only_cross_attention", [False, False, False, True], "expected only_cross_attention False, got"),
+        ("unet", "resnet_time_scale_shift", "scale_shift", "expected resnet_time_scale_shift default, got 'scale_"),
+        ("unet", "num_class_embeds", 3, "expected num_class_embeds None, got 3"),
+        ("unet", "flip_sin_to_cos", False, "expected flip_sin_to_cos True, got False"),
+        ("unet", "act_fn", "gelu", "unet: expected act_fn silu, got 'gelu'"),
+        ("vae", "act_fn", "gelu", "vae: expected act_fn silu, got 'gelu'"),
+        ("vae", "use_quant_conv", False, "vae: expected use_quant_conv True, got False"),
+        ("vae", "block_out_channels", [16, 16, 16], r"\(16, 16, 16, 16\), got \[16, 16, 16\]"),
+        ("vae", "block_out_channels", [[16], [16]], r"expected block_out_channels .*, got \[\[16\], \[16\]\]"),
+        ("vae", "block_out_channels", 16, "vae: expected the weights of this AutoencoderKL as safetensors"),
+        ("vae", "scaling_factor", None, "vae: expected a number as scaling_factor, got None"),
+        ("unet", "class_embed_type", "timestep", "unet: expected class_embed_type None, got 'timestep'"),
         ("vae", "latent_channels", 16, "vae: expected latent_channels 4, got 16"),
     ],
 )
@@ -196,6 +227,28 @@ def test_other_architectures_are_named(folder: Path, part: str, entry: str, valu
     path = folder / part / "config.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), entry: value}))
     refused(folder, match)
+
+
+def test_a_prediction_that_the_unet_was_not_trained_for_is_named(folder: Path) -> None:
+    path = folder / "scheduler" / "scheduler_config.json"
+    path.parent.mkdir()
+    path.write_text(json.dumps({"_class_name": "DDIMScheduler", "prediction_type": "v_prediction"}))
+    refused(folder, "scheduler: expected prediction_type 'epsilon', as of config 'test', got 'v_prediction'")
+
+
+@pytest.mark.parametrize("more", [{}, LATER_15])
+def test_folders_as_they_were_published_are_read(folder: Path, tmp_path: Path, more: dict[str, Any]) -> None:
+    """The entries of diffusers 0.2 alone, of later versions too, and unknown ones; schedulers without a prediction."""
+    own, unet = config(), UNET_15 | more
+    arguments = own.unet.arguments(4, 4) | {"attention_head_dim": 2}
+    for part, published, sizes in (("unet", unet, arguments), ("vae", VAE_15, own.autoencoder.arguments())):
+        given = {key: sizes.get(key, value) for key, value in published.items()}
+        given |= {"_class_name": "Any", "_diffusers_version": "0.2.2", "_name_or_path": "x", "entry_of_tomorrow": 1}
+        (folder / part / "config.json").write_text(json.dumps(given))
+    (folder / "scheduler").mkdir()
+    (folder / "scheduler" / "scheduler_config.json").write_text(json.dumps({"_class_name": "PNDMScheduler"}))
+    made = Generator.from_stable_diffusion(folder, own, empty_prompt=torch.zeros(5, 24))
+    assert made.autoencoder.scale == 0.18215
 
 
 def test_missing_folders_and_prompts_are_named(folder: Path, tmp_path: Path) -> None:
@@ -232,6 +285,12 @@ def test_the_text_encoder_is_loaded_completely_or_not_at_all(folder: Path, monke
     save({**good, next(iter(layer)): torch.zeros(7)})
     with pytest.raises(GeneratorError, match="text_encoder: expected the weights of this CLIPTextModel as safetensors"):
         embedded_empty_prompt(folder)
+    for other in ({"vocab_size": 1000}, {"vocab_size": 49408, "max_position_embeddings": 40}):
+        transformers.CLIPTextModel(transformers.CLIPTextConfig(**size, **other)).save_pretrained(
+            folder / "text_encoder"
+        )
+        with pytest.raises(GeneratorError, match="text_encoder: expected CLIP's, which reads 77 of 49408 tokens"):
+            embedded_empty_prompt(folder)
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ImportError, match=r"^transformers is not installed: pip install 'arbiview_aug\[generator\]'$"):
         embedded_empty_prompt(folder)

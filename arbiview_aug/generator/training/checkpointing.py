@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import signal
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +18,7 @@ import torch
 from torch import nn
 
 from arbiview_aug.errors import GeneratorError, TrainingError, one_line, shown
-from arbiview_aug.generator.checkpoint import CONFIG_FILE, read_checkpoint, write_checkpoint
+from arbiview_aug.generator.checkpoint import read_checkpoint, write_checkpoint
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 _MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")  # in a resumed run
@@ -56,11 +57,6 @@ def save_state(
     for k, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{k}.{key}": torch.as_tensor(value) for key, value in state.items()}
     write_checkpoint(folder, {"step": step, "training": run}, tensors)
-
-
-def has_state(folder: Path) -> bool:
-    """Whether a folder holds a state to resume from."""
-    return (folder / CONFIG_FILE).is_file()
 
 
 def load_state(
@@ -109,9 +105,14 @@ def _broken(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def stop_requests() -> Iterator[list[int]]:
-    """Collect SIGTERM and SIGINT in a list instead of ending the process."""
+    """Collect ``STOP_SIGNALS`` in a list instead of ending the process, but for ignored ones (nohup).
+
+    Outside the main thread, which alone can handle signals, the list stays empty.
+    """
     asked: list[int] = []
-    before = {number: signal.signal(number, lambda number, _: asked.append(number)) for number in STOP_SIGNALS}
+    in_main = threading.current_thread() is threading.main_thread()
+    taken = [n for n in STOP_SIGNALS if in_main and signal.getsignal(n) not in (signal.SIG_IGN, None)]
+    before = {number: signal.signal(number, lambda number, _: asked.append(number)) for number in taken}
     try:
         yield asked
     finally:

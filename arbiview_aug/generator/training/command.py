@@ -17,7 +17,7 @@ from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.data import open_frames
-from arbiview_aug.generator.training.held_out import held_out_scores, report
+from arbiview_aug.generator.training.held_out import held_out_scores, report, spread
 from arbiview_aug.generator.training.losses import load_perceptual
 from arbiview_aug.generator.training.trainer import Trainer, silent
 
@@ -77,12 +77,15 @@ def _evaluate(
         if data != "synthetic" and held_out != unseen:
             raise TrainingError(f"evaluate: {data}: expected the scenes that the generator was trained on, got others")
         held_out = unseen
-    indices = held_out[: arguments.views]
+    else:
+        known = "unknown data" if trained_on is None else trained_on.data
+        say(f"{data}: frames that are not known to be unseen: the generator was trained on {known}")
+    indices = spread(held_out, arguments.views)
     if not indices:
         raise TrainingError(f"evaluate: {data}: expected at least two scenes, one to train on and one held out")
     scores = held_out_scores(generator, frames, indices, seeds=seeds, steps=arguments.steps, show=show)
     say(f"{data}, {arguments.steps or generator.config.steps} steps, guidance {generator.config.guidance:g}")
-    report(scores, len(seeds), say)
+    report(scores, [frames.scenes[index] for index in indices] * len(seeds), say)
 
 
 def check_weights(config: TrainConfig, weights: str | None) -> None:

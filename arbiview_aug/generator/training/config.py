@@ -42,7 +42,7 @@ class PseudoViewConfig:
         _check(self, "at least 1", lambda n: n >= 1, "targets", "mask_bank")
         _check(self, "a finite number from 0", lambda x: 0 <= x < math.inf, "pitch_deg", "lateral_m", "vertical_m")
         _check(self, "0 <= low <= high <= 90", lambda yaw: len(yaw) == 2 and 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
-        _check(self, "0 < low <= high", lambda factor: len(factor) == 2 and 0 < factor[0] <= factor[1], "focal")
+        _check(self, "0 < low <= high, both finite", lambda f: len(f) == 2 and 0 < f[0] <= f[1] < math.inf, "focal")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +62,9 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         _check(self, "normalised or frobenius_sum", lambda m: m in ("normalised", "frobenius_sum"), "geo_mode")
-        _check(self, "at least 0", lambda w: w >= 0, "geo", "perceptual", "snr_limit", "snr_floor")
+        _check(
+            self, "a finite number from 0", lambda w: 0 <= w < math.inf, "geo", "perceptual", "snr_limit", "snr_floor"
+        )
         _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "regression")
         _check(self, "a value in (0, 1]", lambda w: 0 < w <= 1, "known_weight")
         _check(self, "at least 1", lambda n: n >= 1, "perceptual_every")
@@ -96,9 +98,10 @@ class TrainConfig:
         counts = ("steps", "batch", "scenes", "save_every", "validate_every", "validation_items")
         _check(self, "at least 1", lambda n: n >= 1, *counts)
         _check(self, "no or bf16 (never fp16: it overflows)", lambda p: p in ("no", "bf16"), "precision")
-        _check(self, "a value above 0", lambda lr: lr > 0, "lr")
+        _check(self, "a finite number above 0", lambda lr: 0 < lr < math.inf, "lr")
         _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "ema", "cond_drop_prob")
-        _check(self, "at least 0", lambda n: n >= 0, "warmup", "workers", "weight_decay", "max_grad_norm")
+        numbers = ("warmup", "workers", "weight_decay", "max_grad_norm")
+        _check(self, "a finite number from 0", lambda n: 0 <= n < math.inf, *numbers)
         _check(self, "a value from 0 to 2**28", lambda seed: 0 <= seed <= 2**28, "seed")  # 10 seed 2**32 in 64 bits
 
 
@@ -117,7 +120,7 @@ def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
             value = json.loads(text)
         except ValueError:
             value = text.strip()  # a string without quotes
-        _override(data, name.strip().split("."), tuple(value) if isinstance(value, list) else value, setting)
+        _override(data, name.strip().split("."), value, setting)
     return from_plain(TrainConfig, data, "config", TrainingError)
 
 
@@ -131,12 +134,8 @@ def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: st
             raise TrainingError(f"--set {setting}: {name} has no settings of its own")
         _override(default, path[1:], value, setting)
         return
-    if isinstance(default, float) and type(value) is int:
-        value = float(value)
-    if isinstance(default, tuple) and isinstance(value, tuple) and default and isinstance(default[0], float):
-        value = tuple(map(float, value))
-    if isinstance(default, dict) or type(value) is not type(default):
-        raise TrainingError(f"--set {setting}: expected {type(default).__name__} such as {default!r}, got {value!r}")
+    if isinstance(default, dict):
+        raise TrainingError(f"--set {setting}: expected one of its settings, such as {name}.{next(iter(default))}")
     data[name] = value
 
 

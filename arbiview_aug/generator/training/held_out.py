@@ -25,7 +25,7 @@ from arbiview_aug.evaluate.lidar import visible_points
 from arbiview_aug.evaluate.metrics import errors, spectrum_distance_db
 from arbiview_aug.evaluate.report.pictures import contact_sheet
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.completion import denoised, valid_pixels
+from arbiview_aug.generator.completion import denoised, valid_pixels, with_sampling
 from arbiview_aug.generator.training.data import Frames, TrainingFrame
 from arbiview_aug.generator.training.pseudo_views import Batch, Rendered, favs, mask_bank, one_of, retarget
 from arbiview_aug.inpaint.telea import telea
@@ -38,7 +38,7 @@ def sampled(generator: Generator, batch: Batch, *, steps: int, seed: int, pasted
     config = replace(generator.config, steps=steps)
     size = (*batch.truth.shape[:2], config.autoencoder.latent_channels, *config.latent_size)
     noise = torch.randn(size, generator=torch.Generator().manual_seed(seed)).to(batch.truth.device)
-    images = denoised(generator, config, batch.geometry, batch.conditions, noise)
+    images = denoised(generator, config, batch.geometry, batch.conditions, noise).clamp(0, 1)
     return torch.where(batch.known[:, :, None], batch.favs, images) if pasted else images
 
 
@@ -133,8 +133,9 @@ def held_out_scores(
 
     Raises:
         TrainingError: Frames without truth and points, or without a target that they score.
+        GeneratorError: A single step of a generator that was not trained for it.
     """
-    steps = steps or generator.config.steps
+    steps = with_sampling(generator.config, steps, None).steps
     scores: dict[str, list[float]] = {}
     cases = [(seed, index) for seed in seeds for index in indices]
     for seed, index in tqdm(cases, desc="held out", unit="view", disable=not show):
@@ -233,21 +234,29 @@ def _pixels_of(camera: Camera, points: FloatArray) -> tuple[npt.NDArray[np.intp]
     return index, row, column
 
 
-def gains(scores: Mapping[str, Sequence[float]], seeds: int = 1) -> dict[str, Interval]:
-    """Paired gain in dB of each method over Telea, with 95 % bootstrap intervals over streets.
+def spread(indices: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of the indices, evenly spread over them: the first frames of a data set are of one scene."""
+    count = min(count, len(indices))
+    return [indices[k * len(indices) // count] for k in range(count)]
 
-    The ``seeds`` views of a street are resampled together.
+
+def gains(scores: Mapping[str, Sequence[float]], scenes: Sequence[str] = ()) -> dict[str, Interval]:
+    """Paired gain in dB of each method over Telea, mean over scenes, with 95 % bootstrap intervals over them.
+
+    ``scenes`` are those of the values, whose views are averaged; by default each value is of its own.
     """
+    _, scene = np.unique(scenes or range(len(scores["telea"])), return_inverse=True)
     methods = [name for name in scores if name not in ("telea", "sample_spectrum")]
-    gain = {name: np.subtract(scores[name], scores["telea"]).reshape(seeds, -1).mean(0) for name in methods}
-    return {name: bootstrap(of_street.tolist()) for name, of_street in gain.items()}
+    gain = {name: np.bincount(scene, np.subtract(scores[name], scores["telea"])) for name in methods}
+    return {name: bootstrap((of_scene / np.bincount(scene)).tolist()) for name, of_scene in gain.items()}
 
 
-def report(scores: Mapping[str, Sequence[float]], seeds: int = 1, say: Callable[[str], None] = print) -> None:
+def report(scores: Mapping[str, Sequence[float]], scenes: Sequence[str], say: Callable[[str], None] = print) -> None:
     """Print the scores; arguments as for ``gains``."""
-    count = len(scores["telea"])
-    say(f"inside the holes of {count} held-out views; Telea {sum(scores['telea']) / count:.2f} dB; against it, dB:")
-    for name, gain in gains(scores, seeds).items():
+    telea = sum(scores["telea"]) / len(scenes)
+    views = f"{len(scenes)} held-out views of {len(set(scenes))} scenes"
+    say(f"inside the holes of {views}; Telea {telea:.2f} dB; against it, dB:")
+    for name, gain in gains(scores, scenes).items():
         say(f"  {name:<9} {gain}")
     distances = scores.get("sample_spectrum", [])
     if distances:

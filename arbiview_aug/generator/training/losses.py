@@ -17,8 +17,8 @@ from torch import nn
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator.conditioning import FrameGeometry, pooled
-from arbiview_aug.generator.config import Prediction
-from arbiview_aug.generator.denoiser import REGRESSION, TIMESTEPS, Autoencoder, Denoiser, Rows
+from arbiview_aug.generator.config import TIMESTEPS, Prediction
+from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, Denoiser, Rows
 from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.training.config import GeoMode, TrainConfig
 from arbiview_aug.generator.training.pseudo_views import Batch

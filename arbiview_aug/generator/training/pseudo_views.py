@@ -22,6 +22,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import TrainingError
 from arbiview_aug.favs.renderer import render_paper
 from arbiview_aug.generator.completion import Conditions, seeded, unit, valid_pixels
 from arbiview_aug.generator.conditioning import FrameGeometry, batched, frame_geometry, nearest_sources
@@ -120,6 +121,12 @@ class Batch(NamedTuple):
 
 
 def collate(items: Sequence[Batch]) -> Batch:
+    """One batch of items with as many targets; TrainingError, which names the frame, if they have not."""
+    for item in items:
+        expected, got = items[0].truth.shape[1], item.truth.shape[1]
+        if got != expected:
+            fix = "train on frames of as many cameras, or with pseudo_views.targets=1"
+            raise TrainingError(f"frame {item.tokens[0]}: expected {expected} cameras as in others, got {got}: {fix}")
     *tensors, geometries, tokens, views = zip(*items, strict=True)
     names = (tuple(itertools.chain(*of_items)) for of_items in (tokens, views))
     return Batch._make([*map(torch.cat, tensors), batched(geometries), *names])
@@ -207,7 +214,7 @@ class PseudoViews(Dataset[Batch]):
         sources, seen, _ = (torch.cat(maps) for maps in zip(*pseudo, strict=True))
         geometry = frame_geometry(targets, branches, rig.ground_z_m, self.generator)
         return Batch(
-            torch.stack([frame.images[i].float() / 255 for i in places])[None],
+            torch.stack([unit(frame.images[i]) for i in places])[None],
             torch.stack([valid_pixels(camera).to(known.device) for camera in targets])[None],
             view_at[None],
             torch.stack([telea(image, ~is_known) for image, is_known in zip(view_at, known, strict=True)])[None],

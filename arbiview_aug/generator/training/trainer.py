@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,11 @@ from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError, OutputError, TrainingError, one_line
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.checkpoint import CONFIG_FILE
 from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.generator.config import TrainedOn
-from arbiview_aug.generator.training.checkpointing import averaged, has_state, load_state, save_state, stop_requests
+from arbiview_aug.generator.training.checkpointing import averaged, load_state, save_state, stop_requests
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
 from arbiview_aug.generator.training.held_out import mean_hole_psnr, picture, sampled
@@ -96,15 +97,18 @@ class Trainer:
         self.optimiser = torch.optim.AdamW(self.trained.values(), lr=config.lr, weight_decay=config.weight_decay)
         ema = optional_package("diffusers.training_utils", "generator").EMAModel
         self.average = ema(self.trained.values(), decay=config.ema, foreach=True)
+        frozen: list[torch.Tensor] = [p for p in generator.parameters() if not p.requires_grad]
+        frozen += [generator.denoiser.context.empty_prompt, *(self.perceptual.parameters() if self.perceptual else ())]
         self._run = {
             **asdict(config),
             "data": asdict(generator.trained_on),
-            "frozen weights": digest_of(p for p in generator.parameters() if not p.requires_grad),
+            "frozen weights": digest_of(frozen),
             "number of processes": self.accelerator.num_processes,
         }
         self._buffers = {"deviation": generator.denoiser.deviation} if config.generator.residual else {}
         self.done, state = 0, self.output / "state"
-        is_resumed = has_state(state)
+        self._writer: Any = None  # TensorBoard's, in the main process
+        is_resumed = (state / CONFIG_FILE).is_file()
         if is_resumed:
             self.done = load_state(state, self._run, self.trained, self._buffers, self.average, self.optimiser)
             self.say(f"going on after step {self.done} of {state}")
@@ -146,11 +150,10 @@ class Trainer:
         TrainingError if a loss or gradient is not finite, OutputError if the last state could not be saved.
         """
         config = self.config
-        writer = None
         if self.is_main:
             tensorboard = optional_package("torch.utils.tensorboard", "generator")
             purged = self.done + 1 if self.done else None
-            writer = tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=purged)
+            self._writer = tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=purged)
         bar = tqdm(total=config.steps, initial=self.done, desc="train", unit="step", disable=not self.show)
         try:
             with stop_requests() as asked:
@@ -159,13 +162,12 @@ class Trainer:
                     self.done += 1
                     bar.update()
                     last = self.done == config.steps
-                    if writer is not None and (self.done % _LOG_EVERY == 0 or last):
-                        for name, value in terms.items():
-                            writer.add_scalar(f"loss/{name}", value, self.done)
-                        writer.add_scalar("lr", learning_rate(config, self.done - 1), self.done)
+                    if self.done % _LOG_EVERY == 0 or last:
+                        rate = {"lr": learning_rate(config, self.done - 1)}
+                        self._log({f"loss/{name}": value for name, value in terms.items()} | rate)
                         bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()})
                     if self.done % config.validate_every == 0 or last:
-                        self._validate(writer)
+                        self._validate()
                     stops = torch.tensor(float(len(asked)), device=self.device)
                     if self.accelerator.reduce(stops, "sum") > 0:  # all processes stop after the same step
                         break
@@ -174,8 +176,7 @@ class Trainer:
                 self.save()
         finally:
             bar.close()
-            if writer is not None:
-                writer.close()
+            self._log({}, closing=True)
         if self.done < config.steps:
             self.say(f"stopped after step {self.done} of {config.steps}; saved: the same command goes on from there")
         return self.done == config.steps
@@ -216,6 +217,21 @@ class Trainer:
         numbers: Any = [range(n * config.batch, (n + 1) * config.batch) for n in first]
         return iter(DataLoader(self.items, batch_sampler=numbers, collate_fn=collate, **item_workers(config.workers)))
 
+    def _log(self, values: Mapping[str, float], validation: Any = None, *, closing: bool = False) -> None:
+        """Write to TensorBoard; a full disk ends the log, not the run."""
+        if self._writer is None:
+            return
+        try:
+            for name, value in values.items():
+                self._writer.add_scalar(name, value, self.done)
+            if validation is not None:
+                self._writer.add_image("validation", validation, self.done, dataformats="HWC")
+            if closing:
+                self._writer.close()
+        except OSError as error:
+            self._writer = None
+            self.say(f"step {self.done}: logs of TensorBoard end here, the run goes on: {error}")
+
     # --- saving -------------------------------------------------------------------------------------------------------
     def save(self) -> None:
         """Write the state, and the generator with averaged weights; after an OutputError the last is unchanged."""
@@ -234,7 +250,7 @@ class Trainer:
         except OutputError as error:
             self.say(f"step {self.done}: not saved, going on with the last good state: {error}")
 
-    def _validate(self, writer: Any) -> None:
+    def _validate(self) -> None:
         """Log samples of fixed items by the averaged weights, and their mean PSNR inside the holes, in dB by method."""
         config, steps = self.config, max(2, self.config.generator.steps)
         if self.is_main:
@@ -245,9 +261,7 @@ class Trainer:
                     methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
                 methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)
             scores, image = mean_hole_psnr(methods, batch), picture(batch, samples)
-            for name, value in scores.items():
-                writer.add_scalar(f"hole_psnr/{name}", value, self.done)
-            writer.add_image("validation", image, self.done, dataformats="HWC")
+            self._log({f"hole_psnr/{name}": value for name, value in scores.items()}, image)
             try:
                 save_picture(self.output / "validation" / f"{self.done:06d}.png", image)
             except DataError as error:

@@ -62,7 +62,7 @@ def test_train_and_evaluate_on_streets(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(common) == 0
     assert main(["evaluate", "--output", str(tmp_path), "--quiet", "--views", "1"]) == 0
     out = capsys.readouterr().out
-    assert "held-out views; Telea" in out and "one_step" in out and "mean" in out
+    assert "held-out views of 1 scenes; Telea" in out and "one_step" in out and "mean" in out
     study = ["--config", "tiny", "--output", str(tmp_path / "study"), "--quiet", *SMALLER]
     assert training.main([*study, "--views", "1"]) == 0
     assert set(training.VARIANTS) == set(json.loads((tmp_path / "study" / "ablation.json").read_text()))
@@ -120,19 +120,22 @@ def test_evaluate_scores_frames_that_the_generator_never_saw(
     generator.save_pretrained(tmp_path / "generator")
     scored = []
 
-    def opened(_: str, size: tuple[int, int], *, scenes: int, seed: int, **__: object) -> Frames:
+    def opened(kind: str, size: tuple[int, int], *, scenes: int, seed: int, **__: object) -> Frames:
         scored.append((size, seed, scenes > max(held_out)))
-        return drawn
+        return frames(scenes) if kind == "synthetic" else drawn
 
     drawn = frames(scenes)
     monkeypatch.setattr(command, "open_frames", opened)
     monkeypatch.setattr(command, "held_out_scores", lambda _, __, indices, **___: scored.append(indices) or {})
     monkeypatch.setattr(command, "report", lambda *_: None)
     assert main(["evaluate", "--output", str(tmp_path), "--quiet", *more]) == (0 if message is None else 2)
+    printed = capsys.readouterr()
     if message is None:
-        assert scored == [(SIZE, 7, True), held_out]
+        assert scored == [(SIZE, 7, True), list(held_out)]
+        unknown = "frames:/drive: frames that are not known to be unseen: the generator was trained on frames:/another"
+        assert (unknown in printed.out) == (data == "frames:/another")
     else:
-        assert message in capsys.readouterr().err
+        assert message in printed.err
 
 
 def test_missing_vgg_weights_stop_the_run(

@@ -24,6 +24,7 @@ from arbiview_aug.generator.training.held_out import (
     hole_psnr,
     picture,
     sampled,
+    spread,
 )
 from arbiview_aug.generator.training.losses import without_attention
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
@@ -103,7 +104,7 @@ def test_held_out_streets_are_scored_against_their_truth(generator: Generator) -
     assert set(gains(scores)) == {"one_step", "sample", "mean"}
     twice = {"telea": [0.0] * 8, "one_step": [1.0, 2.0, 3.0, 4.0] * 2}  # two views that say the same of each street
     once = {name: values[:4] for name, values in twice.items()}
-    assert gains(twice, seeds=2) == gains(once) != gains(twice)
+    assert gains(twice, scenes=["a", "b", "c", "d"] * 2) == gains(once) != gains(twice)
     again = held_out_scores(generator, streets, [0], seeds=(0,), steps=2, mean_of=0, show=False)
     assert again["sample"] == scores["sample"][:1] and "mean" not in again
     untrained = Generator.from_config(config().generator)
@@ -144,6 +145,11 @@ def test_scores_are_of_the_runs_own_steps_and_guidance(monkeypatch: pytest.Monke
     assert used[-1] == (3, 2.5)
 
 
+def test_scored_frames_are_spread_over_all() -> None:
+    assert spread(range(10, 20), 4) == [10, 12, 15, 17]
+    assert spread((3, 4), 64) == [3, 4] and spread((), 64) == []
+
+
 def test_other_frames_have_no_truth(generator: Generator) -> None:
     with pytest.raises(TrainingError, match="frame frame 0: expected LiDAR points, which score real frames"):
         held_out_scores(generator, frames(), [0], show=False)
@@ -161,7 +167,7 @@ def test_the_table_names_every_variant() -> None:
     gain = {"mean": 1.0, "low": 0.0, "high": 2.0}
     seen = {name: 20.0 for name in ("seen", "without", "wrong rig")}
     row = {"against Telea": {"one_step": gain, "sample": gain}, "seen by a source": seen, "top-1": 0.5}
-    text = text_of({"as written": row, "all additions": row})
+    text = text_of({"as written": row, "all additions": {**row, "against Telea": {}}})  # neither was trained
     assert "as written" in text and "all additions" in text and "+1.00" in text and "50%" in text
 
 
@@ -197,5 +203,7 @@ def test_one_step_of_a_generator_that_was_not_trained_for_it() -> None:
     asked: dict[str, Any] = {"coverage": torch.zeros(3, *rig[0].size, dtype=torch.bool), "targets": rig}
     with pytest.raises(GeneratorError, match="the one-step regression of generator 'of samples' was not trained"):
         generator.complete_views(black, source_images=black, sources=rig, steps=1, **asked)
+    with pytest.raises(GeneratorError, match="was not trained"):
+        held_out_scores(generator, frames(), [0], steps=1, show=False)
     done = generator.complete_views(black, source_images=black, sources=rig, steps=2, **asked)
     assert done.denoised == [0, 1, 2]

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator.training.config import PseudoViewConfig
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate, favs, mask_bank
 from arbiview_aug.transforms.rig_retarget import RigRetarget
@@ -126,6 +127,16 @@ def test_several_targets_are_neighbours_that_read_each_other() -> None:
     assert bool((of_targets & finest.valid.flatten(3).any(3)).flatten(1).any(1).float().mean() > 0.5)
     alone = items()[0]
     assert torch.equal(alone.truth[0, 0], batch.truth[0, 0])  # further targets change nothing of the first
+
+
+def test_frames_with_fewer_cameras_than_others_are_named() -> None:
+    made, narrow = items(targets=2), items(targets=2)
+    for index in narrow.indices:
+        frame = narrow.frames[index]
+        single = frame._replace(images=frame.images[:1], rig=frame.rig.with_cameras([frame.rig[0]]))
+        narrow.frames._cache._values[index] = single
+    with pytest.raises(TrainingError, match=r"frame frame \d.*: expected 2 cameras as in others, got 1: train on"):
+        collate([made[0], narrow[1]])
 
 
 def test_holes_that_are_not_hidden_are_shown_by_the_sources() -> None:

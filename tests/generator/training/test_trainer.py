@@ -7,6 +7,7 @@ import json
 import math
 import os
 import signal
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,20 @@ def test_a_full_disk_leaves_the_last_state(tmp_path: Path, monkeypatch: pytest.M
     assert run(tmp_path, steps=2).done == 2
 
 
+def test_a_full_disk_ends_the_logs_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    made = run(tmp_path, steps=2, validate_every=1)
+    monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter.add_scalar", full)
+    assert made.train()
+    said = [text for text in made.said if "No space left" in text]  # type: ignore[attr-defined]
+    assert len(said) == 1 and said[0].startswith("step 1: logs of TensorBoard end here, the run goes on")
+    monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter.close", full)
+    monkeypatch.setattr("torch.utils.tensorboard.SummaryWriter.add_scalar", lambda *_: None)
+    assert run(tmp_path / "b", steps=1).train()
+
+
 def test_a_loss_that_is_not_finite_names_the_term_and_the_batch(tmp_path: Path) -> None:
     made = run(tmp_path, loss=LossConfig(perceptual=0.0, regression=0.0))
     batch = next(made._batches())
@@ -152,12 +167,17 @@ def test_a_state_of_other_settings_is_refused(tmp_path: Path) -> None:
 
 def test_a_state_of_other_data_weights_or_processes_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It would go on without a word, and say that it was trained on the last data alone."""
-    frozen = replace(config().generator, frozen_unet=True)
+    frozen = replace(config().generator, frozen_unet=True, prompt_tokens=2)
     run(tmp_path, generator=frozen).save()
     with pytest.raises(TrainingError, match=r"state: a run with other data; .* or give another --output"):
         run(tmp_path, generator=frozen, data="frames:/b")
     with pytest.raises(TrainingError, match="a run with other frozen weights;"):
         run(tmp_path, generator=frozen, seed=1)
+    torch.manual_seed(0)
+    another = Generator.from_config(frozen)
+    another.denoiser.context.empty_prompt.fill_(1)
+    with pytest.raises(TrainingError, match="a run with other frozen weights;"):
+        Trainer(config(generator=frozen), frames(), another, tmp_path, show=False)
     monkeypatch.setattr("accelerate.Accelerator.num_processes", 2)
     with pytest.raises(TrainingError, match="a run with other number of processes;"):
         run(tmp_path, generator=frozen)
@@ -173,7 +193,6 @@ def test_the_deviation_of_a_resumed_run_is_not_measured_again(tmp_path: Path) ->
 def test_a_state_that_is_no_state_is_refused(tmp_path: Path) -> None:
     made, file = run(tmp_path), tmp_path / "state" / "config.json"
     made.save()
-    assert checkpointing.has_state(made.output / "state")
     sound = json.loads(file.read_text())
     changes: list[dict[str, Any]] = [{"step": step} for step in ("x", None, -5, True, 9)]
     for change in ({"format": 2}, {"training": [1]}, *changes):
@@ -234,6 +253,29 @@ def test_the_learning_rate_warms_up_and_falls_to_nothing() -> None:
     rates = [learning_rate(settings, step) for step in range(101)]
     assert rates[0] == pytest.approx(0.1) and rates[9] == pytest.approx(1.0) and rates[100] == pytest.approx(0.0)
     assert all(a >= b for a, b in itertools.pairwise(rates[9:]))
+
+
+@pytest.mark.parametrize("in_thread", [False, True])
+def test_signals_that_are_ignored_stay_so(in_thread: bool) -> None:
+    """nohup's SIGHUP; and a thread can handle none at all."""
+    found: list[Any] = []
+
+    def handlers() -> None:
+        with checkpointing.stop_requests():
+            found.extend(signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGTERM))
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN), signal.getsignal(signal.SIGTERM)
+    try:
+        if in_thread:
+            thread = threading.Thread(target=handlers)
+            thread.start()
+            thread.join()
+        else:
+            handlers()
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN and signal.getsignal(signal.SIGTERM) == before[1]
+    finally:
+        signal.signal(signal.SIGHUP, before[0])
+    assert found[0] == signal.SIG_IGN and (found[1] == before[1]) == in_thread
 
 
 def test_signals_of_workers_are_left_to_the_trainer() -> None:
