@@ -193,7 +193,7 @@ def embedded_empty_prompt(where: str | Path) -> torch.Tensor:
 
 
 def trained_prediction(where: str | Path) -> Any:
-    """What the U-Net of a folder or hub id was trained to predict; None without a scheduler that says so."""
+    """The prediction that the U-Net of a folder or hub id was trained for; None without a scheduler that says so."""
     scheduler = optional_package("diffusers", "generator").DPMSolverMultistepScheduler
     try:
         return scheduler.load_config(where, subfolder="scheduler").get("prediction_type", "epsilon")

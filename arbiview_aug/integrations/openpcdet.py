@@ -163,7 +163,7 @@ class RigRetargetDataDict:
         return out | {key: value.astype(out[key].dtype) for key, value in matrices.items() if key in out}
 
     def _labels(self, data_dict: Mapping[str, Any]) -> DataDict:
-        """What the step reads besides cameras: the points, the boxes, and the name of the drive."""
+        """All that the step reads besides cameras: the points, the boxes, and the name of the drive."""
         named = {key: value for key, value in data_dict.items() if key == self.step.sequence_key}
         return {**named, "points": data_dict["points"], "gt_bboxes_3d": data_dict.get("gt_boxes")}
 

@@ -389,7 +389,7 @@ class ViewPlanner:
         if not self.config.layers or sum(won_px.values()) == winner.size:
             return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
         layers = ((winner < 0) & (in_image > 0)).view(np.uint8) if hides else np.zeros(size, np.uint8)
-        # What is asked for, if a source needed it: else the scene may not have it.
+        # The asked geometry only if a source needed it: else the scene may not have it.
         name = self.surface if self.surface in self._geometries else self.scene.best
         paint = road = None
         if name != "infinity":

@@ -43,7 +43,7 @@ class JitteredCalibration(torch.nn.Module):
         return f"angle_deg={self.angle_deg:g}, position_m={self.position_m:g}"
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """A new dict with other ``cam2ego``, in ``rig`` too. What followed from the old one is dropped, with a warning.
+        """A new dict with other ``cam2ego``, in ``rig`` too. Keys derived from the old one are dropped, with a warning.
 
         Raises:
             SampleError: A sample that ``RigRetarget`` would not take either.

@@ -42,7 +42,7 @@ LEAST_SCORE = 0.3
 LEAST_APART_M = 2.0
 """Distance of their centres: queries find a vehicle in several cells."""
 _FOUND = (LEAST_SCORE, LEAST_APART_M, "where cells count")
-"""What detections become boxes; part of the names of results."""
+"""Which detections become boxes; part of the names of results."""
 
 
 @dataclass(frozen=True, kw_only=True)

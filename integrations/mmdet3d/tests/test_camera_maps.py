@@ -45,7 +45,7 @@ def detector(monkeypatch):
 
 
 def metas(count, **settings):
-    """Of samples that were retargeted, as the pipeline packs them."""
+    """Maps of retargeted samples, as the pipeline packs them."""
     step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, geometry="street", **settings)
     results = step(FORMS["mmdet3d"](recording(SyntheticDrive(SOURCE, num_frames=1)[0])))
     return [{"lidar2img": results["lidar2img"]} for _ in range(count)]

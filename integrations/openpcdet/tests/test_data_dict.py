@@ -196,7 +196,7 @@ def test_without_labels_and_with_a_drawn_rig(given: Recording) -> None:
 
 
 def test_frames_of_a_drive_share_a_draw(given: Recording) -> None:
-    """Of the rig and of ``p``, with images and without."""
+    """The rig's draw and that of ``p``, with images and without."""
     random = RandomRig(TARGET, height_m=1.0, per="sequence")
     for one, data in ((step(random), kitti(given)), (step(random, lidar2ego=LIDAR2EGO), nuscenes(given))):
         a, again, b = (one(data | {"scene_token": name})["points"] for name in "aab")

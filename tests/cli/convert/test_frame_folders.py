@@ -68,7 +68,7 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
 
 
 def test_missing_returns_are_told_once(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Where the frame is converted; not again by the report, as a warning of Python's."""
+    """They are in the line of the frame, not again in the report as a warning of Python's."""
     shutil.copytree(source / "0001", tmp_path / "0001")
     points = np.load(tmp_path / "0001" / "lidar.npy")
     points[::7, 1] = np.nan
