@@ -72,7 +72,7 @@ for axes, (name, picture) in zip(grid.flat, pictures.items(), strict=True):
 # ## What the sample offers decides
 #
 # `auto`, the default, takes the best geometry that a sample has keys for, for each pair of cameras. `explain` names
-# it. Without boxes and points only the street is left, and a warning says what that does to a detector.
+# it. Without boxes and points only the street is left; a call then warns that this harms a detector.
 
 # %%
 for keys in (("points", "boxes_3d"), ("boxes_3d",), ()):
@@ -91,6 +91,6 @@ for keys in (("points", "boxes_3d"), ("boxes_3d",), ()):
 # | move | images of a drive with poses | the `depth` command, then `motion` |
 # | move | images alone | depth of a network and `learned`, or do not retarget |
 #
-# [When to retarget](../when.md) has what each closes of a detector's gap, and
-# [surfaces and qualities](../surfaces.md) has how each works. Your own drive has no truth to compare with: there,
+# [When to retarget](../when.md) says how much of a detector's gap each closes, and
+# [surfaces and qualities](../surfaces.md) says how each works. Your own drive has no truth to compare with: there,
 # `evaluate --displaced` takes the photographs of the next frame instead.

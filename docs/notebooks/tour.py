@@ -50,7 +50,7 @@ print(check({**sample, "boxes_3d": in_degrees}))
 # ## Explain
 #
 # The target is a rig: a shipped one, a rig file, or a calibration of another tool. `explain` says which camera serves
-# which view, over which geometry, and how much no camera saw.
+# which view, over which geometry, and how much of it no camera saw.
 
 # %%
 target = load_rig("waymo").undistorted()
