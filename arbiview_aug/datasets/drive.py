@@ -72,7 +72,7 @@ class Recording(Dataset[dict[str, Any]]):
 
 @dataclass(frozen=True, kw_only=True)
 class Neighbours:
-    """Selection of neighbours by distance travelled; a standing vehicle has none.
+    """Selection of neighbours by distance travelled; a drive without motion has none.
 
     Attributes:
         count: Maximum number in each direction.
