@@ -172,7 +172,7 @@ def case_of(frames: Frames, index: int, rng: torch.Generator) -> Case:
         raise TrainingError(f"frame {frame.token}: expected LiDAR points, which score real frames, found none")
     for _ in range(_TRIES):
         place = one_of(rng, len(frame.rig))
-        target = replace(retarget(frame.rig[place], rng), mask=None)
+        target = retarget(frame.rig[place], rng)
         if street is not None:
             case = _street_case(street, index, frame, target)
         else:

@@ -54,7 +54,8 @@ def one_of(rng: torch.Generator, count: int) -> int:
 
 
 def retarget(camera: Camera, rng: torch.Generator) -> Camera:
-    """Draw a target camera: turned aside, pitched, or with a wider lens."""
+    """Draw a target camera without a mask: turned aside, pitched, or with a wider lens."""
+    camera = replace(camera, mask=None)
     kind, sign = one_of(rng, 3), 1 if one_of(rng, 2) else -1
     if kind == 0:
         return camera.turned(yaw_deg=sign * uniform(rng, *_YAW_DEG))
@@ -81,8 +82,7 @@ def mask_bank(rig: Rig, count: int, seed: int) -> torch.Tensor:
     while len(masks) < count:
         for _ in range(_TRIES):
             camera = retarget(rig[one_of(rng, len(rig))], rng)
-            target = Rig([replace(camera, mask=None)], ground_z_m=rig.ground_z_m)
-            covered = build_plan(rig, target, geometry="infinity").coverage[0]
+            covered = build_plan(rig, Rig([camera], ground_z_m=rig.ground_z_m), geometry="infinity").coverage[0]
             if _MIN_HOLES <= 1 - covered.mean() <= _MAX_HOLES:
                 break
         else:  # the rig covers everything or almost nothing: a hole at the side
@@ -228,8 +228,8 @@ class PseudoViews(Dataset[Batch]):
         )
 
     def _pair(self, target: Camera, rng: torch.Generator) -> list[Camera]:
-        """Draw a pseudo pose to the left and one to the right of a camera."""
-        config = self.config
+        """Draw a pseudo pose to the left and one to the right of a camera, without masks."""
+        config, target = self.config, replace(target, mask=None)
         is_moved = uniform(rng, 0, 1) < config.p_translate
         cameras = []
         for name, side in (("left", 1), ("right", -1)):
@@ -239,5 +239,5 @@ class PseudoViews(Dataset[Batch]):
             if is_moved:
                 x_m, y_m = (-abs(aside) * side * target.cam2ego[:2, 0]).tolist()  # to the pose's own side
                 camera = camera.shifted(x_m, y_m, up)
-            cameras.append(replace(camera, name=name, mask=None))
+            cameras.append(replace(camera, name=name))
         return cameras
