@@ -166,7 +166,9 @@ def write_new(path: Path, content: bytes) -> None:
                 os.link(part, path)
             except FileExistsError:
                 pass
-            except OSError:
+            except OSError as error:
+                if error.errno not in _NO_LINKS:
+                    raise
                 os.replace(part, path)
     finally:
         with suppress(OSError):

@@ -6,6 +6,7 @@ names stand behind the errors that they raise, and are those of the CHANGELOG.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any, Literal
@@ -137,9 +138,14 @@ def is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
+def is_whole(value: Any, low: float = -math.inf, high: float = math.inf) -> bool:
+    """Whether it is a whole number within bounds, and not a bool."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and low <= int(value) <= high
+
+
 def checked_stride(name: str, value: Any) -> int:
     """A whole number of pixels from 1; ValueError for anything else."""
-    if not isinstance(value, Integral) or isinstance(value, bool) or value < 1:
+    if not is_whole(value, 1):
         raise ValueError(f"{name}: expected a number of pixels from 1, got {value!r}")
     return int(value)
 

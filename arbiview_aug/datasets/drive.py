@@ -19,7 +19,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import Reduce, is_number
+from arbiview_aug.choices import Reduce, is_number, is_whole
 from arbiview_aug.datasets.image_io import check_reduce
 from arbiview_aug.errors import ArbiviewError, DataError, warn
 from arbiview_aug.sample.neighbours import STILL_M
@@ -88,7 +88,7 @@ class Neighbours:
     direction: Direction = "both"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.count, int | np.integer) or isinstance(self.count, bool) or self.count < 1:
+        if not is_whole(self.count, 1):
             raise ValueError(f"neighbours: count: expected a whole number from 1, got {self.count!r}")
         if not is_number(self.step_m) or not 0 < self.step_m < float("inf"):
             raise ValueError(f"neighbours: step_m: expected metres above 0, got {self.step_m!r}")

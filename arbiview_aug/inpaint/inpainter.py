@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from arbiview_aug.choices import is_number
+from arbiview_aug.choices import is_number, is_whole
 from arbiview_aug.errors import GeneratorError, SampleError
 from arbiview_aug.render.rendered import MAP_KEYS, LabelFill, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
@@ -242,15 +242,15 @@ def checked_settings(
     min_confidence: float, seed: int = 0, steps: int | None = None, guidance: float | None = None
 ) -> tuple[float, int]:
     """Check settings of an inpainter; ValueError for impossible ones."""
-    if steps is not None and (not isinstance(steps, int) or isinstance(steps, bool) or steps < 1):
+    if steps is not None and not is_whole(steps, 1):
         raise ValueError(f"steps: expected a whole number from 1, got {steps!r}")
     if guidance is not None and not is_number(guidance):
         raise ValueError(f"guidance: expected a number, got {guidance!r}")
     if not is_number(min_confidence) or not 0 <= min_confidence <= 1:
         raise ValueError(f"min_confidence: expected a number from 0 to 1, got {min_confidence!r}")
-    if not isinstance(seed, int) or isinstance(seed, bool):
+    if not is_whole(seed):
         raise ValueError(f"seed: expected a whole number, got {seed!r}")
-    return float(min_confidence), seed
+    return float(min_confidence), int(seed)
 
 
 def check_device(network: Any) -> None:

@@ -279,8 +279,8 @@ def converted(settings: Settings) -> Method:
         settings.quality, "auto" if GEOMETRIES[settings.geometry].needs in ("points", *FOLDERS) else settings.geometry
     )
     manifest, target = Manifest(settings.output), settings.sized_target
-    kind = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
-    kind = "nuscenes" if settings.version else kind  # its tables may have any name
+    kept = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
+    kind = "nuscenes" if settings.version else kept  # its tables may have any name
     written = open_data(settings.output, kind=kind, version=settings.version)
     written.load_points = False  # they may be links that leave the output
 

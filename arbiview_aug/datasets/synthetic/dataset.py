@@ -14,6 +14,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import is_whole
 from arbiview_aug.datasets.drive import LazyFrame, Neighbours, camera_fields, check_neighbours, checked_index
 from arbiview_aug.datasets.synthetic.render import Renderer
 from arbiview_aug.datasets.synthetic.scanning import ScanErrors, scan_scene
@@ -206,7 +207,7 @@ def _checked_rig(rig: Any) -> Rig:
 
 
 def _checked_count(name: str, value: Any, low: int, high: int) -> int:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or not low <= value <= high:
+    if not is_whole(value, low, high):
         raise ValueError(f"SyntheticDrive {name}: expected a whole number from {low} to {high}, got {value!r}")
     return int(value)
 

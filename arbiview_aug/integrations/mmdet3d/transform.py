@@ -71,11 +71,9 @@ class RigRetargetMultiView:
         if self._refuses_lenses:
             check_no_lenses([camera.lens for camera in rig])
         self.names = rig.names
-        self.lidar2ego, self.ground_z_m, self.img_norm = (
-            lidar2ego,
-            float(ground_z_m),
-            checked_norm("img_norm", img_norm),
-        )
+        self.lidar2ego = lidar2ego
+        self.ground_z_m = float(ground_z_m)
+        self.img_norm = checked_norm("img_norm", img_norm)
         by_target = held.sequence_key if isinstance(held, RandomRig) and held.per == "sequence" else None
         self.sequence_key = sequence_key or by_target
         self._epochs = held if isinstance(held, RandomRig) else Epochs()
