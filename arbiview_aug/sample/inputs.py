@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise, zip_longest
@@ -397,17 +398,20 @@ def as_array(key: str, value: Any) -> Points:
         raise SampleTypeError(f"{key}: expected a tensor of numbers, got {got}") from None
 
 
-PROJECTION_KEYS = ("lidar2img", "ego2img", "projection_mat", "camera_maps")
+PROJECTION_KEYS = (
+    *("lidar2img", "lidar2image", "ego2img", "global2img", "world2img", "camera_maps"),
+    *("projection", "projection_mat", "projection_matrix", "proj_mat", "P", "P2"),
+)
 """Keys that are functions of intrinsics and poses."""
 
 PIXEL_BOUND_KEYS = (
-    "boxes_2d",
-    "labels_2d",
+    *("boxes_2d", "boxes2d", "bboxes_2d", "bboxes2d", "gt_boxes_2d", "gt_bboxes_2d", "gt_bboxes"),
+    *("labels_2d", "labels2d", "centers_2d", "centers2d"),
     "detections",
-    "centers_2d",
     "depths",
     "depth",
     "depth_m",
+    "gt_depth",
     "keypoints_2d",
     "source_camera",
     "source_frame",
@@ -415,15 +419,39 @@ PIXEL_BOUND_KEYS = (
     "generated",
     "sources",
     "camera_maps_coverage",
+    *("img_metas", "img_aug_matrix", "post_rots", "post_trans"),
     *USUAL_NAMES["K"],
     *PROJECTION_KEYS,
 )
 """Keys bound to the source's pixels; they are dropped, as they would be stale in the target's views."""
 
-POSE_KEYS = (*USUAL_NAMES["cam2ego"], "lidar2cam")  # of the source's cameras: stale, too
+POSE_KEYS = (
+    *USUAL_NAMES["cam2ego"],
+    *("ego2cam", "lidar2cam", "lidar2camera", "cam2lidar", "camera2lidar"),
+    *("cam2global", "global2cam", "cam2world", "world2cam"),
+)
+CAMERA_KEYS = (
+    *POSE_KEYS,
+    *("distortions", "dist_coeffs", "distortion_coeffs", "distortion_coefficients", "img_filename"),
+)
+"""Keys that speak of the source's cameras; they would be stale, too."""
 
 EGO_KEYS = ("points", "boxes_3d", "ego2world")  # they pass, or move with ``SampleKeys(frame="target")``
 _MAX_ENTRIES = 64  # checked per list: longer lists are tokens or numbers
+
+_CAMERA_VALUE = re.compile(r"(.*_)?(depths?|disparity|flow|normals?)(_?(gt|m|maps?))*", re.IGNORECASE)
+_DEPENDS = "depth, disparity, flow and normals have other values in other cameras"
+_DEPTH = "depth_maps(points, views) makes depth maps of the views (docs/lidar.md)"
+_OTHER_FRAMES = (
+    "frames of other times belong into 'neighbours' or samples of their own (docs/formats.md, Several frames)"
+)
+
+
+def refuse_camera_values(labels: Sequence[Any]) -> None:
+    """SampleError for keys of label maps whose values depend on the camera, by their names."""
+    if named := [str(key) for key in labels if _CAMERA_VALUE.fullmatch(str(key))]:
+        fix = f"drop the key, or name it in SampleKeys(keep=...); {_DEPTH}"
+        raise SampleError(f"labels: expected keys of label maps, got {', '.join(named)}: {_DEPENDS}; {fix}")
 
 
 def check_other_keys(
@@ -458,11 +486,27 @@ def check_other_keys(
             except (AttributeError, TypeError, RuntimeError):  # RuntimeError: nested tensors
                 continue
             if any(pair in sizes for pair in pairwise(shape)):
-                raise SampleError(
-                    f"{key}: shape {shape} looks like a map over the source's pixels and would be stale; name it in "
-                    f"SampleKeys(labels=({key!r},)) to render it, or in SampleKeys(keep=({key!r},)) to keep it as it is"
-                )
+                raise SampleError(f"{key}: shape {shape} looks like {_stale_map(key, value, leaf, sample['images'])}")
     return labels
+
+
+def _stale_map(key: Any, value: Any, leaf: Any, images: Any) -> str:
+    """Say what a leaf of an entry is, which has the images' height and width, and what to do with it."""
+    shape = tuple(leaf.shape)
+    image = images[0] if isinstance(images, list | tuple) else images
+    is_nested = leaf is not value and not (isinstance(value, list | tuple) and any(leaf is one for one in value))
+    has_colours = shape[-3:-2] == (3,) and (len(shape) > 3 or leaf is not value)  # not the maps of three cameras
+    if has_colours and str(getattr(leaf, "dtype", "")).removeprefix("torch.") == str(image.dtype)[len("torch.") :]:
+        label = "" if is_nested else f"; if they are label maps, name them in SampleKeys(labels=({key!r},))"
+        return f"images of the source's cameras and would be stale; {_OTHER_FRAMES}; otherwise drop the key{label}"
+    keep = f"SampleKeys(keep=({key!r},)) to keep it as it is"
+    stale = "a map over the source's pixels and would be stale"
+    if _CAMERA_VALUE.fullmatch(str(key)):
+        return f"{stale}; {_DEPENDS}: drop the key, or name it in {keep}; {_DEPTH}"
+    if is_nested:
+        label = "a label map needs a key of its own, named in SampleKeys(labels=...)"
+        return f"{stale}; {label}; {_OTHER_FRAMES}; otherwise drop the key, or name it in {keep}"
+    return f"{stale}; name it in SampleKeys(labels=({key!r},)) to render it, or in {keep}"
 
 
 def _tv_tensor(value: Any) -> str:

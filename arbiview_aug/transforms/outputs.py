@@ -17,7 +17,7 @@ from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, is_readable, lens_names, like, rewrapped, split, stacked
-from arbiview_aug.sample.inputs import CALIBRATION_KEYS, PIXEL_BOUND_KEYS, POSE_KEYS, Frame
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, CAMERA_KEYS, PIXEL_BOUND_KEYS, Frame
 from arbiview_aug.transforms.camera_maps import CameraMaps
 from arbiview_aug.transforms.scans import RetargetedPoints, entries_of
 from arbiview_aug.transforms.settings import SampleKeys
@@ -77,7 +77,7 @@ class SampleWriter:
     def _passed_on(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
         """The entries that do not depend on the images, as the same objects."""
         named = (*labels, *self.keys.keep)
-        bound = (*PIXEL_BOUND_KEYS, *POSE_KEYS)
+        bound = (*PIXEL_BOUND_KEYS, *CAMERA_KEYS)
         stale = [key for key in sample if key in bound and key not in named]
         # The coverage of an earlier retargeting already masks what it generated.
         dropped = [key for key in stale if key not in (*self.keys.extra, "generated", "depth_m")]
@@ -173,7 +173,8 @@ def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
     else:
         is_held = is_held and fill == int(fill)
     if not is_held:
-        raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {fill!r}")
+        fix = "give SampleKeys another ignore_index, or the map another type"
+        raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {fill!r}; {fix}")
     return fill
 
 

@@ -41,6 +41,7 @@ from arbiview_aug.sample.inputs import (
     check_other_keys,
     read_frames,
     read_scene,
+    refuse_camera_values,
     warn_of_cameras,
     warn_of_misnamed,
 )
@@ -144,6 +145,7 @@ class RigRetarget(torch.nn.Module):
         self.fit, self.p = choice("fit", fit, get_args(Fit)), checked_p(p, size)
         self.size = None if size is None else checked_pixels(size)
         self.keys, self.cache = checked_instance("keys", keys, SampleKeys), checked_instance("cache", cache, PlanCache)
+        refuse_camera_values(self.keys.labels)
         self.inpainter = inpainter_of(holes)  # moves with this module
         self.config = self._checked_config(render_config(quality))
         self.harmoniser = Harmoniser(False if self._is_paper and match_exposure is True else match_exposure)
@@ -276,7 +278,9 @@ class RigRetarget(torch.nn.Module):
             warn_of_misnamed(sample, calibrated, not reads_ego_frame, named, self._warn)
             warn_of_cameras(frames, self._warn)
             self._checked.add(types)
-        return check_other_keys(sample, list(sizes), self.keys.labels, self.keys.keep)
+        labels = check_other_keys(sample, list(sizes), self.keys.labels, self.keys.keep)
+        refuse_camera_values(labels)  # masks of torchvision, too
+        return labels
 
     # --- stages -------------------------------------------------------------------------------------------------------
     def plan_frame(self, frame: Frame, target: Rig) -> FramePlan:

@@ -27,6 +27,7 @@ class SampleKeys:
 
     Attributes:
         labels: Keys of label maps (..., N, H, W), or lists of them, to render besides ``tv_tensors.Mask``.
+            ``RigRetarget`` refuses names of depth, disparity, flow and normals, which depend on the camera.
         ignore_index: Value of label pixels that no source sees (False for bool maps).
         keep: Keys to keep although they look bound to the source's pixels; those that the output has anew are replaced.
         extra: Further maps (..., M, h, w) of the output: ``source_camera`` int8, -1 where uncovered; ``source_frame``

@@ -233,8 +233,8 @@ def test_pixel_bound_keys_are_dropped_with_one_warning() -> None:
 
 def test_pixel_bound_keys_can_be_kept_or_rendered() -> None:
     source = ring()
-    sample = sample_of(source, boxes_2d=torch.rand(3, 4), depth=torch.rand(4, *SIZE))
-    out = RigRetarget(source, keys=SampleKeys(keep=["boxes_2d"], labels=["depth"], ignore_index=0))(sample)
+    sample = sample_of(source, boxes_2d=torch.rand(3, 4), confidence=torch.rand(4, *SIZE))
+    out = RigRetarget(source, keys=SampleKeys(keep=["boxes_2d"], labels=["confidence"], ignore_index=0))(sample)
     assert out["boxes_2d"] is sample["boxes_2d"]
     used = {"neighbours": [], "motion_depth_words": "none", "coverage": torch.ones((4, *SIZE)) > 0}
     kept = RigRetarget(source.turned(yaw_deg=5), keys=SampleKeys(keep=tuple(used)))(sample_of(source, **used))
@@ -245,17 +245,98 @@ def test_pixel_bound_keys_can_be_kept_or_rendered() -> None:
     with pytest.raises(ValueError, match=r"SampleKeys.keep: expected no calibration of the source's, got lens, rig"):
         SampleKeys(keep=("rig", "lens"))
     inner = (slice(None), slice(2, -2), slice(2, -2))
-    assert torch.equal(out["depth"][inner], sample["depth"][inner])
+    assert torch.equal(out["confidence"][inner], sample["confidence"][inner])
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        *("ego2cam", "cam2global", "cam2lidar", "world2cam", "P", "P2", "proj_mat", "projection", "projection_matrix"),
+        *("dist_coeffs", "distortions", "post_rots", "post_trans", "img_aug_matrix", "img_metas", "img_filename"),
+        *("gt_depth", "gt_bboxes", "gt_bboxes_2d", "bboxes2d", "boxes2d", "centers2d", "labels2d"),
+    ],
+)
+def test_other_names_of_stale_keys_are_dropped(key: str) -> None:
+    sample = sample_of(ring(), **{key: [1]}, D=[1], uv=[1], lidar2ego=[1], cam_names=["a"])
+    with pytest.warns(UserWarning, match=f"drops {key}: they speak of the source's pixels or cameras"):
+        out = RigRetarget(ring().turned(yaw_deg=3), source=ring())(sample)
+    assert {"D", "uv", "lidar2ego", "cam_names"} <= out.keys() and key not in out
+    keep = SampleKeys(keep=[key])
+    assert RigRetarget(ring().turned(yaw_deg=3), source=ring(), keys=keep)(sample)[key] is sample[key]
+
+
+OF_A_CAMERA = (
+    "depth",
+    "depth_m",
+    "gt_depth",
+    "depth_map",
+    "Depth_GT",
+    "depthmap",
+    "disparity",
+    "optical_flow",
+    "normals",
+)
+
+
+@pytest.mark.parametrize("key", OF_A_CAMERA)
+def test_values_that_depend_on_the_camera_are_no_label_maps(key: str) -> None:
+    refused = (
+        rf"labels: expected keys of label maps, got {key}: depth, .* other cameras; drop .* depth_maps\(points, views"
+    )
+    with pytest.raises(SampleError, match=refused):
+        RigRetarget(ring(), keys=SampleKeys(labels=("seg", key)))
+
+
+@pytest.mark.parametrize("key", ["depth_mask", "flow_valid", "depth_bins", "overflow", "normal_vehicles"])
+def test_label_maps_beside_depth_are_rendered(key: str) -> None:
+    sample = sample_of(ring(), **{key: torch.ones((4, *SIZE), dtype=torch.uint8)})
+    assert key in RigRetarget(ring(), keys=SampleKeys(labels=(key,)))(sample)
+
+
+def test_masks_whose_values_depend_on_the_camera_are_refused() -> None:
+    tv_tensors = pytest.importorskip("torchvision.tv_tensors")
+    sample = sample_of(ring(), gt_flow=tv_tensors.Mask(torch.zeros(4, *SIZE)))
+    with pytest.raises(SampleError, match="labels: expected keys of label maps, got gt_flow"):
+        RigRetarget(ring())(sample)
+    assert RigRetarget(ring(), keys=SampleKeys(keep=("gt_flow",)))(sample)["gt_flow"] is sample["gt_flow"]
 
 
 @pytest.mark.parametrize("shape", [SIZE, (4, *SIZE), (4, 2, *SIZE), (4, *SIZE, 2)])
 @pytest.mark.parametrize("nested", [False, True])
 def test_a_map_over_the_sources_pixels_is_refused(shape: tuple[int, ...], nested: bool) -> None:
-    value: Any = [{"flow": torch.zeros(shape)}] if nested else np.zeros(shape)
-    sample = sample_of(ring(), flow=value)
-    with pytest.raises(SampleError, match=r"flow: shape .* be stale; name it in SampleKeys\(labels=\('flow',\)\)"):
+    value: Any = [{"parts": torch.zeros(shape)}] if nested else np.zeros(shape)
+    sample = sample_of(ring(), parts=value)
+    fix = "a label map needs a key of its own" if nested else r"name it in SampleKeys\(labels=\('parts',\)\)"
+    with pytest.raises(SampleError, match=rf"parts: shape .* be stale; {fix}.* SampleKeys\(keep=\('parts',\)\)"):
         RigRetarget(ring())(sample)
-    assert RigRetarget(ring(), keys=SampleKeys(keep=["flow"]))(sample)["flow"] is value
+    assert RigRetarget(ring(), keys=SampleKeys(keep=["parts"]))(sample)["parts"] is value
+    flow = (
+        r"flow: shape .* be stale; depth, .* other cameras: drop the key, or name it in SampleKeys\(keep=\('flow',\)\)"
+    )
+    with pytest.raises(SampleError, match=flow):
+        RigRetarget(ring())(sample_of(ring(), flow=value))
+
+
+@pytest.mark.parametrize("key", ["sweeps", "cams", "sweep_arrays", "previous", "previous_list"])
+def test_images_of_other_frames_belong_elsewhere(key: str) -> None:
+    sample = sample_of(ring())
+    images = sample["images"]
+    sample[key] = {
+        "sweeps": [{"images": images}],
+        "cams": {"front": {"img": images[0]}},
+        "sweep_arrays": [{"images": images.numpy()}],
+        "previous": images,
+        "previous_list": list(images),
+    }[key]
+    with pytest.raises(
+        SampleError, match=f"{key}: shape .* images of .*'neighbours'.*Several frames.* drop the key"
+    ) as e:
+        RigRetarget(ring())(sample)
+    assert ("SampleKeys(labels=" in str(e.value)) == key.startswith("previous")
+    three = ring().with_cameras(list(ring())[:3])  # (3, H, W) are the maps of three cameras
+    labels = torch.zeros((3, *SIZE), dtype=images.dtype)
+    with pytest.raises(SampleError, match=r"seg: shape .* a map .*; name it in SampleKeys\(labels=\('seg',\)\)"):
+        RigRetarget(three)({"images": images[:3], "rig": three, "seg": labels})
 
 
 def test_bounding_boxes_are_refused() -> None:
@@ -304,7 +385,9 @@ def test_label_maps_that_do_not_fit() -> None:
         labels(torch.zeros((3, *SIZE)))
     with pytest.raises(SampleError, match=r"classes: camera 'camera 0': expected a map of \(h, w\) = \(36, 64\), got"):
         labels(torch.zeros((4, 64, 36)))
-    with pytest.raises(SampleError, match=r"classes: SampleKeys.ignore_index: expected a value of torch.int8, got 255"):
+    with pytest.raises(
+        SampleError, match=r"classes: SampleKeys.ignore_index: expected a value of torch.int8, got 255; give"
+    ):
         labels(torch.zeros((4, *SIZE), dtype=torch.int8))
     with pytest.raises(SampleError, match=r"classes: SampleKeys.ignore_index: expected .* torch.int32, got nan"):
         labels(torch.zeros((4, *SIZE), dtype=torch.int32), ignore_index=float("nan"))
