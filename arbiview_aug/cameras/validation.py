@@ -25,6 +25,8 @@ MOST_M = 1e9  # of positions, as far
 
 _FARTHEST_M, _MOST_HEIGHT_M = 20.0, 8.0  # of a vehicle's cameras, from the ego origin and over the road
 
+BODY_AXES = "a body's axes (ROS: x forward, z up)"  # words of messages
+
 MAX_SIZE_PX = 32766
 """Largest image side: OpenCV's remap needs sizes below 32767."""
 
@@ -221,7 +223,7 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
     for right, mistake, fix in (
         (metres, "positions in millimetres", "divide cam2ego[:3, 3] by 1000"),
         (np.asarray(np.linalg.inv(cam2ego), np.float64), "ego2cam, the inverse", "pass np.linalg.inv(cam2ego)"),
-        (cam2ego @ body, "a body's axes (ROS: x forward, z up)", f"multiply cam2ego[:3, :3] {axes} right"),
+        (cam2ego @ body, BODY_AXES, f"multiply cam2ego[:3, :3] {axes} right"),
         (body @ cam2ego, "an ego frame with a camera's axes (z forward)", f"multiply cam2ego[:3] {axes} left"),
         (cam2ego @ upside_down, "OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]"),
     ):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
 import sys
 import tempfile
@@ -67,6 +68,16 @@ def data(text: str) -> str:
         others = " or ".join(f"{other}:{text}" for other in kinds[1:])
         print(f"{text}: taken as a {READERS[kinds[0]].description}; otherwise: {others}", file=sys.stderr)
     return text
+
+
+def is_rig(text: str) -> bool:
+    """Whether an argument names no data but a rig: what is no folder, or another tool's calibration."""
+    kind, root = split_kind(text)
+    if kind is not None or not os.path.isdir(root):
+        return kind is None
+    from arbiview_aug.cameras.formats.calibration import recognised
+
+    return not kinds_of(root) and recognised(root) is not None
 
 
 def kinds_text() -> str:

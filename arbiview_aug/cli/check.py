@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ import numpy as np
 
 from arbiview_aug.atomic_io import file_name
 from arbiview_aug.cameras.rig import load_rig
-from arbiview_aug.cli.arguments import data, gathered_warnings, writable_folder
-from arbiview_aug.datasets.registry import open_data, split_kind
+from arbiview_aug.cli.arguments import data, gathered_warnings, is_rig, writable_folder
+from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.report.pictures import draw_labels, save_picture
 from arbiview_aug.sample.mistakes import CheckReport, check, check_rig
@@ -21,8 +20,7 @@ from arbiview_aug.sample.mistakes import CheckReport, check, check_rig
 
 def run(arguments: argparse.Namespace) -> int:
     """Print one line for each finding, and draw the first frame; 1 if there are findings."""
-    kind, path = split_kind(arguments.data)
-    if kind is None and not os.path.isdir(path):
+    if is_rig(arguments.data):
         report = CheckReport(tuple(check_rig(load_rig(arguments.data))))
         print(report)
         return int(not report.ok)

@@ -23,12 +23,13 @@ from arbiview_aug.cli.arguments import (
     command_parser,
     count,
     data,
+    is_rig,
     kinds_text,
     positive,
     seed,
     size,
 )
-from arbiview_aug.datasets.registry import READERS, split_kind
+from arbiview_aug.datasets.registry import READERS
 
 SIZE, FULL_SIZE = (256, 704), (900, 1600)
 """Sizes (h, w) of the views that benchmarks render."""
@@ -49,7 +50,7 @@ def check() -> argparse.ArgumentParser:
         "K of another resolution, specks in masks, keys that are not read. Draws boxes and points into the images.",
         "/data/frames --frames 5",
     )
-    text = f"real frames, by their path alone or with their kind, or a rig file. {kinds_text()}"
+    text = f"real frames, by their path alone or with their kind; a rig file or a calibration. {kinds_text()}"
     parser.add_argument("data", metavar="[KIND:]PATH", help=text)
     parser.add_argument("--frames", type=count, default=3, metavar="N", help="number of frames, spread over the data")
     add_reading(parser)
@@ -338,9 +339,9 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
     if name == "train":
         others = ("views", "seeds", "steps") if arguments.command == "train" else ("weights", "vgg_weights")
         refuse(others, f"{arguments.command} reads none")
-    if name == "check" and split_kind(arguments.data)[0] is None:
-        if arguments.data in shipped_rigs() or os.path.isfile(arguments.data):
-            refuse(("frames", "reduce", "clean_masks"), "expected frames with it, got a rig file")
+    if name == "check" and is_rig(arguments.data):
+        if arguments.data in shipped_rigs() or os.path.exists(arguments.data):
+            refuse(("frames", "reduce", "clean_masks"), "expected frames with it, got a rig")
     if name == "convert" and arguments.size is None:
         refuse(("fit",), "expected --size with it, found none")
     if name in ("convert", "evaluate") and "diffusion" not in arguments.holes:

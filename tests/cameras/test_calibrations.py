@@ -177,9 +177,50 @@ def test_ros_has_one_ego_frame(tmp_path: Path) -> None:
     for ends in (("base_footprint", "base_link", 0.3), ("base_link", "base_footprint", -0.3)):
         rig = load_rig(written(tmp_path, tf_static__yaml=of_foot + link.format(*ends)))
         np.testing.assert_allclose(rig.cam2ego, expected.cam2ego, atol=1e-12)
+        assert rig.ground_z_m == -0.3  # at base_footprint
+        assert load_rig(tmp_path / "front.yaml").ground_z_m == -0.3
+    assert load_rig(written(tmp_path, mounting__yaml="ground_z_m: 0.1")).ground_z_m == 0.1  # the user's word counts
+    (tmp_path / "mounting.yaml").unlink()
     assert load_rig(written(tmp_path, tf_static__yaml=TF_STATIC.replace("base_link", "base_footprint"))) == expected
+    map_above = TF_STATIC + link.format("map", "base_footprint", 7) + link.format("base_footprint", "base_link", 0.3)
+    rig = load_rig(written(tmp_path, tf_static__yaml=map_above))
+    assert rig.ground_z_m == -0.3 and np.allclose(rig.cam2ego, expected.cam2ego)
     with pytest.raises(CalibrationError, match=r"camera 'left': where is it on the vehicle"):
         load_rig(written(tmp_path, tf_static__yaml=of_foot))
+
+
+def test_ros_frames_with_a_bodys_axes_are_refused(tmp_path: Path) -> None:
+    """A camera that looks up or down in earnest is not."""
+    of_link = CAMERA_INFO_MESSAGE.replace("front_optical_frame", "front_link")
+    written(tmp_path, front__yaml=of_link, tf_static__yaml=TF_STATIC)
+    message = (
+        r"camera 'front': expected an optical frame .*, got front_link, which seems to have a body's axes .* up by "
+    )
+    message += (
+        r"90 degrees; write frame_id: front_optical_frame to front.yaml, and add that frame, .*tf_static.yaml below"
+    )
+    with pytest.raises(CalibrationError, match=message):
+        load_rig(tmp_path)
+    bare = TF_STATIC.replace("child_frame_id: front_link", "child_frame_id: front").replace("_optical_frame", "_lens")
+    written(tmp_path, front__yaml=CAMERA_INFO, tf_static__yaml=bare)
+    with pytest.raises(
+        CalibrationError, match=r"got front, .*; add a frame front_optical_frame to tf_static.yaml below"
+    ):
+        load_rig(tmp_path)
+    written(tmp_path, mounting__yaml=f"poses: {{front: {ROWS}}}")  # the user's word counts
+    assert np.array_equal(load_rig(tmp_path)[0].cam2ego, FORWARD)
+    (tmp_path / "mounting.yaml").unlink()
+    half = 2**-0.5
+    for frame, elevation_deg, (x, w) in (
+        ("front_optical_frame", 90, (0.0, 1.0)),
+        ("front_link", 45, (-np.sin(np.pi / 8), np.cos(np.pi / 8))),
+        ("front_link", 0, (-half, half)),
+        ("front_link", -90, (1.0, 0.0)),
+    ):
+        pose = f"{{translation: {{x: 1, y: 0, z: 2}}, rotation: {{x: {x}, y: 0, z: 0, w: {w}}}}}"
+        tf = f"transforms:\n- header: {{frame_id: base_link}}\n  child_frame_id: {frame}\n  transform: {pose}\n"
+        written(tmp_path, front__yaml=of_link.replace("front_link", frame), tf_static__yaml=tf)
+        assert load_rig(tmp_path)[0].elevation_deg == pytest.approx(elevation_deg, abs=1e-5)
 
 
 def test_ros_questions(tmp_path: Path) -> None:
@@ -214,6 +255,14 @@ def test_ros_questions(tmp_path: Path) -> None:
         ("poses: !!python/name:os.system ''", "mounting.yaml: expected plain YAML"),
         (f"poses: {{front: {ROWS}, frnt: {ROWS}}}", "poses: expected cameras of front, got frnt: rename or remove it"),
         (f"poses: {{front: {ROWS}}}\nnames: {{0: left}}", "names: expected cameras of front, got 0: "),
+        (
+            f"poses: {{cam: {ROWS}}}\nnames: {{front: cam}}",
+            "poses: expected .* in the files, got its new one, cam: write fr",
+        ),
+        (
+            "sizes: {cam: {width: 3}}\nnames: {front: cam}",
+            "sizes: expected a camera's name in the files, got its new o",
+        ),
         (f"poses: {{front: {ROWS}}}\nsizes: {{left: {{width: 3}}}}", "sizes: expected cameras of front, got left: "),
         ("tokens: c2", "mounting.yaml: tokens: expected a list, got 'c2'"),
     ],

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from arbiview_aug import save_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli import check as command
 from arbiview_aug.datasets import FrameFolder, open_data
@@ -63,7 +64,7 @@ def test_findings_are_lines_with_their_frames(folder: Path, tmp_path: Path, caps
         assert any(line.startswith(begins) and line.endswith(ends) for line in lines), lines
 
 
-def test_a_rig_file_is_checked_alone(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rig_is_checked_alone(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = FrameFolder(folder)[0]["rig"]
     for poses, status in ((rig.cam2ego, 0), (np.linalg.inv(rig.cam2ego), 1)):
         data = rig.to_dict()
@@ -73,6 +74,13 @@ def test_a_rig_file_is_checked_alone(folder: Path, tmp_path: Path, capsys: pytes
         assert main(["check", str(tmp_path / "rig.json")]) == status
     assert capsys.readouterr().out.splitlines()[0] == "no findings"
     assert main(["check", str(tmp_path / "none.yaml")]) == 2
+    ros = save_rig(rig, tmp_path / "ros", format="ros")
+    assert main(["check", str(ros)]) == 0
+    with pytest.raises(SystemExit):
+        main(["check", str(ros), "--frames", "2"])
+    assert "argument --frames: expected frames with it, got a rig" in capsys.readouterr().err
+    camera_file = next(ros.glob("front*.yaml")).rename(folder / "a" / "front.yaml")  # data are data all the same
+    assert main(["check", str(folder / "a"), "--output", str(tmp_path / "out")]) == 0 and camera_file.exists()
 
 
 def test_a_picture_for_each_camera_and_no_finding_of_libraries(

@@ -165,7 +165,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             for option in ("device nope", "batch 4", "reference road")
         ),
         *(
-            (f"check waymo --{option}", f"argument --{option.split()[0]}: expected frames with it, got a rig file")
+            (f"check waymo --{option}", f"argument --{option.split()[0]}: expected frames with it, got a rig")
             for option in ("frames 5", "downscale 2", "clean-masks")
         ),
         ("convert --data frame --target waymo --output o --fit pad", "argument --fit: expected --size with it"),

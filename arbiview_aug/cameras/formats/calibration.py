@@ -27,6 +27,7 @@ class Format(NamedTuple):
     read: Callable[[Path, Mounting], list[dict[str, Any]]]  # cameras as in a rig file
     ground_z_m: float = 0.0  # road in the ego frame, where mounting.yaml does not say otherwise
     files_of: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None
+    road_z_m: Callable[[Path], float | None] = lambda path: None  # the same, where the files say it
 
 
 FORMATS = {
@@ -59,8 +60,8 @@ FORMATS = {
     "ros": Format(
         "ROS", (),
         "K and D of the raw image, not P; optical frames (x right, y down, z forward) below base_link in "
-        f"{camera_files.TF}, or poses from {MOUNTING}",
-        camera_files.read_camera_files, files_of=camera_files.ros_files,
+        f"{camera_files.TF}, the road at base_footprint if it is there, or poses from {MOUNTING}",
+        camera_files.read_camera_files, files_of=camera_files.ros_files, road_z_m=camera_files.ros_road_z_m,
     ),
     "waymo": Format(
         "Waymo", (),
@@ -105,14 +106,14 @@ def read_calibration(path: Path, where: str) -> Any:
             if folder == path:  # of a file alone it may name the others beside it
                 mounting.check([camera["name"] for camera in cameras])
             cameras = mounting.named(cameras)
+            heights = (mounting.ground_z_m, MOUNTING), (form.road_z_m(path), "the files"), (form.ground_z_m, "")
     except ArbiviewError as error:
         raise type(error)(f"{where}: {form.tool}: {error}") from None
     except _BROKEN as error:  # readers take files apart as their tools write them
         got = one_line(described(error))
         raise CalibrationError(f"{where}: expected a calibration as {form.tool} writes it, got {got}") from None
-    is_known = mounting.ground_z_m is not None
-    ground = mounting.ground_z_m if is_known else form.ground_z_m
-    road = f"road at z = {ground} m, {f'from {MOUNTING}' if is_known else 'assumed'}"
+    ground, source = next((height, source) for height, source in heights if height is not None)
+    road = f"road at z = {ground} m, {f'from {source}' if source else 'assumed'}"
     notes, stem = f"read as {form.tool}: {form.convention}; {road}", folder.name if folder == path else path.stem
     return {"name": stem, "ground_z_m": ground, "notes": notes, "cameras": cameras}
 

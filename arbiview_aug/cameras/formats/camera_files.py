@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -15,10 +16,12 @@ from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting, pose_of
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import MOST_BYTES, file_stem, parse_yaml, refuse_large
 from arbiview_aug.cameras.rotations import quaternion_from_rotation
+from arbiview_aug.cameras.validation import BODY_AXES
 from arbiview_aug.errors import CalibrationError
 
 TF = "tf_static.yaml"
-_EGO_FRAMES = ("base_link", "base_footprint")  # REP 105
+_EGO_FRAMES = ("base_link", "base_footprint")  # REP 105; REP 120: base_footprint is on the floor
+_BODY_UP_DEG = 60.0  # a camera that looks up more steeply is none of a car's: its frame is the body's
 _OPTICAL = ("_optical_frame", "_optical", "")  # suffixes of a camera's frame; REP 103
 
 # sensor_msgs/distortion_models.hpp; camera_calibration writes the first three
@@ -59,9 +62,14 @@ def read_camera_files(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
 
     Sources: camera_calibration_parsers of ROS; the sample calib3d/camera_calibration of OpenCV.
     """
-    files, tf = (camera_files(path), path / TF) if path.is_dir() else ([path], path.parent / TF)
-    frames = _tf_poses(tf) if tf.is_file() else {}
+    files, frames = camera_files(path) if path.is_dir() else [path], _frames(path)
     return [_opencv(file, mounting) if is_file_storage(file) else _ros(file, mounting, frames) for file in files]
+
+
+def ros_road_z_m(path: Path) -> float | None:
+    """Height of the road in the ego frame: that of base_footprint, which stands on it; None if tf has no such frame."""
+    foot = _frames(path).get(_EGO_FRAMES[1])
+    return None if foot is None else round(float(foot[2, 3]), 6) + 0.0  # not -0.0
 
 
 def _ros(path: Path, mounting: Mounting, frames: Mapping[str, FloatArray]) -> dict[str, Any]:
@@ -80,10 +88,23 @@ def _ros(path: Path, mounting: Mounting, frames: Mapping[str, FloatArray]) -> di
     else:
         K, coefficients = (data[key]["data"] for key in ("camera_matrix", "distortion_coefficients"))
         size = data["image_width"], data["image_height"]
-    pose = next((frames[frame] for frame in optical if frame in frames), None)
-    if pose is None or name in mounting.poses:
+    frame = next((frame for frame in optical if frame in frames), None)
+    if frame is None or name in mounting.poses:
         there = f", or a frame {optical[0]} to {TF} as `ros2 topic echo /tf_static` prints it"
         pose = mounting.pose(name, there)
+    else:
+        pose = frames[frame]
+        up_deg = math.degrees(math.atan2(pose[2, 2], math.hypot(*pose[:2, 2])))
+        if up_deg > _BODY_UP_DEG and "optical" not in frame.lower():
+            fix = f"add a frame {optical[0]}"
+            if _MESSAGE in data:
+                instead = f"{frame.removesuffix('_link')}_optical_frame"
+                fix = f"write frame_id: {instead} to {path.name}, and add that frame, if it is not there,"
+            raise CalibrationError(
+                f"camera {name!r}: expected an optical frame (x right, y down, z forward), got {frame}, which seems to "
+                f"have {BODY_AXES}: the camera would look up by {up_deg:.0f} degrees; {fix} to "
+                f"{TF} below {frame}, with rotation {{x: -0.5, y: 0.5, z: -0.5, w: 0.5}}"
+            )
     return camera_entry(name, size, np.reshape(K, (3, 3)), pose, _ROS_LENSES[model], coefficients)
 
 
@@ -92,6 +113,12 @@ def _messages(path: Path) -> list[Any]:
     refuse_large(path, path.name)
     documents = re.split(r"^---\s*$", path.read_text(), flags=re.MULTILINE)
     return [parse_yaml(document) for document in documents if document.strip()]
+
+
+def _frames(path: Path) -> dict[str, FloatArray]:
+    """Poses of the tf beside a file, or in a folder; none without one."""
+    tf = (path if path.is_dir() else path.parent) / TF
+    return _tf_poses(tf) if tf.is_file() else {}
 
 
 def _tf_poses(path: Path) -> dict[str, FloatArray]:
@@ -112,7 +139,7 @@ def _tf_poses(path: Path) -> dict[str, FloatArray]:
     ego = next((frame for frame in _EGO_FRAMES if frame in known), "")
     root, ego2root = climbed(ego, "")
     poses = {}
-    for frame in links:
+    for frame in known & {*links, _EGO_FRAMES[1]}:
         at, pose = climbed(frame, ego)
         if at in (ego, root):
             poses[frame] = pose if at == ego else np.asarray(np.linalg.solve(ego2root, pose), np.float64)

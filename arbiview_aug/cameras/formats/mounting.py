@@ -60,6 +60,12 @@ class Mounting:
             data[key] = {str(name): value for name, value in data[key].items()}
         if not isinstance(data.get("tokens", []), list):
             raise CalibrationError(f"{MOUNTING}: tokens: expected a list, got {shown(data['tokens'])}")
+        names = data.get("names", {})
+        for key in {"poses", "sizes"} & set(data):
+            for old, new in names.items():
+                if new in [*data[key]] and new not in [*names]:
+                    got = f"its new one, {new}: write {old}"
+                    raise CalibrationError(f"{MOUNTING}: {key}: expected a camera's name in the files, got {got}")
         poses = {name: pose_of(name, value) for name, value in data.get("poses", {}).items()}
         scale = data.get("metres_per_unit")
         if scale is not None and not (type(scale) in (int, float) and 0 < scale < math.inf):
