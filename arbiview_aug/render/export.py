@@ -32,7 +32,7 @@ def export_plan(plan: RenderPlan, path: str | Path) -> None:
     and ``holes="black"`` on images alone.
 
     Args:
-        plan: Plan of a fixed pair of rigs, from ``RigRetarget.prepare``; its surface is static, the street with ``auto``.
+        plan: Plan of a fixed pair of rigs, from ``RigRetarget.prepare``; ``auto`` plans the street.
         path: The file; its folder is created.
 
     Raises:
