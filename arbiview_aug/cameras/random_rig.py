@@ -69,7 +69,8 @@ class RandomRig(Epochs):
         focal_scale: Focal lengths scaled about the principal point.
         per: ``sample``: one draw per call, from torch's RNG (seeded per worker and epoch by the DataLoader).
             ``sequence``: one draw per value of ``sequence_key``, equal in all workers. It follows the DataLoader's
-            seed; call ``set_epoch`` before each epoch without workers or with persistent ones.
+            seed. Without workers or with persistent ones, call ``set_epoch`` before each epoch: the wrapped dataset's,
+            ``RigRetarget``'s or this one.
         sequence_key: The sample key that names its sequence.
     """
 
@@ -110,13 +111,17 @@ class RandomRig(Epochs):
         return {name: low + (high - low) * x for (name, (low, high)), x in zip(self.ranges.items(), u, strict=True)}
 
     def draw_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> dict[str, float]:
-        """Parameters for a sample, following ``per``.
+        """Parameters for a sample, following ``per``; raises as ``rng_for``."""
+        return self.draw(self.rng_for(sample, rng))
+
+    def rng_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> torch.Generator | None:
+        """Generator of a sample's draws, following ``per``: ``rng``, or that of its sequence.
 
         Raises:
             SampleError: The sample names no sequence, or is a batch of several.
         """
         if self.per == "sample":
-            return self.draw(rng)
+            return rng
         key = self.sequence_key
         leaves = list(_leaves(sample.get(key)))
         if None in leaves:
@@ -125,7 +130,7 @@ class RandomRig(Epochs):
         names = set(map(str, leaves))
         if len(names) != 1:
             raise SampleError(f"RandomRig(per='sequence'): {key}: expected one sequence a batch, got {len(names)}")
-        return self.draw(sequence_rng(names.pop(), self.epoch, rng))
+        return sequence_rng(names.pop(), self.epoch, rng)
 
     def rig(self, params: Mapping[str, float]) -> Rig:
         """The rig of drawn parameters.

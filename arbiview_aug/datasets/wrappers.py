@@ -37,6 +37,10 @@ class RetargetedDataset(Dataset[Any]):
     def __len__(self) -> int:
         return len(self.dataset)
 
+    def set_epoch(self, epoch: int) -> None:
+        """Hand the epoch to the transform and to the dataset, where they have ``set_epoch``."""
+        _set_epoch(epoch, self.retarget, self.dataset)
+
     def __getitem__(self, index: Any) -> Any:
         return _retargeted(self.retarget, self.dataset[index], index)
 
@@ -54,7 +58,8 @@ class MixedDataset(Dataset[Any]):
     """Random mix of raw and retargeted versions of the same samples.
 
     Item ``i`` is ``retargeted[i]`` with probability ``share``, else ``raw[i]``, drawn from torch's global RNG on each
-    access. Samplers, subsets and the length are those of either dataset.
+    access. Samplers, subsets and the length are those of either dataset. A network that reads several frames of a drive
+    needs one draw for all of them: ``p`` with a ``RandomRig(per="sequence")``.
 
     Unlike with ``RigRetarget(p=...)``, the two may differ in keys and number of cameras. ``default_collate`` cannot
     stack such items: use ``DataLoader(..., batch_size=None)`` for single items, or ``collate_fn=list``.
@@ -85,6 +90,10 @@ class MixedDataset(Dataset[Any]):
 
     def __len__(self) -> int:
         return len(self.raw)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Hand the epoch to both datasets, where they have ``set_epoch``; coins follow torch's RNG alone."""
+        _set_epoch(epoch, self.raw, self.retargeted)
 
     def __getitem__(self, index: Any) -> Any:
         return (self.retargeted if torch.rand(()).item() < self.share else self.raw)[index]
@@ -120,9 +129,20 @@ class RetargetedIterable(IterableDataset[Any]):
     def __len__(self) -> int:
         return len(self.dataset)  # TypeError without one, as of the dataset itself
 
+    def set_epoch(self, epoch: int) -> None:
+        """Hand the epoch to the transform and to the dataset, where they have ``set_epoch``."""
+        _set_epoch(epoch, self.retarget, self.dataset)
+
     def __iter__(self) -> Iterator[Any]:
         for number, sample in enumerate(self.dataset):
             yield _retargeted(self.retarget, sample, number)
+
+
+def _set_epoch(epoch: int, *parts: Any) -> None:
+    """Hand the epoch to those parts that have ``set_epoch``."""
+    for part in parts:
+        if callable(set_epoch := getattr(part, "set_epoch", None)):
+            set_epoch(epoch)
 
 
 def _retargeted(retarget: Retarget, sample: Any, index: Any) -> Any:

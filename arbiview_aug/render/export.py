@@ -29,19 +29,24 @@ def export_plan(plan: RenderPlan, path: str | Path) -> None:
 
     ``.npz``: plain arrays, for ``cv2.remap``. ``.onnx`` (extra ``export``) and ``.pt``, TorchScript: N images (3, H, W)
     uint8 in, M views (3, h, w) uint8 out. To one level they are those of ``RigRetarget`` with ``match_exposure=False``
-    and ``holes="black"``.
+    and ``holes="black"`` on images alone.
 
     Args:
-        plan: Plan of a fixed pair of rigs, from ``RigRetarget.prepare``.
+        plan: Plan of a fixed pair of rigs, from ``RigRetarget.prepare``; ``auto`` plans the street.
         path: The file; its folder is created.
 
     Raises:
-        ValueError: Another ending, no name, or no plan.
+        ValueError: Another ending, no name, no plan, or one of ``quality="accurate"``.
         ImportError: ``.onnx`` without the package onnx.
         OutputError: A file that cannot be written.
     """
     if not isinstance(plan, RenderPlan):
         raise ValueError(f"plan: expected what RigRetarget.prepare returns, got {type(plan).__name__}")
+    if plan.config.overlap_depth:
+        raise ValueError(
+            "plan: expected one that all frames share, got one of quality='accurate', which corrects distances in "
+            "every frame; prepare it with quality='fast'"
+        )
     if not isinstance(path, str | Path):
         raise ValueError(f"path: expected a file's name, got {type(path).__name__}")
     path = Path(path)

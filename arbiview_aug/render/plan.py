@@ -342,6 +342,7 @@ class RenderPlan:
     target: Rig  # in the source's ego frame, on the source's road
     layout: AtlasLayout  # the sources' places in the atlas
     targets: tuple[ViewPlan, ...]  # one plan for each target camera
+    config: RenderConfig  # its settings
     counters: dict[str, int] = field(default_factory=dict)  # pairs by surface, cells, dense pixels, bands
     # The maps as tensors, by device (``torch_backend.maps_on``); not pickled.
     on_devices: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)

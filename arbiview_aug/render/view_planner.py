@@ -659,4 +659,4 @@ def _built(
     # The same places for what is read: images that win no pixel are not copied.
     layout = AtlasLayout(tuple(slot for slot in layout.slots if (slot.source, slot.level) in read))
     counters["bands"] = sum(len(t.bands) for t in targets)
-    return RenderPlan(source, target, layout, targets, dict(counters))
+    return RenderPlan(source, target, layout, targets, config, dict(counters))

@@ -99,13 +99,15 @@ class RigRetarget(torch.nn.Module):
         fit: How target cameras come to ``size``: ``crop`` cuts at the top and the sides, ``pad`` adds bars there,
             ``stretch`` changes the aspect.
         p: Probability of retargeting. A skipped sample keeps its own cameras at ``size``, with full coverage, so
-            ``p < 1`` needs ``size`` and equal camera counts (else see ``MixedDataset``).
+            ``p < 1`` needs ``size`` and equal camera counts (else see ``MixedDataset``). Each call draws anew; calls of
+            one sequence share the draw with a ``RandomRig(per="sequence")``.
         keys: Label maps, further outputs and frames: ``SampleKeys``.
         cache: Limits of the plans kept from call to call.
         backend: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
 
-    Draws come from torch's global generator. A batch shares one draw, which ``retarget_params`` tells.
+    Draws come from torch's global generator; with a ``RandomRig(per="sequence")`` from the sequence's. A batch shares
+    one draw, which ``retarget_params`` tells.
 
     Raises:
         ValueError: Impossible settings.
@@ -241,6 +243,16 @@ class RigRetarget(torch.nn.Module):
             run = torch.compiler.disable(run)
         return run(sample, params)
 
+    def set_epoch(self, epoch: int) -> None:
+        """Hand the epoch to a ``RandomRig``, also in running workers; a fixed target ignores it."""
+        if isinstance(self.target, RandomRig):
+            self.target.set_epoch(epoch)
+
+    def draw(self, rng: torch.Generator | None = None) -> dict[str, float]:
+        """Random ``retarget_params``; from torch's global RNG unless ``rng`` is given."""
+        skipped = {"skipped": float(torch.rand((), generator=rng) >= self.p)} if self.p < 1 else {}
+        return skipped | (self.target.draw(rng) if isinstance(self.target, RandomRig) else {})
+
     def _on_host(self, sample: Mapping[str, Any], params: Mapping[str, float] | None) -> dict[str, Any]:
         # Under another default device, numbers of plans would be made there, or nowhere (meta).
         is_cpu = torch.empty(0).device.type == "cpu"  # get_default_device of torch 2.6 misses contexts
@@ -354,19 +366,21 @@ class RigRetarget(torch.nn.Module):
         self, frames: Sequence[Frame], params: Mapping[str, float] | None
     ) -> tuple[Rig, bool, dict[str, float]]:
         """Draw the target rig and whether to skip; return both, and the parameters that replay them."""
-        checked = None if params is None else checked_params(params)
-        draws: dict[str, float] = {}
-        if self.p < 1:
-            draws["skipped"] = float(torch.rand(()) >= self.p) if checked is None else checked.pop("skipped", 0.0)
+        if params is not None:
+            rest = checked_params(params)
+        elif isinstance(self.target, RandomRig):
+            rest = self.draw(self.target.rng_for(frames[0].sample))
+        else:
+            rest = self.draw()
+        draws = {"skipped": rest.pop("skipped", 0.0)} if self.p < 1 else {}
         if isinstance(self.target, RandomRig):
-            rig_params = self.target.draw_for(frames[0].sample) if checked is None else checked
-            target = self._sized(self.target.rig(rig_params))
-            draws.update(rig_params)
+            target = self._sized(self.target.rig(rest))
+            draws.update(rest)
         else:
             assert self._fixed_target is not None
             target = self._fixed_target
-            if checked:
-                raise SampleError(f"params: expected none for a fixed target rig, got {', '.join(checked)}")
+            if rest:
+                raise SampleError(f"params: expected none for a fixed target rig, got {', '.join(rest)}")
         for frame in frames if self.p < 1 else ():
             if len(frame.rig) != len(target):
                 raise SampleError(

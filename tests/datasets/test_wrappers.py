@@ -103,6 +103,28 @@ def test_errors_name_the_sample(dataset: Any, workers: int) -> None:
         list(DataLoader(wrapper(dataset, refuse_three), num_workers=workers, **more))
 
 
+class Counting(Numbers):
+    """Map-style, with an epoch of its own, as a transform may have one."""
+
+    epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def __call__(self, sample: dict[str, Any]) -> dict[str, Any]:
+        return sample
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return iter([self[0]])
+
+
+def test_epochs_reach_the_transform_and_the_dataset() -> None:
+    raw, dataset, transform, streamed = Counting(), Counting(), Counting(), Counting()
+    MixedDataset(raw, RetargetedDataset(dataset, transform)).set_epoch(3)
+    RetargetedIterable(streamed, add_ten).set_epoch(3)  # a transform without epochs
+    assert raw.epoch == dataset.epoch == transform.epoch == streamed.epoch == 3
+
+
 UNSIZED = type("Unsized", (), {"__getitem__": lambda self, k: k})()
 
 

@@ -116,6 +116,9 @@ def test_what_cannot_be_written_is_named(tmp_path: Path) -> None:
         export_plan(plan, "plan.txt")
     with pytest.raises(ValueError, match=r"plan: expected what RigRetarget\.prepare returns, got RigRetarget"):
         export_plan(RigRetarget("waymo"), "plan.npz")  # type: ignore[arg-type]
+    accurate = RigRetarget(CASES["seams"][1], geometry="street", quality="accurate").prepare(CASES["seams"][0])
+    with pytest.raises(ValueError, match=r"plan: expected one that all frames share, got one of quality='accurate'"):
+        export_plan(accurate, tmp_path / "plan.npz")
     with pytest.raises(ValueError, match=r"path: expected a file's name, got NoneType"):
         export_plan(plan, None)  # type: ignore[arg-type]
     (tmp_path / "file").touch()

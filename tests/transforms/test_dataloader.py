@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, default_collate
 
-from arbiview_aug import RandomRig, RetargetedDataset, RigRetarget, SampleKeys, load_rig
+from arbiview_aug import MixedDataset, RandomRig, RetargetedDataset, RigRetarget, SampleKeys, load_rig
 from arbiview_aug.datasets import FrameFolder, NuScenesDataset
 from tests.helpers import same
 
@@ -78,17 +78,20 @@ def test_draws_differ_between_samples_workers_and_epochs(samples: ModuleType, wo
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_one_draw_a_sequence_in_every_worker(samples: ModuleType, workers: int) -> None:
+@pytest.mark.parametrize("p", [1.0, 0.5])
+def test_one_draw_a_sequence_in_every_worker(samples: ModuleType, workers: int, p: float) -> None:
+    """That of the rig and that of ``p``."""
     random_rig = RandomRig(samples.rig(), yaw_deg=20, per="sequence")
-    watched = samples.Watched(samples.Frames(), RigRetarget(random_rig))
+    watched = samples.Watched(samples.Frames(), RigRetarget(random_rig, p=p, size=samples.SIZE))
     loader = DataLoader(watched, batch_size=1, num_workers=workers)
     epochs = []
     for epoch in range(2):
         random_rig.set_epoch(epoch)
-        values: dict[str, set[float]] = {}
+        values: dict[str, set[tuple[float, ...]]] = {}
         processes: dict[str, set[int]] = {}
         for batch in loader:
-            values.setdefault(batch["scene_token"][0], set()).add(batch["retarget_params"]["yaw_deg"].item())
+            drawn_now = tuple(value.item() for value in batch["retarget_params"].values())
+            values.setdefault(batch["scene_token"][0], set()).add(drawn_now)
             processes.setdefault(batch["scene_token"][0], set()).add(batch["worker"].item())
         assert all(len(drawn) == 1 for drawn in values.values()) and len(values) == 2
         assert all(len(seen) == max(workers, 1) for seen in processes.values())  # both had a part of it
@@ -108,12 +111,22 @@ def test_sequences_draw_anew_with_every_start_of_the_workers(samples: ModuleType
 
 
 def test_set_epoch_reaches_persistent_workers(samples: ModuleType) -> None:
+    """Whoever hands it on; a run that goes on draws as one that was not cut off."""
     random_rig = RandomRig(samples.rig(), yaw_deg=20, per="sequence")
-    dataset = RetargetedDataset(samples.Frames(), RigRetarget(random_rig))
-    loader = DataLoader(dataset, batch_size=samples.PER_SEQUENCE, num_workers=1, persistent_workers=True)
+    retarget = RigRetarget(random_rig)
+    dataset = RetargetedDataset(samples.Frames(), retarget)
+    mixed = MixedDataset(samples.Frames(), dataset, share=1)
+    torch.manual_seed(0)
+    loader = DataLoader(mixed, batch_size=samples.PER_SEQUENCE, num_workers=1, persistent_workers=True)
     first, again = draws(loader), draws(loader)
-    random_rig.set_epoch(1)
-    assert first == again and not set(first) & set(draws(loader))
+    assert first == again
+    epochs = [set(first)]
+    for epoch, holder in enumerate([random_rig, retarget, dataset, mixed], 1):
+        holder.set_epoch(epoch)
+        epochs.append(set(draws(loader)))
+    assert len(set.union(*epochs)) == 2 * len(epochs)
+    torch.manual_seed(0)
+    assert set(draws(DataLoader(mixed, batch_size=samples.PER_SEQUENCE, num_workers=1))) == epochs[-1]
 
 
 # --- threads ----------------------------------------------------------------------------------------------------------

@@ -116,9 +116,7 @@ class RigRetargetMultiView:
 
     def draw(self, frame: Mapping[str, Any]) -> dict[str, float]:
         """``retarget_params`` of a frame; those of all frames of its sequence with ``sequence_key``."""
-        target, p, rng = self.retarget.target, self.retarget.p, self.rng(frame)
-        skipped = {"skipped": float(torch.rand((), generator=rng).item() >= p)} if p < 1 else {}
-        return skipped | (target.draw(rng) if isinstance(target, RandomRig) else {})
+        return self.retarget.draw(self.rng(frame))
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.retarget.extra_repr()})"
