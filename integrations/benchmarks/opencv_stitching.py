@@ -1,8 +1,8 @@
 """OpenCV's own panorama stitching as a baseline: spherical warps, seams, multi-band blending, then views cut out of it.
 
 The calibration gives the rotations, so that registration, which overlaps of some ten degrees leave to chance, is not
-needed: the rest is the pipeline of OpenCV's ``stitching_detailed`` example. Cameras stand in one place (the far
-surface), lenses are pinhole.
+needed: the rest is the pipeline of OpenCV's ``stitching_detailed`` example without exposure compensation. Cameras stand
+in one place (the far surface), lenses are pinhole.
 """
 
 from __future__ import annotations

@@ -28,6 +28,7 @@ QUIET = 1.9  # two processes that only count do this much more than one where no
 QUIET_LOAD = 1.0  # before the measurement, over a minute
 FRAMES, EPOCHS = 48, 3
 SOAKED, WARM_UP = 2000, 200  # frames
+AT = (WARM_UP, SOAKED // 2, SOAKED - 20)  # frames after which memory is read: workers that have no more to do end
 MOST_GROWTH_MIB = 8.0
 
 
@@ -87,9 +88,9 @@ def test_soak(report_bound: Callable[..., None]) -> None:
     before = set(multiprocessing.active_children())
     used_mib: list[list[float]] = []
     for k, _ in enumerate(loader):
-        if k in (WARM_UP, SOAKED // 2, SOAKED - 20):  # workers that have no more to do end
+        if k in AT:
             workers = sorted(child.pid for child in set(multiprocessing.active_children()) - before if child.pid)
             used_mib.append([memory_mib("status", "RssAnon", pid) for pid in workers])
-    print(f"MiB of both workers after {WARM_UP}, {SOAKED // 2} and {SOAKED} frames: {used_mib}")
+    print(f"MiB of both workers after {', '.join(map(str, AT))} frames: {used_mib}")
     growth = max(last - first for first, last in zip(used_mib[0], used_mib[-1], strict=True))
     report_bound("MiB by which a worker grows", growth, at_most=MOST_GROWTH_MIB)

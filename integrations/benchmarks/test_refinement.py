@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import pytest
-import torch
 
 from arbiview_aug import PlanCache
+from arbiview_aug.cli.bench.timing import process_ms
 from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.environment import one_thread
 from arbiview_aug.render.overlap_depth import overlap_depth
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
@@ -25,14 +24,9 @@ CACHED_RATIO = 1.5
 
 
 @pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Also for torch and OpenCV; put back afterwards."""
-    threads = cv2.getNumThreads(), torch.get_num_threads()
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-    yield
-    cv2.setNumThreads(threads[0])
-    torch.set_num_threads(threads[1])
+def on_one_thread() -> Iterator[None]:
+    with one_thread():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -42,12 +36,6 @@ def sample(nuscenes_root: Path) -> dict[str, Any]:
     return sample
 
 
-def cpu_ms(run: Callable[[], Any]) -> float:
-    start = time.thread_time()
-    run()
-    return 1e3 * (time.thread_time() - start)
-
-
 def test_a_frame_is_refined_fast_enough(sample: dict[str, Any], report_bound: Callable[..., None]) -> None:
     """The fastest of three medians: other work on a machine can only make it slower."""
 
@@ -55,7 +43,7 @@ def test_a_frame_is_refined_fast_enough(sample: dict[str, Any], report_bound: Ca
         assert overlap_depth(sample["rig"], sample["images"]).corrections
 
     refine()
-    best = min(statistics.median(cpu_ms(refine) for _ in range(ROUNDS)) for _ in range(ATTEMPTS))
+    best = min(statistics.median(process_ms(refine) for _ in range(ROUNDS)) for _ in range(ATTEMPTS))
     report_bound("ms of CPU, refinement of six cameras", best, at_most=REFINEMENT_MS)
 
 
@@ -68,7 +56,7 @@ def test_reused_it_costs_little(sample: dict[str, Any], report_bound: Callable[.
     assert all((retarget(sample)["images"].shape[-2:] == (900, 1600)) for retarget in (fast, accurate))
     ratios = []
     for _ in range(ATTEMPTS):
-        pairs = [(cpu_ms(lambda: accurate(sample)), cpu_ms(lambda: fast(sample))) for _ in range(ROUNDS)]
+        pairs = [(process_ms(lambda: accurate(sample)), process_ms(lambda: fast(sample))) for _ in range(ROUNDS)]
         ratios.append(statistics.median(a / f for a, f in pairs))
     fast_ms = statistics.median(f for _, f in pairs)
     report_bound(f"accurate over fast, {fast_ms:.0f} ms a frame", min(ratios), at_most=CACHED_RATIO)

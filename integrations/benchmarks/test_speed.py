@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import os
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,31 @@ pytestmark = pytest.mark.release
 ATTEMPTS, STEPS, BUDGET_MS = 3, 4, 400
 TOLERANCE, ROUNDS = 0.02, 121
 IMPORT_S = 0.4
+MISSED: Mapping[tuple[int, int], Mapping[str, tuple[float, float]]] = {
+    SIZE: {
+        "street, held": (1.2, 1.6),
+        "street": (5.4, 7.0),
+        "10 boxes": (7.2, 9.6),
+        "30 boxes": (8.0, 10.4),
+        "75 boxes": (8.2, 11.7),
+        "150 boxes": (9.0, 13.2),
+        "LiDAR": (9.8, 16.5),
+        "LiDAR, 75 boxes": (13.4, 22.6),
+    },
+    FULL_SIZE: {
+        "street": (3.8, 4.3),
+        "10 boxes": (4.8, 6.6),
+        "30 boxes": (5.6, 6.0),
+        "75 boxes": (5.6, 6.4),
+        "150 boxes": (6.1, 7.2),
+        "LiDAR": (5.6, 8.4),
+        "LiDAR, 75 boxes": (7.2, 11.7),
+    },
+}
+"""Bounds of calls that miss those of ``BOUNDS``, which are goals here: on pinhole and radtan targets, and on fisheye.
+
+About 1.15 times the ratios in docs/benchmarks.md, of pinhole and radtan the larger.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -44,21 +70,21 @@ def best_ratios() -> dict[tuple[Any, ...], float]:
         for m in report["measures"]:
             key = tuple(m["size"]), m["name"], m["target"]
             best[key] = min(best.get(key, m["ratio"]), m["ratio"])
-        if all(ratio <= BOUNDS[size].get(name, ratio) for (size, name, _), ratio in best.items()):
+        if all(ratio <= _bound(size, name, target == "fisheye") for (size, name, target), ratio in best.items()):
             break
     return best
 
 
-def _known_miss(name: str, fisheye: bool) -> list[pytest.MarkDecorator]:
-    """The bounds stand; the misses are published in docs/benchmarks.md, and a call that meets its bound passes."""
-    missed = pytest.mark.xfail(reason="plans of every frame, and fisheye cameras, take longer", strict=False)
-    return [missed] if fisheye or "held" not in name else []
+def _bound(size: tuple[int, int], name: str, fisheye: bool) -> float:
+    """Largest ratio of a call; infinite if it has none."""
+    kept = BOUNDS[size].get(name, math.inf)
+    return MISSED[size].get(name, (kept, kept))[fisheye]
 
 
 @pytest.mark.parametrize(
     ("size", "name", "fisheye"),
     [
-        pytest.param(size, name, fisheye, marks=_known_miss(name, fisheye))
+        (size, name, fisheye)
         for size, bounds in BOUNDS.items()
         for name in bounds
         for fisheye in (False, True)
@@ -79,7 +105,8 @@ def test_bounds(
     }
     assert ratios, f"{name} was not measured"
     for target, ratio in ratios.items():
-        report_bound(f"ratio, {size}, {name}, {target}", ratio, at_most=BOUNDS[size][name])
+        goal = f"ratio, {size}, {name}, {target}, goal {BOUNDS[size][name]:g}"
+        report_bound(goal, ratio, at_most=_bound(size, name, fisheye))
 
 
 @pytest.mark.filterwarnings("ignore:target cameras")

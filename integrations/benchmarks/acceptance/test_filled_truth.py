@@ -9,19 +9,22 @@ import warnings
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys
+from arbiview_aug.cli.bench.speed import looking_down
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
+from arbiview_aug.evaluate.metrics import psnr_db
+from arbiview_aug.inpaint.telea import telea
 from tests.helpers import Standing
 
 pytestmark = pytest.mark.timeout(1800)
 
-RIG = demo_source_rig((128, 352))
+SIZE = (128, 352)
+RIG = demo_source_rig(SIZE)
 FRAMES = range(4)
 NEAR_M = 15.0
 
@@ -35,14 +38,7 @@ class Street(NamedTuple):
 
 
 def lowered(up_m: float) -> Rig:
-    cameras = []
-    for camera in RIG:
-        h, w = camera.size
-        f = w / 2 / np.tan(np.radians(50))
-        K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
-        cam2ego = camera.turned(pitch_deg=-15).shifted(z_m=up_m).cam2ego
-        cameras.append(Camera(name=camera.name, width_px=w, height_px=h, K=K, cam2ego=cam2ego))
-    return Rig(cameras)
+    return looking_down(RIG, SIZE).shifted(z_m=up_m - 0.6)
 
 
 @functools.cache
@@ -66,12 +62,7 @@ def rendered(sample: dict[str, Any], target: Rig, *keys: str) -> dict[str, Any]:
 
 
 def db(squares: list[np.ndarray]) -> float:
-    return float(10 * np.log10(255**2 / np.concatenate(squares).mean()))
-
-
-def telea(image: np.ndarray, hole: np.ndarray) -> np.ndarray:
-    picture = np.ascontiguousarray(np.where(hole, 0, image).transpose(1, 2, 0))
-    return cv2.inpaint(picture, hole.astype(np.uint8), 3, cv2.INPAINT_TELEA).transpose(2, 0, 1)
+    return psnr_db(float(np.concatenate(squares).mean()))
 
 
 def near_road(camera: Camera) -> np.ndarray:
@@ -97,13 +88,15 @@ def test_real_pixels_beat_invented_ones(lidar: bool, count: int, step_m: float) 
         for k, camera in enumerate(target):
             image, true = out["images"][k].numpy(), truth.images[k].numpy().astype(np.float32)
             there, classes = out["source_frame"][k].numpy() > 0, truth.classes[k].numpy()
-            hole = out["source_frame"][k].numpy() != 0
+            hole = out["source_frame"][k] != 0
+            inpainted = telea(out["images"][k], hole).numpy()
             squares = ((image - true) ** 2).mean(0)
             ours.append(squares[there])
-            theirs.append(((telea(image, hole) - true) ** 2).mean(0)[there])
+            theirs.append(((inpainted - true) ** 2).mean(0)[there])
             road.append(squares[there & (classes == SceneClass.GROUND)])
             walk.append(squares[there & (classes == SceneClass.SIDEWALK)])
-            missing, filled = missing + (hole & near_road(camera)).sum(), filled + (there & near_road(camera)).sum()
+            near = near_road(camera)
+            missing, filled = missing + (hole.numpy() & near).sum(), filled + (there & near).sum()
     print(
         f"\n{'LiDAR' if lidar else 'boxes'}, {2 * count} frames: {filled / missing:.1%} of the near road, "
         f"{db(ours):.1f} dB (Telea {db(theirs):.1f}), road {db(road):.1f}, sidewalk {db(walk):.1f}"

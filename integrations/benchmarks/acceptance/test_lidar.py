@@ -20,10 +20,10 @@ import pytest
 import torch
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
+from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.rendered import render_labels, render_opencv
 from arbiview_aug.render.view_planner import build_plan
@@ -31,7 +31,9 @@ from arbiview_aug.scene.boxes import checked_boxes
 from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from tests.helpers import as_camera, few_or_all
+from integrations.benchmarks.acceptance.protocol import FRAMES, ProtocolFrame, frame_folder
+from integrations.benchmarks.moving_traffic import without_labels
+from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(1800)
 
@@ -48,40 +50,29 @@ OFF_LINES_PX = (3, 10)  # of the frame's own points
 GAIN_DB = 1.5
 
 
-@pytest.mark.parametrize(
-    "frame",
-    [pytest.param("nuscenes-one", marks=pytest.mark.slow), pytest.param("ddad-one", marks=pytest.mark.release)],
-)
-def test_gain_over_ground(frame: str, referee: ModuleType, data_root: Path) -> None:
-    if not (data_root / frame).is_dir():
-        pytest.skip(f"no frame {frame} in {data_root}")
-    cameras, lidar, calibration = referee.load_frame(str(data_root / frame), 0.5)
-    cameras, ground_z_m = referee.equalised(cameras, lidar), float(calibration["ground_z_m"])
-    fit, test = referee.lidar_split(lidar)
-    rig = Rig(
-        [as_camera(n, c["K"], c["cam2ego"], c["image"].shape[:2], c["mask"] > 0) for n, c in cameras.items()],
-        ground_z_m=ground_z_m,
-    )
-    sample = {"images": as_tensors([c["image"] for c in cameras.values()]), "points": torch.from_numpy(lidar[fit])}
+@pytest.mark.parametrize("name", FRAMES)
+def test_gain_over_ground(name: str, referee: ModuleType, data_root: Path) -> None:
+    frame = ProtocolFrame(referee, frame_folder(data_root, name))
+    fit, test = referee.lidar_split(frame.lidar)
+    sample = {"images": as_tensors(frame.images), "points": torch.from_numpy(frame.lidar[fit])}
 
     def ours(targets: list[Any]) -> list[Image]:
-        target = Rig([as_camera(*view) for view in targets], ground_z_m=ground_z_m)
-        return as_arrays(
-            RigRetarget(target, source=rig, geometry="lidar", match_exposure=False, holes="black")(sample)["images"]
-        )
+        (target,) = frame.rigs([targets])
+        retarget = RigRetarget(target, source=frame.rig, geometry="lidar", match_exposure=False, holes="black")
+        return as_arrays(retarget(sample)["images"])
 
-    reference = referee.reference_renderer(cameras, "ground", ground_z=ground_z_m)
+    reference = referee.reference_renderer(frame.cameras, "ground", ground_z=frame.ground_z_m)
     rows = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of targets that are half outside
-        for name, (yaw_deg, shift_m) in MOVES.items():
-            targets = [referee.rotated_targets(cameras, yaw_deg, shift_m)]
-            psnr = [referee.score(r, cameras, lidar[test], targets)["psnr"] for r in (ours, reference)]
-            rows.append((name, *psnr, psnr[0] - psnr[1]))
-    print(f"\n{frame}, PSNR in dB: lidar, ground, gain")
-    print("\n".join(f"  {name:<16}{a:8.2f}{b:8.2f}{gain:+8.2f}" for name, a, b, gain in rows))
-    for (name, *_, gain), least in zip(rows, GAINS_DB[frame], strict=True):
-        assert gain >= least, name
+        for move, (yaw_deg, shift_m) in MOVES.items():
+            targets = [referee.rotated_targets(frame.cameras, yaw_deg, shift_m)]
+            psnr = [referee.score(r, frame.cameras, frame.lidar[test], targets)["psnr"] for r in (ours, reference)]
+            rows.append((move, *psnr, psnr[0] - psnr[1]))
+    print(f"\n{name}, PSNR in dB: lidar, ground, gain")
+    print("\n".join(f"  {move:<16}{a:8.2f}{b:8.2f}{gain:+8.2f}" for move, a, b, gain in rows))
+    for (move, *_, gain), least in zip(rows, GAINS_DB[name], strict=True):
+        assert gain >= least, move
 
 
 def edge_shifts(rendered: np.ndarray, truth: np.ndarray, covered: np.ndarray) -> Iterator[float]:
@@ -155,9 +146,8 @@ def test_other_frames_show_what_is_between_scan_lines(count: int) -> None:
     shifts: dict[tuple[str, str], list[float]] = {}
     for seed, index in SWEPT_FRAMES[:count]:
         drive = SyntheticDrive(rig, num_frames=2, seed=seed, neighbours=Neighbours())
-        sample, source = drive[index], drive.render(index)
-        del sample["boxes_3d"]
-        near = [{key: frame[key] for key in frame if key != "boxes_3d"} for frame in sample["neighbours"]]
+        sample, source = without_labels(drive[index]), drive.render(index)
+        near = sample["neighbours"]
         bare = [{key: value for key, value in frame.items() if key != "points"} for frame in near]
         points = sample["points"].numpy()[:, :3].astype(float)
         for move, by in moves.items():
@@ -172,7 +162,7 @@ def test_other_frames_show_what_is_between_scan_lines(count: int) -> None:
                 ):
                     use = covered & np.isfinite(z) & off_lines(camera, points)
                     error = (view.float() - true.float()).numpy()[:, use]
-                    psnr.setdefault((move, name), []).append(float(10 * np.log10(255**2 / np.mean(error**2))))
+                    psnr.setdefault((move, name), []).append(psnr_db(float(np.mean(error**2))))
     for move, name in psnr:
         half, more, most = np.percentile(shifts[move, name], [50, 75, 90])
         words = f"{np.mean(psnr[move, name]):.1f} dB, 50/75/90 %: {half:.0f}/{more:.0f}/{most:.0f} px"

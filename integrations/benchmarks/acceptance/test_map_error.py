@@ -108,8 +108,9 @@ def sweep(scale: float, surfaces: tuple[str, ...], at_most: int, views: slice = 
         worst, where, count = 0.0, "", 0
         for pair, source, target in rig_pairs(scale, views):
             off = errors(build_plan(source, target, geometry=surface, scene=scene), surface, scene, at_most).px
+            assert len(off) and np.isfinite(off).all(), f"{surface} at {scale:.0%}, {pair}: {len(off)} pixels, or NaN"
             count += len(off)
-            if off.max(initial=0.0) > worst:
+            if off.max() > worst:
                 worst, where = float(off.max()), pair
         print(f"{surface} at {scale:.0%}: worst of {count} pixels {worst:.4f} px, {where}")
         assert worst <= TOLERANCE_PX, f"{surface} at {scale:.0%}, {where}: {worst:.4f} px"

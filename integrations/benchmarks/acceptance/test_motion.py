@@ -15,10 +15,12 @@ import torch
 from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.sample.inputs import MOTION_KEY, read_frames
-from arbiview_aug.sample.neighbours import read_neighbours
-from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
+from arbiview_aug.evaluate.metrics import psnr_db
+from arbiview_aug.sample.inputs import MOTION_KEY
+from arbiview_aug.temporal.motion_depth import MotionDepth
+from integrations.benchmarks.acceptance.protocol import IN_BOTH, frame_folder
 from tests.helpers import Standing
+from tests.temporal.test_motion_depth import depth_of
 
 RIG = demo_source_rig((128, 352))
 STREETS = (0, 1, 2, 3)
@@ -50,13 +52,6 @@ def sample_of(index: int, standing: bool, labels: bool, turned_deg: float) -> di
     return {**kept, "neighbours": near}
 
 
-def depth_of(sample: dict[str, Any]) -> MotionDepth:
-    (frame,) = read_frames(sample, None)
-    near = read_neighbours(frame, lambda topic, message: pytest.fail(message))
-    boxes = sample["boxes_3d"].numpy().astype(float) if "boxes_3d" in sample else None
-    return motion_depth(frame.rig, frame.images, near, boxes, lambda n: n.images(frame.images))
-
-
 def right(index: int, depth: MotionDepth) -> tuple[int, int, int]:
     """Pixels nearer than ``FAR_M`` and off the motion: all, with a depth, with one within a tenth of the truth."""
     pixels = kept = good = 0
@@ -86,7 +81,7 @@ def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -
 @pytest.mark.parametrize(
     ("standing", "labels", "turned_deg", "density", "share", "least_db"),
     [
-        pytest.param(True, False, 0.0, 0.65, 0.9, 3.5, id="nothing else moves", marks=pytest.mark.slow),
+        pytest.param(True, False, 0.0, 0.65, 0.9, 3.5, id="nothing else moves", marks=IN_BOTH),
         pytest.param(False, True, 0.0, 0.0, 0.9, 4.0, id="traffic, labelled", marks=pytest.mark.release),
         pytest.param(False, False, 0.0, 0.65, 0.9, 2.7, id="traffic, no labels", marks=pytest.mark.release),
         pytest.param(True, False, 0.2, 0.65, 0.9, 3.5, id="poses 0.2 degrees wrong", marks=pytest.mark.release),
@@ -99,7 +94,7 @@ def test_depth_is_right_and_renders_better_than_the_street(
     counts, gains = np.zeros(3), {move: [] for move in MOVES}
     for index in STREETS:
         sample = sample_of(index, standing, labels, turned_deg)
-        depth = depth_of(sample)
+        depth = depth_of(sample, boxes=sample["boxes_3d"].numpy().astype(float) if labels else None)
         counts += right(index, depth)
         for move, rows in gains.items():
             rows.append(gain_db(index, move, sample, depth))
@@ -119,7 +114,7 @@ def test_the_next_frame_as_truth(ddad_root: Path) -> None:
 
     What is compared is one of the two images that the depth was found in, as the issue asks; LiDAR has no such help.
     """
-    now, ahead = (FrameFolder(root)[0] for root in (ddad_root, ddad_root.parent / "ddad-next"))
+    now, ahead = (FrameFolder(root)[0] for root in (ddad_root, frame_folder(ddad_root.parent, "ddad-next")))
     ego2ego = np.linalg.solve(now["ego2world"].numpy(), ahead["ego2world"].numpy())
     cameras = [camera.moved(ego2ego) for camera in ahead["rig"]]
     target = Rig(cameras, ground_z_m=now["rig"].ground_z_m).resized(0.5)
@@ -138,7 +133,7 @@ def test_the_next_frame_as_truth(ddad_root: Path) -> None:
             seen = torch.stack([other["coverage"][k] for other in outs.values()]).all(0).numpy()
             use = seen if camera.mask is None else seen & camera.mask
             error = out["images"][k].numpy().transpose(1, 2, 0)[use] - true[use]
-            rows.append(10 * np.log10(255**2 / np.mean(error**2)))
+            rows.append(psnr_db(float(np.mean(error**2))))
         psnr[surface] = float(np.mean(rows))
     print(f"\nthe next frame as truth, dB: {psnr}; covered: {cover}")
     assert psnr["motion"] >= psnr["street"] + 3.0

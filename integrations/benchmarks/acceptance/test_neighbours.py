@@ -7,30 +7,27 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys
+from arbiview_aug import Rig, RigRetarget, SampleKeys
+from arbiview_aug.cli.bench.speed import looking_down
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.lidar import coloured_points, colours_at, equalised, visible_points
+from arbiview_aug.evaluate.metrics import psnr_db
+from integrations.benchmarks.acceptance.protocol import frame_folder
 
 pytestmark = pytest.mark.slow
 
 
 def lowered(rig: Rig) -> Rig:
     """0.6 m higher, pitched down by 15 degrees, 100 degrees wide, at half the size."""
-    cameras = []
-    for camera in rig:
-        h, w = camera.height_px // 2, camera.width_px // 2
-        f = w / 2 / np.tan(np.radians(50))
-        K = np.array([[f, 0, (w - 1) / 2], [0, f, (h - 1) / 2], [0, 0, 1]])
-        cam2ego = camera.turned(pitch_deg=-15).shifted(z_m=0.6).cam2ego
-        cameras.append(Camera(name=camera.name, width_px=w, height_px=h, K=K, cam2ego=cam2ego))
-    return Rig(cameras, ground_z_m=rig.ground_z_m)
+    h, w = rig.sizes[0]
+    return looking_down(rig, (h // 2, w // 2))
 
 
 def test_the_frame_ahead_adds_all_that_it_sees(ddad_root: Path) -> None:
     """3.15 points of the 3.19 that lie on the road before its cameras and are not its own car."""
     now = FrameFolder(ddad_root, load_points=False)[0]
-    ahead = FrameFolder(ddad_root.parent / "ddad-next", load_points=False)[0]
+    ahead = FrameFolder(frame_folder(ddad_root.parent, "ddad-next"), load_points=False)[0]
     target = lowered(now["rig"])
     alone = RigRetarget(target, geometry="street", neighbours=None, holes="black")(now)
     filled = RigRetarget(target, geometry="street", holes="black")(now | {"neighbours": [ahead]})
@@ -60,7 +57,7 @@ def test_the_filled_road_is_as_right_as_the_current_one(ddad_root: Path) -> None
     What the next frame's points say of the filled road is compared with what the current frame's say of the road that
     it sees itself: 23.9 and 20.5 dB, 453 and 9957 points.
     """
-    frames = [FrameFolder(root)[0] for root in (ddad_root, ddad_root.parent / "ddad-next")]
+    frames = [FrameFolder(root)[0] for root in (ddad_root, frame_folder(ddad_root.parent, "ddad-next"))]
     points = [frame.pop("points").numpy().astype(float) for frame in frames]
     for frame, of_frame in zip(frames, points, strict=True):
         images = equalised(frame["rig"], as_arrays(frame["images"]), of_frame)
@@ -85,6 +82,6 @@ def test_the_filled_road_is_as_right_as_the_current_one(ddad_root: Path) -> None
             squares.append(((colours_at(image, uv[use]) - colours[index[use]]) ** 2).mean(1))
         squares_of_all = np.concatenate(squares)
         assert len(squares_of_all) > 100
-        found_db.append(float(10 * np.log10(255**2 / squares_of_all.mean())))
+        found_db.append(psnr_db(float(squares_of_all.mean())))
     print(f"\nroad on LiDAR points, dB: seen now {found_db[0]:.1f}, filled {found_db[1]:.1f}")
     assert found_db[1] > found_db[0] - 1
