@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -25,6 +27,25 @@ from arbiview_aug.errors import ArbiviewError, DataError, warn
 from arbiview_aug.sample.neighbours import STILL_M
 
 Direction = Literal["both", "past", "future"]
+
+CONVERSION_FOLDER = "conversion"  # of a root that ``convert`` writes: manifest, provenance and report
+BEGUN_FILE, FINISHED_FILE = "settings.json", "provenance.json"  # in it: the first file of all, and the last
+
+
+def is_converted(root: Path) -> bool:
+    """Whether ``convert`` wrote a root, or has begun to."""
+    return (root / CONVERSION_FOLDER / BEGUN_FILE).is_file()
+
+
+def warn_of_unfinished(root: Path, found: int) -> None:
+    """Warn of a conversion that is not finished, with the number of frames found."""
+    if not is_converted(root) or (root / CONVERSION_FOLDER / FINISHED_FILE).is_file():
+        return
+    count = f"{found} frames"
+    with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):  # ``convert`` tells what is wrong with it
+        begun = json.loads((root / CONVERSION_FOLDER / BEGUN_FILE).read_text(encoding="utf-8"))
+        count = f"{found} of {len(begun['source']['frames'])} frames"
+    warn(f"{root}: unfinished conversion: {count}; run convert again")
 
 
 def checked_index(index: Any, count: int) -> int:

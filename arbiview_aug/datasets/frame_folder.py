@@ -30,8 +30,9 @@ from arbiview_aug.datasets.drive import (
     camera_fields,
     checked_index,
     parts_of_clock,
+    warn_of_unfinished,
 )
-from arbiview_aug.datasets.image_io import decode_images, encoded_image, reduced_rig
+from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, encoded_image, reduced_rig
 from arbiview_aug.datasets.registry import CALIBRATION_FILE
 from arbiview_aug.errors import (
     ArbiviewError,
@@ -97,7 +98,8 @@ class FrameFolder(WritableRecording):
     A sample is a dict: ``images`` (N, 3, h, w) uint8 RGB, or a list if sizes differ; ``rig`` (names, lenses, masks,
     ground); ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token`` (the folder's name); and, if the frame has
     them, ``points`` (P, >=3) float32, ``boxes_3d`` (B, >=7) float32, ``ego2world`` (4, 4) float64 and ``time_s``;
-    ``scene_token`` (the root's name) if ``sequence.json`` lists the frame.
+    ``scene_token`` (the root's name) if ``sequence.json`` lists the frame; ``coverage`` and ``generated`` (N, h, w)
+    bool, or lists, as ``RigRetarget`` returns them, if ``convert`` wrote them.
     ``neighbours`` are frames of ``sequence.json`` with a pose. The numbers of points and boxes vary: batch with
     ``collate_fn=arbiview_aug.collate``.
 
@@ -128,6 +130,7 @@ class FrameFolder(WritableRecording):
         self.clean_masks = clean_masks
         self._frames = _find_frames(self.root)
         self.tokens = [frame.name for frame in self._frames]
+        warn_of_unfinished(self.root, len(self))
         self._last_rig: tuple[str, Rig] | None = None
         self._rims: dict[tuple[Any, ...], BoolArray | None] = {}
         self._times_s, order = _read_sequence(self.root, self._index)
@@ -137,11 +140,12 @@ class FrameFolder(WritableRecording):
         self._drive = None if neighbours is None else self._find_drive()
 
     def files(self, index: int) -> list[Path]:
-        """Source files of a frame: calibration, images, masks and points."""
+        """Source files of a frame: calibration, images, masks, and last the points."""
         frame = self._frames[checked_index(index, len(self))]
         calib = _read_calibration(frame)
         paths = [frame.folder / CALIBRATION_FILE, *(_image_file(entry, frame) for entry in calib["cameras"])]
         paths += [mask for entry in calib["cameras"] if (mask := _mask_file(entry, frame)) is not None]
+        paths += [file for files in _view_mask_files(calib, frame).values() for file in files if file is not None]
         points = _points_file(calib, frame) if self.load_points else None
         return paths if points is None else [*paths, points]
 
@@ -154,6 +158,7 @@ class FrameFolder(WritableRecording):
             for wrong, meant in misnamed(entries, read).items():
                 self._warn(wrong, f"{frame.where}: {wrong!r} is not read; did you mean {meant!r}?")
         sample = camera_fields(rig, _images(calib, frame, rig.names, self.reduce), frame.name)
+        sample |= _view_masks(calib, frame, self.reduce)
         if self.load_points and (points := _read_points(calib, frame)) is not None:
             sample["points"] = points
         sample |= self._boxes_pose_time(calib, frame)
@@ -209,6 +214,7 @@ class FrameFolder(WritableRecording):
         calib = _read_calibration(frame)
         rig = self._rig(calib, frame)
         fields = {"token": frame.name, "rig": rig, **self._boxes_pose_time(calib, frame)}
+        fields |= _view_masks(calib, frame, self.reduce, ("coverage",))
         points = partial(_read_points, calib, frame) if self.load_points else None
         return LazyFrame(fields, partial(_images, calib, frame, rig.names, self.reduce), points)
 
@@ -331,8 +337,32 @@ def _images(
     calib: Mapping[str, Any], frame: _Frame, names: Sequence[str], reduce: Reduce
 ) -> torch.Tensor | list[torch.Tensor]:
     files = [_image_file(entry, frame) for entry in calib["cameras"]]
-    sizes = [(int(entry["height"]), int(entry["width"])) for entry in calib["cameras"]]
-    return decode_images(files, names=names, sizes=sizes, reduce=reduce)
+    return decode_images(files, names=names, sizes=_sizes(calib), reduce=reduce)
+
+
+def _sizes(calib: Mapping[str, Any]) -> list[tuple[int, int]]:
+    return [(int(entry["height"]), int(entry["width"])) for entry in calib["cameras"]]
+
+
+def _view_mask_files(
+    calib: Mapping[str, Any], frame: _Frame, keys: Sequence[str] = VIEW_MASKS
+) -> dict[str, list[Path | None]]:
+    """The masks beside converted views that are named and there, for each camera."""
+    return {key: [_view_mask_file(entry, key, frame) for entry in calib["cameras"]] for key in keys}
+
+
+def _view_mask_file(entry: Mapping[str, Any], key: str, frame: _Frame) -> Path | None:
+    if not isinstance(name := entry.get(key), str) or not name:
+        return None
+    path = frame.file(name, f"camera {shown(entry.get('name'))}: {key}")
+    return path if path.is_file() else None
+
+
+def _view_masks(
+    calib: Mapping[str, Any], frame: _Frame, reduce: Reduce, keys: Sequence[str] = VIEW_MASKS
+) -> dict[str, Any]:
+    names = [str(entry.get("name")) for entry in calib["cameras"]]
+    return decode_view_masks(_view_mask_files(calib, frame, keys), names=names, sizes=_sizes(calib), reduce=reduce)
 
 
 def _mask_file(entry: Mapping[str, Any], frame: _Frame) -> Path | None:

@@ -7,7 +7,7 @@ orientation, and may leave the output array untouched if decoding into it fails.
 from __future__ import annotations
 
 import stat
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -18,9 +18,11 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.camera import Camera, resize_matrix
+from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
 from arbiview_aug.errors import DataError, SampleTypeError
+from arbiview_aug.sample.batching import stacked
 
 ByteArray = npt.NDArray[np.uint8]
 
@@ -113,16 +115,62 @@ def reduced_camera(camera: Camera, reduce: Reduce) -> Camera:
         return camera
     A = resize_matrix((reduce, reduce), (1, 1))
     height_px, width_px = reduced_size(camera.size, reduce)
-    mask = camera.mask
-    if mask is not None:
-        mask = np.pad(mask, [(0, -side % reduce) for side in mask.shape], mode="edge")
-        mask = np.asarray(mask.reshape(height_px, reduce, width_px, reduce).all(axis=(1, 3)))
+    mask = None if camera.mask is None else _reduced_mask(camera.mask, reduce)
     return replace(camera, width_px=width_px, height_px=height_px, K=A @ camera.K, mask=mask)
+
+
+def _reduced_mask(mask: BoolArray, reduce: int) -> BoolArray:
+    """A mask whose reduced pixels are True only if all of their pixels are."""
+    height_px, width_px = reduced_size(mask.shape[:2], reduce)
+    mask = np.pad(mask, [(0, -side % reduce) for side in mask.shape], mode="edge")
+    return np.asarray(mask.reshape(height_px, reduce, width_px, reduce).all(axis=(1, 3)))
 
 
 def reduced_rig(rig: Rig, reduce: Reduce) -> Rig:
     """The rig of images decoded with ``reduce``."""
     return rig if reduce == 1 else rig.with_cameras([reduced_camera(camera, reduce) for camera in rig])
+
+
+VIEW_MASKS = ("coverage", "generated")
+"""Masks that ``convert`` writes beside its views, and that its sets have in a sample."""
+
+
+def decode_view_masks(
+    files: Mapping[str, Sequence[Path | None]],
+    *,
+    names: Sequence[str],
+    sizes: Sequence[tuple[int, int]],
+    reduce: Reduce = 1,
+) -> dict[str, torch.Tensor | list[torch.Tensor]]:
+    """Read some of ``VIEW_MASKS``, given a file for each camera, or None; ``sizes`` are (h, w) of the full images.
+
+    Pixels without a file are covered and not generated. With ``reduce``, a pixel is covered if all of its pixels are,
+    and generated if any is. Masks without any file are left out.
+
+    Returns:
+        (N, h, w) bool by name, or a list of (h_i, w_i) if the sizes differ.
+
+    Raises:
+        DataError: A file that is no image, or of another size, by camera and file.
+    """
+    masks = {}
+    for key, of_key in files.items():
+        if any(of_key):
+            is_filled = key == "coverage"  # a reduced pixel is as its filled ones are only if all of its pixels are
+            views = []
+            for name, size, path in zip(names, sizes, of_key, strict=True):
+                mask = np.full(size, is_filled) if path is None else _view_mask(path, f"camera {name!r}: {key}", size)
+                views.append(mask if reduce == 1 else _reduced_mask(mask == is_filled, reduce) == is_filled)
+            masks[key] = stacked([torch.from_numpy(view) for view in views])
+    return masks
+
+
+def _view_mask(path: Path, label: str, size: tuple[int, int]) -> BoolArray:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None or image.shape != size:
+        got = "a file that cannot be decoded" if image is None else f"{image.shape[1]}x{image.shape[0]}"
+        raise DataError(f"{label}: expected an image {path} of {size[1]}x{size[0]} (w x h), got {got}; convert again")
+    return np.asarray(image > 0)
 
 
 def read_header(path: Path, label: str) -> tuple[str, tuple[int, int]]:

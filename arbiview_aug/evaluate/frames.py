@@ -26,6 +26,7 @@ from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tens
 from arbiview_aug.evaluate.lidar import ColouredPoints, coloured_points, equalised, lidar_split, sparse_metrics
 from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.metrics import mean_of, truth_metrics
+from arbiview_aug.sample.boxes_2d import rig_of
 
 Render = Callable[[Mapping[str, Any], Rig], list[RenderedView]]  # a view for each of the target rig
 
@@ -92,7 +93,7 @@ def make_frame(
     points_3d = sample.get("points")
     if points_3d is None or not exposures:
         return ScoredFrame(dict(sample) if hand_over_points else inputs, truth=truth, points=points_3d)
-    rig, images = sample["rig"], as_arrays(sample["images"])
+    rig, images = rig_of(sample), as_arrays(sample["images"])  # masked: made-up pixels colour no points
     cloud = points_3d.numpy().astype(np.float64)
     if inputs.get("neighbours"):  # their points lie in the sectors that score, too; their images stay unread
         inputs["neighbours"] = [ChainMap({"points": None}, frame) for frame in inputs["neighbours"]]

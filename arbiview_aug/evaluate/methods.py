@@ -142,10 +142,11 @@ def _with_motion(sample: Sample, surface: GeometryName) -> Sample:
 
 
 def one_camera(sample: Sample, camera: int) -> dict[str, Any]:
-    """Reduce a sample to one camera and its depth maps; geometry in the ego frame stays, neighbours do not."""
+    """Reduce a sample to one camera, its depth and masks; geometry in the ego frame stays, neighbours do not."""
     rig: Rig = sample["rig"]
     kept = {key: value for key, value in sample.items() if key not in ("K", "cam2ego", "detections", "neighbours")}
-    kept |= {key: kept[key][camera : camera + 1] for key in DEPTH_KEYS if kept.get(key) is not None}
+    of_cameras = (*DEPTH_KEYS, "coverage", "ego_mask")
+    kept |= {key: kept[key][camera : camera + 1] for key in of_cameras if kept.get(key) is not None}
     return {**kept, "images": [sample["images"][camera]], "rig": rig.with_cameras([rig[camera]])}
 
 

@@ -25,7 +25,7 @@ from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.settings import FOLDER, RETARGET_OPTIONS, Settings, check_output
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDERS, WithDepth
-from arbiview_aug.datasets.drive import Recording
+from arbiview_aug.datasets.drive import Recording, is_converted
 from arbiview_aug.datasets.registry import kinds_of, open_data, split_kind
 from arbiview_aug.environment import one_thread, versions, working_s
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError, described
@@ -186,7 +186,7 @@ def _begin(settings: Settings, data: Recording, arguments: argparse.Namespace) -
     facts = {"versions": versions(), "settings": settings.rendering(), "source": jobs.format.facts()}
     for note in jobs.format.notes():
         print(f"note: {note}", file=sys.stderr)
-    if not (settings.output / FOLDER / "settings.json").is_file():
+    if not is_converted(settings.output):
         jobs.format.check()
         writable_folder(settings.output, str(settings.output))
     jobs.manifest.begin(facts)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,18 @@ from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE, entry_name
+from arbiview_aug.datasets.image_io import VIEW_MASKS
 from arbiview_aug.datasets.py123d import NOT_SHARED
-from arbiview_aug.errors import DataError
-from arbiview_aug.transforms.scans import RINGS_KEY
+from arbiview_aug.errors import DataError, warn
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, PIXEL_BOUND_KEYS, POSE_KEYS
+from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
+
+_BOX_COUNTS = "num_lidar_pts"
+_OF_SCAN = ("lidar2ego", _BOX_COUNTS)
+"""Keys of a calibration that speak of the source's scan."""
+
+_OF_VIEWS = ("name", "file", "mask", *VIEW_MASKS, "confidence", "width", "height", "K", "cam2ego", "distortion", "lens")
+"""Keys of a camera that the target's cameras have anew."""
 
 
 class FrameFolders(Writer):
@@ -43,9 +53,16 @@ class FrameFolders(Writer):
         calibration, *_ = files = self.data.files(converted.index)
         source = json.loads(calibration.read_text(encoding="utf-8"))
         calib = _calibration(converted)
-        kept = {key: value for key, value in source.items() if key not in (*calib, "dataset", "lidar", "truth")}
         folder, points = calibration.parent.name, converted.out.get("points")
         name, is_scanned = f"{folder}/{POINTS_FILE}", RINGS_KEY in converted.out
+        left_out = {*_left_out(source, calibration.parent, is_scanned)}
+        kept = {key: value for key, value in source.items() if key not in (*calib, *left_out, "dataset", "lidar")}
+        if _BOX_COUNTS in left_out and COUNTS_KEY in converted.out:
+            kept[_BOX_COUNTS] = converted.out[COUNTS_KEY].tolist()
+            left_out.remove(_BOX_COUNTS)
+        if left_out:
+            words = "they speak of the source's pixels, cameras or points, or name files that are not copied"
+            warn(f"calib.json: left out {', '.join(sorted(left_out))}: {words}")
         if points is not None:
             kept["lidar"] = {"file": POINTS_FILE}
         text = json.dumps({**calib, **kept}, indent=1).encode()
@@ -116,6 +133,20 @@ class LogFrames(FrameFolders):
 
     def finished(self) -> list[str]:
         return [SEQUENCE_FILE] if self.data.is_one_drive else []
+
+
+def _left_out(source: Mapping[str, Any], folder: Path, is_scanned: bool) -> Iterator[str]:
+    """Names of a calibration's entries that would be stale beside the new cameras, or beside a new scan."""
+    rig = ("cameras", "ground_z_m", "lidars", "name", "lidar")
+    stale = ({*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *POSE_KEYS, "truth"} | {*(_OF_SCAN if is_scanned else ())}) - {*rig}
+    for key, value in source.items():
+        names_file = isinstance(value, str) and key not in rig and os.path.isfile(os.path.join(folder, value))
+        if key in stale or names_file:
+            yield key
+    of_cameras = {key for camera in source["cameras"] for key in camera if key not in _OF_VIEWS}
+    yield from (f"cameras.{key}" for key in of_cameras)
+    if isinstance(lidar := source.get("lidar"), Mapping):
+        yield from (f"lidar.{key}" for key in lidar if key != "file")
 
 
 def _npy(points: Any) -> bytes:

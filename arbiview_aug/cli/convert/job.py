@@ -146,6 +146,8 @@ class Jobs(Dataset[Done]):
         is_skipped = self.on_error == "skip"
         try:
             if is_skipped:
+                if "files" in (self.manifest.record(token) or {}):
+                    self.manifest.reopen()
                 self._remove_former(token)
                 self.manifest.write({"token": token, "skipped": message}, owner=str(index))
             elif record := self.manifest.record(token):  # no shard may finish the output by an older record

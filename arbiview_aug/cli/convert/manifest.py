@@ -12,8 +12,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from arbiview_aug.atomic_io import checksum, file_name, write_new, write_whole
+from arbiview_aug.atomic_io import checksum, file_name, write_new, write_whole, writing
 from arbiview_aug.cli.convert.settings import FOLDER
+from arbiview_aug.datasets.drive import BEGUN_FILE, FINISHED_FILE
 from arbiview_aug.errors import DataError, shown
 
 Record = Mapping[str, Any]
@@ -28,7 +29,7 @@ class Manifest:
 
     def begin(self, facts: Mapping[str, Any]) -> None:
         """Write versions, settings and source of the output; DataError if it was begun with others."""
-        path, text = self.folder / "settings.json", _text(facts)
+        path, text = self.folder / BEGUN_FILE, _text(facts)
         if not path.is_file():
             write_new(path, text)
         differ = list(differences(_read(path), json.loads(text)))
@@ -77,11 +78,17 @@ class Manifest:
                 sources[record["token"]] = record["sources"]
         files = {name: checksum(self.output / name) for name in finished}
         said = {**facts, "sources": sources, "skipped": skipped, "files": files}
-        write_whole({self.folder / "provenance.json": _signed(said)})
+        write_whole({self.folder / FINISHED_FILE: _signed(said)})
+
+    def reopen(self) -> None:
+        """Say that the conversion is not finished any more, before a frame of it goes."""
+        path = self.folder / FINISHED_FILE
+        with writing(path):
+            path.unlink(missing_ok=True)
 
     def provenance(self) -> dict[str, Any] | None:
         """Read what ``write_provenance`` wrote; None if the conversion is not finished."""
-        path = self.folder / "provenance.json"
+        path = self.folder / FINISHED_FILE
         return _read_signed(path) if path.is_file() else None
 
 

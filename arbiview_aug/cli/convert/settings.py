@@ -11,7 +11,7 @@ from arbiview_aug.atomic_io import Link, checksum, is_part
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Holes, Quality, Reduce
-from arbiview_aug.datasets.drive import Neighbours, Recording
+from arbiview_aug.datasets.drive import BEGUN_FILE, CONVERSION_FOLDER, Neighbours, Recording, is_converted
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.errors import DataError
 from arbiview_aug.generator import load_inpainter
@@ -20,7 +20,7 @@ from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys
 
 RETARGET_OPTIONS = ("quality", "geometry", "size", "fit")  # as ``RigRetarget`` names them
-FOLDER = "conversion"  # subfolder of an output with manifest, provenance and report
+FOLDER = CONVERSION_FOLDER
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,11 +110,11 @@ def check_output(settings: Settings) -> None:
         return
     if not output.is_dir():
         raise DataError(f"--output {settings.output}: expected a folder, got a file or a link that leads nowhere")
-    if (output / FOLDER / "settings.json").is_file():
+    if is_converted(output):
         return
     foreign = next((path.name for path in output.rglob("*") if not path.is_dir() and not is_part(path)), None)
     if foreign is not None:
         raise DataError(
             f"--output {settings.output}: expected an empty folder, or a conversion to go on with, got {foreign} "
-            f"and no {FOLDER}/settings.json; name another folder"
+            f"and no {FOLDER}/{BEGUN_FILE}; name another folder"
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,17 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
-from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields, checked_index
+from arbiview_aug.datasets.drive import (
+    Drive,
+    LazyFrame,
+    Neighbours,
+    WritableRecording,
+    camera_fields,
+    checked_index,
+    is_converted,
+)
 from arbiview_aug.datasets.frame_folder import checked_points
-from arbiview_aug.datasets.image_io import decode_images, reduced_rig
+from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, reduced_rig
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables
@@ -39,6 +47,7 @@ class NuScenesDataset(WritableRecording):
     ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians, velocity x y in m/s over the
     ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
     vary: batch with ``collate_fn=arbiview_aug.collate``. If no sample is annotated, they have no boxes, with a warning.
+    A root that ``convert`` wrote also has ``coverage`` and ``generated``, as ``FrameFolder`` gives them.
 
     With ``neighbours`` a sample also has other frames of its scene, keyframes and sweeps, by the distance that the
     vehicle travelled between the images of the first of ``channels``. A sweep has its own time and ego pose, the image
@@ -87,6 +96,7 @@ class NuScenesDataset(WritableRecording):
         super().__init__(root or "", reduce, load_points, neighbours)
         tables = Tables(root, version, nusc)
         self.root, self.version, self.compensate_ego_motion = tables.root, tables.version, compensate_ego_motion
+        self._view_masks = VIEW_MASKS if is_converted(self.root) else ()
         samples = _chosen_samples(tables, split_scenes)
         self.tokens = [row["token"] for row in samples]
         self.scene_tokens: list[str] = [row["scene_token"] for row in samples]
@@ -108,9 +118,11 @@ class NuScenesDataset(WritableRecording):
         self._drive = Drive(positions_m, self._recordings.parts[self._drive_rows])
 
     def files(self, index: int) -> list[Path]:
-        """Source files of a sample: each camera's image, then the LiDAR's points."""
-        rows = self._recordings.keyframes[checked_index(index, len(self))]
-        return [self.root / self._recordings.file(row) for row in rows]
+        """Source files of a sample: each camera's image, masks of converted views, and last the LiDAR's points."""
+        *cameras, lidar = self._recordings.keyframes[checked_index(index, len(self))]
+        masks = [path for key in self._view_masks for path in self._mask_files(cameras, key) if path is not None]
+        images, points = ([self.root / self._recordings.file(row) for row in rows] for rows in (cameras, [lidar]))
+        return [*images, *masks, *points]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         index = checked_index(index, len(self))
@@ -119,6 +131,7 @@ class NuScenesDataset(WritableRecording):
         ego2global = recordings.ego2global(lidar)
         rig = self._rig(cameras, ego2global)
         sample = camera_fields(rig, self._images(cameras)(), self.tokens[index])
+        sample |= self._masks(cameras, self._view_masks)
         sample |= {"ego2world": torch.from_numpy(ego2global), "time_s": float(recordings.time_s(lidar))}
         sample["scene_token"] = self.scene_tokens[index]
         if self.load_points:
@@ -156,6 +169,18 @@ class NuScenesDataset(WritableRecording):
         """Decoder of the images of cameras, which pickles without the data set."""
         files, sizes = [*map(self._file, cameras)], [*map(self._recordings.size, cameras)]
         return partial(_decode_images, files, names=self.channels, sizes=sizes, reduce=self.reduce)
+
+    def _mask_files(self, cameras: Iterable[int], key: str) -> list[Path | None]:
+        """The masks beside the views of cameras that are there."""
+        paths = []
+        for root, name, where in map(self._file, cameras):
+            path = inside(root, str(PurePosixPath(name).with_suffix(f".{key}.png")), where)
+            paths.append(path if path.is_file() else None)
+        return paths
+
+    def _masks(self, cameras: IntArray, keys: Sequence[str]) -> dict[str, Any]:
+        files, sizes = {key: self._mask_files(cameras, key) for key in keys}, [*map(self._recordings.size, cameras)]
+        return decode_view_masks(files, names=self.channels, sizes=sizes, reduce=self.reduce)
 
     def _points(self, lidar: int, own2ego: FloatArray | None = None) -> Callable[[], torch.Tensor]:
         """Reader of a recording's points in its own ego frame, or in the one that ``own2ego`` leads to."""
@@ -198,6 +223,7 @@ class NuScenesDataset(WritableRecording):
         cameras = recordings.around(row)
         fields = {"token": self._token(place), "time_s": time_s, "ego2world": torch.from_numpy(ego2global)}
         fields["rig"] = self._rig(cameras, ego2global)
+        fields |= self._masks(cameras, self._view_masks[:1])  # coverage
         if (boxes := self._annotations) is not None:
             global2ego, scene = _inverse(ego2global), int(record["scene"])
             there = boxes.at_sample(sample, global2ego) if is_keyframe else boxes.at_time(scene, time_s, global2ego)

@@ -23,6 +23,7 @@ from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator.training.checkpointing import STOP_SIGNALS
 from arbiview_aug.image_ops import resized
 from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.sample.boxes_2d import rig_of
 
 SHARES = (0.6, 0.2)  # shares of the scenes for training and validation; the rest are held out (Sec. Dataset)
 _BLOCKS = 10  # number of scenes into which a drive without scenes is cut
@@ -66,7 +67,7 @@ class Frames:
 
     def _read(self, index: int) -> TrainingFrame:
         sample = self.dataset[index]
-        rig: Rig = sample["rig"].resized(self.size)
+        rig = rig_of(sample).resized(self.size)
         return TrainingFrame([resized(image, self.size) for image in sample["images"]], rig, str(sample["token"]))
 
     def prepare(self, indices: Sequence[int], *, workers: int = 0, show: bool = True) -> None:

@@ -19,11 +19,13 @@ from arbiview_aug import Rig, RigRetarget, SampleKeys, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli import parsers
 from arbiview_aug.cli.convert import command as command_module
-from arbiview_aug.cli.convert.job import coverage_of
+from arbiview_aug.cli.convert.job import Jobs, coverage_of
 from arbiview_aug.cli.convert.manifest import Manifest
-from arbiview_aug.datasets import FrameFolder, WithDepth
+from arbiview_aug.datasets import FrameFolder, Neighbours, WithDepth
 from arbiview_aug.datasets.depth_folder import DepthFolder
 from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.frames import make_frame
+from arbiview_aug.evaluate.methods import one_camera
 from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from tests.cli.convert.drives import SIZE, TARGET, command, tree, write_frames
@@ -56,6 +58,8 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
         for key in ("boxes_3d", "ego2world"):
             assert torch.equal(after[key], before[key])
         assert after["time_s"] == before["time_s"]
+        for key in ("coverage", "generated"):
+            assert torch.equal(after[key], out[key]) and after[key].dtype == torch.bool
         calib = json.loads((output / after["token"] / "calib.json").read_text())
         assert calib["license"] == "as you like"
         for k, camera in enumerate(calib["cameras"]):
@@ -65,6 +69,71 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
             assert (image.parent / camera["confidence"]).is_file()
             made_up = cv2.imread(str(image.parent / camera["generated"]), cv2.IMREAD_GRAYSCALE) > 0
             assert np.array_equal(made_up, out["generated"][k].numpy())
+
+
+def test_coverage_is_read_back(output: Path, tmp_path: Path) -> None:
+    """A reduced pixel is covered if all of its pixels are; made-up pixels are not read, in neighbours neither."""
+    whole = FrameFolder(output)[1]
+    half = FrameFolder(output, reduce=2, neighbours=Neighbours())[1]
+    blocks = {key: whole[key].unfold(1, 2, 2).unfold(2, 2, 2).flatten(3) for key in ("coverage", "generated")}
+    assert torch.equal(half["coverage"], blocks["coverage"].all(-1)) and not whole["coverage"].all()
+    assert torch.equal(half["generated"], blocks["generated"].any(-1)) and half["coverage"].any()
+    assert torch.equal(half["neighbours"][0]["coverage"], FrameFolder(output, reduce=2)[0]["coverage"])
+    again = RigRetarget(whole["rig"], geometry="infinity")(whole)
+    assert not (again["coverage"] & ~whole["coverage"]).any()
+    samples = (whole, {**whole, "coverage": torch.zeros_like(whole["coverage"])})
+    some, none = (len(make_frame(s, exposures=("raw",)).lidar["raw"].points.points) for s in samples)
+    assert some and not none  # whose colours were made up
+    assert one_camera(whole, 1)["coverage"].equal(whole["coverage"][1:2])
+    shutil.copytree(output, tmp_path / "new")
+    one, two = (tmp_path / "new/0000" / f"{whole['rig'].names[0]}.{key}.png" for key in ("coverage", "generated"))
+    assert {one, two} < {*FrameFolder(tmp_path / "new").files(0)}
+    two.unlink()
+    assert not FrameFolder(tmp_path / "new")[0]["generated"][0].any()
+    one.write_bytes(b"cut")
+    with pytest.raises(DataError, match=r"coverage: expected an image .*coverage\.png of 40x24"):
+        FrameFolder(tmp_path / "new")[0]
+
+
+def test_stale_entries_are_left_out(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for folder in sorted(shutil.copytree(source, tmp_path / "drive").glob("0*")):
+        calib = json.loads((folder / "calib.json").read_text())
+        calib["cameras"][0]["exposure_us"] = 3
+        calib |= {"boxes_2d": [1], "lidar2img": [1], "lidar2ego": [1], "num_lidar_pts": [-5], "segmentation": "seg.png"}
+        calib["lidar"] = {"file": "lidar.npy", "labels": "labels.npy"}
+        (folder / "seg.png").touch()
+        (folder / "calib.json").write_text(json.dumps(calib))
+    gone = "boxes_2d, cameras.exposure_us, lidar.labels, lidar2img, segmentation"
+    for points in ("source", "target"):
+        assert main(command(tmp_path / "drive", tmp_path / points, "--points", points)) == 0
+        said = gone if points == "source" else gone.replace("lidar2img", "lidar2ego, lidar2img")
+        assert capsys.readouterr().err.count(f"calib.json: left out {said}: they speak of the source's") == 1
+        calib = json.loads((tmp_path / points / "0000" / "calib.json").read_text())
+        assert not {"boxes_2d", "lidar2img", "segmentation"} & calib.keys() and calib["license"] == "as you like"
+        assert ("lidar2ego" in calib) == (points == "source") == (calib["num_lidar_pts"] == [-5])
+
+
+def test_unfinished_conversions_are_told(source: Path, tmp_path: Path) -> None:
+    shutil.copytree(source, tmp_path / "drive")
+    image, new = tmp_path / "drive/0001/00.jpg", tmp_path / "new"
+    good = image.read_bytes()
+    image.write_bytes(b"")
+    told = r"unfinished conversion: 2 of 3 frames; run convert again"
+    assert main(command(tmp_path / "drive", new)) == 1
+    with pytest.warns(UserWarning, match=told):
+        FrameFolder(new)
+    image.write_bytes(good)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert main(command(tmp_path / "drive", new, "--report", "1")) == 0
+        assert main(command(tmp_path / "drive", new, "--verify")) == 0
+        assert len(FrameFolder(new)) == 3
+    image.write_bytes(b"")
+    settings = command_module._settings(parsers.convert().parse_args(command(tmp_path / "drive", new)[1:]))
+    assert Jobs(settings, settings.open(), [1], "skip")[0].state == "skipped"  # and killed, before the tables
+    (new / "sequence.json").unlink()
+    with pytest.warns(UserWarning, match=told):
+        FrameFolder(new)
 
 
 def test_missing_returns_are_told_once(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -41,6 +41,10 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
         before, after = old[index], new[index]
         out = retarget(before)
         assert torch.equal(after["images"], out["images"][order])
+        for key in ("coverage", "generated"):
+            assert torch.equal(after[key], out[key][order]) and after[key].any()
+        masks = [path for path in new.files(index) if path.suffixes[:1] == [".coverage"]]
+        assert len(masks) == len(order) and new.files(index)[-1].suffix == ".bin"
         # In the ego frame at the LiDAR's time, while the vehicle of the first scene moves at 8 m/s.
         assert torch.allclose(after["cam2ego"], out["cam2ego"][order], atol=1e-9)
         assert torch.allclose(after["K"], out["K"][order])
