@@ -20,7 +20,7 @@ from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SE
 from arbiview_aug.datasets.image_io import VIEW_MASKS
 from arbiview_aug.datasets.py123d import NOT_SHARED
 from arbiview_aug.errors import DataError, warn
-from arbiview_aug.sample.inputs import CALIBRATION_KEYS, PIXEL_BOUND_KEYS, POSE_KEYS
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, CAMERA_KEYS, PIXEL_BOUND_KEYS
 from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
 _BOX_COUNTS = "num_lidar_pts"
@@ -137,11 +137,11 @@ class LogFrames(FrameFolders):
 
 def _left_out(source: Mapping[str, Any], folder: Path, is_scanned: bool) -> Iterator[str]:
     """Names of a calibration's entries that would be stale beside the new cameras, or beside a new scan."""
-    rig = ("cameras", "ground_z_m", "lidars", "name", "lidar")
-    stale = ({*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *POSE_KEYS, "truth"} | {*(_OF_SCAN if is_scanned else ())}) - {*rig}
+    rig = {"cameras", "ground_z_m", "lidars", "name", "lidar"}
+    stale = {*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *CAMERA_KEYS, "truth", *(_OF_SCAN if is_scanned else ())}
     for key, value in source.items():
-        names_file = isinstance(value, str) and key not in rig and os.path.isfile(os.path.join(folder, value))
-        if key in stale or names_file:
+        names_file = isinstance(value, str) and os.path.isfile(os.path.join(folder, value))
+        if key not in rig and (key in stale or names_file):
             yield key
     of_cameras = {key for camera in source["cameras"] for key in camera if key not in _OF_VIEWS}
     yield from (f"cameras.{key}" for key in of_cameras)
