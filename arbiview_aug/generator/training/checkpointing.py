@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import signal
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,12 @@ import torch
 from torch import nn
 
 from arbiview_aug.errors import GeneratorError, TrainingError, one_line, shown
-from arbiview_aug.generator.checkpoint import read_checkpoint, write_checkpoint
+from arbiview_aug.generator.checkpoint import CONFIG_FILE, read_checkpoint, write_checkpoint
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 _MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")  # in a resumed run
+_NO_SETTINGS = ("data", "frozen weights", "number of processes")  # what else a state knows of its run
+_MOST_NAMED = 6  # settings in one message
 
 
 @contextmanager
@@ -59,6 +61,27 @@ def save_state(
     write_checkpoint(folder, {"step": step, "training": run}, tensors)
 
 
+def has_state(output: Path) -> bool:
+    """Whether a run's folder has a state to go on from; TrainingError for a generator without one.
+
+    A run writes its state first: a first save that was killed leaves a state, or neither, and can go on.
+    """
+    if (output / "state" / CONFIG_FILE).is_file():
+        return True
+    generator = output / "generator"
+    if generator.exists():
+        raise TrainingError(
+            f"{generator}: expected none, since {output / 'state'} holds no state to go on from, and a new run would "
+            f"replace the generator; give another --output, or remove {generator}"
+        )
+    return False
+
+
+def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Check settings against those of a saved state, before any work. TrainingError for others, or a broken state."""
+    _read_state(folder, settings, (*_MAY_DIFFER, *_NO_SETTINGS))
+
+
 def load_state(
     folder: Path,
     run: Mapping[str, Any],
@@ -68,17 +91,8 @@ def load_state(
     optimiser: torch.optim.Optimizer,
 ) -> int:
     """Load a saved state into a run; returns its steps. TrainingError for another ``run``, or a broken state."""
+    step, tensors = _read_state(folder, run, _MAY_DIFFER)
     with _broken(folder):
-        data, tensors = read_checkpoint(folder)
-        before, now, step = dict(data["training"]), json.loads(json.dumps(run)), data["step"]
-    changed = [key for key in now | before if key not in _MAY_DIFFER and before.get(key) != now.get(key)]
-    if changed:
-        raise TrainingError(
-            f"{folder}: a run with other {', '.join(changed)}; resume with the same ones, or give another --output"
-        )
-    with _broken(folder):
-        if type(step) is not int or not 0 <= step <= now["steps"]:
-            raise ValueError(f"step: expected 0 to {now['steps']}, got {shown(step)}")
         for (name, parameter), shadow in zip(parameters.items(), average.shadow_params, strict=True):
             parameter.data.copy_(tensors[f"weights.{name}"])
             shadow.copy_(tensors[f"average.{name}"])
@@ -92,6 +106,43 @@ def load_state(
                 state.setdefault(int(k), {})[key] = value
         optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
     return step
+
+
+def _read_state(folder: Path, run: Mapping[str, Any], ignored: Sequence[str]) -> tuple[int, dict[str, torch.Tensor]]:
+    """Steps and tensors of the saved state of a ``run``, which may differ in what is ``ignored``."""
+    with _broken(folder):
+        data, tensors = read_checkpoint(folder)
+        before, step = _named(dict(data["training"])), data["step"]
+    now = _named(json.loads(json.dumps(run)))
+    changed = {
+        name: "" if name == "frozen weights" else f" ({_text(now, name)} instead of {_text(before, name)})"
+        for name in now | before
+        if name.partition(".")[0] not in ignored and before.get(name) != now.get(name)
+    }
+    if changed:
+        named = [f"{name}{values}" for name, values in changed.items()]
+        if len(named) > _MOST_NAMED:
+            named[_MOST_NAMED:] = [f"and {len(named) - _MOST_NAMED} more"]
+        why = "; steps cannot change, since the learning rate falls to 0 at the last one" if "steps" in changed else ""
+        raise TrainingError(
+            f"{folder}: a run with other {', '.join(named)}; resume with the same ones, or give another --output{why}"
+        )
+    with _broken(folder):
+        if type(step) is not int or not 0 <= step <= now["steps"]:
+            raise ValueError(f"step: expected 0 to {now['steps']}, got {shown(step)}")
+    return step, tensors
+
+
+def _named(settings: Mapping[str, Any], group: str = "") -> dict[str, Any]:
+    """Settings under the names that ``--set`` gives them."""
+    named: dict[str, Any] = {}
+    for name, value in settings.items():
+        named |= _named(value, f"{group}{name}.") if isinstance(value, dict) else {f"{group}{name}": value}
+    return named
+
+
+def _text(settings: Mapping[str, Any], name: str) -> str:
+    return shown(settings[name]) if name in settings else "nothing"
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable
+from dataclasses import asdict
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.training.checkpointing import check_settings, has_state
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.data import open_frames
 from arbiview_aug.generator.training.held_out import held_out_scores, report, spread
@@ -38,6 +40,8 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
         _evaluate(arguments, config, output, processes.device, **options)
         return 0
     check_weights(config, arguments.weights)
+    if has_state(output):
+        check_settings(output / "state", asdict(config))
     options["perceptual"] = load_perceptual(arguments.vgg_weights) if config.loss.perceptual else None
     data, device = arguments.data or "synthetic", processes.device
     frames = open_frames(data, config.generator.image_size, scenes=config.scenes, seed=config.seed, device=device)

@@ -16,11 +16,10 @@ from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError, OutputError, TrainingError, one_line
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.checkpoint import CONFIG_FILE
 from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.generator.config import TrainedOn
-from arbiview_aug.generator.training.checkpointing import averaged, load_state, save_state, stop_requests
+from arbiview_aug.generator.training.checkpointing import averaged, has_state, load_state, save_state, stop_requests
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
 from arbiview_aug.generator.training.held_out import mean_hole_psnr, picture, sampled
@@ -48,8 +47,9 @@ class Trainer:
         say: Called with messages.
 
     Raises:
-        TrainingError: The output holds a run with other settings, data, frozen weights or number of processes; the
-            generator is frozen or has another configuration; VGG16 is missing; the process has another precision.
+        TrainingError: The output holds a run with other settings, data, frozen weights or number of processes, or a
+            generator without a state; the generator is frozen or has another configuration; VGG16 is missing; the
+            process has another precision.
         ImportError: accelerate or tensorboard is not installed.
     """
 
@@ -108,7 +108,7 @@ class Trainer:
         self._buffers = {"deviation": generator.denoiser.deviation} if config.generator.residual else {}
         self.done, state = 0, self.output / "state"
         self._writer: Any = None  # TensorBoard's, in the main process
-        is_resumed = (state / CONFIG_FILE).is_file()
+        is_resumed = has_state(self.output)
         if is_resumed:
             self.done = load_state(state, self._run, self.trained, self._buffers, self.average, self.optimiser)
             self.say(f"going on after step {self.done} of {state}")

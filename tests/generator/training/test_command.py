@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 
 from arbiview_aug.__main__ import main as package_main
+from arbiview_aug.errors import DataError
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.checkpoint import write_checkpoint
 from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.generator.training import command
+from arbiview_aug.generator.training.config import CONFIGS
 from arbiview_aug.generator.training.data import Frames
 from arbiview_aug.train import main
 from integrations.benchmarks import training
@@ -45,6 +49,34 @@ def test_train_and_resume(drawn_frames: None, tmp_path: Path, capsys: pytest.Cap
     assert Generator.from_pretrained(tmp_path / "generator").config.image_size == (16, 24)
     assert main(common) == 0
     assert "going on after step 2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("file", "setting", "message"),
+    [
+        ("state/config.json", "loss.geo=0", "state: a run with other loss.geo (0 instead of 0.1); resume with"),
+        ("state/config.json", "workers=0", None),
+        ("generator/config.json", "workers=0", "generator: expected none, since"),
+    ],
+)
+def test_a_folder_that_cannot_be_gone_on_with_is_refused_before_any_frame_is_made(
+    file: str,
+    setting: str,
+    message: str | None,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    settings = {**asdict(CONFIGS["tiny"]()), "data": {"data": "synthetic"}}
+    write_checkpoint((tmp_path / file).parent, {"step": 1, "training": settings}, {})
+
+    def opened(*_: object, **__: object) -> Frames:
+        raise DataError("frames are made")
+
+    monkeypatch.setattr(command, "open_frames", opened)
+    assert main(["--output", str(tmp_path), "--quiet", "--set", setting]) == 2
+    error = capsys.readouterr().err
+    assert (message or "frames are made") in error and error.count("\n") == 1
 
 
 def test_both_entries_have_the_same_help(capsys: pytest.CaptureFixture[str]) -> None:

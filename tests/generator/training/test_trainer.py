@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import math
@@ -17,7 +18,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 from arbiview_aug.errors import OutputError, TrainingError
-from arbiview_aug.generator import Generator
+from arbiview_aug.generator import Generator, checkpoint
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.denoiser import REGRESSION
 from arbiview_aug.generator.training import checkpointing, trainer
@@ -158,10 +159,23 @@ def test_a_gradient_that_is_not_finite_changes_nothing(tmp_path: Path, most: flo
 
 def test_a_state_of_other_settings_is_refused(tmp_path: Path) -> None:
     run(tmp_path, steps=2).train()
-    with pytest.raises(TrainingError, match="a run with other steps, lr; resume with the same"):
+    values = r"steps \(4 instead of 2\), lr \(0.5 instead of 0.001\)"
+    why = "steps cannot change, since the learning rate falls to 0 at the last one"
+    with pytest.raises(TrainingError, match=f"a run with other {values}; resume with the same .*; {why}"):
         run(tmp_path, lr=0.5)
-    with pytest.raises(TrainingError, match="a run with other loss;"):
+    with pytest.raises(TrainingError, match=r"a run with other loss.known_weight \(0.5 instead of 0.2\); .* --output$"):
         run(tmp_path, steps=2, loss=replace(config().loss, known_weight=0.5))
+    many = {
+        "batch": 3,
+        "warmup": 3,
+        "weight_decay": 0.5,
+        "ema": 0.5,
+        "cond_drop_prob": 0.5,
+        "scenes": 3,
+        "attention": False,
+    }
+    with pytest.raises(TrainingError, match=r"attention \(False instead of True\), and 1 more; resume"):
+        run(tmp_path, steps=2, **many)
     run(tmp_path, steps=2, workers=1, save_every=7)  # those may change
 
 
@@ -169,7 +183,9 @@ def test_a_state_of_other_data_weights_or_processes_is_refused(tmp_path: Path, m
     """It would go on without a word, and say that it was trained on the last data alone."""
     frozen = replace(config().generator, frozen_unet=True, prompt_tokens=2)
     run(tmp_path, generator=frozen).save()
-    with pytest.raises(TrainingError, match=r"state: a run with other data; .* or give another --output"):
+    with pytest.raises(
+        TrainingError, match=r"state: a run with other data.data \('frames:/b' instead of ''\); .* --output"
+    ):
         run(tmp_path, generator=frozen, data="frames:/b")
     with pytest.raises(TrainingError, match="a run with other frozen weights;"):
         run(tmp_path, generator=frozen, seed=1)
@@ -179,7 +195,7 @@ def test_a_state_of_other_data_weights_or_processes_is_refused(tmp_path: Path, m
     with pytest.raises(TrainingError, match="a run with other frozen weights;"):
         Trainer(config(generator=frozen), frames(), another, tmp_path, show=False)
     monkeypatch.setattr("accelerate.Accelerator.num_processes", 2)
-    with pytest.raises(TrainingError, match="a run with other number of processes;"):
+    with pytest.raises(TrainingError, match=r"a run with other number of processes \(2 instead of 1\);"):
         run(tmp_path, generator=frozen)
 
 
@@ -202,8 +218,37 @@ def test_a_state_that_is_no_state_is_refused(tmp_path: Path) -> None:
         ):
             run(tmp_path)
     file.write_text(json.dumps({**sound, "training": {**sound["training"], "clip": 1.0}}))
-    with pytest.raises(TrainingError, match="state: a run with other clip; resume with the same ones, or give another"):
+    with pytest.raises(TrainingError, match=r"state: a run with other clip \(nothing instead of 1.0\); resume with"):
         run(tmp_path)
+
+
+def test_a_generator_without_its_state_is_not_replaced(tmp_path: Path) -> None:
+    """A half-copied run, or one whose state was removed to save space."""
+    run(tmp_path).save()
+    (tmp_path / "state" / "config.json").unlink()
+    expected = f"{tmp_path / 'generator'}: expected none, since {tmp_path / 'state'} holds no state to go on from"
+    with pytest.raises(
+        TrainingError, match=rf"{expected}.*; give another --output, or remove {tmp_path / 'generator'}"
+    ):
+        run(tmp_path)
+    Generator.from_pretrained(tmp_path / "generator")
+
+
+@pytest.mark.parametrize("writes", [1, 2, 3])  # of four: weights and configuration of the state and the generator
+def test_a_first_save_that_was_killed_can_go_on(writes: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, whole, left = run(tmp_path), checkpoint.write_whole, iter(range(writes))
+
+    def killed(files: Any) -> None:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        whole(files)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "write_whole", killed)
+        with contextlib.suppress(KeyboardInterrupt):
+            made.save()
+    run(tmp_path).save()
+    Generator.from_pretrained(tmp_path / "generator")
 
 
 def test_a_generator_that_is_frozen_is_refused(tmp_path: Path) -> None:
