@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from typing import Any, get_args
 
@@ -208,6 +209,23 @@ def test_every_command_is_known_here() -> None:
     assert commands() == set(TINY)
 
 
+def study_commands() -> set[str]:
+    """Commands after ``python -m integrations.benchmarks.`` in the README and the pages, without comments."""
+    pages = "\n".join(text_of(page) for page in (ROOT / "README.md", *DOCS))
+    return set(re.findall(r"python -m integrations\.benchmarks\.(\w[^`\n#]*)", pages))
+
+
+def test_every_command_of_a_study_parses() -> None:
+    """Every study is shown in a page."""
+    shown = [shlex.split(command) for command in study_commands()]
+    for name, *arguments in shown:
+        parser = import_module(f"integrations.benchmarks.{name}").parser()
+        parser.parse_args(arguments)
+        assert parser.prog == f"python -m integrations.benchmarks.{name}"
+    modules = (ROOT / "integrations" / "benchmarks").glob("*.py")
+    assert {name for name, *_ in shown} == {path.stem for path in modules if "\ndef parser(" in text_of(path)}
+
+
 @pytest.mark.parametrize(
     "command",
     # These take as long as all the others together; the pictures' commands are others with a seed and a width.
@@ -306,6 +324,12 @@ def test_the_papers_tables_are_the_commands() -> None:
             assert [c == "-" for c in cells] == [w == "-" for w in wanted]
         if "published" in printed[0][1]:
             assert [row[:5] for row in shown] == [row[:5] for row in printed]
+    # The second table's figures tell which baselines are above ours.
+    for name, *cells in tables(measured("paper"))[1][2:]:
+        for (of, kind), cell in zip(product(of_sets, SETS), cells, strict=True):
+            metric = "true_psnr_db" if of == SYNTHETIC else "even_psnr_db"
+            study.means[of][name][kind] = of_sets[of] | {metric: float(cell.split(" / ")[0])}
+    assert "above ours" in paper_report(study)
     assert set(words(paper_report(study))) <= set(words(measured("paper")))
 
 

@@ -20,13 +20,13 @@ import torch
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Quality, Reduce
-from arbiview_aug.cli.arguments import add_data, add_downscale, command_parser, output_file, seed
+from arbiview_aug.cli.arguments import add_data, add_downscale, output_file, seed
 from arbiview_aug.cli.bench.timing import benchmark, machine_line, quartiles, show
 from arbiview_aug.datasets import open_data, reduced_rig
 from arbiview_aug.datasets.depth_folder import WANTED
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.errors import DataError, exit_status
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.agreement import source_overlap, summary
 from arbiview_aug.evaluate.frames import ScoredFrame, make_frame
 from arbiview_aug.evaluate.images import RenderedView
@@ -41,9 +41,8 @@ from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from integrations.benchmarks.paper import paper_stages
-from integrations.benchmarks.study import study
+from integrations.benchmarks.study import run_study, study, study_parser
 
-PROGRAM = "python -m integrations.benchmarks.ablation"
 SYNTHETIC = "synthetic street"
 GEOMETRY = {"boxes": "boxes_3d", "LiDAR": "points", "motion": MOTION_KEY, "learned": LEARNED_KEY}
 """Kinds of geometry, and the sample's keys."""
@@ -166,19 +165,22 @@ NOTES = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure, print the table, write the JSON; the exit status."""
-    parser = command_parser(
-        "",
+    return run_study(parser(), _run, argv)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    parser = study_parser(
+        "ablation",
         "Each stage and setting on and off: accuracy, milliseconds on one thread, and what a ms buys.",
         "--data FOLDER",
-        program=PROGRAM,
     )
     add_data(parser, "a synthetic street", nargs="+", default=[])
     add_downscale(parser, 2)
     parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the synthetic street")
     parser.add_argument("--only", metavar="TEXT", default="", help="steps whose names contain it")
     parser.add_argument("--output", default="output/ablation.json", metavar="FILE", help="file to write to")
-    arguments = parser.parse_args(argv)
-    return exit_status(PROGRAM, lambda: _run(arguments))
+    return parser
 
 
 def _run(arguments: argparse.Namespace) -> None:

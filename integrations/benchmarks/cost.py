@@ -23,6 +23,7 @@ from arbiview_aug.generator.denoiser import Rows
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
 from arbiview_aug.generator.training.data import open_frames
 from arbiview_aug.generator.training.pseudo_views import PseudoViews, collate
+from integrations.benchmarks.study import run_study, study_parser
 
 SUSTAINED_TFLOPS = (120, 350)
 """About 40 % of the dense bfloat16 peak of an A100 (312) and of an H100 (989): an assumption."""
@@ -122,14 +123,21 @@ def row(name: str, cost: dict[str, float]) -> list[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description="what a training step costs, computed")
-    parser.add_argument("--config", nargs="+", choices=tuple(CONFIGS), default=["paper", "inpaint"])
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
-    arguments = parser.parse_args(argv)
+    """Print the table; the exit status."""
+    return run_study(parser(), _run, argv)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    parser = study_parser("cost", "What a training step costs, computed.", "--config paper --set batch=4")
+    parser.add_argument("--config", nargs="+", choices=tuple(CONFIGS), default=["paper", "inpaint"], help="presets")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as batch=4")
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> None:
     table = [row(name, step_cost(overridden(CONFIGS[name](), arguments.set))) for name in arguments.config]
     print(markdown_table(HEADINGS, table))
-    return 0
 
 
 if __name__ == "__main__":

@@ -20,15 +20,16 @@ from tqdm import tqdm
 
 from arbiview_aug import RigRetarget, SampleKeys
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_output, command_parser, count, device_named, size, writable_folder
+from arbiview_aug.cli.arguments import add_output, count, device_named, seed, size, writable_folder
 from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, show
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SceneClass, SyntheticDrive, demo_source_rig
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import make_frame
 from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.generator import Diffusion, Generator
-from integrations.benchmarks.study import study
+from integrations.benchmarks.study import run_study, study, study_parser
 
 SIZE = (256, 448)
 STEPS = (1, 4)
@@ -41,7 +42,7 @@ YAW_DEG, FOCAL = 20.0, 0.7
 
 MOVES_M = {"0.7 m up": (0.0, 0.0, 0.7), "1 m aside": (0.0, 1.0, 0.0)}
 KNOWN = {"LiDAR and boxes": {}, "boxes": {"points": None}}
-"""Function that takes away from a sample what is not known."""
+"""What replaces keys of a sample, so that no more is known."""
 
 BEHIND = {
     "road": GROUND_CLASSES,
@@ -53,30 +54,39 @@ FILLERS = ("telea", "continue")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print the table, write the JSON."""
-    parser = command_parser(
-        "",
-        "Holes left black, inpainted, generated: milliseconds a frame, and PSNR against the true views.",
-        "--steps 1 4",
-        program="python -m integrations.benchmarks.generator",
-    )
+    """Measure, print the table, write the JSON; the exit status."""
+    return run_study(parser(), _run, argv)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    text = "Holes left black, inpainted, generated: milliseconds a frame, and PSNR against the true views."
+    parser = study_parser("generator", text, "--steps 1 4")
     parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of every view")
     parser.add_argument("--repeats", type=count, default=3, metavar="N", help="rounds of timing")
     add_output(parser)
     parser.add_argument("--generator", metavar="DIR", help="a trained one (default: the package's own)")
     parser.add_argument("--steps", nargs="+", type=count, default=STEPS, metavar="N", help="(default: 1 4)")
     parser.add_argument("--frames", type=count, default=2, metavar="N", help="number of streets")
-    parser.add_argument("--seed", type=int, default=HELD_OUT_SEED, metavar="N", help="of the streets")
-    parser.add_argument("--behind", action="store_true", help="by what lies in the holes of moved cameras")
-    arguments = parser.parse_args(argv)
+    parser.add_argument("--seed", type=seed, default=HELD_OUT_SEED, metavar="N", help="of the streets")
+    behind = "instead: fast fillers by what lies in the holes of moved cameras, without generator and times"
+    parser.add_argument("--behind", action="store_true", help=behind)
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    others = [
+        name for name in ("repeats", "generator", "steps") if getattr(arguments, name) != parser().get_default(name)
+    ]
+    if arguments.behind and others:
+        raise DataError(f"--behind: expected no --{others[0]} with it: it runs no generator and takes no times")
     folder = writable_folder(Path(arguments.output), arguments.output)
     if arguments.behind:
         report = measure_behind(arguments)
         show(table_behind(report), report, folder / "behind.json")
-        return 0
+        return
     report = measure(arguments)
     show(table(report), report, folder / "generator.json")
-    return 0
 
 
 def row_name(steps: int) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,12 +21,15 @@ from tqdm import tqdm
 from arbiview_aug import RigRetarget, visible_boxes
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_output, command_parser, count, size, writable_folder
+from arbiview_aug.cli.arguments import add_output, count, seed, size, writable_folder
 from arbiview_aug.cli.bench.timing import benchmark, machine_line, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.synthetic.dataset import GROUND_CLASSES
 from arbiview_aug.datasets.synthetic.raycast import cast, find_candidates, scene_from
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Scene, SceneClass
+from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.report.tables import metric_table
+from integrations.benchmarks.study import run_study, study_parser
 
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.floating]
@@ -53,14 +56,12 @@ class Views(NamedTuple):
         images: (M, h, w, 3) uint8.
         surface: Index in ``SURFACES``, -1 for the sky.
         seen: Whether a source truly sees the pixel's point.
-        hider: (N, M, h, w) int64 primitive that hides it from each source, -1 for none or outside the image.
         instances: Row of ``boxes_3d``, -1 for none.
     """
 
     images: npt.NDArray[np.uint8]
     surface: npt.NDArray[np.int64]
     seen: Bools
-    hider: npt.NDArray[np.int64]
     instances: npt.NDArray[np.int64]
 
 
@@ -69,7 +70,7 @@ def true_views(drive: SyntheticDrive, index: int, target: Rig) -> Views:
     truth, scene = drive.render(index, target), drive.scene(index)
     depth, classes, instances = (np.stack([np.asarray(v) for v in part]) for part in truth[1:])
     points = np.stack([_points(*of_camera) for of_camera in zip(target, depth, strict=True)])
-    seen, hider = map(np.stack, zip(*(visible(scene, drive.rig, camera, points) for camera in drive.rig), strict=True))
+    seen = np.any([visible(scene, drive.rig, camera, points) for camera in drive.rig], axis=0)
     surface = np.full(depth.shape, SURFACES.index("other"))
     surface[np.isin(classes, GROUND_CLASSES)] = SURFACES.index("ground")
     vehicle = classes == SceneClass.VEHICLE
@@ -77,11 +78,11 @@ def true_views(drive: SyntheticDrive, index: int, target: Rig) -> Views:
     surface[vehicle], surface[top] = SURFACES.index("sides"), SURFACES.index("tops")
     surface[~np.isfinite(depth)] = -1
     images = np.stack([np.asarray(v) for v in truth.images]).transpose(0, 2, 3, 1)
-    return Views(images, surface, seen.any(axis=0), hider, instances.astype(int))
+    return Views(images, surface, seen, instances.astype(int))
 
 
-def visible(scene: Scene, rig: Rig, source: Camera, points: Floats) -> tuple[Bools, npt.NDArray[np.int64]]:
-    """Whether a source sees points (M, h, w, 3), and which primitive hides them, -1 for none: by a ray to each.
+def visible(scene: Scene, rig: Rig, source: Camera, points: Floats) -> Bools:
+    """Whether a source sees points (M, h, w, 3): by a ray to each.
 
     Only rays within the image are cast.
     """
@@ -90,10 +91,10 @@ def visible(scene: Scene, rig: Rig, source: Camera, points: Floats) -> tuple[Boo
     if source.mask is not None:
         x, y = np.where(inside[..., None], uv, 0).round().astype(int).clip(0, np.array(source.size[::-1]) - 1).T
         inside &= source.mask[y.T, x.T]
-    seen, hider = np.zeros(inside.shape, bool), np.full(inside.shape, -1)
+    seen = np.zeros(inside.size, bool)
     flat = np.flatnonzero(_tiled(inside))
     if not len(flat):
-        return seen, hider
+        return seen.reshape(inside.shape)
     # Pixels of a tile share a packet, filled up with its last ray.
     flat = flat[np.argsort(flat // _TILE**2, kind="stable")]
     offset = _tiled(points)[flat] - source.center_m
@@ -107,12 +108,9 @@ def visible(scene: Scene, rig: Rig, source: Camera, points: Floats) -> tuple[Boo
     rays = ((offset / distance[:, None]) @ R.T)[rows].transpose(0, 2, 1)
     start = R @ origin + scene.ego2street[:3, 3]
     local, packets = scene_from(scene, start), torch.from_numpy(np.ascontiguousarray(rays, np.float32))
-    t, hit = cast(local, torch.from_numpy(start[None].astype(np.float32)), packets, find_candidates(local, packets))
-    t, hit = (part.numpy()[packet, rank] for part in (t, hit))
-    free = t >= distance * (1 - _TOUCH) - _TOUCH_M
-    out = np.zeros(inside.size, bool), np.full(inside.size, -1)
-    out[0][flat], out[1][flat] = free, np.where(free, -1, hit)
-    return _untiled(out[0], inside.shape), _untiled(out[1], inside.shape)
+    t, _ = cast(local, torch.from_numpy(start[None].astype(np.float32)), packets, find_candidates(local, packets))
+    seen[flat] = t.numpy()[packet, rank] >= distance * (1 - _TOUCH) - _TOUCH_M
+    return _untiled(seen, inside.shape)
 
 
 def _tiled(a: Any) -> Any:
@@ -178,36 +176,43 @@ def cars(views: Views, out: dict[str, Any], box_classes: npt.NDArray[np.int64]) 
     return np.array([np.count_nonzero(one) for one in sets])
 
 
+def check_tiled(image_size: tuple[int, int]) -> None:
+    """DataError for sides that are no multiples of a tile."""
+    if any(side % _TILE for side in image_size):
+        raise DataError(f"--size: expected multiples of {_TILE}, got {image_size[0]}x{image_size[1]}")
+
+
 # --- the command ------------------------------------------------------------------------------------------------------
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print the table, write the JSON."""
-    parser = command_parser(
-        "",
-        "Whether hidden pixels are called covered, on synthetic streets whose truth is known.",
-        "--streets 12",
-        program="python -m integrations.benchmarks.hidden",
-    )
+    """Measure, print the table, write the JSON; the exit status."""
+    return run_study(parser(), _run, argv)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    text = "Whether hidden pixels are called covered, on synthetic streets whose truth is known."
+    parser = study_parser("hidden", text, "--streets 12")
     parser.add_argument("--size", type=size, default=(256, 704), metavar="HxW", help="of every view, multiples of 16")
     parser.add_argument("--streets", type=count, default=12, metavar="N")
-    parser.add_argument("--seed", type=int, default=900, metavar="N", help="of the streets; develop on others")
+    parser.add_argument("--seed", type=seed, default=900, metavar="N", help="of the streets; develop on others")
     parser.add_argument("--targets", nargs="+", choices=MOVES_M, default=list(MOVES_M))
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
-    parser.add_argument("--two-wheelers", action="store_true", help="which no shape fits well")
     add_output(parser)
-    arguments = parser.parse_args(argv)
-    if any(side % _TILE for side in arguments.size):
-        parser.error(f"--size: expected multiples of {_TILE}, got {arguments.size[0]}x{arguments.size[1]}")
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    check_tiled(arguments.size)
     folder = writable_folder(Path(arguments.output), arguments.output)
     report = measure(arguments)
     show(table(report), report, folder / "hidden.json")
-    return 0
 
 
 @benchmark
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """All rows."""
     source = demo_source_rig(arguments.size)
-    street = {"num_frames": arguments.streets, "seed": arguments.seed, "two_wheelers": arguments.two_wheelers}
+    street = {"num_frames": arguments.streets, "seed": arguments.seed}
     drive = SyntheticDrive(source, **street)
     targets = {name: source.shifted(*MOVES_M[name]) for name in arguments.targets}
     totals: dict[str, list[Any]] = {}
@@ -243,30 +248,27 @@ def _row(total: npt.NDArray[np.float64], counts: npt.NDArray[np.int64]) -> dict[
     return row | dict(zip(names, counts.tolist(), strict=True))
 
 
+_COLUMNS = (
+    ("truly hidden", "{hidden:.2%}"),
+    ("hidden called covered", "{hidden_covered:.2%}"),
+    ("seen called hidden", "{seen_hole:.2%}"),
+    ("error: seen", "{error_seen:.1f}"),
+    ("hidden and covered", "{error_hidden_covered:.1f}"),
+    ("holes", "{error_hole:.1f}"),
+    ("all", "{error:.1f}"),
+)
+
+
 def table(report: dict[str, Any]) -> str:
     """The rows as Markdown."""
-
-    def lines() -> Iterator[str]:
-        yield machine_line(report)
-        yield ""
-        columns = "surface", "truly hidden", "hidden called covered", "seen called hidden"
-        columns = *columns, "error: seen", "hidden and covered", "holes", "all"
-        yield "| | " + " | ".join(columns) + " |"
-        yield "| --- | --- |" + " ---: |" * (len(columns) - 1)
-        for name, row in report["rows"].items():
-            for surface in SURFACES:
-                one = row[surface]
-                shares = (f"{one[key]:.2%}" for key in ("hidden", "hidden_covered", "seen_hole"))
-                errors = (f"{one[key]:.1f}" for key in ("error_seen", "error_hidden_covered", "error_hole", "error"))
-                yield f"| {name} | {surface} | " + " | ".join((*shares, *errors)) + " |"
-        yield ""
-        for name, row in report["rows"].items():
-            of_both = f"{row['dropped_of_both']} of {row['cars_of_both']} cars that A and B see"
-            of_b = f"{row['dropped']} of {row['cars']} that B sees"
-            kept = f"{row['kept_unseen']} of which B sees nothing"
-            yield f"{name}: `visible_boxes` drops {of_both}, {of_b}; it keeps {kept}"
-
-    return "\n".join(lines())
+    rows = [{"name": name, "surface": s, **row[s]} for name, row in report["rows"].items() for s in SURFACES]
+    lines = []
+    for name, row in report["rows"].items():
+        of_both = f"{row['dropped_of_both']} of {row['cars_of_both']} cars that A and B see"
+        of_b = f"{row['dropped']} of {row['cars']} that B sees"
+        kept = f"{row['kept_unseen']} of which B sees nothing"
+        lines.append(f"{name}: `visible_boxes` drops {of_both}, {of_b}; it keeps {kept}")
+    return "\n\n".join([machine_line(report), metric_table(rows, _COLUMNS, ("name", "surface")), "\n".join(lines)])
 
 
 if __name__ == "__main__":

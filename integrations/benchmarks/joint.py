@@ -14,18 +14,22 @@ import numpy as np
 import torch
 
 from arbiview_aug import RigRetarget, SampleKeys
-from arbiview_aug.cli.arguments import command_parser, count, size
+from arbiview_aug.cli.arguments import count, size
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.agreement import target_consistency
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.training.held_out import bootstrap
 from integrations.benchmarks.generator import HELD_OUT_SEED, wide_target
+from integrations.benchmarks.study import run_study, study_parser
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Measure and print a line for each number of steps."""
-    arguments = _parser().parse_args(argv)
+    """Measure and print a line for each number of steps; the exit status."""
+    return run_study(parser(), _run, argv)
+
+
+def _run(arguments: argparse.Namespace) -> None:
     generator = Generator.shipped() if arguments.generator is None else Generator.from_pretrained(arguments.generator)
     source = demo_source_rig(arguments.size)
     drive = SyntheticDrive(source, num_frames=arguments.frames, seed=HELD_OUT_SEED, lidar=False)
@@ -65,13 +69,11 @@ def main(argv: list[str] | None = None) -> int:
                 gains[name].append(together - alone)
         text = ", ".join(f"{name} {bootstrap(values)} dB" for name, values in gains.items())
         print(f"{steps} steps, together against each alone, {arguments.frames} streets: {text}", flush=True)
-    return 0
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "", "Views denoised together, or each alone.", "", program="python -m integrations.benchmarks.joint"
-    )
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    parser = study_parser("joint", "Views denoised together, or each alone.", "--steps 1")
     parser.add_argument("--size", type=size, default=(128, 224), metavar="HxW", help="of every view")
     parser.add_argument("--frames", type=count, default=6, metavar="N", help="held-out streets")
     parser.add_argument("--steps", nargs="+", type=count, default=[1, 4], metavar="N", help="(default: 1 4)")

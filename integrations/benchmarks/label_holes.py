@@ -11,9 +11,9 @@ from __future__ import annotations
 import argparse
 import itertools
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -23,12 +23,16 @@ from tqdm import tqdm
 
 from arbiview_aug import RigRetarget
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import add_output, command_parser, count, size, writable_folder
+from arbiview_aug.choices import GeometryName
+from arbiview_aug.cli.arguments import add_output, count, seed, size, writable_folder
 from arbiview_aug.cli.bench.timing import benchmark, machine_line, show
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.datasets.synthetic.dataset import RenderedViews
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.metrics import psnr_db
+from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.sample.boxes_2d import project_boxes_3d
+from integrations.benchmarks.hidden import check_tiled, true_views
+from integrations.benchmarks.study import run_study, study_parser
 
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.floating]
@@ -53,45 +57,14 @@ class Street(NamedTuple):
 
 
 # --- the truth --------------------------------------------------------------------------------------------------------
-def true_holes(rig: Rig, depth_m: Floats, target: Rig, target_depth_m: Floats) -> Bools:
-    """(M, h, w) pixels of exact depth that no source sees: within a pixel, 2 % and 0.1 m."""
-    holes = []
-    for camera, depth in zip(target, target_depth_m, strict=True):
-        rays = camera.unproject_cam(camera.pixel_grid()).directions
-        rays = rays / rays[..., 2:]
-        distance = np.where(np.isfinite(depth), depth, 1e5)[..., None]  # the sky
-        points = rays * distance @ camera.cam2ego[:3, :3].T + camera.center_m
-        seen = np.zeros(camera.size, bool)
-        for source, source_depth in zip(rig, depth_m, strict=True):
-            uv, z, valid = source.project(points)
-            valid &= source.contains(uv, 1e-6)
-            farthest = cv2.dilate(np.where(np.isfinite(source_depth), source_depth, 1e6), np.ones((3, 3), np.uint8))
-            x, y = np.where(valid[..., None], uv, 0).round().astype(int).clip(0, np.array(source.size[::-1]) - 1).T
-            seen |= valid & (z <= 1.02 * farthest[y.T, x.T] + 0.1)
-        holes.append(~seen)
-    return np.stack(holes)
-
-
 def make_street(drive: SyntheticDrive, index: int, target: Rig) -> Street:
     """Street ``index`` with its truth for a target."""
-    sample, own, views = drive[index], drive.render(index), drive.render(index, target)
+    sample, views = drive[index], true_views(drive, index, target)
     rectangles = []
     for found in project_boxes_3d(sample["boxes_3d"], target):
         wide, high = (found.boxes[:, 2:] - found.boxes[:, :2]).T
         rectangles.append(found.boxes[(np.minimum(wide, high) >= LEAST_PX) & (found.visibility > 0)])
-    holes = true_holes(drive.rig, _array(own, "depth_m"), target, _array(views, "depth_m"))
-    return Street(
-        sample,
-        target,
-        _array(views, "images").transpose(0, 2, 3, 1),
-        holes,
-        _array(views, "instances") >= 0,
-        rectangles,
-    )
-
-
-def _array(views: RenderedViews, name: str) -> npt.NDArray[Any]:
-    return np.stack([np.asarray(view) for view in getattr(views, name)])
+    return Street(sample, target, views.images, ~views.seen, views.instances >= 0, rectangles)
 
 
 # --- rings ------------------------------------------------------------------------------------------------------------
@@ -230,24 +203,31 @@ def figures(streets: Sequence[Street], surface: str, seed: int) -> dict[str, flo
 
 # --- the command ------------------------------------------------------------------------------------------------------
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print the table, write the JSON."""
-    parser = command_parser(
-        "",
-        "Whether holes draw the labels, on synthetic streets whose true holes are known.",
-        "--streets 20",
-        program="python -m integrations.benchmarks.label_holes",
-    )
-    parser.add_argument("--size", type=size, default=(256, 704), metavar="HxW", help="of every view")
-    parser.add_argument("--streets", type=count, default=20, metavar="N")
-    parser.add_argument("--seed", type=int, default=50, metavar="N", help="of the streets and the probe")
+    """Measure, print the table, write the JSON; the exit status."""
+    return run_study(parser(), _run, argv)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    text = "Whether holes draw the labels, on synthetic streets whose true holes are known."
+    parser = study_parser("label_holes", text, "--streets 20")
+    parser.add_argument("--size", type=size, default=(256, 704), metavar="HxW", help="of every view, multiples of 16")
+    parser.add_argument("--streets", type=count, default=20, metavar="N", help="2 or more, for two folds")
+    parser.add_argument("--seed", type=seed, default=50, metavar="N", help="of the streets and the probe")
     parser.add_argument("--targets", nargs="+", choices=TARGETS, default=list(TARGETS))
-    parser.add_argument("--surfaces", nargs="+", default=["auto", "boxes"], metavar="NAME")
+    surfaces = get_args(GeometryName)
+    parser.add_argument("--surfaces", nargs="+", choices=surfaces, default=["auto", "boxes"], help="geometry")
     add_output(parser)
-    arguments = parser.parse_args(argv)
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    if arguments.streets < 2:
+        raise DataError("--streets: expected 2 or more, got 1: the probe learns on one half and is tried on the other")
+    check_tiled(arguments.size)
     folder = writable_folder(Path(arguments.output), arguments.output)
     report = measure(arguments)
     show(table(report), report, folder / "label_holes.json")
-    return 0
 
 
 @benchmark
@@ -280,16 +260,8 @@ _COLUMNS = (
 
 def table(report: dict[str, Any]) -> str:
     """The rows as Markdown."""
-
-    def lines() -> Iterator[str]:
-        yield machine_line(report)
-        yield ""
-        yield "| | " + " | ".join(title for title, _ in _COLUMNS) + " |"
-        yield "| --- |" + " ---: |" * len(_COLUMNS)
-        for name, row in report["rows"].items():
-            yield f"| {name} | " + " | ".join(form.format(**row) for _, form in _COLUMNS) + " |"
-
-    return "\n".join(lines())
+    rows = [{"name": name, **row} for name, row in report["rows"].items()]
+    return f"{machine_line(report)}\n\n{metric_table(rows, _COLUMNS)}"
 
 
 if __name__ == "__main__":

@@ -20,14 +20,17 @@ from pathlib import Path
 import numpy as np
 
 from arbiview_aug import Lidar, Rig, RigRetarget, retarget_points
-from arbiview_aug.cli.arguments import command_parser, count
+from arbiview_aug.cli.arguments import count, seed
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import ScanErrors, SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.lidar import lidar_split
+from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.evaluate.scans import chamfer_m, measured_near, rings_dropped, scan_metrics
 from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.scene.point_cloud import own_car
+from integrations.benchmarks.study import run_study, study_parser
 
 COLUMNS = ("recall", "precision", "range_error_m", "chamfer_m", "recall of all")
 PLACE_M = (0.9, 0.0, 1.9)
@@ -55,14 +58,20 @@ PAIRS = {
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Print a table of both studies."""
-    arguments = _parser().parse_args(argv)
-    print(f"| scene | points | {' | '.join(COLUMNS)} |\n| --- | --- |{' ---: |' * len(COLUMNS)}")
-    for scene, name, metrics in (*synthetic(arguments.frames, arguments.seed), *ddad(arguments.data)):
-        cells = (f"{metrics[key]:.3f}" if key in metrics else "" for key in COLUMNS)
-        print(f"| {scene} | {name} | {' | '.join(cells)} |")
+    """Print a table of both studies; the exit status."""
+    return run_study(parser(), _run, argv)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    folder: Path | None = arguments.data
+    if folder is None and "ARBIVIEW_DATA" in os.environ:
+        folder = Path(os.environ["ARBIVIEW_DATA"])
+    elif folder is not None and not (folder / "ddad-next").is_dir():
+        raise DataError(f"--data {folder}: expected a folder with ddad-one and ddad-next, found no ddad-next")
+    found = (*synthetic(arguments.frames, arguments.seed), *ddad(folder))
+    rows = [[scene, name, *(f"{of[key]:.3f}" if key in of else "" for key in COLUMNS)] for scene, name, of in found]
+    print(markdown_table(("scene", "points", *COLUMNS), rows, left=2))
     print(f"\n{speed(arguments.seed)}")
-    return 0
 
 
 def speed(seed: int) -> str:
@@ -152,12 +161,14 @@ def ddad(data: Path | None) -> Iterator[tuple[str, str, dict[str, float]]]:
         yield "DDAD's next scan", name, metrics
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("", __doc__, "--frames 4", program="python -m integrations.benchmarks.lidar")
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    text = "Scans as another scanner would have measured them, against true ones."
+    parser = study_parser("lidar", text, "--frames 4")
     parser.add_argument("--frames", type=count, default=12, metavar="N", help="streets (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=8000, help="seed of the streets (default: %(default)s)")
-    folder = os.environ.get("ARBIVIEW_DATA")
-    parser.add_argument("--data", type=Path, default=folder and Path(folder), help="folder of the real frames")
+    parser.add_argument("--seed", type=seed, default=8000, help="seed of the streets (default: %(default)s)")
+    text = "folder with ddad-one and ddad-next (default: ARBIVIEW_DATA, where it has them)"
+    parser.add_argument("--data", type=Path, metavar="DIR", help=text)
     return parser
 
 

@@ -20,12 +20,13 @@ import torch
 
 from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.arguments import command_parser, count, size
+from arbiview_aug.cli.arguments import count, size
 from arbiview_aug.cli.bench.timing import benchmark, timed_rounds
 from arbiview_aug.datasets.synthetic import demo_source_rig, demo_target_rig
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.render.export import plan_arrays
 from arbiview_aug.render.plan import RenderPlan
+from integrations.benchmarks.study import run_study, study_parser
 
 MOTIONS: dict[str, tuple[float, float]] = {
     "0.003° pitch": (0.003, 0.0),
@@ -92,13 +93,20 @@ def measure(source: Rig, target: Rig, surface: GeometryName, rounds: int) -> dic
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Measure and print a table for each surface."""
-    program = "python -m integrations.benchmarks.moving_calibration"
-    parser = command_parser("", "Calibration that moves: a plan each frame.", "", program=program)
+    """Measure and print a table for each surface; the exit status."""
+    return run_study(parser(), _run, argv)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    parser = study_parser("moving_calibration", "Calibration that moves: a plan each frame.", "--rounds 3")
     parser.add_argument("--size", type=size, default=(900, 1600), metavar="HxW", help="of A's images")
     parser.add_argument("--target-size", type=size, default=(256, 704), metavar="HxW", help="of B's views")
     parser.add_argument("--rounds", type=count, default=9, metavar="N", help="of timing")
-    arguments: argparse.Namespace = parser.parse_args(argv)
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> None:
     source, target = demo_source_rig(arguments.size), demo_target_rig(arguments.target_size)
     surfaces: tuple[GeometryName, ...] = ("infinity", "street")
     for surface in surfaces:
@@ -109,7 +117,6 @@ def main(argv: list[str] | None = None) -> int:
         ]
         print(f"{surface}: {figures['ms']['held']:.1f} ms with the plan held, {figures['ms']['anew']:.1f} ms anew")
         print(markdown_table(["since the plan", "B still: median, largest px, other sources", "B rides along"], rows))
-    return 0
 
 
 if __name__ == "__main__":

@@ -19,15 +19,17 @@ import torch
 from tqdm import tqdm
 
 from arbiview_aug import RigRetarget
-from arbiview_aug.cli.arguments import add_output, command_parser, count, size, writable_folder
+from arbiview_aug.cli.arguments import add_output, count, seed, size, writable_folder
 from arbiview_aug.cli.bench.timing import benchmark, machine_line, show
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.metrics import psnr_db
+from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.sample.inputs import MOTION_KEY, read_frames
 from arbiview_aug.sample.neighbours import read_neighbours
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.temporal.motion_depth import motion_depth
+from integrations.benchmarks.study import run_study, study_parser
 
 Bools = npt.NDArray[np.bool_]
 Floats = npt.NDArray[np.floating]
@@ -110,22 +112,25 @@ def synthetic_rows(drive: SyntheticDrive) -> dict[str, dict[str, float]]:
 
 # --- the command ------------------------------------------------------------------------------------------------------
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure, print the tables, write the JSON."""
-    parser = command_parser(
-        "",
-        "What depth from motion does to moving traffic without labels.",
-        "--streets 6 --seed 91",
-        program="python -m integrations.benchmarks.moving_traffic",
-    )
+    """Measure, print the tables, write the JSON; the exit status."""
+    return run_study(parser(), _run, argv)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    text = "What depth from motion does to moving traffic without labels."
+    parser = study_parser("moving_traffic", text, "--streets 6 --seed 91")
     parser.add_argument("--size", type=size, default=(256, 704), metavar="HxW", help="of synthetic views")
     parser.add_argument("--streets", type=count, default=8, metavar="N", help="synthetic streets")
-    parser.add_argument("--seed", type=int, default=70, metavar="N", help="of the streets")
+    parser.add_argument("--seed", type=seed, default=70, metavar="N", help="of the streets")
     add_output(parser)
-    arguments = parser.parse_args(argv)
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> None:
     folder = writable_folder(Path(arguments.output), arguments.output)
     report = measure(arguments)
     show(table(report), report, folder / "moving_traffic.json")
-    return 0
 
 
 @benchmark
@@ -137,19 +142,12 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def table(report: dict[str, Any]) -> str:
-    """The rows as Markdown."""
-
-    def lines() -> Iterator[str]:
-        yield machine_line(report)
-        rows = report["rows"]
-        for columns in dict.fromkeys(tuple(row) for row in rows.values()):
-            yield f"\n| synthetic | {' | '.join(columns)} |"
-            yield "| --- |" + " ---: |" * len(columns)
-            for name, row in rows.items():
-                if tuple(row) == columns:
-                    yield f"| {name} | " + " | ".join(f"{value:.3f}" for value in row.values()) + " |"
-
-    return "\n".join(lines())
+    """The rows as Markdown, a table for each set of columns."""
+    parts, rows = [machine_line(report)], report["rows"]
+    for columns in dict.fromkeys(tuple(row) for row in rows.values()):
+        cells = [[name, *(f"{v:.3f}" for v in row.values())] for name, row in rows.items() if tuple(row) == columns]
+        parts.append(markdown_table(("synthetic", *columns), cells))
+    return "\n\n".join(parts)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,6 @@ from arbiview_aug.choices import TARGET_SETS, Quality, Reduce
 from arbiview_aug.cli.arguments import (
     add_data,
     add_output,
-    command_parser,
     count,
     gathered_warnings,
     named_steps,
@@ -34,7 +33,7 @@ from arbiview_aug.cli.arguments import (
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.errors import CalibrationError, DataError, SampleError, exit_status
+from arbiview_aug.errors import CalibrationError, DataError, SampleError
 from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scores
 from arbiview_aug.evaluate.images import Image, as_arrays
 from arbiview_aug.evaluate.methods import Method, Sample, retargeting
@@ -47,8 +46,7 @@ from arbiview_aug.generator import Diffusion, load_inpainter
 from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.inpaint.inpainter import Inpainter
 from integrations.benchmarks.baselines import BASELINES, crop_and_slide, method_of, own_camera
-
-PROGRAM = "python -m integrations.benchmarks.paper"
+from integrations.benchmarks.study import run_study, study_parser
 
 OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")  # presets other than the published method
 
@@ -245,7 +243,7 @@ def _losses(study: Study) -> list[str]:
             above = [f"{name} {value:.2f}" for name, value in baselines.items() if value == best]
             if below:
                 losses.append(f"{of}, {heading}: {', '.join(above)} above {', '.join(below)}")
-    return [f"Where a baseline is above ours, unseen pixels black: {'; '.join(losses)}."] if losses else []
+    return [f"Baselines above ours, unseen pixels black: {'; '.join(losses)}."] if losses else []
 
 
 def _methods(study: Study) -> list[str]:
@@ -333,25 +331,24 @@ def study_methods(generator: Inpainter | None = None) -> list[Method]:
 
 def generating(name: str, generator: Inpainter | None) -> list[Method]:
     """``fast`` with holes by a generator, or by the shipped weights; nothing where these are not installed."""
-    if generator is None and not has_generator():
+    if generator is None and importlib.util.find_spec("diffusers") is None:
         return []
     return [retargeting("fast", "street", name, holes=generator or "diffusion")]
-
-
-def has_generator() -> bool:
-    """Whether diffusers is installed, which the shipped weights need."""
-    return importlib.util.find_spec("diffusers") is not None
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
 def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print the tables, or draw the figures; the exit status."""
-    parser = command_parser(
-        "",
-        "The paper's Tables 1 and 2: baselines, the published stages and ours; quarter of an hour. --figure: its "
+    return run_study(parser(), _run, argv)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    parser = study_parser(
+        "paper",
+        "The paper's Tables 1 and 2: baselines, the published stages and ours; about 20 minutes. --figure: its "
         "Figures 2 to 6 from the first frame, as PNG files.",
         "--data FOLDER",
-        program=PROGRAM,
     )
     add_data(parser, "nuscenes-one and ddad-one below ARBIVIEW_DATA, and synthetic streets")
     parser.add_argument("--figure", action="store_true", help="draw the figures instead")
@@ -359,18 +356,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--frames", type=count, metavar="N", help="frames of tables (default: 1; 3 synthetic ones)")
     parser.add_argument("--size", type=size, metavar="HxW", help="of synthetic images (default: 256x704)")
     add_output(parser)
-    arguments = parser.parse_args(argv)
-    return exit_status(PROGRAM, lambda: print(_run(arguments)))
+    return parser
 
 
-def _run(arguments: argparse.Namespace) -> str:
+def _run(arguments: argparse.Namespace) -> None:
     folder = writable_folder(Path(arguments.output), arguments.output)
     generator = None if arguments.generator is None else load_inpainter(arguments.generator)
     trained_on = generator.generator.trained_on if isinstance(generator, Diffusion) else None
     if arguments.figure:
         with gathered_warnings([]):
             files = draw_figures(_figures_sample(arguments, trained_on), folder, generator)
-        return "\n".join(f"picture: {file}" for file in files)
+        print("\n".join(f"picture: {file}" for file in files))
+        return
     with named_steps([]) as tick:  # warnings of targets half outside the view are expected
         study = measure_paper(
             arguments.data,
@@ -382,7 +379,7 @@ def _run(arguments: argparse.Namespace) -> str:
         )
     study.generator = arguments.generator
     (folder / "paper.json").write_text(json.dumps(study.as_dict(), indent=1) + "\n")
-    return f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}"
+    print(f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}")
 
 
 def _figures_sample(arguments: argparse.Namespace, trained_on: TrainedOn | None) -> Sample:

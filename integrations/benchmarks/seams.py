@@ -23,13 +23,14 @@ import numpy.typing as npt
 from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import ego_rays
-from arbiview_aug.cli.arguments import command_parser, data, size
+from arbiview_aug.cli.arguments import data, size
 from arbiview_aug.datasets import open_data
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.render.harmonise import BRIGHT, DARK, tone_curves
 from arbiview_aug.render.plan import FixedMap, ViewPlan
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.sample.inputs import read_frames
+from integrations.benchmarks.study import run_study, study_parser
 
 LEAST_SHARE, LEAST_WON = 0.25, 0.2
 """Least share of a cell that both sources show neither dark nor saturated; and of it that each source of a cell on the
@@ -57,8 +58,11 @@ class Cell(NamedTuple):
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Measure and print a line for each frame and way to match exposures, over all targets."""
-    arguments = _parser().parse_args(argv)
+    """Measure and print a line for each frame and way to match exposures, over all targets; the exit status."""
+    return run_study(parser(), _run, argv)
+
+
+def _run(arguments: argparse.Namespace) -> None:
     warnings.simplefilter("ignore")
     for name in arguments.data:
         sample = open_data(name)[0]
@@ -66,7 +70,6 @@ def main(argv: list[str] | None = None) -> int:
         for label in of_rigs[0]:
             cells = [cell for of_rig in of_rigs for cell in of_rig[label]]
             print(f"{name.rstrip('/').rsplit('/')[-1]}, {label}: {summary(cells)}", flush=True)
-    return 0
 
 
 def seams(sample: Mapping[str, Any], target: str, size: tuple[int, int]) -> dict[str, list[Cell]]:
@@ -156,10 +159,9 @@ def summary(cells: Sequence[Cell]) -> str:
     return "; ".join(parts) or "no seams"
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "", "Steps of brightness along seams.", "--data FOLDER", program="python -m integrations.benchmarks.seams"
-    )
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    parser = study_parser("seams", "Steps of brightness along seams.", "--data FOLDER")
     parser.add_argument("--data", type=data, nargs="+", required=True, metavar="[KIND:]PATH", help="real frames")
     parser.add_argument("--target", nargs="+", default=["waymo", "argoverse2"], metavar="RIG", help="shipped rigs")
     parser.add_argument("--size", type=size, default=(640, 960), metavar="HxW", help="of every view")

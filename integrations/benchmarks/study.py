@@ -1,21 +1,41 @@
-"""The runner that the studies share: scores and times of a list of ``Method``."""
+"""What the studies share: their command lines, and scores and times of a list of ``Method``."""
 
 from __future__ import annotations
 
+import argparse
 import itertools
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cli.arguments import command_parser
 from arbiview_aug.cli.bench.timing import Clock, process_ms
+from arbiview_aug.errors import exit_status
 from arbiview_aug.evaluate.agreement import OverlapScore, summary, target_consistency
 from arbiview_aug.evaluate.frames import ScoredFrame, scores
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, Sample
 from arbiview_aug.evaluate.metrics import mean_of
+
+
+def study_parser(name: str, description: str, example: str) -> argparse.ArgumentParser:
+    """Create the parser of ``python -m integrations.benchmarks.NAME``, without its options."""
+    return command_parser("", description, example, program=f"python -m integrations.benchmarks.{name}")
+
+
+def run_study(
+    parser: argparse.ArgumentParser,
+    run: Callable[[argparse.Namespace], int | None],
+    argv: Sequence[str] | None,
+    *,
+    resumable: bool = False,
+) -> int:
+    """Parse the arguments and run a study; its exit status is that of ``errors.exit_status``."""
+    arguments = parser.parse_args(argv)
+    return exit_status(parser.prog, lambda: run(arguments), resumable=resumable)
 
 
 def study(

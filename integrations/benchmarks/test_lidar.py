@@ -39,9 +39,10 @@ def test_the_next_scan_is_nearer_than_moved_points(data_root: Path) -> None:
 
 
 @pytest.mark.slow
-def test_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["--frames", "1", "--data", str(tmp_path)]) == 0
-    assert "| 32 -> 64 | scanned |" in capsys.readouterr().out
+def test_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
+    assert main(["--frames", "1"]) == 0
+    assert "| 32 -> 64               | scanned         | " in capsys.readouterr().out
 
 
 @pytest.mark.release

@@ -86,7 +86,7 @@ def test_losses_are_told() -> None:
         return {"truck": {"even_psnr_db": value}, "yaw": {"even_psnr_db": 20.0}}
 
     study = Study({"here": {"own camera": db(12), "row split": db(14.5), "draft": db(14), "fast": db(15)}})
-    assert "Where a baseline is above ours, unseen pixels black: here, truck: row split 14.50 above draft 14.00." in (
+    assert "Baselines above ours, unseen pixels black: here, truck: row split 14.50 above draft 14.00." in (
         paper_report(study)
     )
     study.means["here"]["draft"] = db(14.5)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from arbiview_aug import Camera
-from integrations.benchmarks.seams import seam_cells, summary
+from integrations.benchmarks.seams import main, seam_cells, summary
 
 
 def test_a_step_of_a_tenth_is_measured() -> None:
@@ -30,3 +31,12 @@ def test_a_step_of_a_tenth_is_measured() -> None:
     # Rays rise by 10 and fall by 3 degrees inside the view: all kinds occur.
     assert {cell.kind for cell in cells} == {"sky", "road", "other"}
     assert "sky" in summary(cells) and "100% above it" in summary(cells) and summary([]) == "no seams"
+
+
+@pytest.mark.slow
+def test_command(nuscenes_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--data", str(nuscenes_root), "--target", "waymo", "--size", "64x96"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    ways = "recorded", "gains", "gains and seams"
+    assert len(lines) == 3
+    assert all(line.startswith(f"nuscenes-one, {way}: ") for line, way in zip(lines, ways, strict=True))

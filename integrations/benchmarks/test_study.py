@@ -1,10 +1,13 @@
-"""The study runner with a toy method."""
+"""The study runner with a toy method, and plain mistakes in command lines."""
 
 from __future__ import annotations
 
 from functools import partial
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -40,3 +43,38 @@ def test_a_row_is_one_method() -> None:
     rows = [{"name": name, **row["turned"]} for name, row in found.items()]
     printed = metric_table(rows, [("seen", "{seen:.0%}"), ("dB", "{true_psnr_db:.1f}"), ("never", "{unknown:.1f}")])
     assert printed.splitlines()[-1].startswith("| toy | 100% |") and printed.endswith("    - |")
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("ablation --only nosuch", "--only: expected part of one of stage 2"),
+        ("cost --set nosuch=1", "--set nosuch=1: expected one of generator, "),
+        ("generator --behind --steps 4", "--behind: expected no --steps with it"),
+        ("hidden --output file", "--output file: expected a folder that can be written to, got "),
+        ("hidden --size 50x128", "--size: expected multiples of 16, got 50x128"),
+        ("joint --generator nosuch", "nosuch: expected a generator's folder with config.json, found none"),
+        ("label_holes --streets 1", "--streets: expected 2 or more, got 1"),
+        ("lidar --data nosuch", "--data nosuch: expected a folder with ddad-one and ddad-next, found no ddad-next"),
+        ("moving_traffic --output file", "--output file: expected a folder that can be written to, got "),
+        ("paper --data nosuch", "data nosuch: expected a folder, found none"),
+        ("seams --data nosuch", "data nosuch: expected a folder, found none"),
+        ("training --set nosuch=1", "--set nosuch=1: expected one of generator, "),
+    ],
+)
+def test_mistakes_are_told(
+    command: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").touch()
+    name, *arguments = command.split()
+    assert import_module(f"integrations.benchmarks.{name}").main(arguments) == 2
+    *_, line = capsys.readouterr().err.splitlines()  # after progress bars
+    assert line.startswith(f"python -m integrations.benchmarks.{name}: {said}")
+
+
+@pytest.mark.parametrize("name", ["generator", "hidden", "label_holes", "lidar", "moving_traffic", "tops"])
+def test_seeds_are_not_negative(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        import_module(f"integrations.benchmarks.{name}").main(["--seed", "-1"])
+    assert "argument --seed: expected a whole number from 0" in capsys.readouterr().err

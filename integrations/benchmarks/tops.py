@@ -14,10 +14,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from arbiview_aug import RigRetarget
-from arbiview_aug.cli.arguments import command_parser, count, size
+from arbiview_aug.cli.arguments import count, seed, size
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.errors import DataError
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.boxes import PARTS, TOP_PART
+from integrations.benchmarks.study import run_study, study_parser
 from integrations.cross_rig.cuboids import CuboidDrive
 
 LEAST_PX = 40
@@ -25,14 +27,20 @@ LEAST_PX = 40
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Measure and print one line."""
-    arguments = _parser().parse_args(argv)
-    error, pixels = np.array(list(errors(arguments.world, arguments.frames, arguments.seed, arguments.size))).T
+    """Measure and print one line; the exit status."""
+    return run_study(parser(), _run, argv)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    of_vehicles = list(errors(arguments.world, arguments.frames, arguments.seed, arguments.size))
+    if not of_vehicles:
+        fix = "take more --frames or a larger --size"
+        raise DataError(f"expected a vehicle with {LEAST_PX} painted pixels on its tops, found none: {fix}")
+    error, pixels = np.array(of_vehicles).T
     print(
         f"{len(error)} vehicles: mean {error.mean():.1f}, median {np.median(error):.1f}, "
         f"90 % {np.quantile(error, 0.9):.1f}, by pixel {np.average(error, weights=pixels):.1f} levels"
     )
-    return 0
 
 
 def errors(world: str, frames: int, seed: int, image_size: tuple[int, int]) -> Iterator[tuple[float, int]]:
@@ -60,11 +68,14 @@ def errors(world: str, frames: int, seed: int, image_size: tuple[int, int]) -> I
                 yield float(np.abs(np.diff(of_box.mean(2), axis=0)).mean()), of_box.shape[2]
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("", __doc__, "--frames 10", program="python -m integrations.benchmarks.tops")
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    parser = study_parser(
+        "tops", "Colours given to vehicles' tops that no camera saw, against true views.", "--frames 10"
+    )
     parser.add_argument("--world", choices=("drive", "cuboids"), default="drive", help="streets (default: %(default)s)")
     parser.add_argument("--frames", type=count, default=90, metavar="N", help="number of them (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=8000, help="seed of the streets (default: %(default)s)")
+    parser.add_argument("--seed", type=seed, default=8000, help="seed of the streets (default: %(default)s)")
     parser.add_argument("--size", type=size, default=(256, 704), metavar="HxW", help="size of the views")
     return parser
 

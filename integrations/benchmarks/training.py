@@ -1,10 +1,8 @@
-"""``python -m integrations.benchmarks.training``: train variants of the settings and score each on held-out streets.
-
-Options are those of ``python -m arbiview_aug.train``.
-"""
+"""``python -m integrations.benchmarks.training``: train variants of the settings and score each on held-out streets."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -13,8 +11,8 @@ from typing import Any
 
 import torch
 
-from arbiview_aug.cli.parsers import train
-from arbiview_aug.errors import DataError
+from arbiview_aug.cli.arguments import add_output, count, writable_folder
+from arbiview_aug.errors import INTERRUPTED, DataError
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.conditioning import FrameGeometry
@@ -27,6 +25,7 @@ from arbiview_aug.generator.training.held_out import gains, held_out_scores, mea
 from arbiview_aug.generator.training.losses import without_attention
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.trainer import Trainer
+from integrations.benchmarks.study import run_study, study_parser
 
 _AS_WRITTEN = (
     "pseudo_views.p_mask_transfer=0",
@@ -80,7 +79,7 @@ def seen_batch(frames: Frames, indices: Sequence[int], config: TrainConfig, mask
 
 
 def ablate(config: TrainConfig, frames: Frames, output: Path, *, views: int = 64, show: bool = True) -> dict[str, Any]:
-    """Train and score each variant on synthetic streets, and write ``ablation.json``; a stopped study resumes.
+    """Train and score each variant on synthetic streets, and write ``training.json``; a stopped study resumes.
 
     Each variant gets a folder in ``output`` and is scored on ``views`` held-out views.
     """
@@ -104,7 +103,7 @@ def ablate(config: TrainConfig, frames: Frames, output: Path, *, views: int = 64
             "seen by a source": seen_scores(generator, batch),
             "top-1": correct_correspondences(generator, batch),
         }
-        (output / "ablation.json").write_text(json.dumps(table, indent=1) + "\n")
+        (output / "training.json").write_text(json.dumps(table, indent=1) + "\n")
     print(text_of(table))
     return table
 
@@ -121,14 +120,31 @@ def text_of(table: dict[str, dict[str, Any]]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Train, score and print the table."""
-    arguments = train().parse_args(argv)
+    """Train, score and print the table; the exit status, ``INTERRUPTED`` if a signal stopped it."""
+    return run_study(parser(), _run, argv, resumable=True)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the command's parser."""
+    text = "Train variants of the settings, and score each on held-out streets. Run it again to go on where it stopped."
+    parser = study_parser("training", text, "--set steps=200 --views 32")
+    add = parser.add_argument
+    scratch = [name for name, make in CONFIGS.items() if not make().generator.frozen_unet]
+    add("--config", choices=scratch, default="tiny", help="preset of all settings, trained from scratch")
+    add("--data", default="synthetic", metavar="DATA", help="synthetic, or real frames with their kind, KIND:PATH")
+    add_output(parser, "folder of the runs")
+    add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
+    add("--views", type=count, default=64, metavar="N", help="number of held-out views to score")
+    add("--quiet", action="store_true", help="no progress bars")
+    return parser
+
+
+def _run(arguments: argparse.Namespace) -> int:
     config = overridden(CONFIGS[arguments.config](), arguments.set)
-    frames = open_frames(
-        arguments.data or "synthetic", config.generator.image_size, scenes=config.scenes, seed=config.seed
-    )
-    ablate(config, frames, Path(arguments.output), views=arguments.views, show=not arguments.quiet)
-    return 0
+    folder = writable_folder(Path(arguments.output), arguments.output)
+    frames = open_frames(arguments.data, config.generator.image_size, scenes=config.scenes, seed=config.seed)
+    table = ablate(config, frames, folder, views=arguments.views, show=not arguments.quiet)
+    return 0 if len(table) == len(VARIANTS) else INTERRUPTED
 
 
 if __name__ == "__main__":

@@ -174,9 +174,13 @@ def test_the_table_names_every_variant() -> None:
 def test_an_ablation_that_is_stopped_scores_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(training.Trainer, "train", lambda self: False)
     made = training.ablate(config(), frames(), tmp_path, show=False)
-    assert made == {} and not (tmp_path / "ablation.json").exists()
+    assert made == {} and not (tmp_path / "training.json").exists()
     with pytest.raises(DataError, match="expected two scenes or more, one of them to score on; found one"):
         training.ablate(config(), frames(1), tmp_path, show=False)
+    monkeypatch.setattr(training, "open_frames", lambda *_, **__: frames())
+    for table, status in (({}, 130), (dict.fromkeys(training.VARIANTS), 0)):
+        monkeypatch.setattr(training, "ablate", lambda *_, table=table, **__: table)
+        assert training.main(["--output", str(tmp_path)]) == status
 
 
 def test_holes_of_the_condition_as_they_were_in_training(batch: Batch) -> None:
