@@ -37,9 +37,8 @@ from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
 from arbiview_aug.scene.depth_map import motion_camera
-from arbiview_aug.transforms.explain import Explanation
 from arbiview_aug.transforms.plan_cache import PlanCache
-from arbiview_aug.transforms.rig_retarget import RigRetarget
+from integrations.benchmarks.moving_traffic import depth_of, without_labels
 from integrations.benchmarks.paper import paper_stages
 from integrations.benchmarks.study import run_study, study, study_parser
 
@@ -247,11 +246,7 @@ def _frames(data: Sequence[str], reduce: Reduce, seed: int, size: tuple[int, int
 
 def _motion(sample: Mapping[str, Any]) -> list[torch.Tensor]:
     """Depth from motion, without the labels."""
-    frames = [{key: frame[key] for key in frame if key != "boxes_3d"} for frame in (sample, *sample["neighbours"])]
-    raised = RigRetarget(without_masks(sample["rig"].shifted(z_m=UP_M)), geometry="motion", neighbours=None)
-    explained = raised.explain(frames[0] | {"neighbours": frames[1:]})
-    assert isinstance(explained, Explanation) and explained.planned.motion is not None
-    return [torch.from_numpy(depth) for depth in explained.planned.motion.depth_m]
+    return [torch.from_numpy(depth) for depth in depth_of(without_labels(sample))]
 
 
 def _learned(drive: SyntheticDrive) -> torch.Tensor:
