@@ -146,8 +146,7 @@ class RigRetarget(torch.nn.Module):
         self.neighbours = None if neighbours is None else choice("neighbours", neighbours, get_args(Reach))
         self.fit, self.p = choice("fit", fit, get_args(Fit)), checked_p(p, size)
         self.size = None if size is None else checked_pixels(size)
-        self.keys, self.cache = checked_instance("keys", keys, SampleKeys), checked_instance("cache", cache, PlanCache)
-        refuse_camera_values(self.keys.labels)
+        self.keys, self.cache = _checked_keys(keys), checked_instance("cache", cache, PlanCache)
         self.inpainter = inpainter_of(holes)  # moves with this module
         self.config = self._checked_config(render_config(quality))
         self.harmoniser = Harmoniser(False if self._is_paper and match_exposure is True else match_exposure)
@@ -464,3 +463,10 @@ class RigRetarget(torch.nn.Module):
         if self._limited_process != os.getpid() and torch.utils.data.get_worker_info() is not None:
             cv2.setNumThreads(0)
             self._limited_process = os.getpid()
+
+
+def _checked_keys(keys: Any) -> SampleKeys:
+    """Settings of keys whose label maps can be rendered."""
+    checked: SampleKeys = checked_instance("keys", keys, SampleKeys)
+    refuse_camera_values(checked.labels)
+    return checked
