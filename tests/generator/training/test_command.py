@@ -97,7 +97,7 @@ def test_train_and_evaluate_on_streets(tmp_path: Path, capsys: pytest.CaptureFix
     assert "held-out views of 1 scenes; Telea" in out and "one_step" in out and "mean" in out
     study = ["--config", "tiny", "--output", str(tmp_path / "study"), "--quiet", *SMALLER]
     assert training.main([*study, "--views", "1"]) == 0
-    assert set(training.VARIANTS) == set(json.loads((tmp_path / "study" / "ablation.json").read_text()))
+    assert set(training.VARIANTS) == set(json.loads((tmp_path / "study" / "training.json").read_text()))
     assert "wrong rig" in capsys.readouterr().out
 
 
