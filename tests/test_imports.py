@@ -10,7 +10,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1] / "arbiview_aug"
 
 ROOMS = (
-    *("choices", "errors", "environment", "lru_cache", "atomic_io", "image_ops"),
+    *("choices", "errors", "environment", "files", "lru_cache", "atomic_io", "image_ops"),
     *("cameras", "scene", "sample", "render", "favs", "temporal", "inpaint", "generator", "transforms", "datasets"),
     *("evaluate", "cli", "generator.training", "__main__", "train", "integrations"),
 )
