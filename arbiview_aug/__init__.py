@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from arbiview_aug.sample.mistakes import check as check
     from arbiview_aug.sample.training import lift_mask as lift_mask
     from arbiview_aug.sample.training import visible_boxes as visible_boxes
-    from arbiview_aug.transforms.camera_maps import CameraMaps as CameraMaps
-    from arbiview_aug.transforms.camera_maps import CameraPriorStem as CameraPriorStem
-    from arbiview_aug.transforms.jitter import JitteredCalibration as JitteredCalibration
     from arbiview_aug.transforms.plan_cache import PlanCache as PlanCache
     from arbiview_aug.transforms.resize import CropRig as CropRig
     from arbiview_aug.transforms.resize import ResizeRig as ResizeRig

@@ -341,7 +341,7 @@ def test_the_detectors_numbers_are_the_reports() -> None:
         return {change: of_change["variants"] for change, of_change in report["changes"].items()}
 
     def percent(row: dict[str, Any]) -> int:
-        return round(100 * row["share"]["value"])
+        return round(100 * (row.get("share_t") or row["share"])["value"])
 
     readme = text_of(ROOT / "README.md")
     voxels, depths = changes("less").values()
@@ -350,10 +350,11 @@ def test_the_detectors_numbers_are_the_reports() -> None:
         assert percent(voxels[name]) < percent(depths[name]) and f"| {percent(voxels[name])} % |" in readme
     first, second, third = (percent(depths[name]) for name in used)
     assert f"which win back {first}, {second} and {third} % in rows two to four" in readme
-    assert f"| {percent(changes('fov')['fov50-depths']['auto_fill'])} % |" in readme
-    priors = changes("priors")["up70-depths"]
-    assert f"| {percent(priors['auto_fill_random'])} %; {percent(priors['random_a'])} % |" in readme
-    assert f"| {round(100 * changes('seeds')['up70']['recipe']['share_t']['value'])} % | `python -m" in readme
+    random = changes("random")
+    assert f"| {percent(random['fov50-depths']['auto_fill'])} % |" in readme
+    around_b, around_a = (percent(random["up70-depths"][name]) for name in ("auto_fill_random", "random_a"))
+    assert f"| {around_b} %; {around_a} % |" in readme
+    assert f"| {percent(voxels['auto_fill'])} % | `python -m" in readme
 
 
 def test_measurements_name_tests_that_are_there() -> None:

@@ -14,7 +14,7 @@ from arbiview_aug.sample.inputs import DEPTH_KEYS
 
 STACKED = (
     *("images", "K", "cam2ego", "coverage", "ego_mask", "distortion", "ego2world", "ego2ego"),
-    *("camera_maps", "camera_maps_coverage", *DEPTH_KEYS),
+    *DEPTH_KEYS,
 )
 """Keys of one shape in all frames of a rig; so have maps over the images. All else is a list: of points and boxes
 each frame has its own number."""

@@ -399,7 +399,7 @@ def as_array(key: str, value: Any) -> Points:
 
 
 PROJECTION_KEYS = (
-    *("lidar2img", "lidar2image", "ego2img", "global2img", "world2img", "camera_maps"),
+    *("lidar2img", "lidar2image", "ego2img", "global2img", "world2img"),
     *("projection", "projection_mat", "projection_matrix", "proj_mat", "P", "P2"),
 )
 """Keys that are functions of intrinsics and poses."""
@@ -418,7 +418,6 @@ PIXEL_BOUND_KEYS = (
     "confidence",
     "generated",
     "sources",
-    "camera_maps_coverage",
     *("img_metas", "img_aug_matrix", "post_rots", "post_trans"),
     *USUAL_NAMES["K"],
     *PROJECTION_KEYS,

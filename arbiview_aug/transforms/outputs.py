@@ -18,7 +18,6 @@ from arbiview_aug.inpaint.inpainter import SOURCES_KEY
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, is_readable, lens_names, like, rewrapped, split, stacked
 from arbiview_aug.sample.inputs import CALIBRATION_KEYS, CAMERA_KEYS, PIXEL_BOUND_KEYS, Frame
-from arbiview_aug.transforms.camera_maps import CameraMaps
 from arbiview_aug.transforms.scans import RetargetedPoints, entries_of
 from arbiview_aug.transforms.settings import SampleKeys
 
@@ -33,7 +32,6 @@ class SampleWriter:
     lenses: bool  # ``lens`` and ``distortion``
     masks: bool  # ``ego_mask``
     warn: Callable[[str, str], None]  # takes a topic and a message
-    camera_maps: CameraMaps | None = None
 
     def write(
         self,
@@ -72,7 +70,7 @@ class SampleWriter:
             moves = [torch.from_numpy(frame.rig.ego2ego(target)) for frame in frames]
             move_to_target(out, gathered(moves, lead), lead)
             out["ground_z_m"] = torch.full_like(out["ground_z_m"], target.ground_z_m) if lead else target.ground_z_m
-        return out if self.camera_maps is None else self.camera_maps(out)
+        return out
 
     def _passed_on(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
         """The entries that do not depend on the images, as the same objects."""

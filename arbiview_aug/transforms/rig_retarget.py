@@ -48,7 +48,6 @@ from arbiview_aug.sample.inputs import (
 from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
 from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion, warn_of_declined
-from arbiview_aug.transforms.camera_maps import CameraMaps
 from arbiview_aug.transforms.explain import Explanation, PaperExplanation
 from arbiview_aug.transforms.outputs import SampleWriter
 from arbiview_aug.transforms.plan_cache import FramePlan, PlanCache, Plans, check_reach
@@ -208,7 +207,6 @@ class RigRetarget(torch.nn.Module):
             lenses=self.p < 1 or any(not camera.is_rectilinear for camera in base),
             masks=self.p < 1 or any(camera.mask is not None for camera in base),
             warn=self._warn,
-            camera_maps=None if self.keys.camera_maps is None else CameraMaps(stride=self.keys.camera_maps),
         )
 
     def extra_repr(self) -> str:

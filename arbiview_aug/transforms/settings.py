@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
-from arbiview_aug.choices import checked_stride, choice, is_number
+from arbiview_aug.choices import choice, is_number
 from arbiview_aug.errors import SampleError
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.inpaint.continued import Continue, Mean
@@ -34,7 +34,6 @@ class SampleKeys:
             int8, 0 for the current frame, n + 1 for number n of the neighbours; ``confidence`` float32 in [0, 1],
             exp(-e / 10) for an expected error of e grey levels of 255 (``arbiview_aug.render.confidence``). Also
             ``sources``: the source images and calibration, for ``Inpainter.complete_batch``.
-        camera_maps: Stride of the maps of the calibration that ``CameraMaps`` adds; None for none.
         frame: Ego frame of output poses, points and boxes. ``target`` moves them, and ``ego2world``, into the target's
             and adds ``ego2ego`` (..., 4, 4).
         points: ``target``: as its scanners would have measured them, if it has any. ``source``: as they are.
@@ -47,7 +46,6 @@ class SampleKeys:
     ignore_index: float = 255
     keep: tuple[str, ...] = ()
     extra: tuple[str, ...] = ()
-    camera_maps: int | None = None
     frame: Literal["source", "target"] = "source"
     points: Literal["source", "target"] = "target"
 
@@ -63,8 +61,6 @@ class SampleKeys:
             raise ValueError(f"SampleKeys.keep: expected no calibration of the source's, got {', '.join(sorted(own))}")
         for key in self.extra:
             choice("SampleKeys.extra", key, EXTRA_KEYS)
-        if self.camera_maps is not None:
-            checked_stride("SampleKeys.camera_maps", self.camera_maps)
         if not is_number(self.ignore_index):
             raise ValueError(f"SampleKeys.ignore_index: expected a number, got {self.ignore_index!r}")
         choice("SampleKeys.frame", self.frame, ("source", "target"))

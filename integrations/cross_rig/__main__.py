@@ -1,4 +1,4 @@
-"""``python -m integrations.cross_rig --quick | --small | --pilot | --full | --large``, from the repository's root."""
+"""``python -m integrations.cross_rig --quick | --small | --large``, from the repository's root."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from typing import get_args
 
 from arbiview_aug.cli.arguments import count, device_named, seed
 from arbiview_aug.errors import ArbiviewError
-from integrations.cross_rig.deploy import ON_A, ON_B, deploy
 from integrations.cross_rig.experiment import Run, run
 from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.real import recorded_run
 from integrations.cross_rig.report import markdown, write_report
-from integrations.cross_rig.settings import LONGER, Length, Settings, full, jobs, large, pilot, quick, real, small
+from integrations.cross_rig.settings import LONGER, Length, Settings, jobs, large, quick, real, small
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES, World
 
 _REPORT_S = 60.0
 """Least seconds between reports of a run that goes on: a large one takes as long as a training on a GPU."""
 
-PRESETS = {"quick": quick, "small": small, "pilot": pilot, "full": full, "large": large}
+PRESETS = {"quick": quick, "small": small, "large": large}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,11 +52,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     def log(line: str) -> None:
         print(f"[{time.monotonic() - began:6.0f} s] {line}", file=sys.stderr, flush=True)
 
-    if arguments.deploy is not None:
-        text = deploy(setup, arguments.deploy or None, log)
-        (arguments.output / "deploy.md").write_text(text)
-        print(text)
-        return 0
     log(f"{len(missing)} of {len(jobs(settings))} trainings to do, in {arguments.output}")
     written = began
     for left in run(setup, arguments.workers, log):
@@ -85,17 +79,9 @@ def _parser() -> argparse.ArgumentParser:
         type=count,
         default=os.cpu_count() or 1,
         metavar="N",
-        help="processes of one thread (%(default)s); --deploy has one",
+        help="processes of one thread (%(default)s)",
     )
     parser.add_argument("--list", action="store_true", help="only say which trainings are done")
-    parser.add_argument(
-        "--deploy",
-        nargs="*",
-        choices=[*ON_B, *ON_A],
-        metavar="ROW",
-        help="instead: raw A's detectors on B's frames rendered to A's cameras, and on A's with calibration that errs: "
-        f"all rows, or some of {', '.join(map(repr, (*ON_B, *ON_A)))}",
-    )
     parser.add_argument(
         "--real",
         nargs=2,
@@ -111,9 +97,6 @@ def _parser() -> argparse.ArgumentParser:
     change.add_argument("--families", nargs="+", choices=FAMILIES, metavar="FAMILY", help=", ".join(FAMILIES))
     change.add_argument("--seeds", nargs="+", type=seed, metavar="SEED")
     change.add_argument("--streets", type=count, metavar="N", help="another world of streets: 200, 300, …")
-    change.add_argument(
-        "--two-wheelers", action="store_const", const=True, help="streets with bicycles and motorcycles in them"
-    )
     for option in ("--train-frames", "--val-frames", "--test-frames", "--steps"):
         change.add_argument(option, type=count, metavar="N")
     change.add_argument("--precision", choices=("bf16", "fp32"))
@@ -133,19 +116,16 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     settings = PRESETS[arguments.preset]()
     if arguments.real:
         settings = real(settings)
-        for name in ("deploy", "changes", "world", "streets", "two_wheelers"):
+        for name in ("changes", "world", "streets"):
             if getattr(arguments, name) is not None:
                 raise ValueError(f"--{name.replace('_', '-')} is for synthetic streets: leave it out with --real")
     names = (
-        *("changes", "variants", "families", "schedules", "seeds", "streets", "two_wheelers", "world"),
+        *("changes", "variants", "families", "schedules", "seeds", "streets", "world"),
         *("train_frames", "val_frames", "test_frames"),
     )
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
     of_schedule = {n: getattr(arguments, n) for n in ("steps", "precision", "device") if getattr(arguments, n)}
-    for name in given.get("changes", ()):
-        if CHANGES[name].has_lens and arguments.deploy is None:
-            raise ValueError(f"changes: {name} has a lens, and the detectors read K alone: add --deploy")
     return replace(settings, schedule=replace(settings.schedule, **of_schedule), **given)
 
 

@@ -49,7 +49,6 @@ class Run:
             change=change,
             variant=variant,
             streets=s.streets,
-            two_wheelers=s.two_wheelers,
             world=s.world,
         )
 
@@ -109,7 +108,7 @@ class Run:
         """Schedule of a job's training."""
         schedule = self.settings.schedule
         steps = schedule.steps if job.length == "short" else round(LONGER * schedule.steps)
-        return replace(schedule, family=job.family, steps=steps, priors=job.variant.priors)
+        return replace(schedule, family=job.family, steps=steps)
 
     def draws(self, job: Job) -> Draws:
         """The batches of a job's training."""
@@ -132,17 +131,13 @@ class Run:
         if job.variant.renders:
             # Without a mask, coverage has no part in the training.
             names = ("images", *(("coverage",) if job.variant.masked else ()), "K", "cam2ego")
-            names += ("state",) if job.variant.labels == "views" else ()
         raw = self._content(self.source("train"), count)
-        maps = {"maps": code_hash("arbiview_aug.transforms.camera_maps")} if job.variant.priors else {}
         return content_hash(
             {
-                **maps,
                 "frames": images.store().digest(names, count),
                 "rig": images.rig.content_key.hex(),
                 "raw": raw if job.variant.mixed or job.variant.labels_of_a else None,  # the labels are A's
                 "mixed": job.variant.mixed,
-                "labels": job.variant.labels,
                 "augmented": job.variant.augmented,
                 "count": count,
                 "schedule": asdict(self.schedule(job)),

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -16,16 +16,11 @@ import numpy as np
 import torch
 
 from arbiview_aug import Rig
-from arbiview_aug.cameras.lens import BoolArray
-from arbiview_aug.datasets import LazyFrame, Neighbours
-from arbiview_aug.datasets.synthetic import Scene, SyntheticDrive
-from arbiview_aug.datasets.synthetic.scene import SceneClass
-from arbiview_aug.scene.depth_map import motion_camera
+from arbiview_aug.datasets.synthetic import SyntheticDrive
 from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.cache import Arrays, FrameStore, code_hash, fill
 from integrations.cross_rig.cuboids import CuboidDrive
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
-from integrations.cross_rig.noise import LATE_S, noisy_boxes, noisy_depth, thinned, turned
 from integrations.cross_rig.variant import Variant
 from integrations.cross_rig.views import ViewMaker
 from integrations.cross_rig.worlds import CHANGES, STREETS, Size, Split, World, source_rig, street_seed
@@ -33,8 +28,6 @@ from integrations.cross_rig.worlds import CHANGES, STREETS, Size, Split, World, 
 _WORLD = "arbiview_aug.datasets.synthetic"
 _FORMAT = 1
 """Part of every set's name: raise it when this file stores something else."""
-NEIGHBOURS = Neighbours()
-"""One frame before and one after, 1.2 m away."""
 
 _COMPLETING = ("arbiview_aug.generator", "arbiview_aug.generator.inpainter")
 _UNUSED: dict[str, tuple[str, ...]] = {
@@ -58,7 +51,6 @@ class Source:
         change: Vehicle B by its change; None: vehicle A.
         variant: Whose training set; None: the rig's own true frames. Variants that only draw differently share one.
         streets: The world, by ``worlds.street_seed``.
-        two_wheelers: Whether bicycles and motorcycles are in the streets.
         world: The generator of the streets.
     """
 
@@ -68,7 +60,6 @@ class Source:
     change: str | None = None
     variant: Variant | None = None
     streets: int = STREETS
-    two_wheelers: bool = False
     world: World = "drive"
 
     @property
@@ -78,7 +69,7 @@ class Source:
 
     def drive(self, rig: Rig) -> SyntheticDrive:
         """The streets' dataset, as a rig sees them."""
-        make = CuboidDrive if self.world == "cuboids" else partial(SyntheticDrive, two_wheelers=self.two_wheelers)
+        make = CuboidDrive if self.world == "cuboids" else SyntheticDrive
         return make(rig, num_frames=_MAX_FRAMES, seed=self.street_seed, lidar=False)
 
     def world_spec(self) -> dict[str, Any]:
@@ -101,8 +92,6 @@ class Source:
             **self.world_spec(),
             "labels": code_hash("integrations.cross_rig.labels"),
         }
-        if self.two_wheelers:
-            spec["two_wheelers"] = True
         if self.variant is not None:
             variant = self.variant
             spec |= {
@@ -110,46 +99,27 @@ class Source:
                 "arm": variant.views_spec(),  # the key that names existing frame stores
                 "renderer": code_hash("arbiview_aug.transforms.rig_retarget", without=_UNUSED[variant.holes]),
                 # ``variant`` holds what a variant says of its views, so changes of other variants keep these frames.
-                "noise": code_hash("integrations.cross_rig.noise") if variant.noise else None,
                 "views": code_hash("integrations.cross_rig.views", without=("integrations.cross_rig.variant",)),
             }
-            if "neighbours" in variant.reads:
-                spec["neighbours"] = vars(NEIGHBOURS)
         return FrameStore(self.root, spec)
 
     def original(self) -> Source:
         """A's true frames of the same streets."""
         return replace(self, change=None, variant=None)
 
-    def rendered(self) -> Source:
-        """The same views as ``RigRetarget`` renders them, without the truth's pixels."""
-        assert self.variant is not None
-        return replace(self, variant=replace(self.variant, truth=None))
-
     def needs(self) -> list[Source]:
         """The sets that must be there before this one can be made."""
         if self.variant is None:
             return []
-        needed = [self.original()]
-        if self.variant.truth is not None:
-            needed.append(self.true())
-        if self.rendered() != self:
-            needed.append(self.rendered())
-        return needed
-
-    def true(self) -> Source:
-        """The same streets as the rig of these images really sees them."""
-        return replace(self, variant=None)
+        return [self.original()]
 
     def maker(self) -> Callable[[int], Arrays]:
         """Return the function that makes a frame of this set from its index."""
-        if self.variant is None:
-            return _TrueFrames(self)
-        return _VariantFrames(self) if self.rendered() == self else _ChangedFrames(self)
+        return _TrueFrames(self) if self.variant is None else _VariantFrames(self)
 
 
 def box_store(source: Source) -> FrameStore:
-    """Boxes of a split's vehicles, in A's ego frame; of no rendering. They are the same with two-wheelers."""
+    """Boxes of a split's vehicles, in A's ego frame; of no rendering."""
     spec = {
         "format": _FORMAT,
         "boxes": code_hash("integrations.cross_rig.boxes"),
@@ -203,7 +173,7 @@ def one_thread() -> None:
 
 
 class _TrueFrames:
-    """Frames that a rig really sees: images, labels; A's training frames with their depth."""
+    """Frames that a rig really sees: images and labels."""
 
     def __init__(self, source: Source) -> None:
         self.source, self.rig = source, source.rig
@@ -217,10 +187,6 @@ class _TrueFrames:
         cells = box_cells(Grid(), boxes, scene.box_classes, visible)
         assert isinstance(views.images, torch.Tensor) and isinstance(views.depth_m, torch.Tensor)
         arrays = {"images": views.images.numpy(), "state": cells.state, "height_dm": cells.height_dm}
-        if self.source.change is None:
-            depth = views.depth_m.numpy()
-            # Half precision: 6 cm at 100 m. The sky becomes 0: unknown.
-            arrays["depth_m"] = np.where(np.isfinite(depth), depth, 0).astype(np.float16)
         return {**arrays, "cpu_s": np.array(time.process_time() - start, np.float32)}
 
 
@@ -231,89 +197,14 @@ class _VariantFrames:
         assert source.variant is not None
         self.variant, self.original = source.variant, source.original()
         self.store = self.original.store()
-        rig, noise = self.original.rig, self.variant.noise
-        self.views = ViewMaker(self.variant, turned(rig) if noise == "calibration" else rig, source.rig)
-        self.drive = source.drive(rig)
-        self.measured = _Later(self.drive, LATE_S) if noise == "late" else self.drive
+        self.views = ViewMaker(self.variant, self.original.rig, source.rig)
+        self.drive = source.drive(self.original.rig)
 
     def __call__(self, index: int) -> Arrays:
         frame: dict[str, Any] = {"images": torch.from_numpy(self.store.read(index, "images").copy())}
         if "boxes_3d" in self.variant.reads:
-            boxes = self.measured.scene(index).boxes_ego(self.original.rig.ground_z_m)
+            boxes = self.drive.scene(index).boxes_ego(self.original.rig.ground_z_m)
             frame["boxes_3d"] = torch.from_numpy(boxes.astype(np.float32))
-            change = {"boxes": noisy_boxes, "missed": thinned}.get(self.variant.noise or "")
-            if change is not None:
-                frame["boxes_3d"] = change(frame["boxes_3d"], index)
         if "points" in self.variant.reads:
-            frame["points"] = self.measured.points(index)
-        for key in {"depth_m", "learned_depth_m"}.intersection(self.variant.reads):
-            depth = torch.from_numpy(self.store.read(index, "depth_m").astype(np.float32))
-            if key == "learned_depth_m":
-                size = motion_camera(self.original.rig[0]).size
-                depth = torch.nn.functional.interpolate(depth[None], size, mode="nearest-exact")[0]
-            frame[key] = noisy_depth(depth, index) if self.variant.noise == "depth" else depth
-        if "neighbours" in self.variant.reads:
-            frame |= self._neighbours(index)
-        arrays = self.views(index, frame)
-        if "visible" in arrays:
-            scene = self.drive.scene(index)
-            boxes = scene.boxes_ego(self.original.rig.ground_z_m)
-            arrays["state"] = box_cells(Grid(), boxes, scene.box_classes, arrays.pop("visible")).state
-        return arrays
-
-    def _neighbours(self, index: int) -> dict[str, Any]:
-        """The frames before and after, and the pose that they refer to; rendered when they are asked for."""
-        scene, rig, near = self.drive.scene(index), self.original.rig, []
-        for sign in NEIGHBOURS.signs:
-            seconds = sign * NEIGHBOURS.step_m / scene.speed_mps
-            later = scene.after(seconds)
-            known = {"rig": rig, "ego2world": torch.from_numpy(later.ego2street), "time_s": seconds}
-            if "boxes_3d" in self.variant.reads:
-                known["boxes_3d"] = torch.from_numpy(later.boxes_ego(rig.ground_z_m).astype(np.float32))
-            near.append(LazyFrame(known, partial(self._images, index, seconds)))
-        return {"neighbours": near, "ego2world": torch.from_numpy(scene.ego2street), "time_s": 0.0}
-
-    def _images(self, index: int, seconds: float) -> torch.Tensor | list[torch.Tensor]:
-        return _Later(self.drive, seconds).render(index).images
-
-
-class _Later(SyntheticDrive):
-    """The same streets, so much later."""
-
-    def __init__(self, drive: SyntheticDrive, seconds: float) -> None:
-        super().__init__(drive.rig, num_frames=len(drive), seed=drive.seed, lidar=False)
-        self.drive, self.seconds, self._renderer = drive, seconds, drive._renderer
-
-    def scene(self, index: int) -> Scene:
-        return self.drive.scene(index).after(self.seconds)
-
-
-_OUTLINE_PX = 5
-"""Side of the window by which outlines are widened."""
-
-
-class _ChangedFrames:
-    """Rendered views with the truth in their holes, over them, or in the outlines of vehicles."""
-
-    def __init__(self, source: Source) -> None:
-        assert source.variant is not None
-        self.variant, self.width = source.variant, source.size[1]
-        self.store, self.truth, self.drive = source.rendered().store(), source.true().store(), source.drive(source.rig)
-
-    def __call__(self, index: int) -> Arrays:
-        start = time.process_time()
-        arrays = {name: self.store.read(index, name) for name in ("images", "K", "cam2ego", "cpu_s")}
-        covered = np.unpackbits(self.store.read(index, "coverage"), axis=-1, count=self.width).astype(bool)
-        of_vehicles = self.variant.truth == "vehicles"
-        shown = self._vehicles(index) if of_vehicles else covered == (self.variant.truth == "covered")
-        arrays["images"] = np.where(shown[:, None], self.truth.read(index, "images"), arrays["images"])
-        arrays["coverage"] = np.packbits(covered | shown, axis=-1)
-        arrays["cpu_s"] = (arrays["cpu_s"] + time.process_time() - start).astype(np.float32)
-        return arrays
-
-    def _vehicles(self, index: int) -> BoolArray:
-        """(M, h, w) bool: B's true outlines of vehicles, widened."""
-        classes = self.drive.render(index).classes
-        window = np.ones((_OUTLINE_PX, _OUTLINE_PX), np.uint8)
-        shown = [cv2.dilate((view.numpy() == SceneClass.VEHICLE).astype(np.uint8), window) for view in classes]
-        return np.stack(shown).astype(bool)
+            frame["points"] = self.drive.points(index)
+        return self.views(index, frame)

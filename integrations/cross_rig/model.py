@@ -8,13 +8,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from arbiview_aug import CameraMaps, CameraPriorStem
 from integrations.cross_rig.boxes import BOX_CHANNELS
-from integrations.cross_rig.encoders import STRIDE, Backbone, ResNetEncoder, SmallEncoder, conv
+from integrations.cross_rig.encoders import Backbone, ResNetEncoder, SmallEncoder, conv
 from integrations.cross_rig.families import FAMILIES, Batch
 from integrations.cross_rig.labels import Grid
 
@@ -67,29 +65,19 @@ class Detector(nn.Module):
         grid: Grid of the labels.
         family: One of ``FAMILIES``.
         backbone: ``small``, or ``resnet34`` for a GPU.
-        priors: Whether camera maps are added to the features.
     """
 
-    def __init__(
-        self, grid: Grid, family: str = "voxels", backbone: Backbone = "small", *, priors: bool = False
-    ) -> None:
+    def __init__(self, grid: Grid, family: str = "voxels", backbone: Backbone = "small") -> None:
         super().__init__()
         self.encoder: nn.Module = SmallEncoder() if backbone == "small" else ResNetEncoder()
         width = 48 if backbone == "small" else 128
         self.family = FAMILIES[family](grid, int(self.encoder.channels), width)  # type: ignore[arg-type]
         self.heads = Heads(width, queries=family == "queries")
-        self.maps = CameraMaps(stride=STRIDE) if priors else None
-        # Last: the other weights are drawn as without it.
-        self.stem = CameraPriorStem(self.maps.channels, int(self.encoder.channels)) if self.maps else None  # type: ignore[arg-type]
 
     def features(self, batch: Batch) -> Tensor:
         """(T, C, h / 4, w / 4) of the images, uncovered pixels at the mean colour."""
         features: Tensor = self.encoder((batch.images.float() / 255 - _MEAN) / _STD * batch.coverage[:, None])
-        if self.maps is None or self.stem is None:
-            return features
-        maps = self.maps({"images": batch.images, "K": batch.K, "cam2ego": batch.cam2ego})["camera_maps"]
-        with torch.autocast(features.device.type, enabled=False):  # coordinates are never rounded to bf16
-            return self.stem(features.float(), maps)  # type: ignore[no-any-return]
+        return features
 
     def forward(self, batch: Batch) -> Answer:
         answer: Answer = self.heads(self.family(self.features(batch), batch))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import zip_longest
@@ -30,10 +30,9 @@ from integrations.cross_rig.cache import Arrays, FrameStore, code_hash
 from integrations.cross_rig.experiment import Run
 from integrations.cross_rig.frames import Source
 from integrations.cross_rig.labels import Grid, box_cells
-from integrations.cross_rig.settings import Settings, named_rows
+from integrations.cross_rig.settings import Settings
 from integrations.cross_rig.training import FrameSet
 from integrations.cross_rig.variant import Variant
-from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.views import ViewMaker
 from integrations.cross_rig.worlds import OF_TESTS, SPLITS, Split
 
@@ -282,17 +281,8 @@ def recorded_run(a: str, b: str, settings: Settings, output: Path) -> RecordedRu
     Raises:
         DataError: A data set cannot be read, has no labels, or too few drives.
     """
-    check_variants(named_rows("variants", settings.variants, VARIANTS))
     train = min(len(frames_of_a(a, b)), len(frames_of(b, "train")), settings.train_frames)
     counts: dict[str, Any] = {f"{s}_frames": min(len(frames_of(b, s)), settings.count(s)) for s in OF_TESTS}
     for data in (a, b):
         vehicles_of(recording(data)[0], data)
     return RecordedRun(a=a, b=b, settings=replace(settings, train_frames=train, **counts), output=output)
-
-
-def check_variants(variants: Sequence[Variant]) -> None:
-    """ValueError for variants that need a synthetic world."""
-    for variant in variants:
-        reads = set(variant.reads) <= {"points", "boxes_3d"}
-        if variant.noise or variant.truth or variant.labels or not reads:
-            raise ValueError(f"variants: {variant.name} needs the streets' truth: leave it out of --real")

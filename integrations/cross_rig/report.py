@@ -83,9 +83,7 @@ def _of_change(variants: Results, rendering: Mapping[str, float], drives: Sequen
 def markdown(report: Mapping[str, Any]) -> str:
     """The tables, one for each change."""
     s = report["settings"]
-    # Reports from before two-wheelers and worlds do not say.
-    streets = " with two-wheelers" if s.get("two_wheelers") else ""
-    streets += f" on streets of {s['world']}" if s.get("world", "drive") != "drive" else ""
+    streets = f" on streets of {s['world']}" if s["world"] != "drive" else ""
     lines = [
         f"{s['train_frames']} training and {s['test_frames']} test frames{streets} at {s['size'][0]}×{s['size'][1]}, "
         f"batches of {s['schedule']['batch']}, {report['tests_done']} of {report['tests']} "

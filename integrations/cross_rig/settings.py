@@ -47,7 +47,6 @@ class Settings:
         size: (h, w) of every image.
         train_frames, val_frames, test_frames: Sizes of the three sets of streets.
         streets: The world that all three come from, a whole hundred: ``worlds.street_seed``.
-        two_wheelers: Whether bicycles and motorcycles are in its streets.
         world: Maker of the streets.
         seeds: Seeds of the trainings; each variant is trained once with each.
         changes: Names of ``worlds.CHANGES``, or ``REAL`` alone.
@@ -57,7 +56,7 @@ class Settings:
         schedule: The short one of every training; each job's family and length replace its own.
 
     Raises:
-        ValueError: Unknown names, a count below 1, or two-wheelers in a world that has none.
+        ValueError: Unknown names, or a count below 1.
     """
 
     size: Size = (96, 256)
@@ -65,10 +64,9 @@ class Settings:
     val_frames: int = 200
     test_frames: int = 1000
     streets: int = STREETS
-    two_wheelers: bool = False
     world: World = "drive"
     seeds: tuple[int, ...] = (0, 1, 2)
-    changes: tuple[str, ...] = tuple(name for name, change in CHANGES.items() if not change.has_lens)
+    changes: tuple[str, ...] = tuple(CHANGES)
     variants: tuple[str, ...] = tuple(VARIANTS)
     families: tuple[str, ...] = ("voxels",)
     schedules: tuple[Length, ...] = ("short",)
@@ -80,9 +78,7 @@ class Settings:
             named_rows("changes", self.changes, CHANGES)
         named_rows("families", self.families, FAMILIES)
         named_rows("schedules", self.schedules, dict.fromkeys(get_args(Length)))
-        if self.world not in get_args(World) or (self.two_wheelers and self.world != "drive"):
-            worlds = "drive" if self.two_wheelers else ", ".join(get_args(World))
-            raise ValueError(f"world: expected {worlds}, got {self.world}" + " with two-wheelers" * self.two_wheelers)
+        named_rows("world", (self.world,), dict.fromkeys(get_args(World)))
         if self.streets % 100 or self.streets < STREETS:
             raise ValueError(f"streets: expected a whole hundred from {STREETS} on, got {self.streets}")
         for name in ("train_frames", "val_frames", "test_frames"):
@@ -146,16 +142,8 @@ def quick() -> Settings:
     )
 
 
-def pilot() -> Settings:
-    """Three changes, the variants that decide, three seeds: an evening on two cores."""
-    return Settings(
-        changes=("fov50", "up70", "waymo"),
-        variants=("raw", "scale_crop", "street_fill_mixed", "objects_fill", "auto_fill", "recipe", "oracle"),
-    )
-
-
 def small() -> Settings:
-    """One change on streets that no constant was chosen on, two seeds: the tables of docs/benchmarks.md."""
+    """One change on streets that no constant was chosen on, two seeds: the tables of the pages."""
     return Settings(
         train_frames=200,
         val_frames=100,
@@ -163,20 +151,15 @@ def small() -> Settings:
         streets=200,
         seeds=(0, 1),
         changes=("up70",),
-        variants=("raw", "recipe", "oracle"),
+        variants=("raw", "auto_fill", "auto_fill_mixed", "oracle"),
         schedule=Schedule(steps=400),
     )
-
-
-def full() -> Settings:
-    """Everything at the pilot's size."""
-    return Settings()
 
 
 def real(base: Settings) -> Settings:
     """A preset on recorded data, not on streets: the variants that need nothing but points and boxes."""
     variants = ("raw", "scale_crop", "auto_fill", "auto_fill_mixed", "auto_fill_random", "oracle")
-    return replace(base, world="drive", two_wheelers=False, changes=(REAL,), variants=variants)
+    return replace(base, world="drive", changes=(REAL,), variants=variants)
 
 
 def large() -> Settings:

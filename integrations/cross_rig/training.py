@@ -49,7 +49,6 @@ class Schedule:
         batch: Frames a step.
         lr: The peak of a one-cycle schedule; AdamW's default decay.
         backbone: Backbone of the model.
-        priors: Whether the model reads camera maps.
         precision: ``bf16`` runs the networks in bfloat16 (autocast): twice as fast on CPUs with AMX. By default
             ``fast_precision``.
         device: Device to train on.
@@ -60,7 +59,6 @@ class Schedule:
     batch: int = 4
     lr: float = 3e-3
     backbone: Backbone = "small"
-    priors: bool = False
     precision: Literal["bf16", "fp32"] = field(default_factory=fast_precision)
     device: str = "cpu"
 
@@ -189,7 +187,7 @@ def untrained(schedule: Schedule) -> nn.Module:
     """A detector of a schedule's family."""
     if schedule.family == "pillars":
         return PillarDetector(Grid())
-    return Detector(Grid(), schedule.family, schedule.backbone, priors=schedule.priors)
+    return Detector(Grid(), schedule.family, schedule.backbone)
 
 
 def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[float]]:

@@ -8,8 +8,7 @@ from typing import Any, Literal
 from arbiview_aug.choices import GeometryName
 
 Kind = Literal["raw", "oracle", "retarget"]
-Geometry = Literal["points", "boxes_3d", "depth_m", "learned_depth_m", "neighbours"]
-Noise = Literal["depth", "boxes", "missed", "late", "calibration"]
+Geometry = Literal["points", "boxes_3d"]
 
 
 RANDOM: dict[str, dict[str, Any]] = {
@@ -29,20 +28,12 @@ class Variant:
         title: In tables.
         kind: Source of its images: A's as they are, B's own, or A's re-rendered.
         surface: Surface of ``RigRetarget``.
-        reads: Which of the frame's geometry it is given, besides the images; ``neighbours``: the frames 1.2 m before
-            and after it, with boxes where it reads boxes; ``learned_depth_m``: the true depth, at the size of the
-            ``depth`` command's.
+        reads: The frame's geometry that it is given, in addition to the images.
         mixed: Half of the frames drawn are raw ones.
         augmented: Frames are scaled and cropped at random as they are drawn.
         holes: Pixels that no camera saw are black, or filled as ``RigRetarget`` does by default.
         masked: The network masks them by ``coverage``. Otherwise every pixel counts as seen, as in stock detectors.
         random: Targets are drawn around B, or around A by those who do not know B, one for each frame.
-        priors: The network reads ``CameraMaps`` beside its features, by ``CameraPriorStem``.
-        noise: Error of the geometry that it is given (``noise.py``); the labels are right.
-        labels: Whose rig says which vehicles are hidden: A's, which recorded, B's views as they were rendered
-            (``visible_boxes``). None: A's, and for an oracle B's true ones.
-        truth: To find out where the rest is lost: B's true pixels where something is covered, where nothing is, or
-            in and beside the outlines of vehicles (which then count as seen).
     """
 
     name: str
@@ -55,10 +46,6 @@ class Variant:
     holes: Literal["black", "fill"] = "black"
     masked: bool = True
     random: Literal["A", "B"] | None = None
-    priors: bool = False
-    noise: Noise | None = None
-    labels: Literal["A", "views"] | None = None
-    truth: Literal["covered", "holes", "vehicles"] | None = None
 
     @property
     def renders(self) -> bool:
@@ -73,11 +60,9 @@ class Variant:
     @property
     def labels_of_a(self) -> bool:
         """Whether vehicles that A does not see count for nothing."""
-        return self.labels == "A" or (self.renders and self.labels is None)
+        return self.renders
 
     def views_spec(self) -> dict[str, Any]:
         """Settings that change its images, besides rigs and code: variants that differ in how they draw share them."""
         settings = {"kind": self.kind, "surface": self.surface, "reads": list(self.reads), "holes": self.holes}
-        extra: dict[str, Any] = {"random": RANDOM.get(self.random or ""), "truth": self.truth}
-        extra |= {"noise": self.noise, "labels": self.labels if self.renders else None}
-        return settings | {name: value for name, value in extra.items() if value is not None}
+        return settings | ({"random": RANDOM[self.random]} if self.random else {})

@@ -14,7 +14,6 @@ from integrations.environments import python_of
 ROOT = Path(__file__).parents[2]
 FRAMEWORK_TESTS = (
     "mmdet3d/tests/test_compose.py",
-    "mmdet3d/tests/test_camera_maps.py",
     "lightning/tests/test_datamodule.py",
     "webdataset/tests/test_stream.py",
 )

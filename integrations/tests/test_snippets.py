@@ -84,35 +84,3 @@ def test_mmdet3d(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for step, results in zip(steps, given, strict=True):
         out = registry.held[step.pop("type")](**{**step, "size": (48, 132)})(results)
         assert out["coverage"].shape[-3:] == (6, 48, 132)
-
-
-class Lift(torch.nn.Module):
-    """The face of BEVDet's ``LSSViewTransformer``."""
-
-    def __init__(self, *, in_channels: int, downsample: int, numC_Trans: int) -> None:
-        super().__init__()
-
-    def forward(self, input: list[torch.Tensor], metas: Any = None) -> torch.Tensor:
-        return input[0]
-
-
-def test_bevdet_reads_camera_maps_of_augmented_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rays are those that BEVDet makes of its matrices; BEVDet's own repository needs mmcv 1 and CUDA."""
-    stand_in(monkeypatch, "mmdet3d.models.necks.view_transformer", LSSViewTransformer=Lift)
-    (code,) = (code for code in snippets("mmdet3d") if "LSSViewTransformer" in code)
-    names: dict[str, Any] = {}
-    exec(code, names)
-    lift, read = names["LSSWithCameraMaps"](in_channels=5, downsample=8, numC_Trans=64), []
-    lift.stem.register_forward_pre_hook(lambda _, inputs: read.append(inputs[1]))
-    entries = FORMS["BEVDet"](recording(SyntheticDrive(source_rig((64, 176)), num_frames=1)[0]))["img_inputs"]
-    not_mirrored = [0, 2, 3, 4, 5]
-    images, cam2ego, _, K, post_rots, post_trans = (entry[not_mirrored] for entry in entries[:6])
-    h, w = (-(-side // 8) for side in images.shape[-2:])
-    x = torch.rand(1, 5, 5, h, w)
-    out = lift([x, *(entry[None] for entry in (cam2ego, cam2ego, K, post_rots, post_trans)), entries[6]], None)
-    assert torch.equal(out, x)
-    v, u = torch.meshgrid(torch.arange(h) * 8 + 3.5, torch.arange(w) * 8 + 3.5, indexing="ij")
-    pixels = torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3)
-    shown = (pixels - post_trans[:, None]) @ torch.linalg.inv(post_rots).mT  # as LSSViewTransformer.get_lidar_coor
-    rays = torch.nn.functional.normalize(shown @ torch.linalg.inv(K).mT @ cam2ego[:, :3, :3].mT, dim=-1)
-    assert torch.allclose(read[0][0, :, :3], rays.mT.unflatten(-1, (h, w)), atol=1e-5)

@@ -110,13 +110,13 @@ def test_what_is_absent_or_overruled_by_a_rig_stays_so() -> None:
             collate([{**sample, key: None}, {**sample, key: value}])
 
 
-def test_calibration_is_stacked_as_arrays_and_as_maps() -> None:
+def test_calibration_is_stacked_as_arrays() -> None:
     rig = demo_source_rig((36, 64))
     sample = {"images": torch.zeros(len(rig), 3, 36, 64), "K": rig.K, "cam2ego": rig.cam2ego, "ego2world": np.eye(4)}
     assert torch.equal(collate([sample] * 2)["K"], torch.from_numpy(np.stack([rig.K] * 2)))
-    step = RigRetarget(rig, size=(36, 64), keys=SampleKeys(frame="target", camera_maps=8))
+    step = RigRetarget(rig, size=(36, 64), keys=SampleKeys(frame="target"))
     batch, alone = collate([step(sample)] * 2), step(collate([sample] * 2))
-    for key in ("ego2ego", "ego2world", "camera_maps", "camera_maps_coverage"):
+    for key in ("ego2ego", "ego2world"):
         assert batch[key].shape == alone[key].shape and torch.equal(batch[key], alone[key].to(batch[key]))
 
 

@@ -47,10 +47,6 @@ def test_where_footprints_overlap_the_visible_one_has_the_cell(order):
     assert (state == VEHICLE).sum() == 8 and (state == HIDDEN).sum() == 2
 
 
-def test_two_wheelers_are_no_vehicles():
-    assert not cells(*[(0, 0, 1, 2, 1, 2, 0)] * 2, classes=[BoxClass.BICYCLE, BoxClass.MOTORCYCLE]).state.any()
-
-
 def test_no_boxes():
     assert not cells().state.any()
 

@@ -162,17 +162,3 @@ def test_the_larger_backbone_trains():
         torch.isfinite(p.grad).all() and p.grad.abs().max() > 0 for p in model.parameters() if p.grad is not None
     )
     assert sum(p.grad is None for p in model.parameters()) == 0
-
-
-def test_camera_maps_add_nothing_at_first_and_then_what_a_rig_changes():
-    torch.manual_seed(0)
-    plain = Detector(GRID).eval()
-    torch.manual_seed(0)
-    told = Detector(GRID, priors=True).eval()
-    rig = source_rig(SIZE)
-    low, high = batch([rig]), batch([rig.shifted(z_m=0.7)])
-    with torch.no_grad():
-        torch.testing.assert_close(told(low).occupancy, plain(low).occupancy)
-        told.stem.stem[-1].weight.normal_()
-        assert (told.features(low) - told.features(high)).abs().max() > 0.1
-        torch.testing.assert_close(plain.features(low), plain.features(high))

@@ -162,7 +162,6 @@ def test_what_cannot_be_run_is_refused(roots, tmp_path, capsys):
         assert command.main(["--quick", "--output", str(tmp_path), *given]) == 2
         return capsys.readouterr().err
 
-    assert "learned needs the streets' truth" in said("--real", *roots, "--variants", "raw", "learned")
     assert "expected 3 drives or more to split, found 2" in said("--real", roots[1], roots[0])
     assert "expected a folder, found none" in said("--real", roots[0], str(tmp_path / "nothing"))
     (tmp_path / "file").touch()
