@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.key_names import hint, misnamed
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.lidar_fit import checked_scans, fitted_fields
 from arbiview_aug.cameras.validation import checked_numbers, checked_pose
 from arbiview_aug.errors import CalibrationError, calibration_of, shown
 
@@ -147,30 +146,6 @@ class Lidar:
         with _of_lidar():
             T[:3, 3] = checked_numbers(self.name, "shift", (x_m, y_m, z_m), 3, "three finite numbers of metres")
         return self.moved(T)
-
-    @classmethod
-    def fitted(cls, points: Any, lidar2ego: Any, *, rings: Any = None, name: str = "fitted") -> Lidar:
-        """Estimate a scanner from its scans: beams, azimuth step, range, and a sector's azimuths.
-
-        Scans must be of one scanner, not merged with others'. Those that are corrected for the vehicle's motion during
-        the scan need rings, as near points then leave their beam.
-
-        Args:
-            points: (P, >= 3) one scan in the ego frame, metres, or a list of them; rows that are not finite, and those
-                within 1 m of the scanner, are missing returns.
-            lidar2ego: (4, 4) pose of the sensor.
-            rings: (P,) ring of each point, or a list of such arrays; by default beams are where elevations gather.
-                Rings without points are left out of the table.
-            name: The scanner's.
-
-        Raises:
-            CalibrationError: Too few points, or no distinct beams.
-        """
-        with _of_lidar():
-            pose = checked_pose(name, lidar2ego, "lidar2ego")
-        scans, numbers = checked_scans(name, points, rings)
-        local = [(scan - pose[:3, 3]) @ pose[:3, :3] for scan in scans]
-        return cls(name=name, lidar2ego=pose, **fitted_fields(name, local, numbers))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the rig file's format."""

@@ -17,9 +17,6 @@ from arbiview_aug.cameras.rig import Rig
 OBJECT_HEIGHT_M = 1.6
 _DISTANCES_M = np.geomspace(5.0, 40.0, 13)
 _AZIMUTHS_DEG = np.arange(0.0, 360.0, 2.0)
-_OF_ROW, _OF_PARALLAX = 6.4, 2.6
-"""Points of IoU per unit of row and per degree: least squares, without a constant, of what a detector lost under six
-changes (integrations/cross_rig/README.md). Terms of size and of what is unseen do not predict the one left out."""
 _MOST = float(np.log(4.0))
 """Most that one cue counts, a log ratio: the horizon is at an infinite distance."""
 
@@ -42,20 +39,13 @@ class RigGap:
     size: float
     parallax_deg: float
 
-    @property
-    def expected_loss(self) -> float:
-        """Points of IoU that a small detector loses: fitted to six changes of ``integrations.cross_rig``."""
-        return _OF_ROW * self.row + _OF_PARALLAX * self.parallax_deg
-
     def __str__(self) -> str:
         if self.unseen == 1:
             return "For a detector: the first rig sees none of the objects in the other's images; nothing to compare."
         row, size = (100 * np.expm1(value) for value in (self.row, self.size))
         return (
             f"For a detector: {self.unseen:.0%} of the objects unseen; distances wrong by {row:.0f}% by their row, by "
-            f"{size:.0f}% by their size; seen from {self.parallax_deg:.1f} deg elsewhere.\nExpected loss of a detector "
-            f"trained on the first rig: about {self.expected_loss:.0f} points of IoU (six synthetic changes, r = 0.88; "
-            "0.57 with each left out)."
+            f"{size:.0f}% by their size; seen from {self.parallax_deg:.1f} deg elsewhere."
         )
 
 

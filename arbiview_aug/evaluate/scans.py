@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.lidar import Lidar
-from arbiview_aug.cameras.lidar_fit import polar_deg
 from arbiview_aug.scene.boxes import points_by_box
 
 TOLERANCE_M, TOLERANCE = 0.2, 0.02
@@ -42,7 +41,7 @@ class Returns(NamedTuple):
 
 def _polar(lidar: Lidar, points: FloatArray) -> FloatArray:
     """(3, P) elevations and azimuths in degrees, and distances, of points as a scanner sees them."""
-    return polar_deg((points[:, :3].astype(np.float64) - lidar.center_m) @ lidar.lidar2ego[:3, :3])
+    return _polar_deg((points[:, :3].astype(np.float64) - lidar.center_m) @ lidar.lidar2ego[:3, :3])
 
 
 def returns_of(lidar: Lidar, points: FloatArray) -> Returns:
@@ -168,3 +167,10 @@ def measured_near(a: Lidar, b: Lidar, points: FloatArray) -> BoolArray:
     columns_deg = b.azimuth_deg[0] + b.azimuth_step_deg * np.arange(b.shape[1])
     rows = np.rint((np.array(b.elevations_deg) + 90) / _GRID_DEG).astype(int)
     return np.asarray(near[rows[:, None], np.rint(columns_deg / _GRID_DEG).astype(int) % turn] > 0)
+
+
+def _polar_deg(points: FloatArray) -> FloatArray:
+    """(3, n) elevations and azimuths in degrees, and distances, of points (n, 3) in a scanner's frame."""
+    x, y, z = points.T
+    level = np.hypot(x, y)
+    return np.stack([np.degrees(np.arctan2(z, level)), np.degrees(np.arctan2(y, x)), np.hypot(level, z)])

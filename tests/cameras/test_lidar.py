@@ -87,7 +87,6 @@ def test_rigs_with_scanners_are_moved_by_numbers() -> None:
         (lambda: load_rig("waymo").lidars[0].moved(np.ones((4, 4))), "lidar 'TOP': ego2ego: expected last row"),
         (lambda: load_rig("waymo").lidars[0].shifted("a"), "lidar 'TOP': shift: expected three finite numbers"),
         (lambda: load_rig("waymo").lidars[0].shifted(np.nan), "lidar 'TOP': shift: expected three finite numbers"),
-        (lambda: Lidar.fitted(np.zeros((5, 3)), np.ones((4, 4))), "lidar 'fitted': lidar2ego: expected last row"),
     ],
 )
 def test_scanners_are_moved_by_numbers(call: Callable[[], object], message: str) -> None:

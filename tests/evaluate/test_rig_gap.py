@@ -1,17 +1,14 @@
 """How far apart two rigs are: by hand where a formula is known."""
 
-import json
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import integrations.cross_rig
 from arbiview_aug import Camera, Rig, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.evaluate.rig_gap import rig_gap
-from integrations.cross_rig.worlds import CHANGES, source_rig
 
 RESULTS = Path(integrations.cross_rig.__path__[0]) / "results" / "gap.json"
 
@@ -36,7 +33,6 @@ def test_a_rig_is_no_distance_from_itself_at_any_resolution_or_road():
     for target in (ring(), ring(width_px=320), load_moved(ring())):
         gap = rig_gap(ring(), target)
         assert (gap.unseen, gap.row, gap.size, gap.parallax_deg) == pytest.approx((0, 0, 0, 0), abs=2e-3)
-        assert gap.expected_loss == pytest.approx(0, abs=0.05)
 
 
 def load_moved(rig: Rig) -> Rig:
@@ -66,7 +62,7 @@ def test_what_the_source_never_sees_is_a_share_of_what_the_target_sees():
 def test_cameras_below_the_road_have_a_finite_gap():
     for source, target in ((ring(height_m=-1), ring()), (ring(), ring(height_m=-1))):
         gap = rig_gap(source, target)
-        assert gap.unseen < 1 and math.isfinite(gap.expected_loss) and gap.row == pytest.approx(math.log(4))
+        assert gap.unseen < 1 and gap.row == pytest.approx(math.log(4))
 
 
 def test_shipped_rigs_with_lenses():
@@ -75,20 +71,7 @@ def test_shipped_rigs_with_lenses():
         assert 0 <= gap.unseen <= 1 and 0 < gap.row < 1.4 and 0 < gap.size < 1.4 and 0 < gap.parallax_deg < 60
 
 
-def test_it_predicts_what_detectors_lost():
-    """The correlation that ``inspect`` states, from the report beside the detectors."""
-    report = json.loads(RESULTS.read_text())["changes"]
-    source, losses, expected = source_rig((96, 256)), [], []
-    for name, change in report.items():
-        raw, oracle = (change["variants"][variant]["iou"]["value"] for variant in ("raw", "oracle"))
-        losses.append(100 * (oracle - raw))
-        expected.append(rig_gap(source, CHANGES[name].target((96, 256))).expected_loss)
-    assert len(losses) >= 6 and np.corrcoef(losses, expected)[0, 1] == pytest.approx(0.88, abs=0.01)
-    assert np.abs(np.subtract(losses, expected)).max() < 2.5
-
-
 def test_inspect_says_it(capsys, tmp_path):
     assert main(["inspect", "nuscenes", "waymo", "--output", str(tmp_path / "rigs.png")]) == 0
     out = capsys.readouterr().out
     assert "For a detector: 0% of the objects unseen; distances wrong by 87% by their row, by 34% by their size" in out
-    assert "about 10 points of IoU" in out
