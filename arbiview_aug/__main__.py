@@ -6,7 +6,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from arbiview_aug.choices import FLAGS
 from arbiview_aug.cli import parsers
 from arbiview_aug.environment import imported, installed_version, warn_about_cv2_wheels
 from arbiview_aug.errors import exit_status
@@ -97,9 +96,7 @@ def _bench(argv: Sequence[str]) -> int:
         print(f"{_listed(BENCHMARKS)}\n")
     name, *rest = argv if argv and not argv[0].startswith("-") else ["pareto", *argv]
     if name not in BENCHMARKS:
-        new = FLAGS.get(f"bench {name}")
-        fix = f"; it is now {new}" if new else ""
-        print(f"{program}: expected one of {', '.join(BENCHMARKS)}, got {name!r}{fix}", file=sys.stderr)
+        print(f"{program}: expected one of {', '.join(BENCHMARKS)}, got {name!r}", file=sys.stderr)
         return 2
     return run(program, name, BENCHMARKS[name], rest)
 

@@ -20,7 +20,6 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from arbiview_aug.choices import removed_name
 from arbiview_aug.errors import MissingPackageError, warn
 
 _CV2_WHEELS = ("opencv-python", "opencv-python-headless", "opencv-contrib-python", "opencv-contrib-python-headless")
@@ -75,7 +74,7 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
 
     def get(name: str) -> Any:
         if name not in modules:
-            raise removed_name(package, name)
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
         value = imported(f"{modules[name]}:{name}")
         setattr(sys.modules[package], name, value)
         return value

@@ -38,9 +38,6 @@ FAMILIES = {
         (
             *("mmengine==0.10.7", "addict>=2.4", "yapf>=0.40", "rich>=13", "markdown-it-py>=3", "mdurl>=0.1"),
             *("pygments>=2.17", "termcolor>=2", "platformdirs>=4"),
-            # mmcv has no wheels: the lite one has all but the compiled operators.
-            *("mmdet3d==1.4.0", "mmdet==3.3.0", "mmcv-lite==2.1.0", "pycocotools>=2", "shapely>=2"),
-            *("terminaltables>=3.1", "six>=1.16"),
             *("lightning>=2.5,<3", "lightning-utilities>=0.11", "torchmetrics>=1.4"),
             *("webdataset>=1.0,<2", "braceexpand>=0.1.7"),
         ),

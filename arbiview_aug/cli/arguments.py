@@ -5,19 +5,18 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import re
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from tqdm import tqdm
 
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import FLAGS, GeometryName, Holes, Quality, Reduce
+from arbiview_aug.choices import GeometryName, Holes, Quality, Reduce
 from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
 from arbiview_aug.errors import DataError
 
@@ -40,22 +39,12 @@ class _HelpFormatter(argparse.HelpFormatter):
         return f"{text} (default: {' '.join(shown)})"
 
 
-class _Parser(argparse.ArgumentParser):
-    """Parser whose errors give the new names of options that were renamed."""
-
-    def error(self, message: str) -> NoReturn:
-        for old, new in FLAGS.items():
-            if re.search(rf"(?<![\w-]){old}(?![\w-])", message):
-                message += f"; {old} is now {new}"
-        super().error(message)
-
-
 def command_parser(
     command: str, description: str, example: str, program: str = "python -m arbiview_aug"
 ) -> argparse.ArgumentParser:
     """Create the parser of a command, without its options; ``example`` shows arguments at work."""
     prog = f"{program} {command}".strip()
-    return _Parser(
+    return argparse.ArgumentParser(
         prog=prog, description=description, epilog=f"example: {prog} {example}", formatter_class=_HelpFormatter
     )
 

@@ -13,7 +13,6 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import BROKEN_ARRAY, file_name, inside, whole_file
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.datasets.wrappers import checked_map_style
 from arbiview_aug.errors import DataError, SampleError, SampleTypeError
@@ -130,8 +129,7 @@ class WithDepth(Dataset[dict[str, Any]]):
         SampleTypeError: A dataset that is not map-style, or, on access, a sample that is no mapping.
     """
 
-    def __init__(self, dataset: Any, folder: str | Path, *, source: Rig | None = None, **unknown: Any) -> None:
-        refuse_old_options("WithDepth", unknown)
+    def __init__(self, dataset: Any, folder: str | Path, *, source: Rig | None = None) -> None:
         self.dataset, self.source = checked_map_style(dataset, "WithDepth", "pass the dataset first"), source
         below = [inside(Path(folder), name, "depth") for name in FOLDERS.values()]
         self.folders = [DepthFolder(one) for one in below if one.is_dir()] or [DepthFolder(folder)]

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from arbiview_aug.choices import setting_hint
 from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
 from arbiview_aug.generator.correspondence import FACING_M
 
@@ -57,9 +56,7 @@ def from_plain(kind: type[_Config], data: Any, where: str, error: type[ArbiviewE
     hints = get_type_hints(kind)
     unknown = sorted(set(data) - set(hints))
     if unknown:
-        raise error(
-            f"{where}: expected keys among {', '.join(sorted(hints))}, got {', '.join(unknown)}{setting_hint(unknown)}"
-        )
+        raise error(f"{where}: expected keys among {', '.join(sorted(hints))}, got {', '.join(unknown)}")
     values: dict[str, Any] = {}
     for key, value in data.items():
         if is_dataclass(hints[key]):

@@ -16,7 +16,6 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import KEYS
 from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
 from arbiview_aug.sample.masks import CLEANING, dark_rims
@@ -467,8 +466,6 @@ def check_other_keys(
             f"SampleKeys.labels: expected {', '.join(absent)} in the sample, got {', '.join(map(str, sample))}"
         )
     labels = list(label_keys)
-    for old in KEYS.keys() & sample.keys() - {*label_keys, *pass_keys}:
-        raise SampleError(f"{old}: since 0.3 it is {KEYS[old]!r}; rename the key, or keep it by SampleKeys")
     for key, value in sample.items():
         if key in (*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *EGO_KEYS, *labels, *pass_keys):
             continue

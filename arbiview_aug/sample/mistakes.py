@@ -12,7 +12,6 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_mounted, pose_mistake
-from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.sample.inputs import Frame, as_array, focal_mistake, misnamed_keys, read_frames
 from arbiview_aug.sample.masks import CLEANING, dark_rims, without_specks
 from arbiview_aug.scene.boxes import checked_boxes, points_in
@@ -82,7 +81,7 @@ class CheckReport:
         return "\n".join(map(str, self.findings)) or "no findings"
 
 
-def check(sample: Mapping[str, Any], source: Rig | None = None, **unknown: Any) -> CheckReport:
+def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
     """Look for mistakes that rendering cannot notice.
 
     Points in boxes tell the reading of the boxes and the frame of the points; the road in the points tells
@@ -95,7 +94,6 @@ def check(sample: Mapping[str, Any], source: Rig | None = None, **unknown: Any) 
     Raises:
         ArbiviewError: ``RigRetarget`` would refuse the sample too.
     """
-    refuse_old_options("check", unknown)
     frames = read_frames(sample, source)
     findings = [
         Finding(wrong, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")

@@ -16,7 +16,6 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import refuse_old_options
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.image_ops import nearest_resized, resized
 from arbiview_aug.sample.batching import like, rewrapped
@@ -31,9 +30,8 @@ _MAPS = ("coverage", "ego_mask", "source_camera", "source_frame", "confidence", 
 class _PixelTransform(torch.nn.Module, ABC):
     """Applies one change of pixels to the images of a sample and to everything that follows them."""
 
-    def __init__(self, keys: SampleKeys, unknown: Mapping[str, Any]) -> None:
+    def __init__(self, keys: SampleKeys) -> None:
         super().__init__()
-        refuse_old_options(type(self).__name__, unknown)
         self.keys = checked_instance("keys", keys, SampleKeys)
         self._warn = WarnOnce()
 
@@ -93,8 +91,8 @@ class ResizeRig(_PixelTransform):
         keys: Its ``labels`` and ``keep``, as for ``RigRetarget``.
     """
 
-    def __init__(self, size: tuple[int, int], *, keys: SampleKeys = SampleKeys(), **unknown: Any) -> None:  # noqa: B008 - frozen
-        super().__init__(keys, unknown)
+    def __init__(self, size: tuple[int, int], *, keys: SampleKeys = SampleKeys()) -> None:  # noqa: B008 - frozen
+        super().__init__(keys)
         self.size = checked_pixels(size)
 
     def extra_repr(self) -> str:
@@ -127,9 +125,8 @@ class CropRig(_PixelTransform):
         size: tuple[int, int],
         *,
         keys: SampleKeys = SampleKeys(),  # noqa: B008 - frozen
-        **unknown: Any,
     ) -> None:
-        super().__init__(keys, unknown)
+        super().__init__(keys)
         self.top, self.left = checked_pixels((top, left), "top, left", "two numbers", 0)
         self.size = checked_pixels(size)
 

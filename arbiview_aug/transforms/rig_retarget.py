@@ -18,7 +18,7 @@ import torch
 from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.choices import GeometryName, Holes, Quality, choice, refuse_old_options
+from arbiview_aug.choices import GeometryName, Holes, Quality, choice
 from arbiview_aug.environment import compilation_announced, warn_about_cv2_wheels
 from arbiview_aug.errors import GeometryWarning, SampleError, WarnOnce
 from arbiview_aug.favs.config import PaperConfig
@@ -134,10 +134,8 @@ class RigRetarget(torch.nn.Module):
         keys: SampleKeys = SampleKeys(),  # noqa: B008 - frozen
         cache: PlanCache = PlanCache(),  # noqa: B008 - frozen
         backend: Backend = "auto",
-        **unknown: Any,
     ) -> None:
         super().__init__()
-        refuse_old_options("RigRetarget", unknown)
         warn_about_cv2_wheels()
         self.target = target if isinstance(target, RandomRig) else load_rig(target)
         self.source = None if source is None else load_rig(source)

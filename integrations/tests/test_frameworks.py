@@ -12,11 +12,7 @@ import pytest
 from integrations.environments import python_of
 
 ROOT = Path(__file__).parents[2]
-FRAMEWORK_TESTS = (
-    "mmdet3d/tests/test_compose.py",
-    "lightning/tests/test_datamodule.py",
-    "webdataset/tests/test_stream.py",
-)
+FRAMEWORK_TESTS = ("mmdet3d/tests/test_compose.py",)
 EXAMPLES = ("kornia", "lightning", "mmdet3d", "nuscenes", "openpcdet", "webdataset")
 
 
@@ -35,18 +31,15 @@ def run(*arguments: str) -> str:
     return done.stdout
 
 
-def test_every_folder_has_readme_example_and_tests() -> None:
+def test_every_folder_has_readme_and_example() -> None:
     for name in EXAMPLES:
         folder = ROOT / "integrations" / name
         assert f"integrations.{name}.example" in (folder / "README.md").read_text()
-        assert (folder / "example.py").is_file() and list((folder / "tests").glob("test_*.py"))
+        assert (folder / "example.py").is_file()
 
 
 def test_frameworks_are_imported_where_they_are_used(tmp_path: Path) -> None:
-    """Neither the package nor an adapter imports them; a missing one is one line with the command to install it.
-
-    Importing the adapter of mmdet3d registers the step, as ``custom_imports`` does, where mmengine is installed.
-    """
+    """Importing the adapter of mmdet3d registers the step, as ``custom_imports`` does, where mmengine is installed."""
     registry = tmp_path / "mmengine" / "registry.py"
     registry.parent.mkdir()
     (registry.parent / "__init__.py").write_text("")
@@ -55,21 +48,14 @@ def test_frameworks_are_imported_where_they_are_used(tmp_path: Path) -> None:
     )
     code = (
         "import sys, arbiview_aug\n"
-        "from arbiview_aug.integrations import kornia, lightning, mmdet3d, nuscenes, webdataset\n"
-        "print([m for m in ('lightning', 'webdataset') if m in sys.modules])\n"
-        "sys.modules |= dict.fromkeys(('lightning', 'webdataset'))\n"
-        "for use in (lambda: lightning.RetargetDataModule, lambda: webdataset.stream('no.tar', dict)):\n"
-        "    try: use()\n"
-        "    except ImportError as error: print(error)\n"
+        "from arbiview_aug.integrations import kornia, mmdet3d, nuscenes\n"
         "mmdet3d.RigRetargetMultiView, mmdet3d.register\n"
         "import importlib; sys.path.insert(0, sys.argv[1]); importlib.reload(mmdet3d)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=500, check=True
     )
-    hints = [f"{name} is not installed: pip install {name}" for name in ("lightning", "webdataset")]
-    registered = "RigRetargetMultiView arbiview_aug.integrations.mmdet3d.transform"
-    assert done.stdout.splitlines() == ["[]", *hints, registered]
+    assert done.stdout.splitlines() == ["RigRetargetMultiView arbiview_aug.integrations.mmdet3d.transform"]
 
 
 @pytest.mark.slow

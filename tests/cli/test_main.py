@@ -251,25 +251,6 @@ def test_names_in_options_are_those_of_the_tables() -> None:
     assert {*TRAINING_PRESETS} == {*CONFIGS}
 
 
-@pytest.mark.parametrize(
-    ("command", "message"),
-    [
-        ("convert --data d --target waymo --output o --reduce 2", "--reduce is now --downscale"),
-        ("convert --data d --target waymo --output o --motion-depth=d", "--motion-depth is now --depth"),
-        ("evaluate --yaws vehicles", "--yaws is now --target-set SET"),
-        ("evaluate --paper", "--paper is now python -m integrations.benchmarks.paper"),
-        ("bench trade", "it is now bench pareto"),
-        ("bench neighbours", "it is now bench speed --only neighbour"),
-    ],
-)
-def test_old_names_give_the_new_ones(command: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    try:
-        assert main(command.split()) == 2
-    except SystemExit as refused:
-        assert refused.code == 2
-    assert re.search(message, capsys.readouterr().err.splitlines()[-1])
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_an_interrupt_is_one_line_and_130(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

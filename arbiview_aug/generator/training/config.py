@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
 
-from arbiview_aug.choices import setting_hint
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import config as generators
 from arbiview_aug.generator.config import GeneratorConfig, check_fields, from_plain
@@ -127,7 +126,7 @@ def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
 def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: str) -> None:
     name = path[0]
     if name not in data:
-        raise TrainingError(f"--set {setting}: expected one of {', '.join(data)}, got {name!r}{setting_hint([name])}")
+        raise TrainingError(f"--set {setting}: expected one of {', '.join(data)}, got {name!r}")
     default = data[name]
     if len(path) > 1:
         if not isinstance(default, dict):

@@ -39,7 +39,6 @@ def test_overrides() -> None:
     [
         ("step=7", "expected one of generator, .*got 'step'"),
         ("loss.nothing=1", "got 'nothing'"),
-        ("loss.known=1", "since 0.3 known is known_weight"),
         ("steps", "expected KEY=VALUE"),
         ("steps=1.5", "steps: expected int, got 1.5"),
         ("steps=true", "expected int"),
@@ -51,7 +50,6 @@ def test_overrides() -> None:
         ("precision=fp16", "never fp16"),
         ("loss.geo_mode=sum", "expected normalised or frobenius_sum"),
         ("pseudo_views.hidden=2", "expected a probability"),
-        ("pseudo_views.virtual=0", "since 0.3 virtual is gone: no measurement showed a gain"),
         ("pseudo_views.quality=draft", "PseudoViewConfig.quality: expected fast or paper, got 'draft'"),
         ("pseudo_views.yaw_deg=[5]", r"yaw_deg: expected 0 <= low <= high <= 90, got \(5,\)"),
         ("pseudo_views.focal=[0.7, 1, 2]", "focal: expected 0 < low <= high"),
