@@ -27,11 +27,8 @@ from arbiview_aug.choices import GeometryName, Quality
 from arbiview_aug.cli.bench import pareto
 from arbiview_aug.datasets import registry
 from arbiview_aug.errors import MissingPackageError
-from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.generator.training import command as train_command
 from arbiview_aug.render.requirements import HELPFUL_DATA
-from integrations.benchmarks import generator
-from integrations.benchmarks.ablation import NOTES, ROWS, STEPS, markdown
 from integrations.benchmarks.paper import REAL_FRAMES, SETS, SYNTHETIC, Study, paper_report, study_methods
 from tests.generator.training.small import frames as drawn_frames
 from tests.generator.training.test_command import SMALLER
@@ -270,22 +267,6 @@ def test_the_notebooks_run(notebook: Path, tmp_path: Path, monkeypatch: pytest.M
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
-def test_the_ablation_is_the_commands() -> None:
-    """Headings and steps, all that frames without boxes can tell."""
-    move = {"psnr_db": 1.0, "gain_db": 1.0, "gain_db_per_ms": 1.0}
-    figures = {"turned": move, "raised": move, "ms": 1.0, "added_ms": {"median_ms": 1.0}}
-    steps = {name: figures for name, step in STEPS.items() if ROWS[step.row].fits(ScoredFrame({}))}
-    of = {"steps": steps, "overlap": [{}, {}]}
-    (printed,) = tables(markdown({"data": dict.fromkeys(REAL_FRAMES, of)}))
-    (shown,) = tables(measured("ablation"))
-    assert shown[0] == printed[0] and [row[:2] for row in shown] == [row[:2] for row in printed]
-    assert all(re.fullmatch(r"\d\d\.\d\d \([+-]\d\.\d\d\)", row[k]) for row in shown[2:] for k in (2, 3, 6, 7))
-    assert NOTES in words(measured("ablation"))
-    whole = markdown({"data": {"synthetic street": {"steps": dict.fromkeys(STEPS, figures), "overlap": []}}})
-    ((synthetic,), (street,)) = tables(whole), tables(measured("synthetic-ablation"))
-    assert street[0] == synthetic[0] and [row[:2] for row in street] == [row[:2] for row in synthetic]
-
-
 def test_the_trade_is_the_commands() -> None:
     (block,) = re.findall(r"<!-- pareto -->\n(.*?)<!-- /pareto -->", BENCHMARKS, re.DOTALL)
     (table,) = re.findall(r"((?:^\|.*\n)+)", block, re.MULTILINE)
@@ -297,15 +278,6 @@ def test_the_trade_is_the_commands() -> None:
     fastest = min(float(row[2]) for row in rows if "lidar" in row[0])  # the others are static, and cameras move
     assert f"\nNo recommendation: nothing keeps to 20 ms: the fastest takes {fastest} ms. Static surfaces " in block
     assert f"Better: {HELPFUL_DATA}.\n" in block
-
-
-def test_the_generators_table_is_the_commands() -> None:
-    (table,) = tables(measured("generator"))
-    assert table[0] == ["", *(heading for heading, *_ in generator.COLUMNS)]
-    fills = ["holes black", "filled", "inpainted"]
-    assert [row[0] for row in table[2:]] == [*fills, *map(generator.row_name, generator.STEPS)]
-    assert all(re.fullmatch(r"[\d.]+", cell) for row in table[2:] for cell in row[1:])
-    assert generator.NOTES in measured("generator")
 
 
 def test_the_papers_tables_are_the_commands() -> None:

@@ -9,7 +9,7 @@ Run with ``-s`` for the tables.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -32,7 +32,6 @@ from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from integrations.benchmarks.acceptance.protocol import FRAMES, ProtocolFrame, frame_folder
-from integrations.benchmarks.moving_traffic import without_labels
 from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(1800)
@@ -40,6 +39,14 @@ pytestmark = pytest.mark.timeout(1800)
 MOVES = {"up 0.6 m": (0.0, (0.0, 0.0, 0.6)), "11° and moved": (11.0, (0.5, 0.3, 0.7)), "22°": (22.0, (0.0, 0.0, 0.0))}
 GAINS_DB = {"nuscenes-one": (8.0, 9.0, 3.0), "ddad-one": (7.0, 7.0, 3.5)}
 """Over ``ground``, by move: what naive linear interpolation of inverse depth reaches."""
+
+
+def without_labels(sample: Mapping[str, Any]) -> dict[str, Any]:
+    """A sample and its neighbours without boxes."""
+    near = [{key: entry[key] for key in entry if key != "boxes_3d"} for entry in sample["neighbours"]]
+    kept = {key: value for key, value in sample.items() if key not in ("boxes_3d", "box_classes")}
+    return kept | {"neighbours": near}
+
 
 SEEDS = few_or_all(1, 4)
 STREET_MOVES = {"0.7 m higher": {"z_m": 0.7}, "1 m sideways": {"y_m": 1.0}}

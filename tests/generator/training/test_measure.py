@@ -11,7 +11,7 @@ import cv2
 import pytest
 import torch
 
-from arbiview_aug.errors import DataError, GeneratorError, TrainingError
+from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
@@ -28,8 +28,6 @@ from arbiview_aug.generator.training.held_out import (
 )
 from arbiview_aug.generator.training.losses import without_attention
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
-from integrations.benchmarks import training
-from integrations.benchmarks.training import correct_correspondences, seen_scores, text_of, wrong_rig
 from tests.generator.small import ring, stirred
 from tests.generator.training.small import OneColour, config, frames
 from tests.generator.training.test_pseudo_views import HOLE
@@ -80,19 +78,9 @@ def test_samples_repeat_and_leave_known_pixels(batch: Batch, generator: Generato
 def test_switches_of_the_attention_are_felt(batch: Batch, generator: Generator) -> None:
     made = [
         sampled(generator, batch._replace(geometry=change(batch.geometry)), steps=1, seed=0)
-        for change in (lambda geometry: geometry, without_attention, wrong_rig)
+        for change in (lambda geometry: geometry, without_attention)
     ]
-    assert not torch.equal(made[0], made[1]) and not torch.equal(made[0], made[2])
-    everything = wrong_rig(wrong_rig(wrong_rig(batch.geometry)))  # three items: around once
-    assert torch.equal(sampled(generator, batch._replace(geometry=everything), steps=1, seed=0), made[0])
-
-
-def test_scores_of_the_attention(batch: Batch, generator: Generator) -> None:
-    scores = seen_scores(generator, batch)
-    assert list(scores) == ["seen", "without", "wrong rig"]
-    assert all(math.isfinite(value) for value in scores.values())
-    assert scores["seen"] != scores["wrong rig"]
-    assert 0 < correct_correspondences(generator, batch) < 1
+    assert not torch.equal(made[0], made[1])
 
 
 @pytest.mark.slow
@@ -161,26 +149,6 @@ def test_pictures(batch: Batch, tmp_path: Path) -> None:
     back = cv2.imread(str(tmp_path / "a" / "grid.png"))
     assert back.shape == image.shape and image.shape[1] >= 7 * 112
     assert (back[..., ::-1] == image).all()
-
-
-def test_the_table_names_every_variant() -> None:
-    gain = {"mean": 1.0, "low": 0.0, "high": 2.0}
-    seen = {name: 20.0 for name in ("seen", "without", "wrong rig")}
-    row = {"against Telea": {"one_step": gain, "sample": gain}, "seen by a source": seen, "top-1": 0.5}
-    text = text_of({"as written": row, "all additions": {**row, "against Telea": {}}})  # neither was trained
-    assert "as written" in text and "all additions" in text and "+1.00" in text and "50%" in text
-
-
-def test_an_ablation_that_is_stopped_scores_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training.Trainer, "train", lambda self: False)
-    made = training.ablate(config(), frames(), tmp_path, show=False)
-    assert made == {} and not (tmp_path / "training.json").exists()
-    with pytest.raises(DataError, match="expected two scenes or more, one of them to score on; found one"):
-        training.ablate(config(), frames(1), tmp_path, show=False)
-    monkeypatch.setattr(training, "open_frames", lambda *_, **__: frames())
-    for table, status in (({}, 130), (dict.fromkeys(training.VARIANTS), 0)):
-        monkeypatch.setattr(training, "ablate", lambda *_, table=table, **__: table)
-        assert training.main(["--output", str(tmp_path)]) == status
 
 
 def test_holes_of_the_condition_as_they_were_in_training(batch: Batch) -> None:
