@@ -2,8 +2,8 @@
 
 Each neighbour is matched by a plane sweep. The costs of both are merged and aggregated. A pixel is kept where one
 distance fits clearly better than all others, away from outlines, and where enough of its neighbours are kept too.
-Labelled objects are masked in both frames. Unlabelled traffic is put upright where its foot is on the road
-(``arbiview_aug.temporal.moving``). ``docs/drives.md`` (Constants) says how the constants were chosen.
+Labelled objects that moved between the frames are masked in both. Unlabelled traffic is put upright where its foot is
+on the road (``arbiview_aug.temporal.moving``). ``docs/drives.md`` (Constants) says how the constants were chosen.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from arbiview_aug.environment import compilation_announced
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY, Frame
 from arbiview_aug.sample.neighbours import BOX_MARGIN_M, Neighbour, neighbour_images
-from arbiview_aug.scene.boxes import draw_boxes
+from arbiview_aug.scene.boxes import SAME_SIZE_M, STAYED_M, draw_boxes
 from arbiview_aug.scene.depth_map import DepthMap, Maps, anchored_maps, motion_camera
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.scene.scene import GEOMETRIES, Geometry, Scene
@@ -48,6 +48,10 @@ LEAST_SHIFT_PX = 0.06
 
 _NEARER, _MORE = 1e-3, 10
 """Share of confirmed pixels at half the size that may be nearer than the nearest wall, and walls added to that one."""
+
+LABEL_ERROR = 0.1
+"""Largest relative error of a distance on a labelled object: that of an object which moves along with the vehicle, or
+against it, by this share of the vehicle's way, and the difference from a label's face."""
 
 _SPECKLE_PX, _SPECKLE_STEP = 100, 0.15
 """Smallest patch, and the largest relative change of inverse distance from pixel to pixel within it."""
@@ -104,17 +108,20 @@ def motion_depth(
 
     Images (3, H, W) are uint8, or float in [0, 1]; ``load`` reads a neighbour's. They are matched at half the size
     first. Poses are checked on the result (``pose_error``); small errors are corrected and the images matched again.
-    Neighbours and labelled objects (B, 7), which are left out, are in the current ego frame.
+    Neighbours and labelled objects (B, 7) are in the current ego frame. Objects that moved are left out, and depth that
+    contradicts the label of an object which may have moved.
     """
+    labels = np.zeros((0, 7)) if boxes is None else boxes[:, :7]
 
     def declined(reason: str) -> MotionDepth:
         return MotionDepth(tuple(np.zeros(motion_camera(camera).size, np.float32) for camera in rig), reason)
 
-    sides = list(_sides(neighbours, load, rig.ground_z_m))
+    sides = list(_sides(neighbours, labels, load, rig.ground_z_m))
     if not sides:
         least, most = TRAVEL_M
         return declined(f"no frame {least:g} to {most:g} m before or after it can be used")
-    swept = _swept(rig, images, boxes, rig.ground_z_m)
+    moved, unsure = _motion_of_labels(labels, [side.neighbour for side in sides])
+    swept = _swept(rig, images, labels[moved], rig.ground_z_m)
     if any(min(one.camera.size) < 2 for part in (swept, *(side.images for side in sides)) for one in part):
         return declined("images one pixel wide or high have nothing to interpolate")
     words = f"from {' and '.join(side.neighbour.name for side in sides)}"
@@ -138,35 +145,56 @@ def motion_depth(
         elif worst.error_px > MAX_ERROR_PX:
             return declined(f"the pose of frame {sides[measured.index(worst)].neighbour.name} errs by {worst}")
     fine = map(partial(_match, stands=True), swept, others, map(_walls, swept, coarse))
-    return MotionDepth(tuple(map(_depth_m, swept, fine)), words)
+    return MotionDepth(tuple(map(partial(_depth_m, unsure=labels[unsure]), swept, fine)), words)
 
 
-def _sides(neighbours: Sequence[Neighbour], load: Load, ground_z_m: float) -> Iterator[_Side]:
+def _sides(neighbours: Sequence[Neighbour], labels: FloatArray, load: Load, ground_z_m: float) -> Iterator[_Side]:
     """A neighbour behind the vehicle and one ahead of it: those of the best travel that can be loaded."""
     usable = [one for one in neighbours if TRAVEL_M[0] <= one.travel_m <= TRAVEL_M[1]]
     usable.sort(key=lambda one: abs(one.travel_m - BEST_TRAVEL_M))
     for is_ahead in (False, True):
         for one in usable:
             if (one.ahead_m > 0) == is_ahead and (images := load(one)) is not None:
-                yield _Side(one, _swept(one.rig, images, one.boxes, ground_z_m))
+                then = np.zeros((0, 7)) if one.boxes is None else one.boxes
+                yield _Side(one, _swept(one.rig, images, then[_moved_m(then, labels) > STAYED_M], ground_z_m))
                 break
 
 
-def _swept(rig: Rig, images: Sequence[torch.Tensor], boxes: FloatArray | None, ground_z_m: float) -> list[SweptImage]:
+def _swept(rig: Rig, images: Sequence[torch.Tensor], moved: FloatArray, ground_z_m: float) -> list[SweptImage]:
+    """Images without the labelled objects (B, 7) that moved, and without windows that touch them."""
+    from arbiview_aug.temporal.kernels import RADIUS_PX
+
     return [
-        SweptImage(without_objects(motion_camera(camera), boxes), reduced_grey(camera, image), ground_z_m)
+        SweptImage(without_objects(motion_camera(camera), moved, 0, RADIUS_PX), reduced_grey(camera, image), ground_z_m)
         for camera, image in zip(rig, images, strict=True)
     ]
 
 
-def without_objects(camera: Camera, boxes: FloatArray | None) -> Camera:
-    """Mask labelled objects, with a margin around them."""
-    if boxes is None or not len(boxes):
+def _moved_m(boxes: FloatArray, others: FloatArray) -> FloatArray:
+    """How far (B,) labels (B, 7) are from the nearest of their size in another frame (C, 7); infinite without one."""
+    apart_m = np.linalg.norm(boxes[:, None, :3] - others[None, :, :3], axis=-1)
+    differ = np.abs(boxes[:, None, 3:6] - others[None, :, 3:6]).max(axis=-1) > SAME_SIZE_M
+    return np.asarray(np.where(differ, np.inf, apart_m).min(axis=1, initial=np.inf))
+
+
+def _motion_of_labels(labels: FloatArray, neighbours: Sequence[Neighbour]) -> tuple[BoolArray, BoolArray]:
+    """Which labels (B, 7) moved; which may have moved: by less than labels jitter, or without labels of neighbours."""
+    labelled = [(_moved_m(labels, one.boxes), one.travel_m) for one in neighbours if one.boxes is not None]
+    if not labelled:
+        return np.zeros(len(labels), bool), np.ones(len(labels), bool)
+    moved = np.any([moved_m > STAYED_M for moved_m, _ in labelled], axis=0)
+    return moved, np.any([moved_m > LABEL_ERROR * travel_m for moved_m, travel_m in labelled], axis=0) & ~moved
+
+
+def without_objects(camera: Camera, boxes: FloatArray, margin_m: float = BOX_MARGIN_M, margin_px: int = 0) -> Camera:
+    """Mask labelled objects (B, 7), with a margin around their boxes and one around their silhouettes."""
+    if not len(boxes):
         return camera
-    grown = boxes[:, :7] + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0])
-    mask = np.ones(camera.size, bool) if camera.mask is None else camera.mask.copy()
-    mask[draw_boxes(camera, grown)[1] >= 0] = False
-    return replace(camera, mask=mask)
+    grown = boxes[:, :7] + 2 * margin_m * np.array([0, 0, 0, 1, 1, 1, 0])
+    shown = (draw_boxes(camera, grown)[1] >= 0).astype(np.uint8)
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin_px + 1,) * 2)
+    mask = cv2.dilate(shown, around) == 0
+    return replace(camera, mask=mask if camera.mask is None else mask & camera.mask)
 
 
 def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands: bool = False) -> _Estimate:
@@ -226,11 +254,14 @@ def _pose_samples(images: Sequence[SweptImage], estimates: Sequence[_Estimate], 
     return [PoseSamples(image, other, estimate.inverse_distance, estimate.valid) for image, other, estimate in parts]
 
 
-def _depth_m(image: SweptImage, estimate: _Estimate) -> Layer:
-    """z-depth (h, w), 0 outside the mask, where invalid, and in small patches."""
+def _depth_m(image: SweptImage, estimate: _Estimate, unsure: FloatArray) -> Layer:
+    """z-depth (h, w), 0 outside the mask, where invalid, in small patches, and off the faces of ``unsure`` labels."""
     camera, (q, valid) = image.camera, estimate
     q = np.maximum(q, 1 / FARTHEST_M)
     valid = valid if camera.mask is None else valid & camera.mask
+    if len(unsure):
+        face, _ = draw_boxes(camera, unsure)
+        valid = valid & ((face == 0) | (np.abs(q - face) <= LABEL_ERROR * face))
     scale = 1000.0  # fits logarithms from 1 mm up into int16
     log_q: Any = np.where(valid, np.log(np.maximum(q, 1e-3) / 1e-3) * scale + 1, 0).astype(np.int16)
     cv2.filterSpeckles(log_q, 0, _SPECKLE_PX, _SPECKLE_STEP * scale)

@@ -1,5 +1,6 @@
 """Depth from motion on static streets: accuracy, density, and when it declines."""
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -13,6 +14,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.sample.neighbours import Neighbour, read_neighbours
+from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
 from tests.helpers import Standing
@@ -111,12 +113,45 @@ def test_a_lost_frame_leaves_the_other_side(sample: dict[str, Any]) -> None:
     assert one.density > 0.2 and "-0." not in one.words and " and " not in one.words.partition(";")[0]
 
 
-def test_labelled_objects_are_left_out(sample: dict[str, Any], exact: MotionDepth) -> None:
-    box = np.array([[8.0, 6.0, 1.0, 4.0, 2.0, 2.0, 0.0]])
-    less = depth_of(sample, boxes=box)
-    u, v = np.rint(SIDE[1].project(box[:, :3]).uv[0]).astype(int)
-    assert not less.depth_m[1][v - 5 : v + 5, u - 5 : u + 5].any()
-    assert less.density < exact.density
+PARKED = np.array([[8.0, 6.0, 1.0, 4.0, 2.0, 2.0, 0.0]])  # a label at the kerb, front left
+
+
+def with_labels(sample: dict[str, Any], moved_m: float | None) -> MotionDepth:
+    """Depth with the label, which moved along the street in the neighbours; None for neighbours without labels."""
+    (frame,) = read_frames(sample, None)
+    near = read_neighbours(frame, lambda topic, message: pytest.fail(message))
+    then = None if moved_m is None else PARKED + np.array([moved_m, 0, 0, 0, 0, 0, 0])
+    return depth_of(sample, boxes=PARKED, neighbours=[replace(one, boxes=then) for one in near])
+
+
+def test_labels_of_what_moved_are_left_out(sample: dict[str, Any], exact: MotionDepth) -> None:
+    less = with_labels(sample, 1.0).depth_m[1]
+    shown = draw_boxes(SIDE[1], PARKED)[1] >= 0
+    around = cv2.dilate(shown.astype(np.uint8), np.ones((3, 3))) > 0
+    assert shown.sum() > 300 and not less[around].any() and exact.depth_m[1][around].any()
+    far = cv2.dilate(shown.astype(np.uint8), np.ones((41, 41))) == 0
+    assert (less[far] > 0).mean() > 0.95 * (exact.depth_m[1][far] > 0).mean()
+
+
+@pytest.mark.parametrize("moved_m", [None, 0.3], ids=["neighbours without labels", "less than labels jitter"])
+def test_depth_must_agree_with_labels_that_may_have_moved(
+    sample: dict[str, Any], exact: MotionDepth, moved_m: float | None
+) -> None:
+    found, unlabelled = with_labels(sample, moved_m).depth_m[1], exact.depth_m[1]
+    face, _ = draw_boxes(SIDE[1], PARKED)
+    z = SIDE[1].unproject(SIDE[1].pixel_grid())[0] @ SIDE[1].cam2ego[:3, 2]
+    off = np.abs(z / np.maximum(found, 1e-6) - face) > 0.101 * face
+    assert not (found[face > 0] > 0)[off[face > 0]].any() and np.array_equal(
+        found[face == 0] > 0, unlabelled[face == 0] > 0
+    )
+
+
+def test_labels_that_stand_change_nothing(drive: SyntheticDrive, exact: MotionDepth) -> None:
+    labelled = drive[1]  # every object of this street stands
+    boxes = labelled["boxes_3d"].numpy().astype(float)
+    assert sum((draw_boxes(camera, boxes)[1] >= 0).sum() for camera in SIDE) > 1000
+    same = depth_of(labelled, boxes=boxes)
+    assert all(map(np.array_equal, same.depth_m, exact.depth_m))
 
 
 def test_as_a_surface(drive: SyntheticDrive, sample: dict[str, Any], exact: MotionDepth) -> None:
