@@ -36,15 +36,6 @@ COMMANDS = {
     "view": Command("write a recording of frames and their views for Rerun's viewer", "cli.view"),
 }
 
-BENCHMARKS = {
-    "pareto": Command("speed against accuracy of all settings, and which to use (the default)", "cli.bench.pareto"),
-    "speed": Command(
-        "milliseconds against bare cv2.remap calls; --device: batches by torch against a copy", "cli.bench.speed"
-    ),
-    "loader": Command("frames per second of a DataLoader, memory per worker", "cli.bench.loader"),
-}
-"""Commands after ``bench``."""
-
 
 def usage() -> str:
     """The commands with their one-line help."""
@@ -71,8 +62,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"python -m arbiview_aug: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
         return 2
     warn_about_cv2_wheels()
-    if name == "bench":
-        return _bench(rest)
     return run(f"python -m arbiview_aug {name}", name, COMMANDS[name], rest)
 
 
@@ -86,19 +75,6 @@ def run(program: str, name: str, command: Command, argv: Sequence[str] | None) -
         return imported(f"arbiview_aug.{command.module}:run")(arguments)
 
     return exit_status(program, parsed_and_run, resumable=command.resumable)
-
-
-def _bench(argv: Sequence[str]) -> int:
-    """Run the benchmark that is named first, else ``pareto``; ``--help`` after its name explains it."""
-    program = "python -m arbiview_aug bench"
-    if argv[:1] in (["-h"], ["--help"]):
-        print(f"usage: {program} [BENCHMARK] ...\n\nMeasurements, as tables and JSON.\n\nbenchmarks:")
-        print(f"{_listed(BENCHMARKS)}\n")
-    name, *rest = argv if argv and not argv[0].startswith("-") else ["pareto", *argv]
-    if name not in BENCHMARKS:
-        print(f"{program}: expected one of {', '.join(BENCHMARKS)}, got {name!r}", file=sys.stderr)
-        return 2
-    return run(program, name, BENCHMARKS[name], rest)
 
 
 def _listed(commands: Mapping[str, Command]) -> str:

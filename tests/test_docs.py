@@ -65,13 +65,6 @@ TINY = {
     "inspect nuscenes truck.yaml": [],
     "bench --data FOLDER --budget-ms 20": [*TINY_BENCH, "--geometry", "infinity", "lidar", "--budget-ms", "5000"],
     "bench --data FOLDER --budget-ms 200": [*TINY_BENCH, "--geometry", "infinity", "lidar", "--budget-ms", "5000"],
-    "bench loader --data FOLDER": [
-        *["--geometry", "street", "--size", "32x88", "--downscale", "4", "--workers", "0", "1"],
-        *["--frames", "2", "--epochs", "1"],
-    ],
-    "bench speed --only neighbour": ["--repeats", "1", "--size", "32x88"],
-    "bench speed --device cuda": ["--device", "cpu", "--repeats", "1", "--size", "32x88"],
-    "bench speed": ["--repeats", "1", "--size", "32x88"],
     "convert --data FOLDER --target argoverse2 --output converted --size 256x704": [
         *("--size", "24x40", "--downscale", "4", "--workers", "1", "--geometry", "street", "--report", "0")
     ],
@@ -93,8 +86,8 @@ SLOW = (
     "evaluate --lidar",
     "view",
 )
-ALIKE = ("bench --data FOLDER --budget-ms 200", "bench speed")
-"""Commands that run as others do: with another budget, and in ``tests/cli/bench/test_speed.py``."""
+ALIKE = ("bench --data FOLDER --budget-ms 200",)
+"""Commands that run as others do, with another budget."""
 
 
 @cache

@@ -11,10 +11,9 @@ from typing import get_args
 from arbiview_aug.atomic_io import Link
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, GeometryName, OnError, Quality, Reduce, Reference
+from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, OnError, Quality, Reduce, Reference
 from arbiview_aug.cli.arguments import (
     add_data,
-    add_downscale,
     add_frames,
     add_output,
     add_reading,
@@ -35,10 +34,10 @@ SIZE, FULL_SIZE = (256, 704), (900, 1600)
 """Sizes (h, w) of the views that benchmarks render."""
 
 EXECUTIONS = ("opencv", "torch", "cuda")
-"""Backends of ``bench pareto``: ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU."""
+"""Backends of ``bench``: ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU."""
 
 SCORED = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3d", "lidar": "points"}
-"""Geometry that ``bench pareto`` scores, and the sample key that offers it."""
+"""Geometry that ``bench`` scores, and the sample key that offers it."""
 
 _GENERATOR = "folder of a generator or of diffusers, TorchScript file, or OWNER/NAME on the Hugging Face Hub"
 
@@ -258,9 +257,9 @@ def view() -> argparse.ArgumentParser:
 
 
 # --- benchmarks -------------------------------------------------------------------------------------------------------
-def pareto() -> argparse.ArgumentParser:
+def bench() -> argparse.ArgumentParser:
     parser = command_parser(
-        "bench pareto",
+        "bench",
         "Speed against accuracy: every quality, surface, decoded size and execution, for one target rig.",
         "--data FOLDER --budget-ms 20",
     )
@@ -279,42 +278,6 @@ def pareto() -> argparse.ArgumentParser:
     limit = parser.add_mutually_exclusive_group()
     limit.add_argument("--budget-ms", type=positive, metavar="MS", help="recommend the most accurate within it")
     limit.add_argument("--min-psnr", type=positive, metavar="DB", help="recommend the fastest that reaches it")
-    return parser
-
-
-def speed() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "bench speed",
-        "Milliseconds of RigRetarget on one thread, and ratios to bare cv2.remap calls of the same views.",
-        "--device cuda",
-    )
-    add_data(parser, "nuscenes-one below ARBIVIEW_DATA where that is, else a synthetic street")
-    add = parser.add_argument
-    add("--size", type=size, nargs="+", default=[SIZE, FULL_SIZE], metavar="HxW", help="of views (default: both)")
-    add("--repeats", type=count, default=5, metavar="N", help="rounds of timing")
-    add("--only", metavar="TEXT", default="", help="calls whose names contain it")
-    device = "instead: batches that torch renders on cpu, cuda, cuda:1, ..., as ratios to a copy of the same bytes"
-    add("--device", metavar="NAME", help=device)
-    add("--output", default="output/speed.json", metavar="FILE", help="file to write to")
-    return parser
-
-
-def loader() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "bench loader",
-        "Frames per second of a DataLoader with and without retargeting, and memory per worker.",
-        "--data FOLDER --workers 0 2",
-    )
-    add_data(parser, "synthetic streets, written as JPEGs")
-    add = parser.add_argument
-    add("--size", type=size, default=SIZE, metavar="HxW", help="of every view")
-    add_downscale(parser, 2)
-    add_target(parser)
-    add("--workers", type=seed, nargs="+", default=[0, 1, 2], metavar="N", help="workers")
-    add("--geometry", nargs="+", choices=get_args(GeometryName), default=["street", "auto"], help="geometry")
-    add("--frames", type=count, default=48, metavar="N", help="frames in an epoch")
-    add("--epochs", type=count, default=3, metavar="N", help="epochs to measure")
-    add("--output", default="output/loader.json", metavar="FILE", help="file to write to")
     return parser
 
 

@@ -69,10 +69,9 @@ class DepthModel(Protocol):
     name: str
     revision: str
     licence: str
-    takes_prompt: bool  # whether it predicts better from a depth map (h, w) of sparse measurements
 
     def predict(self, views: Sequence[View]) -> list[Prediction]:
-        """Predict the depth of images of one size in one batch, all with a prompt or all without."""
+        """Predict the depth of images of one size in one batch."""
         ...
 
 
@@ -112,12 +111,10 @@ def learned_depth(
 
     A camera is fitted to the first reference of ``wanted`` that it has enough points of.
     """
-    views = {
-        (n, k): View.of(frame, k, model.takes_prompt) for n, frame in enumerate(frames) for k in range(len(frame.rig))
-    }
+    views = {(n, k): View.of(frame, k) for n, frame in enumerate(frames) for k in range(len(frame.rig))}
     alike: dict[Any, list[tuple[int, int]]] = {}
     for key, view in views.items():
-        alike.setdefault((view.image.shape, view.prompt is None), []).append(key)
+        alike.setdefault(view.image.shape, []).append(key)
     predictions: dict[tuple[int, int], Prediction] = {}
     for keys in alike.values():
         for part in (keys[start : start + batch] for start in range(0, len(keys), batch)):
@@ -136,7 +133,6 @@ class View(NamedTuple):
     pinhole: Camera  # the pinhole camera
     ground_z_m: float  # height of the road in their ego frame
     image: torch.Tensor  # (3, h, w) uint8
-    prompt: Layer | None = None  # (h, w) depth of sparse measurements, made dense; None if there are none
 
     @property
     def focal_px(self) -> float:
@@ -144,7 +140,7 @@ class View(NamedTuple):
         return float(self.pinhole.K[0, 0])
 
     @staticmethod
-    def of(frame: DepthInputs, k: int, takes_prompt: bool = False) -> View:
+    def of(frame: DepthInputs, k: int) -> View:
         """The image of a frame's camera, its lens taken out."""
         camera, image = frame.rig[k], frame.images[k]
         if image.dtype != torch.uint8:
@@ -154,9 +150,7 @@ class View(NamedTuple):
             uv = camera.project_cam(pinhole.unproject_cam(pinhole.pixel_grid()).directions).uv.astype(np.float32)
             pixels: Any = cv2.remap(image.permute(1, 2, 0).numpy(), uv, None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
             image = torch.from_numpy(pixels).permute(2, 0, 1)
-        points = frame.points if takes_prompt else None
-        prompt = None if points is None else dense_depth(motion_camera(pinhole), points)
-        return View(motion_camera(camera), pinhole, frame.rig.ground_z_m, image, prompt)
+        return View(motion_camera(camera), pinhole, frame.rig.ground_z_m, image)
 
     def sampled(self, values: Layer) -> tuple[Layer, BoolArray]:
         """A prediction over the pinhole image at the pixels of the depth map, and where it has any."""
@@ -171,7 +165,7 @@ class View(NamedTuple):
         return layer, seen & np.isfinite(layer)
 
 
-def _measured(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray]:
+def measured_pixels(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray]:
     """Pixels (rows, columns) of LiDAR points that a camera sees, and their z-depths."""
     uv, z, valid = camera.project(points[:, :3])
     seen = np.flatnonzero(valid & (z > _NEAREST_M) & (z < FARTHEST_M) & camera.contains(uv))
@@ -182,25 +176,12 @@ def _measured(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray]:
     return (row[nearest], column[nearest]), z[seen][nearest]
 
 
-def dense_depth(camera: Camera, points: FloatArray) -> Layer | None:
-    """A depth map (h, w) with the depth of the nearest measured pixel everywhere; None if there are too few."""
-    pixels, depth_m = _measured(camera, points)
-    if len(depth_m) < LEAST_POINTS:
-        return None
-    unknown, known = np.ones(camera.size, np.uint8), np.zeros(camera.size, np.float32)
-    unknown[pixels], known[pixels] = 0, depth_m
-    _, label = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    by_label = np.zeros(int(label.max()) + 1, np.float32)
-    by_label[label[pixels]] = depth_m
-    return by_label[label]
-
-
 # --- what is known of the depth ---------------------------------------------------------------------------------------
 def _references(frame: DepthInputs, k: int, view: View, seen: BoolArray) -> Iterator[tuple[Reference, Any, FloatArray]]:
     """Measurements that a camera may be fitted to: its name, pixels (rows, columns) and z-depths."""
     camera = view.camera
     if frame.points is not None:
-        pixels, depth_m = _measured(camera, frame.points)
+        pixels, depth_m = measured_pixels(camera, frame.points)
         ask = seen[pixels]
         yield "LiDAR", tuple(index[ask] for index in pixels), depth_m[ask]
     if frame.motion is not None:

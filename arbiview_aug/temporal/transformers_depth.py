@@ -1,27 +1,18 @@
-"""Depth networks of transformers: Depth Anything, Depth Pro, ZoeDepth, DPT, and Prompt Depth Anything with LiDAR."""
+"""Depth networks of transformers, by its own pipeline of image processor, model and post-processing."""
 
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
 from arbiview_aug.atomic_io import checksum
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError
-from arbiview_aug.temporal.learned_depth import Prediction, View
-
-_OUTPUTS: dict[str, Literal["depth", "inverse"]] = {
-    "depth_pro": "inverse",
-    "glpn": "depth",
-    "prompt_depth_anything": "depth",
-    "zoedepth": "depth",
-}
-"""Kind of output of networks, by ``model_type``; the configuration of others says it, or the fit tells."""
+from arbiview_aug.temporal.learned_depth import Output, Prediction, View
 
 _WEIGHTS = ("*.safetensors", "*.bin")
 
@@ -57,41 +48,32 @@ class TransformersDepth:
         commit = str(getattr(config, "_commit_hash", None) or "unknown")[:12]
         self.name, self.revision = (folder.resolve().name, _weights_of(folder)) if folder.is_dir() else (name, commit)
         self.licence = _licence(folder / "README.md" if folder.is_dir() else name)
-        self.kind = str(config.model_type)
-        self.takes_prompt = self.kind == "prompt_depth_anything"
-        stated = {"metric": "depth", "relative": "inverse"}.get(getattr(config, "depth_estimation_type", ""))
-        self._output: Any = _OUTPUTS.get(self.kind, stated)
-        self._is_metric = self.kind in _OUTPUTS or stated == "depth"
+        stated = getattr(config, "depth_estimation_type", "")
+        self._output: Output = {"metric": "depth", "relative": "inverse"}.get(stated)  # type: ignore[assignment]
 
     @torch.inference_mode()
     def predict(self, views: Sequence[View]) -> list[Prediction]:
-        """Predict the depth of images of one size in one batch, all with a prompt or all without.
+        """Predict the depth of images of one size in one batch.
 
         Raises:
             DataError: The batch does not fit on the device.
         """
-        images, prompts = [view.image for view in views], [view.prompt for view in views if view.prompt is not None]
-        prompted: dict[str, Any] = {"prompt_depth": prompts, "prompt_scale_to_meter": 1.0} if prompts else {}
-        inputs = self._processor(images=images, return_tensors="pt", **prompted).to(self.device)
+        images = [view.image for view in views]
+        inputs = self._processor(images=images, return_tensors="pt").to(self.device)
         try:
             out = self.model(**inputs)
         except torch.OutOfMemoryError:
             raise DataError(f"--batch: {len(images)} images do not fit on {self.device}; halve it") from None
         size = tuple(images[0].shape[-2:])
-        predicted = out.predicted_depth
-        if self.kind == "zoedepth":  # it pads its images
-            done = self._processor.post_process_depth_estimation(out, source_sizes=[size] * len(images))
-            predicted = torch.stack([one["predicted_depth"] for one in done])
-        output, is_metric = self._output, self._is_metric
-        if self.takes_prompt and not prompts:  # then it puts out something relative
-            output, is_metric = None, False
-        width = size[1]
-        if self.kind == "zoedepth" and self._processor.do_pad:
-            width += 2 * int(math.sqrt(width / 2) * 3)
-        seen = inputs["pixel_values"].shape[-1] / width  # pixels of the network's for one of the image's
+        done = self._processor.post_process_depth_estimation(out, [size] * len(images))  # takes padding away
+        seen = inputs["pixel_values"].shape[-1] / size[1]  # pixels of the network's for one of the image's
         return [
-            Prediction(values, output, view.focal_px * seen if is_metric else None)
-            for values, view in zip(predicted.float().cpu().numpy(), views, strict=True)
+            Prediction(
+                entry["predicted_depth"].float().cpu().numpy(),
+                self._output,
+                view.focal_px * seen if self._output == "depth" else None,
+            )
+            for entry, view in zip(done, views, strict=True)
         ]
 
 

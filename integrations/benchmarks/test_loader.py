@@ -13,10 +13,10 @@ import pytest
 from torch.utils.data import DataLoader, Dataset
 
 from arbiview_aug import RetargetedDataset, RigRetarget
-from arbiview_aug.__main__ import main
-from arbiview_aug.cli.bench.loader import loader_rates
 from arbiview_aug.cli.bench.timing import memory_mib
 from arbiview_aug.datasets.synthetic import demo_target_rig
+from integrations.benchmarks import loader
+from integrations.benchmarks.loader import loader_rates
 from integrations.benchmarks.machine import counting
 from tests.helpers import street_sample
 from tests.worker_samples import Frames, rig
@@ -73,7 +73,7 @@ def test_rates_against_reading(nuscenes_root: Path, tmp_path: Path, report_bound
     """Two workers, a plan a frame over LiDAR and boxes; and the street, whose plan is held."""
     path = tmp_path / "loader.json"
     arguments = ["--data", f"nuscenes:{nuscenes_root}", "--workers", "2", "--geometry", "street", "lidar"]
-    assert main(["bench", "loader", *arguments, "--output", str(path)]) == 0
+    assert loader.main([*arguments, "--output", str(path)]) == 0
     _, street, lidar = json.loads(path.read_text())["rates"]
     report_bound("rate over the street by that of reading", street["of_reading"], at_least=0.85)
     report_bound("rate over LiDAR and boxes by that of reading", lidar["of_reading"], at_least=0.30)

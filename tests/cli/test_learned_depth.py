@@ -147,25 +147,6 @@ def test_a_random_model_is_declined(transformers: Any, recorded: Path, tmp_path:
 
 
 @pytest.mark.slow
-def test_lidar_is_the_prompt_of_models_that_take_one(
-    transformers: Any, recorded: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
-    folder = saved_depth_model(tmp_path / "prompted", "PromptDepthAnything", depth_estimation_type="metric")
-    prompts = []
-    forward = transformers.PromptDepthAnythingForDepthEstimation.forward
-
-    def noted(self: Any, pixel_values: torch.Tensor, prompt_depth: torch.Tensor | None = None, **rest: Any) -> Any:
-        prompts.append(prompt_depth)
-        return forward(self, pixel_values, prompt_depth, **rest)
-
-    monkeypatch.setattr(transformers.PromptDepthAnythingForDepthEstimation, "forward", noted)
-    asked = ["depth", "--data", str(recorded), "--model", str(folder)]
-    assert main(asked) == 1  # random weights find no depth
-    assert {tuple(prompt.shape) for prompt in prompts} == {(4, 1, 64, 176)} and prompts[0].max() < 120
-    assert main([*asked, "--reference", "road"]) == 1 and prompts[-1] is None
-
-
-@pytest.mark.slow
 def test_models_that_cannot_be_used_are_named(
     transformers: Any, recorded: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
 ) -> None:

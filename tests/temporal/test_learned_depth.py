@@ -34,7 +34,6 @@ class Oracle:
     name = "oracle"
     revision = "1"
     licence = "mit"
-    takes_prompt = False
 
     def predict(self, views: Sequence[View]) -> list[Prediction]:
         self.batches = [*getattr(self, "batches", []), len(views)]

@@ -29,8 +29,16 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Quality, Reduce
 from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
-from arbiview_aug.cli.bench.speed import remap_floor
-from arbiview_aug.cli.bench.timing import Quartiles, benchmark, machine_line, peak_mib, quartiles, show, timed_rounds
+from arbiview_aug.cli.bench.timing import (
+    Quartiles,
+    benchmark,
+    machine_line,
+    peak_mib,
+    quartiles,
+    remap_floor,
+    show,
+    timed_rounds,
+)
 from arbiview_aug.cli.parsers import EXECUTIONS, SCORED
 from arbiview_aug.datasets import open_data
 from arbiview_aug.errors import DataError

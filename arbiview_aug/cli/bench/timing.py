@@ -15,12 +15,13 @@ import platform
 import re
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -157,3 +158,18 @@ def show(table: str, report: Mapping[str, Any], path: Path) -> None:
     except OSError as error:
         raise DataError(f"--output {path}: expected a file that can be written to, got {error.strerror}") from None
     print(f"report: {path}")
+
+
+def remap_floor(images: Iterable[torch.Tensor], size: tuple[int, int]) -> Callable[[], None]:
+    """Bare remaps to views of ``size`` (h, w), one for each of the images (N, 3, >=h, >=w) uint8."""
+    h, w = size
+    sources = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()[:h, :w]) for image in images]
+    y, x = np.indices((h, w), dtype=np.float32)
+    map_x, map_y = 0.97 * x + 0.02 * y + 3, 0.95 * y + 0.01 * x + 5
+    outputs = np.empty((len(sources), h, w, 3), np.uint8)
+
+    def run() -> None:
+        for source, output in zip(sources, outputs, strict=True):
+            cv2.remap(source, map_x, map_y, cv2.INTER_LINEAR, dst=output)
+
+    return run

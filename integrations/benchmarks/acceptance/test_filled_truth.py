@@ -14,11 +14,11 @@ import pytest
 import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys
-from arbiview_aug.cli.bench.speed import looking_down
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.inpaint.telea import telea
+from integrations.benchmarks.speed import looking_down
 from tests.helpers import Standing
 
 pytestmark = pytest.mark.timeout(1800)

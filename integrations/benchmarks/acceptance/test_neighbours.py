@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from arbiview_aug import Rig, RigRetarget, SampleKeys
-from arbiview_aug.cli.bench.speed import looking_down
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.lidar import coloured_points, colours_at, equalised, visible_points
 from arbiview_aug.evaluate.metrics import psnr_db
 from integrations.benchmarks.acceptance.protocol import frame_folder
+from integrations.benchmarks.speed import looking_down
 
 pytestmark = pytest.mark.slow
 

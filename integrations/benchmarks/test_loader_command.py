@@ -12,15 +12,16 @@ import pytest
 
 from arbiview_aug import RetargetedDataset, RigRetarget
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.bench.loader import PLAIN, Repeated, loader_rates
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from integrations.benchmarks import loader
+from integrations.benchmarks.loader import PLAIN, Repeated, loader_rates
 from tests.helpers import write_drive
 
 
 @pytest.fixture
 def samples(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "tests"))
     return importlib.import_module("worker_samples")
 
 
@@ -47,16 +48,16 @@ def test_rates(samples: ModuleType) -> None:
 
 def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "new" / "loader.json"
-    arguments = ["bench", "loader", "--data", str(nuscenes_root), "--geometry", "street", "--size", "32x88"]
+    arguments = ["--data", str(nuscenes_root), "--geometry", "street", "--size", "32x88"]
     tiny = ["--downscale", "4", "--workers", "0", "1", "--frames", "3", "--epochs", "1"]
-    assert main([*arguments, *tiny, "--output", str(path)]) == 0
+    assert loader.main([*arguments, *tiny, "--output", str(path)]) == 0
     report = json.loads(path.read_text())
     assert report["data"] == "nuscenes-one" and report["target"] == "waymo" and report["size"] == [32, 88]
     assert [rate["name"] for rate in report["rates"]] == [PLAIN, PLAIN, *["retargeted, street"] * 2]
     printed = capsys.readouterr().out
     assert "frames/s" in printed and "load" in printed and f"report: {path}" in printed
     with pytest.raises(SystemExit, match="2"):
-        main([*arguments, "--workers", "-1"])
+        loader.main([*arguments, "--workers", "-1"])
 
 
 @pytest.mark.slow
@@ -79,10 +80,10 @@ def test_depth_on_disk_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str
         "--output",
         str(tmp_path / "a.json"),
     ]
-    arguments = ["bench", "loader", "--data", str(root), "--geometry", "motion", "fused", *tiny]
-    assert main(arguments) == 2
+    arguments = ["--data", str(root), "--geometry", "motion", "fused", *tiny]
+    assert loader.main(arguments) == 2
     assert "depth" in capsys.readouterr().err
     assert main(["depth", "--data", str(root)]) == 0
-    assert main(arguments) == 0
+    assert loader.main(arguments) == 0
     names = [rate["name"] for rate in json.loads((tmp_path / "a.json").read_text())["rates"]]
     assert names == [PLAIN, "retargeted, motion", "retargeted, fused"]

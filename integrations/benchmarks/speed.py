@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug bench speed``: whole ``RigRetarget`` calls relative to bare ``cv2.remap`` calls.
+"""``python -m integrations.benchmarks.speed``: whole ``RigRetarget`` calls relative to bare ``cv2.remap`` calls.
 
 The floor of a target rig is one linear ``cv2.remap`` for each view, from interleaved uint8 RGB images into preallocated
 outputs, with float32 maps that read a source of the view's own size at
@@ -23,14 +23,13 @@ import argparse
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from itertools import chain, cycle, islice
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 
@@ -39,9 +38,9 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import Pinhole, intrinsics_for_fov
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Reduce
-from arbiview_aug.cli.arguments import device_named, output_file
+from arbiview_aug.cli.arguments import add_data, count, device_named, output_file, size
 from arbiview_aug.cli.bench.data import Recorded, lidar_maps, recorded
-from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, show, timed_rounds
+from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, remap_floor, show, timed_rounds
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive
@@ -60,6 +59,7 @@ from arbiview_aug.temporal.motion_depth import estimate_motion
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.scans import retarget_points
 from arbiview_aug.transforms.warm_up import compile_kernels
+from integrations.benchmarks.study import run_study, study_parser
 
 BOXES = (10, 30, 75, 150)
 SCANNED = 120_000
@@ -87,7 +87,7 @@ Sample = Mapping[str, Any]
 Calls = dict[str, Callable[[], Any]]  # the first is the floor
 
 
-def run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> None:
     """Measure, print the table, write the JSON."""
     path = output_file(arguments.output)
     device = None if arguments.device is None else device_named(arguments.device)
@@ -312,21 +312,6 @@ def boxes_around(number: int) -> torch.Tensor:
     return torch.from_numpy(np.stack([x, y, lwh[2] / 2, *lwh, yaw], 1).astype(np.float32))
 
 
-def remap_floor(images: Iterable[torch.Tensor], size: tuple[int, int]) -> Callable[[], None]:
-    """Bare remaps to views of ``size`` (h, w), one for each of the images (N, 3, >=h, >=w) uint8."""
-    h, w = size
-    sources = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()[:h, :w]) for image in images]
-    y, x = np.indices((h, w), dtype=np.float32)
-    map_x, map_y = 0.97 * x + 0.02 * y + 3, 0.95 * y + 0.01 * x + 5
-    outputs = np.empty((len(sources), h, w, 3), np.uint8)
-
-    def run() -> None:
-        for source, output in zip(sources, outputs, strict=True):
-            cv2.remap(source, map_x, map_y, cv2.INTER_LINEAR, dst=output)
-
-    return run
-
-
 def _sample(data: Recorded, reduce: Reduce) -> dict[str, Any]:
     """Images (N, 3, h, w) of the first frame, its rig without masks, its points, and depth maps made of them."""
     sample = data.sample(0, reduce)
@@ -334,3 +319,30 @@ def _sample(data: Recorded, reduce: Reduce) -> dict[str, Any]:
         raise DataError(f"--data {data.root}: expected images of one size, and LiDAR points")
     kept = {"images": sample["images"], "rig": without_masks(sample["rig"]), "points": sample["points"]}
     return kept | dict.fromkeys((MOTION_KEY, LEARNED_KEY), torch.from_numpy(np.stack(lidar_maps(kept))))
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the parser."""
+    made = study_parser(
+        "speed",
+        "Milliseconds of RigRetarget on one thread, and ratios to bare cv2.remap calls of the same views.",
+        "--device cuda",
+    )
+    add_data(made, "nuscenes-one below ARBIVIEW_DATA where that is, else a synthetic street")
+    add = made.add_argument
+    add("--size", type=size, nargs="+", default=[SIZE, FULL_SIZE], metavar="HxW", help="of views (default: both)")
+    add("--repeats", type=count, default=5, metavar="N", help="rounds of timing")
+    add("--only", metavar="TEXT", default="", help="calls whose names contain it")
+    device = "instead: batches that torch renders on cpu, cuda, cuda:1, ..., as ratios to a copy of the same bytes"
+    add("--device", metavar="NAME", help=device)
+    add("--output", default="output/speed.json", metavar="FILE", help="file to write to")
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure and print."""
+    return run_study(parser(), _run, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

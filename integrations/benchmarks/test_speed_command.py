@@ -9,14 +9,13 @@ import cv2
 import pytest
 import torch
 
-from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import load_rig
-from arbiview_aug.cli.bench import speed
 from arbiview_aug.cli.bench.data import recorded
-from arbiview_aug.cli.bench.speed import BOUNDS, BOXES, bytes_moved, default_data, measure, table
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.transforms.settings import render_config
+from integrations.benchmarks import speed
+from integrations.benchmarks.speed import BOUNDS, BOXES, bytes_moved, default_data, measure, table
 from tests.helpers import street_sample
 
 ALLOWED = {
@@ -55,7 +54,7 @@ def test_command_writes_the_report(
     monkeypatch.setenv("ARBIVIEW_DATA", str(nuscenes_root.parent))
     assert default_data() == nuscenes_root
     path = tmp_path / "new" / "speed.json"
-    assert main(["bench", "speed", "--repeats", "1", "--size", "256x704", "--output", str(path)]) == 0
+    assert speed.main(["--repeats", "1", "--size", "256x704", "--output", str(path)]) == 0
     report = json.loads(path.read_text())
     assert report["data"] == "nuscenes-one" and report["machine"]["cpu"] and report["versions"]["torch"]
     assert all(m["bound"] == BOUNDS[SIZE].get(m["name"]) for m in report["measures"])
@@ -74,22 +73,21 @@ def test_the_floor_has_a_remap_for_each_view(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_name_without_calls_is_refused_before_anything_is_read(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("arbiview_aug.cli.bench.speed.recorded", None)
-    assert main(["bench", "speed", "--only", "WRONG", "--size", "16x44"]) == 2
+    monkeypatch.setattr("integrations.benchmarks.speed.recorded", None)
+    assert speed.main(["--only", "WRONG", "--size", "16x44"]) == 2
     assert "--only WRONG: expected part of a call's name, such as boxes" in capsys.readouterr().err
 
 
 def test_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "speed", "--data", str(tmp_path)]) == 2
+    assert speed.main(["--data", str(tmp_path)]) == 2
     assert "expected a frame folder (calib.json" in capsys.readouterr().err
-    for arguments in (["speed", "--repeats", "0"], ["--repeats", "0"]):
+    for arguments in (["--repeats", "0"],):
         with pytest.raises(SystemExit, match="2"):
-            main(["bench", *arguments])
-    assert main(["bench", "beauty"]) == 2 and "expected one of pareto, speed" in capsys.readouterr().err
+            speed.main(arguments)
     for wrong in ("abacus", "cuda:99", "meta"):
-        assert main(["bench", "speed", "--device", wrong]) == 2
+        assert speed.main(["--device", wrong]) == 2
         assert "--device: expected cpu" in capsys.readouterr().err
-    assert main(["bench", "speed", "--output", str(tmp_path)]) == 2
+    assert speed.main(["--output", str(tmp_path)]) == 2
     assert "expected a file, got a folder" in capsys.readouterr().err
 
 

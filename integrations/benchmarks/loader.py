@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug bench loader``: frames per second of a ``DataLoader``, and memory per worker.
+"""``python -m integrations.benchmarks.loader``: frames per second of a ``DataLoader``, and memory per worker.
 
 Workers persist, and a first epoch warms them. Rates are wall-clock, so other work on the machine slows them.
 """
@@ -11,16 +11,18 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cli.arguments import output_file
+from arbiview_aug.choices import GeometryName
+from arbiview_aug.cli.arguments import add_data, add_downscale, add_target, count, output_file, seed, size
 from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
 from arbiview_aug.cli.bench.timing import benchmark, machine_line, memory_mib, quartiles, show
+from arbiview_aug.cli.parsers import SIZE
 from arbiview_aug.datasets import RetargetedDataset, WithDepth, open_data
 from arbiview_aug.datasets.depth_folder import FOLDERS
 from arbiview_aug.datasets.registry import split_kind
@@ -28,6 +30,7 @@ from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from integrations.benchmarks.study import run_study, study_parser
 
 PLAIN = "read only"
 
@@ -45,7 +48,7 @@ class Repeated(Dataset[Any]):
         return self.dataset[index % len(self.dataset)]
 
 
-def run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> None:
     """Measure, print the table, write the JSON."""
     path = output_file(arguments.output)
     h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
@@ -161,3 +164,32 @@ def _cpu_s(pids: Sequence[int]) -> float:
     except OSError:
         return 0.0
     return sum(int(fields[11]) + int(fields[12]) for fields in stats) / os.sysconf("SC_CLK_TCK")  # utime, stime
+
+
+def parser() -> argparse.ArgumentParser:
+    """Create the parser."""
+    made = study_parser(
+        "loader",
+        "Frames per second of a DataLoader with and without retargeting, and memory per worker.",
+        "--data FOLDER --workers 0 2",
+    )
+    add_data(made, "synthetic streets, written as JPEGs")
+    add = made.add_argument
+    add("--size", type=size, default=SIZE, metavar="HxW", help="of every view")
+    add_downscale(made, 2)
+    add_target(made)
+    add("--workers", type=seed, nargs="+", default=[0, 1, 2], metavar="N", help="workers")
+    add("--geometry", nargs="+", choices=get_args(GeometryName), default=["street", "auto"], help="geometry")
+    add("--frames", type=count, default=48, metavar="N", help="frames in an epoch")
+    add("--epochs", type=count, default=3, metavar="N", help="epochs to measure")
+    add("--output", default="output/loader.json", metavar="FILE", help="file to write to")
+    return made
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure and print."""
+    return run_study(parser(), _run, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
