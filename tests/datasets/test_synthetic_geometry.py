@@ -142,7 +142,7 @@ def in_box(box: np.ndarray, points: np.ndarray) -> np.ndarray:
 @pytest.mark.slow
 def test_instances_fill_their_boxes():
     """Surface points of every well visible object lie in its box and reach the sides that face the camera."""
-    drive = SyntheticDrive(demo_source_rig((128, 352)), num_frames=4, seed=1, two_wheelers=True)
+    drive = SyntheticDrive(demo_source_rig((128, 352)), num_frames=4, seed=1)
     checked = 0
     for index in range(4):
         boxes = drive.scene(index).boxes_ego(0.0)
@@ -196,7 +196,7 @@ def test_isolated_vehicles_outlines_agree_with_their_boxes():
 def test_every_object_touches_the_six_sides_of_its_box(cls):
     checked = 0
     for index in range(12):
-        scene = make_scene(9, index, two_wheelers=True)
+        scene = make_scene(9, index)
         for row in np.flatnonzero(scene.box_classes == cls)[:6]:
             box = scene.boxes[row]
             c, s = np.cos(box[6]), np.sin(box[6])
@@ -218,52 +218,6 @@ def test_every_object_touches_the_six_sides_of_its_box(cls):
             np.testing.assert_allclose(reach[:, 0], -box[3:6] / 2, atol=0.012)
             checked += 1
     assert checked > 2
-
-
-@pytest.mark.slow
-def test_two_wheelers_join_the_same_street():
-    for index in range(4):
-        plain, joined = make_scene(3, index), make_scene(3, index, two_wheelers=True)
-        added = len(joined.boxes) - len(plain.boxes)
-        assert 4 <= added <= 10
-        for name, value in vars(plain).items():
-            if isinstance(value, np.ndarray):
-                np.testing.assert_array_equal(getattr(joined, name)[: len(value)], value, name)
-            else:
-                assert getattr(joined, name) == value, name
-        assert set(joined.box_classes[-added:]) <= {BoxClass.BICYCLE, BoxClass.MOTORCYCLE}
-        assert (joined.instance[len(plain) :] >= len(plain.boxes)).all()
-        assert (joined.cls[len(plain) :] == SceneClass.TWO_WHEELER).all()
-        assert (np.hypot(*(joined.boxes[-added:, :2] - joined.ego2street[:2, 3]).T) < 45).all()
-        drive = SyntheticDrive(demo_source_rig(SIZE), num_frames=index + 1, seed=3, two_wheelers=True, lidar=False)
-        np.testing.assert_array_equal(drive.scene(index).boxes, joined.boxes)
-
-
-def test_two_wheelers_keep_clear_and_ride_on_the_road():
-    """None overlaps another box or the vehicle; those on the sidewalk stand, the others ride with the traffic."""
-    footprint = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 25), np.linspace(-0.5, 0.5, 9)), -1).reshape(-1, 2)
-    parked = 0
-    for index in range(8):
-        scene = make_scene(4, index, two_wheelers=True)
-        R, origin = scene.ego2street[:2, :2], scene.ego2street[:2, 3]
-        for row in np.flatnonzero(scene.box_classes >= BoxClass.BICYCLE):
-            x, y, z, length, width, height, yaw = scene.boxes[row]
-            c, s = np.cos(yaw), np.sin(yaw)
-            points = (x, y) + footprint * (length, width) @ np.array([[c, s], [-s, c]])
-            ego = (points - origin) @ R
-            assert not ((np.abs(ego[:, 0] - 1.75) < 4.75) & (np.abs(ego[:, 1]) < 2.2)).any()
-            for box in np.delete(scene.boxes, row, 0):
-                c, s = np.cos(box[6]), np.sin(box[6])
-                offset = (points - box[:2]) @ np.array([[c, -s], [s, c]])
-                assert not (np.abs(offset) < box[3:5] / 2).all(1).any()
-            right, left = scene.street.half_width_m
-            on_road = (points[:, 1] > -right).all() and (points[:, 1] < left).all()
-            assert on_road or (points[:, 1] < -right).all() or (points[:, 1] > left).all()
-            assert z - height / 2 == pytest.approx(0 if on_road else scene.street.kerb_m)
-            along = scene.velocities[row] @ (np.cos(yaw), np.sin(yaw)) / scene.speed_mps
-            assert 0.9 <= along <= 1.1 if on_road else along == 0
-            parked += not on_road
-    assert parked > 5
 
 
 def test_lidar_points_lie_on_what_the_cameras_see():

@@ -71,7 +71,6 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         supersampling: Rays across a pixel at outlines; 1 for no antialiasing.
         lidar: Whether samples carry ``points``; or how the scanners err.
         neighbours: Which other frames of the drive come with a sample; None for none.
-        two_wheelers: Whether bicycles and motorcycles join the same streets; their boxes come last.
         device: Device to render on; samples lie on the CPU. Different kinds of device agree up to rounding.
 
     Raises:
@@ -88,7 +87,6 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         supersampling: int = 2,
         lidar: bool | ScanErrors = True,
         neighbours: Neighbours | None = None,
-        two_wheelers: bool = False,
         device: torch.device | str = "cpu",
     ) -> None:
         self.rig = _checked_rig(rig)
@@ -100,7 +98,6 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         self._errors = lidar if isinstance(lidar, ScanErrors) else ScanErrors()
         check_neighbours(neighbours)
         self.neighbours = neighbours
-        self.two_wheelers = bool(two_wheelers)
         supersampling = _checked_count("supersampling", supersampling, 1, 8)
         try:
             self._renderer = Renderer(supersampling=supersampling, device=device)
@@ -116,7 +113,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def scene(self, index: int) -> Scene:
         """The street as plain data; IndexError past the end."""
-        return _street(self.seed, checked_index(index, len(self)), two_wheelers=self.two_wheelers)
+        return _street(self.seed, checked_index(index, len(self)))
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         scene, index = self.scene(index), checked_index(index, len(self))

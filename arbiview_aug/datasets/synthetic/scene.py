@@ -36,13 +36,12 @@ class SceneClass(IntEnum):
     VEGETATION = 6
     VEHICLE = 7
     PEDESTRIAN = 8
-    TWO_WHEELER = 9  # with its rider
 
 
 class BoxClass(IntEnum):
     """Classes of the 3D boxes."""
 
-    CAR, VAN, TRUCK, BUS, PEDESTRIAN, BICYCLE, MOTORCYCLE = range(7)
+    CAR, VAN, TRUCK, BUS, PEDESTRIAN = range(5)
 
 
 class Material(IntEnum):
@@ -218,21 +217,6 @@ class Placed:
         """Add a capped elliptic cylinder, upright or (wheels) with its axis along the object's y."""
         axes = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]) if lateral else _NO_TURN
         self._add(CYLINDER, np.array(center), np.array([*radii, half_length]), look, axes=axes)
-
-    def along(self, start: Vector, end: Vector) -> tuple[Placed, float]:
-        """A frame at ``start`` whose z axis points to ``end`` (not straight aside), and their distance."""
-        way = np.subtract(end, start)
-        length = float(np.linalg.norm(way))
-        forward = np.cross((0.0, 1.0, 0.0), way)
-        forward /= np.linalg.norm(forward)
-        axes = np.column_stack([forward, np.cross(way / length, forward), way / length])
-        origin = self.origin + self.rotation @ np.array(start)
-        return replace(self, origin=origin, rotation=self.rotation @ axes), length
-
-    def tube(self, start: Vector, end: Vector, radius: float, look: Look) -> None:
-        """Add a round cylinder between two points, not straight aside of each other."""
-        place, length = self.along(start, end)
-        place.cylinder((0.0, 0.0, length / 2), (radius, radius), length / 2, look)
 
     def _add(
         self,

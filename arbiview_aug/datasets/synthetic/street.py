@@ -9,7 +9,6 @@ import numpy as np
 from arbiview_aug.cameras.rotations import yaw_matrix
 from arbiview_aug.datasets.synthetic import objects
 from arbiview_aug.datasets.synthetic.scene import (
-    BOX,
     BoxClass,
     Light,
     Look,
@@ -31,15 +30,11 @@ _KINDS = (BoxClass.CAR, BoxClass.VAN, BoxClass.TRUCK, BoxClass.BUS)
 _MOVING_SHARES = (0.62, 0.18, 0.14, 0.06)
 _PARKED_SHARES = (0.76, 0.19, 0.05, 0.0)
 _SPEED_MPS = (6.0, 14.0)
-_TRIES = 60  # places tried for a street's two-wheelers
 _WAITING = 0.2  # share of the people and of the traffic in other directions that stands still
 
 
-def make_scene(seed: int, index: int, *, two_wheelers: bool = False) -> Scene:
-    """Build scene ``index`` of the world ``seed``; the same arguments give the same scene on any machine.
-
-    ``two_wheelers`` adds bicycles and motorcycles, whose boxes come last, and changes nothing else.
-    """
+def make_scene(seed: int, index: int) -> Scene:
+    """Build scene ``index`` of the world ``seed``; the same arguments give the same scene on any machine."""
     rng = np.random.default_rng(np.random.SeedSequence([seed, index]))
     street, ego2street = _layout(rng)
     world = _World(rng, street, ego2street)
@@ -53,9 +48,6 @@ def make_scene(seed: int, index: int, *, two_wheelers: bool = False) -> Scene:
     world.add_furniture()
     world.add_pedestrians()
     speed_mps, velocities = _motion(np.random.SeedSequence([seed, index, 2]), world.builder, parked)
-    if two_wheelers:
-        world.rng = np.random.default_rng(np.random.SeedSequence([seed, index, 3]))
-        velocities = np.concatenate([velocities, world.add_two_wheelers(speed_mps)])
     return Scene(
         speed_mps=speed_mps,
         velocities=velocities,
@@ -328,40 +320,6 @@ class _World:
                 if self.is_clear(x, y, 0.6, 0.6, 0.0):
                     objects.add_pedestrian(self.builder, rng, (x, y, 0.0), math.pi / 2 * float(rng.choice([-1, 1])))
                     self.taken.append((x, y, 0.35))
-
-    def add_two_wheelers(self, speed_mps: float) -> np.ndarray:
-        """Bicycles and motorcycles: riders in lanes and at their edge, others parked on the sidewalks.
-
-        Returns:
-            Their velocities (n, 2): riders keep about the vehicle's speed, as traffic does.
-        """
-        rng, street = self.rng, self.street
-        low = [p for p in self.builder.primitives if p["kind"] != BOX and p["corners"][:, 2].min() < 2.2]
-        self.taken += [(*p["center"][:2], float(max(p["half"][:2]))) for p in low]  # people, posts, trunks, bushes
-        wanted, velocities = int(rng.integers(4, 11)), []
-        for _ in range(_TRIES):
-            cls = BoxClass.BICYCLE if rng.random() < 0.6 else BoxClass.MOTORCYCLE
-            ridden, side, x = rng.random() < 0.7, int(rng.choice([-1, 1])), rng.uniform(-35, 42)
-            yaw = _heading(side) + math.radians(rng.normal(0, 2))
-            size = objects.two_wheeler_size(rng, cls, ridden=ridden)
-            length, width, _ = size
-            if ridden:
-                from_middle = rng.choice([street.lanes - 0.14, rng.integers(street.lanes) + 0.5], p=[0.6, 0.4])
-                y, z, room = side * (from_middle * street.lane_width_m + rng.normal(0, 0.1)), 0.0, length + 4
-            else:
-                across = rng.random() < 0.4
-                yaw += math.pi / 2 * across
-                margin, room = 0.1 + (length if across else width) / 2, length
-                y, z = self.side_y(side, rng.uniform(margin, street.sidewalk_m[side > 0] - margin)), street.kerb_m
-            if self.at_crossing(x, 3) or not self.is_clear(x, y, room, width, yaw):
-                continue
-            objects.add_two_wheeler(self.builder, rng, cls, size, (x, y, z), yaw, ridden=ridden)
-            self.taken += _discs(x, y, length, width, yaw)
-            speed = ridden * speed_mps * rng.uniform(0.9, 1.1)
-            velocities.append((speed * math.cos(yaw), speed * math.sin(yaw)))
-            if len(velocities) == wanted:
-                break
-        return np.array(velocities).reshape(-1, 2)
 
 
 def _heading(side: int) -> float:
