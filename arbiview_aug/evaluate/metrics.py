@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
+import torch
+from kornia.metrics import ssim
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.errors import SampleError
@@ -38,17 +39,8 @@ def ssim_map(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> npt.NDArray[np.flo
 
     Gaussian window 11x11 with σ = 1.5, K1 = 0.01, K2 = 0.03; borders are reflected.
     """
-    a, b = one.astype(np.float64), two.astype(np.float64)
-    c1, c2 = (0.01 * _PEAK) ** 2, (0.03 * _PEAK) ** 2
-
-    def blurred(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        return np.asarray(cv2.GaussianBlur(x, (11, 11), 1.5), dtype=np.float64)
-
-    mean_a, mean_b = blurred(a), blurred(b)
-    var_a, var_b = blurred(a * a) - mean_a**2, blurred(b * b) - mean_b**2
-    covariance = blurred(a * b) - mean_a * mean_b
-    luminance = (2 * mean_a * mean_b + c1) / (mean_a**2 + mean_b**2 + c1)
-    return luminance * (2 * covariance + c2) / (var_a + var_b + c2)
+    a, b = (torch.from_numpy(image.astype(np.float64)).permute(2, 0, 1)[None] for image in (one, two))
+    return np.asarray(ssim(a, b, window_size=11, max_val=_PEAK)[0].permute(1, 2, 0).numpy())
 
 
 def mean_of(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
