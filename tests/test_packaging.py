@@ -36,7 +36,7 @@ def test_public_names_are_there(module: str) -> None:
 def test_one_version_everywhere() -> None:
     (cited,) = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     newest, *older = re.findall(r"^## (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
-    assert cited == newest == arbiview_aug.__version__ and older == ["0.2.0", "0.1.0"]
+    assert cited == newest == arbiview_aug.__version__ and older == ["0.3.0", "0.2.0", "0.1.0"]
 
 
 def test_the_front_door_is_narrow() -> None:
