@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections import Counter
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import yaml
 
 from arbiview_aug.errors import CalibrationError, described, one_line
+from arbiview_aug.files import read_text
 
 MOST_BYTES = 1 << 20
 """Largest calibration file: 8 KiB a camera. It is counted before it is read: YAML takes seconds a megabyte."""
@@ -44,12 +44,34 @@ _Dumper.add_implicit_resolver(*_FLOAT)
 
 def read_plain(path: Path, where: str, most_bytes: int = MOST_BYTES) -> Any:
     """Plain data of a YAML or JSON file; CalibrationError, which begins with ``where``, if it is large or broken."""
-    refuse_large(path, where, most_bytes)
+    documents = read_documents(path, where, most_bytes)
+    if len(documents) != 1:
+        raise CalibrationError(f"{where}: expected plain YAML or JSON, one document, got {len(documents)}")
+    return documents[0]
+
+
+def read_documents(path: Path, where: str, most_bytes: int = MOST_BYTES) -> list[Any]:
+    """Plain data of each document of a file; OpenCV's and Kalibr's first line and tags are taken off."""
+    text = read_calibration_text(path, where, most_bytes)
     try:
-        text = path.read_text()
-        return parse_json(text) if path.suffix == ".json" else parse_yaml(text)
-    except (OSError, ValueError, yaml.YAMLError, RecursionError) as error:
+        if path.suffix == ".json":
+            return [parse_json(text)]
+        text = re.sub(r"\A%YAML.*|!!opencv-(nd-)?matrix", "", text)
+        documents = re.split(r"^---\s*$", text, flags=re.MULTILINE)
+        return [parse_yaml(document) for document in documents if document.strip()] or [None]
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise CalibrationError(f"{where}: expected plain YAML or JSON, got {one_line(error)}") from None
+
+
+def read_calibration_text(path: Path, where: str, most_bytes: int = MOST_BYTES) -> str:
+    """Text of a calibration file, or CalibrationError that says why there is none."""
+    try:
+        return read_text(path, most_bytes)
+    except UnicodeError as error:
+        got = f"another encoding ({one_line(error)}): save it as UTF-8"
+        raise CalibrationError(f"{where}: expected plain YAML or JSON in UTF-8, got {got}") from None
+    except OSError as error:
+        raise CalibrationError(f"{where}: expected a file that can be read, got {error.strerror}") from None
 
 
 def dump_yaml(data: Any) -> str:
@@ -60,13 +82,6 @@ def dump_yaml(data: Any) -> str:
 def file_stem(name: str, index: int) -> str:
     """A camera's name for files; names such as /camera/front are none, and no camera has the space of theirs."""
     return name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", name) else f"camera {index}"
-
-
-def refuse_large(path: Path, where: str, most_bytes: int = MOST_BYTES) -> None:
-    """Raise CalibrationError for a file of more bytes."""
-    size = os.path.getsize(path)
-    if size > most_bytes:
-        raise CalibrationError(f"{where}: expected at most {most_bytes >> 20} MiB, got {size / 2**20:.1f} MiB")
 
 
 def parse_json(text: str | bytes) -> Any:

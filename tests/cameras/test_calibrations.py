@@ -238,7 +238,7 @@ def test_ros_questions(tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=r"'front': distortion_model: expected plumb_bob, .*, got 'thin_prism'"):
         load_rig(tmp_path)
     written(tmp_path, front__yaml=CAMERA_INFO.replace("image_width: 640\n", ""))
-    with pytest.raises(CalibrationError, match=r"expected a calibration as ROS writes it, got KeyError: 'image_width'"):
+    with pytest.raises(CalibrationError, match=r"ROS: camera 'front': how large are its images"):
         load_rig(tmp_path)
 
 
@@ -346,8 +346,8 @@ def test_opencv_file_storage(tmp_path: Path) -> None:
     for text, message in {
         "<opencv_storage><Camera_Matrix>": "wide.xml: expected XML, got no element found",
         '<!DOCTYPE a [<!ENTITY b SYSTEM "/etc/passwd">]><a>&b;</a>': "without declarations, got <!",
-        "<opencv_storage></opencv_storage>": "wide.xml: expected a matrix camera_matrix or ",
-        OPENCV_XML.replace("3.2e+02", "wide"): "expected a calibration as OpenCV writes it, got ValueError",
+        "<opencv_storage></opencv_storage>": r"got dict.* OpenCV \(camera_matrix and distortion_coefficients",
+        OPENCV_XML.replace("3.2e+02", "wide"): "camera 'wide': Camera_Matrix: expected a matrix or list of numbers",
     }.items():
         with pytest.raises(CalibrationError, match=message):
             load_rig(written(tmp_path, wide__xml=text) / "wide.xml")
@@ -423,7 +423,7 @@ def test_kalibr_camchain(tmp_path: Path) -> None:
         load_rig(path)
     for key in ("T_cn_cnm1", "resolution"):
         written(tmp_path, camchain__yaml=CAMCHAIN.replace(f"  {key}:", f"  other_{key}:"))
-        with pytest.raises(CalibrationError, match=rf"camera 'cam[01]': expected intrinsics, .*, missing {key}"):
+        with pytest.raises(CalibrationError, match=rf"camera 'cam[01]': expected .*, missing {key}"):
             load_rig(path)
     for old, new, message in (
         ("  distortion_coeffs: [-0.0132, 0.0501, -0.0451, 0.0124]\n", "", "'cam2': .*, missing distortion_coeffs"),
@@ -437,8 +437,8 @@ def test_kalibr_camchain(tmp_path: Path) -> None:
         written(tmp_path, camchain__yaml=CAMCHAIN.replace(old, new, 1))
         with pytest.raises(CalibrationError, match=message):
             load_rig(path)
-    written(tmp_path, camchain__yaml=CAMCHAIN.replace("ds", "omni"))
-    with pytest.raises(CalibrationError, match=r"'cam0': camera_model-distortion_model: expected .*, got omni-none"):
+    written(tmp_path, camchain__yaml=CAMCHAIN.replace("ds", "fov"))
+    with pytest.raises(CalibrationError, match=r"'cam0': camera_model-distortion_model: expected .*, got fov-none"):
         load_rig(path)
 
 
@@ -638,7 +638,7 @@ def test_waymo(tmp_path: Path, key: str | None, intrinsic: Any) -> None:
     assert rig.names == ["FRONT"] and rig[0].distortion == tuple(INTRINSIC[4:])
     np.testing.assert_array_equal(rig[0].cam2ego, FORWARD)
     (tmp_path / "calibration.json").write_text(json.dumps([{**entry, "name": -1}]))
-    with pytest.raises(CalibrationError, match=r"expected a calibration as Waymo writes it, got KeyError: -1"):
+    with pytest.raises(CalibrationError, match=r"expected a calibration as Waymo writes it, missing -1"):
         load_rig(tmp_path / "calibration.json")
     # Waymo's formula: u = c_u - f_u y / x for a point (x, y, z) in its camera frame, without distortion.
     x, y, z = 400.0, -0.3, 0.2  # nearly on the axis, where the lens hardly bends
@@ -743,7 +743,7 @@ def test_what_a_format_has_not_is_refused(tmp_path: Path) -> None:
 
 
 def test_folders_that_are_no_calibration(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"expected a rig file, or a folder of COLMAP \(images.bin or im"):
+    with pytest.raises(CalibrationError, match=r"expected a rig file, or a folder of COLMAP \(cameras and im"):
         load_rig(tmp_path)
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     with pytest.raises(CalibrationError, match=r"found neither"):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import re
 import struct
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,9 +15,12 @@ import yaml
 
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.formats import camera_files, colmap, datasets, kalibr
+from arbiview_aug.cameras.formats.entries import WAY_OUT
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
-from arbiview_aug.cameras.plain_yaml import dump_yaml, read_plain
-from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line, shown
+from arbiview_aug.cameras.key_names import hint
+from arbiview_aug.cameras.plain_yaml import MOST_BYTES, dump_yaml
+from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line, shown, warn
+from arbiview_aug.files import read_bytes
 
 
 class Format(NamedTuple):
@@ -23,6 +28,7 @@ class Format(NamedTuple):
 
     tool: str
     files: tuple[str, ...]  # patterns, one of which a folder has
+    keys: str  # by which a file is recognised, for errors
     convention: str  # assumed on reading, for ``inspect``
     read: Callable[[Path, Mounting], list[dict[str, Any]]]  # cameras as in a rig file
     ground_z_m: float = 0.0  # road in the ego frame, where mounting.yaml does not say otherwise
@@ -32,39 +38,45 @@ class Format(NamedTuple):
 
 FORMATS = {
     "colmap": Format(
-        "COLMAP", ("images.bin", "images.txt"),
+        "COLMAP", ("images.bin", "images.txt"), "cameras and images, .bin or .txt",
         "images of one moment as cameras; COLMAP's first pixel centre is (0.5, 0.5), so principal points are moved by "
         f"half a pixel; scale and ego frame from {MOUNTING}",
         colmap.read_colmap, files_of=colmap.colmap_files,
     ),
     "argoverse2": Format(
-        "Argoverse 2", ("intrinsics.feather", "calibration/intrinsics.feather"),
+        "Argoverse 2", ("intrinsics.feather", "calibration/intrinsics.feather"), "intrinsics.feather",
         "images are published undistorted, k1 to k3 are not used; ego origin at the rear axle, 0.33 m over the road",
         datasets.read_argoverse2, -0.33,
     ),
     "nuscenes": Format(
-        "nuScenes", (datasets.CALIBRATED_SENSOR,),
+        "nuScenes", (datasets.CALIBRATED_SENSOR,), "calibrated_sensor.json with sensor.json",
         "sensor to ego, quaternions w x y z; images are published undistorted; ego origin on the road",
         datasets.read_nuscenes,
     ),
     "kalibr": Format(
-        "Kalibr", ("*camchain*.yaml",),
-        f"T_cn_cnm1 takes points from the camera before to the camera; pose of one camera from {MOUNTING}",
+        "Kalibr", kalibr.FILES, "cam0, cam1 ... with camera_model and intrinsics",
+        "T_cn_cnm1 takes points from the camera before to the camera, T_cam_imu from the IMU; "
+        f"pose of one camera from {MOUNTING}",
         kalibr.read_kalibr, files_of=kalibr.kalibr_files,
     ),
     "opencv": Format(
-        "OpenCV", (),
-        f"coefficients k1 k2 p1 p2 ..., or k1 to k4 of a fisheye where fisheye_model is 1; poses from {MOUNTING}",
+        "OpenCV", (), "camera_matrix and distortion_coefficients, also mtx and dist, or K and D",
+        f"coefficients k1 k2 p1 p2 ..., or k1 to k4 of a fisheye where the file says so; poses from {MOUNTING}",
         camera_files.read_camera_files,
     ),
     "ros": Format(
-        "ROS", (),
+        "ROS", (), "camera_matrix and distortion_model, or K, D and P; Foxglove's too",
         "K and D of the raw image, not P; optical frames (x right, y down, z forward) below base_link in "
         f"{camera_files.TF}, the road at base_footprint if it is there, or poses from {MOUNTING}",
         camera_files.read_camera_files, files_of=camera_files.ros_files, road_z_m=camera_files.ros_road_z_m,
     ),
+    "woodscape": Format(
+        "WoodScape", (), "intrinsic with model radial_poly",
+        "r = k1 θ + ... + k4 θ⁴; quaternions x y z w, camera to vehicle; vehicle origin on the road",
+        camera_files.read_camera_files,
+    ),
     "waymo": Format(
-        "Waymo", (),
+        "Waymo", (), "camera_calibrations",
         "camera to vehicle; its camera axes x forward, y left, z up are turned to x right, y down, z forward; "
         "f_u f_v c_u c_v k1 k2 p1 p2 k3; vehicle origin on the road",
         datasets.read_waymo,
@@ -72,9 +84,34 @@ FORMATS = {
 }  # fmt: skip
 """Formats by name, in the order in which folders are tried."""
 
+_UNREAD = {
+    "KITTI's text": (
+        r"(?m)^P(_rect_)?\d{1,2}:",
+        "of P the left 3x3 as K, pinhole; cam2ego is inv(R0_rect @ Tr_velo_to_cam) with the Velodyne as ego frame",
+    ),
+    "MEI (CamOdoCal, KITTI-360)": ("mirror_parameters", f"or {WAY_OUT}"),
+    "ORB-SLAM": (r"(?m)^\s*Camera1?[._](type|fx)", "PinHole has radtan k1 k2 p1 p2, KannalaBrandt8 fisheye k1 to k4"),
+    "basalt": ('"camera_type"', "kb4 is fisheye k1 to k4, ds is double_sphere"),
+    "nerfstudio": (r"\bfl_x\b", "K of fl_x fl_y cx cy; negate columns 2 and 3 of transform_matrix (OpenGL's axes)"),
+    "NVIDIA's rig": ("nominalSensor2Rig|bw-poly", "ftheta_backward of bw-poly (docs/formats.md, Lenses)"),
+    "A2D2": ("CamMatrix", "K is CamMatrix, pinhole, of undistorted images"),
+    "Argoverse 1": ("focal_length_x_px_", "K of focal_length and focal_center; vehicle_SE3_camera_ is cam2ego"),
+    "ONCE": ("cam_to_velo", "K is cam_intrinsic; cam_to_velo is cam2ego with the LiDAR as ego frame"),
+    "ZOD": (r"(?s)undistortion.*image_dimensions", "fisheye k1 to k4 of distortion"),
+    "Cityscapes": (r"(?s)baseline.*\bu0\b", "K of fx fy u0 v0, pinhole"),
+    "CARLA, LGSVL": (r"image_size_x|sensor\.camera", "y is to the right there: negate y and yaw for Camera.looking"),
+    "OpenCV's stereo": (r"(?m)^\s*\"?M1\b", "or a file a camera: M1 as camera_matrix, D1 as distortion_coefficients"),
+    "Autoware's sensors": (r"\bcamera_link:", "or these poses to mounting.yaml beside CameraInfo files"),
+}
+"""Formats that are not read: how their text is recognised, and what a rig file takes from them."""
+
+_FIX = "convert them, write a rig file, or move them elsewhere"
+_CAMERA = re.compile(rb"(?i)camera_?mat|intrinsic|distort|camera_?model|\bmtx\b|focal_?length|\bf[lx]_?x?\b")
+_LIKE_CAMERAS = (*camera_files.SUFFIXES, ".npz", ".toml", ".ini")
+
 _BROKEN = (
     *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, OSError, SystemError, RecursionError),
-    *(struct.error, yaml.YAMLError),
+    *(struct.error, yaml.YAMLError, NotImplementedError, MemoryError),  # the last two of pyarrow
 )
 
 
@@ -82,63 +119,117 @@ def read_calibration(path: Path, where: str) -> Any:
     """Plain data in the rig file's format of a rig file, or of a tool's file or folder, then with ``notes``.
 
     Raises:
-        CalibrationError: A file that is not as its tool writes it, or that lacks what ``mounting.yaml`` could say.
+        CalibrationError: A file that is not as its tool writes it, or that lacks what ``mounting.yaml`` could say; a
+            folder with a camera that is not read.
         ImportError: Argoverse 2's files without pyarrow.
     """
-    data = None
+    is_folder = os.path.isdir(path)
     try:
         name = recognised(path)
-        if name is None and not os.path.isdir(path):
-            data = read_plain(path, where)
-            name = _by_content(data)
+        data = None if name or is_folder or path.suffix == ".txt" else next(iter(camera_files.documents(path)), None)
+    except ArbiviewError as error:
+        raise CalibrationError(f"{where}: {str(error).removeprefix(f'{path.name}: ')}") from None
     except OSError as error:
-        raise CalibrationError(f"{where}: expected files that can be read, got {error}") from None
-    if name is None and os.path.isdir(path):
-        known = "; ".join(f"{form.tool} ({' or '.join(form.files)})" for form in FORMATS.values() if form.files)
-        raise CalibrationError(f"{where}: expected a rig file, or a folder of {known}; ROS or OpenCV (a file a camera)")
-    if name is None:
+        raise CalibrationError(f"{where}: expected files that can be read, got {error.strerror}") from None
+    if isinstance(data, Mapping) and isinstance(data.get("cameras"), list):
         return data
-    form, folder = FORMATS[name], path if os.path.isdir(path) else path.parent
+    unread = _unread(path, name) if is_folder else {path: _seems(path)}
+    seems = ", ".join(f"{file.name} ({tool})" for file, tool in unread.items() if tool)
+    if name is None:
+        known = "; ".join(f"{form.tool} ({form.keys})" for form in FORMATS.values())
+        if is_folder:
+            got = f", got {seems}" if seems else ""
+            raise CalibrationError(f"{where}: expected a rig file, or a folder of {known}{got}; docs/rigs.md")
+        got = type(data).__name__ + hint(data if isinstance(data, Mapping) else (), ("cameras",))
+        expected = "expected a mapping with a list 'cameras'"
+        raise CalibrationError(
+            f"{where}: {expected}, got {got}: {seems}. Read are rig files, and {known}; docs/rigs.md"
+        )
+    form, folder = FORMATS[name], path if is_folder else path.parent
     try:
         mounting = Mounting.read(folder)
         with np.errstate(all="ignore"):  # ``Camera`` refuses numbers that are not finite
             cameras = form.read(path, mounting)
-            if folder == path:  # of a file alone it may name the others beside it
+            if is_folder:  # of a file alone it may name the others beside it
                 mounting.check([camera["name"] for camera in cameras])
             cameras = mounting.named(cameras)
             heights = (mounting.ground_z_m, MOUNTING), (form.road_z_m(path), "the files"), (form.ground_z_m, "")
     except ArbiviewError as error:
         raise type(error)(f"{where}: {form.tool}: {error}") from None
     except _BROKEN as error:  # readers take files apart as their tools write them
-        got = one_line(described(error))
-        raise CalibrationError(f"{where}: expected a calibration as {form.tool} writes it, got {got}") from None
+        got = f"missing {error}" if isinstance(error, KeyError) else f"got {one_line(described(error))}"
+        raise CalibrationError(f"{where}: expected a calibration as {form.tool} writes it, {got}") from None
+    if is_folder and seems:
+        raise CalibrationError(
+            f"{where}: {form.tool}: expected all cameras in files of this tool, got also {seems}: {_FIX}"
+        )
+    if is_folder and unread:
+        warn(f"{where}: {form.tool}: not read: {', '.join(file.name for file in unread)}")
     ground, source = next((height, source) for height, source in heights if height is not None)
     road = f"road at z = {ground} m, {f'from {source}' if source else 'assumed'}"
-    notes, stem = f"read as {form.tool}: {form.convention}; {road}", folder.name if folder == path else path.stem
+    notes, stem = f"read as {form.tool}: {form.convention}; {road}", folder.name if is_folder else path.stem
+    stem = stem.encode(errors="replace").decode()
     return {"name": stem, "ground_z_m": ground, "notes": notes, "cameras": cameras}
 
 
 def recognised(path: Path) -> str | None:
-    """Name in ``FORMATS`` of a folder by its files, or of a file by its name and first words."""
+    """Name in ``FORMATS`` of a folder by its files, or of a file by its name and content."""
     if os.path.isdir(path):
         for name, form in FORMATS.items():
             if any(any(path.glob(pattern)) for pattern in form.files):
                 return name
         files = camera_files.camera_files(path)
-        return ("opencv" if camera_files.is_file_storage(files[0]) else "ros") if files else None
-    by_name = {".txt": "colmap", ".bin": "colmap", ".feather": "argoverse2", datasets.CALIBRATED_SENSOR: "nuscenes"}
+        return camera_files.tool_of(files[0]) if files else None
+    if path.suffix == ".txt":
+        return None if _tool(read_bytes(path, 1 << 28)) else "colmap"
+    by_name = {".bin": "colmap", ".feather": "argoverse2", datasets.CALIBRATED_SENSOR: "nuscenes"}
     if path.name in by_name or path.suffix in by_name:
         return by_name.get(path.name) or by_name[path.suffix]
-    return "opencv" if camera_files.is_file_storage(path) else "ros" if camera_files.is_camera_info(path) else None
-
-
-def _by_content(data: Any) -> str | None:
-    """Name of the format of a file's plain data."""
+    if _tool(read_bytes(path, MOST_BYTES)):
+        return None
+    data = next(iter(camera_files.documents(path)), None)
     if datasets.waymo_entries(data):
         return "waymo"
-    if isinstance(data, Mapping) and "camera_matrix" in data:
-        return "ros"
-    return "kalibr" if kalibr.entries(data) else None
+    if kalibr.entries(data):
+        return "kalibr"
+    return camera_files.tool_of(path) if camera_files.has_cameras(path) else None
+
+
+def _unread(folder: Path, name: str | None) -> dict[Path, str]:
+    """Files of a folder that are not read and could have a camera, with what they seem to be; empty if no camera."""
+    if name in ("nuscenes", "argoverse2"):
+        return {}
+    patterns = FORMATS[name].files if name else ()
+    read = {MOUNTING, camera_files.TF, *(path.name for pattern in patterns for path in folder.glob(pattern))}
+    if name and not patterns:
+        read |= {path.name for path in camera_files.camera_files(folder)}
+    stems = {Path(file).stem for file in read}  # ost.txt beside ost.yaml is the same camera
+    files = (path for path in sorted(folder.glob("*.*")) if path.suffix in _LIKE_CAMERAS and path.stem not in stems)
+    return {path: _seems(path) for path in files if not path.is_dir()}
+
+
+def _seems(path: Path) -> str:
+    """What a file that is not read seems to be, and what to do; empty for a rig file and if it has no camera."""
+    try:
+        content = read_bytes(path, MOST_BYTES)
+    except OSError as error:
+        return "" if error.errno == errno.EFBIG else f"a file that cannot be read: {error.strerror}"
+    if tool := _tool(content):
+        return f"{tool}, which is not read: write a rig file, docs/formats.md; {_UNREAD[tool][1]}"
+    if not _CAMERA.search(content.replace(b"\0", b"")) or b"cam2ego" in content:
+        return ""
+    try:
+        if path.suffix in camera_files.SUFFIXES:
+            camera_files.documents(path)
+    except CalibrationError as error:
+        return str(error).removeprefix(f"{path.name}: ")
+    return "a calibration that is not recognised"
+
+
+def _tool(content: bytes) -> str | None:
+    """Name in ``_UNREAD`` of a file's content."""
+    text = content.decode("utf-8", "replace")
+    return next((tool for tool, (pattern, _) in _UNREAD.items() if re.search(pattern, text)), None)
 
 
 def write_calibration(data: Mapping[str, Any], folder: Path, name: str) -> Path:

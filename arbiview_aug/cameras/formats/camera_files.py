@@ -1,103 +1,170 @@
-"""A file a camera: ROS's CameraInfo with tf, and OpenCV's FileStorage."""
+"""A file a camera: CameraInfo of ROS and Foxglove with tf, OpenCV's FileStorage, and what Python scripts write."""
 
 from __future__ import annotations
 
+import errno
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import camera_entry, lens_of
+from arbiview_aug.cameras.formats.entries import camera_entry, lens_of, matrix, plain, refusal
+from arbiview_aug.cameras.formats.fields import has_camera, read_fields
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting, pose_of
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.plain_yaml import MOST_BYTES, file_stem, parse_yaml, refuse_large
-from arbiview_aug.cameras.rotations import quaternion_from_rotation
+from arbiview_aug.cameras.plain_yaml import MOST_BYTES, file_stem, read_calibration_text, read_documents
+from arbiview_aug.cameras.rotations import poses_from, quaternion_from_rotation
 from arbiview_aug.cameras.validation import BODY_AXES
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.errors import CalibrationError, shown
+from arbiview_aug.files import read_bytes
 
 TF = "tf_static.yaml"
+SUFFIXES = (".yaml", ".yml", ".xml", ".json")
 _EGO_FRAMES = ("base_link", "base_footprint")  # REP 105; REP 120: base_footprint is on the floor
 _BODY_UP_DEG = 60.0  # a camera that looks up more steeply is none of a car's: its frame is the body's
 _OPTICAL = ("_optical_frame", "_optical", "")  # suffixes of a camera's frame; REP 103
+_ROS_KEYS = {"distortionmodel", "p", "projectionmatrix", "binningx"}
+_WOODSCAPE_KEYS = set("aspect_ratio cx_offset cy_offset height width k1 k2 k3 k4 model poly_order".split())
+_DEFAULT_NAME = "narrow_stereo"  # of camera_calibration, for every camera
 
-# sensor_msgs/distortion_models.hpp; camera_calibration writes the first three
-_ROS_LENSES = {"plumb_bob": "radtan", "rational_polynomial": "radtan", "equidistant": "fisheye", "fisheye": "fisheye"}
-
-# Keys of OpenCV's samples, of its interactive tool and of its documentation.
-_MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix")
-_COEFFICIENTS = ("distortion_coefficients", "Distortion_Coefficients", "dist_coeffs", "distCoeffs")
-_WIDTH, _HEIGHT = ("image_width", "image_Width"), ("image_height", "image_Height")
-
-_MESSAGE = "binning_x"  # of CameraInfo messages; camera_calibration's files have none
+# Words of which a file with a camera has one; YAML takes seconds a megabyte.
+_WORDS = re.compile(r"(?i)matrix|mat\b|\bmtx\b|intrinsic|\bcam_k\b|\bk\b|\bfx\b|\bmu\b|\bgamma1\b|radial_poly")
 
 
 def camera_files(folder: Path) -> list[Path]:
-    """A folder's files with a camera matrix."""
-    files = (path for path in sorted(folder.glob("*.*")) if path.suffix in (".yaml", ".yml", ".xml", ".json"))
-    return [path for path in files if path.name not in (MOUNTING, TF) and _has(path, (*_MATRIX, _MESSAGE))]
+    """A folder's files with a camera."""
+    files = (path for path in sorted(folder.glob("*.*")) if path.suffix in SUFFIXES and path.name not in (MOUNTING, TF))
+    return [path for path in files if not path.is_dir() and has_cameras(path)]
 
 
-def is_file_storage(path: Path) -> bool:
-    """Whether a file is OpenCV's FileStorage: XML, or YAML or JSON with its own header or types."""
-    return path.suffix == ".xml" or _has(path, ("%YAML:", "!!opencv-", '"opencv-'))
+def has_cameras(path: Path) -> bool:
+    """Whether a file has a camera that is read here; False if it is no text, or too large."""
+    try:
+        if not _WORDS.search(read_bytes(path, MOST_BYTES).decode("utf-8-sig", "replace")):
+            return False
+        return bool(_cameras(path))
+    except CalibrationError:
+        return False
+    except OSError as error:
+        if error.errno == errno.EFBIG:
+            return False
+        raise CalibrationError(f"{path.name}: expected a file that can be read, got {error.strerror}") from None
 
 
-def is_camera_info(path: Path) -> bool:
-    """Whether a file is a CameraInfo message."""
-    return _has(path, (_MESSAGE,))
+def documents(path: Path) -> list[Any]:
+    """Plain data of a file: XML of OpenCV's FileStorage, JSON, or YAML, of which a stream has several."""
+    return [_file_storage(path)] if path.suffix == ".xml" else read_documents(path, path.name)
 
 
-def _has(path: Path, words: Iterable[str]) -> bool:
-    with path.open("rb") as file:
-        text = file.read(MOST_BYTES)
-    return any(word.encode() in text for word in words)
+def tool_of(path: Path) -> str:
+    """Format of a file with cameras: ``ros``, ``woodscape``, or ``opencv`` for FileStorage's and Python's."""
+    data = next(iter(_cameras(path).values()))
+    words = {plain(key) for key in data}
+    return "woodscape" if _is_woodscape(data) else "ros" if _ROS_KEYS & words else "opencv"
+
+
+def _cameras(path: Path) -> dict[str, Mapping[Any, Any]]:
+    """The cameras of a file, by the file's name; by their keys or frames where it has several."""
+    keyed = [
+        (str(key), part)
+        for data in documents(path)
+        if not (isinstance(data, Mapping) and isinstance(data.get("cameras"), list))  # a rig file
+        for key, part in (data.items() if isinstance(data, Mapping) and not _is_camera(data) else _listed(data))
+        if _is_camera(part)
+    ]
+    if len(keyed) == 1 or len({key for key, _ in keyed}) == 1:  # a stream of one camera
+        return {path.stem if not keyed[0][0] or "frame_id" in str(keyed[0][1]) else keyed[0][0]: keyed[0][1]}
+    return {key or f"{path.stem} {k}": part for k, (key, part) in enumerate(keyed)}
+
+
+def _listed(data: Any) -> list[tuple[str, Any]]:
+    """The entries of a list, or one document, by their frames."""
+    parts = data if isinstance(data, list) else [data]
+    return [(_frame_id(part) if isinstance(part, Mapping) else "", part) for part in parts]
+
+
+def _is_camera(data: Any) -> bool:
+    return isinstance(data, Mapping) and (_is_woodscape(data) or has_camera(data))
+
+
+def _frame_id(data: Mapping[Any, Any]) -> str:
+    header = data.get("header")
+    return str((header if isinstance(header, Mapping) else data).get("frame_id") or "").strip("/")
 
 
 def read_camera_files(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
-    """Cameras of ROS's CameraInfo YAML or OpenCV's FileStorage: of one file, or of all of a folder.
+    """Cameras of one file, or of all of a folder.
 
-    Sources: camera_calibration_parsers of ROS; the sample calib3d/camera_calibration of OpenCV.
+    Sources: camera_calibration_parsers of ROS; CameraCalibration of Foxglove's schemas; the sample
+    calib3d/camera_calibration of OpenCV.
     """
-    files, frames = camera_files(path) if path.is_dir() else [path], _frames(path)
-    return [_opencv(file, mounting) if is_file_storage(file) else _ros(file, mounting, frames) for file in files]
+    frames, files = _frames(path), camera_files(path) if path.is_dir() else [path]
+    cameras = [(file, key, data) for file in files for key, data in _cameras(file).items()]
+    names = Counter(_declared(data) for _, _, data in cameras)
+    found = []
+    for file, key, data in cameras:
+        name = _declared(data)
+        is_default = name.startswith(_DEFAULT_NAME) and name not in mounting.poses
+        name = key if not name or names[name] > 1 or is_default else name
+        found.append(_read(file, name, data, mounting, frames))
+    return found
 
 
-def ros_road_z_m(path: Path) -> float | None:
-    """Height of the road in the ego frame: that of base_footprint, which stands on it; None if tf has no such frame."""
-    foot = _frames(path).get(_EGO_FRAMES[1])
-    return None if foot is None else round(float(foot[2, 3]), 6) + 0.0  # not -0.0
+def _is_woodscape(data: Mapping[Any, Any]) -> bool:
+    intrinsic = data.get("intrinsic")
+    return isinstance(intrinsic, Mapping) and intrinsic.get("model") == "radial_poly"
 
 
-def _ros(path: Path, mounting: Mounting, frames: Mapping[str, FloatArray]) -> dict[str, Any]:
-    data = _messages(path)[0]
-    name, model = str(data.get("camera_name") or path.stem), data["distortion_model"]
-    if model not in _ROS_LENSES:
-        raise CalibrationError(f"camera {name!r}: distortion_model: expected {', '.join(_ROS_LENSES)}, got {model!r}")
-    optical = [name.strip("/") + end for end in _OPTICAL]
-    if _MESSAGE in data:
-        data = {key.lower(): value for key, value in data.items()}  # ROS 1 has K and D
-        optical, K, coefficients = [data["header"]["frame_id"].strip("/")], data["k"], data["d"]
-        size = data["width"], data["height"]
-        window = data["roi"]["width"] or size[0], data["roi"]["height"] or size[1]
-        if data["binning_x"] > 1 or data["binning_y"] > 1 or window != size:
-            raise CalibrationError(f"camera {name!r}: expected full images, got binning or a region of interest")
-    else:
-        K, coefficients = (data[key]["data"] for key in ("camera_matrix", "distortion_coefficients"))
-        size = data["image_width"], data["image_height"]
+def _woodscape(name: str, data: Mapping[Any, Any], mounting: Mounting) -> dict[str, Any]:
+    """A camera of WoodScape: r = k1 θ + ... + k4 θ⁴ in pixels, quaternion x y z w, camera to vehicle.
+
+    Source: scripts/calibration/projection.py of valeoai/WoodScape.
+    """
+    lens, extrinsic = data["intrinsic"], data["extrinsic"]
+    if unread := lens.keys() - _WOODSCAPE_KEYS:
+        raise refusal(name, f"intrinsic {', '.join(sorted(_WOODSCAPE_KEYS))}", ", ".join(sorted(unread)))
+    if lens.get("poly_order", 4) != 4:
+        raise refusal(name, "poly_order 4", shown(lens["poly_order"]))
+    width, height, k1 = lens["width"], lens["height"], lens["k1"]
+    K = matrix(k1, k1 * lens["aspect_ratio"], width / 2 - 0.5 + lens["cx_offset"], height / 2 - 0.5 + lens["cy_offset"])
+    x, y, z, w = extrinsic["quaternion"]
+    pose = mounting.poses.get(name, poses_from([*extrinsic["translation"], w, x, y, z]))
+    coefficients = [*(lens[key] / k1 for key in ("k2", "k3", "k4")), 0.0]
+    return camera_entry(name, (width, height), K, pose, "ftheta", coefficients)
+
+
+def _declared(data: Mapping[Any, Any]) -> str:
+    return str(data.get("camera_name") or data.get("name") or "").strip('"')
+
+
+def _read(
+    path: Path,
+    name: str,
+    data: Mapping[Any, Any],
+    mounting: Mounting,
+    frames: Mapping[str, FloatArray],
+) -> dict[str, Any]:
+    if _is_woodscape(data):
+        return _woodscape(name, data, mounting)
+    lens, K, coefficients, size, is_shifted = read_fields(name, data)
+    frame_id = _frame_id(data)
+    optical = [frame_id] if frame_id else [name.strip("/") + end for end in _OPTICAL]
     frame = next((frame for frame in optical if frame in frames), None)
     if frame is None or name in mounting.poses:
-        there = f", or a frame {optical[0]} to {TF} as `ros2 topic echo /tf_static` prints it"
+        is_ros = tool_of(path) == "ros"
+        there = f", or a frame {optical[0]} to {TF} as `ros2 topic echo /tf_static` prints it" if is_ros else ""
         pose = mounting.pose(name, there)
     else:
         pose = frames[frame]
         up_deg = math.degrees(math.atan2(pose[2, 2], math.hypot(*pose[:2, 2])))
         if up_deg > _BODY_UP_DEG and "optical" not in frame.lower():
             fix = f"add a frame {optical[0]}"
-            if _MESSAGE in data:
+            if frame_id:
                 instead = f"{frame.removesuffix('_link')}_optical_frame"
                 fix = f"write frame_id: {instead} to {path.name}, and add that frame, if it is not there,"
             raise CalibrationError(
@@ -105,14 +172,16 @@ def _ros(path: Path, mounting: Mounting, frames: Mapping[str, FloatArray]) -> di
                 f"have {BODY_AXES}: the camera would look up by {up_deg:.0f} degrees; {fix} to "
                 f"{TF} below {frame}, with rotation {{x: -0.5, y: 0.5, z: -0.5, w: 0.5}}"
             )
-    return camera_entry(name, size, np.reshape(K, (3, 3)), pose, _ROS_LENSES[model], coefficients)
+        if is_shifted:
+            fix = f"its frame may be the left camera's: write its own pose to {MOUNTING}, poses: {{{name}: ...}}"
+            raise refusal(name, "a projection matrix without a baseline", "one with", fix)
+    return camera_entry(name, size or mounting.size(name), K, pose, lens, coefficients)
 
 
-def _messages(path: Path) -> list[Any]:
-    """Documents of a file that ``topic echo`` of ROS 1 or 2 printed."""
-    refuse_large(path, path.name)
-    documents = re.split(r"^---\s*$", path.read_text(), flags=re.MULTILINE)
-    return [parse_yaml(document) for document in documents if document.strip()]
+def ros_road_z_m(path: Path) -> float | None:
+    """Height of the road in the ego frame: that of base_footprint, which stands on it; None if tf has no such frame."""
+    foot = _frames(path).get(_EGO_FRAMES[1])
+    return None if foot is None else round(float(foot[2, 3]), 6) + 0.0  # not -0.0
 
 
 def _frames(path: Path) -> dict[str, FloatArray]:
@@ -124,7 +193,7 @@ def _frames(path: Path) -> dict[str, FloatArray]:
 def _tf_poses(path: Path) -> dict[str, FloatArray]:
     """Poses (4, 4) of the frames of TFMessages in the ego frame: base_link, or base_footprint where there is none."""
     links: dict[str, tuple[str, FloatArray]] = {}
-    for one in (one for message in _messages(path) for one in message["transforms"]):
+    for one in (one for message in read_documents(path, path.name) for one in message["transforms"]):
         child, parent = (frame.strip("/") for frame in (one["child_frame_id"], one["header"]["frame_id"]))
         links[child] = parent, pose_of(child, one["transform"])
 
@@ -150,34 +219,26 @@ def _tf_poses(path: Path) -> dict[str, FloatArray]:
     return poses
 
 
-def _opencv(path: Path, mounting: Mounting) -> dict[str, Any]:
-    data = _file_storage(path)
-    values = ([data[key] for key in keys if key in data] for keys in (_MATRIX, _COEFFICIENTS, _WIDTH, _HEIGHT))
-    matrices, coefficients, widths, heights = values
-    if not matrices:
-        raise CalibrationError(f"{path.name}: expected a matrix {' or '.join(_MATRIX)}, found none")
-    name = str(data.get("camera_name", path.stem)).strip('"')
-    size = (float(widths[0]), float(heights[0])) if widths and heights else mounting.size(name)
-    lens = "fisheye" if float(data.get("fisheye_model", 0)) else "radtan"
-    numbers = coefficients[0]["data"] if coefficients else ()
-    return camera_entry(name, size, np.reshape(matrices[0]["data"], (3, 3)), mounting.pose(name), lens, numbers)
-
-
-def _file_storage(path: Path) -> Mapping[str, Any]:
-    """Plain data of a FileStorage; cv2's own reader is not used, as broken files corrupt its memory (OpenCV 5.0)."""
-    refuse_large(path, path.name)
-    text = path.read_text()
-    if path.suffix != ".xml":
-        data: Mapping[str, Any] = parse_yaml(re.sub(r"\A%YAML.*|!!opencv-(nd-)?matrix", "", text))
-        return data
+def _file_storage(path: Path) -> dict[str, Any]:
+    """Plain data of a FileStorage's XML; cv2's own reader is not used, as broken files corrupt its memory."""
+    text = read_calibration_text(path, path.name)
     if re.search("<!(?!--)", text):  # entities could name other files, or multiply
         raise CalibrationError(f"{path.name}: expected XML as OpenCV writes it, without declarations, got <!")
     try:
         nodes = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
         raise CalibrationError(f"{path.name}: expected XML, got {error}") from None
-    matrices = {node.tag: {"data": [*map(float, node.findtext("data", "").split())]} for node in nodes if len(node)}
-    return {node.tag: (node.text or "").strip() for node in nodes} | matrices
+    return {node.tag: _node_data(node) for node in nodes}
+
+
+def _node_data(node: ElementTree.Element) -> Any:
+    if not len(node):
+        return (node.text or "").strip()
+    numbers = node.findtext("data")
+    if numbers is None:
+        return {child.tag: _node_data(child) for child in node}
+    sides = {side: text for side in ("rows", "cols") if (text := node.findtext(side))}
+    return {**sides, "data": numbers.split()}
 
 
 def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,12 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import camera_entry, focal_and_center, lens_of, matrix
+from arbiview_aug.cameras.formats.entries import WAY_OUT, camera_entry, focal_and_center, lens_of, matrix, refusal
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.plain_yaml import refuse_large
+from arbiview_aug.cameras.plain_yaml import read_calibration_text
 from arbiview_aug.cameras.rotations import poses_from, quaternion_from_rotation
 from arbiview_aug.errors import CalibrationError, shown
+from arbiview_aug.files import read_bytes
 
 # src/colmap/sensor/models.h: number of the model, name, numbers of focal lengths and coefficients, our lens. Parameters
 # are focal lengths, cx, cy, coefficients.
@@ -32,7 +33,12 @@ _MODELS = (
     (6, "FULL_OPENCV", 2, 8, "radtan"),
     (8, "SIMPLE_RADIAL_FISHEYE", 1, 1, "fisheye"),
     (9, "RADIAL_FISHEYE", 1, 2, "fisheye"),
+    (10, "THIN_PRISM_FISHEYE", 2, 8, "fisheye"),  # k1 k2 p1 p2 k3 k4 sx1 sy1
+    (14, "SIMPLE_FISHEYE", 1, 0, "fisheye"),
+    (15, "FISHEYE", 2, 0, "fisheye"),
+    (16, "EUCM", 2, 2, "eucm"),
 )
+_NOT_READ = {7: "FOV", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION", 17: "EQUIRECTANGULAR"}
 _MOST_BYTES = 1 << 28  # of images with their points
 
 
@@ -47,7 +53,6 @@ def read_colmap(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     folder = path if path.is_dir() else path.parent
     end = path.suffix if path.is_file() else ".bin" if (folder / "images.bin").is_file() else ".txt"
     cameras_of, images_of = (_binary_cameras, _binary_images) if end == ".bin" else (_text_cameras, _text_images)
-    refuse_large(folder / f"images{end}", f"images{end}", _MOST_BYTES)
     models, images = dict(cameras_of(folder / f"cameras{end}")), list(images_of(folder / f"images{end}"))
     if not mounting.images and len({image.camera for image in images}) < len(images):
         camera, times = Counter(image.camera for image in images).most_common(1)[0]
@@ -89,8 +94,13 @@ def _camera(name: str, camera: tuple[Any, int, int, list[float]], cam2ego: Float
     if len(numbers) != (expected := focals + 2 + bends):
         raise CalibrationError(f"camera {name!r}: expected {expected} parameters of {model}, got {len(numbers)}")
     cx, cy, *coefficients = numbers[focals:]
+    if model == "THIN_PRISM_FISHEYE":
+        k1, k2, p1, p2, k3, k4, *prism = coefficients
+        if any((p1, p2, *prism)):
+            raise refusal(name, f"{model} with p1, p2, sx1 and sy1 of 0", shown(coefficients), WAY_OUT)
+        coefficients = [k1, k2, k3, k4]
     if lens != "pinhole":
-        coefficients += [0.0] * (4 - len(coefficients))
+        coefficients += [0.0] * (4 - len(coefficients)) if lens != "eucm" else []
     K = matrix(numbers[0], numbers[focals - 1], cx - 0.5, cy - 0.5)
     return camera_entry(name, (width, height), K, cam2ego, lens, coefficients)
 
@@ -99,18 +109,23 @@ def _model(key: int | str) -> tuple[int, str, int, int, str]:
     for model in _MODELS:
         if key in model[:2]:
             return model
-    raise CalibrationError(f"camera model: expected {', '.join(model[1] for model in _MODELS)}, got {key}")
+    got = f"{_NOT_READ.get(int(key), key) if isinstance(key, int) else key}; {WAY_OUT}"
+    raise CalibrationError(f"camera model: expected {', '.join(model[1] for model in _MODELS)}, got {got}")
+
+
+def _text(path: Path) -> list[str]:
+    return read_calibration_text(path, path.name, _MOST_BYTES).splitlines()
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, tuple[Any, int, int, list[float]]]]:
-    for line in path.read_text().splitlines():
+    for line in _text(path):
         if line.strip() and not line.startswith("#"):
             number, model, width, height, *numbers = line.split()
             yield int(number), (model, int(width), int(height), list(map(float, numbers)))
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
-    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    lines = [line for line in _text(path) if not line.startswith("#")]
     for points in filter(str.strip, lines[1::2]):  # X, Y and a number of each point
         if len(points.split()) % 3 or not re.search(r"\s-?\d+\s*$", points):
             expected = "two lines for each image, the second with its points or empty"
@@ -121,7 +136,7 @@ def _text_images(path: Path) -> Iterator[_Image]:
 
 
 def _binary_cameras(path: Path) -> Iterator[tuple[int, tuple[Any, int, int, list[float]]]]:
-    data, at = path.read_bytes(), 8
+    data, at = read_bytes(path, _MOST_BYTES), 8
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, key, width, height = struct.unpack_from("<iiQQ", data, at)
         length = _model(key)[2] + 2 + _model(key)[3]
@@ -130,7 +145,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, tuple[Any, int, int, list
 
 
 def _binary_images(path: Path) -> Iterator[_Image]:
-    data, at = path.read_bytes(), 8
+    data, at = read_bytes(path, _MOST_BYTES), 8
     for _ in range(struct.unpack_from("<Q", data)[0]):
         _, *numbers, camera = struct.unpack_from("<i7di", data, at)
         end = data.index(b"\0", at + 64)

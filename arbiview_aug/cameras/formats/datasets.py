@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.formats.entries import camera_entry, matrix
+from arbiview_aug.cameras.formats.fields import read_fields
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.plain_yaml import read_plain
 from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, poses_from
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import CalibrationError
+from arbiview_aug.files import read_bytes
 
 CALIBRATED_SENSOR = "calibrated_sensor.json"
 
@@ -33,22 +35,20 @@ def read_nuscenes(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     rows = [row for row in rows if not mounting.tokens or row["token"] in mounting.tokens]
     by_name: dict[str, Mapping[str, Any]] = {}
     for row in rows:
-        name, numbers = channels[row["sensor_token"]], ("translation", "rotation", "camera_intrinsic")
-        if any(by_name.setdefault(name, row)[key] != row[key] for key in numbers):
+        name = channels[row["sensor_token"]]
+        if {**by_name.setdefault(name, row), "token": row["token"]} != row:
             raise CalibrationError(
                 f"{name} has several calibrations: of which log? Write the tokens of one vehicle's rows to {MOUNTING} "
                 f"beside the file, tokens: [{row['token']}, ...]; or NuScenesDataset(root)[i]['rig'].save(FILE)"
             )
     sizes = {} if mounting.sizes else _nuscenes_sizes(folder)
-    return [
-        camera_entry(
-            name,
-            sizes.get(row["token"]) or mounting.size(name),
-            row["camera_intrinsic"],
-            poses_from([*row["translation"], *row["rotation"]]),
-        )
-        for name, row in by_name.items()
-    ]
+    cameras = []
+    for name, row in by_name.items():
+        lens, K, coefficients, _, _ = read_fields(name, row)  # T4's rows have camera_distortion, k1 k2 p1 p2 k3
+        pose = poses_from([*row["translation"], *row["rotation"]])
+        size = sizes.get(row["token"]) or mounting.size(name)
+        cameras.append(camera_entry(name, size, K, pose, lens, coefficients))
+    return cameras
 
 
 def _table(folder: Path, name: str) -> Any:
@@ -69,10 +69,16 @@ def read_argoverse2(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
 
     Source: ``PinholeCamera.from_feather`` of argoverse/av2-api.
     """
-    read_table = optional_package("pyarrow.feather").read_table
+    feather, arrow = optional_package("pyarrow.feather"), optional_package("pyarrow")
+
+    def rows(file: str) -> Any:
+        table = feather.read_table(arrow.BufferReader(read_bytes(folder / file, _MOST_BYTES)))
+        table.validate(full=True)  # pyarrow reads outside its buffers in damaged tables
+        return table.to_pylist()
+
     folder = path.parent if path.is_file() else path
     folder = folder if (folder / "intrinsics.feather").is_file() else folder / "calibration"
-    mounts = read_table(folder / "egovehicle_SE3_sensor.feather").to_pylist()
+    mounts = rows("egovehicle_SE3_sensor.feather")
     poses = {row["sensor_name"]: poses_from([row[key] for key in _AV2_POSE]) for row in mounts}
     return [
         camera_entry(
@@ -81,7 +87,7 @@ def read_argoverse2(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
             matrix(row["fx_px"], row["fy_px"], row["cx_px"], row["cy_px"]),
             poses[row["sensor_name"]],
         )
-        for row in read_table(folder / "intrinsics.feather").to_pylist()
+        for row in rows("intrinsics.feather")
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +11,36 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import CalibrationError
 
+_CALLED = {
+    "pinhole": "none no null undistorted pinhole perspective ideal",
+    "radtan": "plumbbob rationalpolynomial rational radtan radialtangential brown brownconrady opencv opencvradtan",
+    "fisheye": "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 kb4 kb8",
+    "unified": "mei omni omnidir omnidirectional ucm",
+    **{"double_sphere": "doublesphere ds", "eucm": "eucm", "ftheta": "ftheta", "ftheta_backward": "fthetabackward"},
+}
+_LENSES = {spelling: lens for lens, spellings in _CALLED.items() for spelling in spellings.split()}
+
+WAY_OUT = (
+    "undistort the images to a pinhole's, or fit a lens of this package (docs/rigs.md, A lens that is not read), and "
+    "write a rig file"
+)
+
+
+def plain(key: Any) -> str:
+    """A key or a model's name without case and punctuation: ``Camera_Matrix`` and ``cameraMatrix`` are one."""
+    return re.sub("[^a-z0-9]", "", str(key).lower())
+
+
+def lens_called(value: Any) -> str | None:
+    """This package's lens of a model's name in any tool, ``unified`` for MEI and omni; None for an unknown name."""
+    return _LENSES.get(plain(value))
+
+
+def refusal(name: str, expected: str, got: str, fix: str = "", *, key: str = "") -> CalibrationError:
+    """The error of a camera whose file says something else than ``expected``."""
+    where, end = f"{key}: " if key else "", f"; {fix}" if fix else ""
+    return CalibrationError(f"camera {name!r}: {where}expected {expected}, got {got}{end}")
+
 
 def camera_entry(
     name: str, size: tuple[Any, Any], K: Any, cam2ego: FloatArray, lens: str = "pinhole", coefficients: Any = ()
@@ -17,8 +48,10 @@ def camera_entry(
     """A camera as in a rig file, of (width, height); polynomials of zeros are no distortion."""
     coefficients = [float(k) for k in np.ravel(coefficients)]
     most = {"radtan": 8, "fisheye": 4}.get(lens, len(coefficients))
-    if not any(coefficients[most:]):
-        coefficients = coefficients[:most]  # the others are OpenCV's thin prism and tilt, or fill a message up
+    if any(coefficients[most:]):
+        got = f"{len(coefficients)} (thin prism or tilt)" if lens == "radtan" else len(coefficients)
+        raise refusal(name, f"at most {most} coefficients of {lens}", str(got), WAY_OUT)
+    coefficients = coefficients[:most]  # zeros fill a message up
     has_lens = lens != "pinhole" and (lens != "radtan" or any(coefficients))
     return {
         **{"name": name, "width": size[0], "height": size[1]},
@@ -36,7 +69,7 @@ def focal_and_center(camera: Mapping[str, Any], tool: str) -> list[float]:
     """fx, fy, cx and cy of a rig file's camera, for a tool that knows no skew."""
     (fx, skew, cx), (_, fy, cy), _ = camera["K"]
     if skew:
-        raise CalibrationError(f"camera {camera['name']!r}: expected K without skew for {tool}, got {skew}")
+        raise refusal(camera["name"], f"K without skew for {tool}", skew)
     return [fx, fy, cx, cy]
 
 
@@ -52,5 +85,5 @@ def lens_of(camera: Mapping[str, Any], tool: str, most: Mapping[str, int]) -> tu
     if len(coefficients) > most.get(lens, -1):
         known = ", ".join(f"{name} ({count} coefficients at most)" for name, count in most.items())
         got = f"{lens} with {len(coefficients)}"
-        raise CalibrationError(f"camera {camera['name']!r}: expected a lens of {tool}: pinhole, {known}, got {got}")
+        raise refusal(camera["name"], f"a lens of {tool}: pinhole, {known}", got)
     return lens, coefficients

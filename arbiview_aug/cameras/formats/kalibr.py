@@ -1,4 +1,4 @@
-"""Kalibr's camchain.yaml (wiki "yaml formats" and "supported models" of ethz-asl/kalibr)."""
+"""Kalibr's camchain.yaml (wiki "yaml formats" and "supported models" of ethz-asl/kalibr), also as OpenVINS ships it."""
 
 from __future__ import annotations
 
@@ -9,21 +9,25 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import camera_entry, focal_and_center, lens_of, matrix
+from arbiview_aug.cameras.formats.entries import WAY_OUT, camera_entry, focal_and_center, lens_of, refusal
+from arbiview_aug.cameras.formats.fields import read_fields
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import read_plain
 from arbiview_aug.cameras.validation import checked_pose
 from arbiview_aug.errors import CalibrationError, shown
 
-# By camera_model and distortion_model: our lens, and how many of its coefficients lead ``intrinsics``.
+# By camera_model and distortion_model: how many coefficients lead ``intrinsics``, and our lens for writing.
 _LENSES = {
     ("pinhole", "radtan"): ("radtan", 0),
     ("pinhole", "equidistant"): ("fisheye", 0),
     ("pinhole", "none"): ("pinhole", 0),
     ("ds", "none"): ("double_sphere", 2),
     ("eucm", "none"): ("eucm", 2),
+    ("omni", "none"): ("unified", 1),
+    ("omni", "radtan"): ("unified", 1),
 }
+FILES = ("*camchain*.yaml", "*cam_chain*.yaml")
 
 
 def entries(data: Any) -> dict[str, Mapping[str, Any]]:
@@ -35,40 +39,57 @@ def entries(data: Any) -> dict[str, Mapping[str, Any]]:
 def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     """Cameras of a camchain, in the order of the chain."""
     if path.is_dir():
-        path, *others = sorted(path.glob("*camchain*.yaml"))
+        path, *others = sorted({file for pattern in FILES for file in path.glob(pattern)})
         if others:
             raise CalibrationError(f"which of {path.name}, {', '.join(one.name for one in others)}? Name the file")
     chain = entries(read_plain(path, path.name))
     if all(re.fullmatch(r"cam\d{1,9}", str(name)) for name in chain):  # other tools sort cam10 before cam2
         chain = dict(sorted(chain.items(), key=lambda pair: int(pair[0].removeprefix("cam"))))
-    relative: dict[str, FloatArray] = {}  # poses in the first camera's frame
+    cameras = {name: _camera(name, entry) for name, entry in chain.items()}  # a lens is refused before poses are asked
+    poses = mounting.mounted(_relative(chain))
+    return [cameras[name] | {"cam2ego": cam2ego.tolist()} for name, cam2ego in poses.items()]
+
+
+def _relative(chain: Mapping[str, Mapping[str, Any]]) -> dict[str, FloatArray]:
+    """Poses in the first camera's frame, or in the IMU's where the cameras have T_cam_imu or T_imu_cam alone."""
+    first, *others = chain
+    for key, power in (("T_cam_imu", -1), ("T_imu_cam", 1)):
+        if others and all(one.get(key) and not one.get("T_cn_cnm1") for one in chain.values()):
+            poses = {name: checked_pose(name, one[key], key) for name, one in chain.items()}
+            return {name: np.asarray(np.linalg.matrix_power(pose, power), np.float64) for name, pose in poses.items()}
     pose: FloatArray = np.eye(4)
-    for name, entry in chain.items():
-        is_bent = entry.get("distortion_model", "none") != "none"
-        keys = ["intrinsics", "resolution", *["T_cn_cnm1"] * bool(relative), *["distortion_coeffs"] * is_bent]
-        if missing := [key for key in keys if entry.get(key) is None]:
-            raise CalibrationError(f"camera {name!r}: expected {', '.join(keys)}, missing {', '.join(missing)}")
-        if not relative and entry.get("T_cn_cnm1") is not None:
-            raise CalibrationError(f"camera {name!r}: expected no T_cn_cnm1, as it is the first; sort the file")
-        if relative:
-            pose = pose @ np.asarray(np.linalg.inv(checked_pose(name, entry["T_cn_cnm1"], "T_cn_cnm1")), np.float64)
+    relative = {first: pose}
+    if chain[first].get("T_cn_cnm1") is not None:
+        raise CalibrationError(f"camera {first!r}: expected no T_cn_cnm1, as it is the first; sort the file")
+    for name in others:
+        if chain[name].get("T_cn_cnm1") is None:
+            raise CalibrationError(
+                f"camera {name!r}: expected T_cn_cnm1, or T_cam_imu in all cameras, missing T_cn_cnm1"
+            )
+        pose = pose @ np.asarray(np.linalg.inv(checked_pose(name, chain[name]["T_cn_cnm1"], "T_cn_cnm1")), np.float64)
         relative[name] = pose
-    return [_camera(name, chain[name], cam2ego) for name, cam2ego in mounting.mounted(relative).items()]
+    return relative
 
 
-def _camera(name: str, entry: Mapping[str, Any], cam2ego: FloatArray) -> dict[str, Any]:
-    models = entry["camera_model"], entry.get("distortion_model", "none")
+def _camera(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
+    """A camera without its pose."""
+    models = entry["camera_model"], entry.get("distortion_model") or "none"
     if models not in _LENSES:
-        known, got = (", ".join("-".join(pair) for pair in pairs) for pairs in (_LENSES, (models,)))
-        raise CalibrationError(f"camera {name!r}: camera_model-distortion_model: expected {known}, got {got}")
-    (lens, leading), numbers, (width, height) = _LENSES[models], entry["intrinsics"], entry["resolution"]
-    coefficients = entry.get("distortion_coeffs") or ()
-    if models[1] == "none" and any(coefficients):
-        fix = "name its model, radtan or equidistant"
-        expected = f"no distortion_coeffs with distortion_model none, got {shown(coefficients)}"
-        raise CalibrationError(f"camera {name!r}: expected {expected}; {fix}")
-    coefficients = numbers[:leading] or coefficients
-    return camera_entry(name, (width, height), matrix(*numbers[leading:]), cam2ego, lens, coefficients)
+        known, got = (", ".join("-".join(map(str, pair)) for pair in pairs) for pairs in (_LENSES, (models,)))
+        raise refusal(name, known, got, WAY_OUT, key="camera_model-distortion_model")
+    is_bent, leading = models[1] != "none", _LENSES[models][1]
+    keys = ["intrinsics", "resolution", *["distortion_coeffs"] * is_bent]
+    if missing := [key for key in keys if entry.get(key) is None]:
+        raise CalibrationError(f"camera {name!r}: expected {', '.join(keys)}, missing {', '.join(missing)}")
+    if len(entry["intrinsics"]) != leading + 4:
+        raise refusal(name, f"{leading + 4} intrinsics", shown(entry["intrinsics"]))
+    if not is_bent and any(entry.get("distortion_coeffs") or ()):
+        got = shown(entry["distortion_coeffs"])
+        raise refusal(
+            name, "no distortion_coeffs with distortion_model none", got, "name its model, radtan or equidistant"
+        )
+    lens, K, coefficients, size, _ = read_fields(name, entry)
+    return camera_entry(name, size or (0, 0), K, np.eye(4), lens, coefficients)
 
 
 def kalibr_files(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,208 @@
+"""One camera of another tool's file: keys that are read, neutral ones, and those that are refused by name."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from arbiview_aug.cameras.formats.entries import WAY_OUT, lens_called, matrix, plain, refusal
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.errors import shown
+
+_K = "cameramatrix k mtx cameramat intrinsicmatrix intrinsics intrinsic camk cameraintrinsic cameraintrinsics"
+_D = (
+    "distortioncoefficients distortioncoefficient distortioncoeffs distortioncoeff distcoeffs distcoeff distortion "
+    "dist d camd distortionvector cameradistortion"
+)
+# Spellings of ROS, Foxglove, OpenCV's samples and tools, Python scripts, Kalibr, Autoware.AI, CamOdoCal, MC-Calib, T4,
+# WoodScape and DAIR-V2X, without case and punctuation.
+_SPELLINGS = {
+    **{"K": _K, "D": _D, "R": "rectificationmatrix r", "P": "projectionmatrix p"},
+    "model": "cameramodel modeltype model lens lensmodel lenstype cameratype",
+    "distortion model": "distortionmodel distmodel distortiontype cameradistortionmodel",
+    "is fisheye": "fisheyemodel fisheye isfisheye usefisheye",
+    **{"width": "imagewidth width imgwidth w", "height": "imageheight height imgheight h"},
+    "size": "imagesize imgsize resolution dim size imagedimensions cameraresolution",
+    "shape": "imageshape imgshape shape",
+    **{"binning x": "binningx", "binning y": "binningy", "window": "roi"},
+    **{"fx": "fx gamma1 mu", "fy": "fy gamma2 mv", "cx": "cx u0", "cy": "cy v0"},
+    **{key: key for key in ("xi", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")},
+}
+_MEANINGS = {spelling: meaning for meaning, spellings in _SPELLINGS.items() for spelling in spellings.split()}
+_PINHOLE = ("fx", "fy", "cx", "cy")
+_GROUPS = {*_K.split(), *_D.split(), "projectionparameters", "distortionparameters", "mirrorparameters"}
+
+# Words of keys that say something of the lens or the image, and of those that say how the calibration was made.
+_MATTERS = re.compile(
+    "dist|lens|fisheye|rectif|crop|binning|skew|alpha|mirror|flip|prism|tangential|radial|poly|focal|fov|princip|"
+    "projection|model|omni|offset|scale|intrin|matrix|coef|resol|unit|order|major|optimal|newcam|aspect|^[kpstrd]\\d$|tau"
+)
+_NEUTRAL = re.compile(
+    "error|rms|std|dev|date|time|square|board|pattern|grid|guess|covar|points|extrin|pose|^t|aspectratio$"
+)
+_NO_EFFECT = {"", "0", "00", "1", "10", "px", "pixel", "pixels", "row", "rowmajor", "opencv", "none", "false", "no"}
+_CHOICE = (
+    "for raw images remove it and the projection matrix; for rectified ones write the left 3x3 of the projection "
+    "matrix as camera matrix, and coefficients of 0"
+)
+_NAME_IT = "write distortion_model: plumb_bob (k1 k2 p1 p2), or equidistant (k1 to k4 of a fisheye), to the file"
+
+
+class Fields(NamedTuple):
+    """A camera's lens, (3, 3) intrinsics, coefficients and (width, height), and whether P has a baseline."""
+
+    lens: str
+    K: FloatArray
+    coefficients: Any
+    size: tuple[Any, Any] | None
+    is_shifted: bool
+
+
+def has_camera(data: Any) -> bool:
+    """Whether a mapping has a camera matrix, or focal lengths and a principal point."""
+    if not isinstance(data, Mapping):
+        return False
+    found = _meanings(data)
+    return isinstance(found.get("K", ("", 0))[1], list | Mapping) or {*_PINHOLE} <= found.keys()
+
+
+def _meanings(data: Mapping[Any, Any], name: str = "") -> dict[str, tuple[str, Any]]:
+    """Key and value by meaning, an unknown key by itself. Two keys of one meaning are refused, if a name is given."""
+    found: dict[str, tuple[str, Any]] = {}
+    for key, value in data.items():
+        is_group = plain(key) in _GROUPS and isinstance(value, Mapping) and "data" not in value
+        inner = _meanings(value, name) if is_group else {_MEANINGS.get(plain(key), str(key)): (str(key), value)}
+        if name and (twice := found.keys() & inner.keys()):
+            raise refusal(
+                name, "one key of each kind", f"{found[min(twice)][0]} and {inner[min(twice)][0]}", "remove one"
+            )
+        found |= inner
+    return found
+
+
+def read_fields(name: str, data: Mapping[Any, Any], also_read: str = "") -> Fields:
+    """What a file says of a camera's lens and images.
+
+    Raises:
+        CalibrationError: No camera matrix, an unknown lens, or a key that would change the views and is not read.
+    """
+    found = _meanings(data, name)
+    values = {meaning: value for meaning, (_, value) in found.items() if value is not None}
+    arrays = {key: _array(name, *found[key]) for key in "KDRP" if key in values}
+    K, D = arrays.get("K", np.zeros(0)), arrays.get("D", np.zeros(0)).ravel()
+    if K.ndim == 1 and K.size in (5, 6):  # Kalibr's xi, or two coefficients, before the focal lengths
+        K, D = K[-4:], np.concatenate([K[:-4], D])
+    if not K.size and {*_PINHOLE} <= values.keys():
+        K = np.array([float(values[key]) for key in _PINHOLE])
+    if K.size == 4:
+        K = np.array(matrix(*K.ravel()))
+    elif K.size == 9 or (K.shape in ((3, 4), (4, 4)) and not K[:3, 3].any()):
+        K = K.reshape(3, 3) if K.size == 9 else K[:3, :3]
+    else:
+        raise refusal(name, "a camera matrix of 3x3, or fx, fy, cx, cy", shown(found.get("K", "none")))
+    lens, coefficients = _lens(name, found, D)
+    if lens == "unified":  # (x, y) / (z + ξ d) is 1 + ξ times EUCM's with α = ξ / (1 + ξ) and β = 1
+        xi, *bent = coefficients
+        if any(bent) or not xi >= 0:
+            raise refusal(name, "MEI or omni without distortion", f"{shown(coefficients)} with xi first", WAY_OUT)
+        lens, coefficients, K = "eucm", [xi / (1 + xi), 1.0], K / [[1 + xi, 1, 1], [1, 1 + xi, 1], [1, 1, 1]]
+    for key, value in found.values():
+        if plain(key) not in _MEANINGS and key not in also_read.split():
+            _refuse_meaningful(name, key, value, is_straight=not D.any())
+    width, height = size = _size(name, values) or (0, 0)
+    window = {"width": 0, "height": 0, "x_offset": 0, "y_offset": 0} | (values.get("window") or {})
+    sides = [int(window[key]) for key in window if not key.startswith("do_")]
+    if any(values.get(f"binning {axis}", 0) > 1 for axis in "xy") or sides not in ([0] * 4, [width, height, 0, 0]):
+        raise refusal(name, "full images", "binning or a region of interest")
+    R, P = (arrays.get(key, np.zeros(0)) for key in "RP")
+    if R.any() and not (R.size == 9 and np.allclose(R.reshape(3, 3), np.eye(3), atol=1e-6)):
+        raise refusal(name, "the identity", shown(R.ravel().tolist()), _CHOICE, key=found["R"][0])
+    P = P.reshape(3, 4) if P.any() and P.size == 12 else np.column_stack([K, np.zeros(3)])
+    if not D.any() and lens == "pinhole" and not np.allclose(P[:, :3], K, rtol=1e-4, atol=0.01):
+        got = f"{shown(P[:, :3].tolist())} without distortion"
+        raise refusal(name, "the camera matrix", got, _CHOICE, key=found["P"][0])
+    return Fields(lens, K, coefficients, size if width and height else None, bool(np.abs(P[:, 3]).max() > 1e-6))
+
+
+def _refuse_meaningful(name: str, key: str, value: Any, *, is_straight: bool) -> None:
+    """Refuse a key that is not read and could change the views."""
+    word = plain(key)
+    if value is None or not _MATTERS.search(word) or _NEUTRAL.search(word) or plain(value) in _NO_EFFECT:
+        return
+    if value is True and is_straight and re.search("rect|undist", word):
+        return  # K is that of the images
+    try:
+        numbers = _array(name, key, value)
+    except ValueError:
+        numbers = np.ones(1)
+    if numbers.any() and not np.array_equal(numbers, np.eye(3)):
+        fix = f"remove the key if K and the coefficients describe the images as they are stored, or {WAY_OUT}"
+        raise refusal(name, "keys that are read", f"{key!r}: {shown(value)}", fix)
+
+
+def _array(name: str, key: str, value: Any) -> FloatArray:
+    """Numbers of nested lists, of text, or of a matrix with rows, cols and data."""
+    try:
+        if isinstance(value, Mapping):
+            numbers, shape = np.asarray(value["data"], float), [int(value.get(key, 0)) for key in ("rows", "cols")]
+            return numbers.reshape(shape) if math.prod(shape) == numbers.size else numbers
+        return np.asarray(value.split() if isinstance(value, str) else value, float)
+    except (TypeError, ValueError, LookupError):
+        raise refusal(name, "a matrix or list of numbers", shown(value), key=key) from None
+
+
+def _lens(name: str, found: Mapping[str, tuple[str, Any]], D: FloatArray) -> tuple[str, Any]:
+    """Lens and coefficients, by the models that the file names; those of ``unified`` begin with xi."""
+    lenses = set[str]()
+    for meaning in ("model", "distortion model", "is fisheye"):
+        key, value = found.get(meaning, ("", None))
+        if value is None or value == "":
+            continue
+        lens = lens_called(value)
+        if meaning == "is fisheye" or plain(key) == "distortiontype":  # 0 or 1; of MC-Calib, too
+            lens = "fisheye" if plain(value) in ("1", "10", "true") else "radtan"
+        if lens is None:
+            known = "plumb_bob, rational_polynomial, equidistant, fisheye, pinhole, none"
+            raise refusal(name, known, repr(value), WAY_OUT, key=key)
+        lenses.add(lens)
+    xi = [float(found["xi"][1])] if "xi" in found else []
+    is_unified = bool(xi) or "unified" in lenses
+    if len(named := {"unified"} if is_unified else lenses - {"pinhole"}) > 1:
+        raise refusal(name, "one lens", " and ".join(sorted(named)), "correct the file")
+    lens = next(iter(named), "")
+    numbers = {key: float(value) for key, (_, value) in found.items() if re.fullmatch("[kp][1-6]", key)}
+    if numbers and not D.size:
+        order = "k1 k2 p1 p2 k3 k4 k5 k6" if lens != "fisheye" and "p1" in numbers else "k1 k2 k3 k4"
+        if lens == "fisheye" and "k1" not in numbers:
+            order = "k2 k3 k4 k5"  # CamOdoCal: r = θ + k2 θ³ + ...
+        if unread := [key for key, k in numbers.items() if k and key not in order.split()]:
+            raise refusal(name, f"coefficients {order}", ", ".join(unread), WAY_OUT)
+        D = np.array([numbers.get(key, 0.0) for key in order.split()])
+    if is_unified or lens in ("double_sphere", "eucm", "fisheye"):
+        return lens, [*xi, *D]
+    if not D.any():
+        return "pinhole", ()
+    if not lens and plain(found.get("size", ("",))[0]) == "dim" and D.size == 4:
+        return "fisheye", D  # K, D and DIM are cv2.fisheye's in its best-known tutorial
+    is_none = lens_called(found.get("distortion model", ("", "radtan"))[1] or "none") == "pinhole"
+    if not lens and (is_none or (D.size == 4 and not lenses)):
+        raise refusal(name, "a lens for its coefficients", shown(D.tolist()), _NAME_IT)
+    return lens or "radtan", D
+
+
+def _size(name: str, values: Mapping[str, Any]) -> tuple[Any, Any] | None:
+    """(width, height) of the image."""
+    sizes = [(values["width"], values["height"])] if {"width", "height"} <= values.keys() else []
+    for meaning in {"size", "shape"} & values.keys():
+        value = values[meaning]
+        value = [value.get("width"), value.get("height")] if isinstance(value, Mapping) and "width" in value else value
+        sides = _array(name, meaning, value.replace("x", " ") if isinstance(value, str) else value).ravel()[:3].tolist()
+        sizes.append((sides[1], sides[0]) if meaning == "shape" else (sides[0], sides[1]))
+    sizes = [*{(float(width), float(height)) for width, height in sizes}]
+    if len(sizes) > 1:
+        raise refusal(name, "one size", f"{sizes[0]} and {sizes[1]}", "correct the file")
+    return sizes[0] if sizes else None
