@@ -29,6 +29,7 @@ USUAL_NAMES = {
     "width": ("width_px", "image_width", "w"),
     "height": ("height_px", "image_height", "h"),
     "cameras": ("cams", "sensors"),
+    "lidars": ("lidar", "lidar_sensors", "laser_scanners", "lasers", "scanners", "scanner", "laser"),
 }
 """Common names of the keys in other tools."""
 
@@ -48,6 +49,16 @@ def hint(entries: Iterable[Any], wanted: Sequence[str]) -> str:
     names = tuple(wanted)
     hints = [f"found {k!r}: did you mean {m!r}?" for k in entries if isinstance(k, str) and (m := meant_by(k, names))]
     return "".join(f"; {words}" for words in hints)
+
+
+def unknown_key(entries: Iterable[Any], known: Sequence[str]) -> str:
+    """The first key of a file of this package's that is not known, for an error; keys that begin with _ are notes."""
+    for key in entries:
+        if key not in known and not str(key).startswith(("_", ".", "x-")):
+            meant = meant_by(key, tuple(known)) if isinstance(key, str) else None
+            guess = f"did you mean {meant!r}?" if meant else f"expected keys are {', '.join(sorted(known))}"
+            return f"{str(key)[:100]!r} is not read: {guess}; if it is a note, begin it with _"
+    return ""
 
 
 @lru_cache(maxsize=4096)

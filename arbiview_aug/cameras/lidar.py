@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.cameras.key_names import hint, misnamed
+from arbiview_aug.cameras.key_names import hint, unknown_key
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.validation import checked_numbers, checked_pose
 from arbiview_aug.errors import CalibrationError, calibration_of, shown
@@ -166,8 +166,8 @@ class Lidar:
         if missing := [key for key in _KEYS if entry.get(key) is None]:
             expected, guesses = ", ".join((*_KEYS, "azimuth_deg")), hint(entry, missing)
             raise CalibrationError(f"{where}: expected keys {expected}, missing {', '.join(missing)}{guesses}")
-        for wrong, meant in misnamed(entry, ("azimuth_deg",)).items():
-            raise CalibrationError(f"{where}: {wrong!r} is not read: did you mean {meant!r}?")
+        if unknown := unknown_key(entry, (*_KEYS, "azimuth_deg", "source", "notes")):
+            raise CalibrationError(f"{where}: {unknown}")
         with calibration_of(where):
             return cls(**{key: entry[key] for key in (*_KEYS, "azimuth_deg") if key in entry})
 

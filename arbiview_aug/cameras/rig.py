@@ -12,6 +12,7 @@ import hashlib
 import json
 import math
 import os
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,19 +26,24 @@ import numpy as np
 
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.formats.entries import lens_called
 from arbiview_aug.cameras.framing import Fit
-from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
-from arbiview_aug.cameras.lens import LENSES, FloatArray, canonical_name
+from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed, unknown_key
+from arbiview_aug.cameras.lens import FloatArray, canonical_name
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.plain_yaml import dump_yaml, file_stem, parse_yaml
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.cameras.validation import MAX_SIZE_PX, MOST_M
-from arbiview_aug.errors import CalibrationError, calibration_of, shown
+from arbiview_aug.cameras.validation import MAX_SIZE_PX, MOST_M, doubts
+from arbiview_aug.errors import CalibrationError, calibration_of, shown, warn
+from arbiview_aug.files import read_bytes
 
 MOST_CAMERAS, MOST_LIDARS = 128, 32
 """Largest rig: winning sources are int8."""
 
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
+_NOTES = ("source", "notes", "ego_frame", "ground_source", "dataset", "kind", "license")
+_MOST_MASK_BYTES = 1 << 28
+_ORDERS = {"radtan": "k1 k2 p1 p2 k3 k4 k5 k6", "fisheye": "k1 k2 k3 k4"}  # of a file's coefficients
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,9 +248,10 @@ class Rig:
         """
         if not isinstance(data, Mapping) or not isinstance(data.get("cameras"), list):
             raise CalibrationError(f"{where}: expected a mapping with a list 'cameras', got {type(data).__name__}")
-        _refuse_misnamed(data, "ground_z_m", where)
+        for key in ("ground_z_m", "lidars"):
+            _refuse_misnamed(data, key, where)
         cameras = [_camera_from_dict(entry, k, folder, where) for k, entry in enumerate(data["cameras"])]
-        entries = data.get("lidars") or []
+        entries = [] if data.get("lidars") is None else data["lidars"]
         if not isinstance(entries, list) or len(entries) > MOST_LIDARS:
             raise CalibrationError(f"{where}: lidars: expected a list of at most {MOST_LIDARS}, got {shown(entries)}")
         lidars = [
@@ -293,15 +300,37 @@ def load_rig(name_or_path: Rig | str | Path) -> Rig:
     if isinstance(name_or_path, str) and name_or_path in shipped_rigs():
         text = (resources.files("arbiview_aug.cameras") / "rigs" / f"{name_or_path}.yaml").read_text()
         return Rig.from_dict(parse_yaml(text), where=f"rig {name_or_path}")
-    path = Path(name_or_path)
+    return read_rig(Path(name_or_path) if str(name_or_path) else Path("no name"))[0]
+
+
+def read_rig(path: Path) -> tuple[Rig, str]:
+    """The rig of a file, or of another tool's file or folder, and how that was read; one warning names likely mistakes.
+
+    Raises:
+        CalibrationError: As ``load_rig``.
+    """
     where = f"rig file {path}"
-    if not (os.path.isfile(path) or os.path.isdir(path)):  # unlike Path.is_file, False for a name that is too long
+    if not os.path.exists(path):  # unlike Path.exists, False for a name that is too long
         raise CalibrationError(
             f"{where}: expected a file or one of the shipped rigs ({', '.join(shipped_rigs())}), found neither"
         )
     from arbiview_aug.cameras.formats.calibration import read_calibration
 
-    return Rig.from_dict(read_calibration(path, where), folder=path.parent, where=where)
+    data = read_calibration(path, where)
+    if any(isinstance(entry, Mapping) and "file" in entry for entry in data["cameras"]):  # a frame's, with other keys
+        data = {key: value for key, value in data.items() if key != "lidar"}
+    else:
+        if unknown := unknown_key(data, ("name", "ground_z_m", "cameras", "lidars", *_NOTES)):
+            raise CalibrationError(f"{where}: {unknown}")
+        for entry in data["cameras"]:
+            known = (*_CAMERA_KEYS, *_NOTES, "lens", *USUAL_NAMES["lens"])
+            if isinstance(entry, Mapping) and (unknown := unknown_key(entry, known)):
+                raise CalibrationError(f"{where}: camera {shown(entry.get('name'))}: {unknown}")
+    rig = Rig.from_dict(data, folder=path.parent, where=where)
+    if found := doubts(rig.cameras, rig.ground_z_m):
+        more = f"; and {len(found) - 4} more" if len(found) > 4 else ""
+        warn(f"{where}: {'; '.join(found[:4])}{more}. If this is meant so, ignore the warning (docs/rigs.md)")
+    return rig, data.get("notes", "")
 
 
 def save_rig(
@@ -320,6 +349,8 @@ def save_rig(
         CalibrationError: A lens or a skew that the format has not, or a folder with files of another calibration.
     """
     rig = load_rig(rig)
+    if not str(path).strip() or "\0" in str(path):
+        raise CalibrationError(f"save_rig: path: expected a file's or folder's name, got {shown(str(path))}")
     if format == "rig":
         return rig.save(path)
     from arbiview_aug.cameras.formats.calibration import write_calibration
@@ -343,15 +374,26 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
         if not isinstance(distortion, Mapping) or not {"model", "coeffs"} <= distortion.keys():
             raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {shown(distortion)}")
         calibration |= {"lens": distortion["model"], "distortion": distortion["coeffs"]}
+        _check_order(distortion, label)
     for key in ("lens", *USUAL_NAMES["lens"]):
-        lens = canonical_name(str(entry.get(key) or "pinhole"))
-        is_same = distortion is not None and (lens not in LENSES or lens == canonical_name(distortion["model"]))
-        if lens != "pinhole" and not is_same:
+        lens = lens_called(entry.get(key) or "pinhole")
+        if lens != "pinhole" and (distortion is None or lens != canonical_name(str(distortion["model"]))):
             fix = "write distortion: {model: LENS, coeffs: [...]}, or remove it if it is something else"
             raise CalibrationError(f"{label}: {key!r} is not read: {fix}; got {shown(entry[key])}")
     mask = None if entry.get("mask") is None else read_mask(entry["mask"], folder, label)
     with calibration_of(where):
         return Camera(width_px=entry["width"], height_px=entry["height"], mask=mask, **calibration)
+
+
+def _check_order(distortion: Mapping[str, Any], label: str) -> None:
+    """Refuse coefficients in another order than the lens's, and keys that are not read."""
+    if unknown := unknown_key(distortion, ("model", "coeffs", "order")):
+        raise CalibrationError(f"{label}: distortion: {unknown}")
+    order = distortion.get("order")
+    usual = _ORDERS.get(canonical_name(str(distortion["model"])), "").split()[: len(distortion["coeffs"])]
+    named = re.findall(r"[a-z]+\d", str(order).partition("(")[0])
+    if order is not None and named != usual and not (".." in order and named == [usual[0], usual[-1]]):
+        raise CalibrationError(f"{label}: distortion: order: expected {' '.join(usual)}, got {shown(order)}")
 
 
 def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
@@ -370,10 +412,13 @@ def read_mask(file: Any, folder: Path | None, label: str) -> np.ndarray:
     """Read an (H, W) bool car-body mask from an image file: bright = scene."""
     if not isinstance(file, str) or folder is None:
         raise CalibrationError(f"{label}: mask: expected a file name beside the rig file, got {shown(file)}")
-    path = folder / file
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if os.path.isfile(path) else None
+    try:  # by bytes, as OpenCV ends the process at paths that are not UTF-8
+        content = np.frombuffer(read_bytes(folder / file, _MOST_MASK_BYTES), np.uint8)
+        image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if content.size else None
+    except (OSError, cv2.error):
+        image = None
     if image is None:
-        raise CalibrationError(f"{label}: mask: expected an image file {path}, found none that can be read")
+        raise CalibrationError(f"{label}: mask: expected an image file {folder / file}, found none that can be read")
     return np.asarray(image > 0)
 
 

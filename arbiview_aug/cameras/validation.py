@@ -6,13 +6,19 @@ All functions take the camera's name first, return read-only values and raise ``
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
 import numpy as np
 
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, LensName, canonical_name
-from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, nearest_rotation
+from arbiview_aug.cameras.rotations import (
+    CAMERA_AXES_IN_EGO,
+    nearest_rotation,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from arbiview_aug.errors import CalibrationError, one_line, shown
 
 ROTATION_TOLERANCE = 1e-4
@@ -25,6 +31,9 @@ MOST_M = 1e9  # of positions, as far
 
 _FARTHEST_M, _MOST_HEIGHT_M = 20.0, 8.0  # of a vehicle's cameras, from the ego origin and over the road
 
+_STEEP_DEG = 60.0  # cameras of vehicles roll less and look up less
+_CLEARLY = 0.35  # sine of 20 degrees to the side that a name excludes
+
 BODY_AXES = "a body's axes (ROS: x forward, z up)"  # words of messages
 
 MAX_SIZE_PX = 32766
@@ -35,8 +44,8 @@ def checked_calibration(
     name: Any, width_px: Any, height_px: Any, K: Any, cam2ego: Any, lens: Any, distortion: Any, mask: Any
 ) -> dict[str, Any]:
     """The checked fields of a camera."""
-    if not isinstance(name, str) or not name:
-        raise CalibrationError(f"camera name: expected a non-empty string, got {shown(name)}")
+    if not isinstance(name, str) or not name or re.search("[\0\ud800-\udfff]", name):
+        raise CalibrationError(f"camera name: expected a non-empty string of Unicode, got {shown(name)}")
     w, h = checked_pixels(name, "width_px", width_px), checked_pixels(name, "height_px", height_px)
     K, cam2ego, lens = checked_intrinsics(name, K), checked_pose(name, cam2ego), checked_lens(name, lens)
     return {
@@ -146,6 +155,11 @@ def checked_pose(name: str, value: Any, field: str = "cam2ego") -> FloatArray:
         raise _error(name, field, "a rotation, with entries from -1 to 1", f"{R.tolist()}", fix)
     deviation = float(np.abs(R @ R.T - np.eye(3)).max())
     determinant = float(np.linalg.det(R))
+    if deviation <= 0.1 and determinant < 0:
+        fix = f"np.diag([1, -1, 1, 1]) @ {field}, if y is to the right (CARLA, Unreal)"
+        if R[2, 1] > 0.5:  # the image's y axis is up, where the ego's z is
+            fix = f"negate {field}[:3, 1], if the camera's y axis is up (Unity)"
+        raise _error(name, field, "right-handed axes", "mirrored, left-handed ones (determinant -1)", fix)
     if deviation > ROTATION_TOLERANCE or determinant < 0:
         expected = f"a rotation (|R Rᵀ - I| <= {ROTATION_TOLERANCE:g}, determinant +1)"
         fix = f"the nearest rotation is {nearest_rotation(R).round(9).tolist()}"
@@ -233,6 +247,92 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
     if _stands(cam2ego).all():
         return f"heights over the road of {heights} m", "check that ground_z_m is the road's height in the ego frame"
     return f"cameras that lie on their side or look up, {heights} m over the road", "compare docs/rigs.md"
+
+
+def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[str]:
+    """What is likely wrong with the cameras of a rig: poses, directions unlike their names, K of another size.
+
+    Some may be meant so: cameras that are mounted on their side, or crosswise.
+    """
+    cam2ego, sides = np.stack([camera.cam2ego for camera in cameras]), [_side(camera.name) for camera in cameras]
+    mistake = pose_mistake(cam2ego, ground_z_m)
+    has_body_axes = bool(mistake) and mistake[0] == BODY_AXES
+    y_axes = (cam2ego @ _pose(CAMERA_AXES_IN_EGO) if has_body_axes else cam2ego)[:, 1, 2]
+    swapped = [left * y < -_CLEARLY for y, (_, left) in zip(y_axes, sides, strict=True) if left]
+    if len(swapped) > 1 and all(swapped):
+        fix = "diag(1, -1, 1, 1) @ cam2ego @ [[0, 0, 1, 0], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]"
+        fix = fix if has_body_axes else "negate y of the positions, and yaw"
+        return [
+            f"all cameras: left and right are swapped, as in left-handed axes (CARLA, Unreal: y to the right): {fix}"
+        ]
+    if mistake:
+        return [f"all cameras: {mistake[0]}: {mistake[1]}"]
+    lateral = [pose[1, 3] * pose[1, 2] for pose in cam2ego if abs(pose[1, 3]) > 0.2 and abs(pose[1, 2]) > 0.5]
+    found = []
+    if len(lateral) > 1 and max(lateral) < 0:
+        found.append("all cameras: those that look to the left are on the right: is y of their positions mirrored?")
+    has_front = any(ahead and not left for ahead, left in sides)
+    for camera, side in zip(cameras, sides, strict=True):
+        pose, where, up_deg = camera.cam2ego, f"camera {shown(camera.name)}", camera.elevation_deg
+        said = f"looks to {camera.azimuth_deg:+.0f} degrees, unlike its name" if _belies(pose, side, has_front) else ""
+        if up_deg > _STEEP_DEG:
+            said = f"looks up by {up_deg:.0f} degrees"
+        elif up_deg > -_STEEP_DEG and abs(_roll_deg(pose)) > _STEEP_DEG:
+            said = f"is rolled by {_roll_deg(pose):.0f} degrees"
+        if said:
+            fixes = (f" ({words})" for instead, words in _instead(pose) if _fits(instead, side, has_front))
+            found.append(f"{where} {said}{next(fixes, '')}")
+        elif not is_mounted(pose[None], ground_z_m)[0]:
+            x, y, z = pose[:3, 3]
+            found.append(f"{where} is at ({x:.1f}, {y:.1f}), {z - ground_z_m:.1f} m over the road")
+        (h, w), (x, y) = camera.size, camera.K[:2, 2] + 0.5
+        if not (0 < x < w and 0 < y < h) or (abs(x * h / (y * w) - 1) < 0.1 and not 0.37 < x / w < 0.67):
+            found.append(f"{where}: K is that of an image of about {2 * x:.0f}x{2 * y:.0f}, not of {w}x{h}")
+    return found
+
+
+def _side(name: str) -> tuple[int, int]:
+    """Forward 1 or backward -1, left 1 or right -1, by the words of a name; 0 without or with both."""
+    words = {*re.findall("front|forward|back|rear|left|right|mirror", name.lower())}
+    if "mirror" in words:  # rear-view mirrors are at the front
+        return 0, 0
+    return bool(words & {"front", "forward"}) - bool(words & {"back", "rear"}), ("left" in words) - ("right" in words)
+
+
+def _belies(pose: FloatArray, side: tuple[int, int], has_front: bool) -> bool:
+    """Whether a camera looks elsewhere than its name says; a stereo pair's left and right may look ahead."""
+    (ahead, left), (x, y) = side, pose[:2, 2]
+    if math.hypot(x, y) < 0.5:
+        return False
+    if ahead and left:
+        return bool(left * y < -_CLEARLY or ahead * x < -0.5)
+    return bool((ahead and ahead * x < 0.2) or (left and left * y < (0.2 if has_front else -_CLEARLY)))
+
+
+def _roll_deg(pose: FloatArray) -> float:
+    return math.degrees(math.atan2(pose[2, 0], -pose[2, 1]))
+
+
+def _fits(pose: FloatArray, side: tuple[int, int], has_ahead: bool) -> bool:
+    """Whether a camera is upright, nearly level, and looks where its name says."""
+    return abs(_roll_deg(pose)) < 45 and abs(pose[2, 2]) < 0.7 and not _belies(pose, side, has_ahead)
+
+
+def _pose(R: FloatArray) -> FloatArray:
+    pose = np.eye(4)
+    pose[:3, :3] = R
+    return pose
+
+
+def _instead(pose: FloatArray) -> Iterator[tuple[FloatArray, str]]:
+    """Poses that a wrong one may stand for, with the mistake and the fix."""
+    w, x, y, z = quaternion_from_rotation(pose[:3, :3])
+    axes = f"multiply cam2ego[:3, :3] by {CAMERA_AXES_IN_EGO.astype(int).tolist()} from the right"
+    yield pose @ _pose(CAMERA_AXES_IN_EGO), f"it seems to have {BODY_AXES}: {axes}"
+    yield _pose(rotation_from_quaternion((z, w, x, y))), "its quaternion seems to be x y z w, where w x y z is read"
+    yield _pose(rotation_from_quaternion((x, y, z, w))), "its quaternion seems to be w x y z, where x y z w is read"
+    yield pose @ np.diag([1.0, -1, -1, 1]), "it seems to have OpenGL's axes (y up, z backward): negate cam2ego[:3, 1:3]"
+    yield _pose(pose[:3, :3].T), "it seems to be ego2cam: pass np.linalg.inv(cam2ego)"
 
 
 def _stands(cam2ego: FloatArray) -> BoolArray:

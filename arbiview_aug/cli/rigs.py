@@ -8,9 +8,9 @@ import os
 import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.formats.calibration import read_calibration, recognised
+from arbiview_aug.cameras.formats.calibration import recognised
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.rig import Rig, load_rig, shipped_rigs
+from arbiview_aug.cameras.rig import Rig, load_rig, read_rig, shipped_rigs
 from arbiview_aug.cli.arguments import data
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
@@ -80,9 +80,8 @@ def _load(name: str) -> tuple[Rig, str]:
         return load_rig(root / CALIBRATION_FILE), ""
     is_rig = os.path.isfile(root) or (os.path.isdir(root) and recognised(root))
     if kind is None and name not in shipped_rigs() and is_rig:
-        plain = read_calibration(root, where := f"rig file {root}")
-        rig = Rig.from_dict(plain, folder=root.parent, where=where)
-        return rig, f"\n  {plain['notes']}" if "notes" in plain else ""
+        rig, notes = read_rig(root)
+        return rig, f"\n  {notes}" if notes else ""
     if kind is None and not os.path.isdir(root):
         return load_rig(name), ""
     try:

@@ -62,7 +62,7 @@ def test_a_double_in_large_json_is_found_soon():
 def test_aliases_of_a_real_file_stay(tmp_path):
     path = tmp_path / "rig.yaml"
     cameras = CAMERA.replace("width: 64\n  height: 32", "<<: *base")
-    path.write_text("base: &base {width: 64, height: 32}\ncameras:" + cameras)
+    path.write_text("_base: &base {width: 64, height: 32}\ncameras:" + cameras)
     assert load_rig(path)["front"].size == (32, 64)
 
 

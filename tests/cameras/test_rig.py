@@ -111,7 +111,7 @@ def entry(**changes: object) -> dict:
         ({"cameras": [entry(distortion=[0.1])]}, r"camera 'front': distortion: expected null or \{model, coeffs\}"),
         ({"cameras": [entry(distortion={"model": "mei", "coeffs": []})]}, r"lens: expected one of .* got 'mei'"),
         ({"cameras": [entry(mask="nowhere.png")]}, r"camera 'front': mask: expected an image file .*nowhere.png"),
-        ({"cameras": [entry(mask_file="nowhere.png")]}, r"'mask' is absent or null, and 'mask_file' is not read"),
+        ({"cameras": [entry(mask_file="nowhere.png")]}, r"'mask_file' is not read: did you mean 'mask'"),
         ({"cameras": [entry(lens="fisheye")]}, r"camera 'front': 'lens' is not read: write distortion: \{model: LENS"),
         *(
             ({"cameras": [entry(**{key: lens})]}, rf"camera 'front': '{key}' is not read: .* got '{lens}'")
