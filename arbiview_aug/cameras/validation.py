@@ -31,6 +31,7 @@ MOST_M = 1e9  # of positions, as far
 
 _FARTHEST_M, _MOST_HEIGHT_M = 20.0, 8.0  # of a vehicle's cameras, from the ego origin and over the road
 
+_COMPARE = "compare docs/rigs.md"  # the fix of an unknown mistake
 _STEEP_DEG = 60.0  # cameras of vehicles roll less and look up less
 _CLEARLY = 0.35  # sine of 20 degrees to the side that a name excludes
 
@@ -246,7 +247,7 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
     heights = ", ".join(f"{z:+.1f}" for z in cam2ego[:, 2, 3] - ground_z_m)
     if _stands(cam2ego).all():
         return f"heights over the road of {heights} m", "check that ground_z_m is the road's height in the ego frame"
-    return f"cameras that lie on their side or look up, {heights} m over the road", "compare docs/rigs.md"
+    return f"cameras that lie on their side or look up, {heights} m over the road", _COMPARE
 
 
 def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[str]:
@@ -265,7 +266,7 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[str]:
         return [
             f"all cameras: left and right are swapped, as in left-handed axes (CARLA, Unreal: y to the right): {fix}"
         ]
-    if mistake:
+    if mistake and mistake[1] != _COMPARE:
         return [f"all cameras: {mistake[0]}: {mistake[1]}"]
     lateral = [pose[1, 3] * pose[1, 2] for pose in cam2ego if abs(pose[1, 3]) > 0.2 and abs(pose[1, 2]) > 0.5]
     found = []
@@ -274,27 +275,36 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[str]:
     has_front = any(ahead and not left for ahead, left in sides)
     for camera, side in zip(cameras, sides, strict=True):
         pose, where, up_deg = camera.cam2ego, f"camera {shown(camera.name)}", camera.elevation_deg
+        fixes = [words for instead, words in _instead(pose) if _fits(instead, side, has_front)]
         said = f"looks to {camera.azimuth_deg:+.0f} degrees, unlike its name" if _belies(pose, side, has_front) else ""
         if up_deg > _STEEP_DEG:
             said = f"looks up by {up_deg:.0f} degrees"
         elif up_deg > -_STEEP_DEG and abs(_roll_deg(pose)) > _STEEP_DEG:
             said = f"is rolled by {_roll_deg(pose):.0f} degrees"
+        elif up_deg < -75 and side[1] and fixes:
+            said = "looks straight down"
         if said:
-            fixes = (f" ({words})" for instead, words in _instead(pose) if _fits(instead, side, has_front))
-            found.append(f"{where} {said}{next(fixes, '')}")
+            found.append(f"{where} {said}" + (f" ({fixes[0]})" if fixes else ""))
         elif not is_mounted(pose[None], ground_z_m)[0]:
             x, y, z = pose[:3, 3]
             found.append(f"{where} is at ({x:.1f}, {y:.1f}), {z - ground_z_m:.1f} m over the road")
-        (h, w), (x, y) = camera.size, camera.K[:2, 2] + 0.5
-        if not (0 < x < w and 0 < y < h) or (abs(x * h / (y * w) - 1) < 0.1 and not 0.37 < x / w < 0.67):
-            found.append(f"{where}: K is that of an image of about {2 * x:.0f}x{2 * y:.0f}, not of {w}x{h}")
+        size, middle = np.array(camera.size[::-1]), camera.K[:2, 2] + 0.5
+        by_axis, by_other = middle / size, middle / size[::-1]
+        is_scaled = abs(by_axis[0] / by_axis[1] - 1) < 0.1 and not 0.37 < by_axis[0] < 0.67
+        is_swapped = np.abs(by_axis - 0.5).max() > 0.1 and np.abs(by_other - 0.5).max() < 0.05
+        if is_scaled or is_swapped or not ((by_axis > 0) & (by_axis < 1)).all():
+            given, (w, h) = f"{2 * middle[0]:.0f}x{2 * middle[1]:.0f}", size
+            found.append(f"{where}: K seems to be that of an image of {given}, not of {w}x{h}")
     return found
 
 
 def _side(name: str) -> tuple[int, int]:
     """Forward 1 or backward -1, left 1 or right -1, by the words of a name; 0 without or with both."""
-    words = {*re.findall("front|forward|back|rear|left|right|mirror", name.lower())}
-    if "mirror" in words:  # rear-view mirrors are at the front
+    words = {*re.findall("front|forward|back|rear|left|right|mirror|stereo", name.lower())}
+    if words & {
+        "mirror",
+        "stereo",
+    }:  # rear-view mirrors are at the front, and left and right of a stereo pair look ahead
         return 0, 0
     return bool(words & {"front", "forward"}) - bool(words & {"back", "rear"}), ("left" in words) - ("right" in words)
 

@@ -15,7 +15,6 @@ import yaml
 
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.formats import camera_files, colmap, datasets, kalibr
-from arbiview_aug.cameras.formats.entries import WAY_OUT
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.plain_yaml import MOST_BYTES, dump_yaml
@@ -83,27 +82,6 @@ FORMATS = {
     ),
 }  # fmt: skip
 """Formats by name, in the order in which folders are tried."""
-
-_UNREAD = {
-    "KITTI's text": (
-        r"(?m)^P(_rect_)?\d{1,2}:",
-        "of P the left 3x3 as K, pinhole; cam2ego is inv(R0_rect @ Tr_velo_to_cam) with the Velodyne as ego frame",
-    ),
-    "MEI (CamOdoCal, KITTI-360)": ("mirror_parameters", f"or {WAY_OUT}"),
-    "ORB-SLAM": (r"(?m)^\s*Camera1?[._](type|fx)", "PinHole has radtan k1 k2 p1 p2, KannalaBrandt8 fisheye k1 to k4"),
-    "basalt": ('"camera_type"', "kb4 is fisheye k1 to k4, ds is double_sphere"),
-    "nerfstudio": (r"\bfl_x\b", "K of fl_x fl_y cx cy; negate columns 2 and 3 of transform_matrix (OpenGL's axes)"),
-    "NVIDIA's rig": ("nominalSensor2Rig|bw-poly", "ftheta_backward of bw-poly (docs/formats.md, Lenses)"),
-    "A2D2": ("CamMatrix", "K is CamMatrix, pinhole, of undistorted images"),
-    "Argoverse 1": ("focal_length_x_px_", "K of focal_length and focal_center; vehicle_SE3_camera_ is cam2ego"),
-    "ONCE": ("cam_to_velo", "K is cam_intrinsic; cam_to_velo is cam2ego with the LiDAR as ego frame"),
-    "ZOD": (r"(?s)undistortion.*image_dimensions", "fisheye k1 to k4 of distortion"),
-    "Cityscapes": (r"(?s)baseline.*\bu0\b", "K of fx fy u0 v0, pinhole"),
-    "CARLA, LGSVL": (r"image_size_x|sensor\.camera", "y is to the right there: negate y and yaw for Camera.looking"),
-    "OpenCV's stereo": (r"(?m)^\s*\"?M1\b", "or a file a camera: M1 as camera_matrix, D1 as distortion_coefficients"),
-    "Autoware's sensors": (r"\bcamera_link:", "or these poses to mounting.yaml beside CameraInfo files"),
-}
-"""Formats that are not read: how their text is recognised, and what a rig file takes from them."""
 
 _FIX = "convert them, write a rig file, or move them elsewhere"
 _CAMERA = re.compile(rb"(?i)camera_?mat|intrinsic|distort|camera_?model|\bmtx\b|focal_?length|\bf[lx]_?x?\b")
@@ -181,12 +159,10 @@ def recognised(path: Path) -> str | None:
         files = camera_files.camera_files(path)
         return camera_files.tool_of(files[0]) if files else None
     if path.suffix == ".txt":
-        return None if _tool(read_bytes(path, 1 << 28)) else "colmap"
+        return None if camera_files.unread_tool(read_bytes(path, 1 << 28)) else "colmap"
     by_name = {".bin": "colmap", ".feather": "argoverse2", datasets.CALIBRATED_SENSOR: "nuscenes"}
     if path.name in by_name or path.suffix in by_name:
         return by_name.get(path.name) or by_name[path.suffix]
-    if _tool(read_bytes(path, MOST_BYTES)):
-        return None
     data = next(iter(camera_files.documents(path)), None)
     if datasets.waymo_entries(data):
         return "waymo"
@@ -214,22 +190,18 @@ def _seems(path: Path) -> str:
         content = read_bytes(path, MOST_BYTES)
     except OSError as error:
         return "" if error.errno == errno.EFBIG else f"a file that cannot be read: {error.strerror}"
-    if tool := _tool(content):
-        return f"{tool}, which is not read: write a rig file, docs/formats.md; {_UNREAD[tool][1]}"
-    if not _CAMERA.search(content.replace(b"\0", b"")) or b"cam2ego" in content:
-        return ""
-    try:
-        if path.suffix in camera_files.SUFFIXES:
-            camera_files.documents(path)
-    except CalibrationError as error:
-        return str(error).removeprefix(f"{path.name}: ")
-    return "a calibration that is not recognised"
-
-
-def _tool(content: bytes) -> str | None:
-    """Name in ``_UNREAD`` of a file's content."""
-    text = content.decode("utf-8", "replace")
-    return next((tool for tool, (pattern, _) in _UNREAD.items() if re.search(pattern, text)), None)
+    if tool := camera_files.unread_tool(content):
+        return tool
+    seems = "a calibration that is not recognised" if _CAMERA.search(content) and b"cam2ego" not in content else ""
+    if path.suffix in camera_files.SUFFIXES:
+        try:
+            if seems or not content.decode("utf-8-sig"):
+                camera_files.documents(path)
+        except CalibrationError as error:
+            return str(error).removeprefix(f"{path.name}: ")
+        except UnicodeError:
+            return "text that is not in UTF-8, got another encoding: save it as UTF-8"
+    return seems
 
 
 def write_calibration(data: Mapping[str, Any], folder: Path, name: str) -> Path:

@@ -32,6 +32,26 @@ _ROS_KEYS = {"distortionmodel", "p", "projectionmatrix", "binningx"}
 _WOODSCAPE_KEYS = set("aspect_ratio cx_offset cy_offset height width k1 k2 k3 k4 model poly_order".split())
 _DEFAULT_NAME = "narrow_stereo"  # of camera_calibration, for every camera
 
+_UNREAD = {
+    "KITTI's text": (
+        r"(?m)^P(_rect_)?\d{1,2}:",
+        "of P the left 3x3 as K, pinhole; cam2ego is inv(R0_rect @ Tr_velo_to_cam) with the Velodyne as ego frame",
+    ),
+    "ORB-SLAM": (r"(?m)^\s*Camera1?[._](type|fx)", "PinHole has radtan k1 k2 p1 p2, KannalaBrandt8 fisheye k1 to k4"),
+    "basalt": ('"camera_type"', "kb4 is fisheye k1 to k4, ds is double_sphere"),
+    "nerfstudio": (r"\bfl_x\b", "K of fl_x fl_y cx cy; negate columns 2 and 3 of transform_matrix (OpenGL's axes)"),
+    "NVIDIA's rig": ("nominalSensor2Rig|bw-poly", "ftheta_backward of bw-poly (docs/formats.md, Lenses)"),
+    "A2D2": ("CamMatrix", "K is CamMatrix, pinhole, of undistorted images"),
+    "Argoverse 1": ("focal_length_x_px_", "K of focal_length and focal_center; vehicle_SE3_camera_ is cam2ego"),
+    "ONCE": ("cam_to_velo", "K is cam_intrinsic; cam_to_velo is cam2ego with the LiDAR as ego frame"),
+    "ZOD": (r"(?s)undistortion.*image_dimensions", "fisheye k1 to k4 of distortion"),
+    "Cityscapes": (r"(?s)baseline.*\bu0\b", "K of fx fy u0 v0, pinhole"),
+    "CARLA, LGSVL": (r"image_size_x|sensor\.camera", "y is to the right there: negate y and yaw for Camera.looking"),
+    "OpenCV's stereo": (r"(?m)^\s*\"?M1\b", "or a file a camera: M1 as camera_matrix, D1 as distortion_coefficients"),
+    "Autoware's sensors": (r"\bcamera_link:", "or these poses to mounting.yaml beside CameraInfo files"),
+}
+"""Formats that are not read: how their text is recognised, and what a rig file takes from them."""
+
 # Words of which a file with a camera has one; YAML takes seconds a megabyte.
 _WORDS = re.compile(r"(?i)matrix|mat\b|\bmtx\b|intrinsic|\bcam_k\b|\bk\b|\bfx\b|\bmu\b|\bgamma1\b|radial_poly")
 
@@ -45,15 +65,26 @@ def camera_files(folder: Path) -> list[Path]:
 def has_cameras(path: Path) -> bool:
     """Whether a file has a camera that is read here; False if it is no text, or too large."""
     try:
-        if not _WORDS.search(read_bytes(path, MOST_BYTES).decode("utf-8-sig", "replace")):
-            return False
-        return bool(_cameras(path))
+        content = read_bytes(path, MOST_BYTES)
+        has_words = _WORDS.search(content.decode("utf-8-sig", "replace")) and not unread_tool(content)
+        return bool(has_words and _cameras(path))
     except CalibrationError:
         return False
     except OSError as error:
         if error.errno == errno.EFBIG:
             return False
         raise CalibrationError(f"{path.name}: expected a file that can be read, got {error.strerror}") from None
+
+
+def unread_tool(content: bytes) -> str:
+    """The tool of a file's content, if it is one that is not read, and what to do; else nothing."""
+    text = content.decode("utf-8", "replace")
+    tools = (
+        f"{tool}, which is not read: write a rig file (docs/formats.md); {fix}"
+        for tool, (words, fix) in _UNREAD.items()
+        if re.search(words, text)
+    )
+    return next(tools, "")
 
 
 def documents(path: Path) -> list[Any]:
@@ -69,23 +100,21 @@ def tool_of(path: Path) -> str:
 
 
 def _cameras(path: Path) -> dict[str, Mapping[Any, Any]]:
-    """The cameras of a file, by the file's name; by their keys or frames where it has several."""
-    keyed = [
-        (str(key), part)
-        for data in documents(path)
-        if not (isinstance(data, Mapping) and isinstance(data.get("cameras"), list))  # a rig file
-        for key, part in (data.items() if isinstance(data, Mapping) and not _is_camera(data) else _listed(data))
-        if _is_camera(part)
-    ]
-    if len(keyed) == 1 or len({key for key, _ in keyed}) == 1:  # a stream of one camera
-        return {path.stem if not keyed[0][0] or "frame_id" in str(keyed[0][1]) else keyed[0][0]: keyed[0][1]}
-    return {key or f"{path.stem} {k}": part for k, (key, part) in enumerate(keyed)}
+    """The cameras of a file, by the file's name; by their keys, names or frames where it has several."""
+    keyed, listed = dict[str, Mapping[Any, Any]](), dict[str, Mapping[Any, Any]]()
+    for data in documents(path):
+        if isinstance(data, Mapping) and not _is_camera(data) and not isinstance(data.get("cameras"), list):
+            keyed |= {str(key): part for key, part in data.items() if _is_camera(part)}
+        for part in filter(_is_camera, data if isinstance(data, list) else [data]):
+            key = _declared(part) or _frame_id(part).removesuffix("_frame").removesuffix("_optical") or path.stem
+            if key in listed and _bare(listed[key]) != _bare(part):
+                key = f"{key} {len(listed)}"
+            listed.setdefault(key, part)  # a stream has the same camera again
+    return keyed | (listed if len(listed) != 1 else dict(zip([path.stem], listed.values(), strict=True)))
 
 
-def _listed(data: Any) -> list[tuple[str, Any]]:
-    """The entries of a list, or one document, by their frames."""
-    parts = data if isinstance(data, list) else [data]
-    return [(_frame_id(part) if isinstance(part, Mapping) else "", part) for part in parts]
+def _bare(data: Mapping[Any, Any]) -> dict[Any, Any]:
+    return {key: value for key, value in data.items() if key not in ("header", "timestamp")}
 
 
 def _is_camera(data: Any) -> bool:
