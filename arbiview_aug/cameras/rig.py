@@ -349,11 +349,7 @@ def save_rig(
         CalibrationError: A lens or a skew that the format has not, or a folder with files of another calibration.
     """
     rig = load_rig(rig)
-    try:
-        is_name = bool(str(path).strip()) and b"\0" not in os.fsencode(path)
-    except UnicodeEncodeError:
-        is_name = False
-    if not is_name:
+    if not str(path).strip() or re.search("[\0\ud800-\udbff]", str(path)):
         raise CalibrationError(f"save_rig: path: expected a file's or folder's name, got {shown(str(path))}")
     if format == "rig":
         return rig.save(path)

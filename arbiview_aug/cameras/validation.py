@@ -33,7 +33,6 @@ _FARTHEST_M, _MOST_HEIGHT_M = 20.0, 8.0  # of a vehicle's cameras, from the ego 
 
 _COMPARE = "compare docs/rigs.md"  # the fix of an unknown mistake
 _STEEP_DEG = 60.0  # cameras of vehicles roll less and look up less
-_CLEARLY = 0.35  # sine of 20 degrees to the side that a name excludes
 
 BODY_AXES = "a body's axes (ROS: x forward, z up)"  # words of messages
 
@@ -256,76 +255,67 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[str]:
     Some may be meant so: cameras that are mounted on their side, or crosswise.
     """
     cam2ego, sides = np.stack([camera.cam2ego for camera in cameras]), [_side(camera.name) for camera in cameras]
-    mistake = pose_mistake(cam2ego, ground_z_m)
-    has_body_axes = bool(mistake) and mistake[0] == BODY_AXES
-    y_axes = (cam2ego @ _pose(CAMERA_AXES_IN_EGO) if has_body_axes else cam2ego)[:, 1, 2]
-    swapped = [left * y < -_CLEARLY for y, (_, left) in zip(y_axes, sides, strict=True) if left]
+    mistake, fix = pose_mistake(cam2ego, ground_z_m) or ("", "")
+    y_axes = (cam2ego @ _pose(CAMERA_AXES_IN_EGO) if mistake == BODY_AXES else cam2ego)[:, 1, 2]
+    swapped = [left * y < -0.35 for y, (_, left) in zip(y_axes, sides, strict=True) if left]  # by 20 degrees or more
     if len(swapped) > 1 and all(swapped):
-        fix = "diag(1, -1, 1, 1) @ cam2ego @ [[0, 0, 1, 0], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]"
-        fix = fix if has_body_axes else "negate y of the positions, and yaw"
+        unreal = "diag(1, -1, 1, 1) @ cam2ego @ [[0, 0, 1, 0], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]"
+        fix = unreal if mistake == BODY_AXES else "negate y of the positions, and yaw"
         return [
             f"all cameras: left and right are swapped, as in left-handed axes (CARLA, Unreal: y to the right): {fix}"
         ]
-    if mistake and mistake[1] != _COMPARE:
-        return [f"all cameras: {mistake[0]}: {mistake[1]}"]
+    if mistake and fix != _COMPARE:
+        return [f"all cameras: {mistake}: {fix}"]
     lateral = [pose[1, 3] * pose[1, 2] for pose in cam2ego if abs(pose[1, 3]) > 0.2 and abs(pose[1, 2]) > 0.5]
     found = []
     if len(lateral) > 1 and max(lateral) < 0:
-        found.append("all cameras: those that look to the left are on the right: is y of their positions mirrored?")
-    has_front = any(ahead and not left for ahead, left in sides)
+        found.append("all cameras: those on the left look to the right: is y of the positions mirrored?")
+    has_front = (1, 0) in sides
     for camera, side in zip(cameras, sides, strict=True):
-        pose, where, up_deg = camera.cam2ego, f"camera {shown(camera.name)}", camera.elevation_deg
-        fixes = [words for instead, words in _instead(pose) if _fits(instead, side, has_front)]
-        said = f"looks to {camera.azimuth_deg:+.0f} degrees, unlike its name" if _belies(pose, side, has_front) else ""
-        if up_deg > _STEEP_DEG:
-            said = f"looks up by {up_deg:.0f} degrees"
+        pose, up_deg, said = camera.cam2ego, camera.elevation_deg, []
+        fixes = [f" ({words})" for instead, words in _instead(pose) if _fits(instead, side, has_front)][:1]
+        if up_deg > _STEEP_DEG or (up_deg < -75 and side[1] and fixes):
+            said.append(f"looks {'up' if up_deg > 0 else 'down'} by {abs(up_deg):.0f} degrees")
         elif up_deg > -_STEEP_DEG and abs(_roll_deg(pose)) > _STEEP_DEG:
-            said = f"is rolled by {_roll_deg(pose):.0f} degrees"
-        elif up_deg < -75 and side[1] and fixes:
-            said = "looks straight down"
-        if said:
-            found.append(f"{where} {said}" + (f" ({fixes[0]})" if fixes else ""))
-        elif not is_mounted(pose[None], ground_z_m)[0]:
-            x, y, z = pose[:3, 3]
-            found.append(f"{where} is at ({x:.1f}, {y:.1f}), {z - ground_z_m:.1f} m over the road")
+            said.append(f"is rolled by {_roll_deg(pose):.0f} degrees")
+        elif _belies(pose, side, has_front):
+            said.append(f"looks to {camera.azimuth_deg:+.0f} degrees, unlike its name")
+        said = ["".join([*said, *fixes])] if said else []
+        if not said and not is_mounted(pose[None], ground_z_m)[0]:
+            said.append("is at ({:.1f}, {:.1f}), {:.1f} m over the road".format(*pose[:2, 3], pose[2, 3] - ground_z_m))
         size, middle = np.array(camera.size[::-1]), camera.K[:2, 2] + 0.5
-        by_axis, by_other = middle / size, middle / size[::-1]
-        is_scaled = abs(by_axis[0] / by_axis[1] - 1) < 0.1 and not 0.37 < by_axis[0] < 0.67
-        is_swapped = np.abs(by_axis - 0.5).max() > 0.1 and np.abs(by_other - 0.5).max() < 0.05
-        if is_scaled or is_swapped or not ((by_axis > 0) & (by_axis < 1)).all():
-            given, (w, h) = f"{2 * middle[0]:.0f}x{2 * middle[1]:.0f}", size
-            found.append(f"{where}: K seems to be that of an image of {given}, not of {w}x{h}")
+        (x, y), other = middle / size, middle / size[::-1]
+        is_scaled = abs(x / y - 1) < 0.1 and not 0.37 < x < 0.67
+        is_swapped = max(abs(x - 0.5), abs(y - 0.5)) > 0.1 and np.abs(other - 0.5).max() < 0.05
+        if is_scaled or is_swapped or not (0 < x < 1 and 0 < y < 1):
+            said.append("has K of an image of {:.0f}x{:.0f}, not of {}x{}".format(*2 * middle, *size))
+        found += [f"camera {shown(camera.name)} {words}" for words in said]
     return found
 
 
 def _side(name: str) -> tuple[int, int]:
     """Forward 1 or backward -1, left 1 or right -1, by the words of a name; 0 without or with both."""
     words = {*re.findall("front|forward|back|rear|left|right|mirror|stereo", name.lower())}
-    if words & {
-        "mirror",
-        "stereo",
-    }:  # rear-view mirrors are at the front, and left and right of a stereo pair look ahead
+    if words & {"mirror", "stereo"}:  # rear-view mirrors are at the front, a stereo pair's left and right look ahead
         return 0, 0
     return bool(words & {"front", "forward"}) - bool(words & {"back", "rear"}), ("left" in words) - ("right" in words)
 
 
 def _belies(pose: FloatArray, side: tuple[int, int], has_front: bool) -> bool:
-    """Whether a camera looks elsewhere than its name says; a stereo pair's left and right may look ahead."""
-    (ahead, left), (x, y) = side, pose[:2, 2]
-    if math.hypot(x, y) < 0.5:
-        return False
-    if ahead and left:
-        return bool(left * y < -_CLEARLY or ahead * x < -0.5)
-    return bool((ahead and ahead * x < 0.2) or (left and left * y < (0.2 if has_front else -_CLEARLY)))
+    """Whether a camera looks elsewhere than its name says; left and right without a front may be a stereo pair."""
+    flat = math.hypot(*pose[:2, 2])
+    most_deg = 100 if all(side) else 80 if has_front or side[0] else 110
+    cosine = np.dot(pose[:2, 2], side) / max(flat * math.hypot(*side), 1e-9)
+    return any(side) and flat > 0.5 and bool(cosine < math.cos(math.radians(most_deg)))
 
 
 def _roll_deg(pose: FloatArray) -> float:
     return math.degrees(math.atan2(pose[2, 0], -pose[2, 1]))
 
 
-def _fits(pose: FloatArray, side: tuple[int, int], has_ahead: bool) -> bool:
+def _fits(pose: FloatArray, side: tuple[int, int], has_front: bool) -> bool:
     """Whether a camera is upright, nearly level, and looks where its name says."""
-    return abs(_roll_deg(pose)) < 45 and abs(pose[2, 2]) < 0.7 and not _belies(pose, side, has_ahead)
+    return abs(_roll_deg(pose)) < 45 and abs(pose[2, 2]) < 0.7 and not _belies(pose, side, has_front)
 
 
 def _pose(R: FloatArray) -> FloatArray:

@@ -116,13 +116,9 @@ def read_calibration(path: Path, where: str) -> Any:
     if name is None:
         known = "; ".join(f"{form.tool} ({form.keys})" for form in FORMATS.values())
         if is_folder:
-            got = f", got {seems}" if seems else ""
-            raise CalibrationError(f"{where}: expected a rig file, or a folder of {known}{got}; docs/rigs.md")
-        got = type(data).__name__ + hint(data if isinstance(data, Mapping) else (), ("cameras",))
-        expected = "expected a mapping with a list 'cameras'"
-        raise CalibrationError(
-            f"{where}: {expected}, got {got}: {seems}. Read are rig files, and {known}; docs/rigs.md"
-        )
+            raise CalibrationError(f"{where}: expected a rig file, or a folder of {known}, got {seems or 'none'}")
+        got = f"{type(data).__name__}{hint(data if isinstance(data, Mapping) else (), ('cameras',))}; {seems}"
+        raise CalibrationError(f"{where}: expected a mapping with a list 'cameras', got {got}. Also read are {known}")
     form, folder = FORMATS[name], path if is_folder else path.parent
     try:
         mounting = Mounting.read(folder)
@@ -138,16 +134,13 @@ def read_calibration(path: Path, where: str) -> Any:
         got = f"missing {error}" if isinstance(error, KeyError) else f"got {one_line(described(error))}"
         raise CalibrationError(f"{where}: expected a calibration as {form.tool} writes it, {got}") from None
     if is_folder and seems:
-        raise CalibrationError(
-            f"{where}: {form.tool}: expected all cameras in files of this tool, got also {seems}: {_FIX}"
-        )
+        raise CalibrationError(f"{where}: {form.tool}: expected cameras of one tool, got also {seems}: {_FIX}")
     if is_folder and unread:
         warn(f"{where}: {form.tool}: not read: {', '.join(file.name for file in unread)}")
     ground, source = next((height, source) for height, source in heights if height is not None)
     road = f"road at z = {ground} m, {f'from {source}' if source else 'assumed'}"
     notes, stem = f"read as {form.tool}: {form.convention}; {road}", folder.name if is_folder else path.stem
-    stem = stem.encode(errors="replace").decode()
-    return {"name": stem, "ground_z_m": ground, "notes": notes, "cameras": cameras}
+    return {"name": stem.encode(errors="replace").decode(), "ground_z_m": ground, "notes": notes, "cameras": cameras}
 
 
 def recognised(path: Path) -> str | None:

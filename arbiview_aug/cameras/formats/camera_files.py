@@ -52,6 +52,8 @@ _UNREAD = {
 }
 """Formats that are not read: how their text is recognised, and what a rig file takes from them."""
 
+_INSTEAD = "which is not read: write a rig file (docs/formats.md)"
+
 # Words of which a file with a camera has one; YAML takes seconds a megabyte.
 _WORDS = re.compile(r"(?i)matrix|mat\b|\bmtx\b|intrinsic|\bcam_k\b|\bk\b|\bfx\b|\bmu\b|\bgamma1\b|radial_poly")
 
@@ -79,11 +81,7 @@ def has_cameras(path: Path) -> bool:
 def unread_tool(content: bytes) -> str:
     """The tool of a file's content, if it is one that is not read, and what to do; else nothing."""
     text = content.decode("utf-8", "replace")
-    tools = (
-        f"{tool}, which is not read: write a rig file (docs/formats.md); {fix}"
-        for tool, (words, fix) in _UNREAD.items()
-        if re.search(words, text)
-    )
+    tools = (f"{tool}, {_INSTEAD}; {fix}" for tool, (words, fix) in _UNREAD.items() if re.search(words, text))
     return next(tools, "")
 
 
@@ -171,13 +169,7 @@ def _declared(data: Mapping[Any, Any]) -> str:
     return str(data.get("camera_name") or data.get("name") or "").strip('"')
 
 
-def _read(
-    path: Path,
-    name: str,
-    data: Mapping[Any, Any],
-    mounting: Mounting,
-    frames: Mapping[str, FloatArray],
-) -> dict[str, Any]:
+def _read(file: Path, name: str, data: Any, mounting: Mounting, frames: Mapping[str, FloatArray]) -> dict[str, Any]:
     if _is_woodscape(data):
         return _woodscape(name, data, mounting)
     lens, K, coefficients, size, is_shifted = read_fields(name, data)
@@ -185,7 +177,7 @@ def _read(
     optical = [frame_id] if frame_id else [name.strip("/") + end for end in _OPTICAL]
     frame = next((frame for frame in optical if frame in frames), None)
     if frame is None or name in mounting.poses:
-        is_ros = tool_of(path) == "ros"
+        is_ros = tool_of(file) == "ros"
         there = f", or a frame {optical[0]} to {TF} as `ros2 topic echo /tf_static` prints it" if is_ros else ""
         pose = mounting.pose(name, there)
     else:
@@ -195,7 +187,7 @@ def _read(
             fix = f"add a frame {optical[0]}"
             if frame_id:
                 instead = f"{frame.removesuffix('_link')}_optical_frame"
-                fix = f"write frame_id: {instead} to {path.name}, and add that frame, if it is not there,"
+                fix = f"write frame_id: {instead} to {file.name}, and add that frame, if it is not there,"
             raise CalibrationError(
                 f"camera {name!r}: expected an optical frame (x right, y down, z forward), got {frame}, which seems to "
                 f"have {BODY_AXES}: the camera would look up by {up_deg:.0f} degrees; {fix} to "

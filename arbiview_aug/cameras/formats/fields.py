@@ -182,6 +182,8 @@ def _lens(name: str, found: Mapping[str, tuple[str, Any]], D: FloatArray) -> tup
         if unread := [key for key, k in numbers.items() if k and key not in order.split()]:
             raise refusal(name, f"coefficients {order}", ", ".join(unread), WAY_OUT)
         D = np.array([numbers.get(key, 0.0) for key in order.split()])
+    if lens in ("radtan", "fisheye") and "D" not in found and not numbers:
+        raise refusal(name, f"coefficients of {lens}", "none")
     if is_unified or lens in ("double_sphere", "eucm", "fisheye"):
         return lens, [*xi, *D]
     if not D.any():

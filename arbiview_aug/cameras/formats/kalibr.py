@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import WAY_OUT, camera_entry, focal_and_center, lens_of, refusal
+from arbiview_aug.cameras.formats.entries import camera_entry, focal_and_center, lens_of, refusal
 from arbiview_aug.cameras.formats.fields import read_fields
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import read_plain
 from arbiview_aug.cameras.validation import checked_pose
-from arbiview_aug.errors import CalibrationError, shown
+from arbiview_aug.errors import CalibrationError
 
 # By camera_model and distortion_model: how many coefficients lead ``intrinsics``, and our lens for writing.
 _LENSES = {
@@ -24,8 +24,6 @@ _LENSES = {
     ("pinhole", "none"): ("pinhole", 0),
     ("ds", "none"): ("double_sphere", 2),
     ("eucm", "none"): ("eucm", 2),
-    ("omni", "none"): ("unified", 1),
-    ("omni", "radtan"): ("unified", 1),
 }
 FILES = ("*camchain*.yaml", "*cam_chain*.yaml")
 
@@ -45,9 +43,14 @@ def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     chain = entries(read_plain(path, path.name))
     if all(re.fullmatch(r"cam\d{1,9}", str(name)) for name in chain):  # other tools sort cam10 before cam2
         chain = dict(sorted(chain.items(), key=lambda pair: int(pair[0].removeprefix("cam"))))
-    cameras = {name: _camera(name, entry) for name, entry in chain.items()}  # a lens is refused before poses are asked
-    poses = mounting.mounted(_relative(chain))
-    return [cameras[name] | {"cam2ego": cam2ego.tolist()} for name, cam2ego in poses.items()]
+    found = {
+        name: read_fields(name, entry) for name, entry in chain.items()
+    }  # lenses are refused before poses are asked
+    return [
+        camera_entry(name, one.size or mounting.size(name), one.K, pose, one.lens, one.coefficients)
+        for name, pose in mounting.mounted(_relative(chain)).items()
+        for one in [found[name]]
+    ]
 
 
 def _relative(chain: Mapping[str, Mapping[str, Any]]) -> dict[str, FloatArray]:
@@ -63,33 +66,10 @@ def _relative(chain: Mapping[str, Mapping[str, Any]]) -> dict[str, FloatArray]:
         raise CalibrationError(f"camera {first!r}: expected no T_cn_cnm1, as it is the first; sort the file")
     for name in others:
         if chain[name].get("T_cn_cnm1") is None:
-            raise CalibrationError(
-                f"camera {name!r}: expected T_cn_cnm1, or T_cam_imu in all cameras, missing T_cn_cnm1"
-            )
+            raise refusal(name, "T_cn_cnm1, or T_cam_imu of all cameras", "neither")
         pose = pose @ np.asarray(np.linalg.inv(checked_pose(name, chain[name]["T_cn_cnm1"], "T_cn_cnm1")), np.float64)
         relative[name] = pose
     return relative
-
-
-def _camera(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """A camera without its pose."""
-    models = entry["camera_model"], entry.get("distortion_model") or "none"
-    if models not in _LENSES:
-        known, got = (", ".join("-".join(map(str, pair)) for pair in pairs) for pairs in (_LENSES, (models,)))
-        raise refusal(name, known, got, WAY_OUT, key="camera_model-distortion_model")
-    is_bent, leading = models[1] != "none", _LENSES[models][1]
-    keys = ["intrinsics", "resolution", *["distortion_coeffs"] * is_bent]
-    if missing := [key for key in keys if entry.get(key) is None]:
-        raise CalibrationError(f"camera {name!r}: expected {', '.join(keys)}, missing {', '.join(missing)}")
-    if len(entry["intrinsics"]) != leading + 4:
-        raise refusal(name, f"{leading + 4} intrinsics", shown(entry["intrinsics"]))
-    if not is_bent and any(entry.get("distortion_coeffs") or ()):
-        got = shown(entry["distortion_coeffs"])
-        raise refusal(
-            name, "no distortion_coeffs with distortion_model none", got, "name its model, radtan or equidistant"
-        )
-    lens, K, coefficients, size, _ = read_fields(name, entry)
-    return camera_entry(name, size or (0, 0), K, np.eye(4), lens, coefficients)
 
 
 def kalibr_files(data: Mapping[str, Any]) -> dict[str, Any]:
