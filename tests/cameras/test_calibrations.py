@@ -425,7 +425,7 @@ def test_kalibr_camchain(tmp_path: Path) -> None:
         ("T_cn_cnm1", "expected T_cn_cnm1, or T_cam_imu of all"),
         ("resolution", "how large are its im"),
     ):
-        written(tmp_path, camchain__yaml=CAMCHAIN.replace(f"  {key}:", f"  {key[:1]}:"))
+        written(tmp_path, camchain__yaml=CAMCHAIN.replace(f"  {key}:", f"  of_{key[:3]}:"))
         with pytest.raises(CalibrationError, match=f"camera 'cam[01]': {message}"):
             load_rig(path)
     for old, new, message in (

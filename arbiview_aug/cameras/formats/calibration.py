@@ -85,7 +85,7 @@ FORMATS = {
 
 _FIX = "convert them, write a rig file, or move them elsewhere"
 _CAMERA = re.compile(rb"(?i)camera_?mat|intrinsic|distort|camera_?model|\bmtx\b|focal_?length|\bf[lx]_?x?\b")
-_LIKE_CAMERAS = (*camera_files.SUFFIXES, ".npz", ".toml", ".ini")
+_LIKE_CAMERAS = (*camera_files.SUFFIXES, ".npz", ".toml")
 
 _BROKEN = (
     *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, OSError, SystemError, RecursionError),
@@ -185,7 +185,7 @@ def _seems(path: Path) -> str:
         return "" if error.errno == errno.EFBIG else f"a file that cannot be read: {error.strerror}"
     if tool := camera_files.unread_tool(content):
         return tool
-    seems = "a calibration that is not recognised" if _CAMERA.search(content) and b"cam2ego" not in content else ""
+    seems = "a calibration that is not read" if _CAMERA.search(content) and b"cam2ego" not in content else ""
     if path.suffix in camera_files.SUFFIXES:
         try:
             if seems or not content.decode("utf-8-sig"):

@@ -33,16 +33,19 @@ _SPELLINGS = {
     **{key: key for key in ("xi", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")},
 }
 _MEANINGS = {spelling: meaning for meaning, spellings in _SPELLINGS.items() for spelling in spellings.split()}
+_WINDOW = ("width", "height", "x_offset", "y_offset")
 _PINHOLE = ("fx", "fy", "cx", "cy")
 _GROUPS = {*_K.split(), *_D.split(), "projectionparameters", "distortionparameters", "mirrorparameters"}
 
 # Words of keys that say something of the lens or the image, and of those that say how the calibration was made.
 _MATTERS = re.compile(
-    "dist|lens|fisheye|rectif|crop|binning|skew|alpha|mirror|flip|prism|tangential|radial|poly|focal|fov|princip|"
-    "projection|model|omni|offset|scale|intrin|matrix|coef|resol|unit|order|major|optimal|newcam|aspect|^[kpstrd]\\d$|tau"
+    "dist|lens|fisheye|rectif|crop|binning|skew|alpha|mirror|flip|rotate|prism|tangential|radial|poly|projection|omni|"
+    "(camera|intrinsics?)(model|type|mat)|offset|scale|intrin|coef|resol|unit|^order|order$|major|optimal|aspect|"
+    r"^[kpstrd]\d$|^tau"
 )
 _NEUTRAL = re.compile(
-    "error|rms|std|dev|date|time|square|board|pattern|grid|guess|covar|points|extrin|pose|^t|aspectratio$"
+    "distance|polygon|depth|error|rms|std|date|time|square|board|pattern|grid|guess|covar|points|extrin|pose|"
+    "aspectratio$|^fix|^calib"
 )
 _NO_EFFECT = {"", "0", "00", "1", "10", "px", "pixel", "pixels", "row", "rowmajor", "opencv", "none", "false", "no"}
 _CHOICE = (
@@ -67,7 +70,11 @@ def has_camera(data: Any) -> bool:
     if not isinstance(data, Mapping):
         return False
     found = _meanings(data)
-    return isinstance(found.get("K", ("", 0))[1], list | Mapping) or {*_PINHOLE} <= found.keys()
+    try:
+        is_matrix = _array("", *found.get("K", ("", ()))).size in (4, 5, 6, 9, 12, 16)
+    except ValueError:
+        return False
+    return is_matrix or {*_PINHOLE} <= found.keys()
 
 
 def _meanings(data: Mapping[Any, Any], name: str = "") -> dict[str, tuple[str, Any]]:
@@ -77,14 +84,13 @@ def _meanings(data: Mapping[Any, Any], name: str = "") -> dict[str, tuple[str, A
         is_group = plain(key) in _GROUPS and isinstance(value, Mapping) and "data" not in value
         inner = _meanings(value, name) if is_group else {_MEANINGS.get(plain(key), str(key)): (str(key), value)}
         if name and (twice := found.keys() & inner.keys()):
-            raise refusal(
-                name, "one key of each kind", f"{found[min(twice)][0]} and {inner[min(twice)][0]}", "remove one"
-            )
+            got = f"{found[min(twice)][0]} and {inner[min(twice)][0]}"
+            raise refusal(name, "one key of each kind", got, "remove one")
         found |= inner
     return found
 
 
-def read_fields(name: str, data: Mapping[Any, Any], also_read: str = "") -> Fields:
+def read_fields(name: str, data: Mapping[Any, Any]) -> Fields:
     """What a file says of a camera's lens and images.
 
     Raises:
@@ -106,17 +112,20 @@ def read_fields(name: str, data: Mapping[Any, Any], also_read: str = "") -> Fiel
         raise refusal(name, "a camera matrix of 3x3, or fx, fy, cx, cy", shown(found.get("K", "none")))
     lens, coefficients = _lens(name, found, D)
     if lens == "unified":  # (x, y) / (z + ξ d) is 1 + ξ times EUCM's with α = ξ / (1 + ξ) and β = 1
-        xi, *bent = coefficients
+        xi, *bent = coefficients or [math.nan]
         if any(bent) or not xi >= 0:
             raise refusal(name, "MEI or omni without distortion", f"{shown(coefficients)} with xi first", WAY_OUT)
         lens, coefficients, K = "eucm", [xi / (1 + xi), 1.0], K / [[1 + xi, 1, 1], [1, 1 + xi, 1], [1, 1, 1]]
     for key, value in found.values():
-        if plain(key) not in _MEANINGS and key not in also_read.split():
+        if plain(key) not in _MEANINGS:
             _refuse_meaningful(name, key, value, is_straight=not D.any())
     width, height = size = _size(name, values) or (0, 0)
-    window = {"width": 0, "height": 0, "x_offset": 0, "y_offset": 0} | (values.get("window") or {})
-    sides = [int(window[key]) for key in window if not key.startswith("do_")]
-    if any(values.get(f"binning {axis}", 0) > 1 for axis in "xy") or sides not in ([0] * 4, [width, height, 0, 0]):
+    window = values.get("window") or {}
+    sides = [int(window.get(key, 0)) if isinstance(window, Mapping) else -1 for key in _WINDOW]
+    if any(float(values.get(f"binning {axis}", 0)) > 1 for axis in "xy") or sides not in (
+        [0] * 4,
+        [width, height, 0, 0],
+    ):
         raise refusal(name, "full images", "binning or a region of interest")
     R, P = (arrays.get(key, np.zeros(0)) for key in "RP")
     if R.any() and not (R.size == 9 and np.allclose(R.reshape(3, 3), np.eye(3), atol=1e-6)):
