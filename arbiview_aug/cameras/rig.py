@@ -387,13 +387,17 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
 
 def _check_order(distortion: Mapping[str, Any], label: str) -> None:
     """Refuse coefficients in another order than the lens's, and keys that are not read."""
-    if unknown := unknown_key(distortion, ("model", "coeffs", "order")):
+    unknown, order = unknown_key(distortion, ("model", "coeffs", "order")), distortion.get("order")
+    usual = _ORDERS.get(canonical_name(str(distortion["model"])), "").split()
+    named = re.findall(r"[a-z]+\d", str(order).partition("(")[0])  # k1..k4 (cv2.fisheye)
+    if (
+        not unknown
+        and order is not None
+        and not (named == usual[: len(named)] or (named == ["k1", "k4"] and usual[3:]))
+    ):
+        unknown = f"order: expected {' '.join(usual)}, got {shown(order)}"
+    if unknown:
         raise CalibrationError(f"{label}: distortion: {unknown}")
-    order = distortion.get("order")
-    usual = _ORDERS.get(canonical_name(str(distortion["model"])), "").split()[: len(distortion["coeffs"])]
-    named = re.findall(r"[a-z]+\d", str(order).partition("(")[0])
-    if order is not None and named != usual and not (".." in order and named == [usual[0], usual[-1]]):
-        raise CalibrationError(f"{label}: distortion: order: expected {' '.join(usual)}, got {shown(order)}")
 
 
 def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:

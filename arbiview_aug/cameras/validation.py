@@ -225,22 +225,12 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
     looks_down = cam2ego[:, 2, 2] < -0.8  # such cameras have no lower edge
     if ((_stands(cam2ego) | looks_down) & is_mounted(cam2ego, ground_z_m)).mean() >= 0.5:
         return None
-    body, metres, upside_down = np.eye(4), cam2ego.copy(), np.diag([1.0, -1, -1, 1])
-    body[:3, :3] = CAMERA_AXES_IN_EGO
-    metres[:, :3, 3] /= 1000
     # Cameras of one vehicle, far from the origin: millimetres would be metres apart by thousands.
     middle = cam2ego[:, :3, 3].mean(axis=0)
     is_together = len(cam2ego) > 1 and np.ptp(cam2ego[:, :3, 3], axis=0).max() < _FARTHEST_M
     if is_together and np.abs(middle[:2]).max() > _FARTHEST_M and _stands(cam2ego).mean() > 0.5:
         return "poses in the world's frame", "pass np.linalg.inv(ego2world) @ cam2world"
-    axes = f"by {CAMERA_AXES_IN_EGO.astype(int).tolist()} from the"
-    for right, mistake, fix in (
-        (metres, "positions in millimetres", "divide cam2ego[:3, 3] by 1000"),
-        (np.asarray(np.linalg.inv(cam2ego), np.float64), "ego2cam, the inverse", "pass np.linalg.inv(cam2ego)"),
-        (cam2ego @ body, BODY_AXES, f"multiply cam2ego[:3, :3] {axes} right"),
-        (body @ cam2ego, "an ego frame with a camera's axes (z forward)", f"multiply cam2ego[:3] {axes} left"),
-        (cam2ego @ upside_down, "OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]"),
-    ):
+    for right, mistake, fix in _candidates(cam2ego):
         if (_stands(right) & is_mounted(right, ground_z_m)).mean() > 0.5:
             return mistake, fix
     heights = ", ".join(f"{z:+.1f}" for z in cam2ego[:, 2, 3] - ground_z_m)
@@ -256,7 +246,7 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[str]:
     """
     cam2ego, sides = np.stack([camera.cam2ego for camera in cameras]), [_side(camera.name) for camera in cameras]
     mistake, fix = pose_mistake(cam2ego, ground_z_m) or ("", "")
-    y_axes = (cam2ego @ _pose(CAMERA_AXES_IN_EGO) if mistake == BODY_AXES else cam2ego)[:, 1, 2]
+    y_axes = (cam2ego[:, :3, :3] @ CAMERA_AXES_IN_EGO if mistake == BODY_AXES else cam2ego)[:, 1, 2]
     swapped = [left * y < -0.35 for y, (_, left) in zip(y_axes, sides, strict=True) if left]  # by 20 degrees or more
     if len(swapped) > 1 and all(swapped):
         unreal = "diag(1, -1, 1, 1) @ cam2ego @ [[0, 0, 1, 0], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]"
@@ -273,7 +263,9 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[str]:
     has_front = (1, 0) in sides
     for camera, side in zip(cameras, sides, strict=True):
         pose, up_deg, said = camera.cam2ego, camera.elevation_deg, []
-        fixes = [f" ({words})" for instead, words in _instead(pose) if _fits(instead, side, has_front)][:1]
+        fixes = [f", as with {a}: {b}" for poses, a, b in _candidates(pose[None]) if _fits(poses[0], side, has_front)][
+            :1
+        ]
         if up_deg > _STEEP_DEG or (up_deg < -75 and side[1] and fixes):
             said.append(f"looks {'up' if up_deg > 0 else 'down'} by {abs(up_deg):.0f} degrees")
         elif up_deg > -_STEEP_DEG and abs(_roll_deg(pose)) > _STEEP_DEG:
@@ -318,21 +310,22 @@ def _fits(pose: FloatArray, side: tuple[int, int], has_front: bool) -> bool:
     return abs(_roll_deg(pose)) < 45 and abs(pose[2, 2]) < 0.7 and not _belies(pose, side, has_front)
 
 
-def _pose(R: FloatArray) -> FloatArray:
-    pose = np.eye(4)
-    pose[:3, :3] = R
-    return pose
-
-
-def _instead(pose: FloatArray) -> Iterator[tuple[FloatArray, str]]:
-    """Poses that a wrong one may stand for, with the mistake and the fix."""
-    w, x, y, z = quaternion_from_rotation(pose[:3, :3])
-    axes = f"multiply cam2ego[:3, :3] by {CAMERA_AXES_IN_EGO.astype(int).tolist()} from the right"
-    yield pose @ _pose(CAMERA_AXES_IN_EGO), f"it seems to have {BODY_AXES}: {axes}"
-    yield _pose(rotation_from_quaternion((z, w, x, y))), "its quaternion seems to be x y z w, where w x y z is read"
-    yield _pose(rotation_from_quaternion((x, y, z, w))), "its quaternion seems to be w x y z, where x y z w is read"
-    yield pose @ np.diag([1.0, -1, -1, 1]), "it seems to have OpenGL's axes (y up, z backward): negate cam2ego[:3, 1:3]"
-    yield _pose(pose[:3, :3].T), "it seems to be ego2cam: pass np.linalg.inv(cam2ego)"
+def _candidates(cam2ego: FloatArray) -> Iterator[tuple[FloatArray, str, str]]:
+    """Poses (N, 4, 4) that wrong ones may stand for, what these are instead, and the fix."""
+    body, metres, upside_down = np.eye(4), cam2ego.copy(), np.diag([1.0, -1, -1, 1])
+    body[:3, :3] = CAMERA_AXES_IN_EGO
+    metres[:, :3, 3] /= 1000
+    axes = f"by {CAMERA_AXES_IN_EGO.astype(int).tolist()} from the"
+    yield metres, "positions in millimetres", "divide cam2ego[:3, 3] by 1000"
+    yield np.asarray(np.linalg.inv(cam2ego), np.float64), "ego2cam, the inverse", "pass np.linalg.inv(cam2ego)"
+    yield cam2ego @ body, BODY_AXES, f"multiply cam2ego[:3, :3] {axes} right"
+    yield body @ cam2ego, "an ego frame with a camera's axes (z forward)", f"multiply cam2ego[:3] {axes} left"
+    yield cam2ego @ upside_down, "OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]"
+    for given, read, order in (("x y z w", "w x y z", [3, 0, 1, 2]), ("w x y z", "x y z w", [1, 2, 3, 0])):
+        right = cam2ego.copy()
+        quaternions = np.stack([quaternion_from_rotation(pose[:3, :3])[order] for pose in cam2ego])
+        right[:, :3, :3] = rotation_from_quaternion(quaternions)
+        yield right, f"a quaternion in the order {given}, read as {read}", f"pass it as {read}"
 
 
 def _stands(cam2ego: FloatArray) -> BoolArray:

@@ -17,7 +17,7 @@ from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.formats import camera_files, colmap, datasets, kalibr
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
 from arbiview_aug.cameras.key_names import hint
-from arbiview_aug.cameras.plain_yaml import MOST_BYTES, dump_yaml
+from arbiview_aug.cameras.plain_yaml import MOST_BYTES, dump_yaml, read_calibration_text
 from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line, shown, warn
 from arbiview_aug.files import read_bytes
 
@@ -84,7 +84,7 @@ FORMATS = {
 """Formats by name, in the order in which folders are tried."""
 
 _FIX = "convert them, write a rig file, or move them elsewhere"
-_CAMERA = re.compile(rb"(?i)camera_?mat|intrinsic|distort|camera_?model|\bmtx\b|focal_?length|\bf[lx]_?x?\b")
+_CAMERA = re.compile(r"(?i)camera_?mat|intrinsic|distort|camera_?model|\bmtx\b|focal_?length|\bf[lx]_?x?\b")
 _LIKE_CAMERAS = (*camera_files.SUFFIXES, ".npz", ".toml")
 
 _BROKEN = (
@@ -152,7 +152,7 @@ def recognised(path: Path) -> str | None:
         files = camera_files.camera_files(path)
         return camera_files.tool_of(files[0]) if files else None
     if path.suffix == ".txt":
-        return None if camera_files.unread_tool(read_bytes(path, 1 << 28)) else "colmap"
+        return None if camera_files.unread_tool(read_calibration_text(path, path.name, 1 << 28)) else "colmap"
     by_name = {".bin": "colmap", ".feather": "argoverse2", datasets.CALIBRATED_SENSOR: "nuscenes"}
     if path.name in by_name or path.suffix in by_name:
         return by_name.get(path.name) or by_name[path.suffix]
@@ -180,21 +180,16 @@ def _unread(folder: Path, name: str | None) -> dict[Path, str]:
 def _seems(path: Path) -> str:
     """What a file that is not read seems to be, and what to do; empty for a rig file and if it has no camera."""
     try:
-        content = read_bytes(path, MOST_BYTES)
+        text = read_bytes(path, MOST_BYTES).decode("utf-8-sig", "replace")
     except OSError as error:
         return "" if error.errno == errno.EFBIG else f"a file that cannot be read: {error.strerror}"
-    if tool := camera_files.unread_tool(content):
-        return tool
-    seems = "a calibration that is not read" if _CAMERA.search(content) and b"cam2ego" not in content else ""
-    if path.suffix in camera_files.SUFFIXES:
-        try:
-            if seems or not content.decode("utf-8-sig"):
-                camera_files.documents(path)
-        except CalibrationError as error:
-            return str(error).removeprefix(f"{path.name}: ")
-        except UnicodeError:
-            return "text that is not in UTF-8, got another encoding: save it as UTF-8"
-    return seems
+    seems = "a calibration that is not read" if _CAMERA.search(text) and "cam2ego" not in text else ""
+    try:
+        if path.suffix in camera_files.SUFFIXES and (seems or "\ufffd" in text):  # the second is in another encoding
+            camera_files.documents(path)
+    except CalibrationError as error:
+        return str(error).removeprefix(f"{path.name}: ")
+    return camera_files.unread_tool(text) or seems
 
 
 def write_calibration(data: Mapping[str, Any], folder: Path, name: str) -> Path:

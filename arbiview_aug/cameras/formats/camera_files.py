@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import re
 from collections import Counter
@@ -17,11 +16,10 @@ from arbiview_aug.cameras.formats.entries import camera_entry, lens_of, matrix, 
 from arbiview_aug.cameras.formats.fields import has_camera, read_fields
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting, pose_of
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.plain_yaml import MOST_BYTES, file_stem, read_calibration_text, read_documents
+from arbiview_aug.cameras.plain_yaml import file_stem, read_calibration_text, read_documents
 from arbiview_aug.cameras.rotations import poses_from, quaternion_from_rotation
 from arbiview_aug.cameras.validation import BODY_AXES
-from arbiview_aug.errors import CalibrationError, shown
-from arbiview_aug.files import read_bytes
+from arbiview_aug.errors import CalibrationError
 
 TF = "tf_static.yaml"
 SUFFIXES = (".yaml", ".yml", ".xml", ".json")
@@ -35,7 +33,7 @@ _DEFAULT_NAME = "narrow_stereo"  # of camera_calibration, for every camera
 _UNREAD = {
     "KITTI's text": (
         r"(?m)^P(_rect_)?\d{1,2}:",
-        "of P the left 3x3 as K, pinhole; cam2ego is inv(R0_rect @ Tr_velo_to_cam) with the Velodyne as ego frame",
+        "K is P's left 3x3, cam2ego inv(R0_rect @ Tr_velo_to_cam) to the LiDAR",
     ),
     "ORB-SLAM": (r"(?m)^\s*Camera1?[._](type|fx)", "PinHole has radtan k1 k2 p1 p2, KannalaBrandt8 fisheye k1 to k4"),
     "basalt": ('"camera_type"', "kb4 is fisheye k1 to k4, ds is double_sphere"),
@@ -65,22 +63,16 @@ def camera_files(folder: Path) -> list[Path]:
 
 
 def has_cameras(path: Path) -> bool:
-    """Whether a file has a camera that is read here; False if it is no text, or too large."""
+    """Whether a file has a camera that is read here; False if it cannot be read."""
     try:
-        content = read_bytes(path, MOST_BYTES)
-        has_words = _WORDS.search(content.decode("utf-8-sig", "replace")) and not unread_tool(content)
-        return bool(has_words and _cameras(path))
+        text = read_calibration_text(path, path.name)
+        return bool(_WORDS.search(text) and not unread_tool(text) and _cameras(path))
     except CalibrationError:
         return False
-    except OSError as error:
-        if error.errno == errno.EFBIG:
-            return False
-        raise CalibrationError(f"{path.name}: expected a file that can be read, got {error.strerror}") from None
 
 
-def unread_tool(content: bytes) -> str:
-    """The tool of a file's content, if it is one that is not read, and what to do; else nothing."""
-    text = content.decode("utf-8", "replace")
+def unread_tool(text: str) -> str:
+    """The tool of a file, if it is one that is not read, and what to do; else nothing."""
     tools = (f"{tool}, {_INSTEAD}; {fix}" for tool, (words, fix) in _UNREAD.items() if re.search(words, text))
     return next(tools, "")
 
@@ -105,14 +97,10 @@ def _cameras(path: Path) -> dict[str, Mapping[Any, Any]]:
             keyed |= {str(key): part for key, part in data.items() if _is_camera(part)}
         for part in filter(_is_camera, data if isinstance(data, list) else [data]):
             key = _declared(part) or _frame_id(part).removesuffix("_frame").removesuffix("_optical") or path.stem
-            if key in listed and _bare(listed[key]) != _bare(part):
-                key = f"{key} {len(listed)}"
-            listed.setdefault(key, part)  # a stream has the same camera again
+            part = {one: value for one, value in part.items() if one not in ("timestamp", "time_offset")}
+            part["header"] = {"frame_id": _frame_id(part)}  # a stream has the same camera again, at other times
+            listed[key if listed.get(key, part) == part else f"{key} {len(listed)}"] = part
     return keyed | (listed if len(listed) != 1 else dict(zip([path.stem], listed.values(), strict=True)))
-
-
-def _bare(data: Mapping[Any, Any]) -> dict[Any, Any]:
-    return {key: value for key, value in data.items() if key not in ("header", "timestamp")}
 
 
 def _is_camera(data: Any) -> bool:
@@ -153,10 +141,10 @@ def _woodscape(name: str, data: Mapping[Any, Any], mounting: Mounting) -> dict[s
     Source: scripts/calibration/projection.py of valeoai/WoodScape.
     """
     lens, extrinsic = data["intrinsic"], data["extrinsic"]
-    if unread := lens.keys() - _WOODSCAPE_KEYS:
-        raise refusal(name, f"intrinsic {', '.join(sorted(_WOODSCAPE_KEYS))}", ", ".join(sorted(unread)))
-    if lens.get("poly_order", 4) != 4:
-        raise refusal(name, "poly_order 4", shown(lens["poly_order"]))
+    if (unread := lens.keys() - _WOODSCAPE_KEYS) or lens.get("poly_order", 4) != 4:
+        raise refusal(
+            name, f"intrinsic {', '.join(sorted(_WOODSCAPE_KEYS))} 4", ", ".join(unread) or "another poly_order"
+        )
     width, height, k1 = lens["width"], lens["height"], lens["k1"]
     K = matrix(k1, k1 * lens["aspect_ratio"], width / 2 - 0.5 + lens["cx_offset"], height / 2 - 0.5 + lens["cy_offset"])
     x, y, z, w = extrinsic["quaternion"]

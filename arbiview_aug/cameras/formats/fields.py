@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -48,33 +48,16 @@ _NEUTRAL = re.compile(
     "aspectratio$|^fix|^calib"
 )
 _NO_EFFECT = {"", "0", "00", "1", "10", "px", "pixel", "pixels", "row", "rowmajor", "opencv", "none", "false", "no"}
-_CHOICE = (
-    "for raw images remove it and the projection matrix; for rectified ones write the left 3x3 of the projection "
-    "matrix as camera matrix, and coefficients of 0"
-)
+_CHOICE = "for raw images remove R and P; for rectified ones write P's left 3x3 as camera matrix, without coefficients"
 _NAME_IT = "write distortion_model: plumb_bob (k1 k2 p1 p2), or equidistant (k1 to k4 of a fisheye), to the file"
-
-
-class Fields(NamedTuple):
-    """A camera's lens, (3, 3) intrinsics, coefficients and (width, height), and whether P has a baseline."""
-
-    lens: str
-    K: FloatArray
-    coefficients: Any
-    size: tuple[Any, Any] | None
-    is_shifted: bool
 
 
 def has_camera(data: Any) -> bool:
     """Whether a mapping has a camera matrix, or focal lengths and a principal point."""
-    if not isinstance(data, Mapping):
-        return False
-    found = _meanings(data)
-    try:
-        is_matrix = _array("", *found.get("K", ("", ()))).size in (4, 5, 6, 9, 12, 16)
-    except ValueError:
-        return False
-    return is_matrix or {*_PINHOLE} <= found.keys()
+    found = _meanings(data) if isinstance(data, Mapping) else {}
+    K = found.get("K", ("", None))[1]
+    is_matrix = isinstance(K, list) and (len(K) in (3, 4, 5, 6, 9) or isinstance(K[:1], list))
+    return is_matrix or isinstance(K, Mapping) or {*_PINHOLE} <= found.keys()
 
 
 def _meanings(data: Mapping[Any, Any], name: str = "") -> dict[str, tuple[str, Any]]:
@@ -90,8 +73,8 @@ def _meanings(data: Mapping[Any, Any], name: str = "") -> dict[str, tuple[str, A
     return found
 
 
-def read_fields(name: str, data: Mapping[Any, Any]) -> Fields:
-    """What a file says of a camera's lens and images.
+def read_fields(name: str, data: Mapping[Any, Any]) -> tuple[str, FloatArray, Any, tuple[float, float] | None, bool]:
+    """A camera's lens, (3, 3) intrinsics, coefficients and (width, height), and whether P has a baseline.
 
     Raises:
         CalibrationError: No camera matrix, an unknown lens, or a key that would change the views and is not read.
@@ -134,7 +117,7 @@ def read_fields(name: str, data: Mapping[Any, Any]) -> Fields:
     if not D.any() and lens == "pinhole" and not np.allclose(P[:, :3], K, rtol=1e-4, atol=0.01):
         got = f"{shown(P[:, :3].tolist())} without distortion"
         raise refusal(name, "the camera matrix", got, _CHOICE, key=found["P"][0])
-    return Fields(lens, K, coefficients, size if width and height else None, bool(np.abs(P[:, 3]).max() > 1e-6))
+    return lens, K, coefficients, size if width and height else None, bool(np.abs(P[:, 3]).max() > 1e-6)
 
 
 def _refuse_meaningful(name: str, key: str, value: Any, *, is_straight: bool) -> None:
@@ -205,7 +188,7 @@ def _lens(name: str, found: Mapping[str, tuple[str, Any]], D: FloatArray) -> tup
     return lens or "radtan", D
 
 
-def _size(name: str, values: Mapping[str, Any]) -> tuple[Any, Any] | None:
+def _size(name: str, values: Mapping[str, Any]) -> tuple[float, float] | None:
     """(width, height) of the image."""
     sizes = [(values["width"], values["height"])] if {"width", "height"} <= values.keys() else []
     for meaning in {"size", "shape"} & values.keys():

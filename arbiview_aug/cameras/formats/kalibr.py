@@ -43,14 +43,12 @@ def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     chain = entries(read_plain(path, path.name))
     if all(re.fullmatch(r"cam\d{1,9}", str(name)) for name in chain):  # other tools sort cam10 before cam2
         chain = dict(sorted(chain.items(), key=lambda pair: int(pair[0].removeprefix("cam"))))
-    found = {
-        name: read_fields(name, entry) for name, entry in chain.items()
-    }  # lenses are refused before poses are asked
-    return [
-        camera_entry(name, one.size or mounting.size(name), one.K, pose, one.lens, one.coefficients)
-        for name, pose in mounting.mounted(_relative(chain)).items()
-        for one in [found[name]]
-    ]
+    cameras = {}
+    for name, entry in chain.items():  # lenses are refused before poses are asked
+        lens, K, coefficients, size, _ = read_fields(name, entry)
+        cameras[name] = camera_entry(name, size or mounting.size(name), K, np.eye(4), lens, coefficients)
+    poses = mounting.mounted(_relative(chain))
+    return [cameras[name] | {"cam2ego": pose.tolist()} for name, pose in poses.items()]
 
 
 def _relative(chain: Mapping[str, Mapping[str, Any]]) -> dict[str, FloatArray]:
