@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from numbers import Number
@@ -33,6 +34,16 @@ USUAL_NAMES = {
 }
 """Common names of the keys in other tools."""
 
+_CALLED = {
+    "pinhole": "none no null undistorted pinhole perspective ideal",
+    "radtan": "plumbbob rationalpolynomial rational radtan radialtangential brown brownconrady opencv opencvradtan",
+    "fisheye": "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 kb4 kb8",
+    "unified": "mei omni omnidir omnidirectional ucm",
+    **{"double_sphere": "doublesphere ds", "eucm": "eucm", "ftheta": "ftheta", "ftheta_backward": "fthetabackward"},
+}
+_LENSES = {spelling: lens for lens, spellings in _CALLED.items() for spelling in spellings.split()}
+"""This package's lens by the names that tools give it; ``unified`` is MEI and omni."""
+
 _LIKENESS = 0.88
 """Least difflib ratio of a misspelling: ``masks`` for ``mask`` has 0.89, ``boxes_2d`` for ``boxes_3d`` 0.875."""
 
@@ -49,6 +60,16 @@ def hint(entries: Iterable[Any], wanted: Sequence[str]) -> str:
     names = tuple(wanted)
     hints = [f"found {k!r}: did you mean {m!r}?" for k in entries if isinstance(k, str) and (m := meant_by(k, names))]
     return "".join(f"; {words}" for words in hints)
+
+
+def plain(key: Any) -> str:
+    """A key or a model's name without case and punctuation: ``Camera_Matrix`` and ``cameraMatrix`` are one."""
+    return re.sub("[^a-z0-9]", "", str(key).lower())
+
+
+def lens_called(value: Any) -> str | None:
+    """This package's lens of a model's name in any tool, ``unified`` for MEI and omni; None for an unknown name."""
+    return _LENSES.get(plain(value))
 
 
 def unknown_key(entries: Iterable[Any], known: Sequence[str]) -> str:

@@ -26,9 +26,8 @@ import numpy as np
 
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.formats.entries import lens_called
 from arbiview_aug.cameras.framing import Fit
-from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed, unknown_key
+from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, lens_called, misnamed, unknown_key
 from arbiview_aug.cameras.lens import FloatArray, canonical_name
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.plain_yaml import dump_yaml, file_stem, parse_yaml

@@ -317,10 +317,10 @@ def _candidates(cam2ego: FloatArray) -> Iterator[tuple[FloatArray, str, str]]:
     metres[:, :3, 3] /= 1000
     axes = f"by {CAMERA_AXES_IN_EGO.astype(int).tolist()} from the"
     yield metres, "positions in millimetres", "divide cam2ego[:3, 3] by 1000"
-    yield np.asarray(np.linalg.inv(cam2ego), np.float64), "ego2cam, the inverse", "pass np.linalg.inv(cam2ego)"
     yield cam2ego @ body, BODY_AXES, f"multiply cam2ego[:3, :3] {axes} right"
     yield body @ cam2ego, "an ego frame with a camera's axes (z forward)", f"multiply cam2ego[:3] {axes} left"
     yield cam2ego @ upside_down, "OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]"
+    yield np.asarray(np.linalg.inv(cam2ego), np.float64), "ego2cam, the inverse", "pass np.linalg.inv(cam2ego)"
     for given, read, order in (("x y z w", "w x y z", [3, 0, 1, 2]), ("w x y z", "x y z w", [1, 2, 3, 0])):
         right = cam2ego.copy()
         quaternions = np.stack([quaternion_from_rotation(pose[:3, :3])[order] for pose in cam2ego])

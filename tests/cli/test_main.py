@@ -140,7 +140,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         *((f"demo --target {name}", "expected a file or one of the shipped rigs") for name in (LONG, "loop.yaml")),
         *((f"demo --output {name}", "expected a folder that can be written to") for name in ("loop", "loop/a.png")),
         ("convert --data frame --target waymo --output loop", "expected a folder, got a file or a link"),
-        ("inspect large.yaml", r"expected at most 1 MiB, got 23\.8 MiB"),
+        ("inspect large.yaml", r"a file of 23\.8 MiB, more than 1\.0 MiB"),
         *((f"check {name}", "expected at most 128 cameras, got 1[25]. or more") for name in ("crowd", "few")),
         ("convert --data frame --target waymo --output o --version v1.0-mini", "expected no version, which a frame f"),
         *((f"bench --budget-ms {ms}", "expected a finite number above 0") for ms in (-1, 0, "nan", "inf")),

@@ -12,8 +12,8 @@ import pytest
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.formats import calibration
 from arbiview_aug.cameras.rig import Rig, load_rig, save_rig
-from arbiview_aug.cli import rigs
 from arbiview_aug.cli.rigs import differences
 
 
@@ -87,7 +87,7 @@ def test_other_tools_calibrations_are_read_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_rig(load_rig("nuscenes"), tmp_path / "kalibr", format="kalibr")
-    reads, read = [], rigs.read_calibration
-    monkeypatch.setattr(rigs, "read_calibration", lambda *where: reads.append(where) or read(*where))
+    reads, read = [], calibration.read_calibration
+    monkeypatch.setattr(calibration, "read_calibration", lambda *where: reads.append(where) or read(*where))
     assert main(["inspect", str(tmp_path / "kalibr"), "--output", str(tmp_path / "rig.png")]) == 0
     assert "read as Kalibr: " in capsys.readouterr().out and len(reads) == 1

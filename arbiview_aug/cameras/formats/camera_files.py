@@ -12,9 +12,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import camera_entry, lens_of, matrix, plain, refusal
+from arbiview_aug.cameras.formats.entries import camera_entry, lens_of, matrix, refusal
 from arbiview_aug.cameras.formats.fields import has_camera, read_fields
 from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting, pose_of
+from arbiview_aug.cameras.key_names import plain
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import file_stem, read_calibration_text, read_documents
 from arbiview_aug.cameras.rotations import poses_from, quaternion_from_rotation

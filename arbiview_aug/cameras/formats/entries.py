@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,29 +10,10 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import CalibrationError
 
-_CALLED = {
-    "pinhole": "none no null undistorted pinhole perspective ideal",
-    "radtan": "plumbbob rationalpolynomial rational radtan radialtangential brown brownconrady opencv opencvradtan",
-    "fisheye": "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 kb4 kb8",
-    "unified": "mei omni omnidir omnidirectional ucm",
-    **{"double_sphere": "doublesphere ds", "eucm": "eucm", "ftheta": "ftheta", "ftheta_backward": "fthetabackward"},
-}
-_LENSES = {spelling: lens for lens, spellings in _CALLED.items() for spelling in spellings.split()}
-
 WAY_OUT = (
     "undistort the images to a pinhole's, or fit a lens of this package (docs/rigs.md, A lens that is not read), and "
     "write a rig file"
 )
-
-
-def plain(key: Any) -> str:
-    """A key or a model's name without case and punctuation: ``Camera_Matrix`` and ``cameraMatrix`` are one."""
-    return re.sub("[^a-z0-9]", "", str(key).lower())
-
-
-def lens_called(value: Any) -> str | None:
-    """This package's lens of a model's name in any tool, ``unified`` for MEI and omni; None for an unknown name."""
-    return _LENSES.get(plain(value))
 
 
 def refusal(name: str, expected: str, got: str, fix: str = "", *, key: str = "") -> CalibrationError:

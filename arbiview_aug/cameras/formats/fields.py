@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import WAY_OUT, lens_called, matrix, plain, refusal
+from arbiview_aug.cameras.formats.entries import WAY_OUT, matrix, refusal
+from arbiview_aug.cameras.key_names import lens_called, plain
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import shown
 
