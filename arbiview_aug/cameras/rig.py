@@ -348,7 +348,8 @@ def save_rig(
         CalibrationError: A lens or a skew that the format has not, or a folder with files of another calibration.
     """
     rig = load_rig(rig)
-    if not str(path).strip() or re.search("[\0\ud800-\udbff]", str(path)):
+    is_long = max(map(len, os.fspath(path).split(os.sep))) > 255
+    if not str(path).strip() or is_long or re.search("[\0\ud800-\udbff]", str(path)):
         raise CalibrationError(f"save_rig: path: expected a file's or folder's name, got {shown(str(path))}")
     if format == "rig":
         return rig.save(path)

@@ -76,6 +76,8 @@ def _pixels_per_deg(camera: Camera) -> float:
 def _load(name: str) -> tuple[Rig, str]:
     """A rig, and a line on what another tool's calibration was read as."""
     kind, root = split_kind(name)
+    if not name:  # which would be the current folder
+        return load_rig(name), ""
     if kind is None and os.path.isfile(root / CALIBRATION_FILE):  # its images need not be there
         return load_rig(root / CALIBRATION_FILE), ""
     is_rig = os.path.isfile(root) or (os.path.isdir(root) and recognised(root))

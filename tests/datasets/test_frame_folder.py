@@ -179,7 +179,7 @@ def edit(key: str, value: Any, camera: int | None = None) -> Change:
     [
         (edit("K", [[np.nan, 0, 32], [0, 40, 24], [0, 0, 1]], 0), CalibrationError, "'front': K: expected finite"),
         (edit("K", [[1, 2], [3, 4]], 0), CalibrationError, r"'front': K: expected shape \(3, 3\)"),
-        (edit("cam2ego", np.diag([1, 1, -1, 1]).tolist(), 0), CalibrationError, "'front': cam2ego: expected right-handed axes"),
+        (edit("cam2ego", np.diag([1, 1, -1, 1]).tolist(), 0), CalibrationError, "'front': cam2ego: expected right"),
         (edit("distortion", {"model": "mei", "coeffs": [1]}, 1), CalibrationError, "'back': lens: expected one of"),
         (edit("distortion", {"model": "fisheye", "coeffs": [1]}, 1), CalibrationError, "4 coefficients for a fisheye"),
         (edit("name", "front", 1), CalibrationError, "front more than once"),

@@ -84,8 +84,8 @@ FORMATS = {
 """Formats by name, in the order in which folders are tried."""
 
 _FIX = "convert them, write a rig file, or move them elsewhere"
-_CAMERA = re.compile(r"(?i)camera_?mat|intrinsic|distort|camera_?model|\bmtx\b|focal_?length|\bf[lx]_?x?\b")
-_LIKE_CAMERAS = (*camera_files.SUFFIXES, ".npz", ".toml")
+_CAMERA = re.compile(r"(?i)camera_?mat|intrinsic|distort|camera_?model|\bmtx\b|focal|\bf[lx]_?x?\b")
+_LIKE_CAMERAS = (*camera_files.SUFFIXES, ".npz", ".npy", ".mat", ".pkl", ".toml")
 
 _BROKEN = (
     *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, OSError, SystemError, RecursionError),

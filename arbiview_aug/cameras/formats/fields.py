@@ -17,7 +17,7 @@ from arbiview_aug.errors import shown
 _K = "cameramatrix k mtx cameramat intrinsicmatrix intrinsics intrinsic camk cameraintrinsic cameraintrinsics"
 _D = (
     "distortioncoefficients distortioncoefficient distortioncoeffs distortioncoeff distcoeffs distcoeff distortion "
-    "dist d camd distortionvector cameradistortion"
+    "dist d camd distortionvector cameradistortion coeffs"
 )
 # Spellings of ROS, Foxglove, OpenCV's samples and tools, Python scripts, Kalibr, Autoware.AI, CamOdoCal, MC-Calib, T4,
 # WoodScape and DAIR-V2X, without case and punctuation.
@@ -30,7 +30,7 @@ _SPELLINGS = {
     "size": "imagesize imgsize resolution dim size imagedimensions cameraresolution",
     "shape": "imageshape imgshape shape",
     **{"binning x": "binningx", "binning y": "binningy", "window": "roi"},
-    **{"fx": "fx gamma1 mu", "fy": "fy gamma2 mv", "cx": "cx u0", "cy": "cy v0"},
+    **{"fx": "fx gamma1 mu", "fy": "fy gamma2 mv", "cx": "cx u0 ppx", "cy": "cy v0 ppy"},
     **{key: key for key in ("xi", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")},
 }
 _MEANINGS = {spelling: meaning for meaning, spellings in _SPELLINGS.items() for spelling in spellings.split()}
@@ -178,7 +178,7 @@ def _lens(name: str, found: Mapping[str, tuple[str, Any]], D: FloatArray) -> tup
     if lens in ("radtan", "fisheye") and "D" not in found and not numbers:
         raise refusal(name, f"coefficients of {lens}", "none")
     if is_unified or lens in ("double_sphere", "eucm", "fisheye"):
-        return lens, [*xi, *D]
+        return lens, [*xi, *D.tolist()]
     if not D.any():
         return "pinhole", ()
     if not lens and plain(found.get("size", ("",))[0]) == "dim" and D.size == 4:
