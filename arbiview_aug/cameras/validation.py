@@ -251,9 +251,7 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[str]:
     if len(swapped) > 1 and all(swapped):
         unreal = "diag(1, -1, 1, 1) @ cam2ego @ [[0, 0, 1, 0], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]"
         fix = unreal if mistake == BODY_AXES else "negate y of the positions, and yaw"
-        return [
-            f"all cameras: left and right are swapped, as in left-handed axes (CARLA, Unreal: y to the right): {fix}"
-        ]
+        return [f"all cameras: left and right are swapped, as in left-handed axes (CARLA, Unreal: y is right): {fix}"]
     if mistake and fix != _COMPARE:
         return [f"all cameras: {mistake}: {fix}"]
     lateral = [pose[1, 3] * pose[1, 2] for pose in cam2ego if abs(pose[1, 3]) > 0.2 and abs(pose[1, 2]) > 0.5]
@@ -263,16 +261,15 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[str]:
     has_front = (1, 0) in sides
     for camera, side in zip(cameras, sides, strict=True):
         pose, up_deg, said = camera.cam2ego, camera.elevation_deg, []
-        fixes = [f", as with {a}: {b}" for poses, a, b in _candidates(pose[None]) if _fits(poses[0], side, has_front)][
-            :1
-        ]
-        if up_deg > _STEEP_DEG or (up_deg < -75 and side[1] and fixes):
+        likely = (f", as with {a}: {b}" for right, a, b in _candidates(pose[None]) if _fits(right[0], side, has_front))
+        fix = next(likely, "")
+        if up_deg > _STEEP_DEG or (up_deg < -75 and side[1] and fix):
             said.append(f"looks {'up' if up_deg > 0 else 'down'} by {abs(up_deg):.0f} degrees")
         elif up_deg > -_STEEP_DEG and abs(_roll_deg(pose)) > _STEEP_DEG:
             said.append(f"is rolled by {_roll_deg(pose):.0f} degrees")
         elif _belies(pose, side, has_front):
             said.append(f"looks to {camera.azimuth_deg:+.0f} degrees, unlike its name")
-        said = ["".join([*said, *fixes])] if said else []
+        said = [f"{words}{fix}" for words in said]
         if not said and not is_mounted(pose[None], ground_z_m)[0]:
             said.append("is at ({:.1f}, {:.1f}), {:.1f} m over the road".format(*pose[:2, 3], pose[2, 3] - ground_z_m))
         size, middle = np.array(camera.size[::-1]), camera.K[:2, 2] + 0.5

@@ -113,6 +113,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "rectified, bent": (cam(D=BENT, rectified=True), "got 'rectified': True"),
     "new matrix": (cam(D=BENT, new_camera_matrix=TURNED), "got 'new_camera_matrix'"),
     "crop": (cam(crop=[0, 60, 640, 360]), "got 'crop'"),
+    "offset": (cam(y_offset=10), "got 'y_offset': 10"),
+    "f-theta": (cam(D=FOUR, model="ftheta"), "model: expected plumb_bob"),
     "scale": (cam(scale=0.5), "got 'scale': 0.5"),
     "units": (cam(units="mm"), "got 'units': 'mm'"),
     "column-major": (cam(storage_order="column"), "got 'storage_order'"),

@@ -48,7 +48,7 @@ _NEUTRAL = re.compile(
     "distance|polygon|depth|error|rms|std|date|time|square|board|pattern|grid|guess|covar|points|extrin|pose|"
     "aspectratio$|^fix|^calib"
 )
-_NO_EFFECT = {"", "0", "00", "1", "10", "px", "pixel", "pixels", "row", "rowmajor", "opencv", "none", "false", "no"}
+_NO_EFFECT = {"", "0", "00", "px", "pixel", "pixels", "row", "rowmajor", "opencv", "none", "false", "no"}
 _CHOICE = "for raw images remove R and P; for rectified ones write P's left 3x3 as camera matrix, without coefficients"
 _NAME_IT = "write distortion_model: plumb_bob (k1 k2 p1 p2), or equidistant (k1 to k4 of a fisheye), to the file"
 
@@ -57,7 +57,7 @@ def has_camera(data: Any) -> bool:
     """Whether a mapping has a camera matrix, or focal lengths and a principal point."""
     found = _meanings(data) if isinstance(data, Mapping) else {}
     K = found.get("K", ("", None))[1]
-    is_matrix = isinstance(K, list) and (len(K) in (3, 4, 5, 6, 9) or isinstance(K[:1], list))
+    is_matrix = isinstance(K, list) and (len(K) in (4, 5, 6, 9, 12) or any(isinstance(row, list) for row in K))
     return is_matrix or isinstance(K, Mapping) or {*_PINHOLE} <= found.keys()
 
 
@@ -106,10 +106,8 @@ def read_fields(name: str, data: Mapping[Any, Any]) -> tuple[str, FloatArray, An
     width, height = size = _size(name, values) or (0, 0)
     window = values.get("window") or {}
     sides = [int(window.get(key, 0)) if isinstance(window, Mapping) else -1 for key in _WINDOW]
-    if any(float(values.get(f"binning {axis}", 0)) > 1 for axis in "xy") or sides not in (
-        [0] * 4,
-        [width, height, 0, 0],
-    ):
+    is_binned = any(float(values.get(f"binning {axis}", 0)) > 1 for axis in "xy")
+    if is_binned or sides not in ([0] * 4, [width, height, 0, 0]):
         raise refusal(name, "full images", "binning or a region of interest")
     R, P = (arrays.get(key, np.zeros(0)) for key in "RP")
     if R.any() and not (R.size == 9 and np.allclose(R.reshape(3, 3), np.eye(3), atol=1e-6)):
@@ -128,6 +126,8 @@ def _refuse_meaningful(name: str, key: str, value: Any, *, is_straight: bool) ->
         return
     if value is True and is_straight and re.search("rect|undist", word):
         return  # K is that of the images
+    if value == 1 and value is not True and re.search("scale|aspect", word):
+        return
     try:
         numbers = _array(name, key, value)
     except ValueError:
@@ -158,7 +158,7 @@ def _lens(name: str, found: Mapping[str, tuple[str, Any]], D: FloatArray) -> tup
         lens = lens_called(value)
         if meaning == "is fisheye" or plain(key) == "distortiontype":  # 0 or 1; of MC-Calib, too
             lens = "fisheye" if plain(value) in ("1", "10", "true") else "radtan"
-        if lens is None:
+        if lens is None or lens.startswith("ftheta"):  # whose coefficients are in pixels elsewhere
             known = "plumb_bob, rational_polynomial, equidistant, fisheye, pinhole, none"
             raise refusal(name, known, repr(value), WAY_OUT, key=key)
         lenses.add(lens)
