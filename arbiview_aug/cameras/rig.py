@@ -283,9 +283,10 @@ class Rig:
 def load_rig(name_or_path: Rig | str | Path) -> Rig:
     """A shipped rig by name (see ``shipped_rigs``), a rig file (YAML or JSON), or another tool's calibration.
 
-    Recognised are files and folders of ROS (CameraInfo as camera_calibration writes it, with tf), Kalibr, COLMAP,
-    OpenCV, nuScenes, Argoverse 2 and Waymo, with a file ``mounting.yaml`` beside them that holds what they lack
-    (docs/rigs.md). Files are read by safe parsers. A ``Rig`` is returned as it is.
+    Recognised are files and folders of ROS and Foxglove (CameraInfo, with tf), OpenCV, Python scripts, Kalibr, COLMAP,
+    nuScenes, Argoverse 2, Waymo and WoodScape, with a file ``mounting.yaml`` beside them that holds what they lack
+    (docs/rigs.md). Cameras that are likely wrong give one warning. Files are read by safe parsers. A ``Rig`` is
+    returned unchanged.
 
     Raises:
         CalibrationError: An unknown name, a missing or unreadable file, or an impossible or ambiguous calibration.

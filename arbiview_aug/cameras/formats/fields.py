@@ -36,6 +36,22 @@ _SPELLINGS = {
 _MEANINGS = {spelling: meaning for meaning, spellings in _SPELLINGS.items() for spelling in spellings.split()}
 _WINDOW = ("width", "height", "x_offset", "y_offset")
 _PINHOLE = ("fx", "fy", "cx", "cy")
+_SCALARS = {
+    *_PINHOLE,
+    "width",
+    "height",
+    "binning x",
+    "binning y",
+    "xi",
+    "k1",
+    "k2",
+    "k3",
+    "k4",
+    "k5",
+    "k6",
+    "p1",
+    "p2",
+}
 _GROUPS = {*_K.split(), *_D.split(), "projectionparameters", "distortionparameters", "mirrorparameters"}
 
 # Words of keys that say something of the lens or the image, and of those that say how the calibration was made.
@@ -80,14 +96,19 @@ def read_fields(name: str, data: Mapping[Any, Any]) -> tuple[str, FloatArray, An
     Raises:
         CalibrationError: No camera matrix, an unknown lens, or a key that would change the views and is not read.
     """
-    found = _meanings(data, name)
-    values = {meaning: value for meaning, (_, value) in found.items() if value is not None}
+    found = {meaning: (key, value) for meaning, (key, value) in _meanings(data, name).items() if value is not None}
+    for meaning in found.keys() & _SCALARS:
+        key, number = found[meaning][0], _array(name, *found[meaning]).ravel()
+        if number.size != 1:
+            raise refusal(name, "a number", shown(found[meaning][1]), key=key)
+        found[meaning] = key, float(number[0])
+    values = {meaning: value for meaning, (_, value) in found.items()}
     arrays = {key: _array(name, *found[key]) for key in "KDRP" if key in values}
     K, D = arrays.get("K", np.zeros(0)), arrays.get("D", np.zeros(0)).ravel()
     if K.ndim == 1 and K.size in (5, 6):  # Kalibr's xi, or two coefficients, before the focal lengths
         K, D = K[-4:], np.concatenate([K[:-4], D])
     if not K.size and {*_PINHOLE} <= values.keys():
-        K = np.array([float(values[key]) for key in _PINHOLE])
+        K = np.array([values[key] for key in _PINHOLE])
     if K.size == 4:
         K = np.array(matrix(*K.ravel()))
     elif K.size == 9 or (K.shape in ((3, 4), (4, 4)) and not K[:3, 3].any()):
@@ -106,7 +127,7 @@ def read_fields(name: str, data: Mapping[Any, Any]) -> tuple[str, FloatArray, An
     width, height = size = _size(name, values) or (0, 0)
     window = values.get("window") or {}
     sides = [int(window.get(key, 0)) if isinstance(window, Mapping) else -1 for key in _WINDOW]
-    is_binned = any(float(values.get(f"binning {axis}", 0)) > 1 for axis in "xy")
+    is_binned = any(values.get(f"binning {axis}", 0) > 1 for axis in "xy")
     if is_binned or sides not in ([0] * 4, [width, height, 0, 0]):
         raise refusal(name, "full images", "binning or a region of interest")
     R, P = (arrays.get(key, np.zeros(0)) for key in "RP")
@@ -144,7 +165,7 @@ def _array(name: str, key: str, value: Any) -> FloatArray:
             numbers, shape = np.asarray(value["data"], float), [int(value.get(key, 0)) for key in ("rows", "cols")]
             return numbers.reshape(shape) if math.prod(shape) == numbers.size else numbers
         return np.asarray(value.split() if isinstance(value, str) else value, float)
-    except (TypeError, ValueError, LookupError):
+    except (TypeError, ValueError, LookupError, OverflowError):
         raise refusal(name, "a matrix or list of numbers", shown(value), key=key) from None
 
 
@@ -162,12 +183,12 @@ def _lens(name: str, found: Mapping[str, tuple[str, Any]], D: FloatArray) -> tup
             known = "plumb_bob, rational_polynomial, equidistant, fisheye, pinhole, none"
             raise refusal(name, known, repr(value), WAY_OUT, key=key)
         lenses.add(lens)
-    xi = [float(found["xi"][1])] if "xi" in found else []
+    xi = [found["xi"][1]] if "xi" in found else []
     is_unified = bool(xi) or "unified" in lenses
     if len(named := {"unified"} if is_unified else lenses - {"pinhole"}) > 1:
         raise refusal(name, "one lens", " and ".join(sorted(named)), "correct the file")
     lens = next(iter(named), "")
-    numbers = {key: float(value) for key, (_, value) in found.items() if re.fullmatch("[kp][1-6]", key)}
+    numbers = {key: value for key, (_, value) in found.items() if re.fullmatch("[kp][1-6]", key)}
     if numbers and not D.size:
         order = "k1 k2 p1 p2 k3 k4 k5 k6" if lens != "fisheye" and "p1" in numbers else "k1 k2 k3 k4"
         if lens == "fisheye" and "k1" not in numbers:
@@ -195,7 +216,9 @@ def _size(name: str, values: Mapping[str, Any]) -> tuple[float, float] | None:
     for meaning in {"size", "shape"} & values.keys():
         value = values[meaning]
         value = [value.get("width"), value.get("height")] if isinstance(value, Mapping) and "width" in value else value
-        sides = _array(name, meaning, value.replace("x", " ") if isinstance(value, str) else value).ravel()[:3].tolist()
+        sides = _array(name, meaning, value.replace("x", " ") if isinstance(value, str) else value).ravel().tolist()
+        if len(sides) < 2:
+            raise refusal(name, "width and height", shown(value), key=meaning)
         sizes.append((sides[1], sides[0]) if meaning == "shape" else (sides[0], sides[1]))
     sizes = [*{(float(width), float(height)) for width, height in sizes}]
     if len(sizes) > 1:
