@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
-from kornia.metrics import ssim
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.errors import SampleError
@@ -39,6 +38,8 @@ def ssim_map(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> npt.NDArray[np.flo
 
     Gaussian window 11x11 with σ = 1.5, K1 = 0.01, K2 = 0.03; borders are reflected.
     """
+    from kornia.metrics import ssim  # half a second, which those who need errors alone do not pay
+
     a, b = (torch.from_numpy(image.astype(np.float64)).permute(2, 0, 1)[None] for image in (one, two))
     return np.asarray(ssim(a, b, window_size=11, max_val=_PEAK)[0].permute(1, 2, 0).numpy())
 
