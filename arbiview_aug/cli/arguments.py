@@ -121,6 +121,24 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     add_downscale(parser)
     text = "take specks out of frame folders' masks, and mask the dark rims of fisheye images without a mask"
     parser.add_argument("--clean-masks", action="store_true", help=text)
+    add_lidar(parser)
+
+
+def add_lidar(parser: argparse.ArgumentParser) -> None:
+    """Add ``--lidar-channel`` and ``--lidar-columns``."""
+    text = "nuScenes: the LiDAR to read (default: LIDAR_TOP, or the only one)"
+    parser.add_argument("--lidar-channel", metavar="NAME", help=text)
+    text = (
+        "nuScenes: columns of LiDAR files without a header, such as x y z intensity, float32 or with a type as in "
+        "ring:uint16 (default: x y z intensity ring)"
+    )
+    parser.add_argument("--lidar-columns", nargs="+", metavar="NAME", help=text)
+
+
+def reading(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Options of ``open_data`` that the command has."""
+    names = ("reduce", "clean_masks", "lidar_channel", "lidar_columns")
+    return {name: getattr(arguments, name) for name in names if hasattr(arguments, name)}
 
 
 def add_output(parser: argparse.ArgumentParser, text: str = "folder to write to") -> None:

@@ -21,7 +21,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import inside, remove_parts
 from arbiview_aug.choices import Reference
-from arbiview_aug.cli.arguments import device_named, gathered_warnings, writable_folder
+from arbiview_aug.cli.arguments import device_named, gathered_warnings, reading, writable_folder
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.registry import open_data, split_kind
@@ -131,7 +131,7 @@ def run(arguments: argparse.Namespace) -> int:
     _, root = split_kind(arguments.data)
     warned: list[str] = []
     with gathered_warnings(warned):
-        data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED)
+        data: Any = open_data(arguments.data, neighbours=None if arguments.model else WANTED, **reading(arguments))
         folder = Path(arguments.output or inside(root, LEARNED_FOLDER if arguments.model else FOLDER, "depth"))
         model = TransformersDepth(arguments.model, device) if arguments.model else None  # before the folder is made
         depths = DepthFolder(writable_folder(folder, str(folder)))

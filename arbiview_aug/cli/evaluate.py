@@ -21,7 +21,7 @@ import numpy as np
 from arbiview_aug.atomic_io import file_name, inside
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.arguments import REAL_TARGET, device_named, frames_text, named_steps, writable_folder
+from arbiview_aug.cli.arguments import REAL_TARGET, device_named, frames_text, named_steps, reading, writable_folder
 from arbiview_aug.cli.scans import evaluate_scans
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
@@ -135,8 +135,7 @@ def open_frames(arguments: argparse.Namespace, surfaces: Sequence[GeometryName],
     """Open ``--data``, or a synthetic drive; with neighbours and learned depth where a surface needs them."""
     neighbours = WANTED if any(GEOMETRIES[name].needs == "motion" for name in surfaces) else None
     if arguments.data is not None:
-        options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
-        data = open_data(arguments.data, neighbours=neighbours, **options)
+        data = open_data(arguments.data, neighbours=neighbours, **reading(arguments))
         learned = inside(split_kind(arguments.data)[1], LEARNED_FOLDER, "learned depth")
         reads = learned.is_dir() and any(LEARNED_KEY in GEOMETRIES[name].reads for name in surfaces)
         return WithDepth(data, learned) if reads else data

@@ -15,6 +15,7 @@ from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, OnError, Quality
 from arbiview_aug.cli.arguments import (
     add_data,
     add_frames,
+    add_lidar,
     add_output,
     add_reading,
     add_rendering,
@@ -116,6 +117,7 @@ def demo() -> argparse.ArgumentParser:
     add_output(parser, "folder for demo.png, or a picture file ending in .png or .jpg")
     add_rendering(parser)
     add_frames(parser, 1)
+    add_lidar(parser)
     parser.add_argument("--width", type=count, default=1800, metavar="PX", help="width of the contact sheet")
     parser.set_defaults(target_set=None, reduce=1, clean_masks=False)
     return parser
@@ -139,6 +141,7 @@ def depth() -> argparse.ArgumentParser:
     references = list(get_args(Reference))
     reference = "what scale and shift of the model are fitted to, the first that a camera has"
     add("--reference", nargs="+", choices=references, default=references, help=reference)
+    add_lidar(parser)
     return parser
 
 

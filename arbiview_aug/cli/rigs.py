@@ -87,10 +87,9 @@ def _load(name: str) -> tuple[Rig, str]:
     if kind is None and not os.path.isdir(root):
         return load_rig(name), ""
     try:
-        recording = open_data(data(name))
+        recording = open_data(data(name), load_points=False)
     except DataError as error:
         if kind is not None:
             raise
         raise DataError(f"{error}; nor is it a folder of another tool's calibration (docs/rigs.md)") from None
-    recording.load_points = False
     return recording[0]["rig"], ""

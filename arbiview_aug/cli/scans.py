@@ -15,7 +15,7 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.cli.arguments import REAL_TARGET, frames_text, named_steps
+from arbiview_aug.cli.arguments import REAL_TARGET, frames_text, named_steps, reading
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.depth_folder import WANTED
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -50,8 +50,7 @@ class TrueScan(NamedTuple):
 def evaluate_scans(arguments: argparse.Namespace, folder: Path) -> None:
     """Measure, print the table, write ``evaluate.json`` and a picture of the first frame."""
     if arguments.displaced:
-        options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
-        data = open_data(arguments.data, neighbours=WANTED, **options)
+        data = open_data(arguments.data, neighbours=WANTED, **reading(arguments))
         scans, count = _displaced(arguments, data), arguments.frames or len(data)
     else:
         scans, count = _synthetic(arguments), arguments.frames or 1

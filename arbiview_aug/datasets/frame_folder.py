@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -14,9 +15,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.atomic_io import BROKEN_ARRAY, check_name, inside
+from arbiview_aug.atomic_io import check_name, inside
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.key_names import hint, misnamed
+from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, canonical_name
 from arbiview_aug.cameras.plain_yaml import parse_json
 from arbiview_aug.cameras.rig import MOST_CAMERAS, Rig, read_mask
@@ -33,6 +34,8 @@ from arbiview_aug.datasets.drive import (
     warn_of_unfinished,
 )
 from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, encoded_image, reduced_rig
+from arbiview_aug.datasets.lens_keys import unread_lens
+from arbiview_aug.datasets.lidar_files import read_cloud
 from arbiview_aug.datasets.registry import CALIBRATION_FILE
 from arbiview_aug.errors import (
     ArbiviewError,
@@ -44,12 +47,19 @@ from arbiview_aug.errors import (
     shown,
     warn,
 )
+from arbiview_aug.files import read_text
 from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
 from arbiview_aug.scene.point_cloud import returns, shape_mistake
 
 SEQUENCE_FILE = "sequence.json"
 POINTS_FILE = "lidar.npy"
+MOST_BYTES = 1 << 26  # of a frame's or a sequence's JSON: 64 MiB, 200,000 boxes
+
+_COLUMNS = 'say them in calib.json: "lidar": {"file": NAME, "columns": ["x", "y", "z", "intensity"]}'
+_OF_POINTS = re.compile(r"2ego|2world|pose|transl|rotat|transf|extrin|unit|scale|type|order|layout|field", re.IGNORECASE)
+"""Keys of ``lidar`` that would give its points another meaning, and are not read."""
+_CLOCK = re.compile(r"^(?!time_s$)(?:time|stamp|t$|n?sec)", re.IGNORECASE)  # other keys of a sequence's times
 
 _CACHED_MASKS = 16  # masks that a worker keeps: those of two eight-camera rigs, 2 MB each at full size
 
@@ -278,13 +288,16 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
     if not path.is_file():
         return {}, []
     try:
-        listed = parse_json(path.read_text(encoding="utf-8"))["frames"]
+        listed = parse_json(read_text(path, MOST_BYTES))["frames"]
         names = [*map(entry_name, listed)]
+        if unread := sorted({k for one in listed if isinstance(one, Mapping) for k in one if _CLOCK.search(str(k))}):
+            raise ValueError(f"{', '.join(unread)}, which is not read: time_s is in seconds")
         timed = [entry for entry in listed if isinstance(entry, Mapping) and "time_s" in entry]
         times_s = {entry_name(entry): float(entry["time_s"]) for entry in timed}
     except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         expected = "{'frames': [names, or {'name': ..., 'time_s': ...}]}"
-        raise DataError(f"{path}: expected {expected}, got {type(error).__name__}: {error}") from None
+        got = f"no {error}" if isinstance(error, KeyError) else getattr(error, "strerror", None) or error
+        raise DataError(f"{path}: expected {expected}, got {got}") from None
     for name in names:
         if name not in index:
             raise DataError(f"{path}: expected names of the folders beside it, got {shown(name)}")
@@ -298,7 +311,7 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
 def _read_calibration(frame: _Frame) -> dict[str, Any]:
     path = frame.file(CALIBRATION_FILE)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, MOST_BYTES)
         _check_count(text.count('"cam2ego"') // 2, path)  # before millions of entries are parsed; notes may name it too
         calib = parse_json(text)
     except CalibrationError:
@@ -306,7 +319,7 @@ def _read_calibration(frame: _Frame) -> dict[str, Any]:
     except FileNotFoundError:
         raise DataError(f"{path}: expected a calibration, found no file") from None
     except (OSError, ValueError, RecursionError) as error:  # ValueError: numbers of thousands of digits too
-        raise DataError(f"{path}: expected JSON, got {error}") from None
+        raise DataError(f"{path}: expected JSON, got {getattr(error, 'strerror', None) or error}") from None
     if not isinstance(calib, dict) or not isinstance(calib.get("cameras"), list):
         got = type(calib).__name__ + (hint(calib, ("cameras",)) if isinstance(calib, dict) else "")
         raise DataError(f"{path}: expected an object with a list 'cameras', got {got}")
@@ -314,6 +327,10 @@ def _read_calibration(frame: _Frame) -> dict[str, Any]:
     for k, entry in enumerate(calib["cameras"]):
         if not isinstance(entry, dict):
             raise CalibrationError(f"{path}: camera {k}: expected a mapping, got {type(entry).__name__}")
+        refused = "distortion", "lens", *USUAL_NAMES["distortion"]  # by ``Rig.from_dict``
+        if entry.get("distortion") is None and (lens := unread_lens(entry, refused)):
+            fix = "write distortion: {model, coeffs} (docs/formats.md), or remove it"
+            raise CalibrationError(f"{path}: camera {shown(entry.get('name', k))}: {lens} is not read; {fix}")
     return calib
 
 
@@ -402,7 +419,7 @@ def _cached_mask(path: str, clean: bool, modified_s: float) -> BoolArray:
 def _points_file(calib: Mapping[str, Any], frame: _Frame) -> Path | None:
     entry = calib.get("lidar")
     named = entry.get("file") if isinstance(entry, Mapping) else entry
-    if named is not None and not isinstance(named, str):
+    if not (named is None or (isinstance(named, str) and named)):
         raise DataError(f"{frame.where}: lidar: expected {{'file': name}}, got {shown(entry)}")
     path = frame.file(named or POINTS_FILE, "lidar")
     if path.is_file():
@@ -417,11 +434,12 @@ def _read_points(calib: Mapping[str, Any], frame: _Frame) -> torch.Tensor | None
     path = _points_file(calib, frame)
     if path is None:
         return None
-    try:
-        array = np.load(path, allow_pickle=False)
-    except BROKEN_ARRAY as error:
-        raise DataError(f"points {path}: expected a .npy array of numbers, got {error}") from None
-    return checked_points(array, str(path))
+    entry = calib["lidar"] if isinstance(calib.get("lidar"), Mapping) else {}
+    unread = [key for key in entry if _OF_POINTS.search(key) and entry[key]]
+    if unread or "ego" not in str(entry.get("frame") or "ego").lower():
+        got = ", ".join(f"{key}: {shown(entry[key])}" for key in unread or ["frame"])
+        raise DataError(f"{frame.where}: lidar: expected file and columns of float32 points in the ego frame, got {got}")
+    return checked_points(read_cloud(path, entry.get("columns"), _COLUMNS), str(path))
 
 
 def checked_points(array: Any, where: str) -> torch.Tensor:

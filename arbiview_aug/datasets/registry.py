@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from arbiview_aug.choices import Reduce
 from arbiview_aug.environment import imported
@@ -54,7 +54,7 @@ READERS = {
         lambda root, version=None, clean_masks=False, **options: imported(
             "arbiview_aug.datasets.nuscenes.reader:NuScenesDataset"
         )(root, version or table_folders(root)[0], **options),
-        options=("version", "clean_masks"),  # there are no masks to clean
+        options=("version", "clean_masks", "lidar_channel", "lidar_columns"),  # there are no masks to clean
         writer="arbiview_aug.cli.convert.nuscenes:NuScenes",
     ),
     "py123d": Reader(
@@ -111,8 +111,11 @@ def open_data(
     kind: str | None = None,
     version: str | None = None,
     reduce: Reduce = 1,
+    load_points: bool = True,
     neighbours: Neighbours | None = None,
     clean_masks: bool = False,
+    lidar_channel: str | None = None,
+    lidar_columns: Sequence[str] | None = None,
 ) -> Recording:
     """Open a data set with the reader that fits it.
 
@@ -123,17 +126,24 @@ def open_data(
         kind: A key of ``READERS``, instead of ``KIND:``.
         version: nuScenes' folder of tables; by default v1.0-mini or v1.0-trainval, else the first one.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size.
+        load_points: Whether to read the LiDAR's points.
         neighbours: Which other frames of the drive come with a sample; None for none.
         clean_masks: As for ``FrameFolder``; nuScenes has no masks, and py123d's logs refuse it.
+        lidar_channel: As for ``NuScenesDataset``, alone.
+        lidar_columns: As for ``NuScenesDataset``, alone; frame folders state them in ``calib.json``.
 
     Raises:
         DataError: There is no such folder, no reader fits it, an option is not for this kind, or it is empty.
     """
     root, reader = find_reader(data, kind, version=version)
-    options = {name: value for name, value in (("version", version), ("clean_masks", clean_masks)) if value}
-    if not options.keys() <= {*reader.options}:  # the version is checked already
-        raise DataError(f"data {root}: expected no clean_masks (--clean-masks), which a {reader.description} has not")
-    recording = reader.open(root, reduce=reduce, neighbours=neighbours, **options)
+    options: dict[str, Any] = {"version": version, "clean_masks": clean_masks}
+    options |= {"lidar_channel": lidar_channel, "lidar_columns": lidar_columns}
+    options = {name: value for name, value in options.items() if value}
+    for name in options.keys() - {*reader.options}:  # the version is checked already
+        fix = "; its calib.json states columns (docs/formats.md)" if name == "lidar_columns" else ""
+        option = f"{name} (--{name.replace('_', '-')})"
+        raise DataError(f"data {root}: expected no {option}, which a {reader.description} has not{fix}")
+    recording = reader.open(root, reduce=reduce, neighbours=neighbours, load_points=load_points, **options)
     if not recording.tokens:
         raise DataError(f"data {root}: expected samples, got none; check the copy of the data")
     return recording

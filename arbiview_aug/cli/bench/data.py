@@ -46,9 +46,7 @@ class Recorded:
 
     def reader(self, reduce: Reduce) -> Callable[[], Any]:
         """Function that reads the first frame from disk, without its points."""
-        data = open_data(self.root, reduce=reduce)
-        data.load_points = False
-        return partial(data.__getitem__, 0)
+        return partial(open_data(self.root, reduce=reduce, load_points=False).__getitem__, 0)
 
     def target(self, name: str | None, size: tuple[int, int]) -> Rig:
         """Rig to render, stretched to (h, w), by default the one that other commands take; without scanners, which

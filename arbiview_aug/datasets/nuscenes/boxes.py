@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,8 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rotations import poses_from
-from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Tables, Tokens
+from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables, Tokens
+from arbiview_aug.errors import warn
 
 MAX_STEP_S = 1.5  # between annotations for a velocity; doubled for central differences (``NuScenes.box_velocity``)
 
@@ -99,12 +101,14 @@ def read_annotations(
     annotations: list[tuple[Any, ...]] = [
         (np.empty(0, np.int32), np.empty((0, 2), np.int32), np.empty(0, np.bytes_), none.astype(np.float64), none, none)
     ]
+    left_out: list[Any] = []
     for batch in tables.batches(table):
         of_samples = tables.column(table, batch, "sample_token", TOKENS)
         rows = [row for row, token in zip(batch, of_samples, strict=True) if token in samples]
+        is_whole = _are_whole(rows)
+        left_out += (row.get("token") for row in compress(rows, ~is_whole))
+        rows = [*compress(rows, is_whole)]
         sizes_m = tables.numbers(table, rows, "size", (3,))
-        for k in np.flatnonzero((sizes_m <= 0).any(axis=1))[:1]:
-            raise tables.error(table, "sizes above 0", f"{sizes_m[k].tolist()} in row {rows[k].get('token')!r}")
         numbered = tables.follow(table, rows, "instance_token", "instance", objects)
         numbers = np.array([samples[row["sample_token"]] for row in rows], np.int32)
         tokens = np.array([token.encode() for token in unique.add(rows)], np.bytes_)
@@ -112,6 +116,9 @@ def read_annotations(
         sizes, headings = sizes_m[:, [1, 0, 2]].astype(np.float32), poses[:, :3, 0].astype(np.float32)
         pairs = np.array(numbered, np.int32).reshape(-1, 2)
         annotations.append((numbers, pairs, tokens, poses[:, :3, 3], sizes, headings))
+    if left_out:
+        count = f"{len(left_out)} boxes, row {left_out[0]!r} first,"
+        warn(f"nuScenes {tables.root}: {table}: {count} have no size above 0, or a number that is not finite: left out")
     unique.check()
     columns = [np.concatenate([batch[k] for batch in annotations]) for k in range(len(annotations[0]))]
     order = np.argsort(columns[0], kind="stable")
@@ -133,6 +140,15 @@ def read_annotations(
         scenes=scenes,
         order=np.lexsort((times_s, scenes)),
     )
+
+
+def _are_whole(rows: Sequence[Row]) -> npt.NDArray[np.bool_]:
+    """(B,) whether a box has finite numbers and sizes above 0; True for other mistakes, which are named later."""
+    try:
+        numbers = np.array([[*row["size"], *row["translation"], *row["rotation"]] for row in rows], np.float64)
+        return np.isfinite(numbers).all(axis=1) & (numbers[:, :3] > 0).all(axis=1)
+    except (KeyError, TypeError, ValueError, OverflowError, IndexError):
+        return np.ones(len(rows), bool)
 
 
 def _in_time(instance: IntArray, scene: npt.NDArray[np.int64], time_s: FloatArray) -> tuple[IntArray, IntArray]:

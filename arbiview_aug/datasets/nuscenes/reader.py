@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from itertools import compress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -27,15 +28,17 @@ from arbiview_aug.datasets.drive import (
 )
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, reduced_rig
+from arbiview_aug.datasets.lidar_files import NUSCENES_COLUMNS, read_cloud
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
-from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables
+from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables, is_camera
 from arbiview_aug.errors import DataError, calibration_of, warn
 
 CAMERA_RING = ("CAM_FRONT", "CAM_FRONT_RIGHT", "CAM_BACK_RIGHT", "CAM_BACK", "CAM_BACK_LEFT", "CAM_FRONT_LEFT")
 """Order of the cameras in a sample, clockwise from above; other cameras follow by name."""
 
-_POINT_FLOATS = 5  # x y z intensity ring
+_COLUMNS = "say them: lidar_columns=['x', 'y', 'z', 'intensity'] (--lidar-columns x y z intensity)"
+_LABELS = ("category", "sample_annotation")  # tables without which there are no boxes
 
 
 class NuScenesDataset(WritableRecording):
@@ -43,10 +46,12 @@ class NuScenesDataset(WritableRecording):
 
     A sample is a dict, everything in the ego frame at the LiDAR's time: ``images`` (N, 3, h, w) uint8 RGB; ``rig``;
     ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token``, ``scene_token``; ``ego2world`` (4, 4) float64;
-    ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring; with ``load_boxes`` the
+    ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring, or x y z, intensity and further
+    columns as the files have them; with ``load_boxes`` the
     ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians, velocity x y in m/s over the
     ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
     vary: batch with ``collate_fn=arbiview_aug.collate``. If no sample is annotated, they have no boxes, with a warning.
+    Boxes without a size are left out, with a warning. Cameras have the lens of ``camera_distortion``, if it is there.
     A root that ``convert`` wrote also has ``coverage`` and ``generated``, as ``FrameFolder`` gives them.
 
     With ``neighbours`` a sample also has other frames of its scene, keyframes and sweeps, by the distance that the
@@ -72,6 +77,10 @@ class NuScenesDataset(WritableRecording):
         neighbours: Which other frames of the drive come with a sample; None for none. Sweeps make opening half as long
             again. If no sweep's file exists, only keyframes are neighbours, with a warning; if none of the LiDAR's
             does, only they have points.
+        lidar_channel: The LiDAR to read; None for ``LIDAR_TOP``, or the only one. Without any, samples have no points,
+            and the time and ego pose of their first camera.
+        lidar_columns: Columns of LiDAR files without a header, such as ``["x", "y", "z", "intensity"]``, float32 unless
+            they say otherwise (``"ring:uint16"``); None for x y z intensity ring, of which files must look like rows.
 
     Raises:
         TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
@@ -92,6 +101,8 @@ class NuScenesDataset(WritableRecording):
         load_boxes: bool = True,
         reduce: Reduce = 1,
         neighbours: Neighbours | None = None,
+        lidar_channel: str | None = None,
+        lidar_columns: Sequence[str] | None = None,
     ) -> None:
         super().__init__(root or "", reduce, load_points, neighbours)
         tables = Tables(root, version, nusc)
@@ -103,15 +114,23 @@ class NuScenesDataset(WritableRecording):
         scene = {token: k for k, token in enumerate(dict.fromkeys(self.scene_tokens))}
         scenes = [scene[token] for token in self.scene_tokens]
         self.channels = _chosen_channels(tables, channels)
-        self.other_channels = [row["channel"] for row in tables.rows("sensor") if row.get("modality") != "camera"]
-        sweeps = [] if neighbours is None else [*self.channels, LIDAR] if load_points else self.channels
-        self._recordings = read_recordings(tables, self._index, scenes, self.channels, sweeps)
+        self.other_channels = [row["channel"] for row in tables.rows("sensor") if not is_camera(row)]
+        self.lidar_channel = _chosen_lidar(tables, lidar_channel, load_points)
+        self.load_points = load_points and self.lidar_channel is not None
+        self.lidar_columns = None if lidar_columns is None else [*lidar_columns]
+        lidars = [self.lidar_channel] if self.lidar_channel and load_points else []
+        sweeps = [] if neighbours is None else [*self.channels, *lidars]
+        self._recordings = read_recordings(tables, self._index, scenes, self.channels, self.lidar_channel, sweeps)
         times_s = self._recordings.time_s(self._recordings.keyframes[:, -1])
+        if load_boxes and (missing := [table for table in _LABELS if not tables.has(table)]):
+            warn(f"nuScenes {self.root} {self.version}: no table {', '.join(missing)}: samples come without boxes_3d")
+            load_boxes = False
         self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
         if self._annotations is not None and self.tokens and not len(self._annotations.tokens):
             self._annotations = None  # an empty list of boxes would mean an empty street
             lacks = "has no rows of these samples (a test split?): they come without boxes_3d"
             warn(f"nuScenes {self.root}: sample_annotation {lacks}")
+        self._sizes: dict[int, tuple[int, int]] = {}  # of sensors whose rows have none
         self._has_lidar_sweeps = False
         self._drive_rows = np.empty(0, np.int64) if neighbours is None else self._find_drive_rows()
         positions_m = self._recordings.ego2global(self._drive_rows)[:, :3, 3]
@@ -121,8 +140,13 @@ class NuScenesDataset(WritableRecording):
         """Source files of a sample: each camera's image, masks of converted views, and last the LiDAR's points."""
         *cameras, lidar = self._recordings.keyframes[checked_index(index, len(self))]
         masks = [path for key in self._view_masks for path in self._mask_files(cameras, key) if path is not None]
-        images, points = ([self.root / self._recordings.file(row) for row in rows] for rows in (cameras, [lidar]))
+        points = [lidar] if self.lidar_channel else []
+        images, points = ([self.root / self._recordings.file(row) for row in rows] for rows in (cameras, points))
         return [*images, *masks, *points]
+
+    def moment_file(self, index: int) -> str:
+        """Name of the file that was recorded at a sample's time: the LiDAR's, or without one the first camera's."""
+        return self._recordings.file(self._recordings.keyframes[index, -1])
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         index = checked_index(index, len(self))
@@ -154,10 +178,20 @@ class NuScenesDataset(WritableRecording):
             cam2ego, K = recordings.sensor2ego[sensor], recordings.K[sensor]
             if self.compensate_ego_motion:
                 cam2ego = own2ego @ cam2ego
-            height_px, width_px = recordings.size(row)
+            height_px, width_px = self._size(row)
+            lens, distortion = recordings.lenses[sensor]
+            optics: dict[str, Any] = {"K": K, "lens": lens, "distortion": tuple(distortion)}
             with calibration_of(f"nuScenes {self.root}: image {recordings.file(row)}"):
-                rig.append(Camera(name=channel, width_px=width_px, height_px=height_px, K=K, cam2ego=cam2ego))
+                rig.append(Camera(name=channel, width_px=width_px, height_px=height_px, cam2ego=cam2ego, **optics))
         return reduced_rig(Rig(rig, ground_z_m=0.0, name="nuscenes"), self.reduce)
+
+    def _size(self, row: int) -> tuple[int, int]:
+        """(h, w) of an image: of its row, or where that has none of the first such image of its sensor."""
+        size, sensor = self._recordings.size(row), int(self._recordings.rows["sensor"][row])
+        if not all(size) and sensor not in self._sizes:
+            height_px, width_px = decode_images([inside(*self._file(row))])[0].shape[-2:]
+            self._sizes[sensor] = height_px, width_px
+        return size if all(size) else self._sizes[sensor]
 
     def _file(self, row: int) -> tuple[Path, str, str]:
         """A recording's file, which must lie below the root: arguments of ``inside``."""
@@ -167,7 +201,7 @@ class NuScenesDataset(WritableRecording):
 
     def _images(self, cameras: IntArray) -> Callable[[], torch.Tensor | list[torch.Tensor]]:
         """Decoder of the images of cameras, which pickles without the data set."""
-        files, sizes = [*map(self._file, cameras)], [*map(self._recordings.size, cameras)]
+        files, sizes = [*map(self._file, cameras)], [*map(self._size, cameras)]
         return partial(_decode_images, files, names=self.channels, sizes=sizes, reduce=self.reduce)
 
     def _mask_files(self, cameras: Iterable[int], key: str) -> list[Path | None]:
@@ -179,13 +213,14 @@ class NuScenesDataset(WritableRecording):
         return paths
 
     def _masks(self, cameras: IntArray, keys: Sequence[str]) -> dict[str, Any]:
-        files, sizes = {key: self._mask_files(cameras, key) for key in keys}, [*map(self._recordings.size, cameras)]
+        files, sizes = {key: self._mask_files(cameras, key) for key in keys}, [*map(self._size, cameras)]
         return decode_view_masks(files, names=self.channels, sizes=sizes, reduce=self.reduce)
 
     def _points(self, lidar: int, own2ego: FloatArray | None = None) -> Callable[[], torch.Tensor]:
         """Reader of a recording's points in its own ego frame, or in the one that ``own2ego`` leads to."""
         sensor2ego = self._recordings.sensor2ego[self._recordings.rows["sensor"][lidar]]
-        return partial(_read_points, self._file(lidar), sensor2ego if own2ego is None else own2ego @ sensor2ego)
+        points2ego = sensor2ego if own2ego is None else own2ego @ sensor2ego
+        return partial(_read_points, self._file(lidar), points2ego, self.lidar_columns)
 
     def _find_drive_rows(self) -> IntArray:
         """Rows of the first camera that can be neighbours: all, or keyframes only if sweeps were not copied.
@@ -264,9 +299,9 @@ def _refuse_text(option: str, names: Any) -> None:
 
 def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str]:
     rows = tables.rows("sensor")
-    modalities = tables.column("sensor", rows, "modality", TEXTS)
+    tables.column("sensor", rows, "modality", TEXTS)
     names = tables.column("sensor", rows, "channel", TOKENS)
-    cameras = {name for name, modality in zip(names, modalities, strict=True) if modality == "camera"}
+    cameras = {*compress(names, map(is_camera, rows))}
     if LIDAR in cameras:
         raise tables.error("sensor", f"modality lidar of {LIDAR}", "camera")
     if channels is None:
@@ -284,23 +319,26 @@ def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str
     return chosen
 
 
+def _chosen_lidar(tables: Tables, wanted: str | None, load_points: bool) -> str | None:
+    """The LiDAR's channel: the wanted one, ``LIDAR``, or the only one; without points any, if there is one."""
+    lidars = sorted({row["channel"] for row in tables.rows("sensor") if str(row["modality"]).lower() == "lidar"})
+    if wanted is not None and wanted not in lidars:
+        got = f"{', '.join(lidars) or 'none'} in table sensor"
+        raise DataError(f"nuScenes {tables.root}: lidar_channel: expected {wanted!r}, with modality lidar, got {got}")
+    if wanted is None and LIDAR not in lidars and len(lidars) > 1 and load_points:
+        fix = f"lidar_channel={lidars[0]!r} (--lidar-channel {lidars[0]})"
+        raise DataError(f"nuScenes {tables.root}: expected {LIDAR} or one LiDAR, got {', '.join(lidars)}; {fix}")
+    return wanted or (LIDAR if LIDAR in lidars else lidars[0] if lidars else None)
+
+
 def _decode_images(files: Sequence[tuple[Path, str, str]], **settings: Any) -> torch.Tensor | list[torch.Tensor]:
     return decode_images([inside(*file) for file in files], **settings)
 
 
-def _read_points(file: tuple[Path, str, str], sensor2ego: FloatArray) -> torch.Tensor:
+def _read_points(
+    file: tuple[Path, str, str], sensor2ego: FloatArray, columns: Sequence[str] | None
+) -> torch.Tensor:
     path = inside(*file)
-    try:
-        numbers = np.fromfile(path, dtype="<f4")
-        size = path.stat().st_size
-    except FileNotFoundError:
-        fix = "check the data root, or pass load_points=False"
-        raise DataError(f"points {path}: expected the LiDAR's file, found none; {fix}") from None
-    except OSError as error:
-        raise DataError(f"points {path}: expected a readable file, got {error.strerror}") from None
-    if size == 0 or size % (4 * _POINT_FLOATS):
-        got = f"got {size} bytes (truncated?); copy it again"
-        raise DataError(f"points {path}: expected whole points of {_POINT_FLOATS} float32, {got}")
-    points = checked_points(numbers.reshape(-1, _POINT_FLOATS), str(path)).numpy()
+    points = checked_points(read_cloud(path, columns, _COLUMNS, NUSCENES_COLUMNS), str(path)).numpy()
     points[:, :3] = points[:, :3].astype(np.float64) @ sensor2ego[:3, :3].T + sensor2ego[:3, 3]
     return torch.from_numpy(points)

@@ -13,15 +13,29 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.lens import LENSES, FloatArray
 from arbiview_aug.cameras.rotations import poses_from
 from arbiview_aug.datasets.drive import clock_message
+from arbiview_aug.datasets.lens_keys import is_neutral, unread_lens
 from arbiview_aug.datasets.nuscenes import tables as kinds
-from arbiview_aug.datasets.nuscenes.tables import TOKENS, Tables, Tokens
+from arbiview_aug.datasets.nuscenes.tables import TOKENS, Row, Tables, Tokens
 from arbiview_aug.errors import DataError, warn
 
-LIDAR = "LIDAR_TOP"  # sensor whose time and ego pose are the sample's
+LIDAR = "LIDAR_TOP"  # nuScenes' only LiDAR
 MAX_APART_S = 0.1  # maximum time to a sweep's nearest image; cameras record every 50 to 100 ms
+_LEAST_STEP_S = 1e-3  # between keyframes in time: less where times are in milliseconds or seconds
+
+_COLUMNS = (
+    *("token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "timestamp", "fileformat"),
+    *("is_key_frame", "height", "width", "filename", "prev", "next"),
+)
+"""Columns of ``sample_data`` in nuScenes."""
+_COEFFICIENTS = ("camera_distortion", "distortion", "distortion_coefficients", "dist_coeffs", "D")
+_MODELS = ("camera_distortion_model", "distortion_model", "camera_model", "lens")
+"""Columns of a lens in tables of the same layout; T4 and nuImages have camera_distortion."""
+_FISHEYES = ("fisheye", "opencv_fisheye", "equidistant", "kannala_brandt", "kannala_brandt4", "kb4")
+_OF_IMAGES = ("camera_intrinsic", "intrinsic", "intrinsics", "K", "translation", "rotation")
+"""Columns that would give an image another calibration than its sensor has."""
 
 IntArray = npt.NDArray[np.int64]
 
@@ -35,12 +49,13 @@ is the number of the first channel's rows in the table's order."""
 class Recordings:
     """Recordings of all sensors, sorted by channel, scene and time."""
 
-    channels: list[str]  # the cameras, whose first one times a drive's frames, and last the LiDAR
+    channels: list[str]  # the cameras, whose first one times a drive's frames, and last the LiDAR, or "" without one
     sensor2ego: FloatArray  # (C, 4, 4) by calibrated sensor
     K: FloatArray  # (C, 3, 3), the identity for the LiDAR
+    lenses: list[tuple[str, list[float]]]  # (C) models and coefficients
     rows: npt.NDArray[Any]  # (R,) records of ``_ROW``
     first: IntArray  # (channels * scenes + 1,) first row of each channel in each scene, and the end
-    keyframes: IntArray  # (S, channels) row of each sample's recording
+    keyframes: IntArray  # (S, channels) row of each sample's recording; without a LiDAR the last is the first camera's
     poses: FloatArray  # (E, 7) ego poses: x y z and quaternion w x y z, world frame
     file_names: list[tuple[str, str | None]]  # file names before and after the time; None after a name without the time
     tokens: npt.NDArray[np.bytes_]  # (F,) tokens of the first channel's rows; empty without sweeps
@@ -92,15 +107,20 @@ class Recordings:
 
 
 def read_recordings(
-    tables: Tables, samples: Mapping[str, int], scenes: Sequence[int], channels: Sequence[str], sweeps: Sequence[str]
+    tables: Tables,
+    samples: Mapping[str, int],
+    scenes: Sequence[int],
+    channels: Sequence[str],
+    lidar: str | None,
+    sweeps: Sequence[str],
 ) -> Recordings:
     """Read the recordings of the samples (number by token), which lie in ``scenes``, by the cameras ``channels``.
 
-    ``sweeps`` are channels read between keyframes too, nine tenths of two tables. DataError for a malformed row, a
+    The time and ego pose of a sample are those of ``lidar``, or without one of the first camera. ``sweeps`` are channels read between keyframes too, nine tenths of two tables. DataError for a malformed row, a
     dangling token, or a sample that lacks a recording.
     """
-    wanted = [*channels, LIDAR]
-    calibrated, channel_of, sensor2ego, K = _calibrations(tables, wanted)
+    wanted = [*channels, lidar or ""]
+    calibrated, channel_of, sensor2ego, K, lenses = _calibrations(tables, wanted)
     poses: dict[str, int] = {}
     files: dict[tuple[str, str | None], int] = {}
     tokens: list[str] = []
@@ -119,12 +139,14 @@ def read_recordings(
             for row, sensor in zip(kept, sensors, strict=True)
         ]
         kept, sensors = [*compress(kept, is_wanted)], [*compress(sensors, is_wanted)]
+        _refuse_calibrations(tables, kept)
         part = np.zeros(len(kept), _ROW)
         part["sensor"], part["channel"] = sensors, [channel_of[sensor] for sensor in sensors]
         part["sample"] = [samples[row["sample_token"]] for row in kept]
         part["scene"] = [scenes[sample] for sample in part["sample"].tolist()]
         part["key"] = [row["is_key_frame"] for row in kept]
-        part["time_us"] = times_us = tables.column(table, kept, "timestamp", kinds.MICROSECONDS)
+        times = tables.column(table, kept, "timestamp", kinds.MICROSECONDS)
+        part["time_us"] = times_us = [time // 1000 if time >= kinds.NANOSECONDS else time for time in times]
         for key in ("height", "width"):
             part[key] = tables.column(table, kept, key, kinds.COUNTS, default=0)  # none for the LiDAR
         of_poses = tables.column(table, kept, "ego_pose_token", TOKENS)
@@ -151,9 +173,17 @@ def read_recordings(
         expected = f"one keyframe of {wanted[channel]} for sample {list(samples)[k]}"
         raise tables.error(table, expected, str(counts[k, channel]), "remove the others")
     keyframes[of_keys["sample"], of_keys["channel"]] = np.flatnonzero(rows["key"])
+    if lidar is None:
+        keyframes[:, -1] = keyframes[:, 0]
     for k in np.flatnonzero((keyframes < 0).any(axis=1))[:1]:
         missing = ", ".join(channel for channel, row in zip(wanted, keyframes[k], strict=True) if row < 0)
-        raise tables.error("sample_data", f"keyframes of {missing} for sample {list(samples)[k]}", "none")
+        fix = "a sample needs rows with is_key_frame of every sensor that is read (channels=, lidar_channel=)"
+        raise tables.error("sample_data", f"keyframes of {missing} for sample {list(samples)[k]}", "none", fix)
+    times_us = np.sort(rows["time_us"][keyframes[:, -1]] + 10**17 * np.array(scenes, np.int64))
+    steps_us = np.diff(times_us)[np.diff(times_us) > 0]
+    if len(steps_us) and np.median(steps_us) < 1e6 * _LEAST_STEP_S:
+        got = f"keyframes {np.median(steps_us):g} apart"
+        raise tables.error("sample_data", "timestamps in microseconds", got, "are they in milliseconds or seconds?")
     count = max(scenes, default=-1) + 1
     order = rows["token"][: len(tokens)]
     tokens, previous = [tokens[k] for k in order], [previous[k] for k in order]
@@ -161,6 +191,7 @@ def read_recordings(
         channels=wanted,
         sensor2ego=sensor2ego,
         K=K,
+        lenses=lenses,
         rows=rows,
         first=np.searchsorted(
             rows["channel"].astype(np.int64) * count + rows["scene"], np.arange(len(wanted) * count + 1)
@@ -173,8 +204,10 @@ def read_recordings(
     )
 
 
-def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int], list[int], FloatArray, FloatArray]:
-    """Number of each calibrated sensor, -1 for others such as radars; channels, sensor2ego and K by number."""
+def _calibrations(
+    tables: Tables, wanted: Sequence[str]
+) -> tuple[dict[str, int], list[int], FloatArray, FloatArray, list[tuple[str, list[float]]]]:
+    """Number of each calibrated sensor, -1 for others such as radars; channels, sensor2ego, K and lenses by number."""
     by_token = tables.by_token("calibrated_sensor")
     sensors = tables.follow(
         "calibrated_sensor", [*by_token.values()], "sensor_token", "sensor", tables.by_token("sensor")
@@ -185,9 +218,41 @@ def _calibrations(tables: Tables, wanted: Sequence[str]) -> tuple[dict[str, int]
     rows, channel_of = [by_token[token] for token in read], [wanted.index(channels[token]) for token in read]
     sensor2ego = poses_from(tables.poses("calibrated_sensor", rows))
     K = np.tile(np.eye(3), (len(rows), 1, 1))
-    cameras = [k for k, channel in enumerate(channel_of) if wanted[channel] != LIDAR]
+    cameras = [k for k, channel in enumerate(channel_of) if channel < len(wanted) - 1]
     K[cameras] = tables.numbers("calibrated_sensor", [rows[k] for k in cameras], "camera_intrinsic", (3, 3))
-    return calibrated, channel_of, sensor2ego, K
+    lenses = [_lens(tables, row) if k in cameras else ("pinhole", []) for k, row in enumerate(rows)]
+    return calibrated, channel_of, sensor2ego, K, lenses
+
+
+def _lens(tables: Tables, row: Row) -> tuple[str, list[float]]:
+    """Model and coefficients of a camera's lens; DataError for columns of a lens that are not read."""
+    there = [key for key in _COEFFICIENTS if row.get(key)]
+    coefficients = next((key for key in there if not is_neutral(row[key])), there[0] if there else "")
+    model = next((key for key in _MODELS if not is_neutral(row.get(key), is_name=True)), "")
+    is_fisheye = model != "" and str(row[model]).lower() in _FISHEYES
+    odd = unread_lens(row, (coefficients, model)) or (f"{model}: {row[model]}" if model and not is_fisheye else None)
+    if odd is None and not (is_fisheye or coefficients):
+        return "pinhole", []
+    lens, values = "fisheye" if is_fisheye else "radtan", row.get(coefficients)
+    if odd is None and isinstance(values, list | tuple):
+        numbers = tables.numbers("calibrated_sensor", [row], coefficients, (len(values),))[0].tolist()
+        for count in LENSES[lens].coefficient_counts:
+            if len(numbers) >= count and not any(numbers[count:]):
+                return (lens, numbers[:count]) if is_fisheye or any(numbers) else ("pinhole", [])
+    expected = "camera_distortion of k1 k2 p1 p2 [k3 [k4 k5 k6]], or of k1 k2 k3 k4 with distortion_model fisheye"
+    got = f"{odd or f'{coefficients or model}: {values or row[model]}'} in row {row.get('token')!r}"
+    raise tables.error("calibrated_sensor", expected, got, "undistort the images, or write frame folders")
+
+
+def _refuse_calibrations(tables: Tables, rows: Sequence[Row]) -> None:
+    """Raise DataError for rows of ``sample_data`` with a calibration or lens of their own."""
+    if others := {key for keys in {*map(tuple, rows)} for key in keys} - {*_COLUMNS}:
+        for row in rows:
+            entry = {key: row[key] for key in others if row.get(key) is not None}
+            own = next((f"{key}: {entry[key]}" for key in _OF_IMAGES if not is_neutral(entry.get(key))), None)
+            if odd := unread_lens(entry) or own:
+                expected = "each image's calibration in calibrated_sensor alone"
+                raise tables.error("sample_data", expected, f"{odd[:120]} in row {row.get('token')!r}")
 
 
 def _ego_poses(tables: Tables, wanted: Mapping[str, int]) -> FloatArray:

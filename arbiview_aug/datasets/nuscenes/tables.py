@@ -24,11 +24,14 @@ _BATCH = 1 << 10  # rows in memory at once, 1.5 MB; the largest tables have 2.6 
 _BLOCK, _LONGEST_ROW = 1 << 20, 1 << 16  # characters read at once, and of a row at most: no block ends within a row
 _LONGEST_TOKEN = 255  # maximum characters of a token, which names files; nuScenes' own have 32
 _LARGEST_WHOLE, _LARGEST = 2**53, 1e9  # of whole numbers (exact in float64), and of positions (m) and pixels
+NANOSECONDS = 10**17  # times from here on are in nanoseconds: as microseconds they would be of the year 5138
 
 _SPACE, _DELIMITER = re.compile(r"\s*"), re.compile(r"\s*([,\]])\s*")
 
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = 120
+
+_WRITE = "docs/formats.md has the tables and columns that are read"
 
 Row = Mapping[str, Any]
 
@@ -59,12 +62,17 @@ def _are_whole(values: list[Any]) -> bool:
     return kinds <= {int, float} and all(abs(value) < _LARGEST_WHOLE and value % 1 == 0 for value in values)
 
 
+def _are_times(values: list[Any]) -> bool:
+    in_us = [value // 1000 if type(value) is int and value >= NANOSECONDS else value for value in values]
+    return _are_whole(in_us)
+
+
 TEXTS = Kind("as text", _are_texts)
 FILES = Kind("as text", lambda values: {*map(type, values)} <= {str})  # ``inside`` refuses impossible names
 LINKS = Kind("as a token or an empty text", _are_links)
 TOKENS = Kind(f"as a token of 1 to {_LONGEST_TOKEN} letters", lambda values: _are_links(values) and all(values))
-FLAGS = Kind("as true or false", lambda values: {*map(type, values)} <= {bool})
-MICROSECONDS = Kind("as a whole number of microseconds", _are_whole)
+FLAGS = Kind("as true or false", lambda values: {*map(type, values)} <= {bool, int, float} and {*values} <= {0, 1})
+MICROSECONDS = Kind("as a whole number of microseconds", _are_times)
 COUNTS = Kind(
     "as a whole number from 0",
     lambda values: _are_whole(values) and 0 <= min(values, default=0) and max(values, default=0) < 1 << 31,
@@ -97,6 +105,9 @@ class Tables:
         """Path of a table's file; DataError for a link that leaves the root."""
         return inside(self.root, f"{self.version}/{table}.json", f"nuScenes {self.root}: table {table}")
 
+    def has(self, table: str) -> bool:
+        return self.path(table).is_file() if self.nusc is None else getattr(self.nusc, table, None) is not None
+
     def rows(self, table: str) -> list[Row]:
         return [row for batch in self.batches(table) for row in batch]
 
@@ -112,7 +123,7 @@ class Tables:
             return
         path, count = self.path(table), 0
         try:
-            with path.open(encoding="utf-8") as file:
+            with path.open(encoding="utf-8-sig") as file:
                 entries = _entries(file)
                 while batch := list(islice(entries, _BATCH)):
                     yield self._objects(table, batch, count)
@@ -120,12 +131,13 @@ class Tables:
         except DataError:
             raise
         except FileNotFoundError:
-            raise self.error(table, f"the file {path}", "none", "the version's metadata archive has it") from None
+            raise self.error(table, f"the file {path}", "none", _WRITE) from None
         except _NoListError as error:
             raise self.error(table, "a list of objects", str(error)) from None
         except (OSError, ValueError, RecursionError) as error:  # no UTF-8, no JSON, or a number of 5,000 digits
             # error.msg, since the error's position counts from the start of a block
-            raise self.error(table, "JSON", getattr(error, "msg", str(error)), "unpack the archive again") from None
+            got = getattr(error, "msg", None) or getattr(error, "strerror", None) or str(error)
+            raise self.error(table, "JSON", got, "is the file complete, and UTF-8?") from None
 
     def row(self, table: str, number: int) -> Row:
         return next(islice(chain.from_iterable(self.batches(table)), number, None))
@@ -164,7 +176,7 @@ class Tables:
     def dangling(self, table: str, row: Row, key: str, target: str) -> DataError:
         """Make the error for a row that names a missing row of another table."""
         expected = f"the token {_short.repr(row.get(key))} that row {_short.repr(row.get('token'))} of {table} names"
-        return self.error(target, expected, "none", f"correct its {key}, or unpack the archive again")
+        return self.error(target, expected, "none", f"correct its {key}, or add that row")
 
     def numbers(self, table: str, rows: Sequence[Row], key: str, shape: tuple[int, ...]) -> FloatArray:
         """(len(rows), *shape) float64 of one column of finite numbers."""
@@ -193,9 +205,7 @@ class Tables:
             raise self.error(table, "unit quaternions w x y z", f"{row['rotation']} in row {row.get('token')!r}")
         return np.hstack([positions, quaternions])
 
-    def error(
-        self, table: str, expected: str, got: str, fix: str = "mend the table, or unpack the archive again"
-    ) -> DataError:
+    def error(self, table: str, expected: str, got: str, fix: str = _WRITE) -> DataError:
         """Make an error that names data set, version and table."""
         return DataError(f"nuScenes {self.root} {self.version}: table {table}: expected {expected}, got {got}; {fix}")
 
@@ -204,6 +214,10 @@ class Tables:
             if not isinstance(row, Mapping):
                 raise self.error(table, "a list of objects", f"an entry {type(row).__name__}, number {first + k}")
         return batch
+
+
+def is_camera(sensor: Row) -> bool:
+    return str(sensor.get("modality")).lower() == "camera"
 
 
 class Tokens:

@@ -1,0 +1,43 @@
+"""Fields of cameras in tables and files that speak of a lens: what is not read must say nothing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from typing import Any
+
+_KEYS = re.compile(
+    r"distort|^dist$|dist_?co|lens|fish|rectif|projection_(?:model|type)|skew|mirror|polynom"
+    r"|^(?:camera_|cam_)?model(?:_type)?$|^(?:d|xi|alpha|beta|[kpj]\d)$",
+    re.IGNORECASE,
+)
+_NO_LENSES = ("", "none", "null", "false", "no", "pinhole", "perspective", "rectilinear", "rectified", "undistorted")
+_LENSES = re.compile(
+    r"fish|equi|kannala|kb4|omni|mei|unified|sphere|eucm|^ds$|theta|scaramuzza|^poly|_poly$|cylind|division|fov|distort", re.I
+)
+"""Words of models that are not the perspective one; others, such as plumb_bob, mean nothing without coefficients."""
+
+_IDENTITIES = ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [1, 0, 0, 0, 1, 0, 0, 0, 1])  # rectifications that turn nothing
+
+
+def unread_lens(entry: Mapping[str, Any], read: Collection[str] = ()) -> str | None:
+    """``KEY: VALUE`` of a lens that an entry has under a key that is not ``read``; None if all others are neutral."""
+    for key, value in entry.items():
+        if isinstance(key, str) and key not in read and _KEYS.search(key):
+            word = key.lower()
+            if "rectif" in word or "undistort" in word:
+                is_none = value in (None, True, "true", "yes", *_IDENTITIES)
+            else:
+                is_none = is_neutral(value, "model" in word or "lens" in word)
+            if not is_none:
+                return f"{key}: {str(value)[:80]}"
+    return None
+
+
+def is_neutral(value: Any, is_name: bool = False) -> bool:
+    """Whether a value is nothing, 0, the name of a pinhole camera, or such values alone; ``is_name``: of a model."""
+    if isinstance(value, str):
+        return value.strip().lower() in _NO_LENSES or (is_name and not _LENSES.search(value))
+    if isinstance(value, Mapping | list | tuple):
+        return all(map(is_neutral, value.values() if isinstance(value, Mapping) else value))
+    return not value
