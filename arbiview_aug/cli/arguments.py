@@ -193,6 +193,14 @@ def size(text: str) -> tuple[int, int]:
     return int(height), int(width)
 
 
+def pair(text: str) -> tuple[str, str]:
+    """Two names from ``OLD=NEW``."""
+    old, _, new = text.partition("=")
+    if not (old and new):
+        raise argparse.ArgumentTypeError(f"expected OLD=NEW, got {text!r}")
+    return old, new
+
+
 def frames_text(count_of: int) -> str:
     """Number of frames, for titles."""
     return f"{count_of} frame{'s' * (count_of > 1)}"

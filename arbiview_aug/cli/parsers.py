@@ -25,6 +25,7 @@ from arbiview_aug.cli.arguments import (
     data,
     is_rig,
     kinds_text,
+    pair,
     positive,
     seed,
     size,
@@ -69,6 +70,8 @@ def convert() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--version", metavar="NAME", help="nuScenes' folder of tables (default: v1.0-mini, -trainval)")
     add_target(parser, required=True)
+    names = "new names of the target's cameras, such as ring_front_center=CAM_FRONT, by which detectors find them"
+    add("--names", nargs="+", type=pair, default=[], metavar="OLD=NEW", help=names)
     add("--output", required=True, metavar="DIR", help="folder to write to")
     add_rendering(parser)
     add("--generator", type=Path, metavar="PATH", help=f"of --holes diffusion: {_GENERATOR} (default: the own)")

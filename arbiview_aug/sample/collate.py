@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug.errors import SampleError
-from arbiview_aug.sample.batching import lens_names, rewrapped
+from arbiview_aug.errors import SampleError, warn
+from arbiview_aug.sample.batching import lens_names, rewrapped, stacked
 from arbiview_aug.sample.inputs import DEPTH_KEYS
 
 STACKED = (
@@ -18,6 +18,12 @@ STACKED = (
 )
 """Keys of one shape in all frames of a rig; so have maps over the images. All else is a list: of points and boxes
 each frame has its own number."""
+
+_ABSENT = {"coverage": True, "generated": False, "ego_mask": False}
+"""Masks that samples without them stand for: all is seen, nothing made up, no car of one's own in the image."""
+
+_CALIBRATION = ("rig", "K", "cam2ego", "lens", "distortion", "ground_z_m", "ego2ego")
+"""Keys without which the others mean something else."""
 
 
 def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -29,18 +35,20 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     Frames of one rig keep it. If each has its own (nuScenes: cameras and LiDAR expose at different times), ``K`` and
     ``cam2ego`` say so.
 
+    Keys that some samples lack are left out, with a warning; but samples without ``coverage``, ``generated`` or
+    ``ego_mask`` are covered, not generated, and show no car.
+
     Args:
-        samples: At least one; with equal keys.
+        samples: At least one.
 
     Raises:
-        SampleError: No samples, different keys, or rigs that differ and have lenses or masks: tensors carry neither.
+        SampleError: No samples; other calibrations in some than in others; or rigs that differ and have lenses or
+            masks: tensors carry neither.
     """
     if not samples or not all(isinstance(sample, Mapping) and "images" in sample for sample in samples):
         raise SampleError("collate: expected one or more samples with 'images', got none or something else")
+    samples = _with_equal_keys(samples)
     first = samples[0]
-    if any(set(sample) != set(first) for sample in samples):
-        odd = sorted({str(key) for sample in samples for key in set(sample) ^ set(first)})
-        raise SampleError(f"collate: expected equal keys in all samples, got {', '.join(odd)} in some")
     batch: dict[str, Any] = {}
     for key in sorted(first, key=lambda key: key == "rig"):  # last, as a rig wins over K and cam2ego
         values = [sample[key] for sample in samples]
@@ -63,6 +71,26 @@ def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return batch
 
 
+def _with_equal_keys(samples: Sequence[Mapping[str, Any]]) -> Sequence[Mapping[str, Any]]:
+    """The samples with the keys that all have, completed by masks; SampleError if a calibration is not among them."""
+    if all(set(sample) == set(samples[0]) for sample in samples):
+        return samples
+    masks = {key: value for key, value in _ABSENT.items() if any(sample.get(key) is not None for sample in samples)}
+    filled = []
+    for sample in samples:
+        missing = {key: value for key, value in masks.items() if sample.get(key) is None}
+        images = [image.shape[-2:] for image in sample["images"]]
+        filled.append({**sample, **{k: stacked([torch.full(i, v) for i in images]) for k, v in missing.items()}})
+    common = set(filled[0]).intersection(*filled)
+    odd = sorted({str(key) for sample in filled for key in sample if key not in common})
+    if needed := [key for key in odd if key in _CALIBRATION]:
+        fix = "retarget in the dataset (RetargetedDataset), or give all of them"
+        raise SampleError(f"collate: expected {', '.join(needed)} in all samples or in none, got some without; {fix}")
+    if odd:
+        warn(f"collate: left out {', '.join(odd)}, which not all samples have")
+    return [{key: sample[key] for key in sample if key in common} for sample in filled]
+
+
 def are_maps(values: Sequence[Any], images: Any) -> bool:
     """Whether all values are maps over all images: label maps, masks; of a sample, or of a batch."""
     sizes = [tuple(image.shape[-2:]) for image in images]
@@ -78,7 +106,7 @@ def are_maps(values: Sequence[Any], images: Any) -> bool:
 def _stacked(key: str, values: Sequence[Any]) -> Any:
     """One tensor, or where cameras have tensors of their own a list of one for each camera; tv_tensors stay such."""
     try:
-        values = [torch.as_tensor(value) if isinstance(value, np.ndarray) else value for value in values]
+        values = [torch.from_numpy(value.copy()) if isinstance(value, np.ndarray) else value for value in values]
         if all(isinstance(value, torch.Tensor) for value in values):
             return rewrapped(torch.stack(list(values)), values[0])
         cameras = [torch.stack(list(of_camera)) for of_camera in zip(*values, strict=True)]

@@ -84,7 +84,7 @@ def retarget_points(
         up = ground_z_m - target.ground_z_m  # scanners keep their rays where nothing moves
         lidars = [lidar.shifted(z_m=up) for lidar in target.lidars] if up else target.lidars
         own = len(measured)
-        if not isinstance(sweeps, Sequence | np.ndarray | torch.Tensor):
+        if not isinstance(sweeps, Sequence | np.ndarray | torch.Tensor) or getattr(sweeps, "ndim", 1) == 0:
             raise SampleTypeError(f"sweeps: expected a list of points (Q, C), got {type(sweeps).__name__}")
         if len(sweeps):
             points = _joined(points, [as_array(f"sweeps[{k}]", sweep) for k, sweep in enumerate(sweeps)])
@@ -107,7 +107,7 @@ def _joined(points: Any, sweeps: Sequence[Points]) -> Any:
             raise SampleError(f"sweeps[{k}]: expected the columns of points {tuple(points.shape)}, got {sweep.shape}")
     if isinstance(points, np.ndarray):
         return np.concatenate([points, *sweeps], dtype=points.dtype)
-    return torch.cat([points.detach(), *(torch.from_numpy(sweep).to(points) for sweep in sweeps)])
+    return torch.cat([points.detach(), *(torch.from_numpy(np.ascontiguousarray(sweep)).to(points) for sweep in sweeps)])
 
 
 def _at(points: Any, rows: Any, hits: Any) -> Any:

@@ -6,9 +6,11 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ from arbiview_aug.cli.arguments import gathered_warnings, writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, State, checksum_once, coverage_of
 from arbiview_aug.cli.convert.manifest import Manifest, differences
 from arbiview_aug.cli.convert.ray_runner import ray_results
-from arbiview_aug.cli.convert.settings import FOLDER, RETARGET_OPTIONS, Settings, check_output
+from arbiview_aug.cli.convert.settings import FOLDER, READING, RETARGET_OPTIONS, Settings, check_output
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDERS, WithDepth
 from arbiview_aug.datasets.drive import Recording, is_converted
@@ -134,7 +136,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _check_depth(folder: Path, geometry: str) -> None:
     """Refuse a folder of ``--depth`` that the geometry would not read."""
-    if not folder.is_dir():
+    if not os.path.isdir(folder):  # unlike Path.is_dir, False for a name that is too long
         raise DataError(f"--depth {folder}: expected a folder that the depth command wrote, found none")
     there = {key for one in WithDepth([], folder).folders if (key := one.needed_by())} or {*FOLDERS}
     fitting = [name for name, row in GEOMETRIES.items() if there & {*row.reads}]
@@ -160,18 +162,27 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     return Settings(
         root=root,
         kind=kind,
-        target=load_rig(arguments.target),
+        target=_renamed(load_rig(arguments.target), arguments.names),
         output=Path(arguments.output).absolute(),
-        generator=generator.absolute() if generator is not None and generator.exists() else generator,  # or a hub id
+        generator=generator.absolute() if generator is not None and os.path.exists(generator) else generator,  # or a hub id
         motion_depth=None if depth is None else depth.absolute(),
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
         link=arguments.link,
         points=arguments.points,
         **{
             name: getattr(arguments, name)
-            for name in ("version", *RETARGET_OPTIONS, "holes", "steps", "reduce", "clean_masks", "neighbours")
+            for name in ("version", *RETARGET_OPTIONS, "holes", "steps", *READING, "neighbours")
         },
     )
+
+
+def _renamed(target: Rig, names: Sequence[tuple[str, str]]) -> Rig:
+    """The target with new names of cameras, given as pairs of an old and a new one."""
+    if unknown := {old for old, _ in names} - {*target.names}:
+        got = ", ".join(sorted(unknown))
+        raise DataError(f"--names: expected cameras of the target, {', '.join(target.names)}, got {got}")
+    new = dict(names)
+    return target.with_cameras([replace(camera, name=new.get(camera.name, camera.name)) for camera in target])
 
 
 def _begin(settings: Settings, data: Recording, arguments: argparse.Namespace) -> tuple[Jobs, Mapping[str, Any]]:
@@ -281,8 +292,8 @@ def converted(settings: Settings) -> Method:
     manifest, target = Manifest(settings.output), settings.sized_target
     kept = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
     kind = "nuscenes" if settings.version else kept  # its tables may have any name
-    written = open_data(settings.output, kind=kind, version=settings.version)
-    written.load_points = False  # they may be links that leave the output
+    # Points may be links that leave the output.
+    written = open_data(settings.output, kind=kind, version=settings.version, load_points=False)
 
     def render(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:
         record = manifest.record(sample["token"])

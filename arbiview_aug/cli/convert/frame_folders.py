@@ -16,10 +16,11 @@ from arbiview_aug.atomic_io import file_name, write_whole, writing
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
-from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, POINTS_FILE, SEQUENCE_FILE, entry_name
+from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, MOST_BYTES, POINTS_FILE, SEQUENCE_FILE, entry_name
 from arbiview_aug.datasets.image_io import VIEW_MASKS
 from arbiview_aug.datasets.py123d import NOT_SHARED
 from arbiview_aug.errors import DataError, warn
+from arbiview_aug.files import read_text
 from arbiview_aug.sample.inputs import CALIBRATION_KEYS, CAMERA_KEYS, PIXEL_BOUND_KEYS
 from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
@@ -51,10 +52,11 @@ class FrameFolders(Writer):
     def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Path], dict[str, Any]]:
         """Scanned points, and the calibration, which is written last and makes the folder a frame; or kept points."""
         calibration, *_ = files = self.data.files(converted.index)
-        source = json.loads(calibration.read_text(encoding="utf-8"))
+        source = json.loads(read_text(calibration, MOST_BYTES))
         calib = _calibration(converted)
         folder, points = calibration.parent.name, converted.out.get("points")
-        name, is_scanned = f"{folder}/{POINTS_FILE}", RINGS_KEY in converted.out
+        is_scanned = RINGS_KEY in converted.out
+        file = POINTS_FILE if is_scanned or points is None else f"lidar{files[-1].suffix}"
         left_out = {*_left_out(source, calibration.parent, is_scanned)}
         kept = {key: value for key, value in source.items() if key not in (*calib, *left_out, "dataset", "lidar")}
         if _BOX_COUNTS in left_out and COUNTS_KEY in converted.out:
@@ -64,10 +66,11 @@ class FrameFolders(Writer):
             words = "they speak of the source's pixels, cameras or points, or name files that are not copied"
             warn(f"calib.json: left out {', '.join(sorted(left_out))}: {words}")
         if points is not None:
-            kept["lidar"] = {"file": POINTS_FILE}
+            entry = source["lidar"] if isinstance(source.get("lidar"), Mapping) and not is_scanned else {}
+            kept["lidar"] = {"file": file, **{key: entry[key] for key in ("columns",) if key in entry}}
         text = json.dumps({**calib, **kept}, indent=1).encode()
-        scan = {name: _npy(points)} if is_scanned else {}
-        links = {} if points is None or is_scanned else {name: files[-1]}
+        scan = {f"{folder}/{file}": _npy(points)} if is_scanned else {}
+        links = {} if points is None or is_scanned else {f"{folder}/{file}": files[-1]}
         return {**scan, f"{folder}/{CALIBRATION_FILE}": text}, links, {}
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
@@ -75,7 +78,7 @@ class FrameFolders(Writer):
         self._remove(left_out)
         path = self.data.root / SEQUENCE_FILE
         if path.is_file():
-            sequence = json.loads(path.read_text(encoding="utf-8"))
+            sequence = json.loads(read_text(path, MOST_BYTES))
             frames = sequence["frames"]
             sequence["frames"] = [frame for frame in frames if entry_name(frame) not in left_out]
             write_whole({self.output / SEQUENCE_FILE: json.dumps(sequence, indent=1).encode()})
@@ -146,7 +149,7 @@ def _left_out(source: Mapping[str, Any], folder: Path, is_scanned: bool) -> Iter
     of_cameras = {key for camera in source["cameras"] for key in camera if key not in _OF_VIEWS}
     yield from (f"cameras.{key}" for key in of_cameras)
     if isinstance(lidar := source.get("lidar"), Mapping):
-        yield from (f"lidar.{key}" for key in lidar if key != "file")
+        yield from (f"lidar.{key}" for key in lidar if key not in ("file", *(() if is_scanned else ("columns",))))
 
 
 def _npy(points: Any) -> bytes:

@@ -64,7 +64,8 @@ def rig_of(target: Rig, out: Mapping[str, Any], source: Rig) -> Rig:
 
 def coverage_of(image: Path) -> BoolArray:
     """Read the (h, w) coverage beside a view's image."""
-    return np.asarray(cv2.imread(str(image.with_suffix(".coverage.png")), cv2.IMREAD_GRAYSCALE)) > 0
+    coded = np.frombuffer(image.with_suffix(".coverage.png").read_bytes(), np.uint8)
+    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)) > 0
 
 
 def _as_bytes(key: str, values: torch.Tensor) -> Any:

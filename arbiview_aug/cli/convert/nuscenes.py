@@ -24,7 +24,7 @@ from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.nuscenes_rows import NewSensors, Remaining, kept_sensors, view_stem, visible_shares
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
-from arbiview_aug.datasets.nuscenes.reader import NuScenesDataset
+from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING, NuScenesDataset
 from arbiview_aug.datasets.nuscenes.recordings import IntArray
 from arbiview_aug.datasets.nuscenes.tables import (
     COUNTS,
@@ -91,7 +91,9 @@ class NuScenes(Writer):
     def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
         self.output, self.data, self.suffix, self.how = settings.output, data, settings.suffix, settings.link
         self.target, self.scanned = settings.target, bool(settings.target.lidars) and settings.points == "target"
+        self.scanned &= data.lidar_channel is not None
         self.tables = Tables(data.root, data.version, None)
+        self.moment = data.lidar_channel or data.channels[0]
         self.there = [name for name in _TABLES if self.tables.path(name).is_file()]  # in writing order
         self.written = [name for name in self.there if not (self.scanned and name in _OF_POINTS)]
         lenses = [f"{camera.name} ({camera.lens})" for camera in self.target if not camera.is_rectilinear]
@@ -115,6 +117,13 @@ class NuScenes(Writer):
         root = self.data.root.resolve().name
         return {"kind": "nuscenes", "root": root, "version": self.data.version, "tables": tables}
 
+    def notes(self) -> list[str]:
+        names, wanted = self.target.names, CAMERA_RING
+        if {*wanted} <= {*names}:
+            return []
+        fix = f"--names {names[0]}={wanted[0]} ... names them"
+        return [f"channels {', '.join(names)}: detectors' converters ask for {', '.join(wanted)} by name; {fix}"]
+
     def check(self) -> None:
         """Read all tables once.
 
@@ -122,12 +131,12 @@ class NuScenes(Writer):
             DataError: A malformed table; a dangling reference, a file outside the root or a missing column;
                 a duplicate token; a circle of ``next`` or ``prev``; image names that clash or no file can have.
         """
-        names = [self.data.files(index)[-1].name for index in range(len(self.data))]
+        names = [PurePosixPath(self.data.moment_file(index)).name for index in range(len(self.data))]
         (stem, times), *_ = Counter(view_stem(name, "") for name in names).most_common(1)
         if times > 1:
             name = next(name for name in names if view_stem(name, "") == stem)
             raise DataError(
-                f"nuScenes {self.data.root}: expected LiDAR files of different names, after which the new images are "
+                f"nuScenes {self.data.root}: expected {self.moment} files of different names, after which the new images are "
                 f"named, got {times} of the name {name}; rename them"
             )
         for camera in self.target:
@@ -173,7 +182,7 @@ class NuScenes(Writer):
                 raise DataError(f"{where}: expected a file outside of {', '.join(own_folders)}, got one in {folder}")
 
     def stem(self, index: int, camera: int, name: str) -> str:
-        return view_stem(self.data.files(index)[-1].name, name)
+        return view_stem(PurePosixPath(self.data.moment_file(index)).name, name)
 
     def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Path], dict[str, Any]]:
         """The scan; the visible share of each annotation's box in the new cameras, and its number of points."""
@@ -184,7 +193,9 @@ class NuScenes(Writer):
             shares = np.round(visible_shares(converted.rig, coverage, sample["boxes_3d"].numpy()), 3).tolist()
             facts["visible"] = dict(zip(tokens, shares, strict=True))
         if self.scanned:
-            name = self.data.files(converted.index)[-1].relative_to(self.data.root).as_posix()
+            name = self.data.moment_file(converted.index)
+            if not name.endswith(".bin"):  # others have a header
+                name = facts["lidar_file"] = f"{name}.bin"
             lidar2ego = converted.rig.lidars[0].lidar2ego
             if not len(out["points"]):
                 fix = "--points source keeps those that were measured"
@@ -197,8 +208,8 @@ class NuScenes(Writer):
     def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
         """Write the tables and link the files of the remaining sensors."""
         source = self.tables
-        remaining = Remaining(source, left_out, self.scanned)
-        new = NewSensors(records, self.suffix, remaining.lidar_sensor)
+        remaining = Remaining(source, left_out, self.scanned, self.moment)
+        new = NewSensors(records, self.suffix, remaining.moment_sensor)
         keyframes, poses = remaining.moments()
         self._missing = 0
         rows: dict[str, Callable[[], Iterable[Row]]] = {
@@ -218,7 +229,7 @@ class NuScenes(Writer):
         for path in self._maps():
             link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"), how=self.how)
         for name in self.written:
-            _write_table(self.output / self.data.version / f"{name}.json", rows.get(name, partial(source.rows, name))())
+            _write_table(self.kept_path(f"{self.data.version}/{name}.json"), rows.get(name, partial(source.rows, name))())
         notes = []
         if self._missing:
             notes.append(f"{self._missing} files that sample_data names are not in the source: were sweeps not copied?")
@@ -235,7 +246,7 @@ class NuScenes(Writer):
     def kept(self, left_out: set[str]) -> Iterator[tuple[Path, Path]]:
         for path in self._maps():
             yield self._kept(path.relative_to(self.data.root).as_posix(), "maps")
-        tables: dict[str, Iterable[Row]] = {"sample_data": Remaining(self.tables, left_out, self.scanned).sample_data()}
+        tables: dict[str, Iterable[Row]] = {"sample_data": Remaining(self.tables, left_out, self.scanned, self.moment).sample_data()}
         tables |= {name: self.tables.rows(name) for name in _OF_POINTS if name in self.written}
         for table, rows in tables.items():
             for row in rows:
@@ -261,9 +272,10 @@ class NuScenes(Writer):
 
 
 def _scan_file(points: FloatArray, rings: IntArray, lidar2ego: FloatArray) -> bytes:
-    """A LiDAR file of points (P, >=4) in the ego frame: x y z in the scanner's frame, intensity, ring; float32."""
+    """A LiDAR file of points (P, >=3) in the ego frame: x y z in the scanner's frame, intensity, ring; float32."""
     xyz = (points[:, :3] - lidar2ego[:3, 3]) @ lidar2ego[:3, :3]
-    return np.column_stack([xyz, points[:, 3], rings]).astype("<f4").tobytes()
+    intensity = points[:, 3] if points.shape[1] > 3 else np.zeros(len(points))
+    return np.column_stack([xyz, intensity, rings]).astype("<f4").tobytes()
 
 
 def _write_table(path: Path, rows: Iterable[Row]) -> None:

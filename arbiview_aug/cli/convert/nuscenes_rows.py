@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -18,12 +19,13 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.rotations import quaternion_from_rotation
 from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR
-from arbiview_aug.datasets.nuscenes.tables import Row, Tables
+from arbiview_aug.datasets.nuscenes.tables import Row, Tables, is_camera
 from arbiview_aug.scene.boxes import draw_boxes, silhouette_sums
 
 LEVELS = ("1", "2", "3", "4")  # tokens of nuScenes' table ``visibility``: 0 to 40, 40 to 60, 60 to 80 and 80 to 100 %
 
 _BOUNDS = (0.4, 0.6, 0.8)
+_SUFFIX = re.compile(r"(?:\.(?:pcd|npy|jpg|jpeg|png))?(?:\.bin)?$")  # of what was recorded at a sample's time
 _RASTER_PX = 400  # approximate width that boxes are rasterised at: a nuScenes car at 50 m has 100 pixels
 
 
@@ -78,7 +80,7 @@ def _widened(camera: Camera, step: int) -> tuple[Camera, tuple[int, int]]:
 
 def kept_sensors(tables: Tables) -> tuple[set[str], set[str]]:
     """Tokens of the sensors other than cameras, and of their calibrations."""
-    sensors = {row["token"] for row in tables.rows("sensor") if row.get("modality") != "camera"}
+    sensors = {row["token"] for row in tables.rows("sensor") if not is_camera(row)}
     calibrated = tables.rows("calibrated_sensor")
     return sensors, {row["token"] for row in calibrated if row["sensor_token"] in sensors}
 
@@ -87,10 +89,10 @@ class Remaining:
     """The source's rows without its cameras and without the samples ``left_out``; chains between rows are closed again.
 
     A LiDAR keyframe of a sample that was left out becomes a sweep of the next sample of its scene. With ``scanned``
-    scans go as cameras do: the target's replace them.
+    scans of the sensor ``moment``, whose keyframes time the samples, go as cameras do: the target's replace them.
     """
 
-    def __init__(self, tables: Tables, left_out: set[str], scanned: bool) -> None:
+    def __init__(self, tables: Tables, left_out: set[str], scanned: bool, moment: str) -> None:
         self.tables, self.left_out, self.scanned = tables, left_out, scanned
         self._drives: dict[str, list[str]] = {}
         self._stand_in: dict[str, str] = {}
@@ -106,10 +108,10 @@ class Remaining:
                 self._stand_in[token] = later
         self.drives = [*self._drives.values()]  # tokens by scene, in order of time
         self._sensors, self._calibrated = kept_sensors(tables)
-        self.lidar_sensor = next(row["token"] for row in tables.rows("sensor") if row["channel"] == LIDAR)
+        self.moment_sensor = next(row["token"] for row in tables.rows("sensor") if row["channel"] == moment)
         calibrated = tables.rows("calibrated_sensor")
-        self._lidar = {row["token"] for row in calibrated if row["sensor_token"] == self.lidar_sensor}
-        self._kept = self._calibrated - self._lidar if scanned else self._calibrated
+        self._moment = {row["token"] for row in calibrated if row["sensor_token"] == self.moment_sensor}
+        self._kept = self._calibrated - self._moment if scanned else self._calibrated
         self._annotations_left_out = {
             row["token"]: (row.get("prev", ""), row.get("next", ""), row["instance_token"])
             for batch in (tables.batches("sample_annotation") if left_out else ())
@@ -162,7 +164,8 @@ class Remaining:
                 around = {key: self._remaining(row.get(key, ""), k) for k, key in enumerate(("prev", "next"))}
                 row = self._changed(row, around)
                 if "visibility_token" in row:
-                    row = {**row, "visibility_token": level(visible[row["token"]], row["visibility_token"])}
+                    share = visible.get(row["token"], 1.0)  # of a box that was not read, unknown
+                    row = {**row, "visibility_token": level(share, row["visibility_token"])}
                 if row["token"] in num_lidar_pts:
                     row = {**row, "num_lidar_pts": num_lidar_pts[row["token"]]}
                 yield row
@@ -183,14 +186,16 @@ class Remaining:
                     yield {**row, "sample_token": stand_in, "is_key_frame": False}
 
     def moments(self) -> tuple[dict[str, Row], set[str]]:
-        """The LiDAR's keyframe of each sample, and the tokens of all ego poses in use."""
+        """The keyframe that times each sample, and the tokens of all ego poses in use."""
         keyframes, poses = {}, set()
-        for row in self._recorded():
-            is_moment = row["is_key_frame"] and row["calibrated_sensor_token"] in self._lidar
-            if is_moment:
-                keyframes[row["sample_token"]] = row
-            if is_moment or row["calibrated_sensor_token"] in self._kept:
-                poses.add(row["ego_pose_token"])
+        for batch in self.tables.batches("sample_data"):
+            for row in batch:
+                sample, sensor = row["sample_token"], row["calibrated_sensor_token"]
+                if row["is_key_frame"] and sensor in self._moment and sample not in self.left_out:
+                    keyframes[sample] = row
+                    poses.add(row["ego_pose_token"])
+                elif sensor in self._kept and self._stand_in[sample]:
+                    poses.add(row["ego_pose_token"])
         return keyframes, poses
 
     def ego_pose(self, used: set[str]) -> Iterator[Row]:
@@ -220,10 +225,12 @@ class NewSensors:
         self._calibrations: dict[str, Row] = {}
         self._views: dict[str, list[tuple[str, Row]]] = {}
         self._scans: dict[str, str] = {}  # calibration of each sample's scan, where it is the target's
+        self._files: dict[str, str | None] = {}  # names of scans, where they are new
         for record in records:
             self.visible |= record["visible"]
             self._views[record["token"]] = [self._view(camera) for camera in record["cameras"]]
             if "lidar2ego" in record:
+                self._files[record["token"]] = record.get("lidar_file")
                 self.num_lidar_pts |= record["num_lidar_pts"]
                 self._scans[record["token"]] = self._calibrated(LIDAR, lidar_sensor, record["lidar2ego"], [])
 
@@ -242,6 +249,8 @@ class NewSensors:
                 if sample in self._scans:
                     around = (token and keyframes[token]["token"] for token in (before, after))
                     calibrated = {"calibrated_sensor_token": self._scans[sample]}
+                    if name := self._files[sample]:
+                        calibrated |= {"filename": name, "fileformat": "bin"}
                     yield {**moment, **calibrated, **dict(zip(("prev", "next"), around, strict=True))}
                 for name, view in self._views[sample]:
                     yield {
@@ -276,8 +285,8 @@ class NewSensors:
 
 
 def view_stem(lidar: str, name: str) -> str:
-    """Path of a camera's image below the root, without suffix, after the name of the same sample's LiDAR file."""
-    channel, stem = quote(name, safe="", errors="surrogatepass"), lidar.removesuffix(".bin").removesuffix(".pcd")
+    """Path of a camera's image below the root, without suffix, after the file that times the same sample."""
+    channel, stem = quote(name, safe="", errors="surrogatepass"), _SUFFIX.sub("", lidar)
     return f"samples/{channel}/{stem.replace(LIDAR, channel) if LIDAR in stem else f'{stem}__{channel}'}"
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from arbiview_aug.atomic_io import Link, checksum, is_part
+from arbiview_aug.atomic_io import Link, checksum, inside, is_part
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Holes, Quality, Reduce
@@ -20,6 +20,7 @@ from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys
 
 RETARGET_OPTIONS = ("quality", "geometry", "size", "fit")  # as ``RigRetarget`` names them
+READING = ("reduce", "clean_masks", "lidar_channel", "lidar_columns")  # as ``open_data`` names them
 FOLDER = CONVERSION_FOLDER
 
 
@@ -27,7 +28,7 @@ FOLDER = CONVERSION_FOLDER
 class Settings:
     """Source, output and what decides the output's bytes; ``convert --help`` explains each.
 
-    ``root``, ``kind``, ``version``, ``reduce`` and ``clean_masks`` are those of ``open_data``, ``RETARGET_OPTIONS``
+    ``root``, ``kind``, ``version`` and ``READING`` are those of ``open_data``, ``RETARGET_OPTIONS``
     those of ``RigRetarget``, ``points`` that of ``SampleKeys``. ``motion_depth`` is None where depth is estimated from
     the neighbours. Only ``link`` does not decide bytes.
     """
@@ -47,6 +48,8 @@ class Settings:
     points: Literal["source", "target"] = "target"
     reduce: Reduce = 1
     clean_masks: bool = False
+    lidar_channel: str | None = None
+    lidar_columns: list[str] | None = None
     neighbours: int = 0
     motion_depth: Path | None = None
     suffix: Literal[".jpg", ".png"] = ".jpg"
@@ -59,7 +62,7 @@ class Settings:
 
     def open(self) -> Recording:
         neighbours = Neighbours(count=self.neighbours) if self.neighbours else None
-        options = {name: getattr(self, name) for name in ("kind", "version", "reduce", "clean_masks")}
+        options = {name: getattr(self, name) for name in ("kind", "version", *READING)}
         return open_data(self.root, neighbours=neighbours, **options)
 
     def retarget(self) -> RigRetarget:
@@ -88,7 +91,7 @@ class Settings:
         return {
             **{name: getattr(self, name) for name in names},
             **({} if self.size is None else {"fit": self.fit}),
-            **({"clean_masks": True} if self.clean_masks else {}),
+            **{name: getattr(self, name) for name in READING[1:] if getattr(self, name)},
             **({"points": self.points} if self.target.lidars else {}),
             "motion_depth": self.motion_depth is not None,
             "generator": sums if sums or self.generator is None else str(self.generator),  # a hub id
@@ -98,7 +101,10 @@ class Settings:
 
 def check_output(settings: Settings) -> None:
     """Raise DataError if the output overlaps the source, or holds files that no conversion wrote."""
-    source, output = (Path(os.path.realpath(path)) for path in (settings.root, settings.output))  # links may loop
+    try:
+        source, output = (Path(os.path.realpath(path)) for path in (settings.root, settings.output))  # links may loop
+    except ValueError:
+        raise DataError(f"--output {str(settings.output)!a}: expected a folder's name, got a NUL in it") from None
     if source == output or source in output.parents or output in source.parents:
         where = "the source itself" if source == output else "in it" if source in output.parents else "around it"
         raise DataError(f"--output {settings.output}: expected a folder apart from the source {source}, got {where}")
@@ -110,6 +116,8 @@ def check_output(settings: Settings) -> None:
         return
     if not output.is_dir():
         raise DataError(f"--output {settings.output}: expected a folder, got a file or a link that leads nowhere")
+    for name in (FOLDER, f"{FOLDER}/samples"):
+        inside(output, name, f"--output {settings.output}")  # no link leads records out of it
     if is_converted(output):
         return
     foreign = next((path.name for path in output.rglob("*") if not path.is_dir() and not is_part(path)), None)
