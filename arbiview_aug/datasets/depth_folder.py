@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.datasets.wrappers import checked_map_style
 from arbiview_aug.errors import DataError, SampleError, SampleTypeError
+from arbiview_aug.files import read_bytes
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY
 from arbiview_aug.scene.depth_map import motion_camera
@@ -30,7 +32,7 @@ FOLDERS = {"motion": FOLDER, LEARNED_KEY: LEARNED_FOLDER}
 WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
 """Neighbours to open a data set with: at half the best travel and at all of it."""
 
-_FORMAT = 2
+_FORMAT, _MOST_BYTES = 2, 1 << 29
 _KINDS: dict[str, type[MotionDepth]] = {"motion": MotionDepth, "learned": LearnedDepth}
 _SAME_PX, _SAME_POSE = 0.05, 1e-3
 """Tolerances of equal calibrations, wide enough for images decoded at half size."""
@@ -49,7 +51,8 @@ class DepthFolder:
     def needed_by(self) -> str | None:
         """The key of ``FOLDERS`` that its depth is for, by its first file; None if that does not tell."""
         for path in filter(Path.is_file, self.root.glob("*.npz")):
-            with suppress(*BROKEN_ARRAY, KeyError), np.load(path, allow_pickle=False) as file:
+            with suppress(*BROKEN_ARRAY, KeyError):
+                file = np.load(BytesIO(read_bytes(path, _MOST_BYTES)), allow_pickle=False)
                 return LEARNED_KEY if str(file["kind"]) == "learned" else "motion"
             break
         return None
@@ -95,7 +98,7 @@ class DepthFolder:
             fix = "make it with python -m arbiview_aug depth --data FOLDER, and --model MODEL for learned depth"
             raise DataError(f"{path}: expected depth of frame {token!r}, found none; {fix}")
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with np.load(BytesIO(read_bytes(path, _MOST_BYTES)), allow_pickle=False) as file:
                 arrays: dict[str, Any] = {name: file[name] for name in file.files}
             depth = tuple(arrays[f"depth_{k:02}"].astype(np.float32) for k in range(len(arrays["K"])))
             words, of = str(arrays["words"]), str(arrays.get("token", token))  # older files name no token
@@ -142,8 +145,8 @@ class WithDepth(Dataset[dict[str, Any]]):
         if not isinstance(sample, Mapping):
             raise SampleTypeError(f"WithDepth: expected samples that are mappings, got {type(sample).__name__}")
         rig, token = sample.get("rig", self.source), sample.get("token")
-        if rig is None or token is None:
-            raise SampleError("sample: expected 'rig' and 'token', to find its depth by; pass source=")
+        if rig is None or not isinstance(token, str | int):
+            raise SampleError("sample: expected 'rig' and 'token', a text, to find its depth by; pass source=")
         out = dict(sample)
         for folder in self.folders:
             depth = folder.read(str(token), rig)

@@ -23,7 +23,8 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce, is_number, is_whole
 from arbiview_aug.datasets.image_io import check_reduce
-from arbiview_aug.errors import ArbiviewError, DataError, warn
+from arbiview_aug.errors import ArbiviewError, DataError, shown, warn
+from arbiview_aug.files import read_text
 from arbiview_aug.sample.neighbours import STILL_M
 
 Direction = Literal["both", "past", "future"]
@@ -43,7 +44,7 @@ def warn_of_unfinished(root: Path, found: int) -> None:
         return
     count = f"{found} frames"
     with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):  # ``convert`` tells what is wrong with it
-        begun = json.loads((root / CONVERSION_FOLDER / BEGUN_FILE).read_text(encoding="utf-8"))
+        begun = json.loads(read_text(root / CONVERSION_FOLDER / BEGUN_FILE, 1 << 28))  # all names of 2 million frames
         count = f"{found} of {len(begun['source']['frames'])} frames"
     warn(f"{root}: unfinished conversion: {count}; run convert again")
 
@@ -83,10 +84,10 @@ class Recording(Dataset[dict[str, Any]]):
 
     def by_token(self, token: str) -> dict[str, Any]:
         """The sample with this token; DataError if there is none."""
-        if token not in self._index:
+        if not isinstance(token, str) or token not in self._index:
             some = ", ".join(self.tokens[:3])
             raise DataError(
-                f"{self.root}: expected the token of one of {len(self)} samples, got {token!r}; they are {some} …"
+                f"{self.root}: expected the token of one of {len(self)} samples, got {shown(token)}; they are {some} …"
             )
         return self[self._index[token]]
 

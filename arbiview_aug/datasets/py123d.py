@@ -110,6 +110,7 @@ class Py123dDataset(WritableRecording):
         frames: list[tuple[int, int, int]] = []
         for folder in folders:
             with _reading(folder):
+                _refuse_damaged(folder)
                 log = _open(folder, scene_of(folder), cameras)
                 times_us = [int(time.time_us) for time in log.scene.get_all_iteration_timestamps()]
             frames += [(len(self._logs), k, time_us) for k, time_us in enumerate(times_us)]
@@ -219,6 +220,16 @@ def _points(log: _Log, iteration: int, token: str) -> torch.Tensor | None:
         scans = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
         clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in scans if one is not None]
     return checked_points(np.concatenate(clouds), f"of {token}") if clouds else None
+
+
+def _refuse_damaged(folder: Path) -> None:
+    """Validate a log's tables: pyarrow reads outside of its memory where offsets are damaged."""
+    arrow = optional_package("pyarrow", "py123d")
+    for path in sorted(folder.glob("*.arrow")):
+        if not path.is_file():  # a pipe would be waited for
+            raise DataError(f"py123d log {folder}: expected a regular file {path.name}, got something else")
+        with arrow.memory_map(str(path)) as file:
+            arrow.ipc.open_file(file).read_all().validate(full=True)
 
 
 def _open(folder: Path, scene: Any, names: Sequence[str] | None) -> _Log:

@@ -15,7 +15,7 @@ import torch
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_rigid
-from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError
+from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError, shown
 from arbiview_aug.sample.batching import check_container, checked_images
 from arbiview_aug.sample.inputs import Frame, as_array, frame_from, numbers
 from arbiview_aug.scene.boxes import carried, checked_boxes, moved_boxes, moved_by, points_in
@@ -131,7 +131,7 @@ def _read(frame: Frame, warn: Warn) -> list[Neighbour]:
     boxes, neighbours = frame.array("boxes_3d"), []
     for number, entry in enumerate(entries):
         token = entry.get("token") if isinstance(entry, Mapping) else None
-        name = str(number) if token is None else repr(str(token))
+        name = str(number) if token is None else shown(token)
         try:
             neighbour = _neighbour(frame, boxes, entry, number, name)
         except (ArbiviewError, OSError) as error:

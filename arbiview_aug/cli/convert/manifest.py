@@ -16,6 +16,9 @@ from arbiview_aug.atomic_io import checksum, file_name, write_new, write_whole, 
 from arbiview_aug.cli.convert.settings import FOLDER
 from arbiview_aug.datasets.drive import BEGUN_FILE, FINISHED_FILE
 from arbiview_aug.errors import DataError, shown
+from arbiview_aug.files import read_text
+
+_MOST_BYTES = 1 << 30  # of provenance.json, which has a kilobyte a sample
 
 Record = Mapping[str, Any]
 """``token``; for a converted sample ``cameras``, ``ground_z_m``, ``files`` (bytes by path), ``checksums`` and
@@ -114,7 +117,7 @@ def _read_signed(path: Path) -> dict[str, Any]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(read_text(path, _MOST_BYTES))
         if isinstance(data, dict):
             return data
         got = type(data).__name__
