@@ -285,10 +285,12 @@ def entry_name(entry: Any) -> str:
 def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, float], list[str]]:
     """Read times (s) by frame and the frames in order; nothing without ``sequence.json``."""
     path = inside(root, SEQUENCE_FILE, str(root))
-    if not path.is_file():
+    if not os.path.lexists(path):
         return {}, []
     try:
         listed = parse_json(read_text(path, MOST_BYTES))["frames"]
+        if not isinstance(listed, list):
+            raise TypeError(f"frames of type {type(listed).__name__}")
         names = [*map(entry_name, listed)]
         if unread := sorted({k for one in listed if isinstance(one, Mapping) for k in one if _CLOCK.search(str(k))}):
             raise ValueError(f"{', '.join(unread)}, which is not read: time_s is in seconds")
@@ -296,7 +298,7 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
         times_s = {entry_name(entry): float(entry["time_s"]) for entry in timed}
     except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         expected = "{'frames': [names, or {'name': ..., 'time_s': ...}]}"
-        got = f"no {error}" if isinstance(error, KeyError) else getattr(error, "strerror", None) or error
+        got = f"no {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
         raise DataError(f"{path}: expected {expected}, got {got}") from None
     for name in names:
         if name not in index:
@@ -369,10 +371,10 @@ def _view_mask_files(
 
 
 def _view_mask_file(entry: Mapping[str, Any], key: str, frame: _Frame) -> Path | None:
-    if not isinstance(name := entry.get(key), str) or not name:
+    if entry.get(key) is None:
         return None
-    path = frame.file(name, f"camera {shown(entry.get('name'))}: {key}")
-    return path if path.is_file() else None
+    path = frame.file(*_named(entry, key, frame, DataError))
+    return path if os.path.lexists(path) else None
 
 
 def _view_masks(

@@ -6,6 +6,8 @@ import re
 from collections.abc import Collection, Mapping
 from typing import Any
 
+from arbiview_aug.errors import shown
+
 _KEYS = re.compile(
     r"distort|^dist$|dist_?co|lens|fish|rectif|projection_(?:model|type)|skew|mirror|polynom"
     r"|^(?:camera_|cam_)?model(?:_type)?$|^(?:d|xi|alpha|beta|[kpj]\d)$",
@@ -30,14 +32,15 @@ def unread_lens(entry: Mapping[str, Any], read: Collection[str] = ()) -> str | N
             else:
                 is_none = is_neutral(value, "model" in word or "lens" in word)
             if not is_none:
-                return f"{key}: {str(value)[:80]}"
+                return f"{key}: {shown(value)}"
     return None
 
 
-def is_neutral(value: Any, is_name: bool = False) -> bool:
+def is_neutral(value: Any, is_name: bool = False, levels: int = 3) -> bool:
     """Whether a value is nothing, 0, the name of a pinhole camera, or such values alone; ``is_name``: of a model."""
     if isinstance(value, str):
         return value.strip().lower() in _NO_LENSES or (is_name and not _LENSES.search(value))
     if isinstance(value, Mapping | list | tuple):
-        return all(map(is_neutral, value.values() if isinstance(value, Mapping) else value))
+        values = value.values() if isinstance(value, Mapping) else value
+        return levels > 0 and all(is_neutral(one, is_name, levels - 1) for one in values)
     return not value

@@ -45,7 +45,7 @@ def read_cloud(path: Path, columns: Any, how: str, assumed: Sequence[str] | None
     Raises:
         DataError: No such file, one of another format, or of other columns.
     """
-    where, stated = f"points {path}", None if columns is None else _row_type(columns, f"points {path}: columns")
+    where, stated = f"points {path}", None if columns is None else row_type(columns, f"points {path}: columns")
     try:
         data = read_bytes(path, MOST_BYTES)
     except FileNotFoundError:
@@ -61,7 +61,7 @@ def read_cloud(path: Path, columns: Any, how: str, assumed: Sequence[str] | None
     if other is not None or path.suffix == ".npy":
         got = f"{other} file" if other else f"file that begins with {data[:8]!r}"
         raise DataError(f"{where}: expected .npy, .pcd or rows of numbers, got a {got}; write it as .npy, (P, >=3)")
-    row = stated or (None if assumed is None else _row_type(assumed, where))
+    row = stated or (None if assumed is None else row_type(assumed, where))
     expected = "a statement of the columns" if row is None else f"points of {_named(row)}"
     is_single = row is None or {row[k] for k in range(len(row))} == {np.dtype("<f4")}
     if is_single and (likely := _likely(np.frombuffer(data[: len(data) // 4 * 4], "<f4"), row and len(row))):
@@ -87,7 +87,7 @@ def check_columns(array: npt.NDArray[Any], where: str) -> None:
         raise DataError(f"{where}: expected {array.shape[1]} columns, got numbers that look like {likely}; reshape them")
 
 
-def _row_type(columns: Any, where: str) -> np.dtype[Any]:
+def row_type(columns: Any, where: str) -> np.dtype[Any]:
     """Type of a row by ``NAME`` or ``NAME:TYPE`` of its columns; the first word is the name."""
     try:
         if isinstance(columns, str) or not 3 <= len(columns) <= 64:

@@ -28,7 +28,7 @@ from arbiview_aug.datasets.drive import (
 )
 from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, reduced_rig
-from arbiview_aug.datasets.lidar_files import NUSCENES_COLUMNS, read_cloud
+from arbiview_aug.datasets.lidar_files import NUSCENES_COLUMNS, read_cloud, row_type
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables, is_camera
@@ -117,7 +117,9 @@ class NuScenesDataset(WritableRecording):
         self.other_channels = [row["channel"] for row in tables.rows("sensor") if not is_camera(row)]
         self.lidar_channel = _chosen_lidar(tables, lidar_channel, load_points)
         self.load_points = load_points and self.lidar_channel is not None
-        self.lidar_columns = None if lidar_columns is None else [*lidar_columns]
+        self.lidar_columns = lidar_columns
+        if lidar_columns is not None:
+            row_type(lidar_columns, f"nuScenes {self.root}: lidar_columns")
         lidars = [self.lidar_channel] if self.lidar_channel and load_points else []
         sweeps = [] if neighbours is None else [*self.channels, *lidars]
         self._recordings = read_recordings(tables, self._index, scenes, self.channels, self.lidar_channel, sweeps)

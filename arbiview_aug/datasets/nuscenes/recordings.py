@@ -19,7 +19,7 @@ from arbiview_aug.datasets.drive import clock_message
 from arbiview_aug.datasets.lens_keys import is_neutral, unread_lens
 from arbiview_aug.datasets.nuscenes import tables as kinds
 from arbiview_aug.datasets.nuscenes.tables import TOKENS, Row, Tables, Tokens
-from arbiview_aug.errors import DataError, warn
+from arbiview_aug.errors import DataError, shown, warn
 
 LIDAR = "LIDAR_TOP"  # nuScenes' only LiDAR
 MAX_APART_S = 0.1  # maximum time to a sweep's nearest image; cameras record every 50 to 100 ms
@@ -229,8 +229,8 @@ def _lens(tables: Tables, row: Row) -> tuple[str, list[float]]:
     there = [key for key in _COEFFICIENTS if row.get(key)]
     coefficients = next((key for key in there if not is_neutral(row[key])), there[0] if there else "")
     model = next((key for key in _MODELS if not is_neutral(row.get(key), is_name=True)), "")
-    is_fisheye = model != "" and str(row[model]).lower() in _FISHEYES
-    odd = unread_lens(row, (coefficients, model)) or (f"{model}: {row[model]}" if model and not is_fisheye else None)
+    is_fisheye = isinstance(row.get(model), str) and row[model].lower() in _FISHEYES
+    odd = unread_lens(row, (coefficients, model)) or (f"{model}: {shown(row[model])}" if model and not is_fisheye else None)
     if odd is None and not (is_fisheye or coefficients):
         return "pinhole", []
     lens, values = "fisheye" if is_fisheye else "radtan", row.get(coefficients)
@@ -240,7 +240,7 @@ def _lens(tables: Tables, row: Row) -> tuple[str, list[float]]:
             if len(numbers) >= count and not any(numbers[count:]):
                 return (lens, numbers[:count]) if is_fisheye or any(numbers) else ("pinhole", [])
     expected = "camera_distortion of k1 k2 p1 p2 [k3 [k4 k5 k6]], or of k1 k2 k3 k4 with distortion_model fisheye"
-    got = f"{odd or f'{coefficients or model}: {values or row[model]}'} in row {row.get('token')!r}"
+    got = f"{odd or f'{coefficients or model}: {shown(values or row[model])}'} in row {row.get('token')!r}"
     raise tables.error("calibrated_sensor", expected, got, "undistort the images, or write frame folders")
 
 
@@ -249,10 +249,10 @@ def _refuse_calibrations(tables: Tables, rows: Sequence[Row]) -> None:
     if others := {key for keys in {*map(tuple, rows)} for key in keys} - {*_COLUMNS}:
         for row in rows:
             entry = {key: row[key] for key in others if row.get(key) is not None}
-            own = next((f"{key}: {entry[key]}" for key in _OF_IMAGES if not is_neutral(entry.get(key))), None)
+            own = next((f"{key}: {shown(entry[key])}" for key in _OF_IMAGES if not is_neutral(entry.get(key))), None)
             if odd := unread_lens(entry) or own:
                 expected = "each image's calibration in calibrated_sensor alone"
-                raise tables.error("sample_data", expected, f"{odd[:120]} in row {row.get('token')!r}")
+                raise tables.error("sample_data", expected, f"{odd} in row {row.get('token')!r}")
 
 
 def _ego_poses(tables: Tables, wanted: Mapping[str, int]) -> FloatArray:

@@ -96,8 +96,9 @@ class Tables:
             raise SampleTypeError(f"nusc: expected a devkit NuScenes object, got {got}; pass a folder as root=")
         self.nusc, self.root = nusc, Path(nusc.dataroot if root is None else root)
         self.version = str(getattr(nusc, "version", version))
-        if nusc is None and not os.path.isdir(self.root / version):
-            there = ", ".join(sorted(p.parent.name for p in self.root.glob("*/sample.json"))) or "none"
+        if nusc is None and not os.path.isdir(self.root / self.version):
+            tables = self.root.glob("*/sample.json") if os.path.isdir(self.root) else ()  # a name may be too long
+            there = ", ".join(sorted(p.parent.name for p in tables)) or "none"
             expected = f"expected a folder of tables {version!r}, found none"
             raise DataError(f"nuScenes {root}: {expected}; folders with tables: {there}")
 
