@@ -57,7 +57,9 @@ POINTS_FILE = "lidar.npy"
 MOST_BYTES = 1 << 26  # of a frame's or a sequence's JSON: 64 MiB, 200,000 boxes
 
 _COLUMNS = 'say them in calib.json: "lidar": {"file": NAME, "columns": ["x", "y", "z", "intensity"]}'
-_OF_POINTS = re.compile(r"2ego|2world|pose|transl|rotat|transf|extrin|unit|scale|type|order|layout|field", re.IGNORECASE)
+_OF_POINTS = re.compile(
+    r"2ego|2world|pose|transl|rotat|transf|extrin|unit|scale|type|order|layout|field", re.IGNORECASE
+)
 """Keys of ``lidar`` that would give its points another meaning, and are not read."""
 _CLOCK = re.compile(r"^(?!time_s$)(?:time|stamp|t$|n?sec)", re.IGNORECASE)  # other keys of a sequence's times
 
@@ -440,7 +442,9 @@ def _read_points(calib: Mapping[str, Any], frame: _Frame) -> torch.Tensor | None
     unread = [key for key in entry if _OF_POINTS.search(key) and entry[key]]
     if unread or "ego" not in str(entry.get("frame") or "ego").lower():
         got = ", ".join(f"{key}: {shown(entry[key])}" for key in unread or ["frame"])
-        raise DataError(f"{frame.where}: lidar: expected file and columns of float32 points in the ego frame, got {got}")
+        raise DataError(
+            f"{frame.where}: lidar: expected file and columns of float32 points in the ego frame, got {got}"
+        )
     return checked_points(read_cloud(path, entry.get("columns"), _COLUMNS), str(path))
 
 

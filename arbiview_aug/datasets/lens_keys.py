@@ -15,23 +15,22 @@ _KEYS = re.compile(
 )
 _NO_LENSES = ("", "none", "null", "false", "no", "pinhole", "perspective", "rectilinear", "rectified", "undistorted")
 _LENSES = re.compile(
-    r"fish|equi|kannala|kb4|omni|mei|unified|sphere|eucm|^ds$|theta|scaramuzza|^poly|_poly$|cylind|division|fov|distort", re.I
+    r"fish|equi|kannala|kb4|omni|mei|unified|sphere|eucm|^ds$|theta|scaramuzza|^poly|_poly$|cylind|division|fov|distort",
+    re.IGNORECASE,
 )
 """Words of models that are not the perspective one; others, such as plumb_bob, mean nothing without coefficients."""
-
-_IDENTITIES = ([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [1, 0, 0, 0, 1, 0, 0, 0, 1])  # rectifications that turn nothing
+_FLAT = (None, True, "true", "yes", [[1, 0, 0], [0, 1, 0], [0, 0, 1]], [1, 0, 0, 0, 1, 0, 0, 0, 1])
+"""Values of ``rectified`` and the like that turn nothing."""
 
 
 def unread_lens(entry: Mapping[str, Any], read: Collection[str] = ()) -> str | None:
     """``KEY: VALUE`` of a lens that an entry has under a key that is not ``read``; None if all others are neutral."""
     for key, value in entry.items():
         if isinstance(key, str) and key not in read and _KEYS.search(key):
-            word = key.lower()
-            if "rectif" in word or "undistort" in word:
-                is_none = value in (None, True, "true", "yes", *_IDENTITIES)
-            else:
-                is_none = is_neutral(value, "model" in word or "lens" in word)
-            if not is_none:
+            is_flag, is_name = (
+                any(word in key.lower() for word in of) for of in (("rectif", "undis"), ("model", "lens"))
+            )
+            if not (value in _FLAT if is_flag else is_neutral(value, is_name)):
                 return f"{key}: {shown(value)}"
     return None
 

@@ -1,4 +1,4 @@
-"""LiDAR files: .npy, .pcd, and rows of numbers without a header, whose columns are stated or tested for plausibility."""
+"""LiDAR files: .npy, .pcd, and rows of numbers without a header, whose columns are stated, or tested."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from arbiview_aug.atomic_io import BROKEN_ARRAY
 from arbiview_aug.errors import DataError, shown, warn
 from arbiview_aug.files import read_bytes
 
+Array = npt.NDArray[Any]
+
 MOST_BYTES = 1 << 29  # 512 MiB, 27 million points of five columns
 NUSCENES_COLUMNS = ("x", "y", "z", "intensity", "ring")
 
-_TESTED = 12 * 2520  # numbers that the plausibility test reads: a multiple of all ``_WIDTHS``
 _WIDTHS = range(3, 11)
-_LEAST_TESTED = 100  # numbers below which chance decides
-_EXPLAINED = 0.7
-"""Least share of the best width's score. The true width has the best one but for noise; a half of it, the next best,
-had 0.58 of it on real frames."""
-_LEAST_SCORE = 0.1  # of the best width: below it all columns are alike, and nothing is known
+_LEAST_TESTED, _MOST_TESTED = 100, 12 * 2520  # numbers: chance decides below; a multiple of all ``_WIDTHS``
+_LEAST_SCORE, _EXPLAINED = 0.1, 0.7
+"""Least score of a width, below which all columns are alike, and least share of the best score: the true width has the
+best one but for noise, and half of it had 0.58 of it on real frames."""
 _NEAREST, _FARTHEST, _SANE = 1e-3, 1e5, 0.9
-"""Magnitudes of coordinates other than 0, and least share of numbers within: those of another type are anything."""
+"""Magnitudes of numbers other than 0, and least share of those within: bytes of another type are anything."""
 
-_OTHERS = {b"ply": "PLY", b"LASF": "LAS", b"PK": "NPZ or ZIP", b"\x1f\x8b": "gzip", b"ARROW1": "Arrow", b"\x89HDF": "HDF5"}
+_OTHERS = re.compile(rb"ply|LASF|PK|\x1f\x8b|ARROW1|\x89HDF")  # first bytes of PLY, LAS, NPZ, gzip, Arrow, HDF5
 _PCD_DATA = re.compile(rb"^DATA[ \t]+(\w+)[^\n]*\n", re.MULTILINE)
 
 
-def read_cloud(path: Path, columns: Any, how: str, assumed: Sequence[str] | None = None) -> npt.NDArray[Any]:
+def read_cloud(path: Path, columns: Any, how: str, assumed: Sequence[str] | None = None) -> Array:
     """Points (P, >=3) of a file: x y z, intensity if there is one, then its other columns.
 
     Args:
         path: A .npy file, a .pcd file, or rows of numbers; its first bytes tell which.
-        columns: Names of the columns with optional types, such as ``["x", "y", "z", "intensity:uint8"]``; of rows,
-            numbers are float32 by default. None if nobody stated them.
-        how: How a user states the columns, for messages.
+        columns: Their names, as ``row_type`` takes them; None if nobody stated them.
+        how: How a user states them, for messages.
         assumed: Columns of rows that nobody stated; the file must look like them.
 
     Raises:
         DataError: No such file, one of another format, or of other columns.
     """
-    where, stated = f"points {path}", None if columns is None else row_type(columns, f"points {path}: columns")
+    where = f"points {path}"
+    stated = None if columns is None else row_type(columns, f"{where}: columns")
     try:
         data = read_bytes(path, MOST_BYTES)
     except FileNotFoundError:
@@ -57,44 +57,31 @@ def read_cloud(path: Path, columns: Any, how: str, assumed: Sequence[str] | None
         return _array(data, where, stated)
     if data.startswith((b"# .PCD", b"VERSION", b"FIELDS")):
         return _stacked(_pcd(data, where), where)
-    other = next((name for magic, name in _OTHERS.items() if data.startswith(magic)), None)
-    if other is not None or path.suffix == ".npy":
-        got = f"{other} file" if other else f"file that begins with {data[:8]!r}"
-        raise DataError(f"{where}: expected .npy, .pcd or rows of numbers, got a {got}; write it as .npy, (P, >=3)")
+    if _OTHERS.match(data) or path.suffix == ".npy":
+        got = f"a file that begins with {data[:8]!r}; write it as .npy, (P, >=3)"
+        raise DataError(f"{where}: expected a .npy array of numbers, .pcd or rows of numbers, got {got}")
     row = stated or (None if assumed is None else row_type(assumed, where))
-    expected = "a statement of the columns" if row is None else f"points of {_named(row)}"
-    is_single = row is None or {row[k] for k in range(len(row))} == {np.dtype("<f4")}
-    if is_single and (likely := _likely(np.frombuffer(data[: len(data) // 4 * 4], "<f4"), row and len(row))):
+    types = [] if row is None else [row[name].name for name in row.names]
+    expected = f"points of {len(types)} {' '.join(dict.fromkeys(types))}" if types else "a statement of the columns"
+    if {*types} <= {"float32"} and (likely := _likely(np.frombuffer(data[: len(data) // 4 * 4], "<f4"), len(types))):
         message = f"{where}: expected {expected}, got a file that looks like {likely}; {how}"
         if stated is None:
             raise DataError(message)
         warn(message)
-    if row is None:
-        raise DataError(f"{where}: expected {expected}, got none; {how}")
-    if not data or len(data) % row.itemsize:
+    if row is None or not data or len(data) % row.itemsize:
         raise DataError(f"{where}: expected whole {expected}, got {len(data)} bytes; copy it again, or {how}")
     rows = np.frombuffer(data, row)
-    points = _stacked({str(name): rows[name] for name in rows.dtype.names or ()}, where)
-    if points.size >= _LEAST_TESTED and _sane_share(points[:_TESTED, :3]) < _SANE:
-        raise DataError(f"{where}: expected {expected}, got numbers that are no coordinates in metres; {how}")
-    return points
+    return _stacked({name: rows[name] for name in row.names}, where)
 
 
-def check_columns(array: npt.NDArray[Any], where: str) -> None:
-    """Raise DataError for an array that looks like one of other columns, reshaped."""
-    flat = np.ascontiguousarray(array[: _TESTED // array.shape[1] + 1]).reshape(-1)
-    if likely := _likely(flat, array.shape[1]):
-        raise DataError(f"{where}: expected {array.shape[1]} columns, got numbers that look like {likely}; reshape them")
-
-
-def row_type(columns: Any, where: str) -> np.dtype[Any]:
-    """Type of a row by ``NAME`` or ``NAME:TYPE`` of its columns; the first word is the name."""
+def row_type(columns: Any, where: str) -> Any:
+    """numpy's type of a row by its columns: the first word is the name; float32, or the type that follows as in ring:uint8."""
     try:
         if isinstance(columns, str) or not 3 <= len(columns) <= 64:
             raise ValueError
-        pairs = [(text.partition(":")[0], text.partition(":")[2].strip() or "<f4") for text in columns]
-        row = np.dtype([(re.findall(r"\w+", name)[0].lower(), type) for name, type in pairs])
-        if not {"x", "y", "z"} <= {*(row.names or ())} or any(row[k].kind not in "iuf" for k in range(len(row))):
+        pairs = [text.partition(":")[::2] for text in columns]
+        row: Any = np.dtype([(re.findall(r"\w+", name)[0].lower(), type.strip() or "<f4") for name, type in pairs])
+        if not {"x", "y", "z"} <= {*row.names} or any(row[name].kind not in "iuf" for name in row.names):
             raise ValueError
     except (ValueError, TypeError, AttributeError, IndexError, SyntaxError):
         expected = "expected different names with x, y and z among them, each with an optional type as in ring:uint8"
@@ -102,46 +89,42 @@ def row_type(columns: Any, where: str) -> np.dtype[Any]:
     return row
 
 
-def _named(row: np.dtype[Any]) -> str:
-    types = {row[k].name for k in range(len(row))}
-    return f"{len(row)} {types.pop()}" if len(types) == 1 else f"{len(row)} numbers of {row.itemsize} bytes"
-
-
-def _stacked(columns: Mapping[str, npt.NDArray[Any]], where: str) -> npt.NDArray[Any]:
+def _stacked(columns: Mapping[str, Array], where: str) -> Array:
     """(P, >=3) float32, or float64 if any is: x y z, intensity, and the others in their order."""
-    if missing := [name for name in "xyz" if name not in columns]:
-        got = ", ".join(columns) or "no columns"
-        raise DataError(f"{where}: expected the columns x, y and z, got {got}: no {', '.join(missing)}")
-    first = [name for name in ("x", "y", "z", "intensity") if name in columns]
-    arrays = [columns[name] for name in (*first, *(name for name in columns if name not in first))]
-    return np.stack(arrays, axis=1).astype(np.float64 if any(a.dtype.itemsize > 4 for a in arrays) else np.float32)
+    if not {"x", "y", "z"} <= columns.keys():
+        raise DataError(f"{where}: expected the columns x, y and z, got {', '.join(columns) or 'none'}")
+    names = dict.fromkeys(name for name in ("x", "y", "z", "intensity", *columns) if name in columns)
+    points = np.stack([columns[name] for name in names], axis=1)
+    return points.astype(np.float64 if points.dtype.itemsize > 4 else np.float32)
 
 
-def _array(data: bytes, where: str, stated: np.dtype[Any] | None) -> npt.NDArray[Any]:
+def _array(data: bytes, where: str, stated: Any) -> Array:
     try:
         array: Any = np.load(BytesIO(data), allow_pickle=False)
     except BROKEN_ARRAY as error:
         raise DataError(f"{where}: expected a .npy array of numbers, got {error}") from None
-    if array.dtype.names:
-        return _stacked({name.lower(): array[name].reshape(-1) for name in array.dtype.names}, where)
-    if array.ndim == 2 and array.dtype.kind == "f" and array.shape[1] >= 3:
-        check_columns(array, where)
-        if stated is not None:
-            if len(stated) != array.shape[1]:
-                raise DataError(f"{where}: expected {len(stated)} columns as stated, got shape {array.shape}")
-            return _stacked(dict(zip(stated.names or (), array.T, strict=True)), where).astype(array.dtype)
-    return array  # type: ignore[no-any-return]
+    if array.ndim != 2 or array.dtype.kind != "f" or array.shape[1] < 3:
+        return array  # type: ignore[no-any-return]  # refused by ``checked_points``
+    rows, width = array[: _MOST_TESTED // array.shape[1] + 1], array.shape[1]
+    likely = _likely(np.ascontiguousarray(rows).reshape(-1), width)
+    if likely and likely.endswith("columns"):  # far coordinates are left out later
+        raise DataError(f"{where}: expected {width} columns, got numbers that look like {likely}; reshape them")
+    if stated is None:
+        return array  # type: ignore[no-any-return]
+    if len(stated.names) != width:
+        raise DataError(f"{where}: expected {len(stated.names)} columns as stated, got shape {array.shape}")
+    return _stacked(dict(zip(stated.names, array.T, strict=True)), where)
 
 
-def _pcd(data: bytes, where: str) -> dict[str, npt.NDArray[Any]]:
+def _pcd(data: bytes, where: str) -> dict[str, Array]:
     """Columns of a PCD file, by the names in its header (pointclouds.org/documentation/tutorials/pcd_file_format)."""
     try:
         end = _PCD_DATA.search(data[: 1 << 16])
-        lines = [line.split() for line in data[: end.start() if end else 0].decode("ascii", "replace").splitlines()]
+        kind, body = (b"", b"") if end is None else (end[1], data[end.end() :])
+        lines = [line.split() for line in data[: len(data) - len(body)].decode("ascii", "replace").splitlines()]
         header = {line[0].upper(): line[1:] for line in lines if line}
         names = [name.lower() for name in header["FIELDS"]]
         counts = [*map(int, header.get("COUNT", ["1"] * len(names)))]
-        body, kind = data[end.end() :] if end else b"", end[1] if end else b""
         if kind == b"binary":
             types = [f"<{type.lower()}{size}" for type, size in zip(header["TYPE"], header["SIZE"], strict=True)]
             row = np.dtype([(str(k), *one) for k, one in enumerate(zip(types, counts, strict=True))])
@@ -159,30 +142,30 @@ def _pcd(data: bytes, where: str) -> dict[str, npt.NDArray[Any]]:
     return {name: column for name, column in columns.items() if name != "_"}
 
 
-def _likely(numbers: npt.NDArray[Any], width: int | None) -> str | None:
-    """Describe rows that numbers look like if those are not of ``width`` columns; None if they may be."""
+def _likely(numbers: Array, width: int) -> str | None:
+    """Describe the rows that numbers look like, if those are not of ``width`` columns (0: unknown); else None."""
     if len(numbers) < _LEAST_TESTED:
         return None
-    pairs = np.frombuffer(numbers[: min(len(numbers), _TESTED) // 2 * 2].tobytes(), "<f8")
-    is_single = numbers.dtype == np.float32
+    pairs = np.frombuffer(numbers[: min(len(numbers), _MOST_TESTED) // 2 * 2].tobytes(), "<f8")
     with np.errstate(invalid="ignore"):  # NaN of damaged bytes
-        numbers = numbers[:_TESTED].astype(np.float64)
-    best, score = _best_width(numbers)
-    if is_single and _sane_share(pairs) > _SANE > _sane_share(numbers):
+        wide = numbers[:_MOST_TESTED].astype(np.float64)
+    if numbers.dtype == np.float32 and _sane_share(pairs) > _SANE > _sane_share(wide):
         return f"{_best_width(pairs)[0]} float64 columns"
-    if score < _LEAST_SCORE or (width is not None and _score(numbers, width) >= _EXPLAINED * score):
-        return None
-    return f"{best} columns"
+    best, score = _best_width(wide)
+    if score > _LEAST_SCORE and (not width or _score(wide, width) < _EXPLAINED * score):
+        return f"{best} columns"
+    is_same = not width or _sane_share(wide[: len(wide) // width * width].reshape(-1, width)[:, :3]) > _SANE
+    return None if is_same else "other numbers than coordinates in metres"
 
 
-def _best_width(numbers: npt.NDArray[np.float64]) -> tuple[int, float]:
-    """The narrowest of the widths with the best score, and that score."""
+def _best_width(numbers: Array) -> tuple[int, float]:
+    """The narrowest of the widths with about the best score, and that score."""
     scores = {width: _score(numbers, width) for width in _WIDTHS}
     best = max(scores.values())
     return next(width for width in _WIDTHS if scores[width] >= min(best, _EXPLAINED * best)), best
 
 
-def _score(numbers: npt.NDArray[np.float64], width: int) -> float:
+def _score(numbers: Array, width: int) -> float:
     """Share of the numbers' variance that is between columns of this width: of magnitudes, signs and whole numbers."""
     rows = numbers[: len(numbers) // width * width].reshape(-1, width)
     with np.errstate(invalid="ignore"):
@@ -192,7 +175,7 @@ def _score(numbers: npt.NDArray[np.float64], width: int) -> float:
     return max(shares) - width / rows.size
 
 
-def _sane_share(numbers: npt.NDArray[Any]) -> float:
-    """Share of numbers that may be coordinates."""
+def _sane_share(numbers: Array) -> float:
+    """Share of numbers that may be coordinates, or missing."""
     size = np.abs(numbers)
     return float(((size == 0) | ((size > _NEAREST) & (size < _FARTHEST)) | ~np.isfinite(numbers)).mean())

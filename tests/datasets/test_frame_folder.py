@@ -288,6 +288,34 @@ def test_folders_that_are_none(tmp_path: Path) -> None:
         dataset[0]
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda calib: calib["cameras"][0].update(xi=0.9), "camera 'front': xi: 0.9 is not read; write distortion"),
+        (lambda calib: calib["cameras"][0].update(rectified=False), "rectified: False is not read"),
+        (lambda calib: calib["cameras"][0].update(distortion_model="equidistant"), "'equidistant' is not read"),
+        (lambda calib: calib["cameras"][0].update(coverage=3), "coverage: expected an image's file name, got 3"),
+        (lambda calib: calib.update(lidar=""), "lidar: expected {'file': name}, got ''"),
+    ],
+)
+def test_what_would_change_the_meaning_is_refused(tmp_path: Path, change: Change, message: str) -> None:
+    with pytest.raises((CalibrationError, DataError), match=message):
+        FrameFolder(frame(tmp_path, change))[0]
+
+
+def test_notes_of_neutral_lenses_and_byte_order_marks(tmp_path: Path) -> None:
+    notes = {"rectified": True, "camera_model": "FLIR BFS", "k1": 0, "distortion_model": "plumb_bob", "lens": "6 mm"}
+    frame(tmp_path / "000", lambda calib: calib["cameras"][0].update(notes))
+    (tmp_path / "sequence.json").write_text(json.dumps({"frames": ["000"]}))
+    for path in (tmp_path / "sequence.json", tmp_path / "000" / "calib.json"):
+        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
+    assert FrameFolder(tmp_path)[0]["scene_token"] == tmp_path.name
+    for text in ('{"frames": {}}', '{"frames": [{"name": "000", "timestamp": 1}]}', "{}"):
+        (tmp_path / "sequence.json").write_text(text)
+        with pytest.raises(DataError, match=r"got (TypeError: frames|ValueError: timestamp, which|no 'frames')"):
+            FrameFolder(tmp_path)
+
+
 # --- masks that are cleaned -------------------------------------------------------------------------------------------
 def test_specks_in_masks_are_cleaned_on_demand(ddad_root: Path) -> None:
     for reduce in (1, 4):

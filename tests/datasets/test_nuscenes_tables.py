@@ -33,6 +33,10 @@ def test_rows_are_those_of_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     assert [len(batch) for batch in tables.batches("sample")] == [7] * 14 + [2]
 
 
+def test_a_byte_order_mark_is_dropped(tmp_path: Path) -> None:
+    assert table(tmp_path, '\ufeff[{"token": "a"}]\r\n').rows("sample") == [{"token": "a"}]
+
+
 def test_an_empty_table(tmp_path: Path) -> None:
     assert table(tmp_path, " [ ] ").rows("sample") == []
 

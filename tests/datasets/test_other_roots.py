@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from torch.utils.data import DataLoader
 
 from arbiview_aug import RetargetedDataset, Rig, RigRetarget, collate, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import Neighbours, NuScenesDataset, open_data
+from arbiview_aug.errors import DataError
 from tests.cli.convert.drives import SIZE, SURROUND, TARGET_FILE, command
-from tests.datasets.nuscenes_root import CHANNELS, streets, tables_of, write_root
+from tests.datasets.nuscenes_root import CHANNELS, START_US, Tables, streets, tables_of, write_root
+
+Edit = Callable[[Tables], Any]
 
 NAMES = ("CAM_BUMPER_FRONT", *(f"CAM_FENDER_{end}" for end in ("FRONT_LEFT", "FRONT_RIGHT", "L", "R")), "CAM_TAILGATE")
 
@@ -58,3 +65,137 @@ def test_one_vehicles_data_becomes_anothers(vehicles: tuple[Path, Path], tmp_pat
         assert np.allclose(one["K"], two["K"]) and np.allclose(one["cam2ego"], two["cam2ego"], atol=1e-9)
         assert np.allclose(one["boxes_3d"], two["boxes_3d"], equal_nan=True)
         assert np.array_equal(one["images"], retarget(open_data(tall)[k])["images"])
+
+
+# --- tables that others write -----------------------------------------------------------------------------------------
+def renamed(lidar: str | None) -> Edit:
+    def edit(data: Tables) -> None:
+        data["sensor"] = [row for row in data["sensor"] if lidar or row["modality"] != "lidar"]
+        for row in data["sensor"]:
+            row["channel"] = lidar if row["modality"] == "lidar" else row["channel"]
+        sensors = {row["token"] for row in data["sensor"]}
+        data["calibrated_sensor"] = [row for row in data["calibrated_sensor"] if row["sensor_token"] in sensors]
+        tokens = {row["token"] for row in data["calibrated_sensor"]}
+        data["sample_data"] = [row for row in data["sample_data"] if row["calibrated_sensor_token"] in tokens]
+
+    return edit
+
+
+def put(table: str, **columns: Any) -> Edit:
+    """Change columns of all rows of a table, by value or by function of the row."""
+
+    def edit(data: Tables) -> None:
+        for row in data[table]:
+            row |= {key: value(row) if callable(value) else value for key, value in columns.items()}
+
+    return edit
+
+
+def drop(*names: str) -> Edit:
+    return lambda data: [data.pop(name) for name in names]
+
+
+READ: dict[str, tuple[Edit, str]] = {
+    "another LiDAR": (renamed("LIDAR_LEFT"), ""),
+    "no LiDAR": (renamed(None), ""),
+    "flags as numbers": (put("sample_data", is_key_frame=lambda row: int(row["is_key_frame"])), ""),
+    "no labels": (drop("category", "instance", "sample_annotation"), "no table category, sample_annotation"),
+    "a box of size 0": (lambda data: data["sample_annotation"][0].update(size=[0, 1, 1]), "1 boxes, row .* left out"),
+    "a box of NaN": (lambda d: d["sample_annotation"][0].update(translation=[float("nan"), 1, 1]), "left out"),
+    "nanoseconds": (put("sample_data", timestamp=lambda row: row["timestamp"] * 1000), ""),
+    "capitals": (put("sensor", modality=lambda row: row["modality"].upper()), ""),
+    "no sizes": (put("sample_data", width=0, height=None), ""),
+    "zero distortion": (put("calibrated_sensor", camera_distortion=[0] * 6, distortion_model="plumb_bob"), ""),
+}
+
+
+@pytest.mark.parametrize("title", READ)
+def test_own_tables_are_read_and_converted(title: str, tmp_path: Path) -> None:
+    edit, said = READ[title]
+    data = tables_of(SURROUND, streets(2, goes=lambda time_s: 8 * time_s))
+    edit(data)
+    root = write_root(tmp_path / "root", data, SIZE)
+    if title == "nanoseconds":  # all others are neighbours as before
+        assert NuScenesDataset(root, neighbours=Neighbours())[0]["time_s"] == pytest.approx(1e-6 * START_US)
+    with pytest.warns(UserWarning, match=said) if said else nullcontext():
+        (batch,) = DataLoader(NuScenesDataset(root), batch_size=2, collate_fn=collate)
+    assert batch["images"].shape == (2, 6, 3, *SIZE)
+    assert ("points" in batch) == (title != "no LiDAR") and ("boxes_3d" in batch) == (title != "no labels")
+    assert main(command(root, tmp_path / "new", "--points", "source")) == 0
+    converted = open_data(tmp_path / "new")[0]
+    assert torch.equal(converted["ego2world"], batch["ego2world"][0]) and ("points" in converted) == ("points" in batch)
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (put("calibrated_sensor", camera_distortion=[0.1, 0.2, 0.3]), "expected camera_distortion of k1 k2 p1 p2"),
+        (put("calibrated_sensor", camera_distortion=[0.1, 0.2, 0, 0]), r"distortion_model \(plumb_bob or fisheye\)"),
+        (put("calibrated_sensor", camera_distortion=[0.1, 0, 0, 0, 0, 0.2]), r"got camera_distortion: \[0.1, .*in row"),
+        (put("calibrated_sensor", lens_model="omni", xi=0.9), "got lens_model: 'omni' in row"),
+        (put("calibrated_sensor", camera_model="cylindrical"), "got camera_model: 'cylindrical' in row"),
+        (put("calibrated_sensor", rectified=False), "got rectified: False in row"),
+        (put("sample_data", camera_intrinsic=[[1, 0, 0], [0, 1, 0], [0, 0, 1]]), "each image's calibration in cal"),
+        (put("sample_data", is_undistorted=False), "got is_undistorted: False in row"),
+        (put("sample_data", timestamp=lambda row: row["timestamp"] // 1000), "are they in milliseconds or seconds"),
+        (put("sample_data", timestamp=lambda row: row["timestamp"] / 1e6), "as a whole number of microseconds"),
+        (put("sample_data", is_key_frame="true"), "is_key_frame as true or false, got 'true'.*docs/formats.md"),
+        (drop("scene"), "expected the file .*, got none; docs/formats.md has the tables"),
+    ],
+)
+def test_other_tables_are_refused_with_a_way_out(edit: Edit, message: str, tmp_path: Path) -> None:
+    data = tables_of(SURROUND, streets(2, goes=lambda time_s: 8 * time_s))
+    edit(data)
+    with pytest.raises(DataError, match=message) as caught:
+        NuScenesDataset(write_root(tmp_path, data, SIZE))
+    assert "archive" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("columns", "lens", "coefficients"),
+    [
+        ({"camera_distortion": [-0.3, 0.1, 0.001, 0.0, 0.02]}, "radtan", (-0.3, 0.1, 0.001, 0.0, 0.02)),
+        ({"camera_distortion": [-0.3, 0.1, 0, 0, 0.01, 0]}, "radtan", (-0.3, 0.1, 0, 0, 0.01)),
+        ({"distortion": [0.01, 0, 0, 0], "distortion_model": "equidistant"}, "fisheye", (0.01, 0, 0, 0)),
+        ({"camera_distortion": [0] * 4, "camera_model": "Fisheye"}, "fisheye", (0, 0, 0, 0)),
+        ({"camera_distortion": [], "distortion_model": "none", "rectified": True}, "pinhole", ()),
+    ],
+)
+def test_lenses_in_tables_are_read(columns: dict[str, Any], lens: str, coefficients: Any, tmp_path: Path) -> None:
+    """T4 and nuImages have ``camera_distortion``, which was ignored."""
+    data = tables_of(SURROUND, streets(1, stands=lambda time_s: 0.0))
+    put("calibrated_sensor", **columns)(data)
+    (camera, *_) = NuScenesDataset(write_root(tmp_path, data, SIZE))[0]["rig"]
+    assert camera.lens == lens and camera.distortion == coefficients
+
+
+def test_one_of_several_lidars_is_chosen(tmp_path: Path) -> None:
+    data = tables_of(SURROUND, streets(1, stands=lambda time_s: 0.0))
+    renamed("LIDAR_LEFT")(data)
+    data["sensor"].append({"token": "other", "channel": "LIDAR_RIGHT", "modality": "lidar"})
+    root = write_root(tmp_path / "root", data, SIZE)
+    with pytest.raises(DataError, match=r"got LIDAR_LEFT, LIDAR_RIGHT; lidar_channel='LIDAR_LEFT' \(--lidar-channel"):
+        NuScenesDataset(root)
+    assert "points" not in NuScenesDataset(root, load_points=False)[0]
+    with pytest.raises(DataError, match="lidar_channel: expected 'X', with modality lidar, got LIDAR_LEFT, LIDAR_RIGH"):
+        open_data(root, lidar_channel="X")
+    for path in (root / "samples" / "LIDAR_TOP").iterdir():
+        np.ones((7, 4), np.float32).tofile(path)
+    asked = ["--lidar-channel", "LIDAR_LEFT", "--lidar-columns", "x", "y", "z", "intensity"]
+    assert open_data(root, lidar_channel=asked[1], lidar_columns=asked[3:])[0]["points"].shape == (7, 4)
+    assert main(["check", str(root), *asked, "--output", str(tmp_path / "pictures")]) in (0, 1)
+    assert main(["check", str(root), *asked[:2], "--output", str(tmp_path / "pictures")]) == 2
+    assert main(["inspect", f"nuscenes:{root}", "--output", str(tmp_path / "rig.png")]) == 0
+    assert main([*command(root, tmp_path / "new", "--points", "source"), *asked]) == 0
+
+
+def test_convert_names_channels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = write_vehicle(tmp_path / "root", SURROUND)
+    assert main(command(root, tmp_path / "a", "--points", "source")) == 0
+    assert "detectors' converters ask for CAM_FRONT, CAM_FRONT_RIGHT" in (said := capsys.readouterr().err)
+    name, *_ = load_rig(TARGET_FILE).names
+    assert f"--names {name}=CAM_FRONT ..." in said
+    assert main(command(root, tmp_path / "b", "--points", "source", "--names", f"{name}=CAM_FRONT")) == 0
+    assert NuScenesDataset(tmp_path / "b").channels[0] == "CAM_FRONT"
+    assert main(command(root, tmp_path / "c", "--names", "gone=CAM_FRONT")) == 2
+    assert f"--names: expected cameras of the target, {name}, " in capsys.readouterr().err

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -261,3 +263,17 @@ def test_licences_that_restrict_derivatives(root: Path, tmp_path: Path, capsys: 
     assert "-merged-" in data.tokens[3] and torch.equal(data[3]["points"], data[0]["points"])
     drive = data[2]
     assert all("-drive-" in frame["token"] for frame in drive["neighbours"])
+
+
+def test_damaged_tables_are_refused(tmp_path: Path) -> None:
+    """Offsets beyond the file's end let pyarrow crash."""
+    path = next(write_log(tmp_path).rglob("box_detections_se3.arrow"))
+    data = path.read_bytes()
+    for at in range(8, len(data), 40):
+        path.write_bytes(data[:at] + b"\xff\xff\xff\x7f" + data[at + 4 :])
+        with suppress(DataError):
+            Py123dDataset(tmp_path)[0]
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(DataError, match=r"expected a regular file box_detections_se3\.arrow"):
+        Py123dDataset(tmp_path)

@@ -164,7 +164,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         kind=kind,
         target=_renamed(load_rig(arguments.target), arguments.names),
         output=Path(arguments.output).absolute(),
-        generator=generator.absolute() if generator is not None and os.path.exists(generator) else generator,  # or a hub id
+        generator=generator.absolute() if generator and os.path.exists(generator) else generator,  # or a hub id
         motion_depth=None if depth is None else depth.absolute(),
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
         link=arguments.link,

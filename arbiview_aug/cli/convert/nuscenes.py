@@ -136,8 +136,8 @@ class NuScenes(Writer):
         if times > 1:
             name = next(name for name in names if view_stem(name, "") == stem)
             raise DataError(
-                f"nuScenes {self.data.root}: expected {self.moment} files of different names, after which the new images are "
-                f"named, got {times} of the name {name}; rename them"
+                f"nuScenes {self.data.root}: expected {self.moment} files of different names, after which new images "
+                f"are named, got {times} of the name {name}; rename them"
             )
         for camera in self.target:
             longest = view_stem(max(names, key=len), camera.name) + ".confidence.png"
@@ -229,7 +229,8 @@ class NuScenes(Writer):
         for path in self._maps():
             link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"), how=self.how)
         for name in self.written:
-            _write_table(self.kept_path(f"{self.data.version}/{name}.json"), rows.get(name, partial(source.rows, name))())
+            of_table = rows.get(name, partial(source.rows, name))
+            _write_table(self.kept_path(f"{self.data.version}/{name}.json"), of_table())
         notes = []
         if self._missing:
             notes.append(f"{self._missing} files that sample_data names are not in the source: were sweeps not copied?")
@@ -246,7 +247,8 @@ class NuScenes(Writer):
     def kept(self, left_out: set[str]) -> Iterator[tuple[Path, Path]]:
         for path in self._maps():
             yield self._kept(path.relative_to(self.data.root).as_posix(), "maps")
-        tables: dict[str, Iterable[Row]] = {"sample_data": Remaining(self.tables, left_out, self.scanned, self.moment).sample_data()}
+        remaining = Remaining(self.tables, left_out, self.scanned, self.moment)
+        tables: dict[str, Iterable[Row]] = {"sample_data": remaining.sample_data()}
         tables |= {name: self.tables.rows(name) for name in _OF_POINTS if name in self.written}
         for table, rows in tables.items():
             for row in rows:

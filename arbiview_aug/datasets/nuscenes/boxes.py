@@ -146,7 +146,7 @@ def _are_whole(rows: Sequence[Row]) -> npt.NDArray[np.bool_]:
     """(B,) whether a box has finite numbers and sizes above 0; True for other mistakes, which are named later."""
     try:
         numbers = np.array([[*row["size"], *row["translation"], *row["rotation"]] for row in rows], np.float64)
-        return np.isfinite(numbers).all(axis=1) & (numbers[:, :3] > 0).all(axis=1)
+        return np.asarray(np.isfinite(numbers).all(axis=1) & (numbers[:, :3] > 0).all(axis=1))
     except (KeyError, TypeError, ValueError, OverflowError, IndexError):
         return np.ones(len(rows), bool)
 

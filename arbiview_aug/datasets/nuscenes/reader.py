@@ -46,12 +46,12 @@ class NuScenesDataset(WritableRecording):
 
     A sample is a dict, everything in the ego frame at the LiDAR's time: ``images`` (N, 3, h, w) uint8 RGB; ``rig``;
     ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token``, ``scene_token``; ``ego2world`` (4, 4) float64;
-    ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring, or x y z, intensity and further
-    columns as the files have them; with ``load_boxes`` the
-    ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians, velocity x y in m/s over the
-    ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The numbers of points and boxes
-    vary: batch with ``collate_fn=arbiview_aug.collate``. If no sample is annotated, they have no boxes, with a warning.
-    Boxes without a size are left out, with a warning. Cameras have the lens of ``camera_distortion``, if it is there.
+    ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring, or other columns after x y z;
+    with ``load_boxes`` the ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians,
+    velocity x y in m/s over the ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The
+    numbers of points and boxes vary: batch with ``collate_fn=arbiview_aug.collate``. If no sample is annotated, they
+    have no boxes, with a warning; boxes without a size are left out, with a warning. Cameras have the lens of
+    ``camera_distortion``, if it is there.
     A root that ``convert`` wrote also has ``coverage`` and ``generated``, as ``FrameFolder`` gives them.
 
     With ``neighbours`` a sample also has other frames of its scene, keyframes and sweeps, by the distance that the
@@ -337,9 +337,7 @@ def _decode_images(files: Sequence[tuple[Path, str, str]], **settings: Any) -> t
     return decode_images([inside(*file) for file in files], **settings)
 
 
-def _read_points(
-    file: tuple[Path, str, str], sensor2ego: FloatArray, columns: Sequence[str] | None
-) -> torch.Tensor:
+def _read_points(file: tuple[Path, str, str], sensor2ego: FloatArray, columns: Sequence[str] | None) -> torch.Tensor:
     path = inside(*file)
     points = checked_points(read_cloud(path, columns, _COLUMNS, NUSCENES_COLUMNS), str(path)).numpy()
     points[:, :3] = points[:, :3].astype(np.float64) @ sensor2ego[:3, :3].T + sensor2ego[:3, 3]

@@ -5,6 +5,7 @@ Rows as Python objects would take ten times the memory, in every worker.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import compress
@@ -116,8 +117,9 @@ def read_recordings(
 ) -> Recordings:
     """Read the recordings of the samples (number by token), which lie in ``scenes``, by the cameras ``channels``.
 
-    The time and ego pose of a sample are those of ``lidar``, or without one of the first camera. ``sweeps`` are channels read between keyframes too, nine tenths of two tables. DataError for a malformed row, a
-    dangling token, or a sample that lacks a recording.
+    The time and ego pose of a sample are those of ``lidar``, or without one of the first camera. ``sweeps`` are
+    channels read between keyframes too, nine tenths of two tables. DataError for a malformed row, a dangling token, or
+    a sample that lacks a recording.
     """
     wanted = [*channels, lidar or ""]
     calibrated, channel_of, sensor2ego, K, lenses = _calibrations(tables, wanted)
@@ -179,11 +181,11 @@ def read_recordings(
         missing = ", ".join(channel for channel, row in zip(wanted, keyframes[k], strict=True) if row < 0)
         fix = "a sample needs rows with is_key_frame of every sensor that is read (channels=, lidar_channel=)"
         raise tables.error("sample_data", f"keyframes of {missing} for sample {list(samples)[k]}", "none", fix)
-    times_us = np.sort(rows["time_us"][keyframes[:, -1]] + 10**17 * np.array(scenes, np.int64))
-    steps_us = np.diff(times_us)[np.diff(times_us) > 0]
-    if len(steps_us) and np.median(steps_us) < 1e6 * _LEAST_STEP_S:
-        got = f"keyframes {np.median(steps_us):g} apart"
-        raise tables.error("sample_data", "timestamps in microseconds", got, "are they in milliseconds or seconds?")
+    moments_us = np.sort(rows["time_us"][keyframes[:, -1]] + kinds.NANOSECONDS * np.array(scenes, np.int64))
+    steps_us = np.diff(moments_us)
+    if (step_us := np.median(steps_us[steps_us > 0]) if steps_us.any() else math.inf) < 1e6 * _LEAST_STEP_S:
+        got, fix = f"keyframes {step_us:g} apart", "are they in milliseconds or seconds?"
+        raise tables.error("sample_data", "timestamps in microseconds", got, fix)
     count = max(scenes, default=-1) + 1
     order = rows["token"][: len(tokens)]
     tokens, previous = [tokens[k] for k in order], [previous[k] for k in order]
@@ -227,20 +229,20 @@ def _calibrations(
 def _lens(tables: Tables, row: Row) -> tuple[str, list[float]]:
     """Model and coefficients of a camera's lens; DataError for columns of a lens that are not read."""
     there = [key for key in _COEFFICIENTS if row.get(key)]
-    coefficients = next((key for key in there if not is_neutral(row[key])), there[0] if there else "")
-    model = next((key for key in _MODELS if not is_neutral(row.get(key), is_name=True)), "")
-    is_fisheye = isinstance(row.get(model), str) and row[model].lower() in _FISHEYES
-    odd = unread_lens(row, (coefficients, model)) or (f"{model}: {shown(row[model])}" if model and not is_fisheye else None)
-    if odd is None and not (is_fisheye or coefficients):
-        return "pinhole", []
-    lens, values = "fisheye" if is_fisheye else "radtan", row.get(coefficients)
-    if odd is None and isinstance(values, list | tuple):
-        numbers = tables.numbers("calibrated_sensor", [row], coefficients, (len(values),))[0].tolist()
-        for count in LENSES[lens].coefficient_counts:
+    key = next((key for key in there if not is_neutral(row[key])), there[0] if there else "")
+    model = next((name for name in _MODELS if not is_neutral(row.get(name))), "")
+    values, word = row.get(key, []), row[model].lower() if isinstance(row.get(model), str) else ""
+    lens = "fisheye" if word in _FISHEYES else "radtan"
+    read = (key, model) if lens == "fisheye" else (key,)
+    if (odd := unread_lens(row, read)) is None and isinstance(values, list | tuple):
+        numbers = tables.numbers("calibrated_sensor", [row], key, (len(values),))[0].tolist() if key else []
+        if lens == "radtan" and not any(numbers):
+            return "pinhole", []
+        for count in LENSES[lens].coefficient_counts if len(numbers) > 4 or word else ():  # four may be a fisheye's
             if len(numbers) >= count and not any(numbers[count:]):
-                return (lens, numbers[:count]) if is_fisheye or any(numbers) else ("pinhole", [])
-    expected = "camera_distortion of k1 k2 p1 p2 [k3 [k4 k5 k6]], or of k1 k2 k3 k4 with distortion_model fisheye"
-    got = f"{odd or f'{coefficients or model}: {shown(values or row[model])}'} in row {row.get('token')!r}"
+                return lens, numbers[:count]
+    expected = "camera_distortion of k1 k2 p1 p2 k3 [k4 k5 k6], or distortion_model (plumb_bob or fisheye) with it"
+    got = f"{odd or f'{key or model}: {shown(values or word)}'} in row {row.get('token')!r}"
     raise tables.error("calibrated_sensor", expected, got, "undistort the images, or write frame folders")
 
 

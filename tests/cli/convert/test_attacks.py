@@ -411,3 +411,23 @@ def _link(folder: Path, name: str, target: Path) -> None:
             path.symlink_to(target)
     except (OSError, ValueError):
         pass
+
+
+@pytest.mark.parametrize("name", ["conversion", "conversion/samples", "v1.0-mini"])
+def test_no_link_leads_out_of_the_output(name: str, tables: Home) -> None:
+    """Records and tables were written where it led."""
+    (tables.root / "elsewhere").mkdir()
+    (tables.output / name).parent.mkdir(parents=True)
+    (tables.output / name).symlink_to(tables.root / "elsewhere")
+    assert tables.convert() == 2 and "links must not leave the folder" in tables.said
+    assert not [*(tables.root / "elsewhere").iterdir()]
+
+
+@pytest.mark.parametrize(("option", "value"), [("--output", "a\0b"), ("--output", "x" * 300), ("--depth", "x" * 300)])
+def test_impossible_folders(option: str, value: str, tables: Home) -> None:
+    given = command(tables.source, tables.output)
+    if option == "--output":
+        given[given.index(option) + 1] = value
+    else:
+        given += [option, value]
+    assert tables.run(*given) == 2 and f"{option} " in tables.said and "Errno" not in tables.said
