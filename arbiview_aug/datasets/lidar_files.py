@@ -75,7 +75,7 @@ def read_cloud(path: Path, columns: Any, how: str, assumed: Sequence[str] | None
 
 
 def row_type(columns: Any, where: str) -> Any:
-    """numpy's type of a row by its columns: the first word is the name; float32, or the type that follows as in ring:uint8."""
+    """numpy's type of a row by its columns: a name, and float32 or the type that follows, as in ring:uint8."""
     try:
         if isinstance(columns, str) or not 3 <= len(columns) <= 64:
             raise ValueError

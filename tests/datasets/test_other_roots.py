@@ -108,6 +108,8 @@ READ: dict[str, tuple[Edit, str]] = {
     "zero distortion": (put("calibrated_sensor", camera_distortion=[0] * 6, distortion_model="plumb_bob"), ""),
 }
 
+CONVERTED = ("another LiDAR", "no LiDAR", "no labels", "a box of NaN")  # and the others are no different there
+
 
 @pytest.mark.parametrize("title", READ)
 def test_own_tables_are_read_and_converted(title: str, tmp_path: Path) -> None:
@@ -121,6 +123,8 @@ def test_own_tables_are_read_and_converted(title: str, tmp_path: Path) -> None:
         (batch,) = DataLoader(NuScenesDataset(root), batch_size=2, collate_fn=collate)
     assert batch["images"].shape == (2, 6, 3, *SIZE)
     assert ("points" in batch) == (title != "no LiDAR") and ("boxes_3d" in batch) == (title != "no labels")
+    if title not in CONVERTED:
+        return
     assert main(command(root, tmp_path / "new", "--points", "source")) == 0
     converted = open_data(tmp_path / "new")[0]
     assert torch.equal(converted["ego2world"], batch["ego2world"][0]) and ("points" in converted) == ("points" in batch)

@@ -181,9 +181,10 @@ def read_recordings(
         missing = ", ".join(channel for channel, row in zip(wanted, keyframes[k], strict=True) if row < 0)
         fix = "a sample needs rows with is_key_frame of every sensor that is read (channels=, lidar_channel=)"
         raise tables.error("sample_data", f"keyframes of {missing} for sample {list(samples)[k]}", "none", fix)
-    moments_us = np.sort(rows["time_us"][keyframes[:, -1]] + kinds.NANOSECONDS * np.array(scenes, np.int64))
-    steps_us = np.diff(moments_us)
-    if (step_us := np.median(steps_us[steps_us > 0]) if steps_us.any() else math.inf) < 1e6 * _LEAST_STEP_S:
+    moments = rows[keyframes[:, -1]]
+    moments = moments[np.lexsort((moments["time_us"], moments["scene"]))]
+    steps_us = np.diff(moments["time_us"])[(np.diff(moments["scene"]) == 0) & (np.diff(moments["time_us"]) > 0)]
+    if (step_us := np.median(steps_us) if len(steps_us) else math.inf) < 1e6 * _LEAST_STEP_S:
         got, fix = f"keyframes {step_us:g} apart", "are they in milliseconds or seconds?"
         raise tables.error("sample_data", "timestamps in microseconds", got, fix)
     count = max(scenes, default=-1) + 1
