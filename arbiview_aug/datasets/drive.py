@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import operator
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -35,7 +36,7 @@ BEGUN_FILE, FINISHED_FILE = "settings.json", "provenance.json"  # in it: the fir
 
 def is_converted(root: Path) -> bool:
     """Whether ``convert`` wrote a root, or has begun to."""
-    return (root / CONVERSION_FOLDER / BEGUN_FILE).is_file()
+    return os.path.isfile(root / CONVERSION_FOLDER / BEGUN_FILE)  # unlike Path.is_file, False for impossible names
 
 
 def warn_of_unfinished(root: Path, found: int) -> None:
