@@ -128,9 +128,8 @@ def inlined(function: Any) -> Any:
 
 @contextmanager
 def compilation_announced() -> Iterator[None]:
-    """Say on stderr that kernels are compiled, where numba's cache does not hold them, and how long it took."""
+    """Say on stderr that kernels are compiled, where numba's cache does not hold them."""
     compilation = _compilation()
-    before_s = compilation.seconds
     with compilation.lock:
         compilation.announcers += 1
     try:
@@ -138,8 +137,12 @@ def compilation_announced() -> Iterator[None]:
     finally:
         with compilation.lock:
             compilation.announcers -= 1
-        if not compilation.announcers and compilation.seconds > before_s:
-            print(f"arbiview_aug: kernels compiled in {compilation.seconds - before_s:.1f} s", file=sys.stderr)
+
+
+def is_kept(kernel: Any) -> bool:
+    """Whether numba's cache holds a kernel in its present form; a kernel without a cache counts as held."""
+    files = getattr(kernel._cache, "_cache_file", None)
+    return files is None or bool(files._load_index())
 
 
 def working_s() -> float:
@@ -148,21 +151,26 @@ def working_s() -> float:
 
 
 @cache
+def say_compiling() -> None:
+    """Say on stderr, once for each process, why the first frames take long."""
+    print("arbiview_aug: compiling kernels, once for each installation", file=sys.stderr)
+
+
+@cache
 def _compilation() -> Any:
     """The listener that measures how long this process compiled kernels."""
     from numba.core import event
 
     class Compilation(event.Listener):  # type: ignore[misc]
-        seconds, announcers, said, lock = 0.0, 0, False, Lock()  # threads announce beside each other
+        seconds, announcers, lock = 0.0, 0, Lock()  # threads announce beside each other
         depth, start_s, collects = 0, 0.0, False
 
         def on_start(self, event: Any) -> None:
             if not self.depth and not event.data["dispatcher"].py_func.__module__.startswith("arbiview_aug."):
                 return
             if not self.depth:
-                if self.announcers and not self.said:
-                    self.said = True
-                    print("arbiview_aug: compiling kernels, once for each installation", file=sys.stderr)
+                if self.announcers:
+                    say_compiling()
                 self.start_s, self.collects = time.perf_counter(), gc.isenabled()
                 gc.disable()  # the compiler's many small objects would be searched for garbage over and over
             self.depth += 1
@@ -185,7 +193,15 @@ def _kernel_cache() -> type:
     from numba.core.caching import FunctionCache, IndexDataCacheFile
 
     class Files(IndexDataCacheFile):  # type: ignore[misc]
-        """The files of a kernel; each ends in its SHA-256, as numba runs what it reads."""
+        """The files of a kernel; each ends in its SHA-256, as numba runs what it reads.
+
+        Code is named after its signature, not numbered: processes that save at the same time never mix it up.
+        """
+
+        def save(self, key: Any, data: Any) -> None:
+            name = f"{self._index_name[:-4]}.{sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
+            self._save_data(name, data)
+            self._save_index({**self._load_index(), key: name})
 
         def _load_index(self) -> Any:
             return super()._load_index() if is_intact(Path(self._index_path)) else {}

@@ -7,10 +7,12 @@ from tempfile import TemporaryDirectory
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets.synthetic import SyntheticDrive
-from arbiview_aug.transforms.warm_up import compile_kernels
+from arbiview_aug.transforms.warm_up import GROUPS, compile_kernels, compiling
 from tests.cli.convert.drives import FRAMES, command, write_frames
 
 if __name__ == "__main__":
+    with compiling(*GROUPS):
+        pass
     compile_kernels()
     SyntheticDrive(FRAMES, num_frames=1)[0]
     with TemporaryDirectory() as folder:  # those of depth from motion, and of points and boxes in float32

@@ -29,6 +29,7 @@ from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
 from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.scans import retarget_points
+from arbiview_aug.transforms.warm_up import compiling
 
 PICTURE_FILE = "demo.png"
 _COMPARED: tuple[GeometryName, ...] = ("street", "ground", "infinity")
@@ -46,8 +47,9 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.target is not None:
         load_rig(arguments.target)  # refused before a street is drawn
     data = open_frames(arguments, [arguments.geometry], lidar=arguments.geometry == "lidar")
-    sample = data[0]
-    read_scene(read_frames(sample, None)[0], arguments.geometry)  # refuses what the sample lacks before minutes of work
+    with compiling("objects", "plans", *(() if arguments.data is None else ("points",))):
+        sample = data[0]
+        read_scene(read_frames(sample, None)[0], arguments.geometry)  # refuses what the sample lacks before any work
     methods = _compared(arguments.quality, arguments.geometry, arguments.holes)
     notes: list[str] = []
     done = measured(arguments, data, methods, notes, agreement=False)

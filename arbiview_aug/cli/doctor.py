@@ -33,6 +33,7 @@ from arbiview_aug.environment import (
     working_s,
 )
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from arbiview_aug.transforms.warm_up import compiling
 
 _CALLS = 5
 _FRAME_MB = 0.6
@@ -107,7 +108,8 @@ def _extras() -> list[str]:
 
 def _frame(size: tuple[int, int]) -> Line:
     """Time one frame of a synthetic street, and check that something was seen."""
-    sample = SyntheticDrive(demo_source_rig(size), num_frames=1)[0]
+    with compiling("objects", "plans", "points"):
+        sample = SyntheticDrive(demo_source_rig(size), num_frames=1)[0]
     target = demo_target_rig(size)
     calls = {
         "street": partial(RigRetarget(target, geometry="street"), sample),

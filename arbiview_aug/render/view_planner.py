@@ -48,7 +48,7 @@ from arbiview_aug.render.plan import (
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.weights import SecondBest, seam_weights, source_weight
 from arbiview_aug.scene.boxes import BOX_ERROR
-from arbiview_aug.scene.point_cloud import occlusion_level, seen_through
+from arbiview_aug.scene.point_cloud import occlusion_level
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.scene.surface import FAR_PARALLAX_PX, OcclusionMap, is_within_wall, worst_parallax_px
 
@@ -607,7 +607,7 @@ def build_plan(
 
 
 def warm_up() -> None:
-    """Compile the kernels of cameras, scenes and plans, or load them from numba's cache."""
+    """Compile the kernels of cameras and of plans over objects, or load them from numba's cache."""
     from arbiview_aug.render.kernels import read_ahead
 
     # A lens without and one with an array of rays: kernels are compiled once for all lenses.
@@ -619,15 +619,13 @@ def warm_up() -> None:
         )
         for lens, distortion in lenses for side in (-1, 0, 1)
     ]  # fmt: skip
-    wall = np.stack(np.meshgrid(8.0, np.linspace(-2, 2, 20), np.linspace(0.3, 1.5, 10)), -1).reshape(-1, 3)
     boxes = np.array([[8.5, 0, 1, 1, 4, 2, 0], [5, 3, 1, 1, 1, 2, 0]])
     source = Rig(
         [replace(camera, mask=np.eye(32, dtype=bool) < 1) for camera in views if not camera.name.endswith("0")]
     )
     target = Rig([camera for camera in views if camera.name.endswith("0")])
-    scene, config = Scene(boxes=boxes, points=wall), RenderConfig(certainty=True)
-    seen_through(wall, wall, target[0].center_m)
-    for surface in ("ground", "boxes", "lidar"):
+    scene, config = Scene(boxes=boxes), RenderConfig(certainty=True)
+    for surface in ("ground", "boxes"):
         plan = build_plan(source, target, geometry=surface, config=config, scene=scene)
     read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
 
