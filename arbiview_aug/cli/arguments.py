@@ -8,7 +8,7 @@ import os
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -98,9 +98,12 @@ def add_rendering(parser: argparse.ArgumentParser, holes: str = "continue", *, s
         parser.add_argument(name, choices=choices, help=text, **options)
 
 
-def add_frames(parser: argparse.ArgumentParser, default: int | None, text: str = "number of frames") -> None:
-    """Add ``--frames``, ``--seed`` and ``--size``."""
-    parser.add_argument("--frames", type=count, default=default, metavar="N", help=text)
+def add_frames(
+    parser: argparse.ArgumentParser, default: int | None, text: str = "number of frames", *, slices: bool = False
+) -> None:
+    """Add ``--frames``, ``--seed`` and ``--size``; with ``slices``, ``--frames`` takes A:B:STEP, too."""
+    kind, metavar = (frames, "N|A:B:STEP") if slices else (count, "N")
+    parser.add_argument("--frames", type=kind, default=default, metavar=metavar, help=text)
     parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the synthetic streets")
     parser.add_argument(
         "--size",
@@ -148,6 +151,27 @@ def add_output(parser: argparse.ArgumentParser, text: str = "folder to write to"
 def count(text: str) -> int:
     """Integer above 0."""
     return _integer(text, 1, "above 0")
+
+
+def frames(text: str) -> int | str:
+    """Number of frames, or ``A:B:STEP`` as in Python."""
+    if ":" not in text:
+        return count(text)
+    first, end, *step = text.split(":")
+    if len(step) > 1 or not all(not part or part.isdecimal() for part in (first, end, *step)) or step == ["0"]:
+        raise argparse.ArgumentTypeError(f"expected a number of frames or A:B:STEP such as 0:100:10, got {text!r}")
+    return text
+
+
+def chosen_frames(asked: int | str, count_of: int) -> list[int]:
+    """Indices of the frames that ``--frames`` asks for: a number spread over all ``count_of``, or a slice of them."""
+    if isinstance(asked, int):
+        number = min(asked, count_of)
+        return [k * count_of // number for k in range(number)]
+    indices = list(range(count_of)[slice(*(int(part) if part else None for part in asked.split(":")))])
+    if not indices:
+        raise DataError(f"--frames {asked}: expected some of the {count_of} frames, got none")
+    return indices
 
 
 def seed(text: str) -> int:
@@ -216,9 +240,15 @@ def writable_folder(path: Path, asked: str) -> Path:
     return path
 
 
-def output_file(asked: str) -> Path:
-    """Path of a file to write, given by ``--output``; creates its folder before any work starts."""
+PICTURES = ".png", ".jpg", ".jpeg"
+"""Endings of pictures that commands write."""
+
+
+def output_file(asked: str, endings: Sequence[str] = ()) -> Path:
+    """Path of a file to write, given by ``--output``, with one of some endings; creates its folder before any work."""
     path = Path(asked)
+    if endings and path.suffix.lower() not in endings:
+        raise DataError(f"--output {asked}: expected a name ending in {' or '.join(endings)}, got {path.name!r}")
     if path.is_dir():
         raise DataError(f"--output {asked}: expected a file, got a folder")
     writable_folder(path.parent, asked)
@@ -227,7 +257,7 @@ def output_file(asked: str) -> Path:
 
 @contextmanager
 def gathered_warnings(lines: list[str]) -> Iterator[None]:
-    """Collect warnings in ``lines``, each once, instead of printing them across a progress bar.
+    """Collect warnings in ``lines``, as ``told_once`` tells them, instead of printing them across a progress bar.
 
     What libraries deprecate is left out, as Python does.
     """
@@ -235,7 +265,15 @@ def gathered_warnings(lines: list[str]) -> Iterator[None]:
         warnings.simplefilter("always")
         warnings.simplefilter("ignore", DeprecationWarning)
         yield
-    lines.extend(dict.fromkeys(str(warning.message) for warning in caught))
+    lines.extend(told_once(str(warning.message) for warning in caught))
+
+
+def told_once(texts: Iterable[str]) -> list[str]:
+    """Messages of a run: the first of those that differ in numbers and quoted names alone, with the others counted."""
+    alike: dict[str, list[str]] = {}
+    for text in dict.fromkeys(texts):
+        alike.setdefault(re.sub(r"'[^']*'|\d+", "#", text), []).append(text)
+    return [f"{first} ({len(others)} more like it)" if others else first for first, *others in alike.values()]
 
 
 @contextmanager

@@ -21,7 +21,15 @@ import numpy as np
 from arbiview_aug.atomic_io import file_name, inside
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.arguments import REAL_TARGET, device_named, frames_text, named_steps, reading, writable_folder
+from arbiview_aug.cli.arguments import (
+    REAL_TARGET,
+    chosen_frames,
+    device_named,
+    frames_text,
+    named_steps,
+    reading,
+    writable_folder,
+)
 from arbiview_aug.cli.scans import evaluate_scans
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
@@ -115,11 +123,11 @@ def _displaced(arguments: argparse.Namespace, notes: list[str], look: Look | Non
     """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
     everything: GeometryName = "fused" if arguments.geometry == ["auto"] else "motion"
     data, displaced = open_frames(arguments, [everything, *arguments.geometry]), arguments.displaced
-    count_of = min(arguments.frames or len(data), len(data))
-    with named_steps(notes, count_of) as tick:
+    chosen = chosen_frames(arguments.frames or len(data), len(data))
+    with named_steps(notes, len(chosen)) as tick:
         options = {name: getattr(arguments, name) for name in ("reduce", "clean_masks")}
         next_frame = FrameFolder(displaced, **options)[0] if isinstance(displaced, str) else None
-        frames = displaced_frames(data, count_of, next_frame)
+        frames = displaced_frames(data, chosen, next_frame)
         first = next(frames, None)
         if first is None:
             expected = "a 'truth' camera in calib.json, or a later frame of the drive (sequence.json and ego2world)"
@@ -158,9 +166,9 @@ def target_rigs(arguments: argparse.Namespace, chosen: Rig | None, source: Rig) 
     return {name: rig.resized(arguments.size, "crop") for name, rig in rigs.items()}
 
 
-def scored_frames(data: Any, frames: int, hand_over_points: bool) -> Iterator[tuple[str, ScoredFrame]]:
-    """Name and frame of the first samples; synthetic ones are scored by the true views, not by points."""
-    for index in range(frames):
+def scored_frames(data: Any, indices: Sequence[int], hand_over_points: bool) -> Iterator[tuple[str, ScoredFrame]]:
+    """Name and frame of samples; synthetic ones are scored by the true views, not by points."""
+    for index in indices:
         sample, is_synthetic = data[index], isinstance(data, SyntheticDrive)
         truth = partial(data.render, index) if is_synthetic else None
         exposures = () if is_synthetic else EXPOSURES
@@ -192,9 +200,9 @@ def measured(
     agreement: bool = True,
     look: Look | None = None,
 ) -> Evaluation:
-    """Evaluate methods on the first frames, behind a progress bar; warnings go to ``notes``."""
+    """Evaluate methods on the frames of ``--frames``, behind a progress bar; warnings go to ``notes``."""
     chosen = None if arguments.target is None else load_rig(arguments.target)
-    count_of = min(arguments.frames or 1, len(data))
-    frames = scored_frames(data, count_of, any(method.reads_points for method in methods))
-    with named_steps(notes, count_of) as tick:
+    indices = chosen_frames(arguments.frames or 1, len(data))
+    frames = scored_frames(data, indices, any(method.reads_points for method in methods))
+    with named_steps(notes, len(indices)) as tick:
         return evaluate(frames, partial(target_rigs, arguments, chosen), methods, tick, agreement=agreement, look=look)

@@ -174,7 +174,8 @@ def evaluate() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--generator", metavar="PATH", help=f"of --holes diffusion: {_GENERATOR}")
     add("--steps", nargs="+", type=count, default=[None], metavar="N", help="steps of the generator (default: its own)")
-    add_frames(parser, None, "number of frames (default: 1; --displaced: all)")
+    text = "number of frames, spread over the data, or a slice of them (default: 1; --displaced: all)"
+    add_frames(parser, None, text, slices=True)
     add_reading(parser)
     add_output(parser)
     displaced = (
@@ -329,5 +330,7 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
             refuse(("detector_weights", "detector_classes"), "expected --detector with it, found none")
         if arguments.segmenter and arguments.data is not None and not arguments.displaced:
             parser.error("argument --segmenter: expected --displaced with --data: it compares with true images")
+        if isinstance(arguments.frames, str) and arguments.data is None:
+            parser.error("argument --frames: expected --data FOLDER with A:B:STEP, found none")
         if arguments.displaced and arguments.data is None:
             parser.error("argument --displaced: expected --data FOLDER with it, found none")

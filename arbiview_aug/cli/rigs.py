@@ -11,7 +11,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.formats.calibration import recognised
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig, read_rig, shipped_rigs
-from arbiview_aug.cli.arguments import data
+from arbiview_aug.cli.arguments import PICTURES, data, output_file
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import DataError
@@ -25,11 +25,12 @@ NOISE_DEG, NOISE_M = 0.2, 0.02
 
 def run(arguments: argparse.Namespace) -> None:
     """Print the rigs and the differences of the others from the first; write the picture."""
+    path = output_file(arguments.output, PICTURES)
     rigs, notes = zip(*(_load(name) for name in arguments.rigs), strict=True)
     print("\n\n".join(f"{rig!r}{note}" for rig, note in zip(rigs, notes, strict=True)))
     for other in rigs[1:]:
         print(f"\n{differences(rigs[0], other)}\n\n{rig_gap(rigs[0], other)}")
-    print(f"\npicture: {save_picture(arguments.output, draw_rigs(rigs))}")
+    print(f"\npicture: {save_picture(path, draw_rigs(rigs))}")
 
 
 def differences(source: Rig, target: Rig) -> str:

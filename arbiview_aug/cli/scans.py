@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +14,7 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.cli.arguments import REAL_TARGET, frames_text, named_steps, reading
+from arbiview_aug.cli.arguments import REAL_TARGET, chosen_frames, frames_text, named_steps, reading
 from arbiview_aug.datasets import FrameFolder, open_data
 from arbiview_aug.datasets.depth_folder import WANTED
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -51,13 +50,14 @@ def evaluate_scans(arguments: argparse.Namespace, folder: Path) -> None:
     """Measure, print the table, write ``evaluate.json`` and a picture of the first frame."""
     if arguments.displaced:
         data = open_data(arguments.data, neighbours=WANTED, **reading(arguments))
-        scans, count = _displaced(arguments, data), arguments.frames or len(data)
+        chosen = chosen_frames(arguments.frames or len(data), len(data))
+        scans, count = _displaced(arguments, data, chosen), len(chosen)
     else:
         scans, count = _synthetic(arguments), arguments.frames or 1
     rows: list[dict[str, Any]] = []
     picture, notes = None, list[str]()
     with named_steps(notes, count) as tick:
-        for scan in islice(scans, count):
+        for scan in scans:
             tick(scan.name, 1)
             for lidar in scan.rig.lidars:
                 clouds = clouds_of(scan, lidar)
@@ -116,14 +116,14 @@ def _synthetic(arguments: argparse.Namespace) -> Iterator[TrueScan]:
         yield TrueScan(f"street {k}", mounted, points, boxes, truth, source)
 
 
-def _displaced(arguments: argparse.Namespace, data: Any) -> Iterator[TrueScan]:
+def _displaced(arguments: argparse.Namespace, data: Any, indices: Sequence[int]) -> Iterator[TrueScan]:
     """Scans of a drive, each against the next one, from where that was taken; of static things."""
     from sklearn.neighbors import KDTree
 
     chosen = None if arguments.target is None else load_rig(arguments.target)
     next_frame = FrameFolder(arguments.displaced)[0] if isinstance(arguments.displaced, str) else None
     problems, found = list[str](), False
-    for index in range(len(data)):
+    for index in indices:
         sample = data[index]
         found_later = later_neighbour(sample, next_frame, problems)
         if found_later is None or "points" not in (later := found_later[1].given) or "points" not in sample:

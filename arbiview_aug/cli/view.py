@@ -23,7 +23,6 @@ from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.datasets.image_io import encoded_image
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import views_of
 from arbiview_aug.evaluate.report.pictures import BOX, HOLE, RIG_COLOURS, box_lines, left_to_right
@@ -48,9 +47,7 @@ _MAPS = ("boxes", "coverage", "confidence")  # over a camera's image, in two dim
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the recording; with ``--open`` show it, and return the viewer's exit status."""
-    path = output_file(arguments.output)
-    if path.suffix != ".rrd":
-        raise DataError(f"--output {arguments.output}: expected a name ending in .rrd, got {path.name!r}")
+    path = output_file(arguments.output, [".rrd"])
     optional_package("rerun", "viewer")  # before work starts
     chosen = None if arguments.target is None else load_rig(arguments.target)
     notes: list[str] = []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import cv2
@@ -13,7 +13,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.frame_folder import FrameFolder
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, warn
 from arbiview_aug.evaluate.frames import Photographs, ScoredFrame
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.methods import Method
@@ -22,17 +22,20 @@ from arbiview_aug.sample.inputs import LEARNED_KEY, Frame, read_frames
 from arbiview_aug.sample.neighbours import STILL_M, Neighbour, read_neighbours
 from arbiview_aug.temporal.motion_depth import without_objects
 
+MOST_APART_S = 2.0
+"""Longest time to the photograph that is the truth: a vehicle that stands waits longer, and traffic has gone on."""
 
-def displaced_frames(data: Any, count: int, next_frame: Mapping[str, Any] | None) -> Iterator[tuple[str, ScoredFrame]]:
-    """Name and frame of the first ``count`` samples with photographs; methods get all that a sample has.
+
+def displaced_frames(
+    data: Any, indices: Iterable[int], next_frame: Mapping[str, Any] | None
+) -> Iterator[tuple[str, ScoredFrame]]:
+    """Name and frame of those samples at ``indices`` that have photographs; methods get all that a sample has.
 
     The truth is a ``FrameFolder``'s ``truth`` camera; else ``next_frame``, or the nearest neighbour recorded later.
     Samples without one are left out; DataError says why if there is no other.
     """
-    problems, found = list[str](), 0
-    for index in range(len(data)):
-        if found == count:
-            return
+    problems, found = list[str](), False
+    for index in indices:
         sample, truth = data[index], None
         recorded = data.dataset if isinstance(data, WithDepth) else data
         if next_frame is None and isinstance(recorded, FrameFolder):
@@ -50,7 +53,7 @@ def displaced_frames(data: Any, count: int, next_frame: Mapping[str, Any] | None
             sample = {**frame.sample, **({"neighbours": others} if others else {})}
         points, rig = sample.get("points"), photographs.rig
         yield str(sample.get("token", index)), ScoredFrame(sample, truth=photographs.of_rig, target=rig, points=points)
-        found += 1
+        found = True
     if problems and not found:
         raise DataError(problems[0])
 
@@ -60,13 +63,21 @@ def later_neighbour(
 ) -> tuple[Frame, Neighbour, list[Any]] | None:
     """A sample's frame, ``next_frame`` or else the nearest neighbour recorded later, and the neighbours elsewhere.
 
-    None if there is no such frame; what was wrong with neighbours goes to ``problems``.
+    None if there is no such frame, or the vehicle stands so long that it comes more than ``MOST_APART_S`` later. What
+    was wrong goes to ``problems``.
     """
     entries = [*([] if next_frame is None else [next_frame]), *(sample.get("neighbours") or [])]
     (frame,) = read_frames({**sample, "neighbours": entries}, None)
     neighbours = read_neighbours(frame, lambda _, message: problems.append(message))
     later = next((one for one in neighbours if one.is_later and (next_frame is None or one.number == 0)), None)
     if later is None:
+        return None
+    if next_frame is None and (later.seconds or 0.0) > MOST_APART_S:
+        problems.append(
+            f"--displaced: frame {str(sample.get('token', ''))!r} is left out, since its vehicle stands: the next "
+            f"frame from elsewhere is {later.seconds:.1f} s later"
+        )
+        warn(problems[-1])
         return None
     apart_m = {one.number: np.linalg.norm((one.ego2ego - later.ego2ego)[:3, 3]) for one in neighbours}
     return frame, later, [entry for k, entry in enumerate(entries) if apart_m.get(k, np.inf) > STILL_M]

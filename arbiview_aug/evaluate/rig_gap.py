@@ -44,8 +44,10 @@ class RigGap:
             return "For a detector: the first rig sees none of the objects in the other's images; nothing to compare."
         row, size = (100 * np.expm1(value) for value in (self.row, self.size))
         return (
-            f"For a detector: {self.unseen:.0%} of the objects unseen; distances wrong by {row:.0f}% by their row, by "
-            f"{size:.0f}% by their size; seen from {self.parallax_deg:.1f} deg elsewhere."
+            f"For a detector, of objects {OBJECT_HEIGHT_M} m high, {_DISTANCES_M[0]:.0f} to {_DISTANCES_M[-1]:.0f} m "
+            f"away in the other rig's images: the first rig does not see {self.unseen:.0%}. Read as the first rig's "
+            f"images, distances are wrong by {row:.0f}% of the true ones by objects' rows, by {size:.0f}% by their "
+            f"sizes; objects are seen from directions {self.parallax_deg:.1f} deg apart."
         )
 
 

@@ -13,7 +13,7 @@ view's seams, so a sample of these says what the gain of each part of the view's
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cache
 from statistics import median
@@ -101,9 +101,14 @@ class PhotometricReport:
     reason: str  # why, or why not
 
     def __str__(self) -> str:
+        return self.of_cameras(map(str, range(len(self.gains))))
+
+    def of_cameras(self, names: Iterable[str]) -> str:
+        """The gains with the names of their cameras."""
         if not self.accepted:
             return f"colours as recorded: {self.reason}"
-        return f"gains {', '.join(f'{gain:.2f}' for gain in self.gains)}: {self.reason}"
+        gains = (f"{name} {gain:.2f}" for name, gain in zip(names, self.gains, strict=True))
+        return f"gains {', '.join(gains)}: {self.reason}"
 
 
 class Overlaps(NamedTuple):

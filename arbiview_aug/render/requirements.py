@@ -30,6 +30,12 @@ HELPFUL_DATA = (
 )
 """Data that keeps the shape of objects if cameras move, for messages."""
 
+STATIC_HARM = (
+    "Trained on such views alone, a detector that samples voxels finds fewer boxes than one trained on untouched "
+    "images; one that lifts by depths finds more (docs/when.md)"
+)
+"""What a static surface does to detectors where cameras move: ``integrations/cross_rig/results/less.json``."""
+
 _COARSE_MASK_PX = 16  # margin that must be unmasked: weights know masks by blocks of 8 px
 _ROUNDING_PX = 1e-6  # of float64 at the outermost pixel centres; plans allow for 1e-3
 _MAP_ERROR_PX = 1 / 32  # rounding of fixed-point maps, with as much again
@@ -65,9 +71,8 @@ def needs_geometry(source: Rig, target: Rig, surface: str, config: RenderConfig)
 def static_harm(source: Rig, target: Rig, surface: str, config: RenderConfig) -> str | None:
     """Explain how a detector suffers from cameras that move over a static surface; None if it does not.
 
-    Objects are projected onto the road or the house behind them. A detector trained on such views alone was 3 to 5
-    points of IoU worse; with half of the frames untouched it was 1 point better (``integrations/cross_rig``). The
-    target is in its own ego frame; the surface is the one that is rendered over, not ``auto``.
+    Objects are projected onto the road or the house behind them. The target is in its own ego frame; the surface is the
+    one that is rendered over, not ``auto``.
     """
     if not GEOMETRIES[surface].is_static:
         return None
@@ -76,8 +81,7 @@ def static_harm(source: Rig, target: Rig, surface: str, config: RenderConfig) ->
         return None
     return (
         f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and a static surface does not "
-        "know what stands on the street: objects lean and stretch, and a detector trained on such views alone was 3 to "
-        "5 points of IoU worse than one trained on untouched images (integrations/cross_rig)"
+        f"know what stands on the street: objects lean and stretch. {STATIC_HARM}"
     )
 
 

@@ -63,7 +63,7 @@ class Explanation:
     def __str__(self) -> str:
         lines = []
         if self.harmonisation is not None:
-            lines.append(str(self.harmonisation))
+            lines.append(self.harmonisation.of_cameras(self.plan.source.names))
         if self.planned.harm is not None:
             lines += [self.planned.harm, f"better: {harm_remedies(self.plan.source, self.plan.target)}"]
         if self.planned.overlap is not None:

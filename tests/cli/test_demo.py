@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
+import torch
 
 from arbiview_aug.__main__ import main
+from arbiview_aug.cli import demo
+from arbiview_aug.datasets.synthetic import demo_source_rig
 
 
 def numbers(printed: str, surface: str) -> list[float]:
@@ -16,6 +21,21 @@ def numbers(printed: str, surface: str) -> list[float]:
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in printed.splitlines() if line[:1] == "|"]
     (cells,) = [cells for name, *cells in rows if name == surface]
     return [float(cell.rstrip("%")) for cell in cells]
+
+
+def test_each_time_is_of_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A call pays 1 s, a new plan 10 s more, and the first call 100 s more for rays."""
+    clock, known = [0.0], set()
+    sample = {"rig": demo_source_rig((8, 22)), "boxes_3d": torch.zeros(1, 7)}
+
+    def retarget(sample: Mapping[str, Any]) -> None:
+        clock[0] += 1 + (0 if known else 100)
+        plan = sample["rig"].content_key, sample["boxes_3d"].numpy().tobytes()
+        clock[0] += 10 * (plan not in known)
+        known.add(plan)
+
+    monkeypatch.setattr(demo, "working_s", lambda: clock[0])
+    assert demo.timed(retarget, sample) == pytest.approx((1e3, 11e3, 100e3))
 
 
 def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import warnings
 from collections.abc import Mapping
@@ -17,9 +18,10 @@ import pytest
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli import evaluate as command
+from arbiview_aug.cli.arguments import chosen_frames, frames, gathered_warnings
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.errors import SampleError
+from arbiview_aug.errors import DataError, SampleError
 from arbiview_aug.evaluate.images import RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.targets import YAWS_DEG
@@ -31,6 +33,43 @@ AGREEMENT_DB = 0.01
 def run(arguments: list[str], folder: Path) -> dict:
     assert main(["evaluate", *arguments, "--output", str(folder)]) == 0
     return json.loads((folder / "evaluate.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        ("3", [0, 3, 6]),
+        ("99", [*range(10)]),
+        ("2:8:3", [2, 5]),
+        (":4", [0, 1, 2, 3]),
+        ("8:", [8, 9]),
+        ("::4", [0, 4, 8]),
+    ],
+)
+def test_frames_are_spread_over_the_drive_or_a_slice_of_it(asked: str, expected: list[int]) -> None:
+    assert chosen_frames(frames(asked), 10) == expected
+
+
+@pytest.mark.parametrize("text", ["0", "1:2:3:4", "a:b", "-3:4", "1:9:0", ":"])
+def test_frames_that_are_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    if text == ":":
+        with pytest.raises(SystemExit):
+            main(["evaluate", f"--frames={text}"])
+        assert "expected --data FOLDER with A:B:STEP" in capsys.readouterr().err
+    else:
+        with pytest.raises((argparse.ArgumentTypeError, ValueError)):
+            frames(text)
+    with pytest.raises(DataError, match="expected some of the 10 frames, got none"):
+        chosen_frames("10:20", 10)
+
+
+def test_warnings_of_frames_are_one_of_the_run() -> None:
+    lines: list[str] = []
+    with gathered_warnings(lines):
+        for k in range(3):
+            warnings.warn(f"neighbour 'frame {k}' is left out: {k} m away", stacklevel=1)
+            warnings.warn("the target cannot be reached", stacklevel=1)
+    assert lines == ["neighbour 'frame 0' is left out: 0 m away (2 more like it)", "the target cannot be reached"]
 
 
 def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -65,6 +67,7 @@ def test_data_without_samples(toy: Path, monkeypatch: pytest.MonkeyPatch, capsys
     empty = Toy(toy)
     empty.tokens = []
     monkeypatch.setitem(READERS, "toy", replace(READERS["toy"], open=lambda root, **_: empty))
+    monkeypatch.setitem(sys.modules, "rerun", ModuleType("rerun"))  # of the extra viewer
     for command in (["check"], ["demo", "--data"], ["view"]):
         assert main([*command, str(toy)]) == 2
         assert "toys: expected samples, got none" in capsys.readouterr().err

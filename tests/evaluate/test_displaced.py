@@ -79,7 +79,7 @@ def test_a_stereo_pair(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 def test_the_next_frame_without_what_moved() -> None:
     drive = SyntheticDrive(RIG, num_frames=1, supersampling=1, neighbours=Neighbours(count=1, step_m=1.2))
-    ((_, frame),) = displaced_frames(drive, 1, None)
+    ((_, frame),) = displaced_frames(drive, [0], None)
     before, after = drive[0]["neighbours"]
     assert [entry["token"] for entry in frame.sample["neighbours"]] == [before["token"]], "the truth is not given"
     assert frame.target is not None and frame.truth is not None
@@ -96,10 +96,20 @@ def test_a_given_next_frame_is_not_read_and_far_frames_are_left_out() -> None:
     far["ego2world"][0, 3] += 500
     for own in ([before], [before, after]):
         given = [far, sample | {"neighbours": own}]
-        ((_, frame),) = displaced_frames(given, 2, {**after, "token": "again"})
+        ((_, frame),) = displaced_frames(given, [0, 1], {**after, "token": "again"})
         assert [entry["token"] for entry in frame.sample["neighbours"]] == [before["token"]]
     with pytest.raises(DataError, match="neighbour 'next' is left out: ego2ego: expected at most 60 m of travel"):
-        next(displaced_frames([far], 1, {**after, "token": "next"}))
+        next(displaced_frames([far], [0], {**after, "token": "next"}))
+
+
+def test_a_vehicle_that_stands_is_left_out_with_the_time_that_it_waits() -> None:
+    sample = SyntheticDrive(RIG, num_frames=1, supersampling=1, neighbours=Neighbours(count=1, step_m=1.2))[0]
+    _, after = sample["neighbours"]
+    sample = sample | {"time_s": 1.0, "token": "red light", "neighbours": [{**after, "time_s": 4.4}]}
+    message = "frame 'red light' is left out, since its vehicle stands: the next frame from elsewhere is 3.4 s later"
+    with pytest.warns(UserWarning, match=message), pytest.raises(DataError, match=message):
+        next(displaced_frames([sample], [0], None))
+    assert len([*displaced_frames([sample], [0], {**after, "time_s": 4.4, "token": "given"})]) == 1
 
 
 def test_surfaces_are_all_that_a_sample_has_geometry_for() -> None:

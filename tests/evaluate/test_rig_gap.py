@@ -74,4 +74,5 @@ def test_shipped_rigs_with_lenses():
 def test_inspect_says_it(capsys, tmp_path):
     assert main(["inspect", "nuscenes", "waymo", "--output", str(tmp_path / "rigs.png")]) == 0
     out = capsys.readouterr().out
-    assert "For a detector: 0% of the objects unseen; distances wrong by 87% by their row, by 34% by their size" in out
+    assert "1.6 m high, 5 to 40 m away in the other rig's images: the first rig does not see 0%" in out
+    assert "distances are wrong by 87% of the true ones by objects' rows, by 34% by their sizes" in out

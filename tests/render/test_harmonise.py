@@ -292,7 +292,7 @@ def test_the_transform(street) -> None:
         both = RigRetarget(target, backend=execution)(batch)["images"]
         assert ((both[0].int() - out.int()).abs().float().mean()) <= 0.05
     words = str(estimating.explain(sample))
-    assert f"gains {report.gains[0]:.2f}, " in words and "dB on held-out tiles" in words
+    assert f"gains {rig[0].name} {report.gains[0]:.2f}, " in words and "dB on held-out tiles" in words
     assert "gains" not in str(plain.explain(sample)) and plain.harmonisation(sample).reason == "match_exposure is off"
     assert fixed.harmonisation(sample).reason == "given"
     assert "match_exposure=off" in repr(plain) and "match_exposure=on" in repr(estimating)

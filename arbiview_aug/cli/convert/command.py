@@ -20,7 +20,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import checksum, inside, remove_parts, write_whole
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.cli.arguments import gathered_warnings, writable_folder
+from arbiview_aug.cli.arguments import gathered_warnings, told_once, writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, State, checksum_once, coverage_of
 from arbiview_aug.cli.convert.manifest import Manifest, differences
 from arbiview_aug.cli.convert.ray_runner import ray_results
@@ -122,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
         records.append(done)
         if done.state == "stopped" or (done.state == "failed" and arguments.on_error == "fatal"):
             break
-    for line in dict.fromkeys(line for done in records if done.is_converted for line in done.messages):
+    for line in told_once(line for done in records if done.is_converted for line in done.messages):
         print(f"note: {line}", file=sys.stderr)
     print(_summary(settings.output, records, working_s() - started_s))
     for done in records:
