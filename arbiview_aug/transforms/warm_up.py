@@ -122,5 +122,5 @@ def _small_scene() -> tuple[Camera, FloatArray, FloatArray]:
     """A camera that looks at a car's rear and a pedestrian, (B, 7), and at points on that rear, (P, 3)."""
     wall = np.stack(np.meshgrid(8.0, np.linspace(-2, 2, 20), np.linspace(0.3, 1.5, 10)), -1).reshape(-1, 3)
     boxes = np.array([[8.5, 0, 1, 1, 4, 2, 0], [5, 3, 1, 1, 1, 2, 0]])
-    size = {"width_px": 32, "height_px": 32}
-    return Camera.looking(name="small", azimuth_deg=0, **size, horizontal_fov_deg=90), boxes, wall
+    camera = Camera.looking(name="small", azimuth_deg=0, width_px=32, height_px=32, horizontal_fov_deg=90)
+    return camera, boxes, wall
