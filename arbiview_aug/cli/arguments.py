@@ -157,8 +157,7 @@ def frames(text: str) -> int | str:
     """Number of frames, or ``A:B:STEP`` as in Python."""
     if ":" not in text:
         return count(text)
-    first, end, *step = text.split(":")
-    if len(step) > 1 or not all(not part or part.isdecimal() for part in (first, end, *step)) or step == ["0"]:
+    if not re.fullmatch(r"\d*:\d*(:[1-9]\d*)?", text):
         raise argparse.ArgumentTypeError(f"expected a number of frames or A:B:STEP such as 0:100:10, got {text!r}")
     return text
 

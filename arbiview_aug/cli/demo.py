@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from timeit import timeit
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> None:
     with gathered_warnings(notes):
         (target,) = done.targets.values()
         retarget = RigRetarget(target, quality=arguments.quality, geometry=arguments.geometry, holes=arguments.holes)
-        times = timed(retarget, sample)
+        same_ms, other_ms, once_ms = timed(retarget, sample)
         views, explained = views_of(retarget(sample)), retarget.explain(sample)
     for note in dict.fromkeys(notes):
         print(f"note: {note}\n")
@@ -68,13 +68,13 @@ def run(arguments: argparse.Namespace) -> None:
     count_of = frames_text(min(arguments.frames, len(data)))
     print(text_table(f"{table[0]} ({len(target)} cameras, {count_of})", *table[1:]))
     planned = (
-        f"{times.other_ms:.1f} ms with another calibration or other boxes, whose plan is new; {times.once_ms:.0f} ms "
-        "more once in each process, for the rays of the cameras."
+        f"{other_ms:.1f} ms with another calibration or other boxes, whose plan is new; {once_ms:.0f} ms more "
+        "once in each process, for the rays of the cameras."
     )
     if arguments.quality == "paper":
         planned = "nothing can be planned ahead."
     print(
-        f"\n{times.same_ms:.1f} ms a frame: {len(source)} source images to {len(target)} views of "
+        f"\n{same_ms:.1f} ms a frame: {len(source)} source images to {len(target)} views of "
         f"{target[0].height_px}x{target[0].width_px}, quality {arguments.quality}, {cv2.getNumThreads()} threads; "
         f"{planned}"
     )
@@ -88,31 +88,18 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"picture: {save_picture(path, sheet)}")
 
 
-class Times(NamedTuple):
-    """Milliseconds of calls: on the same sample again, on one with another calibration or boxes, and once a process."""
-
-    same_ms: float
-    other_ms: float
-    once_ms: float  # by which the first call takes longer than others with a new plan
-
-
-def timed(retarget: Callable[[Mapping[str, Any]], Any], sample: Mapping[str, Any]) -> Times:
-    """Time calls; kernels are loaded before, since they are compiled and read from the disk once."""
-
-    def call_ms(sample: Mapping[str, Any]) -> float:
-        return 1e3 * timeit(partial(retarget, sample), timer=working_s, number=1)
-
-    first_ms, boxes = call_ms(sample), sample.get("boxes_3d")
-    others = []
-    for k in range(1, 1 + _TIMED_CALLS):
-        other = {**sample, "rig": sample["rig"].shifted(x_m=k * _OTHER_M)}
-        if boxes is not None:
-            other["boxes_3d"] = boxes + k * _OTHER_M
-        others.append(call_ms(other))
-    other_ms = statistics.median(others)
-    retarget(sample)
-    same_ms = statistics.median(call_ms(sample) for _ in range(_TIMED_CALLS))
-    return Times(same_ms, other_ms, max(first_ms - other_ms, 0.0))
+def timed(retarget: Callable[[Mapping[str, Any]], Any], sample: Mapping[str, Any]) -> tuple[float, float, float]:
+    """Milliseconds of a call on the same sample again, of one with another calibration and boxes, and of what the first
+    call takes more than that; kernels are loaded already."""
+    rig, boxes = sample["rig"], sample.get("boxes_3d")
+    moved = [
+        {**sample, "rig": rig.shifted(x_m=k * _OTHER_M), "boxes_3d": None if boxes is None else boxes + k * _OTHER_M}
+        for k in range(1 + _TIMED_CALLS)
+    ]
+    calls = [*moved, *[moved[-1]] * _TIMED_CALLS]
+    first, *later = (1e3 * timeit(partial(retarget, call), timer=working_s, number=1) for call in calls)
+    other_ms = statistics.median(later[:_TIMED_CALLS])
+    return statistics.median(later[_TIMED_CALLS:]), other_ms, max(first - other_ms, 0.0)
 
 
 def _scans(data: Any, sample: Mapping[str, Any], target: Rig) -> dict[str, FloatArray]:

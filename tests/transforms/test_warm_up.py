@@ -30,7 +30,7 @@ class FakeProcess:
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     monkeypatch.setattr(FakeProcess, "calls", [])
     monkeypatch.setattr(warm_up.multiprocessing, "get_context", lambda _: SimpleNamespace(Process=FakeProcess))
-    monkeypatch.setattr(warm_up, "_warm_up", lambda name: FakeProcess.calls.append(("here", name)))
+    monkeypatch.setattr(warm_up, "_warm_up", lambda names: FakeProcess.calls.append(("here", *names)))
     monkeypatch.setattr(warm_up.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
     warm_up.say_compiling.cache_clear()
     return FakeProcess.calls
@@ -42,7 +42,7 @@ def test_each_core_takes_its_share_and_one_line_says_so(
     monkeypatch.setattr(warm_up, "is_kept", lambda kernel: False)
     with compiling("objects", "plans", "points"):
         assert calls == [("start", "plans")], "the caller's own work goes on meanwhile"
-    assert calls[1:] == [("here", "objects"), ("here", "points"), ("join", "plans"), ("kill", "plans")]
+    assert calls[1:] == [("here", "objects", "points"), ("join", "plans"), ("kill", "plans")]
     calls.clear()
     with pytest.raises(KeyError), compiling("objects", "plans"):
         raise KeyError
@@ -76,7 +76,7 @@ if __name__ == "__main__":
     with event.install_recorder("numba:compile") as recorded:
         compile_kernels()
     print([str(e.data["dispatcher"].py_func.__name__) for _, e in recorded.buffer])
-    print(all(is_kept(_named(kernel)) for group in GROUPS.values() for kernel in group.last))
+    print(all(is_kept(kernel) for _, last in GROUPS.values() for kernel in _named(last)))
 """
     (tmp_path / "cold.py").write_text(code)
     environment = {**warm_up.os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": ":".join(sys.path)}
