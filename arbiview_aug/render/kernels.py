@@ -703,8 +703,8 @@ def mark_objects(q: Any, face: Any, winner: Any, limit: Any, cell: int, layers: 
 def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table: Any) -> tuple[int, int]:
     """Find the unseen pixels of objects, and a sample of seen ones; return their numbers.
 
-    The first ``RIM_PX`` seen pixels below each column of an unseen top are samples of its rim. Vehicles without another
-    sample give all their seen pixels.
+    The first ``RIM_PX`` seen pixels of the cabin below each column of an unseen roof are samples of its rim. Vehicles
+    without another sample give all their seen pixels.
 
     Args:
         face: (h, w) int32 faces of objects, -1 elsewhere.
@@ -728,8 +728,8 @@ def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table:
                 table[0, hidden], table[1, hidden] = y * w + x, part[number]
                 hidden += 1
                 first, below = part[number] - TOP_PART, face[min(y + 1, h - 1), x]
-                if first % PARTS or below < 0 or not first <= part[below] < part[number]:
-                    continue  # no top, or no side of the same object below it
+                if first % PARTS or below < 0 or part[below] != first:
+                    continue  # no top, or no cabin of the same object below it
                 for yy in range(y + 1, min(y + 1 + RIM_PX, h)):
                     if face[yy, x] != below or winner[yy, x] < 0:
                         break

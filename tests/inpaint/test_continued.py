@@ -484,54 +484,67 @@ def painted(top_seen: bool, scale: float = 1.0) -> tuple[torch.Tensor, Paint, to
     return view, paint, seen
 
 
-def in_light(paint: float) -> float:
-    """A top over a side of this level, in the light of tops."""
-    return float(255 * (1.4 * (paint / 255) ** 2.2 + 0.02) ** (1 / 2.2))
-
-
-def test_tops_take_the_paint_of_their_rims_in_the_light_of_tops() -> None:
-    for top_seen, expected in ((True, None), (False, in_light(100))):
-        view, paint, seen = painted(top_seen)
+def test_tops_take_their_bodies_paint_in_the_light_of_seen_tops() -> None:
+    view, paint, seen = painted(top_seen=True)
+    colours = object_colours([view.numpy()], [paint])
+    np.testing.assert_array_equal(colours[:5, 0], 40)
+    np.testing.assert_array_equal(colours[PARTS : PARTS + 5, 0], 100)
+    assert 78 < colours[TOP_PART, 0] < 84 and 142 < colours[PARTS + TOP_PART, 0] < 152
+    for scale in (1.0, 1 / 255):
+        view, paint, seen = painted(top_seen=False, scale=scale)  # the other's top is twice as bright as its body
         colours = object_colours([view.numpy()], [paint])
-        np.testing.assert_array_equal(colours[:5, 0], 40)
-        np.testing.assert_array_equal(colours[PARTS : PARTS + 5, 0], 100)
-        assert in_light(40) < colours[5, 0] < 80 and (colours == colours[:, :1]).all()
-        top = colours[PARTS + TOP_PART, 0]
-        assert top == pytest.approx(expected, abs=1e-3) if expected else in_light(100) < top < 150
-        layers = np.full(seen.shape, OBJECT, np.uint8)
+        top = float(colours[PARTS + TOP_PART, 0])
+        assert 1.05 * 100 < top / scale < 150 and (colours == colours[:, :1]).all()
         alone = replace(paint, nearest=np.full_like(paint.nearest, -1))
-        (out,) = fill_holes([view.clone()], [seen], [layers], [alone])
-        assert (out[:, ~seen] == round(float(top))).all() and torch.equal(out[:, seen], view[:, seen])
-        of_float, paint, _ = painted(top_seen, 1 / 255)
-        (out,) = fill_holes([of_float], [seen], [layers], [alone])
-        torch.testing.assert_close(out[:, ~seen], torch.full_like(out[:, ~seen], float(top) / 255))
+        (out,) = fill_holes([view.clone()], [seen], [np.full(seen.shape, OBJECT, np.uint8)], [alone])
+        torch.testing.assert_close(
+            out[:, ~seen].float(), torch.full((3, int((~seen).sum())), top), atol=0.51 * (scale == 1), rtol=1e-5
+        )
+        assert torch.equal(out[:, seen], view[:, seen])
+
+
+def test_tops_are_as_bright_as_their_bodies_where_no_top_is_seen() -> None:
+    view, paint, _ = painted(top_seen=False)
+    others = paint.sample_part != TOP_PART
+    paint = replace(paint, sample=paint.sample[others], sample_part=paint.sample_part[others])
+    assert object_colours([view.numpy()], [paint])[PARTS + TOP_PART, 0] == pytest.approx(100, abs=1e-3)
 
 
 def test_tops_go_on_from_the_seen_pixels_of_their_body() -> None:
     view, paint, seen = painted(top_seen=False)
     (out,) = fill_holes([view.clone()], [seen], [np.full(seen.shape, OBJECT, np.uint8)], [paint])
-    column = out[0, 10:20, 50].float()  # the side below it is 100
-    assert (column.diff() <= 0).all() and column[-1] < 103 and abs(column[0] - (in_light(100) + 1.6 * 100) / 2.6) < 1
+    column, top = out[0, 10:20, 50].float(), float(object_colours([view.numpy()], [paint])[PARTS + TOP_PART, 0])
+    assert (column.diff() <= 0).all() and column[-1] < 103 and abs(column[0] - (top + 1.6 * 100) / 2.6) < 1
 
 
-def test_roofs_of_another_colour_than_the_body_take_that_of_their_rims() -> None:
-    view, paint, _ = painted(top_seen=False)
-    rim = paint.sample[paint.sample_part == PARTS + RIM_PART]
-    assert sorted(set((rim // 64).tolist())) == [20, 21, 22] and len(rim) == 3 * 24
-    view[0, 20:22, 36:60] = 50  # the upper two rows of the rim; windows begin in the third
-    top = object_colours([view.numpy()], [paint])[PARTS + TOP_PART]
-    np.testing.assert_allclose(top, [in_light(50), in_light(100), in_light(100)], atol=1e-3)
-    bare = replace(paint, sample_part=np.where(paint.sample_part == PARTS + RIM_PART, PARTS + 1, paint.sample_part))
-    assert object_colours([view.numpy()], [bare])[PARTS + TOP_PART, 0] == pytest.approx(in_light(100), abs=1e-3)
+@pytest.mark.parametrize(
+    ("rim", "expected"),
+    [(30, (160, 60, 60)), (95, (160, 60, 60)), ((40, 160, 40), (40, 160, 40)), (230, (230, 230, 230))],
+    ids=["glass up to the roof", "glass and body", "another paint", "a white roof"],
+)
+def test_roofs_take_their_bodies_paint_unless_the_rim_has_another(rim: Any, expected: tuple[int, ...]) -> None:
+    face = np.full((64, 64), -1, np.int32)
+    face[10:20, 36:60], face[20:35, 36:60], face[35:50, 36:60] = 11, 10, 6  # roof, cabin, body
+    parts = np.where(np.arange(12) == 10, PARTS, FACE_PARTS).astype(np.int32)
+    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
+    view[:, 35:50, 36:60] = torch.tensor([160, 60, 60])[:, None, None]
+    view[:, 20:35, 36:60] = 30
+    view[:, 20:23, 36:60] = torch.tensor(np.broadcast_to(rim, 3).copy())[:, None, None]
+    paint = find_paint(face, np.where(face == 11, -1, 0).astype(np.int8), parts)
+    edge = paint.sample[paint.sample_part == PARTS + RIM_PART] // 64
+    assert sorted(set(edge.tolist())) == [20, 21, 22] and len(edge) == 3 * 24
+    np.testing.assert_allclose(object_colours([view.numpy()], [paint])[PARTS + TOP_PART], expected, atol=1e-2)
 
 
 def test_windows_and_what_stands_behind_do_not_colour_tops() -> None:
     view, paint, _ = painted(top_seen=False)
-    lamp = replace(paint, sample_part=np.full_like(paint.sample_part, PARTS))  # all on the cabin, without a rim
-    assert object_colours([view.numpy()], [lamp])[PARTS + TOP_PART, 0] == pytest.approx(in_light(100), abs=1e-3)
+    others = paint.sample_part != TOP_PART
+    lamp = replace(paint, sample=paint.sample[others], sample_part=np.full(others.sum(), PARTS, np.int32))
+    assert object_colours([view.numpy()], [lamp])[PARTS + TOP_PART, 0] == pytest.approx(100, abs=1e-3)  # all on cabins
     view, paint, _ = painted(top_seen=True)
-    view[2, 10:20, 36:54] = 90  # what sources show there is yellow, the rim grey
-    assert object_colours([view.numpy()], [paint])[PARTS + TOP_PART, 0] == pytest.approx(in_light(100), abs=1e-3)
+    view[2, 10:20, 36:54] = 90  # what sources show there is yellow, the body grey
+    top = object_colours([view.numpy()], [paint])[PARTS + TOP_PART]
+    assert np.ptp(top) < 1e-3
 
 
 def test_a_top_without_any_seen_part_is_left_to_the_background() -> None:
