@@ -34,6 +34,13 @@ AIR_M = 0.2
 """Distance outside an object within which points count as its own, m."""
 
 
+SIDE_CELLS = 8, 16
+"""Rows and columns of displacements on each side of an object: 0.2 by 0.3 m on a car, a few scan lines at 10 m."""
+
+SCANNER_M = 1.0, 0.0, 1.9
+"""A place of scanners on roofs, over the road, from which points were seen; nuScenes' is at 0.9, 0, 1.8."""
+
+
 class Piece(NamedTuple):
     """A tapered slab in shares of its box's length, width and height, from -0.5 to 0.5.
 
@@ -136,20 +143,25 @@ def solids(boxes: FloatArray) -> FloatArray:
 ByBox = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 
 
-def solids_among(boxes: FloatArray, points: Points) -> tuple[FloatArray, BoolArray]:
-    """Shapes in boxes (B, 7), as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs.
+def solids_among(
+    boxes: FloatArray, points: Points, ground_z_m: float = 0.0
+) -> tuple[FloatArray, BoolArray, npt.NDArray[np.float32]]:
+    """Shapes in boxes (B, 7), as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs; how
+    far their sides (B, 5, rows, columns) lie off the shapes, metres.
 
-    Of the profiles that fit a box it is the one whose faces lie nearest to its points. Points within ``AIR_M`` of it
-    are its own: mirrors, and the noise of points and labels. This far over the box's floor they may be the road's.
+    Of the profiles that fit a box it is the one whose faces lie nearest to its points; then these faces move to their
+    points. Points within ``AIR_M`` of it are its own: mirrors, and the noise of points and labels. This far over the
+    box's floor they may be the road's.
     """
-    from arbiview_aug.scene.kernels import fit_profiles
+    from arbiview_aug.scene.shape_kernels import fit_profiles
 
-    boxes = np.ascontiguousarray(boxes)
-    planes_and_own = np.empty((len(boxes), PIECES, 6, 4)), np.zeros(len(points), bool)
-    points = np.ascontiguousarray(points, np.float32)
-    within = points_by_box(boxes, points, AIR_M)
-    fit_profiles(boxes, PROFILES, OF_KIND[kinds(boxes)], points, *within, LEAST_POINTS, AIR_M, *planes_and_own)
-    return planes_and_own
+    boxes, points = np.ascontiguousarray(boxes), np.ascontiguousarray(points, np.float32)
+    planes, is_own = np.empty((len(boxes), PIECES, 6, 4)), np.zeros(len(points), bool)
+    displaced = np.zeros((len(boxes), 5, *SIDE_CELLS), np.float32)
+    scanner = np.array([*SCANNER_M[:2], SCANNER_M[2] + ground_z_m])
+    fitting = PROFILES, OF_KIND[kinds(boxes)], points, *points_by_box(boxes, points, AIR_M), LEAST_POINTS, AIR_M
+    fit_profiles(boxes, *fitting, scanner, planes, is_own, displaced)
+    return planes, is_own, displaced
 
 
 def points_by_box(boxes: FloatArray, points: Points, air_m: float) -> ByBox:
@@ -166,7 +178,7 @@ def whole(boxes: FloatArray) -> FloatArray:
 
 
 def _planes(boxes: FloatArray, profiles: FloatArray) -> FloatArray:
-    from arbiview_aug.scene.kernels import planes_of
+    from arbiview_aug.scene.shape_kernels import planes_of
 
     planes = np.empty((*profiles.shape[:2], 6, 4))
     for box, profile, out in zip(boxes, profiles, planes, strict=True):

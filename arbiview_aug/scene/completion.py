@@ -489,7 +489,7 @@ def read_layer(rows: Any, columns: Any, layer: Any, out: Any) -> None:
 
 
 @called
-def _between(nodes: Any, step: int, out: Any) -> None:
+def between_nodes(nodes: Any, step: int, out: Any) -> None:
     """Values (n,) between nodes ``step`` apart; the last ones lie on the last pixel."""
     whole = nodes.shape[0] - 2
     for k in range(step):
@@ -515,8 +515,8 @@ def _between_rows(nodes: Any, step: int, y: int, h: int, around: Any, out: Any) 
         return
     if around[0, w] != j:
         if around[0, w] != j - 1:
-            _between(nodes[j], step, around[j % 2, :w])
-        _between(nodes[j + 1], step, around[(j + 1) % 2, :w])
+            between_nodes(nodes[j], step, around[j % 2, :w])
+        between_nodes(nodes[j + 1], step, around[(j + 1) % 2, :w])
         around[0, w] = j
     t = np.float32(y - j * step) / np.float32(max(min(step, h - 1 - j * step), 1))
     above, below = around[j % 2], around[(j + 1) % 2]

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
@@ -419,14 +420,26 @@ def _turned(rays: Layer, R: FloatArray) -> FloatArray:
 class PointCloudWithBoxes(BoxSurface):
     """Labelled objects among points: a shape decides within its silhouette, what was measured before it wins.
 
-    An object's points choose its shape and are left out of the panoramas, where they would blur over its outline.
+    An object's points choose its shape, move its faces and displace them where they were measured. They are left out of
+    the panoramas, where they would blur over its outline.
 
     Attributes:
         street: The surface of the points that are of no object.
         boxes: (B, 7), as in ``BoxSurface``.
+        displaced: (B, 5, rows, columns) how far the objects' sides lie off their shapes, as in ``solids_among``.
     """
 
     street: PointCloudSurface
+    displaced: Layer = field(kw_only=True)
+
+    def drawn(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> tuple[Layer, npt.NDArray[np.int32]]:
+        """Rasterise the objects, and move their faces to where they were measured."""
+        from arbiview_aug.scene.shape_kernels import displace
+
+        q, face = super().drawn(camera, rays, memory)
+        pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), np.ascontiguousarray(camera.center_m)
+        displace(rays.planes, rays.parameters, *pose, self.boxes, self.solids, self.displaced, face, q)
+        return q, face
 
     def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> Layer:
         return self.street.hidden(camera, rays, memory, coarse=coarse)

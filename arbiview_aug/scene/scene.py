@@ -166,12 +166,12 @@ def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: 
     swept = len(parts[1]) > 0
     if boxes is None:
         return PointCloudSurface(street, together, len(pixels), swept, known)
-    planes, is_own = solids_among(boxes, together)
+    planes, is_own, displaced = solids_among(boxes, together, ground_z_m)
     is_own_pixel = is_own[len(together) - len(pixels) :]
     if known:
         forget(known, pixels[is_own_pixel])
     others = together[: close_gaps(together, is_own)], int(np.count_nonzero(~is_own_pixel))
-    return PointCloudWithBoxes(PointCloudSurface(street, *others, swept, known), boxes, planes)
+    return PointCloudWithBoxes(PointCloudSurface(street, *others, swept, known), boxes, planes, displaced=displaced)
 
 
 GEOMETRIES: dict[str, GeometryRow] = {

@@ -19,8 +19,8 @@ from arbiview_aug.scene.boxes import (
     solids,
     solids_among,
 )
-from arbiview_aug.scene.kernels import planes_of
 from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.shape_kernels import planes_of
 from arbiview_aug.scene.surface import Street
 from tests.scene.single_rays import inverse_distance, occlusion_depth, points_and_boxes, solids_ahead
 
@@ -130,14 +130,41 @@ def test_points_choose_among_profiles() -> None:
     for box in (CAR, pick_up):
         for number in OF_KIND[kinds(box)[0]]:
             planes = profile_planes(box[0], number)
-            chosen, is_own = solids_among(box, surface_points(planes, box[0]))
-            assert np.allclose(chosen[0], planes) and is_own.mean() > 0.9
+            chosen, is_own, displaced = solids_among(box, surface_points(planes, box[0]))
+            assert np.allclose(chosen[0], planes) and is_own.mean() > 0.9 and np.abs(displaced).max() < 0.05
     one, two = (surface_points(profile_planes(CAR[0], number), CAR[0]) for number in OF_KIND[kinds(CAR)[0]][:2])
     count = min(len(one), len(two) // 2, 300)
     mixed = np.concatenate([one[:count, None], two[: 2 * count].reshape(count, 2, 3)], 1).reshape(-1, 3)
     orders = mixed, mixed[1:], mixed[2:], np.random.default_rng(0).permutation(mixed)
     assert len(mixed) > 512 and len({solids_among(CAR, points)[0].tobytes() for points in orders}) == 1
     assert len(PROFILES) > len(OF_KIND[0])
+
+
+SCANNER = Camera.looking(
+    name="scanner", azimuth_deg=0, position_m=(1.0, 0.0, 1.9), width_px=640, height_px=320, horizontal_fov_deg=40
+)
+
+
+@pytest.mark.parametrize(
+    ("wider_m", "shifted_m"), [((0.26, 0.26, 0.2), (0.0, 0.0, 0.0)), ((0.0, 0.0, 0.0), (0.1, 0.08, 0.0))]
+)
+def test_what_was_measured_stays_and_the_shape_closes(wider_m: tuple[float, ...], shifted_m: tuple[float, ...]) -> None:
+    """A label that is larger than the body in it, or lies off it; only the lower half of the body was measured."""
+    label = CAR.copy()
+    label[0, 1], label[0, 6] = 2.0, 2.9
+    body = solids(label)
+    label[0, :3] += shifted_m
+    label[0, 3:6] += wider_m
+    rays, _ = SCANNER.unproject(SCANNER.pixel_grid())
+    q, face = solids_ahead(label - [[*shifted_m, *wider_m, 0]], body, SCANNER.center_m, rays)
+    points = SCANNER.center_m + rays / np.maximum(q, 1e-9)[..., None]
+    is_low = (face >= 0) & (points[..., 2] < 0.9)
+    surface = points_and_boxes(points[is_low][::7], label)
+    drawn, faces = surface.drawn(SCANNER, pixel_rays(SCANNER))
+    inner = cv2.erode(is_low.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    off_m = np.abs(1 / drawn - 1 / np.maximum(q, 1e-9))[inner & (faces >= 0)]
+    assert np.median(off_m) < 0.03 and np.quantile(off_m, 0.8) < 0.08
+    assert (faces >= 0)[inner].mean() > 0.99 and (faces >= 0)[face >= 0].mean() > 0.95
 
 
 def test_points_beside_an_object_are_the_background_s() -> None:
