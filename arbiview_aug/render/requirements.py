@@ -36,6 +36,10 @@ STATIC_HARM = (
 )
 """What a static surface does to detectors where cameras move: ``integrations/cross_rig/results/less.json``."""
 
+LEVEL_M, OFF_ROAD_M, FARTHEST_M = 40.0, 1.0, 250.0
+"""Boxes beyond the first stand on another height of the road; the bottoms of nearer ones are at most the second from
+it. Nothing is labelled beyond the third."""
+
 _COARSE_MASK_PX = 16  # margin that must be unmasked: weights know masks by blocks of 8 px
 _ROUNDING_PX = 1e-6  # of float64 at the outermost pixel centres; plans allow for 1e-3
 _MAP_ERROR_PX = 1 / 32  # rounding of fixed-point maps, with as much again
@@ -83,6 +87,24 @@ def static_harm(source: Rig, target: Rig, surface: str, config: RenderConfig) ->
         f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and a static surface does not "
         f"know what stands on the street: objects lean and stretch. {STATIC_HARM}"
     )
+
+
+def stand_in_view(source: Rig, boxes: FloatArray) -> bool:
+    """Whether most boxes (B, 7) stand on the road, by those nearby if there are any, and one of them is in a view."""
+    away_m = np.hypot(boxes[:, 0], boxes[:, 1])
+    near = away_m < LEVEL_M
+    stand = np.abs(boxes[:, 2] - boxes[:, 5] / 2 - source.ground_z_m) < np.where(near, OFF_ROAD_M, away_m / 10)
+    stand &= away_m < FARTHEST_M
+    if stand[near if near.any() else ...].mean() < 0.5:
+        return False
+    c, s = np.cos(boxes[stand, 6]), np.sin(boxes[stand, 6])
+    ahead = np.stack([c, s, np.zeros_like(c)], axis=-1) * boxes[stand, 3:4] / 2
+    places = boxes[stand, :3] + np.stack([0 * ahead, ahead, -ahead])  # centres and ends
+    for camera in source:
+        seen = camera.project(places)
+        if (seen.valid & camera.contains(seen.uv)).any():
+            return True
+    return False
 
 
 def harm_remedies(source: Rig, target: Rig) -> str:

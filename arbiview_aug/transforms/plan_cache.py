@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
@@ -12,15 +12,15 @@ import numpy as np
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rays import RayCache
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cameras.validation import pose_mistake
+from arbiview_aug.cameras.validation import is_mounted, pose_mistake
 from arbiview_aug.choices import GeometryName, is_number
 from arbiview_aug.errors import GeometryWarning, UnreachableError, WarnOnce
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.overlap_depth import OverlapDepth
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
-from arbiview_aug.render.requirements import needs_geometry, static_harm
+from arbiview_aug.render.requirements import needs_geometry, stand_in_view, static_harm
 from arbiview_aug.render.view_planner import build_plan, plan_key
-from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.sample.inputs import Frame, focal_mistake
 from arbiview_aug.sample.neighbours import Neighbour
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.temporal.motion_depth import MotionDepth
@@ -28,6 +28,7 @@ from arbiview_aug.temporal.motion_depth import MotionDepth
 Coverages = Sequence[BoolArray]
 """Coverage (h, w) of each target camera."""
 
+_FINER = 3.0  # readers decode at 1/4, while targets have their full size; 1/2 is a fair trade
 _UNREACHABLE = 0.5  # warn of target cameras of which less than this share is covered
 _SUSPICIOUS = 0.3  # a rig of which less is covered may have wrong poses
 
@@ -38,6 +39,8 @@ def check_reach(source: Rig, target: Rig, coverages: Coverages, unseen: str, war
     Raises:
         UnreachableError: The sources cover none of the target's pixels.
     """
+    for topic, message in _unlikely_target(source, target):
+        warn(topic, message, GeometryWarning)
     is_empty = not any(map(np.any, coverages))
     if "unreachable" in warn.topics and not is_empty:  # the means below take milliseconds
         return
@@ -51,6 +54,22 @@ def check_reach(source: Rig, target: Rig, coverages: Coverages, unseen: str, war
         cause = f"{_likely_cause(source, target)}. " if np.mean(shares) < _SUSPICIOUS else ""
         covered = f"covered are {', '.join(poor)}. {cause}{unseen}"
         warn("unreachable", f"{lost}: {covered} Or choose another target", GeometryWarning)
+
+
+def _unlikely_target(source: Rig, target: Rig) -> Iterator[tuple[str, str]]:
+    """Topics and warnings of target cameras that no vehicle has, and of views much finer than the source's images."""
+    for camera, mounted in zip(target, is_mounted(target.cam2ego, target.ground_z_m), strict=True):
+        where = f"target camera {camera.name!r}"
+        if not mounted:
+            x, y, z = camera.center_m - (0, 0, target.ground_z_m)
+            place = f"({x:.1f}, {y:.1f}) m, {z:.1f} m above the road"
+            yield "mounting", f"{where}: expected a place on a vehicle, got {place}; are moves and poses in metres?"
+        if mistake := focal_mistake(camera):
+            yield "target focal", f"{where}: K: expected a focal length in pixels, got {'; '.join(mistake)}"
+    finer = float(np.median(target.K[:, 0, 0]) / source.K[:, 0, 0].max())
+    if finer > _FINER:
+        views = f"views are {finer:.0f} times as fine as the finest source image, and blurred"
+        yield "fine", f"{views}; read the images larger (reduce), or set a smaller size= or a wider field of view"
 
 
 def _likely_cause(source: Rig, target: Rig) -> str:
@@ -135,7 +154,13 @@ class FramePlan:
     @property
     def harm(self) -> str | None:
         """Why a detector suffers from cameras that move over a static surface; None if it does not."""
-        return self.pair.harm if GEOMETRIES[self.surface].is_static else None
+        if GEOMETRIES[self.surface].is_static or self.pair.harm is None:
+            return self.pair.harm
+        boxes = self.scene.boxes
+        if self.surface != "boxes" or boxes is None or not len(boxes) or stand_in_view(self.pair.source, boxes):
+            return None
+        lost = f"boxes_3d: most of {len(boxes)} are off the road or in no camera's view (python -m arbiview_aug check)"
+        return f"{lost}; {self.pair.harm}"
 
 
 class Plans:

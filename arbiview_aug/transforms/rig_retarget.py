@@ -60,6 +60,7 @@ from arbiview_aug.transforms.settings import (
     checked_pixels,
     inpainter_of,
     render_config,
+    size_mistake,
     unseen_note,
 )
 
@@ -114,8 +115,9 @@ class RigRetarget(torch.nn.Module):
         CalibrationError: A target rig that cannot be loaded.
 
     Warns:
-        GeometryWarning: Cameras move and only the street is known, which harms a detector; or the target is hardly
-            covered. ``warnings.simplefilter("error", GeometryWarning)`` makes errors of both.
+        GeometryWarning: Cameras move and only the street is known, which harms a detector; the target is hardly
+            covered; or ``size`` leaves little of its views. ``warnings.simplefilter("error", GeometryWarning)``
+            makes errors of them.
     """
 
     def __init__(
@@ -151,6 +153,8 @@ class RigRetarget(torch.nn.Module):
         self._check_paper()
         self.overlaps = overlap_cache(cache.share_overlap, self.config)
         self._warn = WarnOnce()
+        if self.size is not None and (mistake := size_mistake(self._base, self.size, self.fit)):
+            self._warn("size", mistake, GeometryWarning)
         self._check_reach = partial(check_reach, unseen=unseen_note(self.inpainter), warn=self._warn)
         self._plans = self._empty_plans()
         self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
@@ -327,7 +331,7 @@ class RigRetarget(torch.nn.Module):
 
     def _warn_of_harm(self, planned: Sequence[FramePlan]) -> None:
         """Warn once that ``auto`` falls back to the static street although cameras move, which harms a detector."""
-        if self.geometry != "auto" or self.p <= _MIXED_P or "static" in self._warn.topics:
+        if self.geometry not in ("auto", "boxes") or self.p <= _MIXED_P or "static" in self._warn.topics:
             return
         for one in planned:
             if one.harm is not None:

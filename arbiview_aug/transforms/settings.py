@@ -6,6 +6,11 @@ import operator
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
+import numpy as np
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.framing import Fit
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.choices import choice, is_number
 from arbiview_aug.errors import SampleError
@@ -146,3 +151,37 @@ def checked_pixels(value: Any, name: str = "size", form: str = "(h, w)", least: 
         limits = f"whole numbers from {least} to {MAX_SIZE_PX}"
         raise ValueError(f"{name}: expected {form} in pixels, got {value!r}; {limits}")
     return one, two
+
+
+_LEAST_KEPT, _LEAST_ROWS = 0.5, 0.4
+"""Shares of a view below which a size is hardly meant. Detectors cut the sky: 256x704 leaves 0.43 to 0.66 of shipped
+rigs' vertical fields of view."""
+
+
+def size_mistake(rig: Rig, size: tuple[int, int], fit: Fit) -> str | None:
+    """Say what (h, w) and ``fit`` cost most cameras of a target, and the fix; None if enough remains."""
+    lost = [text for camera in rig if (text := _lost(camera, size, fit))]
+    if len(lost) < len(rig) / 2:
+        return None
+    swapped = size[::-1]
+    is_swapped = not any(_lost(camera, swapped, fit) for camera in rig)
+    other = "'pad' or 'stretch'" if fit == "crop" else "'crop'"
+    fix = f"size is (h, w): did you mean {swapped}" if is_swapped else f"choose a size of the images' shape, or {other}"
+    return f"size={size}, fit={fit!r}: {lost[0]}; {fix}?"
+
+
+def _lost(camera: Camera, size: tuple[int, int], fit: Fit) -> str:
+    """What becomes of a camera whose view keeps less than ``_LEAST_KEPT``; empty otherwise."""
+    ratio = size[0] * camera.width_px / (size[1] * camera.height_px)
+    share = min(ratio, 1 / ratio)
+    if share >= _LEAST_KEPT:
+        return ""
+    if fit != "crop":
+        how = f"are squeezed to {share:.0%} along one side" if fit == "stretch" else f"fill {share:.0%} of the view"
+        return f"images of {camera.name!r} {how}"
+    # By the outer edges' angles, which a lens may crowd together.
+    fov, kept = (np.array(c.fov_deg) for c in (camera, camera.resize(size, fit)))
+    side = int((kept / fov).argmin())
+    if kept[side] >= (_LEAST_KEPT, _LEAST_ROWS)[side] * fov[side]:
+        return ""
+    return f"{camera.name!r} keeps {kept[side]:.0f} of its {fov[side]:.0f} degrees {('across', 'up and down')[side]}"

@@ -818,7 +818,7 @@ def test_a_rig_that_sees_nothing_of_the_sources(quality: Any, execution: Any) ->
 
 def test_an_object_that_hides_everything_is_no_error() -> None:
     source = ring().with_cameras([ring()[0]])
-    before = torch.tensor([[3.0, 0, 1.5, 0.5, 40, 40, 0]])
+    before = torch.tensor([[3.0, 0, 20.0, 0.5, 40, 40, 0]])
     out = RigRetarget(source.shifted(x_m=8.0), geometry="boxes")({**sample_of(source), "boxes_3d": before})
     assert not out["coverage"].any()
 
