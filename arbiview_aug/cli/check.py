@@ -10,12 +10,18 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.atomic_io import file_name
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.cli.arguments import data, gathered_warnings, is_rig, reading, writable_folder
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.report.pictures import draw_labels, save_picture
-from arbiview_aug.sample.mistakes import CheckReport, check, check_rig
+from arbiview_aug.sample.camera_mistakes import neighbour_errors
+from arbiview_aug.sample.findings import CheckReport
+from arbiview_aug.sample.inputs import Frame, read_frames
+from arbiview_aug.sample.mistakes import check, check_own_car, check_rig
+
+_MOST_HELD = 8  # frames in memory at once, in which the own car is looked for
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -31,16 +37,27 @@ def run(arguments: argparse.Namespace) -> int:
         count = min(arguments.frames, len(samples))
         chosen = np.unique(np.linspace(0, len(samples) - 1, count).round().astype(int)).tolist()
         lines: dict[tuple[str, str], list[str]] = {}
+        frames: list[Frame] = []
+        errors: dict[tuple[str, str], list[FloatArray]] = {}
         for index in chosen:
             sample = samples[index]
+            if index in chosen[:: -(-len(chosen) // _MOST_HELD)]:
+                frames += read_frames(sample, None)
             for finding in check(sample).findings:
                 lines.setdefault((finding.where, finding.fix), []).append(str(finding))
+            for pair, found in neighbour_errors(sample["rig"], sample["images"]).items():
+                errors.setdefault(pair, []).append(found)
             if index == chosen[0]:
                 pictures = _draw(sample, folder)
+        for finding in check_own_car(frames):
+            lines[finding.where, finding.fix] = [str(finding)] * len(chosen)
     for note in notes:
         print(note)
     for same in lines.values():
         print(same[0] if len(chosen) == 1 else f"{same[0]} ({len(same)} of {len(chosen)} frames)")
+    if errors:
+        angles = [f"{one}, {two} {np.median(np.concatenate(found)):.2f}" for (one, two), found in errors.items()]
+        print(f"degrees between matches of neighbouring cameras, median: {'; '.join(angles)}")
     count = len(notes) + len(lines)
     print(
         f"{count or 'no'} finding{'s' * (count != 1)} in {len(chosen)} of {len(samples)} frames; pictures: {pictures}"

@@ -12,7 +12,12 @@ import torch
 
 from arbiview_aug import Camera, Rig
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, rotation_z
+from arbiview_aug.cameras.rotations import (
+    CAMERA_AXES_IN_EGO,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    rotation_z,
+)
 
 Sample = dict[str, Any]
 BODY = np.eye(4)
@@ -122,6 +127,81 @@ def renamed(key: str, name: str) -> Callable[[Sample], Sample]:
     return lambda sample: {name if k == key else k: value for k, value in sample.items()}
 
 
+def moved(key: str, A: FloatArray | list[list[float]], t: tuple[float, ...] = (0, 0, 0)) -> Callable[[Sample], Sample]:
+    """Points or boxes moved by A (3, 3) and t; boxes' headings with them."""
+
+    def mistaken(sample: Sample) -> Sample:
+        rows, matrix = sample[key].clone(), torch.as_tensor(A, dtype=sample[key].dtype)
+        rows[:, :3] = rows[:, :3] @ matrix.T + torch.tensor(t, dtype=rows.dtype)
+        if key == "boxes_3d":
+            yaw = rows[:, 6]
+            ahead = torch.stack([yaw.cos(), yaw.sin(), 0 * yaw], dim=1) @ matrix.T
+            rows[:, 3:6] *= matrix[0].norm()
+            rows[:, 6] = torch.atan2(ahead[:, 1], ahead[:, 0])
+        return {**sample, key: rows}
+
+    return mistaken
+
+
+def in_camera(key: str) -> Callable[[Sample], Sample]:
+    """Points, or boxes as KITTI has them: the bottom's centre, and yaw about the y axis down."""
+
+    def mistaken(sample: Sample) -> Sample:
+        pose, rows = sample["rig"][0].cam2ego, sample[key].double().numpy().copy()
+        if key == "boxes_3d":
+            rows[:, 2] -= rows[:, 5] / 2
+            ahead = np.stack([np.cos(rows[:, 6]), np.sin(rows[:, 6]), 0 * rows[:, 6]], axis=1) @ pose[:3, :3]
+            rows[:, 6] = np.arctan2(-ahead[:, 2], ahead[:, 0])
+        rows[:, :3] = (rows[:, :3] - pose[:3, 3]) @ pose[:3, :3]
+        return {**sample, key: torch.from_numpy(rows)}
+
+    return mistaken
+
+
+def in_local_world(key: str) -> Callable[[Sample], Sample]:
+    """In a world that begins nearby, as simulators and odometry have it."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_z(37), (25, -14, 0.3)
+    change = moved(key, pose[:3, :3], tuple(pose[:3, 3]))
+    return lambda sample: {**change(sample), "ego2world": torch.from_numpy(pose)}
+
+
+def sizes(factor: float) -> Callable[[Sample], Sample]:
+    scale = torch.tensor([1.0] * 3 + [factor] * 3)
+    return lambda sample: {**sample, "boxes_3d": sample["boxes_3d"][:, :7] * torch.cat([scale, torch.ones(1)])}
+
+
+def at_the_top(sample: Sample) -> Sample:
+    boxes = sample["boxes_3d"].clone()
+    boxes[:, 2] += boxes[:, 5] / 2
+    return {**sample, "boxes_3d": boxes}
+
+
+def second_camera(change: Callable[[FloatArray], FloatArray]) -> Callable[[Sample], Sample]:
+    def mistaken(sample: Sample) -> Sample:
+        first, second, *others = sample["rig"]
+        second = replace(second, cam2ego=change(second.cam2ego))
+        return {**sample, "rig": sample["rig"].with_cameras([first, second, *others])}
+
+    return mistaken
+
+
+def turn(change: Callable[[FloatArray], FloatArray]) -> Callable[[FloatArray], FloatArray]:
+    """A change of the rotation alone."""
+    return lambda pose: np.vstack([np.hstack([change(pose[:3, :3]), pose[:3, 3:]]), pose[3:]])
+
+
+def quaternion_misread(order: list[int]) -> Callable[[Sample], Sample]:
+    return second_camera(turn(lambda R: rotation_from_quaternion(quaternion_from_rotation(R)[order])))
+
+
+def swapped_images(sample: Sample) -> Sample:
+    first, second, *others = sample["images"]
+    return {**sample, "images": torch.stack([second, first, *others])}
+
+
+MIRROR = np.diag([1.0, -1, 1, 1])
+FLIP_Y, FLIP_X, DOWN, SWAP = np.diag([1.0, -1, 1]), np.diag([-1.0, 1, 1]), np.diag([1.0, -1, -1]), np.eye(3)[[1, 0, 2]]
 quarter = math.pi / 2
 MISTAKES: dict[str, tuple[Callable[[Sample], Sample], str]] = {
     "yaw in degrees": (yaws(torch.rad2deg), "boxes_3d: .*in radians.* torch.deg2rad"),
@@ -156,5 +236,52 @@ MISTAKES: dict[str, tuple[Callable[[Sample], Sample], str]] = {
     "gt_boxes": (renamed("boxes_3d", "gt_boxes"), "gt_boxes: .*did you mean boxes_3d"),
     "boxes3d": (renamed("boxes_3d", "boxes3d"), "boxes3d: .*did you mean boxes_3d"),
     "lidar_points": (renamed("points", "lidar_points"), "lidar_points: .*did you mean points"),
+    "boxes in a camera's frame": (
+        in_camera("boxes_3d"),
+        "boxes_3d: .*frame of camera .*; apply the cam2ego of",
+    ),
+    "boxes in the LiDAR's frame": (
+        moved("boxes_3d", rotation_z(90), (0.0, 0.94, -1.84)),
+        "boxes_3d: .*turned by 90 degrees and 1.8 m lower.*lidar2ego",
+    ),
+    "mirrored boxes": (moved("boxes_3d", FLIP_Y), "boxes_3d: .*mirrored.*; negate y and yaw$"),
+    "boxes with x backward": (moved("boxes_3d", FLIP_X), "boxes_3d: .*; negate x, and pass pi - yaw$"),
+    "boxes with x and y swapped": (moved("boxes_3d", SWAP), "boxes_3d: .*; swap x and y, and pass pi / 2 - yaw$"),
+    "boxes with z down": (moved("boxes_3d", DOWN), "boxes_3d: .*z down.*; negate y, z and yaw$"),
+    "boxes in feet": (moved("boxes_3d", np.eye(3) / 0.3048), "boxes_3d: .*multiply positions and sizes by 0.3048"),
+    "boxes in a world nearby": (in_local_world("boxes_3d"), r"boxes_3d: .*; apply inv\(ego2world\), to yaw too"),
+    "z at the top": (at_the_top, "boxes_3d: .*centre.*subtract half the height"),
+    "sizes from the centre": (sizes(0.5), "boxes_3d: .*half the size of what.*Double"),
+    "sizes twice as large": (sizes(2.0), "boxes_3d: .*twice the size of what.*halve"),
+    "sizes in millimetres": (sizes(1000.0), "boxes_3d: expected sizes in metres.*millimetres"),
+    "mirrored points": (moved("points", FLIP_Y), "points: .*mirrored.*edges of the images; negate y$"),
+    "points with x and y swapped": (moved("points", SWAP), "points: .*; swap x and y$"),
+    "points with z down": (moved("points", DOWN), "points: .*z down.*; negate y and z$"),
+    "points in a camera's frame": (in_camera("points"), "points: .*frame of camera .*; apply the cam2ego of"),
+    "points in a world nearby": (in_local_world("points"), r"points: .*; apply inv\(ego2world\)$"),
+    "one camera with a body's axes": (second_camera(lambda pose: pose @ BODY.T), "camera .*: cam2ego: .*ROS.*right$"),
+    "one camera with OpenGL's axes": (
+        second_camera(lambda pose: pose @ np.diag([1.0, -1, -1, 1])),
+        "camera .*: cam2ego: .*OpenGL.*; negate",
+    ),
+    "one camera rolled": (second_camera(turn(lambda R: R @ rotation_z(120))), "camera .*: cam2ego: .*rolled by -1[12]"),
+    "one quaternion x y z w": (quaternion_misread([1, 2, 3, 0]), "camera .*: cam2ego: .*x y z w read as w x y z"),
+    "one quaternion w x y z": (quaternion_misread([3, 0, 1, 2]), "camera .*: cam2ego: .*w x y z read as x y z w"),
+    "left-handed positions": (
+        poses(lambda pose: pose * np.array([1.0, 1, 1, -1]) ** np.array([[0], [1], [0], [0]])),
+        r"cam2ego: .*mirrored; positions are left-handed.*negate cam2ego\[1, 3\]",
+    ),
+    "left-handed poses": (
+        poses(lambda pose: MIRROR @ pose @ np.diag([-1.0, 1, 1, 1])),
+        "cam2ego: .*all sides mirrored; the frame is left-handed",
+    ),
+    "y of the ego frame forward": (
+        poses(lambda pose: np.vstack([rotation_z(90) @ pose[:3], pose[3:]])),
+        "cam2ego: .*x of the ego frame forward.*turned by 1[12]. degrees",
+    ),
+    "a mask that hides all": (
+        cameras(lambda c: replace(c, mask=np.zeros(c.size, bool))),
+        "mask: .*100% of the image hidden; pass ~mask",
+    ),
 }
 """Each mistake, and how its finding reads."""

@@ -5,16 +5,19 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from arbiview_aug import (
     ArbiviewError,
+    Camera,
     CheckReport,
     Finding,
     Rig,
@@ -24,10 +27,26 @@ from arbiview_aug import (
     load_rig,
     shipped_rigs,
 )
+from arbiview_aug.cameras.rotations import rotation_z
 from arbiview_aug.datasets import FrameFolder, cleaned_rig, open_data
-from arbiview_aug.sample.mistakes import check_rig, road_height_m
+from arbiview_aug.sample.label_mistakes import road_height_m
+from arbiview_aug.sample.mistakes import check_rig
 from tests.helpers import street_sample
-from tests.sample.mistakes import MISTAKES, Sample, at_the_bottom, columns, lidar_frame, turned, without, yaws
+from tests.sample.mistakes import (
+    MISTAKES,
+    Sample,
+    at_the_bottom,
+    at_the_top,
+    columns,
+    in_camera,
+    lidar_frame,
+    moved,
+    swapped_images,
+    turn,
+    turned,
+    without,
+    yaws,
+)
 
 
 @lru_cache
@@ -62,11 +81,30 @@ def test_a_silent_mistake_is_found(frame: str, mistake: str, request: pytest.Fix
         (columns([0, 1, 2, 4, 3, 5, 6]), "Swap columns 3 and 4"),
         (columns([0, 1, 2, 5, 4, 3, 6]), "Reorder"),
         (yaws(torch.rad2deg), "deg2rad"),
+        (at_the_top, "half a height over the road; subtract half the height"),
+        (in_camera("boxes_3d"), "m over it: boxes in the frame of camera"),
+        (moved("boxes_3d", np.eye(3), (0.9, 0.0, -1.84)), "1.8 m lower; are they in the LiDAR's frame"),
+        (moved("boxes_3d", np.eye(3), (0.0, 0.0, 2.6)), "m higher; are they in the LiDAR's frame"),
     ],
 )
 def test_boxes_alone_tell(make: Any, message: str, street: Sample, nuscenes: Sample) -> None:
     for right in (street, nuscenes):
         assert message in str(check(without("points")(make(right))))
+
+
+def test_points_on_images_tell_of_single_cameras(street: Sample) -> None:
+    first, *others = check(swapped_images(street)).findings
+    assert "fit that of" in first.found and first.fix == "are the images in another order?", others
+    for k in (1, 2):
+        wrong = list(right_street()["rig"])
+        wrong[k] = replace(wrong[k], cam2ego=turn(np.transpose)(wrong[k].cam2ego))
+        (finding,) = check({**right_street(), "rig": Rig(wrong)}).findings
+        assert finding.fix == "transpose cam2ego[:3, :3]" and wrong[k].name in finding.where
+
+
+def test_boxes_that_no_reading_fits(nuscenes: Sample) -> None:
+    (finding,) = check(moved("boxes_3d", rotation_z(20), (7.0, 5, 0))(nuscenes)).findings
+    assert finding.found.startswith("hardly any of") and "are they of one moment" in finding.fix
 
 
 def test_the_road_alone_tells_points_of_the_lidar(street: Sample, nuscenes: Sample) -> None:
@@ -80,6 +118,9 @@ def test_right_labels_have_no_findings(yaw_deg: float) -> None:
     """Jittered as labels are, and with few points and boxes."""
     for seed in (0, 3):
         rng, sample = np.random.default_rng(seed), turned(right_street(seed), yaw_deg)
+        if yaw_deg > 60:  # cameras called front would look aside
+            unnamed = [replace(camera, name=f"camera {k}") for k, camera in enumerate(sample["rig"])]
+            sample["rig"] = sample["rig"].with_cameras(unnamed)
         assert check(sample).ok, check(sample)
         boxes = sample["boxes_3d"].clone()
         jitter = np.zeros(boxes.shape)
@@ -107,7 +148,7 @@ def test_sides_and_yaw_that_are_both_swapped_are_the_same_boxes(street: Sample) 
 @pytest.mark.slow
 def test_given_frames_have_no_false_finding(data_root: Path) -> None:
     """Specks in DDAD's masks are there, and so is the rim of three of four fisheye images."""
-    for name in ("nuscenes-one", "ddad-one", "kitti-stereo", "surround-fisheye"):
+    for name in ("nuscenes-one", "ddad-one", "kitti-stereo", "surround-fisheye", "pandaset"):
         if not (data_root / name).is_dir():
             pytest.skip(f"no frame {name} in {data_root}")
         frames = FrameFolder(data_root / name, reduce=2)
@@ -175,6 +216,49 @@ def test_a_rig_of_heights_that_no_vehicle_has(street: Sample) -> None:
     on_its_side = rig.with_cameras([camera.turned(roll_deg=90) for camera in street["rig"]])
     (finding,) = check_rig(Rig(list(on_its_side)))
     assert "lie on their side" in finding.found
+
+
+# --- several images ---------------------------------------------------------------------------------------------------
+def pattern(camera: Camera, seed: int = 0) -> torch.Tensor:
+    """The camera's image (3, h, w) of a blurred noise far away."""
+    noise = np.random.default_rng(seed).uniform(0, 255, (256, 1024)).astype(np.float32)
+    sky = cv2.GaussianBlur(noise, (0, 0), 2) * 6 - 640
+    x, y, z = np.moveaxis(camera.unproject(camera.pixel_grid()).directions, -1, 0)
+    u, v = (np.arctan2(y, x) / np.pi + 1) * 512, (np.arcsin(z) / np.pi + 0.5) * 256
+    gray = cv2.remap(sky, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
+    return torch.from_numpy(gray.clip(0, 190).astype(np.uint8)).expand(3, -1, -1).contiguous()
+
+
+@pytest.mark.parametrize(("yaw_deg", "pitch_deg"), [(0, 0), (0, 2.5), (-2.5, 0)])
+def test_neighbours_that_disagree(yaw_deg: float, pitch_deg: float) -> None:
+    looking = {"width_px": 400, "height_px": 240, "horizontal_fov_deg": 80}
+    rig = Rig([Camera.looking(name=name, azimuth_deg=a, **looking) for name, a in (("front", 0), ("front_left", 40))])
+    images = torch.stack([pattern(camera) for camera in rig])
+    first = rig[0].turned(yaw_deg=yaw_deg, pitch_deg=pitch_deg)
+    findings = check({"images": images, "rig": rig.with_cameras([first, rig[1]])}).findings
+    if not yaw_deg and not pitch_deg:
+        assert not findings
+    else:
+        (finding,) = findings
+        assert finding.where == "cameras 'front' and 'front_left'" and "calibrate them again" in finding.fix
+        assert float(finding.found.split()[0]) == pytest.approx(2.5, abs=0.3)
+
+
+@pytest.mark.parametrize(("step_m", "masked"), [(3.0, False), (0.0, False), (3.0, True)])
+def test_the_own_car_in_images_of_a_moving_vehicle(step_m: float, masked: bool) -> None:
+    """A bonnet that stays in every frame; none where the vehicle stands, or a mask hides it."""
+    mask = np.ones((96, 160), bool)
+    mask[66:] = False
+    camera = Camera.looking(
+        name="front", azimuth_deg=0, width_px=160, height_px=96, horizontal_fov_deg=90, mask=mask if masked else None
+    )
+    images = torch.stack([pattern(camera, seed if step_m else 0)[None] for seed in range(4)])
+    images[..., 70:, 20:] = 255
+    ego2world = torch.eye(4).repeat(4, 1, 1)
+    ego2world[:, 0, 3] = step_m * torch.arange(4)
+    findings = check({"images": images, "rig": Rig([camera]), "ego2world": ego2world}).findings
+    assert [finding.where for finding in findings] == ["camera 'front': mask"] * (step_m > 0 and not masked)
+    assert all(re.search(r"about 2\d% of the image", finding.found) for finding in findings)
 
 
 @pytest.mark.slow

@@ -1,0 +1,360 @@
+"""Mistakes of single cameras: their axes and names, points on their images, neighbours that disagree, the own car."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations, pairwise
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.rotations import (
+    CAMERA_AXES_IN_EGO,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
+from arbiview_aug.cameras.validation import BODY_AXES
+from arbiview_aug.sample.findings import Finding
+from arbiview_aug.scene.surface import Points
+
+Gray = npt.NDArray[np.float32]
+
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+"""From a left-handed frame, y to the right, to the ego frame."""
+
+# --- poses and names --------------------------------------------------------------------------------------------------
+_SIDES = {"front": (1, 0), "back": (-1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}
+_AGAINST = -0.5  # cosine: a side's camera may look 30 degrees past the front or the back, as stereo pairs do not
+
+_LEVEL = 0.2, 0.6  # sines of a mounted camera's roll and elevation
+
+_LEAST_NAMED, _ALIKE = 3, 0.8
+"""Cameras with sides in their names, and the length of the mean of their unit vectors, for them to tell of the set."""
+
+
+def _opposes(name: str, cam2ego: FloatArray) -> list[str]:
+    """Sides in a camera's name that its optical axis points away from."""
+    sides = re.findall("|".join(_SIDES), name.lower())
+    return [side for side in sides if np.dot(_SIDES[side], cam2ego[:2, 2]) < _AGAINST]
+
+
+def pose_readings(cam2ego: FloatArray) -> Iterator[tuple[str, str, FloatArray]]:
+    """What a pose may be instead, the fix, and the pose that is then meant, the likeliest first."""
+    R, body = cam2ego[:3, :3], CAMERA_AXES_IN_EGO
+    w, x, y, z = quaternion_from_rotation(R)
+    axes = f"by {body.astype(int).tolist()} from the"
+    for found, fix, meant in (
+        (BODY_AXES, f"multiply cam2ego[:3, :3] {axes} right", R @ body),
+        ("OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]", R * (1, -1, -1)),
+        ("a quaternion x y z w read as w x y z", "reorder it", rotation_from_quaternion((z, w, x, y))),
+        ("a quaternion w x y z read as x y z w", "reorder it", rotation_from_quaternion((x, y, z, w))),
+        ("ego2cam's rotation, the inverse", "transpose cam2ego[:3, :3]", R.T),
+        ("an ego frame with a camera's axes (z forward)", f"multiply cam2ego[:3] {axes} left", body @ R),
+        (
+            "y to the right (a left-handed frame)",
+            "negate cam2ego[1] and cam2ego[:, 0]",
+            MIRROR[:3, :3] @ R * (-1, 1, 1),
+        ),
+    ):
+        yield found, fix, np.vstack([np.hstack([meant, cam2ego[:3, 3:]]), cam2ego[3:]])
+
+
+def likely_readings(camera: Camera) -> Iterator[tuple[str, str, FloatArray]]:
+    """``pose_readings`` in which the camera is upright and level, and looks to the side in its name."""
+    for found, fix, meant in pose_readings(camera.cam2ego):
+        is_level = abs(meant[2, 0]) < _LEVEL[0] and abs(meant[2, 2]) < _LEVEL[1]
+        if is_level and is_upright(meant) and not _opposes(camera.name, meant):
+            yield found, fix, meant
+
+
+def _set_finding(rig: Rig) -> Finding | None:
+    """The set mirrored or turned as a whole, by the sides in the cameras' names."""
+    names, axes = [], []
+    for camera in rig:
+        sides = [complex(*_SIDES[side]) for side in re.findall("|".join(_SIDES), camera.name.lower())]
+        if abs(sum(sides)) > 0.5 and np.hypot(*camera.cam2ego[:2, 2]) > 0.5:
+            names.append(sum(sides) / abs(sum(sides)))
+            axes.append(complex(*camera.cam2ego[:2, 2]))
+    if len(names) < _LEAST_NAMED:
+        return None
+    turned = complex(np.mean(np.multiply(axes, np.conj(names))))
+    mirrored = float(np.mean(np.multiply(axes, names)).real)
+    turn = float(np.degrees(np.angle(turned)))
+    if abs(turned) > _ALIKE and abs(turn) > 60:
+        fix = f"turn poses, points and boxes by {-turn:.0f} degrees about z"
+        return Finding("cam2ego", "x of the ego frame forward", f"all cameras turned by {turn:.0f} degrees", fix)
+    if mirrored > max(_ALIKE, abs(turned)):
+        fix = "the frame is left-handed (y to the right): negate cam2ego[1] and cam2ego[:, 0]; or were sides swapped?"
+        return Finding("cam2ego", "left cameras that look to the left, y > 0", "all sides mirrored", fix)
+    return None
+
+
+def pose_findings(rig: Rig) -> Iterator[Finding]:
+    """Cameras that lie, or look away from the side in their name; the whole set where it is mirrored or turned."""
+    if (set_finding := _set_finding(rig)) is not None:
+        yield set_finding
+        return
+    lean, y_m = rig.cam2ego[:, 1, 2], rig.cam2ego[:, 1, 3]
+    aside = (np.abs(lean) > 0.5) & (np.abs(y_m) > 0.1)
+    if aside.sum() > 1 and (np.sign(lean[aside]) != np.sign(y_m[aside])).all():
+        fix = "positions are left-handed (y to the right): negate cam2ego[1, 3]"
+        yield Finding("cam2ego", "cameras that look to the left on the left", "y of all positions mirrored", fix)
+    for camera in rig:
+        pose, sides = camera.cam2ego, _opposes(camera.name, camera.cam2ego)
+        expected, found = f"a camera that looks to the {''.join(sides[:1])}", f"{camera.azimuth_deg:+.0f} degrees"
+        if not is_upright(pose):
+            roll = np.degrees(np.arctan2(pose[2, 0], -pose[2, 1]))
+            expected = "an upright image"
+            found = f"rolled by {roll:.0f} degrees, looking {camera.elevation_deg:.0f} degrees up"
+        elif not sides:
+            continue
+        unknown = "", "turn the image, or mend its pose; ignore this if it is mounted like that"
+        how, fix = next(((how, fix) for how, fix, _ in likely_readings(camera)), unknown)
+        yield Finding(f"camera {camera.name!r}: cam2ego", expected, f"{found}{how and ': ' + how}", fix)
+
+
+def is_upright(cam2ego: FloatArray) -> bool:
+    """Whether an image's lower edge is down and it does not show the sky, or it shows the road from above."""
+    return bool((cam2ego[2, 1] < -0.5 and cam2ego[2, 2] < 0.5) or cam2ego[2, 2] < -0.8)
+
+
+# --- points on images -------------------------------------------------------------------------------------------------
+EDGE_WIDTH_PX, _NEARER, _LEAST_EDGES = 160, 0.2, 50
+"""Points are compared with images of this width: pixels whose depth's logarithm is so much less than two pixels aside
+are edges of objects. Levinson and Thrun (2013) calibrate online by the same evidence."""
+
+CLEAR_FIT, FIT_GAIN = 0.1, 0.05
+"""Fits of right points are 0.11 to 0.36 on 16 real frames and streets, of mirrored or turned ones up to 0.12, and at
+least 0.06 below those of the right ones."""
+
+
+class EdgeFit(NamedTuple):
+    """How well edges of objects in the points lie on edges of an image."""
+
+    gain: float  # mean rank of the image's gradient at edges of the points, less that at other points: -0.5 to 0.5
+    edges: int  # number of pixels with edges
+
+    def beats(self, other: EdgeFit) -> bool:
+        """Whether it is clearly better: by ``FIT_GAIN`` and four standard errors of uniform ranks."""
+        gain, edges = other if other.edges >= _LEAST_EDGES else (0.0, self.edges)  # it sees nothing to speak of
+        error = 0.29 * np.sqrt(1 / max(self.edges, 1) + 1 / max(edges, 1))
+        least = _LEAST_EDGES if other.edges >= _LEAST_EDGES else 2 * _LEAST_EDGES
+        return self.edges >= least and self.gain > max(CLEAR_FIT, gain + max(FIT_GAIN, 4 * error))
+
+
+def gray(camera: Camera, image: torch.Tensor, width_px: int) -> tuple[Camera, Gray]:
+    """The camera and its image (3, H, W) in grey levels, both at a width."""
+    pixels = image.detach().cpu().float().mean(dim=0).numpy() * (1 if image.dtype == torch.uint8 else 255)
+    scale = min(1.0, width_px / camera.width_px)
+    size = max(1, round(camera.height_px * scale)), max(1, round(camera.width_px * scale))
+    return camera.resize(size), np.asarray(cv2.resize(pixels, size[::-1], interpolation=cv2.INTER_AREA), np.float32)
+
+
+def edge_ranks(pixels: Gray) -> Gray:
+    """Rank in [0, 1] of each pixel's horizontal gradient."""
+    gradient = np.abs(cv2.Sobel(pixels, cv2.CV_32F, 1, 0)).ravel()
+    return (gradient.argsort().argsort() / gradient.size).reshape(pixels.shape).astype(np.float32)
+
+
+def edge_fit(camera: Camera, ranks: Gray, points: Points) -> EdgeFit:
+    """Compare points with an image of the camera's size by ``edge_ranks``."""
+    seen = camera.project(points)
+    inside = seen.valid & camera.contains(seen.uv)
+    x, y = np.round(seen.uv[inside]).astype(int).T
+    depth = np.full(camera.size, np.inf, np.float32)
+    np.minimum.at(depth, (y, x), np.log(np.linalg.norm(points[inside] - camera.center_m, axis=1)))
+    nearest = cv2.erode(depth, np.ones((3, 3)))
+    sides = np.roll(nearest, 2, axis=1), np.roll(nearest, -2, axis=1)
+    known = np.isfinite(depth) & np.isfinite(sides[0]) & np.isfinite(sides[1])
+    known[:, :3] = known[:, -3:] = False
+    edges = known & (np.maximum(*sides) - np.where(known, nearest, 0) > _NEARER)
+    if camera.mask is not None:
+        edges, known = edges & camera.mask, known & camera.mask
+    if not edges.any() or (known == edges).all():
+        return EdgeFit(0.0, 0)
+    return EdgeFit(float(ranks[edges].mean() - ranks[known & ~edges].mean()), int(edges.sum()))
+
+
+def total(fits: Sequence[EdgeFit]) -> EdgeFit:
+    """The mean fit of several images, by their edges."""
+    edges = sum(fit.edges for fit in fits)
+    return EdgeFit(sum(fit.gain * fit.edges for fit in fits) / max(edges, 1), edges)
+
+
+def fit_findings(views: Sequence[tuple[Camera, Gray]], points: Points) -> Iterator[Finding]:
+    """Cameras that points do not fit although they fit others, where another pose or image is clearly better.
+
+    Those whose pose alone is impossible are left to ``pose_findings``.
+    """
+    fits = [edge_fit(camera, ranks, points) for camera, ranks in views]
+    for k, (camera, ranks) in enumerate(views):
+        others = total(fits[:k] + fits[k + 1 :])
+        is_doubted = not is_upright(camera.cam2ego) or _opposes(camera.name, camera.cam2ego)
+        if is_doubted or fits[k].gain > CLEAR_FIT or others.gain < CLEAR_FIT:
+            continue
+        where, expected = f"camera {camera.name!r}", "points on the edges of its image"
+        for other, image in views:
+            if other is not camera and image.shape == ranks.shape and edge_fit(camera, image, points).beats(fits[k]):
+                yield Finding(where, expected, f"they fit that of {other.name!r}", "are the images in another order?")
+                break
+        else:
+            for found, fix, meant in likely_readings(camera):
+                if edge_fit(replace(camera, cam2ego=meant), ranks, points).beats(fits[k]):
+                    yield Finding(f"{where}: cam2ego", expected, found, fix)
+                    break
+
+
+# --- neighbouring cameras ---------------------------------------------------------------------------------------------
+DISAGREE_DEG, _LEAST_MATCHES = 1.0, 15
+"""Neighbours of real rigs disagree by 0.05 to 0.6 degrees, the most where cameras fire apart while the car moves."""
+
+_VIEW_PX, _RATIO, _NEAREST_M, _FALSE_DEG = 800, 0.8, 2.0, 10.0
+"""Size of the common view; Lowe's ratio; the nearest scene; matches farther apart are false."""
+
+
+def neighbour_errors(rig: Rig, images: Sequence[torch.Tensor]) -> dict[tuple[str, str], FloatArray]:
+    """Angles in degrees by which matches in the overlap of two cameras miss each other at any distance of the scene."""
+    errors = {}
+    for (one, image), (two, other) in combinations(zip(rig, images, strict=True), 2):
+        view = _common_view(one, two)
+        if view is not None and len(found := _match_errors(view, (one, image), (two, other))) >= _LEAST_MATCHES:
+            errors[one.name, two.name] = found
+    return errors
+
+
+def _common_view(one: Camera, two: Camera) -> Camera | None:
+    """An upright pinhole camera that looks at what both see far away; None without overlap."""
+    u, v = np.meshgrid(np.linspace(0, one.width_px - 1, 24), np.linspace(0, one.height_px - 1, 24))
+    rays = one.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
+    directions = rays.directions[rays.valid]
+    seen = two.project(two.center_m + directions)
+    directions = directions[seen.valid & two.contains(seen.uv)]
+    if len(directions) < 8:
+        return None
+    x, y, z = directions.mean(axis=0)
+    azimuth, elevation = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+    camera = Camera.looking(
+        name="view", azimuth_deg=azimuth, elevation_deg=elevation, width_px=8, height_px=8, horizontal_fov_deg=90
+    )
+    x, y, z = (directions @ camera.cam2ego[:3, :3]).T
+    ahead = z > 0.3
+    if not ahead.any():
+        return None
+    half = np.minimum([np.abs(x[ahead] / z[ahead]).max(), np.abs(y[ahead] / z[ahead]).max()], 1.1) * 1.1
+    f = min(one.K[0, 0], two.K[0, 0], *(_VIEW_PX / 2 / half))
+    w, h = np.maximum(2 * half * f, 16).astype(int)
+    K = np.array([[f, 0, w / 2 - 0.5], [0, f, h / 2 - 0.5], [0, 0, 1]])
+    return replace(camera, width_px=int(w), height_px=int(h), K=K)
+
+
+def _match_errors(view: Camera, *pair: tuple[Camera, torch.Tensor]) -> FloatArray:
+    """Errors in degrees of mutual matches of SIFT features in both images, as turned into the view."""
+    sift, matcher = cv2.SIFT.create(1000), cv2.BFMatcher()
+    keys, features = [], []
+    directions = view.unproject(view.pixel_grid()).directions
+    for camera, image in pair:
+        camera, pixels = gray(camera, image, camera.width_px)
+        seen = camera.project(camera.center_m + directions)
+        valid = seen.valid & camera.contains(seen.uv)
+        u, v = np.moveaxis(np.where(valid[..., None], seen.uv, -9).astype(np.float32), -1, 0)
+        turned = cv2.remap(pixels.astype(np.uint8), u, v, cv2.INTER_LINEAR)
+        if camera.mask is not None:
+            valid &= cv2.remap(camera.mask.astype(np.uint8), u, v, cv2.INTER_NEAREST) > 0
+        points, found = sift.detectAndCompute(turned, cv2.erode(valid.astype(np.uint8) * 255, np.ones((9, 9))))
+        if len(points) < 2:
+            return np.zeros(0)
+        keys.append(np.array([point.pt for point in points]))
+        features.append(found)
+    ways = [
+        {
+            (best.queryIdx, best.trainIdx)
+            for best, next_ in matcher.knnMatch(a, b, k=2)
+            if best.distance < _RATIO * next_.distance
+        }
+        for a, b in (features, features[::-1])
+    ]
+    both = [(a, b) for a, b in ways[0] if (b, a) in ways[1]]
+    if not both:
+        return np.zeros(0)
+    one, two = (
+        view.unproject(points[list(rows)]).directions
+        for points, rows in zip(keys, zip(*both, strict=True), strict=True)
+    )
+    apart = pair[1][0].center_m - pair[0][0].center_m
+    at = one - np.linspace(0, 1 / _NEAREST_M, 40)[:, None, None] * apart
+    cosine = (at / np.linalg.norm(at, axis=-1, keepdims=True) * two).sum(axis=-1)
+    errors = np.degrees(np.arccos(np.clip(cosine, -1, 1))).min(axis=0)
+    return errors[errors < _FALSE_DEG] if (errors < _FALSE_DEG).mean() > 0.6 else np.zeros(0)
+
+
+def neighbour_findings(errors: dict[tuple[str, str], FloatArray]) -> Iterator[Finding]:
+    """Pairs of cameras whose matches disagree alike by more than ``DISAGREE_DEG``."""
+    for (one, two), angles in errors.items():
+        middle = float(np.median(angles))
+        if middle > DISAGREE_DEG and ((angles > middle / 2) & (angles < 2 * middle)).mean() > 0.6:
+            found = f"{middle:.1f} degrees apart in the median of {len(angles)} matches"
+            fix = "calibrate them again; or were the images taken at different times while the car turned?"
+            yield Finding(f"cameras {one!r} and {two!r}", "the same directions in their overlap", found, fix)
+
+
+# --- the own car ------------------------------------------------------------------------------------------------------
+_ROAD_AHEAD_M, _FLOW_PX, _GRADIENT, _STEADY = 12.0, 3.0, 3.0, 0.85
+"""An edge of the own car is in all frames, where the road nearer than the first would have moved across it by the
+second; its gradient is so many grey levels a pixel, and so much of the mean of the frames' gradients."""
+
+_LEAST_WIDTH, _LEAST_FRAMES = 0.2, 3
+"""Length of such an edge as a share of the width: 0.28 to 0.63 on a roof, up to 0.13 on 16 views of moving traffic."""
+
+
+def own_car_findings(
+    rig: Rig, images: Sequence[Sequence[torch.Tensor]], ego2world: Sequence[FloatArray]
+) -> Iterator[Finding]:
+    """Cameras without a mask that see the own car: parts of the images (frames, cameras) stay while the road moves."""
+    for k, camera in enumerate(rig if len(images) >= _LEAST_FRAMES else ()):
+        if camera.mask is None and (
+            share := _own_car(camera, [frame[k] for frame in images], ego2world, rig.ground_z_m)
+        ):
+            found = f"no mask, and edges that stay while the road moves: about {share:.0%} of the image"
+            fix = "mask it in the rig file: True on the scene"
+            yield Finding(f"camera {camera.name!r}: mask", "a mask that hides the own car", found, fix)
+
+
+def _own_car(
+    camera: Camera, images: Sequence[torch.Tensor], ego2world: Sequence[FloatArray], ground_z_m: float
+) -> float:
+    """Share of the images below edges of the own car; 0 where there are none."""
+    small = [gray(camera, image, EDGE_WIDTH_PX) for image in images]
+    camera = small[0][0]
+    gradients = np.stack([np.stack([cv2.Sobel(p, cv2.CV_32F, *d) / 8 for d in ((1, 0), (0, 1))], -1) for _, p in small])
+    mean = gradients.mean(axis=0)
+    strength = np.linalg.norm(mean, axis=-1)
+    across = mean / np.maximum(strength, 1e-6)[..., None]
+    stays = (strength > _GRADIENT) & ((gradients * across).sum(axis=-1).min(axis=0) > strength / 2)
+    stays &= strength > _STEADY * np.linalg.norm(gradients, axis=-1).mean(axis=0)
+    pixels = camera.pixel_grid()
+    rays = camera.unproject(pixels)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        away_m = (ground_z_m - camera.center_m[2]) / rays.directions[..., 2]
+    stays &= rays.valid & (away_m > 0) & (away_m < _ROAD_AHEAD_M)
+    road = camera.center_m + away_m[stays][:, None] * rays.directions[stays]
+    flow = np.zeros(len(road))
+    for one, two in pairwise(ego2world):
+        pose = np.linalg.inv(two) @ one
+        moved = camera.project(road @ pose[:3, :3].T + pose[:3, 3])
+        past = np.abs(((moved.uv - pixels[stays]) * across[stays]).sum(axis=-1))
+        flow = np.maximum(flow, np.where(moved.valid, past, np.inf))
+    edges = np.zeros(camera.size, np.uint8)
+    edges[stays] = flow > _FLOW_PX
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(cv2.dilate(edges, np.ones((3, 3))), connectivity=8)
+    longest = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) >= _LEAST_WIDTH * camera.width_px
+    longest[0] = False
+    below = np.maximum.accumulate(longest[labels] & (edges > 0), axis=0)
+    return float(below.mean())
