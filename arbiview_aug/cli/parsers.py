@@ -47,8 +47,8 @@ _GENERATOR = "folder of a generator or of diffusers, TorchScript file, or OWNER/
 def check() -> argparse.ArgumentParser:
     parser = command_parser(
         "check",
-        "Look for silent mistakes: yaw in degrees, other columns or axes, points in the LiDAR's frame, a wrong road, "
-        "K of another resolution, specks in masks, keys that are not read. Draws boxes and points into the images.",
+        "Look for silent mistakes: other columns, axes, frames and units, a wrong road, cameras that disagree, "
+        "the own car, K of another resolution, specks in masks, keys that are not read. Draws boxes and points into images.",
         "/data/frames --frames 5",
     )
     text = f"real frames, by their path alone or with their kind; a rig file or a calibration. {kinds_text()}"

@@ -97,11 +97,13 @@ def stand_in_view(source: Rig, boxes: FloatArray) -> bool:
     stand &= away_m < FARTHEST_M
     if stand[near if near.any() else ...].mean() < 0.5:
         return False
-    c, s = np.cos(boxes[stand, 6]), np.sin(boxes[stand, 6])
-    ahead = np.stack([c, s, np.zeros_like(c)], axis=-1) * boxes[stand, 3:4] / 2
-    places = boxes[stand, :3] + np.stack([0 * ahead, ahead, -ahead])  # centres and ends
+    boxes = boxes[stand]
+    c, s, half = np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), boxes[:, 3:6] / 2
     for camera in source:
-        seen = camera.project(places)
+        apart_m = np.linalg.norm(boxes[:, :3] - camera.center_m, axis=1)
+        x, y, z = (camera.center_m + apart_m[:, None] * camera.cam2ego[:3, 2] - boxes[:, :3]).T
+        x, y, z = np.clip(np.stack([c * x + s * y, c * y - s * x, z], axis=-1), -half, half).T
+        seen = camera.project(boxes[:, :3] + np.stack([c * x - s * y, s * x + c * y, z], axis=-1))  # most central
         if (seen.valid & camera.contains(seen.uv)).any():
             return True
     return False
