@@ -48,7 +48,7 @@ def check() -> argparse.ArgumentParser:
     parser = command_parser(
         "check",
         "Look for silent mistakes: other columns, axes, frames and units, a wrong road, cameras that disagree, "
-        "the own car, K of another resolution, specks in masks, keys that are not read. Draws boxes and points into images.",
+        "the own car, K of another resolution, specks in masks, unread keys. Draws boxes and points into the images.",
         "/data/frames --frames 5",
     )
     text = f"real frames, by their path alone or with their kind; a rig file or a calibration. {kinds_text()}"

@@ -36,6 +36,8 @@ _AGAINST = -0.5  # cosine: a side's camera may look 30 degrees past the front or
 
 _LEVEL = 0.2, 0.6  # sines of a mounted camera's roll and elevation
 
+_SAME_COSINE = 0.94  # of 20 degrees: such a mistake hardly turns this camera, and points cannot tell it
+
 _LEAST_NAMED, _ALIKE = 3, 0.8
 """Cameras with sides in their names, and the length of the mean of their unit vectors, for them to tell of the set."""
 
@@ -70,8 +72,9 @@ def pose_readings(cam2ego: FloatArray) -> Iterator[tuple[str, str, FloatArray]]:
 def likely_readings(camera: Camera) -> Iterator[tuple[str, str, FloatArray]]:
     """``pose_readings`` in which the camera is upright and level, and looks to the side in its name."""
     for found, fix, meant in pose_readings(camera.cam2ego):
+        is_other = np.trace(meant[:3, :3].T @ camera.cam2ego[:3, :3]) < 1 + 2 * _SAME_COSINE
         is_level = abs(meant[2, 0]) < _LEVEL[0] and abs(meant[2, 2]) < _LEVEL[1]
-        if is_level and is_upright(meant) and not _opposes(camera.name, meant):
+        if is_other and is_level and is_upright(meant) and not _opposes(camera.name, meant):
             yield found, fix, meant
 
 

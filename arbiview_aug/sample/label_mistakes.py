@@ -53,7 +53,7 @@ _HALVES, _ALONE, _TWICE = 0.35, 1.2, 0.6
 """Shares of the points in boxes twice as large that other readings hold; points a third farther out, where objects
 stand alone; shares in boxes' inner halves, where right ones are hollow."""
 
-_LEAST_BOXES, _LEAST_HELD = 5, 0.1  # so many near boxes, of which fewer hold points, are not where the points are
+_LEAST_BOXES, _LEAST_HELD = 5, 0.65  # near boxes with points around, and the least share of them with points inside
 _MOST_LONG_M = 30.0  # the median of the boxes' longest sides: no street has so many trains
 _NEAR_M = 40.0  # boxes farther away stand on another height of the road
 ELSEWHERE_M = 200.0  # nothing nearer than this: another frame, or another unit
@@ -124,9 +124,12 @@ def _first_of_boxes(
 ) -> list[Finding]:
     """Mistakes in boxes, the simplest that explains them."""
     single = _order_finding(boxes, objects) or (None if objects is None else _size_finding(boxes, objects))
-    single = single or _elsewhere(rig, boxes, objects, ego2world, is_sure)
-    single = single or (None if objects is None else _emptiness(boxes, objects))
-    return list(_box_findings(rig, boxes, objects)) if single is None else [single]
+    if single := single or _elsewhere(rig, boxes, objects, ego2world, is_sure):
+        return [single]
+    several = list(_box_findings(rig, boxes, objects))
+    if several or objects is None or (empty := _emptiness(boxes, objects)) is None:
+        return several
+    return [empty]
 
 
 def _readings(rig: Rig, ego2world: FloatArray | None) -> list[Reading]:
@@ -325,13 +328,17 @@ def _size_finding(boxes: FloatArray, objects: Points) -> Finding | None:
 
 
 def _emptiness(boxes: FloatArray, objects: Points) -> Finding | None:
-    """Boxes of which hardly any holds points, though nothing else explains it."""
+    """Boxes of which many are empty, though points are around them and nothing else explains it."""
     near = np.hypot(boxes[:, 0], boxes[:, 1]) < _NEAR_M
     held = _counts(boxes[near], objects)
-    if near.sum() < _LEAST_BOXES or (held >= _LEAST_POINTS).mean() >= _LEAST_HELD:
+    # Points around a box tell that the scan is dense enough there to fill it.
+    around = _counts(boxes[near] * ([1] * 3 + [3] * 3 + [1]), objects) >= _LEAST_POINTS
+    if around.sum() < _LEAST_BOXES or (held[around] > 0).mean() >= _LEAST_HELD:
         return None
     fix = "no usual frame or unit fits: are they of one moment, and in one frame?"
-    return Finding("boxes_3d and points", "boxes that hold points", f"hardly any of {near.sum()} nearby", fix)
+    return Finding(
+        "boxes_3d and points", "boxes that hold points", f"none in many of {around.sum()} with points around", fix
+    )
 
 
 def _yaws(boxes: FloatArray) -> dict[str, FloatArray]:
