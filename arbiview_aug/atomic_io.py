@@ -20,6 +20,7 @@ from typing import Any, BinaryIO, Literal
 from urllib.parse import quote
 
 from arbiview_aug.errors import DataError, OutputError
+from arbiview_aug.files import open_regular
 
 BROKEN_ARRAY = (
     *(OSError, ValueError, EOFError, SyntaxError, RuntimeError, MemoryError),
@@ -254,7 +255,7 @@ def checksum(path: Path) -> str:
 
 
 def _blocks(path: Path) -> Iterator[bytes]:
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         while block := file.read(1 << 20):
             yield block
 

@@ -33,7 +33,7 @@ class ArbiviewError(Exception):
     """Base of this package's errors; messages name the camera or file, the expected and the given value."""
 
 
-def described(error: Exception) -> str:
+def described(error: BaseException) -> str:
     """One line about an error; errors of other packages with their type."""
     return str(error) if isinstance(error, ArbiviewError) else f"{type(error).__name__}: {error}"
 

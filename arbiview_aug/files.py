@@ -6,30 +6,43 @@ import errno
 import os
 import stat
 from pathlib import Path
+from typing import BinaryIO
 
 
-def read_bytes(path: str | Path, most_bytes: int) -> bytes:
-    """Bytes of a regular file of at most ``most_bytes``.
+def open_regular(path: str | Path) -> BinaryIO:
+    """Open a regular file to read its bytes.
 
     Raises:
-        OSError: No such file, a folder, pipe, socket or device, more bytes, or a name that no file can have. Its
-            ``strerror`` says which.
+        OSError: No such file, a folder, pipe, socket or device, or a name that no file can have. Its ``strerror`` says
+            which.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except ValueError:  # NUL or a lone surrogate
         raise OSError(errno.EINVAL, "a name that no file can have") from None
-    try:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):  # opened without blocking: a pipe would be waited for
-            raise OSError(errno.EINVAL, "a folder, pipe, socket or device in place of a file")
-        if status.st_size > most_bytes:
-            size, most = (f"{count / 2**20:.1f} MiB" for count in (status.st_size, most_bytes))
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):  # opened without blocking: a pipe would be waited for
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    raise OSError(errno.EINVAL, "a folder, pipe, socket or device in place of a file")
+
+
+def read_bytes(path: str | Path, most_bytes: int) -> bytes:
+    """Bytes of a regular file of at most ``most_bytes``; OSError for more, and as ``open_regular``."""
+    with open_regular(path) as file:
+        length = os.fstat(file.fileno()).st_size
+        if length > most_bytes:
+            size, most = (f"{count / 2**20:.1f} MiB" for count in (length, most_bytes))
             raise OSError(errno.EFBIG, f"a file of {size}, more than {most}")
-        with os.fdopen(descriptor, "rb", closefd=False) as file:
-            return file.read(most_bytes)
-    finally:
-        os.close(descriptor)
+        # A bound makes reading ten times slower; files of the kernel, /proc, say 0 bytes and may not end.
+        return file.read() if length else file.read(most_bytes)
+
+
+def check_regular(folder: str | Path) -> None:
+    """Raise OSError for a pipe, socket or device in a folder that a library reads, which would wait for it."""
+    for parent, _, names in os.walk(folder):
+        for path in (os.path.join(parent, name) for name in names):
+            if os.path.exists(path) and not os.path.isfile(path):
+                raise OSError(errno.EINVAL, f"a pipe, socket or device {os.path.relpath(path, folder)}")
 
 
 def read_text(path: str | Path, most_bytes: int) -> str:

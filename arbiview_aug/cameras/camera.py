@@ -278,6 +278,9 @@ class Camera:
         xd, yd, valid = self.lens_model.distort(x, y, z)
         u = self.K[0, 0] * xd + self.K[0, 1] * yd + self.K[0, 2]
         v = self.K[1, 1] * yd + self.K[1, 2]
+        if not self.is_rectilinear:  # angles of infinities are numbers
+            with np.errstate(invalid="ignore", over="ignore"):
+                valid = valid & np.isfinite(u + v + z)
         return Projection(np.stack([u, v], -1), z, valid)
 
     def unproject(self, uv: Any) -> Rays:

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import length_hint
 from typing import Any
 
 import numpy as np
@@ -57,10 +56,14 @@ class Lidar:
 
     def _checked(self) -> dict[str, Any]:
         name, elevations = self.name, self.elevations_deg
-        count = length_hint(elevations)
+        try:
+            count = len(elevations)
+        except TypeError:  # a generator, which may have no end, or a number
+            count = 0
         beams = f"1 to {MOST_BEAMS} elevations from -90 to 90 degrees"
-        table = checked_numbers(name, "elevations_deg", elevations, max(count, 1), beams)
-        if count > MOST_BEAMS or max(map(abs, table)) > 90:
+        is_short = 0 < count <= MOST_BEAMS
+        table = checked_numbers(name, "elevations_deg", elevations, count, beams) if is_short else ()
+        if not table or max(map(abs, table)) > 90:
             raise CalibrationError(f"camera {shown(name)}: elevations_deg: expected {beams}, got {shown(elevations)}")
         span = "two azimuths in degrees, the first below the second by at most 360"
         first, end = checked_numbers(name, "azimuth_deg", self.azimuth_deg, 2, span)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
+from numbers import Number
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +16,8 @@ import torch
 
 from arbiview_aug.cameras.camera import with_mask_of
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.errors import CalibrationError, SampleError, shown
+from arbiview_aug.choices import is_whole
+from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError, shown
 
 Range = float | tuple[float, float]
 """A half-width about the neutral value (0, or 1 for scales: 0.2 means 0.8 to 1.2), or (low, high)."""
@@ -46,8 +49,10 @@ class Epochs:
             self._epoch.share_memory_()
 
     def set_epoch(self, epoch: int) -> None:
-        """Change the draws by sequence, also in running workers."""
-        self._epoch.fill_(epoch)
+        """Change the draws by sequence, also in running workers; ValueError for what is no whole number of 63 bits."""
+        if not is_whole(epoch, -(2**63), 2**63 - 1):
+            raise ValueError(f"set_epoch: expected a whole number below 2**63, got {shown(epoch)}")
+        self._epoch.fill_(int(epoch))
 
     @property
     def epoch(self) -> int:
@@ -123,11 +128,10 @@ class RandomRig(Epochs):
         if self.per == "sample":
             return rng
         key = self.sequence_key
-        leaves = list(_leaves(sample.get(key)))
-        if None in leaves:
+        names = set(names_in(key, sample.get(key)))
+        if None in names:
             keys = ", ".join(map(str, sample))
             raise SampleError(f"RandomRig(per='sequence'): expected {key!r} in the sample, not None, got {keys}")
-        names = set(map(str, leaves))
         if len(names) != 1:
             raise SampleError(f"RandomRig(per='sequence'): {key}: expected one sequence a batch, got {len(names)}")
         return sequence_rng(names.pop(), self.epoch, rng)
@@ -174,12 +178,31 @@ def _range(name: str, value: Any) -> tuple[float, float]:
     return low, high
 
 
-def _leaves(value: Any) -> Iterator[Any]:
-    """The leaves of nested lists, tensors and arrays, as in a collated batch."""
-    if isinstance(value, torch.Tensor | np.ndarray):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        for entry in value:
-            yield from _leaves(entry)
-    else:
-        yield value
+def names_in(key: str, value: Any) -> list[str | None]:
+    """Names of sequences or frames in nested lists, tensors and arrays, as in a collated batch, and None where it is.
+
+    A container that holds itself is read once. SampleError for values without a text that is theirs in all processes.
+    """
+    names: list[str | None] = []
+    seen: dict[int, Any] = {}
+    waiting = [value]
+    while waiting:
+        entry = waiting.pop()
+        if isinstance(entry, torch.Tensor) and (entry.device.type == "meta" or entry.layout != torch.strided):
+            raise SampleTypeError(f"{key}: expected names, got tensors without values")
+        if isinstance(entry, torch.Tensor | np.ndarray):
+            entry = entry.tolist()
+        if isinstance(entry, list | tuple):
+            if id(entry) not in seen:
+                seen[id(entry)] = entry
+                waiting += reversed(entry)
+        elif entry is None or isinstance(entry, str | bytes | Number | np.generic):
+            names.append(None if entry is None else str(entry))
+        else:
+            try:
+                names.append(json.dumps(entry, sort_keys=True, default=lambda part: part.tolist()))
+            except (AttributeError, TypeError, ValueError, RuntimeError):  # not plain data, or in a circle
+                expected = "text or a number, the same in all processes"
+                got = f"{type(entry).__name__}; pass its text"
+                raise SampleTypeError(f"{key}: expected a name, {expected}, got {got}") from None
+    return names

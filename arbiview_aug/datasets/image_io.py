@@ -1,12 +1,12 @@
 """Decoding of a frame's images into one block, in the renderer's memory layout, and encoding.
 
-OpenCV hides three failures, which are checked here: it fills truncated JPEGs with grey, rotates images by their EXIF
-orientation, and may leave the output array untouched if decoding into it fails.
+OpenCV crashes on paths that are not UTF-8, so files are read here and it gets their bytes. It hides three failures,
+which are checked here: it fills truncated JPEGs with grey, rotates images by their EXIF orientation, and may leave the
+output array untouched if decoding into it fails.
 """
 
 from __future__ import annotations
 
-import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +22,13 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reduce
 from arbiview_aug.errors import DataError, SampleTypeError
+from arbiview_aug.files import read_bytes
 from arbiview_aug.sample.batching import stacked
 
 ByteArray = npt.NDArray[np.uint8]
+
+MOST_BYTES = 1 << 28
+"""Largest image file, 256 MiB: more than an uncompressed PNG of 9,000 by 9,000 pixels."""
 
 # The reduced flags without their BGR bit, which excludes IMREAD_COLOR_RGB.
 _REDUCED_FLAGS = {
@@ -76,7 +80,8 @@ def decode_images(
         if given is not None and len(given) != len(files):
             raise ValueError(f"{argument}: expected one for each of {len(files)} images, got {len(given)}")
     labels = [f"camera {(names[k] if names else file.stem)!r}: image {file}" for k, file in enumerate(files)]
-    headers = [read_header(file, label) for file, label in zip(files, labels, strict=True)]
+    contents = [_content(file, label) for file, label in zip(files, labels, strict=True)]
+    headers = [_header(content, label) for content, label in zip(contents, labels, strict=True)]
     for (_, (h, w)), label, size in zip(headers, labels, sizes, strict=True) if sizes is not None else ():
         if (h, w) != size:
             fix = "use the calibration of these images, or resize its camera (Camera.resize) with them"
@@ -85,8 +90,15 @@ def decode_images(
     shapes = [(*reduced_size(size, reduce), 3) for _, size in headers]
     is_block = len(set(shapes)) == 1
     images: Any = np.empty((len(files), *shapes[0]), np.uint8) if is_block else [np.empty(s, np.uint8) for s in shapes]
-    for file, label, (format, _), out in zip(files, labels, headers, images, strict=True):
-        _decode_into(out, file, label, format, reduce)
+    for file, content, label, (format, _), out in zip(files, contents, labels, headers, images, strict=True):
+        if format == "JPEG" and reduce == 1 and _decode_jpeg_in_place(out, file):
+            continue
+        image = _decoded(content, label, format, _FLAGS | (_REDUCED_FLAGS[reduce] if format == "JPEG" else 0))
+        if format == "PNG":  # cv2's reduced flags round sizes down, to another scale than for JPEGs
+            image = area_reduced(image, reduce)
+        if image.shape != out.shape:
+            raise DataError(f"{label}: expected {out.shape} as its header says, decoded {image.shape}; write it again")
+        out[...] = _as_rgb(image)
     if is_block:
         return torch.from_numpy(images).permute(0, 3, 1, 2)
     return [torch.from_numpy(image).permute(2, 0, 1) for image in images]
@@ -166,29 +178,25 @@ def decode_view_masks(
 
 
 def _view_mask(path: Path, label: str, size: tuple[int, int]) -> BoolArray:
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if image is None or image.shape != size:
-        got = "a file that cannot be decoded" if image is None else f"{image.shape[1]}x{image.shape[0]}"
+    image = decode_grey(path, label)
+    if image.shape != size:
+        got = f"{image.shape[1]}x{image.shape[0]}"
         raise DataError(f"{label}: expected an image {path} of {size[1]}x{size[0]} (w x h), got {got}; convert again")
-    return np.asarray(image > 0)
+    return image > 0
 
 
-def read_header(path: Path, label: str) -> tuple[str, tuple[int, int]]:
-    """Read format and (h, w) of a JPEG or PNG file; ``label`` names camera and file in messages.
+def decode_grey(path: Path, label: str) -> ByteArray:
+    """Decode an image file as grey levels (h, w); DataError by ``label`` for one that is missing or broken."""
+    return _decoded(_content(path, label), label, "file", cv2.IMREAD_GRAYSCALE)
 
-    DataError for a missing, empty or truncated file, or one of another format.
-    """
+
+def _content(path: Path, label: str) -> bytes:
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for
-            raise DataError(f"{label}: expected an image file, got a folder, pipe, socket or device")
-        return _header(path.read_bytes(), label)
+        return read_bytes(path, MOST_BYTES)
     except FileNotFoundError:
         raise DataError(f"{label}: expected an image file, found none; check the path and the data root") from None
-    except DataError:
-        raise
-    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        got = getattr(error, "strerror", None) or error
-        raise DataError(f"{label}: expected a readable image file, got {got}") from None
+    except OSError as error:
+        raise DataError(f"{label}: expected a readable image file, got {error.strerror}") from None
 
 
 def _header(data: bytes, label: str) -> tuple[str, tuple[int, int]]:
@@ -216,10 +224,21 @@ def decode_bytes(data: bytes, label: str) -> ByteArray:
     if not isinstance(data, bytes | bytearray):
         raise DataError(f"{label}: expected a file's bytes, got {type(data).__name__}; do not decode before")
     format, _ = _header(data, label)
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), _FLAGS)
+    return _as_rgb(_decoded(data, label, format, _FLAGS))
+
+
+def _decoded(data: bytes, label: str, format: str, flags: int) -> ByteArray:
+    try:
+        image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:  # no bytes, or more pixels than OpenCV decodes
+        image = None
     if image is None:
         raise DataError(f"{label}: expected an image, got a {format} that cannot be decoded; copy it again")
-    return np.asarray(image if _RGB_FLAG is not None else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    return image  # type: ignore[no-any-return]
+
+
+def _as_rgb(image: ByteArray) -> ByteArray:
+    return image if _RGB_FLAG is not None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _jpeg_size(data: bytes) -> tuple[tuple[int, int], bool]:
@@ -239,23 +258,6 @@ def _number(data: bytes, at: int, length: int) -> int:
     return int.from_bytes(data[at : at + length], "big")
 
 
-def _decode_into(out: ByteArray, path: Path, label: str, format: str, reduce: int) -> None:
-    """Decode into ``out`` (h, w, 3), which has the shape of the (reduced) image."""
-    if format == "JPEG" and _decode_jpeg_in_place(out, path, reduce):
-        return
-    # For PNGs cv2's reduced flags round sizes down, to another scale than for JPEGs.
-    image = cv2.imread(str(path), _FLAGS | (_REDUCED_FLAGS[reduce] if format == "JPEG" else 0))
-    if image is None:
-        raise DataError(f"{label}: expected an image, got a {format} that cannot be decoded; copy it again")
-    if _RGB_FLAG is None:
-        cv2.cvtColor(image, cv2.COLOR_BGR2RGB, image)
-    if format == "PNG":
-        image = area_reduced(image, reduce)
-    if image.shape != out.shape:
-        raise DataError(f"{label}: expected {out.shape} as its header says, decoded {image.shape}; write it again")
-    out[...] = image
-
-
 def area_reduced(image: npt.NDArray[Any], reduce: int) -> npt.NDArray[Any]:
     """(h, w, 3) reduced about the outer top-left corner, as ``reduced_camera`` says; contiguous."""
     if reduce == 1:
@@ -265,13 +267,17 @@ def area_reduced(image: npt.NDArray[Any], reduce: int) -> npt.NDArray[Any]:
     return cv2.resize(image, reduced_size((h, w), reduce)[::-1], interpolation=cv2.INTER_AREA)
 
 
-def _decode_jpeg_in_place(out: ByteArray, path: Path, reduce: int) -> bool:
-    """Decode into ``out``; returns False on failure, which a mark detects that was left untouched."""
+def _decode_jpeg_in_place(out: ByteArray, path: Path) -> bool:
+    """Decode a file that was read before into ``out``, which bytes cannot: their copy costs a tenth of the time.
+
+    Returns False on failure, which a mark detects that was left untouched, and for a path that OpenCV crashes on.
+    """
     mark = np.resize(np.array([0, 255, 0, 255, 0, 255, 255], np.uint8), out[0].shape)
     out[0] = out[-1] = mark
     try:
-        image = cv2.imread(str(path), out, _FLAGS | _REDUCED_FLAGS[reduce])
-    except cv2.error:  # the decoded size is not the header's
+        str(path).encode()
+        image = cv2.imread(str(path), out, _FLAGS)
+    except (UnicodeEncodeError, cv2.error):  # cv2.error: the decoded size is not the header's
         return False
     if image is None or not np.may_share_memory(image, out) or (out[0] == mark).all() or (out[-1] == mark).all():
         return False

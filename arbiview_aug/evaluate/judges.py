@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import os
 import re
 import sys
 from collections.abc import Callable, Collection, Sequence
@@ -22,6 +23,7 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError, described, one_line, shown
 from arbiview_aug.evaluate.report.pictures import Picture
+from arbiview_aug.files import open_regular
 from arbiview_aug.inpaint.networks import load_torchscript
 from arbiview_aug.temporal.transformers_depth import load_pretrained
 
@@ -100,7 +102,7 @@ def load_detector(
         raise DataError(f"{option}: no class is a vehicle or person: {shown(names)}; choose by --detector-classes")
 
     def detector(image: Picture) -> Detections:
-        found = checked_detections(option, _called(option, detect, image), image)
+        found: Detections = _called(option, lambda rgb: checked_detections(option, detect(rgb), image), image)
         counts = [label in classes if classes else label.isdecimal() or is_road_user(label) for label in found.labels]
         return found.subset(np.array(counts, bool) & (found.scores >= LEAST_SCORE))
 
@@ -168,7 +170,8 @@ def _of_torchvision(
     model = models.get_model(name, weights=None, weights_backbone=None)
     file = f"--detector-weights {weights}"
     try:
-        state = torch.load(weights, map_location="cpu", weights_only=True)
+        with open_regular(weights) as content:
+            state = torch.load(content, map_location="cpu", weights_only=True)
         model.load_state_dict(state["model"] if "model" in state else state)  # torchvision's references save more
     except FileNotFoundError:
         raise DataError(f"{file}: expected a file, found none") from None
@@ -228,8 +231,8 @@ def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
     option = f"--segmenter {name}"
     segment = _function(option, name) if names_a_function(name) else _of_torchscript(option, name, device)
 
-    def segmenter(image: Picture) -> BoolArray:
-        masks = _called(option, segment, image)
+    def masks_of(image: Picture) -> BoolArray:
+        masks = segment(image)
         try:
             array = np.asarray(_host(masks))
         except (TypeError, ValueError, RuntimeError):
@@ -240,7 +243,7 @@ def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
             raise DataError(f"{option}: expected masks {expected} of 0 and 1: drivable area and lane marks, got {got}")
         return array.astype(bool)
 
-    return segmenter
+    return partial(_called, option, masks_of)
 
 
 def _of_torchscript(option: str, name: str, device: torch.device | str) -> Callable[[Picture], BoolArray]:
@@ -283,17 +286,18 @@ def _function(option: str, name: str) -> Callable[[Picture], Any]:
     file, _, wanted = (name, "", "") if name.endswith(".py") else name.rpartition(":")
     if not wanted:
         raise DataError(f"{option}: expected FILE.py:function, got no function; add its name, such as {file}:detect")
-    path = Path(file)
-    if not path.is_file():
+    if not os.path.isfile(file):  # unlike Path.is_file, False for a name that is too long
         raise DataError(f"{option}: expected a file {file}, found none")
-    spec = importlib.util.spec_from_file_location(f"arbiview_aug_judge_{path.stem}", path)
+    spec = importlib.util.spec_from_file_location(f"arbiview_aug_judge_{Path(file).stem}", file)
     assert spec is not None and spec.loader is not None
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except (Exception, SystemExit) as error:
+        function = getattr(module, wanted, None)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # SystemExit, too, which would end the command as if it was done
         raise DataError(f"{option}: importing {file} raised {type(error).__name__}: {one_line(error)}") from error
-    function = getattr(module, wanted, None)
     if not callable(function):
         there = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
         raise DataError(f"{option}: expected a function {wanted} in {file}, found {shown(there)}")
@@ -301,11 +305,11 @@ def _function(option: str, name: str) -> Callable[[Picture], Any]:
 
 
 def _called(option: str, function: Callable[[Picture], Any], image: Picture) -> Any:
-    """Call a judge; it may raise anything."""
+    """Call a judge with a copy of an image: it may write into it, and raise anything."""
     try:
-        return function(image)
-    except DataError:
+        return function(image.copy())
+    except (DataError, KeyboardInterrupt):
         raise
-    except Exception as error:
+    except BaseException as error:  # SystemExit, too, which would end the command as if it was done
         text = one_line(described(error))
         raise DataError(f"{option}: raised {text} for an image {image.shape} {image.dtype}") from error

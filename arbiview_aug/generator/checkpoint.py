@@ -19,11 +19,13 @@ from torch import nn
 from arbiview_aug.atomic_io import checksum, remove_parts, write_whole
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError, one_line, shown
+from arbiview_aug.files import read_text
 
 FORMAT = 1
 CONFIG_FILE = "config.json"
 _DIGITS = 12
 _NAME = re.compile(rf"weights-[0-9a-f]{{{_DIGITS}}}\.safetensors")
+_MOST_CONFIG_BYTES = 1 << 20  # shipped: 2 kB
 _MAX_MESSAGE = 500  # characters of torch's message, which names every tensor
 
 
@@ -54,7 +56,7 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tenso
     if not path.is_file():
         raise GeneratorError(f"{folder}: expected a generator's folder with {CONFIG_FILE}, found none")
     try:
-        config = json.loads(path.read_text())
+        config = json.loads(read_text(path, _MOST_CONFIG_BYTES))
         version, weights = config.pop("format"), config.pop("weights")
     except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise GeneratorError(f"{path}: expected a generator's configuration ({error!r})") from None

@@ -13,6 +13,7 @@ import torch
 from arbiview_aug.choices import is_number
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError, one_line, shown
+from arbiview_aug.files import check_regular
 from arbiview_aug.generator.checkpoint import load_weights, read_checkpoint, write_checkpoint
 from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
@@ -151,6 +152,7 @@ def load_part(kind: str, where: str | Path, subfolder: str, arguments: Mapping[s
     cls = getattr(optional_package("diffusers", "generator"), kind)
     label = f"{where}/{subfolder}"
     try:
+        check_regular(where)
         config = cls.load_config(where, subfolder=subfolder)
     except (OSError, ValueError) as error:
         raise GeneratorError(f"{label}: expected a diffusers folder or hub id with a {kind}: {error}") from None

@@ -53,14 +53,14 @@ class Inpainter(ABC):
         """Fill the holes (h, w) bool of views (3, h, w), uint8 or float in [0, 1], of any frames together.
 
         Args:
-            views: Views, black where no source shows a pixel; they may differ in size and are not modified.
-            holes: Pixels to fill; all others of the result are ignored.
+            views: Copies of the views, black where no source shows a pixel; they may differ in size.
+            holes: Copies of the pixels to fill; all others of the result are ignored.
             seeds: A seed for each view.
         """
 
     def _inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int], counts: Sequence[int]) -> Any:
-        """``inpaint``; ``counts`` are how many views each frame has."""
-        return self.inpaint(views, holes, seeds)
+        """``inpaint`` of copies, into which it may write; ``counts`` are how many views each frame has."""
+        return self.inpaint([view.clone() for view in views], [hole.clone() for hole in holes], seeds)
 
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
         """Fill rendered ``frames``.

@@ -19,6 +19,7 @@ import torch
 
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, GeneratorError, one_line
+from arbiview_aug.files import check_regular, open_regular
 from arbiview_aug.inpaint.crops import Canvas, Window, drawn, packed, windows
 from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, check_device, checked_settings
 from arbiview_aug.inpaint.telea import telea
@@ -198,6 +199,7 @@ class PipelineInpainter(NetworkInpainter):
         diffusers = optional_package("diffusers", "generator")
         optional_package("transformers", "generator")
         try:
+            check_regular(where)
             pipeline = diffusers.AutoPipelineForInpainting.from_pretrained(where, **settings)
         except (OSError, ValueError, RuntimeError, AttributeError) as error:
             raise GeneratorError(f"{where}: expected an inpainting pipeline of diffusers: {one_line(error)}") from None
@@ -273,8 +275,8 @@ class TorchScriptInpainter(NetworkInpainter):
 def load_torchscript(path: str | Path, what: str, kind: type[ArbiviewError]) -> Any:
     """Load a TorchScript file onto the CPU; an error of a ``kind`` says ``what`` it was to be."""
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), open_regular(path) as file:
             warnings.simplefilter("ignore", FutureWarning)  # advice of torch 2.14 to those who write such files
-            return torch.jit.load(str(path), map_location="cpu")
+            return torch.jit.load(file, map_location="cpu")
     except (RuntimeError, ValueError, OSError) as error:
         raise kind(f"{what}: expected a TorchScript file: {one_line(error)}") from None

@@ -53,7 +53,7 @@ class OnImages(torch.nn.Module):
             raise ValueError(f"OnImages: expected a tensor 'images', of one size, {found}{fix}")
         flat = images.reshape(-1, *images.shape[-3:])
         checked_images(tuple(flat))
-        levels = flat.float() / 255 if flat.dtype == torch.uint8 else flat
+        levels = flat.float() / 255 if flat.dtype == torch.uint8 else flat.clone()  # some modules write into it
         changed = self.module(levels)
         far = ((changed - 0.5).abs() > 1).float().mean()  # noise may reach out with some pixels
         if not changed.is_floating_point() or far > _FAR_SHARE:

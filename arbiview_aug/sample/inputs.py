@@ -15,6 +15,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
+from arbiview_aug.cameras.random_rig import names_in
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
@@ -115,11 +116,7 @@ class Frame:
             if not isinstance(names, list | tuple) or len(names) != count:
                 raise SampleError(f"{key}: expected a name for each of {count} frames, got {type(names).__name__}")
             value = names[self.number]
-        if not isinstance(value, torch.Tensor):
-            return str(value)
-        if value.device.type == "meta" or value.layout != torch.strided:
-            raise SampleTypeError(f"{key}: expected names, got tensors without values")
-        return str(value.tolist())
+        return ", ".join(map(str, names_in(key, value)))
 
 
 def read_frames(sample: Any, source: Rig | None) -> list[Frame]:

@@ -132,7 +132,7 @@ class View(NamedTuple):
     camera: Camera  # the camera at the size of its depth map
     pinhole: Camera  # the pinhole camera
     ground_z_m: float  # height of the road in their ego frame
-    image: torch.Tensor  # (3, h, w) uint8
+    image: torch.Tensor  # (3, h, w) uint8, a copy
 
     @property
     def focal_px(self) -> float:
@@ -143,8 +143,7 @@ class View(NamedTuple):
     def of(frame: DepthInputs, k: int) -> View:
         """The image of a frame's camera, its lens taken out."""
         camera, image = frame.rig[k], frame.images[k]
-        if image.dtype != torch.uint8:
-            image = (image * 255).round().to(torch.uint8)
+        image = image.clone() if image.dtype == torch.uint8 else (image * 255).round().to(torch.uint8)
         pinhole = camera.undistorted()
         if not camera.is_rectilinear:
             uv = camera.project_cam(pinhole.unproject_cam(pinhole.pixel_grid()).directions).uv.astype(np.float32)

@@ -12,6 +12,7 @@ import torch
 from arbiview_aug.atomic_io import checksum
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError
+from arbiview_aug.files import check_regular
 from arbiview_aug.temporal.learned_depth import Output, Prediction, View
 
 _WEIGHTS = ("*.safetensors", "*.bin")
@@ -80,6 +81,7 @@ class TransformersDepth:
 def load_pretrained(kind: Any, option: str, name: str, expected: str) -> Any:
     """Load a part of a model of transformers, a folder or hub id; DataError names the option and what was expected."""
     try:
+        check_regular(name)
         return kind.from_pretrained(name)
     except Exception as error:  # of many types, some of many lines
         why = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)

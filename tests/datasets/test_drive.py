@@ -227,6 +227,6 @@ def test_images_are_read_where_they_fill_something(recorded: Path, monkeypatch: 
     folder = FrameFolder(recorded, neighbours=Neighbours())
     sample = folder[1]
     read = []
-    monkeypatch.setattr(cv2, "imread", lambda *a, **k: read.append(a) or np.zeros((1, 1, 3), np.uint8))
+    monkeypatch.setattr(cv2, "imdecode", lambda *a, **k: read.append(a) or np.zeros((1, 1, 3), np.uint8))
     RigRetarget(sample["rig"].turned(yaw_deg=0))(sample)  # nothing is missing
     assert not read

@@ -11,7 +11,7 @@ import pytest
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, OutputError
 from arbiview_aug.evaluate.report.pictures import (
     HOLE,
     contact_sheet,
@@ -76,7 +76,7 @@ def test_save_picture(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], picture)
     with pytest.raises(DataError, match=r"expected a name ending in .png or .jpg"):
         save_picture(tmp_path / "sheet.words", picture)
-    with pytest.raises(DataError, match="in a folder that can be written to"):
+    with pytest.raises(OutputError, match=r"sheet\.png: expected a file that can be written, got Not a directory"):
         save_picture(path / "below_a_file" / "sheet.png", picture)
 
 

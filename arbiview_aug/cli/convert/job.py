@@ -26,7 +26,7 @@ from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.drive import Recording, WritableRecording
-from arbiview_aug.datasets.image_io import encoded, encoded_image
+from arbiview_aug.datasets.image_io import decode_grey, encoded, encoded_image
 from arbiview_aug.datasets.registry import find_reader
 from arbiview_aug.environment import repeatable_opencv, working_s
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError, described
@@ -64,8 +64,8 @@ def rig_of(target: Rig, out: Mapping[str, Any], source: Rig) -> Rig:
 
 def coverage_of(image: Path) -> BoolArray:
     """Read the (h, w) coverage beside a view's image."""
-    coded = np.frombuffer(image.with_suffix(".coverage.png").read_bytes(), np.uint8)
-    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)) > 0
+    path = image.with_suffix(".coverage.png")
+    return decode_grey(path, f"coverage {path}") > 0
 
 
 def _as_bytes(key: str, values: torch.Tensor) -> Any:

@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.image_io import encoded
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.images import Image, RenderedView, to_bytes
 from arbiview_aug.evaluate.lidar import visible_points
@@ -157,13 +159,9 @@ def coloured(values: FloatArray) -> Picture:
 def save_picture(path: str | Path, picture: Picture) -> Path:
     """Write a picture as PNG or JPEG, by its suffix, and create its folder."""
     path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        written = cv2.imwrite(str(path), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    except (OSError, cv2.error):
-        written = False
-    if not written:
-        raise DataError(f"picture {path}: expected a name ending in .png or .jpg, in a folder that can be written to")
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise DataError(f"picture {path}: expected a name ending in .png or .jpg, got {path.name!r}")
+    write_whole({path: encoded(np.ascontiguousarray(picture[..., ::-1]), path.suffix)})
     return path
 
 

@@ -16,6 +16,7 @@ from torch import nn
 
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
+from arbiview_aug.files import open_regular
 from arbiview_aug.generator.conditioning import FrameGeometry, pooled
 from arbiview_aug.generator.config import TIMESTEPS, Prediction
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, Denoiser, Rows
@@ -127,7 +128,8 @@ def load_perceptual(weights: str | Path | None) -> Perceptual:
         if weights is None:
             state = models.VGG16_Weights.IMAGENET1K_V1.get_state_dict(progress=False, check_hash=True)
         else:
-            state = torch.load(weights, map_location="cpu", weights_only=True)
+            with open_regular(weights) as file:
+                state = torch.load(file, map_location="cpu", weights_only=True)
         with torch.device("meta"):
             vgg = models.vgg16()
         vgg.load_state_dict(state, assign=True)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from arbiview_aug import CalibrationError, RandomRig, Rig, RigRetarget, SampleError, SampleKeys
-from arbiview_aug.cameras.random_rig import Epochs, sequence_rng
+from arbiview_aug.cameras.random_rig import Epochs, names_in, sequence_rng
 from arbiview_aug.choices import is_number
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, retarget_img_inputs
 from arbiview_aug.integrations.mmdet3d.images import Norm, checked_norm
@@ -112,7 +112,7 @@ class RigRetargetMultiView:
             return None
         if key not in frame:
             raise SampleError(f"sequence_key: expected {key!r} in the results, got {', '.join(map(str, frame))}")
-        return sequence_rng(f"{frame[key]}{use}", self._epochs.epoch)
+        return sequence_rng(f"{', '.join(map(str, names_in(key, frame[key])))}{use}", self._epochs.epoch)
 
     def draw(self, frame: Mapping[str, Any]) -> dict[str, float]:
         """``retarget_params`` of a frame; those of all frames of its sequence with ``sequence_key``."""
