@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -69,6 +70,8 @@ def run(program: str, name: str, command: Command, argv: Sequence[str] | None) -
     """Parse a command's arguments, import it and run it; the exit status of ``main``."""
 
     def parsed_and_run() -> int | None:
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="backslashreplace")  # names of files that are not UTF-8
         parser = getattr(parsers, name)()
         arguments = parser.parse_args(argv)
         parsers.check_together(name, parser, arguments)

@@ -32,7 +32,7 @@ Link = Literal["hard", "copy", "symlink"]
 """Kinds of links to kept files."""
 
 _SEPARATOR = re.compile(r"[/\\]")
-_LONGEST_NAME = 255  # bytes of a name in all common file systems
+LONGEST_NAME = 255  # bytes of a name in all common file systems
 _LONGEST_TOKEN = 200  # characters of an escaped token: the names of half-written files are 50 longer
 
 _PART = ".part"
@@ -50,7 +50,7 @@ def check_name(name: Any, what: str) -> None:
     """
     try:
         coded = name.encode()
-        short = len(coded) <= _LONGEST_NAME or max(map(len, coded.split(b"/"))) <= _LONGEST_NAME
+        short = len(coded) <= LONGEST_NAME or max(map(len, coded.split(b"/"))) <= LONGEST_NAME
         leads_out = name.startswith(("/", "\\")) or (".." in name and ".." in _SEPARATOR.split(name))
         if name and short and not leads_out and "\0" not in name:
             return
@@ -59,7 +59,7 @@ def check_name(name: Any, what: str) -> None:
     got = ascii(name)
     raise DataError(
         f"{what}: expected a file name relative to the folder of the data, without '..', in UTF-8, at most "
-        f"{_LONGEST_NAME} bytes a part, got {got if len(got) <= _LONGEST_NAME else got[:80] + '…'}"
+        f"{LONGEST_NAME} bytes a part, got {got if len(got) <= LONGEST_NAME else got[:80] + '…'}"
     )
 
 

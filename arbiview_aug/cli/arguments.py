@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from tqdm import tqdm
 
+from arbiview_aug.atomic_io import LONGEST_NAME
 from arbiview_aug.cameras.shipped import shipped_rigs
 from arbiview_aug.choices import GeometryName, Holes, Quality, Reduce
 from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, shown
 
 if TYPE_CHECKING:
     import torch
@@ -50,9 +51,22 @@ def command_parser(
     )
 
 
+def path(text: str) -> str:
+    """Text that can name a file or a folder; a rig's or a model's name can, too."""
+    try:
+        parts = os.fsencode(text).split(b"/")
+    except UnicodeEncodeError:  # a lone surrogate
+        parts = []
+    if not text or not parts or "\0" in text or max(map(len, parts)) > LONGEST_NAME:
+        expected = f"a name that a file can have, of 1 to {LONGEST_NAME} bytes between slashes"
+        raise argparse.ArgumentTypeError(f"expected {expected}, got {shown(text)}")
+    return text
+
+
 def data(text: str) -> str:
     """``PATH`` or ``KIND:PATH`` for ``open_data``; prints to stderr which kind an ambiguous path is taken as."""
     kind, root = split_kind(text)
+    path(text if kind is None else text.partition(":")[2])
     kinds = kinds_of(root) if kind is None else [kind]
     if len(kinds) > 1:
         others = " or ".join(f"{other}:{text}" for other in kinds[1:])
@@ -85,7 +99,7 @@ def add_data(parser: argparse.ArgumentParser, without: str | None = None, **opti
 def add_target(group: argparse._ActionsContainer, *, required: bool = False) -> None:
     default = "" if required else f" (default: a higher five-camera rig; of real frames, {REAL_TARGET})"
     text = f"rig to render: a shipped one ({', '.join(shipped_rigs())}), a rig file or a calibration{default}"
-    group.add_argument("--target", metavar="RIG", required=required, help=text)
+    group.add_argument("--target", type=path, metavar="RIG", required=required, help=text)
 
 
 def add_rendering(parser: argparse.ArgumentParser, holes: str = "continue", *, several: bool = False) -> None:
@@ -146,7 +160,7 @@ def reading(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def add_output(parser: argparse.ArgumentParser, text: str = "folder to write to") -> None:
-    parser.add_argument("--output", default="output", metavar="DIR", help=text)
+    parser.add_argument("--output", type=path, default="output", metavar="DIR", help=text)
 
 
 def count(text: str) -> int:

@@ -26,6 +26,7 @@ from arbiview_aug.cli.arguments import (
     is_rig,
     kinds_text,
     pair,
+    path,
     positive,
     seed,
     size,
@@ -44,6 +45,10 @@ SCORED = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3
 _GENERATOR = "folder of a generator or of diffusers, TorchScript file, or OWNER/NAME on the Hugging Face Hub"
 
 
+def _file(text: str) -> Path:
+    return Path(path(text))
+
+
 def check() -> argparse.ArgumentParser:
     parser = command_parser(
         "check",
@@ -52,7 +57,7 @@ def check() -> argparse.ArgumentParser:
         "/data/frames --frames 5",
     )
     text = f"real frames, by their path alone or with their kind; a rig file or a calibration. {kinds_text()}"
-    parser.add_argument("data", metavar="[KIND:]PATH", help=text)
+    parser.add_argument("data", type=path, metavar="[KIND:]PATH", help=text)
     parser.add_argument("--frames", type=count, default=3, metavar="N", help="number of frames, spread over the data")
     add_reading(parser)
     add_output(parser, "folder for the pictures")
@@ -68,13 +73,13 @@ def convert() -> argparse.ArgumentParser:
     )
     add_data(parser)
     add = parser.add_argument
-    add("--version", metavar="NAME", help="nuScenes' folder of tables (default: v1.0-mini, -trainval)")
+    add("--version", type=path, metavar="NAME", help="nuScenes' folder of tables (default: v1.0-mini, -trainval)")
     add_target(parser, required=True)
     names = "new names of the target's cameras, such as ring_front_center=CAM_FRONT, by which detectors find them"
     add("--names", nargs="+", type=pair, default=[], metavar="OLD=NEW", help=names)
-    add("--output", required=True, metavar="DIR", help="folder to write to")
+    add("--output", type=path, required=True, metavar="DIR", help="folder to write to")
     add_rendering(parser)
-    add("--generator", type=Path, metavar="PATH", help=f"of --holes diffusion: {_GENERATOR} (default: the own)")
+    add("--generator", type=_file, metavar="PATH", help=f"of --holes diffusion: {_GENERATOR} (default: the own)")
     add("--steps", type=count, metavar="N", help="steps of the generator (default: its own)")
     add("--size", type=size, metavar="HxW", help="height and width of every view (default: the target's own)")
     fit = "with --size: cut at the top and the sides (default), add black bars there, or stretch"
@@ -88,7 +93,7 @@ def convert() -> argparse.ArgumentParser:
         "what the depth command wrote, for --geometry auto, motion, fused or learned (default: its folder in the data; "
         "auto: none)"
     )
-    add("--depth", dest="motion_depth", type=Path, metavar="DIR", help=depth)
+    add("--depth", dest="motion_depth", type=_file, metavar="DIR", help=depth)
     add("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
     add("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0")
     add("--num-shards", type=count, default=1, metavar="N", help="number of shards")
@@ -136,9 +141,14 @@ def depth() -> argparse.ArgumentParser:
     )
     add_data(parser)
     add = parser.add_argument
-    add("--output", metavar="FOLDER", help="where to write (default: motion_depth or learned_depth beside the data)")
+    add(
+        "--output",
+        type=path,
+        metavar="FOLDER",
+        help="where to write (default: motion_depth or learned_depth beside the data)",
+    )
     add("--workers", type=count, default=1, metavar="N", help="processes")
-    add("--model", metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub")
+    add("--model", type=path, metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub")
     add("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... (default: the GPU, if there is one)")
     add("--batch", type=count, default=8, metavar="N", help="images that the model sees at once")
     references = list(get_args(Reference))
@@ -172,7 +182,7 @@ def evaluate() -> argparse.ArgumentParser:
     target.add_argument("--target-set", choices=TARGET_SETS, help=sets)
     add_rendering(parser, "black", several=True)
     add = parser.add_argument
-    add("--generator", metavar="PATH", help=f"of --holes diffusion: {_GENERATOR}")
+    add("--generator", type=path, metavar="PATH", help=f"of --holes diffusion: {_GENERATOR}")
     add("--steps", nargs="+", type=count, default=[None], metavar="N", help="steps of the generator (default: its own)")
     text = "number of frames, spread over the data, or a slice of them (default: 1; --displaced: all)"
     add_frames(parser, None, text, slices=True)
@@ -182,7 +192,7 @@ def evaluate() -> argparse.ArgumentParser:
         "photographs as truth: of the frames' `truth` camera (docs/formats.md), else of the next frame of the drive; "
         "with NEXT of this frame folder's first frame. Surfaces: a copy, and all that the data offers"
     )
-    add("--displaced", nargs="?", const=True, metavar="NEXT", help=displaced)
+    add("--displaced", nargs="?", type=path, const=True, metavar="NEXT", help=displaced)
     lidar = (
         "instead of images, score points as the target's scanners would have measured them, against true scans: of "
         "synthetic streets; with --displaced, the next frame's, by the target's scanners or those in calib.json"
@@ -193,15 +203,15 @@ def evaluate() -> argparse.ArgumentParser:
         "name, or FILE.py:function (RGB (H, W, 3) uint8 to boxes (n, 4) xyxy, scores, labels). Scores labelled "
         "objects, and true images where there are some (docs/benchmarks.md)"
     )
-    add("--detector", metavar="MODEL", help=detector)
-    add("--detector-weights", metavar="FILE", help="weights of a torchvision detector")
+    add("--detector", type=path, metavar="MODEL", help=detector)
+    add("--detector-weights", type=path, metavar="FILE", help="weights of a torchvision detector")
     classes = "labels that count (default: names of vehicles and people; all numbers)"
     add("--detector-classes", nargs="+", default=[], metavar="LABEL", help=classes)
     segmenter = (
         "judge views by drivable area and lane marks, against true images: TorchScript of TwinLiteNet's kind, or "
         "FILE.py:function (RGB (H, W, 3) uint8 to masks (2, H, W))"
     )
-    add("--segmenter", metavar="MODEL", help=segmenter)
+    add("--segmenter", type=path, metavar="MODEL", help=segmenter)
     return parser
 
 
@@ -211,8 +221,8 @@ def inspect() -> argparse.ArgumentParser:
         f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), another tool's calibration "
         "(docs/rigs.md), or data as other commands' --data takes it: the rig of its first frame"
     )
-    parser.add_argument("rigs", nargs="+", metavar="RIG", help=rigs)
-    parser.add_argument("--output", default="inspect.png", metavar="FILE", help="the picture")
+    parser.add_argument("rigs", type=path, nargs="+", metavar="RIG", help=rigs)
+    parser.add_argument("--output", type=path, default="inspect.png", metavar="FILE", help="the picture")
     return parser
 
 
@@ -230,12 +240,12 @@ def train() -> argparse.ArgumentParser:
     add("--config", choices=TRAINING_PRESETS, default="tiny", help="preset of all settings")
     kinds = " or ".join(f"{kind}:PATH" for kind in READERS)
     text = f"synthetic, or real frames with their kind: {kinds} (default: synthetic; evaluate: the run's)"
-    add("--data", metavar="DATA", help=text)
+    add("--data", type=path, metavar="DATA", help=text)
     add_output(parser, "folder of the run")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
     weights = "config paper or inpaint: Stable Diffusion 1.5, or its inpainting model: a folder or hub id"
-    add("--weights", metavar="DIR", help=weights)
-    add("--vgg-weights", metavar="FILE", help="torchvision's vgg16 weights (default: cache or download)")
+    add("--weights", type=path, metavar="DIR", help=weights)
+    add("--vgg-weights", type=path, metavar="FILE", help="torchvision's vgg16 weights (default: cache or download)")
     add("--views", type=count, default=64, metavar="N", help="number of held-out views to score")
     add("--seeds", type=count, default=1, metavar="N", help="evaluate: targets a scene")
     add("--steps", type=count, metavar="N", help="evaluate: steps of a sample (default: the run's own)")
@@ -257,7 +267,7 @@ def view() -> argparse.ArgumentParser:
     add_rendering(parser)
     add_frames(parser, 5)
     add_reading(parser)
-    add("--output", default="output/view.rrd", metavar="FILE", help="recording to write")
+    add("--output", type=path, default="output/view.rrd", metavar="FILE", help="recording to write")
     add("--open", action="store_true", help="open it in the viewer")
     parser.set_defaults(target_set=None)
     return parser

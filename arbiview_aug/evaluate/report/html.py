@@ -50,7 +50,8 @@ def html_report(
         if shown:
             boxes = {row: pictures for (of, row), pictures in (judged or {}).items() if of in (SOURCES, target)}
             parts.append(_target_section(target, rig, done, shown, boxes))
-    return _PAGE.replace("{title}", escape(title)).replace("{body}", "\n".join(parts))
+    page = _PAGE.replace("{title}", escape(title)).replace("{body}", "\n".join(parts))
+    return page.encode(errors="backslashreplace").decode()  # names of files that are not UTF-8
 
 
 def layers(
