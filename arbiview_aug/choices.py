@@ -6,6 +6,7 @@ Nothing else of the package is imported: command lines show the names before any
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any, Literal
@@ -45,7 +46,7 @@ def choice(option: str, value: object, choices: Iterable[str]) -> Any:
     allowed = tuple(choices)
     if isinstance(value, str) and value in allowed:
         return value
-    raise ValueError(f"{option}: expected one of {', '.join(allowed)}, got {value!r}")
+    raise ValueError(f"{option}: expected one of {', '.join(allowed)}, got {reprlib.repr(value)}")
 
 
 def is_number(value: Any) -> bool:
@@ -61,5 +62,5 @@ def is_whole(value: Any, low: float = -math.inf, high: float = math.inf) -> bool
 def checked_stride(name: str, value: Any) -> int:
     """A whole number of pixels from 1; ValueError for anything else."""
     if not is_whole(value, 1):
-        raise ValueError(f"{name}: expected a number of pixels from 1, got {value!r}")
+        raise ValueError(f"{name}: expected a number of pixels from 1, got {reprlib.repr(value)}")
     return int(value)

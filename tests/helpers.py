@@ -7,6 +7,7 @@ import inspect
 import itertools
 import json
 import math
+import os
 import re
 import signal
 from collections import Counter
@@ -141,6 +142,15 @@ def assert_same_to_a_level(got: Any, expected: Any) -> None:
 
 class HangError(BaseException):
     """The time is over; no handler of exceptions catches it."""
+
+
+def latin(folder: Path) -> Path:
+    """A folder in another, whose name is no UTF-8; skips the test where file systems have no such names."""
+    try:
+        (path := folder / os.fsdecode(b"d\xe9p\xf4t")).mkdir()
+    except OSError:
+        pytest.skip("names of files are UTF-8 here")
+    return path
 
 
 @contextmanager

@@ -28,9 +28,9 @@ _RAW = {"digits": "7" * 5000, "deep": "[" * 3000 + "]" * 3000, "circle": "&a [*a
 _LETTERS = st.sampled_from([bytes([letter]) for letter in b'{}[]",:0e9-\x00\xff&*!%'])
 
 
-def nested(depth: int) -> list[Any]:
+def nested(depth: int, *inmost: Any) -> list[Any]:
     """Lists within lists."""
-    value: list[Any] = []
+    value: list[Any] = [*inmost]
     for _ in range(depth):
         value = [value]
     return value

@@ -97,7 +97,7 @@ class RandomRig(Epochs):
         self.base = load_rig(base)
         self._unmasked = self.base.with_cameras([replace(camera, mask=None) for camera in self.base])
         if per not in ("sample", "sequence"):
-            raise CalibrationError(f"RandomRig: per: expected 'sample' or 'sequence', got {per!r}")
+            raise CalibrationError(f"RandomRig: per: expected 'sample' or 'sequence', got {shown(per)}")
         self.per, self.sequence_key = per, sequence_key
         ranges = {
             "yaw_deg": yaw_deg,

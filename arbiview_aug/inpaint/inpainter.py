@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 
 from arbiview_aug.choices import is_number, is_whole
-from arbiview_aug.errors import GeneratorError, SampleError
+from arbiview_aug.errors import GeneratorError, SampleError, shown
 from arbiview_aug.render.rendered import MAP_KEYS, LabelFill, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
 from arbiview_aug.sample.inputs import Frame, read_frames
@@ -243,13 +243,13 @@ def checked_settings(
 ) -> tuple[float, int]:
     """Check settings of an inpainter; ValueError for impossible ones."""
     if steps is not None and not is_whole(steps, 1):
-        raise ValueError(f"steps: expected a whole number from 1, got {steps!r}")
+        raise ValueError(f"steps: expected a whole number from 1, got {shown(steps)}")
     if guidance is not None and not is_number(guidance):
-        raise ValueError(f"guidance: expected a number, got {guidance!r}")
+        raise ValueError(f"guidance: expected a number, got {shown(guidance)}")
     if not is_number(min_confidence) or not 0 <= min_confidence <= 1:
-        raise ValueError(f"min_confidence: expected a number from 0 to 1, got {min_confidence!r}")
+        raise ValueError(f"min_confidence: expected a number from 0 to 1, got {shown(min_confidence)}")
     if not is_whole(seed):
-        raise ValueError(f"seed: expected a whole number, got {seed!r}")
+        raise ValueError(f"seed: expected a whole number, got {shown(seed)}")
     return float(min_confidence), int(seed)
 
 

@@ -34,7 +34,7 @@ from arbiview_aug.cameras.rays import (
     project_rays,
 )
 from arbiview_aug.cameras.rig import Rig, content_order
-from arbiview_aug.errors import SampleError
+from arbiview_aug.errors import SampleError, shown
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.plan import SEAM_ROWS, RenderPlan
 from arbiview_aug.scene.surface import Street
@@ -372,6 +372,6 @@ def _checked_gains(choice: object) -> tuple[float, ...]:
     if not gains or not all(1 / _MAX_GIVEN_GAIN <= gain <= _MAX_GIVEN_GAIN for gain in gains):  # NaN fails too
         raise ValueError(
             "match_exposure: expected a bool or for each camera a gain from "
-            f"{1 / _MAX_GIVEN_GAIN:g} to {_MAX_GIVEN_GAIN:g}, got {choice!r}"
+            f"{1 / _MAX_GIVEN_GAIN:g} to {_MAX_GIVEN_GAIN:g}, got {shown(choice)}"
         )
     return gains

@@ -26,7 +26,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.choices import is_number
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.errors import CalibrationError, shown
 from arbiview_aug.image_ops import FRESH, Memory, level_size
 
 
@@ -64,11 +64,11 @@ def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
     """Raise ValueError for fields of a config outside their (lowest, highest) value, and flags that are no bool."""
     for flag in (one.name for one in fields(config) if isinstance(one.default, bool)):
         if not isinstance(value := getattr(config, flag), bool):
-            raise ValueError(f"{type(config).__name__}.{flag}: expected True or False, got {value!r}")
+            raise ValueError(f"{type(config).__name__}.{flag}: expected True or False, got {shown(value)}")
     for name, (low, high) in ranges.items():
         value = getattr(config, name)
         if not is_number(value) or not low <= value <= high:
-            raise ValueError(f"{type(config).__name__}.{name}: expected {low:g} to {high:g}, got {value!r}")
+            raise ValueError(f"{type(config).__name__}.{name}: expected {low:g} to {high:g}, got {shown(value)}")
 
 
 PRESETS = {

@@ -17,7 +17,7 @@ from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
 from arbiview_aug.cameras.random_rig import names_in
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import SampleError, SampleTypeError, one_line
+from arbiview_aug.errors import SampleError, SampleTypeError, one_line, shown
 from arbiview_aug.sample.batching import check_container, checked_images, entry, leading_shape, split
 from arbiview_aug.sample.masks import CLEANING, dark_rims
 from arbiview_aug.scene.boxes import checked_boxes
@@ -318,7 +318,7 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
             raise SampleError(f"distortion: expected {expected}{hint(sample, ('lens',))}")
         return [("pinhole", ())] * count
     if not isinstance(names, list | tuple) or len(names) != count:
-        raise SampleError(f"lens: expected a list of {count} names, one for each camera, got {names!r}")
+        raise SampleError(f"lens: expected a list of {count} names, one for each camera, got {shown(names)}")
     lenses = [_lens(name, index) for name in names]
     if all(lens in LENSES and LENSES[lens].coefficient_counts == (0,) for lens in lenses):
         return [(lens, ()) for lens in lenses]
@@ -338,10 +338,10 @@ def _lens(name: Any, index: tuple[int, ...]) -> str:
         if isinstance(name, str):
             break
         if not isinstance(name, list | tuple) or not i < len(name):
-            raise SampleError(f"lens: expected a name for each frame of the batch, got {name!r}")
+            raise SampleError(f"lens: expected a name for each frame of the batch, got {shown(name)}")
         name = name[i]
     if not isinstance(name, str):
-        raise SampleTypeError(f"lens: expected names, one for each camera, got {name!r}")
+        raise SampleTypeError(f"lens: expected names, one for each camera, got {shown(name)}")
     return canonical_name(name)
 
 

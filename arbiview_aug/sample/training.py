@@ -11,7 +11,7 @@ import torch
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.choices import checked_stride
-from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.errors import SampleError, SampleTypeError, shown
 from arbiview_aug.sample.boxes_2d import rig_of
 from arbiview_aug.scene.boxes import PIECES, checked_boxes, draw_solids, silhouette_sums, solids
 
@@ -80,7 +80,7 @@ def _check(function: str, sample: Any, least: Any) -> None:
     if not isinstance(sample, Mapping):
         raise SampleTypeError(f"{function}: expected an output of RigRetarget, got {type(sample).__name__}")
     if not isinstance(least, Real):
-        raise ValueError(f"least: expected a share from 0 to 1, got {least!r}")
+        raise ValueError(f"least: expected a share from 0 to 1, got {shown(least)}")
 
 
 def _pooled(seen: torch.Tensor, ignore: torch.Tensor | None, stride: int, least: float) -> torch.Tensor:

@@ -13,7 +13,7 @@ import torch
 
 from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import SampleError, SampleTypeError
+from arbiview_aug.errors import SampleError, SampleTypeError, shown
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, is_readable, lens_names, like, rewrapped, split, stacked
@@ -172,7 +172,7 @@ def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
         is_held = is_held and fill == int(fill)
     if not is_held:
         fix = "give SampleKeys another ignore_index, or the map another type"
-        raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {fill!r}; {fix}")
+        raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {shown(fill)}; {fix}")
     return fill
 
 

@@ -13,7 +13,7 @@ from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.choices import choice, is_number
-from arbiview_aug.errors import SampleError
+from arbiview_aug.errors import SampleError, shown
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.inpaint.continued import Continue, Mean
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY, Black, Inpainter
@@ -58,7 +58,7 @@ class SampleKeys:
         for name in ("labels", "keep", "extra"):
             value = getattr(self, name)
             if not isinstance(value, list | tuple) or not all(isinstance(key, str) for key in value):
-                raise ValueError(f"SampleKeys.{name}: expected names in a list or tuple, got {value!r}")
+                raise ValueError(f"SampleKeys.{name}: expected names in a list or tuple, got {shown(value)}")
             object.__setattr__(self, name, tuple(value))
         if own := {*self.labels} & {*CALIBRATION_KEYS}:
             raise ValueError(f"SampleKeys.labels: expected keys of label maps, got {', '.join(sorted(own))}")
@@ -83,7 +83,9 @@ def render_config(quality: Any) -> Any:
     presets = {**PRESETS, "paper": PaperConfig()}
     if isinstance(quality, str) and quality in presets:
         return presets[quality]
-    raise ValueError(f"quality: expected one of {', '.join(presets)}, a RenderConfig or a PaperConfig, got {quality!r}")
+    raise ValueError(
+        f"quality: expected one of {', '.join(presets)}, a RenderConfig or a PaperConfig, got {shown(quality)}"
+    )
 
 
 def inpainter_of(holes: Any) -> Inpainter:
@@ -120,7 +122,7 @@ def checked_instance(name: str, value: Any, kind: type[T]) -> T:
 def checked_probability(p: Any) -> float:
     """A number from 0 to 1; ValueError for anything else."""
     if not is_number(p) or not 0 <= p <= 1:
-        raise ValueError(f"p: expected a probability from 0 to 1, got {p!r}")
+        raise ValueError(f"p: expected a probability from 0 to 1, got {shown(p)}")
     return float(p)
 
 
@@ -138,7 +140,7 @@ def checked_params(params: Any) -> dict[str, float]:
         return {name: float(value) for name, value in params.items()}  # tensors in a collated batch
     except (AttributeError, TypeError, ValueError, RuntimeError):
         pass
-    raise SampleError(f"params: expected the 'retarget_params' of an output, names and numbers, got {params!r}")
+    raise SampleError(f"params: expected the 'retarget_params' of an output, names and numbers, got {shown(params)}")
 
 
 def checked_pixels(value: Any, name: str = "size", form: str = "(h, w)", least: int = 1) -> tuple[int, int]:
@@ -149,7 +151,7 @@ def checked_pixels(value: Any, name: str = "size", form: str = "(h, w)", least: 
         one = two = -1
     if not least <= min(one, two) <= max(one, two) <= MAX_SIZE_PX:
         limits = f"whole numbers from {least} to {MAX_SIZE_PX}"
-        raise ValueError(f"{name}: expected {form} in pixels, got {value!r}; {limits}")
+        raise ValueError(f"{name}: expected {form} in pixels, got {shown(value)}; {limits}")
     return one, two
 
 

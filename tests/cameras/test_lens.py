@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import get_args
 
@@ -99,6 +100,15 @@ def test_project_agrees_with_opencv_and_with_the_published_formulas(camera: Came
     np.testing.assert_allclose(got.uv, want.reshape(-1, 2), atol=1e-6)
 
 
+def test_infinities_are_not_valid(camera: Camera) -> None:
+    values = (0.0, 1.0, math.inf, -math.inf, math.nan)
+    points = np.array([*itertools.product(values, repeat=3)])
+    with np.errstate(all="ignore"):
+        uv, depth_m, valid = camera.project_cam(points)
+    assert valid.any() and np.isfinite(uv[valid]).all() and np.isfinite(depth_m[valid]).all()
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda camera: camera.name)
 def test_unproject_round_trip(camera: Camera) -> None:
     grid = camera.resize((60, 80)).pixel_grid()
     rays = camera.resize((60, 80)).unproject(grid)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -43,6 +44,8 @@ def test_a_sector_has_no_column_at_its_end() -> None:
         ({"name": ""}, "lidar name: expected a non-empty string"),
         ({"elevations_deg": ()}, "lidar 'top': elevations_deg: expected 1 to 1024 elevations"),
         ({"elevations_deg": (0.0,) * 10_000}, "elevations_deg: expected 1 to 1024"),
+        ({"elevations_deg": range(10**12)}, "elevations_deg: expected 1 to 1024"),
+        ({"elevations_deg": itertools.repeat(0.0)}, "elevations_deg: expected 1 to 1024"),
         ({"elevations_deg": (0.0, float("nan"))}, "elevations_deg: expected 1 to 1024"),
         ({"elevations_deg": (95.0,)}, "elevations_deg: expected 1 to 1024 elevations from -90 to 90"),
         ({"elevations_deg": 3}, "elevations_deg"),

@@ -13,6 +13,9 @@ import pytest
 import torch
 
 from arbiview_aug import CalibrationError, Camera, RandomRig, Rig, SampleError, load_rig
+from arbiview_aug.errors import SampleTypeError
+from arbiview_aug.sample.inputs import Frame
+from tests.mutations import nested
 
 NEUTRAL = {
     "yaw_deg": 0.0,
@@ -148,6 +151,42 @@ def test_batches_of_sequences() -> None:
     for more in ({}, {"scene_token": None}, {"scene_token": ["a", None]}):
         with pytest.raises(SampleError, match=r"expected 'scene_token' in the sample, .*, got images, token"):
             random_rig.draw_for({"images": 0, "token": 0} | more)
+
+
+CIRCLE: list[Any] = ["a"]
+CIRCLE.append(CIRCLE)
+
+
+@pytest.mark.parametrize("name", [CIRCLE, nested(100_000, "a"), b"a", np.str_("a"), np.array("a"), {"b": np.int64(1)}])
+def test_names_however_nested(name: Any) -> None:
+    random_rig = by_sequence()
+    assert random_rig.draw_for({"scene_token": name}) == random_rig.draw_for({"scene_token": copy.copy(name)})
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        object(),
+        {"a": object()},
+        {"a", "b"},
+        lambda: 0,
+        {"a": CIRCLE},
+        {"a": nested(100_000)},
+        torch.zeros(2).to("meta"),
+    ],
+    ids=["object", "in a dict", "set", "function", "circle", "deep", "meta"],
+)
+def test_what_has_another_text_in_each_process_names_nothing(name: Any) -> None:
+    with pytest.raises(SampleTypeError, match="scene_token: expected"):
+        by_sequence().draw_for({"scene_token": name})
+    with pytest.raises(SampleTypeError, match="token: expected"):
+        Frame((), load_rig("waymo"), {"token": name}).name("token")
+
+
+@pytest.mark.parametrize("epoch", [math.nan, 1.5, 2**70, -(2**70), "1", None, True])
+def test_epochs_are_whole_numbers(epoch: Any) -> None:
+    with pytest.raises(ValueError, match="set_epoch: expected a whole number below"):
+        by_sequence().set_epoch(epoch)
 
 
 @pytest.mark.parametrize(

@@ -188,6 +188,13 @@ def detect(rgb):
     h, w = rgb.shape[:2]
     return [[0, 0, w / 2, h]], [0.6], ["car"]
 
+def blank(rgb):
+    rgb[:] = 0
+    return [], [], []
+
+def leave(rgb):
+    raise SystemExit(0)
+
 def wrong(rgb):
     return [[0, 0, 1, 1]], [0.6]
 
@@ -214,6 +221,13 @@ def test_judges_of_a_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     page = (tmp_path / "report.html").read_text()
     assert all(f">{name}: judged<" in page for name in ("nearest source camera", "fast, infinity, continue", "truth"))
     assert "Labelled objects that the detector finds" in page
+
+
+def test_a_judge_that_writes_into_its_image_changes_no_number(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(JUDGES)
+    asked = ["--size", "24x66", "--geometry", "infinity"]
+    judged = run([*asked, "--detector", f"{tmp_path}/own.py:blank"], tmp_path)
+    assert judged["views"] == run(asked, tmp_path)["views"]
 
 
 def test_a_method_that_declines_a_frame_is_in_no_table(
@@ -263,7 +277,11 @@ def test_rows_do_not_depend_on_other_rows(tmp_path: Path) -> None:
 
 def test_judges_are_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "own.py").write_text(JUDGES)
-    for function, message in (("none", "expected a function none"), ("wrong", "expected boxes (n, 4) x0 y0 x1 y1")):
+    for function, message in (
+        ("none", "expected a function none"),
+        ("wrong", "expected boxes (n, 4) x0 y0 x1 y1"),
+        ("leave", "raised SystemExit: 0 for an image"),
+    ):
         judge = ["--detector", f"{tmp_path}/own.py:{function}", "--size", "24x66", "--geometry", "infinity"]
         assert main(["evaluate", *judge, "--output", str(tmp_path)]) == 2
         error = capsys.readouterr().err

@@ -23,11 +23,13 @@ import pytest
 from arbiview_aug import __main__, environment, load_rig
 from arbiview_aug.__main__ import COMMANDS, Command, main
 from arbiview_aug.choices import TRAINING_PRESETS, GeometryName, Quality
-from arbiview_aug.cli import parallel
+from arbiview_aug.cli import parallel, parsers
+from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.errors import OutputError
 from arbiview_aug.generator.training.config import CONFIGS
 from arbiview_aug.render.plan import PRESETS
 from arbiview_aug.scene.scene import GEOMETRIES
+from tests.helpers import latin, street_sample
 
 
 @pytest.fixture(autouse=True)
@@ -133,11 +135,11 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         *((f"{name} nuscenes:frame", "expected a nuScenes root .*; it is a frame folder") for name in DATA_COMMANDS),
         ("check py123d:frame", "expected a folder of py123d's logs .*found none"),
         ("check py123d:logs", r"py123d is not installed: pip install 'arbiview_aug\[py123d\]'"),
-        *((f"{name} {LONG}", "expected a (folder|file or)") for name in DATA_COMMANDS),
-        *((f"{name} {kind}:{LONG}", "expected a folder") for name in DATA_COMMANDS for kind in ("frames", "nuscenes")),
+        *((f"{name} {LONG}", "expected a name that a file can have") for name in DATA_COMMANDS),
+        *((f"{name} nuscenes:{LONG}", "expected a name that a file can have") for name in DATA_COMMANDS),
         *((f"{name} loop", "expected a (folder|file or)") for name in DATA_COMMANDS),
-        (f"demo --output {LONG}/{LONG}", "expected a folder that can be written to, got File name too long"),
-        *((f"demo --target {name}", "expected a file or one of the shipped rigs") for name in (LONG, "loop.yaml")),
+        (f"demo --output {'x/' * 3000}", "expected a folder that can be written to, got File name too long"),
+        ("demo --target loop.yaml", "expected a file or one of the shipped rigs"),
         *((f"demo --output {name}", "expected a folder that can be written to") for name in ("loop", "loop/a.png")),
         ("convert --data frame --target waymo --output loop", "expected a folder, got a file or a link"),
         ("inspect large.yaml", r"a file of 23\.8 MiB, more than 1\.0 MiB"),
@@ -184,6 +186,52 @@ def test_mistakes_are_one_line(command: str, message: str, capsys: pytest.Captur
     said = capsys.readouterr()
     assert re.search(message, said.err.splitlines()[-1]) and "Traceback" not in said.err
     assert said.err.startswith("usage") or len(said.err.splitlines()) == 1
+
+
+PATH_METAVARS = ("PATH", "DIR", "FOLDER", "FILE", "RIG", "MODEL", "NEXT", "DATA", "ID_OR_PATH", "NAME")
+
+
+@pytest.mark.parametrize("command", sorted({*COMMANDS, *BENCHMARKS} - {"bench"}))
+def test_every_option_that_names_a_file_refuses_what_no_file_is_called(command: str) -> None:
+    parser = getattr(parsers, command)()
+    options = [action for action in parser._actions if str(action.metavar).rpartition("]")[2] in PATH_METAVARS]
+    options = [action for action in options if action.dest not in ("device", "command")]
+    assert options or command == "doctor"
+    for action in options:
+        for wrong in ("", LONG, f"a/{LONG}", "a\0b", "\ud800"):
+            assert action.type is not None, action.dest
+            with pytest.raises(argparse.ArgumentTypeError, match="expected a name that a file can have, of 1 to 255"):
+                action.type(wrong)
+        assert str(action.type(os.fsdecode(b"d\xe9/x.py:f"))) == os.fsdecode(b"d\xe9/x.py:f")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "inspect DATA --output OUT/a.png",
+        "check DATA --output OUT",
+        "demo --data DATA --target waymo --size 24x36 --output OUT",
+        "evaluate --data DATA --target waymo --size 24x36 --geometry infinity --output OUT",
+        *(
+            pytest.param(more, marks=pytest.mark.slow)
+            for more in (
+                "convert --data DATA --target waymo --size 24x36 --workers 1 --output PLAIN",
+                "depth --data DATA --output OUT",
+                "view DATA --target waymo --size 24x36 --output OUT/a.rrd",
+                "bench loader --data DATA --size 24x36 --workers 0 --frames 2 --epochs 1 --output OUT/a.json",
+            )
+        ),
+    ],
+)
+def test_folders_that_are_not_utf_8(command: str, tmp_path: Path) -> None:
+    """In processes of their own, which OpenCV would end."""
+    root = latin(tmp_path)
+    write_frame(root / "data", street_sample((48, 72)))
+    names = {"DATA": f"{root}/data", "OUT": f"{root}/out", "PLAIN": f"{tmp_path}/plain"}
+    words = [re.sub("^(DATA|OUT|PLAIN)", lambda found: names[found[0]], word) for word in command.split()]
+    done = subprocess.run([sys.executable, "-m", "arbiview_aug", *words], capture_output=True, check=False)
+    assert done.returncode in ((0, 1) if words[0] in ("check", "depth") else (0,)), done.stderr.decode()[-2000:]
+    assert b"Traceback" not in done.stderr
 
 
 def test_killed_workers_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

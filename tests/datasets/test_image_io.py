@@ -12,9 +12,10 @@ import pytest
 import torch
 
 from arbiview_aug.datasets import image_io as images_module
-from arbiview_aug.datasets.image_io import decode_images, reduced_camera
+from arbiview_aug.datasets.image_io import decode_images, decode_view_masks, reduced_camera
 from arbiview_aug.errors import DataError
-from tests.helpers import camera
+from arbiview_aug.evaluate.report.pictures import save_picture
+from tests.helpers import camera, latin
 
 
 def ramp(height_px: int, width_px: int) -> np.ndarray:
@@ -197,6 +198,33 @@ def test_bad_files(tmp_path: Path, suffix: str, damage: Callable[[Any], Any] | N
     with pytest.raises(DataError, match=rf"camera 'left': image .*left\{suffix}: .*{re.escape(message)}") as caught:
         decode_images([file], names=["left"])
     assert str(caught.value).count("camera 'left'") == 1
+
+
+@pytest.mark.timeout(20)
+def test_view_masks_that_are_no_images(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.png")
+    (tmp_path / "text.png").write_text("none")
+    (tmp_path / "empty.png").touch()
+    for name in ("pipe", "text", "empty", "none"):
+        with pytest.raises(DataError, match="camera 'left': coverage: expected"):
+            decode_view_masks({"coverage": [tmp_path / f"{name}.png"]}, names=["left"], sizes=[(4, 6)])
+
+
+@pytest.mark.parametrize("reduce", [1, 2])
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_paths_that_are_not_utf_8(tmp_path: Path, suffix: str, reduce: Any) -> None:
+    """OpenCV's own functions crash on them."""
+    plain = write(tmp_path / f"a{suffix}", ramp(90, 160))
+    file = latin(tmp_path) / f"a{suffix}"
+    file.write_bytes(plain.read_bytes())
+    decoded, expected = (decode_images([path], reduce=reduce) for path in (file, plain))
+    assert torch.equal(decoded, expected)  # type: ignore[arg-type]
+    picture = ramp(8, 9)
+    save_picture(file, picture)
+    if suffix == ".png":
+        assert torch.equal(decode_images([file])[0].permute(1, 2, 0), torch.from_numpy(picture))
+        seen = decode_view_masks({"coverage": [file]}, names=["a"], sizes=[(8, 9)])["coverage"]
+        assert seen.shape == (1, 8, 9)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

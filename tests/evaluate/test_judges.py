@@ -15,6 +15,7 @@ from arbiview_aug.evaluate.judges import LEAST_SCORE, SEGMENTED, is_road_user, l
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (90, 160, 3), np.uint8)
 ONE = "[[10, 20, 30, 40]], [0.9]"
+EXITS = "type('Boxes', (), {'__array__': lambda *_, **__: exit(0)})()"
 
 
 @pytest.fixture
@@ -76,6 +77,9 @@ def test_classes_that_count(file: Callable[[str], str]) -> None:
         ("[[1, 2, 3, 4]], [0.5], [float('inf')]", "got other values"),
         ("[torch.ones(4, requires_grad=True)], [0.5], [0]", "got other values"),
         ("rgb.missing", "raised AttributeError: 'numpy.ndarray' object has no attribute 'missing' for an image"),
+        ("exit(0)", "raised SystemExit: 0 for an image"),
+        ("(_ for _ in ()).throw(GeneratorExit)", "raised GeneratorExit"),
+        (f"{EXITS}, [0.5], [0]", "raised SystemExit: 0 for an image"),
     ],
 )
 def test_detections_of_other_shapes(file: Callable[[str], str], expression: str, message: str) -> None:
@@ -96,13 +100,21 @@ def test_files_without_a_function(load: Callable[[str], object], file: Callable[
             load(name.replace(":judge", f":{missing}"))
     with pytest.raises(DataError, match=r"importing .*own\.py raised ModuleNotFoundError: No module named 'nowhere'"):
         load(file("1", "import nowhere"))
-    with pytest.raises(DataError, match=r"importing .*own\.py raised SystemExit: 3"):
-        load(file("1", "raise SystemExit(3)"))
+    for head, raised in (
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("raise GeneratorExit", "GeneratorExit"),
+        ("def __getattr__(name): exit(0)", "SystemExit: 0"),
+    ):
+        with pytest.raises(DataError, match=rf"importing .*own\.py raised {raised}"):
+            load(file("1", head).replace(":judge", ":missing" if "getattr" in head else ":judge"))
 
 
 def test_a_segmenter_of_a_file(file: Callable[[str], str]) -> None:
     masks = load_segmenter(file("np.stack([rgb[..., 0] > 9, rgb[..., 1] > 9])"))(IMAGE)
     assert masks.dtype == np.bool_ and np.array_equal(masks, IMAGE.transpose(2, 0, 1)[:2] > 9)
+    for exits in ("exit(0)", EXITS):
+        with pytest.raises(DataError, match=r"--segmenter .*: raised SystemExit: 0 for an image"):
+            load_segmenter(file(exits))(IMAGE)
     wrong_ones = {"rgb[..., 0] > 9": "bool (90, 160)", "rgb.transpose(2, 0, 1)[:2]": "uint8", "None": "NoneType"}
     for wrong, got in wrong_ones.items():
         with pytest.raises(DataError, match=r"--segmenter .*expected masks \(2, 90, 160\).*got " + re.escape(got)):

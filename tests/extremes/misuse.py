@@ -45,6 +45,7 @@ JUNK: tuple[Callable[[], Any], ...] = (
     lambda: torch.zeros(2, 3, *SIZE).to(torch.float8_e5m2),
     lambda: torch.zeros(2, 3, 3, dtype=torch.complex64),
     lambda: torch.eye(4).expand(2, 4, 4),
+    *(lambda: np.array(3.0), lambda: np.eye(4)[::-1], lambda: np.ones((2, 5, 3), np.float32)[:, ::-1]),
 )
 """Values that no key expects, made anew each time."""
 
@@ -54,7 +55,13 @@ TENSOR_CHANGES: tuple[Callable[[torch.Tensor], Any], ...] = (
     *(lambda t: t.flip(0) if t.ndim else t, lambda t: t[0] if t.ndim and len(t) else t),
     *((lambda t, dtype=dtype: t.to(dtype)) for dtype in (torch.half, torch.bfloat16, torch.double, torch.int64)),
     *((lambda t, dtype=dtype: t.to(dtype)) for dtype in (torch.float8_e4m3fn, torch.bool, torch.complex64)),
-    *(lambda t: t.to("meta"), lambda t: t.numpy(), lambda t: t.tolist(), lambda t: list(t.unbind(0)) if t.ndim else t),
+    *(
+        lambda t: t.to("meta"),
+        lambda t: t.numpy(),
+        lambda t: np.flip(t.numpy()),
+        lambda t: t.tolist(),
+        lambda t: list(t.unbind(0)) if t.ndim else t,
+    ),
     *(lambda t: t.float().requires_grad_(), lambda t: t.float() * -1, lambda t: t.float() * 1e30),
     *(lambda t: t.float() * 1e-30, lambda t: t.float() + float("nan")),
     lambda t: t.float().index_fill(0, torch.tensor([0]), float("inf")) if t.ndim and len(t) else t,

@@ -33,7 +33,7 @@ from arbiview_aug.transforms.warm_up import compile_kernels
 from tests.extremes import misuse
 from tests.extremes.conftest import Worst
 from tests.helpers import examples, limited
-from tests.mutations import HANG_S, mutated_json, works
+from tests.mutations import HANG_S, mutated_json, nested, works
 
 TARGET = misuse.rig(spread_deg=30.0).shifted(z_m=0.3)
 GROWTH_KB = 1024**2  # of the process's peak memory: 1 GiB beyond what the tests before it needed
@@ -95,6 +95,16 @@ def test_mutated_calibrations(frame_folder: Path, worst: Worst, text: bytes, yam
 @examples(50, 500, sample=misuse.wrong_samples())
 def test_mutated_samples_are_checked(sample: dict[str, Any]) -> None:
     works(lambda: str(find_mistakes(sample)))
+
+
+@pytest.mark.parametrize("key", ["lens", "K", "images", "token", "boxes_3d", "points", "detections"])
+def test_values_too_deep_to_print(key: str) -> None:
+    sample = {"images": torch.zeros(2, 3, *misuse.SIZE), "K": torch.eye(3), "cam2ego": torch.eye(4)}
+    for value in (nested(100_000), [nested(100_000, "a")] * 2):
+        with pytest.raises(ArbiviewError):
+            RigRetarget(TARGET, geometry="boxes")({**sample, key: value})
+        with pytest.raises(ValueError, match="expected"):
+            RigRetarget(TARGET, quality=value)  # type: ignore[arg-type]
 
 
 def test_samples_that_hold_themselves() -> None:

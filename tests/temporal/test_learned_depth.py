@@ -42,6 +42,7 @@ class Oracle:
             seen = self.truth[view.image.numpy().tobytes()] * (self.assumed_px or view.focal_px) / view.focal_px
             scale_px = view.focal_px if self.assumed_px is not None else None
             predictions.append(Prediction(self.form(seen).astype(np.float32), self.output, scale_px))
+            view.image.zero_()  # a copy: the truth knows the images by their bytes
         return predictions
 
 

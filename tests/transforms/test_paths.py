@@ -241,6 +241,20 @@ def test_what_an_inpainter_made_is_checked(made: Callable[[Any], Any]) -> None:
         CompletedLoader([], "telea")  # type: ignore[arg-type]
 
 
+def test_an_inpainter_that_writes_into_its_views_changes_holes_alone() -> None:
+    class Own(Inpainter):
+        def inpaint(self, views: Any, holes: Any, seeds: Any) -> Any:
+            filled = [view.clone().fill_(7) for view in views]
+            for tensor in (*views, *holes):
+                tensor.zero_()
+            return filled
+
+    seen, out = (RigRetarget(TARGET, holes=holes)(a_sample()) for holes in ("black", Own()))
+    shown = on(seen["coverage"], out["images"])
+    assert torch.equal(out["generated"], ~seen["coverage"]) and out["generated"].any()
+    assert torch.equal(out["images"], torch.where(shown, seen["images"], 7))
+
+
 def test_a_generator_on_the_cpu_works_in_workers(generator: Generator) -> None:
     retarget = RigRetarget(TARGET, holes=Diffusion(generator, steps=1))
     data = [a_sample(f"frame {k}", k) for k in range(2)]

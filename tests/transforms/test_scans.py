@@ -55,6 +55,19 @@ def test_points_are_those_of_the_target(sample: dict[str, Any]) -> None:
     assert "top (2160 rays)" in str(RigRetarget(target()).explain(sample))
 
 
+@pytest.mark.parametrize(
+    "as_sweep", [lambda p: p.numpy()[::-1], lambda p: np.asarray(p, order="F"), lambda p: p.double()]
+)
+def test_sweeps_in_any_memory_layout(sample: dict[str, Any], as_sweep: Any) -> None:
+    points = sample["points"]
+    expected = retarget_points(points, target(), sweeps=[points.flip(0)]).points
+    for given in (points, points.numpy()):
+        assert len(retarget_points(given, target(), sweeps=[as_sweep(points)]).points) == len(expected)
+        for none in (np.array(3.0), [np.array(3.0)]):
+            with pytest.raises((SampleError, SampleTypeError), match="sweeps"):
+                retarget_points(given, target(), sweeps=none)  # type: ignore[arg-type]
+
+
 def test_points_pass_without_scanners(sample: dict[str, Any]) -> None:
     out = RigRetarget(target(lidars=()))(sample)
     assert out["points"] is sample["points"] and "point_rings" not in out and "num_points" not in out

@@ -49,6 +49,12 @@ def test_v2s_own_resize_leaves_k_wrong(sample: dict) -> None:
     assert torch.allclose(right["K"], torch.from_numpy(TARGET.resized((32, 88), "crop").K))
 
 
+def test_a_module_that_writes_into_its_images_leaves_the_sample(sample: dict) -> None:
+    before = {**sample, "images": sample["images"].float() / 255}
+    out = OnImages(lambda images: images.mul_(0))(before)
+    assert not out["images"].any() and before["images"].any()
+
+
 def test_kornias_image_sequential(sample: dict) -> None:
     """Known again by inverting; black holes stay black; one draw for all cameras where it is asked for."""
     expected = RigRetarget(TARGET, geometry="infinity", holes="black")(sample)
