@@ -181,28 +181,24 @@ def _range(name: str, value: Any) -> tuple[float, float]:
 def names_in(key: str, value: Any) -> list[str | None]:
     """Names of sequences or frames in nested lists, tensors and arrays, as in a collated batch, and None where it is.
 
-    A container that holds itself is read once. SampleError for values without a text that is theirs in all processes.
+    A container that holds itself is read once. SampleTypeError for values without a text that is theirs in all
+    processes.
     """
     names: list[str | None] = []
     seen: dict[int, Any] = {}
     waiting = [value]
     while waiting:
         entry = waiting.pop()
-        if isinstance(entry, torch.Tensor) and (entry.device.type == "meta" or entry.layout != torch.strided):
-            raise SampleTypeError(f"{key}: expected names, got tensors without values")
-        if isinstance(entry, torch.Tensor | np.ndarray):
-            entry = entry.tolist()
-        if isinstance(entry, list | tuple):
-            if id(entry) not in seen:
+        try:
+            entry = entry.tolist() if isinstance(entry, torch.Tensor | np.ndarray) else entry
+            if isinstance(entry, list | tuple):
+                waiting += () if id(entry) in seen else reversed(entry)
                 seen[id(entry)] = entry
-                waiting += reversed(entry)
-        elif entry is None or isinstance(entry, str | bytes | Number | np.generic):
-            names.append(None if entry is None else str(entry))
-        else:
-            try:
+            elif entry is None or isinstance(entry, str | bytes | Number | np.generic):
+                names.append(None if entry is None else str(entry))
+            else:
                 names.append(json.dumps(entry, sort_keys=True, default=lambda part: part.tolist()))
-            except (AttributeError, TypeError, ValueError, RuntimeError):  # not plain data, or in a circle
-                expected = "text or a number, the same in all processes"
-                got = f"{type(entry).__name__}; pass its text"
-                raise SampleTypeError(f"{key}: expected a name, {expected}, got {got}") from None
+        except (AttributeError, TypeError, ValueError, RuntimeError):  # no plain data, a circle, or on meta
+            expected = "names: text or numbers, the same in all processes"
+            raise SampleTypeError(f"{key}: expected {expected}, got {type(entry).__name__}; pass its text") from None
     return names

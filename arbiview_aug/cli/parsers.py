@@ -141,12 +141,8 @@ def depth() -> argparse.ArgumentParser:
     )
     add_data(parser)
     add = parser.add_argument
-    add(
-        "--output",
-        type=path,
-        metavar="FOLDER",
-        help="where to write (default: motion_depth or learned_depth beside the data)",
-    )
+    output = "where to write (default: motion_depth or learned_depth beside the data)"
+    add("--output", type=path, metavar="FOLDER", help=output)
     add("--workers", type=count, default=1, metavar="N", help="processes")
     add("--model", type=path, metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub")
     add("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... (default: the GPU, if there is one)")
