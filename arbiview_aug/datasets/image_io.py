@@ -27,8 +27,7 @@ from arbiview_aug.sample.batching import stacked
 
 ByteArray = npt.NDArray[np.uint8]
 
-MOST_BYTES = 1 << 28
-"""Largest image file, 256 MiB: more than an uncompressed PNG of 9,000 by 9,000 pixels."""
+_MOST_BYTES = 1 << 28  # of an image file: more than 9,000 by 9,000 pixels take, uncompressed
 
 # The reduced flags without their BGR bit, which excludes IMREAD_COLOR_RGB.
 _REDUCED_FLAGS = {
@@ -192,7 +191,7 @@ def decode_grey(path: Path, label: str) -> ByteArray:
 
 def _content(path: Path, label: str) -> bytes:
     try:
-        return read_bytes(path, MOST_BYTES)
+        return read_bytes(path, _MOST_BYTES)
     except FileNotFoundError:
         raise DataError(f"{label}: expected an image file, found none; check the path and the data root") from None
     except OSError as error:

@@ -218,7 +218,7 @@ def test_every_option_that_names_a_file_refuses_what_no_file_is_called(command: 
                 "convert --data DATA --target waymo --size 24x36 --workers 1 --output PLAIN",
                 "depth --data DATA --output OUT",
                 "view DATA --target waymo --size 24x36 --output OUT/a.rrd",
-                "bench --data DATA --size 24x36 --repeats 1 --quality fast --downscale 4 --geometry street --output OUT",
+                "bench --data DATA --size 24x36 --repeats 1 --quality fast --geometry street --output OUT",
             )
         ),
     ],
