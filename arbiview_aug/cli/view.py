@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,6 +24,7 @@ from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.datasets.image_io import encoded_image
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import views_of
 from arbiview_aug.evaluate.report.pictures import BOX, HOLE, RIG_COLOURS, box_lines, left_to_right
@@ -48,6 +50,8 @@ _MAPS = ("boxes", "coverage", "confidence")  # over a camera's image, in two dim
 def run(arguments: argparse.Namespace) -> int:
     """Write the recording; with ``--open`` show it, and return the viewer's exit status."""
     path = output_file(arguments.output, [".rrd"])
+    if re.search("[\ud800-\udfff]", arguments.output):
+        raise DataError(f"--output {arguments.output!a}: expected a name in UTF-8, which Rerun's writer needs")
     optional_package("rerun", "viewer")  # before work starts
     chosen = None if arguments.target is None else load_rig(arguments.target)
     notes: list[str] = []

@@ -161,6 +161,7 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("evaluate --steps 3", "argument --steps: expected it with --holes diffusion"),
         *((f"train --{option} 3", f"argument --{option}: train reads none") for option in ("views", "steps", "seeds")),
         ("train evaluate --vgg-weights a", "argument --vgg-weights: evaluate reads none"),
+        ("view --output d\udce9/a.rrd", "expected a name in UTF-8, which Rerun's writer needs"),
         ("view --output a.mp4", r"expected a name ending in \.rrd, got 'a\.mp4'"),
         *(
             (f"depth --data frame --{option}", f"argument --{option.split()[0]}: expected it with --model alone")
@@ -217,7 +218,7 @@ def test_every_option_that_names_a_file_refuses_what_no_file_is_called(command: 
             for more in (
                 "convert --data DATA --target waymo --size 24x36 --workers 1 --output PLAIN",
                 "depth --data DATA --output OUT",
-                "view DATA --target waymo --size 24x36 --output OUT/a.rrd",
+                "view DATA --target waymo --size 24x36 --output PLAIN/a.rrd",
                 "bench --data DATA --size 24x36 --repeats 1 --quality fast --geometry street --output OUT",
             )
         ),
