@@ -145,7 +145,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
 def add_lidar(parser: argparse.ArgumentParser) -> None:
     """Add ``--lidar-channel`` and ``--lidar-columns``."""
     text = "nuScenes: the LiDAR to read (default: LIDAR_TOP, or the only one)"
-    parser.add_argument("--lidar-channel", metavar="NAME", help=text)
+    parser.add_argument("--lidar-channel", type=path, metavar="NAME", help=text)
     text = (
         "nuScenes: columns of LiDAR files without a header, such as x y z intensity, float32 or with a type as in "
         "ring:uint16 (default: x y z intensity ring)"
