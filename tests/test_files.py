@@ -50,7 +50,7 @@ def with_pipe(folder: Path, name: str = "config.json") -> Path:
 )
 def test_pipes_among_weights_are_refused(load: Callable[[Path], object], tmp_path: Path) -> None:
     """They would be waited for."""
-    with pytest.raises(ArbiviewError, match="pipe|expected a generator's folder"):
+    with pytest.raises(ArbiviewError, match=r"pipe|expected a generator's folder"):
         load(tmp_path)
 
 

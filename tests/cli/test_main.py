@@ -192,7 +192,7 @@ def test_mistakes_are_one_line(command: str, message: str, capsys: pytest.Captur
 PATH_METAVARS = ("PATH", "DIR", "FOLDER", "FILE", "RIG", "MODEL", "NEXT", "DATA", "ID_OR_PATH", "NAME")
 
 
-@pytest.mark.parametrize("command", sorted({*COMMANDS, *BENCHMARKS} - {"bench"}))
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_option_that_names_a_file_refuses_what_no_file_is_called(command: str) -> None:
     parser = getattr(parsers, command)()
     options = [action for action in parser._actions if str(action.metavar).rpartition("]")[2] in PATH_METAVARS]
@@ -218,8 +218,8 @@ def test_every_option_that_names_a_file_refuses_what_no_file_is_called(command: 
             for more in (
                 "convert --data DATA --target waymo --size 24x36 --workers 1 --output PLAIN",
                 "depth --data DATA --output OUT",
-                "view DATA --target waymo --size 24x36 --output OUT/a.rrd",
-                "bench loader --data DATA --size 24x36 --workers 0 --frames 2 --epochs 1 --output OUT/a.json",
+                "view DATA --target waymo --size 24x36 --output PLAIN/a.rrd",
+                "bench --data DATA --size 24x36 --repeats 1 --quality fast --geometry street --output OUT",
             )
         ),
     ],

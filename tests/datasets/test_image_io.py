@@ -219,7 +219,7 @@ def test_paths_that_are_not_utf_8(tmp_path: Path, suffix: str, reduce: Any) -> N
     file.write_bytes(plain.read_bytes())
     decoded, expected = (decode_images([path], reduce=reduce) for path in (file, plain))
     assert torch.equal(decoded, expected)  # type: ignore[arg-type]
-    picture = ramp(8, 9)
+    picture = ramp(8, 9).astype(np.uint8)
     save_picture(file, picture)
     if suffix == ".png":
         assert torch.equal(decode_images([file])[0].permute(1, 2, 0), torch.from_numpy(picture))
