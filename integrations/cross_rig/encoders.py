@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 STRIDE = 4
 """Pixels of an image along a side of a feature."""
-
-Backbone = Literal["small", "resnet34"]
 
 
 def conv(into: int, out: int, *, stride: int = 1, dilation: int = 1) -> nn.Sequential:
@@ -24,7 +20,7 @@ def conv(into: int, out: int, *, stride: int = 1, dilation: int = 1) -> nn.Seque
 
 
 class Residual(nn.Module):
-    """A convolution beside the identity."""
+    """A convolution and the identity."""
 
     def __init__(self, channels: int, *, dilation: int = 1) -> None:
         super().__init__()
@@ -48,26 +44,3 @@ class SmallEncoder(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         fine = self.fine(x)
         return torch.relu(fine + F.interpolate(self.merge(self.coarse(fine)), fine.shape[-2:], mode="bilinear"))
-
-
-class ResNetEncoder(nn.Module):
-    """torchvision's ResNet-34 without pretrained weights, strides 4 to 16 merged: (T, 3, h, w) to (T, 64, h/4, w/4)."""
-
-    channels = 64
-
-    def __init__(self) -> None:
-        super().__init__()
-        from torchvision.models import resnet34
-
-        net = resnet34(weights=None)
-        self.stem = nn.Sequential(net.conv1, net.bn1, net.relu, net.maxpool, net.layer1)
-        self.layer2, self.layer3 = net.layer2, net.layer3
-        self.merge2, self.merge3 = nn.Conv2d(128, 64, 1), nn.Conv2d(256, 64, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        fine = self.stem(x)
-        middle = self.layer2(fine)
-        merged = fine
-        for merge, features in ((self.merge2, middle), (self.merge3, self.layer3(middle))):
-            merged = merged + F.interpolate(merge(features), fine.shape[-2:], mode="bilinear")
-        return torch.relu(merged)

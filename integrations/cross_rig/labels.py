@@ -46,25 +46,12 @@ class Grid:
         return np.stack(np.meshgrid(axis, axis, indexing="ij"), -1)
 
 
-@dataclass(frozen=True)
-class BoxCells:
-    """Labels of a frame.
-
-    Attributes:
-        state: (cells, cells) uint8 ``FREE``, ``VEHICLE`` or ``HIDDEN``.
-        height_dm: (cells, cells) uint8, the vehicle's height in decimetres; 0 where there is none.
-    """
-
-    state: Cells
-    height_dm: Cells
-
-
 def box_cells(
     grid: Grid,
     boxes: npt.NDArray[np.floating],
     classes: npt.NDArray[np.integer],
     visible: npt.NDArray[np.bool_],
-) -> BoxCells:
+) -> Cells:
     """The cells whose centres lie in vehicles' footprints.
 
     Args:
@@ -72,9 +59,12 @@ def box_cells(
         boxes: (B, 7) centre x y z, length, width, height, yaw; ego frame.
         classes: (B,) ``BoxClass``.
         visible: (B,) whether the rig sees the object.
+
+    Returns:
+        (cells, cells) uint8 ``FREE``, ``VEHICLE`` or ``HIDDEN``.
     """
     x, y = np.moveaxis(grid.centres(), -1, 0)
-    state, height = (np.zeros((grid.cells, grid.cells), np.uint8) for _ in range(2))
+    state = np.zeros((grid.cells, grid.cells), np.uint8)
     for box, is_visible in sorted(
         ((box, seen) for box, cls, seen in zip(boxes, classes, visible, strict=True) if cls in VEHICLES),
         key=lambda pair: pair[1],  # where footprints touch, the visible one has the cell
@@ -83,8 +73,7 @@ def box_cells(
         dx, dy = x - box[0], y - box[1]
         inside = (np.abs(c * dx + s * dy) <= box[3] / 2) & (np.abs(c * dy - s * dx) <= box[4] / 2)
         state[inside] = VEHICLE if is_visible else HIDDEN
-        height[inside] = min(255, round(10 * float(box[5])))
-    return BoxCells(state, height)
+    return state
 
 
 def visible_objects(pixels: npt.NDArray[np.integer], size: tuple[int, int]) -> npt.NDArray[np.bool_]:

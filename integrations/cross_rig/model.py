@@ -12,12 +12,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from integrations.cross_rig.boxes import BOX_CHANNELS
-from integrations.cross_rig.encoders import Backbone, ResNetEncoder, SmallEncoder, conv
+from integrations.cross_rig.encoders import SmallEncoder, conv
 from integrations.cross_rig.families import FAMILIES, Batch
 from integrations.cross_rig.labels import Grid
 
 _MEAN, _STD = 0.45, 0.25
 """Mean and deviation of the images in [0, 1]."""
+_WIDTH = 48
+"""Width of the map."""
 _PRIOR_LOGIT = -3.3
 """Logit of the 3.5 % of covered cells that hold a vehicle: training need not find that out first."""
 
@@ -64,15 +66,13 @@ class Detector(nn.Module):
     Args:
         grid: Grid of the labels.
         family: One of ``FAMILIES``.
-        backbone: ``small``, or ``resnet34`` for a GPU.
     """
 
-    def __init__(self, grid: Grid, family: str = "voxels", backbone: Backbone = "small") -> None:
+    def __init__(self, grid: Grid, family: str = "voxels") -> None:
         super().__init__()
-        self.encoder: nn.Module = SmallEncoder() if backbone == "small" else ResNetEncoder()
-        width = 48 if backbone == "small" else 128
-        self.family = FAMILIES[family](grid, int(self.encoder.channels), width)  # type: ignore[arg-type]
-        self.heads = Heads(width, queries=family == "queries")
+        self.encoder = SmallEncoder()
+        self.family = FAMILIES[family](grid, SmallEncoder.channels, _WIDTH)
+        self.heads = Heads(_WIDTH, queries=family == "queries")
 
     def features(self, batch: Batch) -> Tensor:
         """(T, C, h / 4, w / 4) of the images, uncovered pixels at the mean colour."""

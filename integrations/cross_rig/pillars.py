@@ -59,13 +59,11 @@ class PointSet:
     Attributes:
         points: Points of each frame (P, 4), within the grid.
         state: (F, cells, cells) of ``labels``.
-        height_dm: (F, cells, cells).
         boxes: (F, n, 7), padded with NaN.
     """
 
     points: Sequence[npt.NDArray[np.float16]]
     state: npt.NDArray[np.uint8]
-    height_dm: npt.NDArray[np.uint8]
     boxes: npt.NDArray[np.float32]
 
     @property
@@ -82,12 +80,12 @@ class PointSet:
         """Frames as one batch."""
         cells = frames[0].state.shape[0]
         points = np.concatenate([frame.points for frame in frames]).astype(np.float32)
-        frame = np.repeat(np.arange(len(frames)), [len(one.points) for one in frames])
+        frame = np.repeat(np.arange(len(frames)), [len(scan.points) for scan in frames])
         row, column = cells_at(Grid(cells=cells), points[:, :2])
         pillar = (frame * cells + row) * cells + column
         order = np.argsort(pillar, kind="stable")
         count = np.bincount(pillar, minlength=len(frames) * cells * cells)
-        state, boxes = (np.stack([getattr(one, name) for one in frames]) for name in ("state", "boxes"))
+        state, boxes = (np.stack([getattr(scan, name) for scan in frames]) for name in ("state", "boxes"))
         return PointBatch(
             torch.from_numpy(points[order]),
             torch.from_numpy(np.cumsum(count) - count),

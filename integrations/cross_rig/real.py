@@ -1,4 +1,4 @@
-"""The protocol on two recorded data sets: A's samples are retargeted to B's cameras, and B's own samples judge.
+"""Two recorded data sets: A's samples are retargeted to B's cameras, and B's own samples judge.
 
 Both are read as the package reads them (``open_data``), made small, and moved to a road at z = 0, so that the grid and
 the detectors are those of the streets. Drives are split, never frames. Vehicles with fewer than 5 LiDAR points count
@@ -8,13 +8,12 @@ for nothing.
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -26,14 +25,12 @@ from arbiview_aug.datasets.synthetic import BoxClass
 from arbiview_aug.errors import DataError
 from arbiview_aug.scene.boxes import points_in
 from integrations.cross_rig.boxes import boxes_on_grid
-from integrations.cross_rig.cache import Arrays, FrameStore, code_hash
-from integrations.cross_rig.experiment import Run
+from integrations.cross_rig.cache import Arrays
 from integrations.cross_rig.frames import Source
 from integrations.cross_rig.labels import Grid, box_cells
 from integrations.cross_rig.settings import Settings
-from integrations.cross_rig.training import FrameSet
-from integrations.cross_rig.variant import Variant
-from integrations.cross_rig.views import ViewMaker
+from integrations.cross_rig.variants import Variant
+from integrations.cross_rig.views import ViewMaker, arrays_of
 from integrations.cross_rig.worlds import OF_TESTS, SPLITS, Split
 
 _VEHICLES = {"vehicle", "car", "van", "truck", "bus", "trailer"}
@@ -93,11 +90,11 @@ def frames_of(data: str, split: Split | None) -> list[int]:
         shuffled = np.random.default_rng(0).permutation(names).tolist()
         val, test = (max(1, round(_SHARES[s] * len(names))) for s in ("val", "test"))
         names = {"val": shuffled[:val], "test": shuffled[val : val + test], "train": shuffled[val + test :]}[split]
-    of_drive: dict[str, list[int]] = {name: [] for name in names}
+    by_drive: dict[str, list[int]] = {name: [] for name in names}
     for k in np.random.default_rng(0).permutation(len(drives)).tolist():
-        if drives[k] in of_drive:
-            of_drive[drives[k]].append(k)
-    return [k for turn in zip_longest(*of_drive.values()) for k in turn if k is not None]
+        if drives[k] in by_drive:
+            by_drive[drives[k]].append(k)
+    return [k for turn in zip_longest(*by_drive.values()) for k in turn if k is not None]
 
 
 def frames_of_a(a: str, b: str) -> list[int]:
@@ -119,92 +116,75 @@ class RecordedSource(Source):
     """As ``Source``, of recorded frames.
 
     Attributes:
-        a, b: ``open_data``'s names of both data sets.
+        data: ``open_data``'s names of the data sets of A and B.
     """
 
-    a: str
-    b: str
+    data: tuple[str, str]
 
     @property
     def is_of_a(self) -> bool:
-        """Whether A recorded these frames, or what they are rendered from."""
+        """Whether A recorded these frames, or those that they are rendered from."""
         return self.change is None or self.variant is not None
 
     @property
-    def data(self) -> str:
-        """The data set whose frames these are."""
-        return self.a if self.is_of_a else self.b
+    def recorded_by(self) -> str:
+        """The data set whose frames these are, or that they are rendered from."""
+        return self.data[not self.is_of_a]
 
     @cached_property
     def frames(self) -> list[int]:
         """Its samples."""
-        return frames_of_a(self.a, self.b) if self.is_of_a else frames_of(self.b, self.split)
+        return frames_of_a(*self.data) if self.is_of_a else frames_of(self.data[1], self.split)
 
     @cached_property
     def rig(self) -> Rig:
         """The cameras of the first frame, small and without lenses, over a road at z = 0."""
-        return small_rig(first_rig(self.a if self.change is None else self.b), self.size)
+        return small_rig(first_rig(self.data[self.change is not None]), self.size)
 
-    def store(self) -> FrameStore:
-        """Folder of the frames: named after the data set, its samples, the code, and the variant."""
-        spec: dict[str, Any] = {
-            "data": str(Path(self.data).resolve()),
-            "calibration": calibration_hash(self.data),
-            "samples": [recording(self.data).tokens[k] for k in self.frames],
-            "size": list(self.size),
-            "grid": vars(Grid()),
-            "real": code_hash("integrations.cross_rig.real"),
-            "readers": code_hash("arbiview_aug.datasets"),  # names them all; the registry has them as strings
-            "renderer": code_hash("arbiview_aug.transforms.rig_retarget"),
-        }
-        if self.variant is not None:
-            spec |= {"target": self.rig.content_key.hex(), "variant": self.variant.views_spec()}
-        return FrameStore(self.root, spec)
+    def spec(self) -> dict[str, Any]:
+        """Data set, samples and calibration."""
+        data = self.recorded_by
+        samples = [recording(data).tokens[k] for k in self.frames]
+        where = {"data": str(Path(data).resolve()), "calibration": calibration_hash(data), "samples": samples}
+        return where | {"size": self.size, "rig": self.rig.content_key.hex()}
+
+    def drives(self, count: int) -> list[int]:
+        """Numbers of the drives of the first frames."""
+        chosen = [drives_of(self.recorded_by)[k] for k in self.frames[:count]]
+        return [sorted(set(chosen)).index(name) for name in chosen]
 
     def maker(self) -> Callable[[int], Arrays]:
-        """Function that makes a frame of this set; indices past its end begin anew, to fill the last chunk."""
-        make = (
-            self._recorded
-            if self.variant is None
-            else self._retargeted(ViewMaker(self.variant, self.original().rig, self.rig))
-        )
+        """Function that makes a frame of this set; indices past its end begin again, to fill the last chunk."""
+        make = super().maker()
         return lambda index: make(self.frames[index % len(self.frames)])
 
+    def _true_frames(self) -> Callable[[int], Arrays]:
+        return self._recorded
+
     def _recorded(self, index: int) -> Arrays:
-        start = time.process_time()
-        sample = recording(self.data)[index]
+        sample = recording(self.recorded_by)[index]
         rig = sample["rig"]
         shrink = RigRetarget(small_rig(rig, self.size, road=rig.ground_z_m), geometry="infinity", holes="black")
-        out = shrink({"images": sample["images"], "rig": rig})
-        boxes, points = vehicles_of(sample, self.data)
+        boxes, points = vehicles_of(sample, self.recorded_by)
         boxes[:, 2] -= rig.ground_z_m
-        cells = box_cells(Grid(), boxes, np.full(len(boxes), BoxClass.CAR), points >= LEAST_POINTS)
-        return _arrays(out, rig.ground_z_m) | {
-            "state": cells.state,
-            "height_dm": cells.height_dm,
-            "boxes": boxes_on_grid(Grid(), boxes),
-            "cpu_s": np.array(time.process_time() - start, np.float32),
-        }
+        state = box_cells(Grid(), boxes, np.full(len(boxes), BoxClass.CAR), points >= LEAST_POINTS)
+        views = arrays_of(shrink({"images": sample["images"], "rig": rig}))
+        return _over_road(views, rig) | {"state": state, "boxes": boxes_on_grid(Grid(), boxes)}
 
-    def _retargeted(self, views: ViewMaker) -> Callable[[int], Arrays]:
+    def _views(self, variant: Variant) -> Callable[[int], Arrays]:
+        views = ViewMaker(variant, self.original().rig, self.rig)
+
         def make(index: int) -> Arrays:
-            sample = recording(self.data)[index]
-            arrays = views(index, sample)
-            arrays["cam2ego"][:, 2, 3] -= np.float32(sample["rig"].ground_z_m)
-            return arrays
+            sample = recording(self.recorded_by)[index]
+            return _over_road(views(index, sample), sample["rig"])
 
         return make
 
 
-def _arrays(out: dict[str, Any], ground_z_m: float) -> Arrays:
-    cam2ego = out["cam2ego"].numpy().astype(np.float32)
-    cam2ego[:, 2, 3] -= np.float32(ground_z_m)
-    return {
-        "images": out["images"].numpy(),
-        "coverage": np.packbits(out["coverage"].numpy(), axis=-1),
-        "K": out["K"].numpy().astype(np.float32),
-        "cam2ego": cam2ego,
-    }
+def _over_road(views: Arrays, rig: Rig) -> Arrays:
+    """Views whose poses are in a frame with the road at z = 0."""
+    views["cam2ego"][:, 2, 3] -= np.float32(rig.ground_z_m)
+    return views
 
 
 def small_rig(rig: Rig, size: tuple[int, int], *, road: float = 0.0) -> Rig:
@@ -230,59 +210,16 @@ def vehicles_of(sample: dict[str, Any], data: str) -> tuple[np.ndarray, np.ndarr
     return boxes, np.array([len(found) for found in inside], int)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RecordedRun(Run):
-    """As ``Run``, from one recorded data set to another.
-
-    Attributes:
-        a, b: ``open_data``'s names of the data sets of both vehicles.
-    """
-
-    calibration: ClassVar[tuple[str, ...]] = ("K", "cam2ego")
-
-    a: str
-    b: str
-
-    def source(self, split: Split, change: str | None = None, variant: Variant | None = None) -> RecordedSource:
-        return RecordedSource(
-            root=self.output / "frames",
-            size=self.settings.size,
-            split=split,
-            change=change,
-            variant=variant,
-            a=self.a,
-            b=self.b,
-        )
-
-    def _frames(self, images: Source, labels: Source, count: int, *, own: bool, masked: bool) -> FrameSet:
-        # Every frame has a calibration of its own.
-        return super()._frames(images, labels, count, own=True, masked=own and masked)
-
-    def box_store(self, source: Source) -> FrameStore:
-        """File of the boxes, beside the images."""
-        return source.store()
-
-    def prepare(self) -> None:
-        """Nothing: the data sets are there."""
-
-    def title(self, change: str) -> str:
-        return f"{Path(self.a).name} to {Path(self.b).name}"
-
-    def drives(self, change: str) -> list[int]:
-        """The drive of each test frame, in order."""
-        names = drives_of(self.b)
-        chosen = [names[k] for k in self.source("test", change).frames[: self.settings.test_frames]]
-        return [sorted(set(chosen)).index(name) for name in chosen]
-
-
-def recorded_run(a: str, b: str, settings: Settings, output: Path) -> RecordedRun:
-    """The run, of as many frames as there are: B's own training frames are no more than A's.
+def fitted(settings: Settings) -> Settings:
+    """Settings of as many frames as there are: B's own training frames are no more than A's.
 
     Raises:
         DataError: A data set cannot be read, has no labels, or too few drives.
     """
+    assert settings.recorded is not None
+    a, b = settings.recorded
     train = min(len(frames_of_a(a, b)), len(frames_of(b, "train")), settings.train_frames)
     counts: dict[str, Any] = {f"{s}_frames": min(len(frames_of(b, s)), settings.count(s)) for s in OF_TESTS}
     for data in (a, b):
         vehicles_of(recording(data)[0], data)
-    return RecordedRun(a=a, b=b, settings=replace(settings, train_frames=train, **counts), output=output)
+    return replace(settings, train_frames=train, **counts)

@@ -40,17 +40,10 @@ _HEIGHT_M = 1.5
 _FOV_DEG = 65.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class Change:
-    """A change of vehicle.
+    """A change of vehicle: its title in tables, and vehicle B at a size, in A's ego frame."""
 
-    Attributes:
-        name: On the command line and in files.
-        title: In tables.
-        target: Vehicle B at a size, in A's ego frame.
-    """
-
-    name: str
     title: str
     target: Callable[[Size], Rig]
 
@@ -74,20 +67,9 @@ def source_rig(size: Size, *, fov_deg: float = _FOV_DEG, height_m: float = _HEIG
     return Rig(cameras, name="A")
 
 
-def _zoomed(fov_deg: float) -> Callable[[Size], Rig]:
-    return lambda size: source_rig(size, fov_deg=fov_deg)
-
-
-def _lifted(by_m: float) -> Callable[[Size], Rig]:
-    return lambda size: source_rig(size, height_m=_HEIGHT_M + by_m)
-
-
 CHANGES: dict[str, Change] = {
-    change.name: change
-    for change in (
-        Change(name="fov50", title="FOV 65° → 50°", target=_zoomed(50.0)),
-        Change(name="up70", title="+0.7 m", target=_lifted(0.7)),
-        Change(name="waymo", title="Waymo-like, 5 at 2.1 m", target=demo_target_rig),
-    )
+    "fov50": Change("FOV 65° → 50°", lambda size: source_rig(size, fov_deg=50.0)),
+    "up70": Change("+0.7 m", lambda size: source_rig(size, height_m=_HEIGHT_M + 0.7)),
+    "waymo": Change("Waymo-like, 5 at 2.1 m", demo_target_rig),
 }
 """By name. ``waymo``: Waymo's azimuths and height at A's field of view, so that it stays a change of the layout."""

@@ -1,4 +1,4 @@
-"""A whole run, tiny: it goes on after being killed, and ends with the numbers of an uninterrupted one."""
+"""A whole run, tiny: killed, it continues, and ends with the numbers of an uninterrupted one."""
 
 import json
 import shutil
@@ -10,8 +10,10 @@ import pytest
 
 from integrations.cross_rig import __main__ as command
 from integrations.cross_rig import cache, experiment
-from integrations.cross_rig.experiment import Run, load_results, run
-from integrations.cross_rig.report import markdown, summary, write_report
+from integrations.cross_rig.cache import FrameStore
+from integrations.cross_rig.experiment import Run, run
+from integrations.cross_rig.labels import FREE, HIDDEN, VEHICLE
+from integrations.cross_rig.report import summary, write_report
 from integrations.cross_rig.settings import Settings, jobs, quick, small
 from integrations.cross_rig.training import Schedule
 
@@ -20,33 +22,64 @@ TINY = Settings(
     train_frames=2,
     val_frames=1,
     test_frames=2,
-    seeds=(0,),
     changes=("fov50",),
-    variants=("raw", "scale_crop", "objects_fill_mixed", "oracle"),
+    variants=("raw", "scale_crop", "auto_fill_mixed", "oracle"),
     schedule=Schedule(steps=3, batch=2, precision="fp32"),
 )
 
 
-@pytest.fixture(autouse=True)
-def _short_chunks(monkeypatch):
-    monkeypatch.setattr(cache, "CHUNK_FRAMES", 1)
+@pytest.fixture(autouse=True, scope="module")
+def _short_chunks():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cache, "CHUNK_FRAMES", 1)
+        yield
 
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory) -> Run:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache, "CHUNK_FRAMES", 1)
-        setup = Run(settings=TINY, output=tmp_path_factory.mktemp("cross_rig"))
-        assert list(run(setup, 1, lambda line: None)) == [4, 3, 2, 1, 0]
+    setup = Run(settings=TINY, output=tmp_path_factory.mktemp("cross_rig"))
+    assert list(run(setup, 1, lambda line: None)) == [4, 3, 2, 1, 0]
     return setup
 
 
-def counts(setup: Run) -> dict[str, list]:
-    return {variant: by_seed[0]["by_distance"] for variant, by_seed in load_results(setup, "voxels")["fov50"].items()}
+def test_frames_are_whole_or_not_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "CHUNK_FRAMES", 4)
+
+    def frames(chunk: int, dies_at: int = -1):
+        for index in range(4 * chunk, 4 * chunk + 4):
+            if index == dies_at:
+                raise KeyboardInterrupt
+            yield {"images": np.full((2, 3), index, np.uint8), "state": np.uint8(index)}
+
+    store, save = FrameStore(tmp_path, {"a": 1}), np.save
+    store.write(0, frames(0))
+    with pytest.raises(KeyboardInterrupt):
+        store.write(1, frames(1, dies_at=6))
+    assert store.missing(9) == [1, 2]
+
+    def meanwhile(path, array):  # another process makes the same chunk
+        monkeypatch.setattr(np, "save", save)
+        save(path, array)
+        FrameStore(tmp_path, {"a": 1}).write(1, frames(1))
+
+    monkeypatch.setattr(np, "save", meanwhile)
+    store.write(1, frames(1))
+    assert store.missing(8) == [] and not list(tmp_path.rglob(".part*"))
+    np.testing.assert_array_equal(store.stacked("state", 7), np.arange(7))
+    assert (store.images(6) == 6).all() and FrameStore(tmp_path, {"a": 2}).missing(1) == [0]
+
+
+def test_any_code_names_what_it_makes(monkeypatch):
+    before, read = FrameStore(Path(), {}).key, []
+    text = Path.read_text
+    monkeypatch.setattr(Path, "read_text", lambda path: (read.append(path.name), text(path) + "# changed")[1])
+    monkeypatch.setattr(cache, "code_hash", cache.code_hash.__wrapped__)
+    assert FrameStore(Path(), {}).key != before
+    assert {"rig_retarget.py", "continued.py", "kernels.py", "reader.py", "training.py"} <= set(read)
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_to_the_same_numbers(done, tmp_path, monkeypatch):
+def test_a_killed_run_continues_to_the_same_numbers(done, tmp_path, monkeypatch):
     shutil.copytree(done.output / "frames", tmp_path / "frames")
     shutil.rmtree(tmp_path / "frames" / done.source("test", "fov50").store().key / "00000")
     killed = replace(done, output=tmp_path)
@@ -61,193 +94,88 @@ def test_a_killed_run_goes_on_to_the_same_numbers(done, tmp_path, monkeypatch):
     monkeypatch.setattr(experiment, "train", dying)
     with pytest.raises(KeyboardInterrupt):
         list(run(killed, 1, lambda line: None))
-    assert [job.variant.name for job in killed.missing()] == ["objects_fill_mixed", "oracle"]
+    assert [job.variant.name for job in killed.missing()] == ["auto_fill_mixed", "oracle"]
     trained.clear()
     assert list(run(killed, 1, lambda line: None)) == [2, 1, 0]
-    assert trained == [True, False]
-    assert counts(killed) == counts(done)
-    assert not list(tmp_path.rglob(".*"))
-
-
-@pytest.mark.slow
-def test_what_is_done_is_not_done_again(done, monkeypatch):
+    assert trained == [True, False] and not list(tmp_path.rglob(".*"))
+    assert killed.results("voxels", "short") == done.results("voxels", "short")
     monkeypatch.setattr(experiment, "train", None)
-    assert list(run(done, 1, lambda line: None)) == [0]
-    # Other test streets: the weights are there.
-    more = replace(done, settings=replace(TINY, test_frames=1, variants=("raw",)))
-    assert list(run(more, 1, lambda line: None)) == [1, 0]
+    assert list(run(killed, 1, lambda line: None)) == [0]
 
 
 @pytest.mark.slow
-def test_variants_with_the_same_frames_are_one_training(done):
-    """Every surface is the same when the centres stay: only the first one is trained."""
-    more = replace(done, settings=replace(TINY, variants=("raw", "street_fill", "objects_fill", "oracle")))
-    assert list(run(more, 1, lambda line: None)) == [1, 0]
-    results = load_results(more, "voxels")["fov50"]
-    assert set(results) == {"raw", "street_fill", "objects_fill", "oracle"}
-    assert results["street_fill"] == results["objects_fill"]
+def test_families_and_schedules_have_tables_of_their_own(done):
+    settings = replace(TINY, variants=("raw", "oracle"), families=("voxels", "depths", "queries"))
+    more = replace(done, settings=replace(settings, schedules=("short", "long")))
+    assert list(run(more, 1, lambda line: None)) == [*range(10, -1, -1)]
     report = write_report(more)
-    assert report["changes"]["fov50"]["same_frames"] == {"objects_fill": "street_fill"}
-    assert "| objects, filled holes, no mask (the frames of street, filled holes, no mask) |" in markdown(report)
-
-
-@pytest.mark.slow
-def test_variants_without_a_mask_lift_every_pixel(tmp_path):
-    """Black holes: the pixels of the masked variant. Filled holes: what was seen is the same bit for bit."""
-    settings = replace(TINY, changes=("up70",), variants=("auto", "auto_black", "auto_fill"))
-    more = Run(settings=settings, output=tmp_path)
-    assert list(run(more, 1, lambda line: None)) == [3, 2, 1, 0]
-    masked, black, filled = jobs(more.settings)
-    assert more.images(black).store().key == more.images(masked).store().key != more.images(filled).store().key
-    frames = [more.training_set(job).frame(1) for job in (masked, black, filled)]
-    seen = np.broadcast_to(frames[0].coverage[:, None], frames[0].images.shape)
-    assert 0.05 < 1 - seen.mean() < 0.95
-    assert frames[1].coverage.all() and frames[2].coverage.all()
-    np.testing.assert_array_equal(frames[1].images, frames[0].images)
-    assert not frames[1].images[~seen].any()
-    np.testing.assert_array_equal(frames[2].images[seen], frames[0].images[seen])
-    assert (frames[2].images[~seen] > 0).mean() > 0.5
-
-
-@pytest.mark.slow
-def test_report(done):
-    report = write_report(done)
     assert json.loads((done.output / "report.json").read_text()) == json.loads(json.dumps(report))
-    assert (done.output / "report.png").stat().st_size > 1000
-    assert report["tests_done"] == report["tests"] == 4
-    rows = report["changes"]["fov50"]["variants"]
-    assert list(rows) == list(TINY.variants)
-    for name, row in rows.items():
-        assert (row["loading_cpu_s"] > 0) == (name in ("scale_crop", "objects_fill_mixed"))
-        assert 0 <= row["iou"]["low"] <= row["iou"]["value"] <= row["iou"]["high"] <= 1
-        assert 0 <= row["ap"]["value"]["value"] <= 1
-    assert "| objects, filled holes, no mask, + raw |" in markdown(report)
+    seen = {name: change["samples_seen"] for name, change in report["changes"].items()}
+    names = ("fov50", "fov50-depths", "fov50-queries")
+    assert seen == {f"{name}{length}": n for length, n in (("", 6), ("-long", 16)) for name in names}
+    assert "| FOV 65° → 50°, queries, long; raw A | 16 |" in (done.output / "report.md").read_text()
+    for change in report["changes"].values():
+        assert list(change["variants"]) == ["raw", "oracle"]
+        assert all(0 <= row["value"] <= 1 and 0 <= row["ap"]["value"] <= 1 for row in change["variants"].values())
+    del report["changes"]["fov50"]["variants"]["oracle"]
+    assert "FOV" in summary(report), "a run that is not done"
 
 
 @pytest.mark.slow
-def test_families_have_tables_of_their_own(done):
-    more = replace(done, settings=replace(TINY, variants=("raw", "oracle"), families=("depths", "queries", "voxels")))
-    assert list(run(more, 1, lambda line: None)) == [4, 3, 2, 1, 0]
-    report = write_report(more)
-    assert set(report["changes"]) == {"fov50", "fov50-depths", "fov50-queries"} and report["tests_done"] == 6
-    assert "**FOV 65° → 50°, queries**, 6 samples seen, seeds 0" in markdown(report)
-    losses = [more.trained(job)[1]["losses"][-1] for job in jobs(more.settings) if job.variant.name == "raw"]
-    assert len(set(losses)) == 3
-
-
-@pytest.mark.slow
-def test_schedules_have_tables_of_their_own_that_say_how_many_samples_were_seen(done):
-    """The short one is trained already; frames are the same."""
-    more = replace(done, settings=replace(TINY, variants=("raw", "oracle"), schedules=("short", "long")))
-    assert list(run(more, 1, lambda line: None)) == [2, 1, 0]
-    report = write_report(more)
-    assert {name: change["samples_seen"] for name, change in report["changes"].items()} == {
-        "fov50": 3 * 2,
-        "fov50-long": 8 * 2,
-    }
-    assert report["tests_done"] == report["tests"] == 4
-    text, short = markdown(report), summary(report)
-    assert "**FOV 65° → 50°**, 6 samples seen, seeds 0" in text
-    assert "**FOV 65° → 50°, long**, 16 samples seen, seeds 0" in text
-    assert "samples seen" in short.splitlines()[0]
-    alone = {**report, "changes": {"fov50-long": report["changes"]["fov50-long"]}}
-    assert [row.split(" | ")[1] for row in summary(alone).splitlines()[2:]] == ["16", "16"]
-
-
-@pytest.mark.slow
-def test_labels_are_the_sources_within_the_targets_cells(done):
-    raw, _, mixed, oracle = (done.training_set(job) for job in jobs(TINY))
-    np.testing.assert_array_equal(raw.state, mixed.state)
-    np.testing.assert_array_equal(mixed.counts, oracle.counts)
-    assert raw.counts.sum() > oracle.counts.sum()
-
-
-@pytest.mark.slow
-def test_variants_are_paired(done):
-    """The same frames in the same order, whatever else a variant draws."""
-    first = []
-    for job in jobs(TINY):
-        draws = done.draws(replace(job, seed=5))
-        first.append(np.concatenate([draws.batch(1).state.numpy() for _ in range(20)]))
+def test_labels_and_draws_are_paired(done):
+    """A's labels in B's cells; the same frames in the same order, whatever else a variant draws."""
+    raw, _, mixed, oracle = sets = [done.draws(replace(job, seed=5)) for job in jobs(TINY)]
+    np.testing.assert_array_equal(raw.frames.state, mixed.frames.state)
+    np.testing.assert_array_equal(mixed.frames.counts, oracle.frames.counts)
+    assert raw.frames.counts.sum() > oracle.frames.counts.sum()
+    first = [np.concatenate([draws.batch(1).state.numpy() for _ in range(20)]) for draws in sets]
     np.testing.assert_array_equal(first[0], first[1])
     np.testing.assert_array_equal(first[0], first[2])
-
-
-@pytest.mark.slow
-def test_mixed_variants_draw_raw_frames_half_of_the_time(done):
-    job = next(job for job in jobs(TINY) if job.variant.mixed)
-    draws, raw_rig = done.draws(job), done.source("train").rig
-    from_raw = [bool(np.isclose(draws.batch(1).K[0, 0, 0], raw_rig.K[0, 0, 0])) for _ in range(200)]
+    raw_focal = raw.frames.K[0, 0, 0, 0]
+    from_raw = [bool(np.isclose(mixed.batch(1).K[0, 0, 0], raw_focal)) for _ in range(200)]
     assert 75 < sum(from_raw) < 125
 
 
-def test_presets():
-    assert len(jobs(quick())) == 2 * 3  # schedules, variants
-    # Raw and scale/crop once for each seed, five variants for each change.
-    assert len({job.name for job in jobs(small())}) == len(jobs(small())) == 2 * 4  # seeds, variants
-
-
 @pytest.mark.slow
-def test_keys_follow_what_matters(done):
-    raw, _, mixed, oracle = jobs(TINY)
-    keys = {done.training_key(job) for job in (raw, mixed, oracle)}
-    assert len(keys) == 3
-    longer = replace(done, settings=replace(TINY, schedule=replace(TINY.schedule, steps=4)))
-    assert longer.training_key(raw) != done.training_key(raw)
-    assert longer.images(raw).store().key == done.images(raw).store().key
-    assert done.result_path(raw, "fov50") != longer.result_path(raw, "fov50")
+def test_frames_follow_the_world(tmp_path):
+    settings = replace(TINY, world="cuboids", changes=("up70",), variants=("auto_fill",))
+    setups = [Run(settings=replace(settings, world=world), output=tmp_path) for world in ("cuboids", "drive")]
+    images = []
+    for setup in setups:
+        for source in setup.sources():
+            experiment.make_frames(source, 1, 1)
+        state = setup.source("train").store().stacked("state", 1)
+        assert set(np.unique(state)) <= {FREE, VEHICLE, HIDDEN} and (state == VEHICLE).sum() > 20
+        images.append([source.store().images(0) for source in setup.sources()])
+    assert all((one != other).mean() > 0.8 for one, other in zip(*images, strict=True))
+
+
+def test_settings_of_the_command(tmp_path):
+    assert len(jobs(quick())) == 2 * 3 and len({job.name for job in jobs(small())}) == 2 * 4
+    given = ["--small", "--world", "cuboids", "--schedules", "short", "long", "--steps", "10"]
+    setup = Run(settings=command.settings_of(command.parser().parse_args(given)), output=tmp_path)
+    assert {source.world for source in setup.sources()} == {"cuboids"}
+    assert {job.length: setup.schedule(job).steps for job in jobs(setup.settings)} == {"short": 10, "long": 26}
+    raw, longer = jobs(setup.settings)[0], replace(setup, settings=replace(setup.settings, test_frames=1))
+    assert longer.source("train").store().key == setup.source("train").store().key
+    assert longer.result_path(raw) != setup.result_path(raw)
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ("--streets 150", "streets: expected a whole hundred"),
-        *(
-            (f"--real A B {option}", f"{option.split()[0]} is for synthetic streets: leave it out with --real")
-            for option in ("--world cuboids", "--streets 200", "--changes up70")
-        ),
+        ("--real A B --world cuboids", "--world is for synthetic streets: leave it out with --real"),
+        ("--real A B --changes up70", "--changes is for synthetic streets: leave it out with --real"),
+        ("--device cuda:99", "expected cpu or a CUDA device that is there"),
+        *((text, "error: argument") for text in ("--steps 0", "--seeds -1", "--variants nothing", "--workers 0")),
     ],
 )
-def test_command_refuses_what_makes_no_sense(given, message, capsys, tmp_path):
-    assert command.main(["--quick", *given.split(), "--output", str(tmp_path)]) == 2
+def test_command_refuses(given, message, capsys, tmp_path):
+    try:
+        assert command.main(["--quick", *given.split(), "--output", str(tmp_path)]) == 2
+    except SystemExit as ended:
+        assert ended.code == 2
     assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("given", ["--steps 0", "--steps -3", "--seeds -1", "--train-frames 0", "--workers 0"])
-def test_command_refuses_numbers(given, capsys):
-    with pytest.raises(SystemExit, match="2"):
-        command.main(["--quick", *given.split()])
-    assert "error: argument" in capsys.readouterr().err
-
-
-def test_command_lists_and_refuses(capsys, tmp_path):
-    assert command.main(["--small", "--seeds", "0", "--changes", "up70", "--list", "--output", str(tmp_path)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 4 and all(line.startswith("missing") for line in lines)
-    with pytest.raises(SystemExit):
-        command.main(["--small", "--variants", "nothing"])
-    capsys.readouterr()
-    few = ["--small", "--seeds", "0", "--changes", "up70", "--output", str(tmp_path)]
-    assert command.main([*few, "--device", "cuda:99"]) == 2
-    assert "expected cpu or a CUDA device that is there" in capsys.readouterr().err
-
-
-def test_command_chooses_world_and_schedules(tmp_path):
-    given = ["--small", "--world", "cuboids", "--schedules", "short", "long", "--steps", "10"]
-    setup = Run(settings=command._settings(command._parser().parse_args(given)), output=tmp_path)
-    assert {source.world for source, _ in setup.sources()} == {"cuboids"}
-    steps = {job.length: setup.schedule(job).steps for job in jobs(setup.settings)}
-    assert steps == {"short": 10, "long": 26}
-    assert {job.name.endswith("-long") for job in jobs(setup.settings) if job.length == "long"} == {True}
-    for other in (["--small"], ["--quick", "--real", "A", "B"]):  # recorded data are of no streets
-        assert command._settings(command._parser().parse_args(other)).world == "drive"
-    with pytest.raises(ValueError, match="schedules: expected some of short, long, got longest"):
-        Settings(schedules=("longest",))
-
-
-@pytest.mark.slow
-def test_the_large_run_is_planned_on_a_machine_without_a_gpu(tmp_path):
-    assert command.main(["--large", "--list", "--output", str(tmp_path)]) == 0
 
 
 @pytest.mark.release
@@ -258,6 +186,5 @@ def test_quick_oracle_is_above_raw(tmp_path: Path, monkeypatch):
     changes = json.loads((tmp_path / "report.json").read_text())["changes"]
     assert set(changes) == {"up70", "up70-long"}
     for change in changes.values():
-        variants = change["variants"]
-        assert variants["oracle"]["iou"]["value"] > variants["raw"]["iou"]["value"]
-        assert set(variants) == {"raw", "auto_fill", "oracle"}
+        assert set(change["variants"]) == {"raw", "auto_fill", "oracle"}
+        assert change["variants"]["oracle"]["value"] > change["variants"]["raw"]["value"]

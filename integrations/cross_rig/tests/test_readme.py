@@ -19,7 +19,4 @@ def test_every_report_has_its_table():
 
 @pytest.mark.parametrize("name", TABLES)
 def test_tables_are_the_reports(name):
-    report = json.loads((FOLDER / "results" / f"{name}.json").read_text())
-    assert TABLES[name] == summary(report)
-    del report["changes"]["up70"]["variants"]["oracle"]
-    assert "+0.7 m" in summary(report), "a run that is not done"
+    assert TABLES[name] == summary(json.loads((FOLDER / "results" / f"{name}.json").read_text()))

@@ -1,7 +1,6 @@
 """The protocol between two recorded data sets: made-up nuScenes roots of two vehicles, end to end."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +12,15 @@ from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.errors import DataError
 from integrations.cross_rig import __main__ as command
 from integrations.cross_rig import cache, real
+from integrations.cross_rig.experiment import Run
 from integrations.cross_rig.labels import FREE, HIDDEN, VEHICLE
-from integrations.cross_rig.settings import REAL, Settings
-from integrations.cross_rig.settings import real as on_real
+from integrations.cross_rig.settings import REAL, Settings, jobs, recorded
 from integrations.cross_rig.training import Schedule
 from integrations.cross_rig.worlds import OF_TESTS
 from tests.datasets.nuscenes_root import START_US, Street, streets, tables_of, write_root
 
 SIZE = (24, 64)
-SMALL = Settings(size=SIZE, seeds=(0,), schedule=Schedule(steps=2, batch=2, precision="fp32"))
+SMALL = Settings(size=SIZE, train_frames=1000, schedule=Schedule(steps=2, batch=2, precision="fp32"))
 
 
 @pytest.fixture(autouse=True)
@@ -57,12 +56,17 @@ def roots(tmp_path_factory) -> tuple[str, str]:
     return str(a), str(_root(folder / "B", rig.shifted(z_m=0.7), range(4)))
 
 
+def run_of(a: str, b: str, output: Path) -> Run:
+    return Run(settings=real.fitted(recorded(SMALL, a, b)), output=output)
+
+
 @pytest.mark.slow
 def test_frames_have_labels_where_the_lidar_saw_a_vehicle(roots, tmp_path):
-    run = real.recorded_run(*roots, on_real(SMALL), tmp_path)
+    run = run_of(*roots, tmp_path)
     assert (run.settings.train_frames, run.settings.val_frames, run.settings.test_frames) == (4, 2, 2)
     source = run.source("train")
-    arrays = source.maker()(0)
+    make = source.maker()
+    arrays = make(0)
     assert arrays["images"].shape == (6, 3, *SIZE) and arrays["images"].mean() == pytest.approx(90, abs=1)
     sample = real.recording(roots[0])[source.frames[0]]
     boxes, points = real.vehicles_of(sample, roots[0])
@@ -72,92 +76,57 @@ def test_frames_have_labels_where_the_lidar_saw_a_vehicle(roots, tmp_path):
             cell = ((box[:2] + 25) / 0.5).astype(int)
             assert arrays["state"][tuple(cell)] == (VEHICLE if inside else HIDDEN)
     assert (arrays["state"] == FREE).mean() > 0.8
-    # Indices past the end begin anew.
-    np.testing.assert_array_equal(source.maker()(4)["state"], arrays["state"])
-
-
-@pytest.mark.slow
-def test_views_have_the_other_vehicles_cameras_over_one_road(roots, tmp_path):
-    run = real.recorded_run(*roots, on_real(SMALL), tmp_path)
-    by_name = {job.variant.name: job for job in real_jobs(run)}
-    arrays = run.images(by_name["auto_fill"]).maker()(0)
+    np.testing.assert_array_equal(make(4)["state"], arrays["state"], "indices past the end begin again")
+    # Views have the other vehicle's cameras, over the same road.
+    views = next(run.images(job) for job in jobs(run.settings) if job.variant.name == "auto_fill").maker()(0)
     true = run.source("test", REAL).maker()(0)
-    np.testing.assert_allclose(arrays["K"], true["K"], rtol=1e-5)
-    np.testing.assert_allclose(arrays["cam2ego"][:, 2, 3], true["cam2ego"][:, 2, 3], atol=0.02)
-    raw = run.source("train").maker()(0)
-    np.testing.assert_allclose(arrays["cam2ego"][:, 2, 3] - raw["cam2ego"][:, 2, 3], 0.7, atol=0.02)
-
-
-def real_jobs(run):
-    from integrations.cross_rig.settings import jobs
-
-    return jobs(run.settings)
+    np.testing.assert_allclose(views["K"], true["K"], rtol=1e-5)
+    np.testing.assert_allclose(views["cam2ego"][:, 2, 3], true["cam2ego"][:, 2, 3], atol=0.02)
+    np.testing.assert_allclose(views["cam2ego"][:, 2, 3] - arrays["cam2ego"][:, 2, 3], 0.7, atol=0.02)
 
 
 def test_drives_are_split_and_drawn_together(roots, tmp_path, monkeypatch):
-    run = real.recorded_run(*roots, on_real(SMALL), tmp_path)
-    names = real.drives_of(roots[1])
+    run, names = run_of(*roots, tmp_path), real.drives_of(roots[1])
     splits = [{names[k] for k in real.frames_of(roots[1], split)} for split in ("train", "val", "test")]
     assert all(splits) and sum(map(len, splits)) == len(set(names)) == len(set.union(*splits))
     # A data set against itself: what tests is no less apart from what trains the oracle.
-    itself = real.recorded_run(roots[1], roots[1], on_real(SMALL), tmp_path)
+    itself = run_of(roots[1], roots[1], tmp_path)
     tested = {k for split in OF_TESTS for k in itself.source(split, REAL).frames}
     trained = set(itself.source("train", REAL).frames)
     assert tested and trained and not tested & trained and set(itself.source("train").frames) == trained
-    # The first frames are of all drives.
-    assert {names[k] for k in real.frames_of(roots[1], None)[:4]} == set(names)
-    with (
-        monkeypatch.context() as patch,
-        pytest.raises(DataError, match="drives that are not of B's validation or test"),
-    ):
-        patch.setattr(real, "drives_of", lambda data: names if data == roots[1] else [names[k] for k in tested])
-        real.frames_of_a("a", roots[1])
-    drives = run.drives(REAL)
+    assert {names[k] for k in real.frames_of(roots[1], None)[:4]} == set(names), "the first are of all drives"
+    drives = run.source("test", REAL).drives(run.settings.test_frames)
     assert len(drives) == run.settings.test_frames and len(set(drives)) == len(splits[2])
+    monkeypatch.setattr(real, "drives_of", lambda data: names if data == roots[1] else [names[k] for k in tested])
+    with pytest.raises(DataError, match="drives that are not of B's validation or test"):
+        real.frames_of_a("a", roots[1])
 
 
-@pytest.mark.slow
-def test_frames_are_made_anew_when_a_reader_changes(roots, tmp_path, monkeypatch):
-    read, source = set(), cache._source
-    monkeypatch.setattr(cache, "_source", lambda name: (read.add(name), source(name))[1])
-    cache.code_hash.cache_clear()
-    real.recorded_run(*roots, on_real(SMALL), tmp_path).source("train").store()
-    cache.code_hash.cache_clear()
-    assert {f"arbiview_aug.datasets.{name}" for name in ("nuscenes.reader", "frame_folder", "py123d")} <= read
+def test_frames_and_results_follow_the_calibration(roots, tmp_path, monkeypatch):
+    def paths() -> set[Path]:
+        run = run_of(*roots, tmp_path)
+        return {run.source("train").store().folder, *map(run.result_path, jobs(run.settings))}
 
-
-def test_frames_and_trainings_follow_the_calibration(roots, tmp_path, monkeypatch):
-    def paths(output: str, turn_deg: float) -> list[str]:
-        run = real.recorded_run(*roots, replace(on_real(SMALL), variants=("raw", "oracle")), tmp_path / output)
-        for source, count in run.sources():
-            rig = source.rig.turned(yaw_deg=turn_deg)
-            names = ("images", "coverage", "state", "height_dm", "boxes")
-            frame = dict.fromkeys(names, np.zeros(1)) | {"K": rig.K, "cam2ego": rig.cam2ego}
-            for chunk in source.store().missing(count):
-                source.store().write(chunk, [frame] * 2)
-        return [run.result_path(job, REAL).name for job in real_jobs(run)]
-
-    before, store = paths("a", 0), real.recorded_run(*roots, on_real(SMALL), tmp_path).source("train").store()
-    assert before == paths("b", 0) and not set(before) & set(paths("c", 20))
+    before = paths()
+    assert before == paths()
     monkeypatch.setattr(real, "calibration_hash", lambda data: "another")
-    assert real.recorded_run(*roots, on_real(SMALL), tmp_path).source("train").store().key != store.key
+    assert not before & paths()
 
 
 @pytest.mark.slow
-def test_the_command_runs_goes_on_and_reports(roots, tmp_path, capsys, monkeypatch):
+def test_the_command_runs_continues_and_reports(roots, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(command.PRESETS, "quick", lambda: SMALL)
     variants = ["--variants", "raw", "auto_fill", "auto_fill_mixed", "oracle"]
     given = ["--quick", "--real", *roots, *variants, "--workers", "1", "--output", str(tmp_path)]
     assert command.main(given) == 0
     out, err = capsys.readouterr()
-    assert "**A to B**, 4 samples seen, seeds 0" in out and "4 of 4 trainings to do" in err
-    rows = json.loads((tmp_path / "report.json").read_text())["changes"][REAL]["variants"]
-    assert list(rows) == ["raw", "auto_fill", "auto_fill_mixed", "oracle"]
+    assert "| A to B; auto, filled holes, no mask | 4 |" in out and "4 of 4 trainings to do" in err
+    assert list(json.loads((tmp_path / "report.json").read_text())["changes"][REAL]["variants"]) == variants[1:]
     assert command.main(given) == 0
     assert "0 of 4 trainings to do" in capsys.readouterr().err
 
 
-def test_what_cannot_be_run_is_refused(roots, tmp_path, capsys):
+def test_data_that_cannot_be_run_is_refused(roots, tmp_path, capsys):
     def said(*given: str) -> str:
         assert command.main(["--quick", "--output", str(tmp_path), *given]) == 2
         return capsys.readouterr().err
@@ -166,20 +135,13 @@ def test_what_cannot_be_run_is_refused(roots, tmp_path, capsys):
     assert "expected a folder, found none" in said("--real", roots[0], str(tmp_path / "nothing"))
     (tmp_path / "file").touch()
     assert "--output: expected a folder, got the file" in said("--output", str(tmp_path / "file"))
-    sample = {"token": "t", "boxes_3d": torch.zeros(0, 7)}
     with pytest.raises(DataError, match="sample t: expected boxes_3d and box_names"):
-        real.vehicles_of(sample, "X")
+        real.vehicles_of({"token": "t", "boxes_3d": torch.zeros(0, 7)}, "X")
 
 
 def test_vehicles_by_category():
-    names = [
-        "vehicle.bus.rigid",
-        "vehicle.bicycle",
-        "human.pedestrian.construction_worker",
-        "SCHOOL_BUS",
-        "Car",
-        "bush",
-    ]
+    people = "human.pedestrian.construction_worker"
+    names = ["vehicle.bus.rigid", "vehicle.bicycle", people, "SCHOOL_BUS", "Car", "bush"]
     sample = {"token": "t", "boxes_3d": torch.arange(6)[:, None] * torch.ones(6, 7), "box_names": names}
     boxes, points = real.vehicles_of(sample, "X")
     assert boxes[:, 0].tolist() == [0, 3, 4] and (points == real.LEAST_POINTS).all()

@@ -1,16 +1,12 @@
 """Views that the variants make of A's frames."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 
 from arbiview_aug.datasets.synthetic import SyntheticDrive
-from integrations.cross_rig.augmentation import SCALE, scaled_and_cropped
-from integrations.cross_rig.settings import Settings
 from integrations.cross_rig.variants import VARIANTS
-from integrations.cross_rig.views import ViewMaker
+from integrations.cross_rig.views import SCALE, ViewMaker, scaled_and_cropped
 from integrations.cross_rig.worlds import CHANGES, SPLITS, source_rig, street_seed
 
 SIZE = (24, 64)
@@ -19,42 +15,21 @@ SIZE = (24, 64)
 @pytest.fixture(scope="module")
 def frame() -> dict:
     drive = SyntheticDrive(source_rig(SIZE), num_frames=1, seed=9)
-    return {
-        "images": drive.render(0).images,
-        "points": drive.points(0),
-        "boxes_3d": torch.from_numpy(drive.scene(0).boxes_ego(0.0)).float(),
-    }
+    boxes = torch.from_numpy(drive.scene(0).boxes_ego(0.0)).float()
+    return {"images": drive.render(0).images, "points": drive.points(0), "boxes_3d": boxes}
 
 
-@pytest.mark.parametrize("name", [name for name, variant in VARIANTS.items() if variant.renders])
+@pytest.mark.parametrize("name", ["auto_fill", "street_fill", "objects_fill", "auto_fill_random", "random_a"])
 @pytest.mark.filterwarnings("ignore")
-def test_every_arm_renders(frame, name):
+def test_every_variant_renders(frame, name):
     source, target = source_rig(SIZE), CHANGES["waymo"].target(SIZE)
     target = target if VARIANTS[name].knows_target else source
-    views = ViewMaker(VARIANTS[name], source, target)(0, frame)
-    coverage = np.unpackbits(views["coverage"], axis=-1, count=SIZE[1]).astype(bool)
+    views, again = (ViewMaker(VARIANTS[name], source, target)(0, frame) for _ in range(2))
     assert views["images"].shape == (len(target), 3, *SIZE) and views["images"].dtype == np.uint8
-    assert coverage.shape == (len(target), *SIZE) and coverage.mean() > 0.4
-    uncovered = views["images"].transpose(0, 2, 3, 1)[~coverage]
-    assert uncovered.all(-1).mean() > 0.5 if VARIANTS[name].holes == "fill" else not uncovered.any()
-    if VARIANTS[name].random:
-        assert not np.allclose(views["K"], target.K)
-        again = ViewMaker(VARIANTS[name], source, target)(0, frame)
-        np.testing.assert_array_equal(again["images"], views["images"])
-    else:
-        np.testing.assert_allclose(views["K"], target.K, rtol=1e-6)
-        np.testing.assert_allclose(views["cam2ego"], target.cam2ego, atol=1e-6)
-
-
-@pytest.mark.parametrize("change", ["up70", "waymo"])
-def test_what_auto_picks_where_cameras_move(frame, change):
-    """LiDAR with boxes."""
-    source, target = source_rig(SIZE), CHANGES[change].target(SIZE)
-    picked, asked = (
-        ViewMaker(replace(VARIANTS["auto"], surface=surface), source, target)(0, frame) for surface in ("auto", "lidar")
-    )
-    for key in ("images", "coverage", "cam2ego"):
-        np.testing.assert_array_equal(picked[key], asked[key])
+    assert views["images"].any(1).mean() > 0.9, "holes are filled"
+    np.testing.assert_array_equal(again["images"], views["images"])
+    assert np.allclose(views["K"], target.K, rtol=1e-6) == (VARIANTS[name].random is None)
+    assert np.allclose(views["cam2ego"], target.cam2ego, atol=1e-6) == (VARIANTS[name].random is None)
 
 
 def test_scaled_and_cropped_keeps_pixels_and_calibration_together():
@@ -68,29 +43,20 @@ def test_scaled_and_cropped_keeps_pixels_and_calibration_together():
         out, coverage, K2 = scaled_and_cropped(image, K, rng)
         moved = K2[0] @ np.linalg.inv(K[0]) @ (column, row, 1)
         scales.append(K2[0, 0, 0] / K[0, 0, 0])
-        if not (2 < moved[0] < 61 and 2 < moved[1] < 45):
-            continue
-        weight = out[0, 0].astype(float)
-        v, u = np.indices(weight.shape)
-        centre = (weight * u).sum() / weight.sum(), (weight * v).sum() / weight.sum()
-        np.testing.assert_allclose(centre, moved[:2], atol=0.1)
-        # A smaller picture leaves a border that nobody saw; a larger one fills the window.
-        assert coverage.mean() == pytest.approx(min(1, scales[-1] ** 2), abs=0.05)
+        if 2 < moved[0] < 61 and 2 < moved[1] < 45:
+            weight = out[0, 0].astype(float)
+            v, u = np.indices(weight.shape)
+            centre = (weight * u).sum() / weight.sum(), (weight * v).sum() / weight.sum()
+            np.testing.assert_allclose(centre, moved[:2], atol=0.1)
+            # A smaller picture leaves a border that nobody saw; a larger one fills the window.
+            assert coverage.mean() == pytest.approx(min(1, scales[-1] ** 2), abs=0.05)
     assert SCALE[0] <= min(scales) < 0.9 and 1.15 < max(scales) <= SCALE[1]
 
 
-def test_streets_are_disjoint_and_rigs_stand_on_one_road():
+def test_streets_are_disjoint_and_rigs_are_on_one_road():
     assert len({street_seed(split, streets) for split in SPLITS for streets in (100, 200)}) == 6
-    for change in CHANGES.values():
-        rig = change.target((96, 256))
-        assert rig.ground_z_m == 0 and set(rig.sizes) == {(96, 256)}
-    heights = {name: float(np.median(change.target(SIZE).cam2ego[:, 2, 3])) for name, change in CHANGES.items()}
+    rigs = {name: change.target((96, 256)) for name, change in CHANGES.items()}
+    assert all(rig.ground_z_m == 0 and set(rig.sizes) == {(96, 256)} for rig in rigs.values())
+    heights = {name: float(np.median(rig.cam2ego[:, 2, 3])) for name, rig in rigs.items()}
     assert heights == pytest.approx({"fov50": 1.5, "up70": 2.2, "waymo": 2.1}, abs=0.02)
-    assert CHANGES["fov50"].target(SIZE)[0].fov_deg[0] == pytest.approx(50)
-
-
-def test_unknown_names_are_refused():
-    with pytest.raises(ValueError, match=r"variants: expected some of raw, .*, got nothing"):
-        Settings(variants=("nothing",))
-    with pytest.raises(ValueError, match=r"changes: expected some of fov50, .*, got up7"):
-        Settings(changes=("up7",))
+    assert rigs["fov50"][0].fov_deg[0] == pytest.approx(50)
