@@ -60,9 +60,9 @@ class Run:
     def frames(self, images: Source, labels: Source) -> FrameSet:
         """Images of one set with labels of another, in the cells that the images' rig covers."""
         count, store, counts = self.settings.count(images.split), images.store(), covered_cells(Grid(), images.rig)
-        calibration = [store.stacked(name, count) for name in ("K", "cam2ego")]
+        K, cam2ego = (store.stacked(name, count) for name in ("K", "cam2ego"))
         state, boxes = (labels.store().stacked(name, count) for name in ("state", "boxes"))
-        return FrameSet(store, *calibration, state, counts, boxes)
+        return FrameSet(store, K, cam2ego, state, counts, boxes)
 
     # --- trainings and tests ------------------------------------------------------------------------------------------
     def schedule(self, job: Job) -> Schedule:
@@ -102,10 +102,10 @@ class Run:
         """Train and test; returns a line for the log."""
         start, schedule = time.process_time(), self.schedule(job)
         model, losses = train(self.draws(job), schedule, job.seed)
-        tested = {
-            change: evaluate(model, *(self.frames(true, true) for true in self.tests(change)), schedule)
-            for change in self.tested_on(job)
-        }
+        tested = {}
+        for change in self.tested_on(job):
+            val, test = (self.frames(true, true) for true in self.tests(change))
+            tested[change] = evaluate(model, val, test, schedule)
         cpu_s = time.process_time() - start
         result = {"losses": losses, "cpu_s": cpu_s, "tested": {name: t.for_json() for name, t in tested.items()}}
         write_whole({self.result_path(job): json.dumps(result).encode()})

@@ -25,7 +25,8 @@ from integrations.cross_rig.variants import Variant
 from integrations.cross_rig.views import ViewMaker
 from integrations.cross_rig.worlds import CHANGES, STREETS, Size, Split, World, source_rig, street_seed
 
-T, U = TypeVar("T"), TypeVar("U")
+T = TypeVar("T")
+U = TypeVar("U")
 
 _MAX_FRAMES = 1 << 20
 """Length of the streets' datasets: a set of frames grows without becoming another."""

@@ -15,7 +15,6 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import RenderedViews
 from arbiview_aug.evaluate.lidar import equalised
 from arbiview_aug.evaluate.metrics import psnr_db
-from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
 from tests.helpers import as_camera
 
 IN_BOTH = (pytest.mark.slow, pytest.mark.release)
@@ -48,15 +47,15 @@ class ProtocolFrame:
     """A frame at half resolution as the protocol reads it, and as this package does.
 
     Attributes:
-        cameras: The protocol's cameras; exposures made even unless ``raw``.
+        cameras: The protocol's cameras, exposures made even.
         lidar: (P, 3+) points in the ego frame.
         rig: The cameras as ours.
-        images: (h, w, 3) uint8 for each camera; exposures made even unless ``raw``.
+        images: (h, w, 3) uint8 for each camera, exposures made even.
     """
 
-    def __init__(self, referee: ModuleType, folder: Path, raw: bool = False) -> None:
-        self.cameras, self.lidar, self.calibration = referee.load_frame(str(folder), 0.5)
-        self.referee, self.ground_z_m = referee, float(self.calibration["ground_z_m"])
+    def __init__(self, referee: ModuleType, folder: Path) -> None:
+        self.cameras, self.lidar, calibration = referee.load_frame(str(folder), 0.5)
+        self.ground_z_m = float(calibration["ground_z_m"])
         self.rig = Rig(
             [
                 as_camera(name, c["K"], c["cam2ego"], c["image"].shape[:2], c["mask"] > 0)
@@ -65,15 +64,8 @@ class ProtocolFrame:
             ground_z_m=self.ground_z_m,
             name=folder.name,
         )
-        self.images = [c["image"] for c in self.cameras.values()]
-        if not raw:
-            self.images = list(equalised(self.rig, self.images, self.lidar))
-            self.cameras = referee.equalised(self.cameras, self.lidar)
-
-    def targets(self) -> dict[str, list[Any]]:
-        """The protocol's own targets by set, turned and raised."""
-        yaws = [self.referee.rotated_targets(self.cameras, yaw) for yaw in YAWS_DEG]
-        return {"yaw": yaws, "up": [self.referee.rotated_targets(self.cameras, 0.0, (0.0, 0.0, UP_M))]}
+        self.images = list(equalised(self.rig, [c["image"] for c in self.cameras.values()], self.lidar))
+        self.cameras = referee.equalised(self.cameras, self.lidar)
 
     def rigs(self, targets: Iterable[Any]) -> list[Rig]:
         """The protocol's targets as ours."""

@@ -42,49 +42,38 @@ class Pixels(NamedTuple):
     error: np.ndarray
 
 
-class Calibration(NamedTuple):
-    """Figures of the bins, the least confident first."""
+class Bins(NamedTuple):
+    """Mean errors of the bins, the least confident first.
+
+    Attributes:
+        errors: Of bins of equal count.
+        wide: Of bins of equal width, where populated.
+        claimed: Errors that the confidence of the bins of equal count claims.
+        halving: Mean error of all pixels over that of the most confident half.
+    """
 
     errors: list[float]
-    spearman: float
-    equal_width_errors: list[float]
-    equal_width_spearman: float
-    halving: float
-    """Mean error of all pixels over that of the most confident half."""
-
+    wide: list[float]
     claimed: list[float]
-    """The error that each bin's confidence claims."""
+    halving: float
 
 
 def spearman(errors: list[float]) -> float:
     """Rank correlation of the errors with the bins' order."""
-    ranks = np.argsort(np.argsort(errors))
-    return float(np.corrcoef(np.arange(len(errors)), ranks)[0, 1])
+    return float(np.corrcoef(np.arange(len(errors)), np.argsort(np.argsort(errors)))[0, 1])
 
 
-def calibration(pixels: Pixels) -> Calibration:
+def binned(pixels: Pixels) -> Bins:
     # Ties (exact pixels) are in the order in which they came: no order of theirs is better than another.
     order = np.argsort(pixels.confidence, kind="stable")
     error = pixels.error[order]
-    bins = [float(part.mean()) for part in np.array_split(error, BINS)]
     claims = -EXPECTED_ERROR_LEVELS * np.log(np.maximum(pixels.confidence[order], 1e-6))
+    errors, claimed = ([float(part.mean()) for part in np.array_split(values, BINS)] for values in (error, claims))
     index = np.minimum((pixels.confidence * BINS).astype(int), BINS - 1)
     count = np.bincount(index, minlength=BINS)
     populated = count >= 1e-3 * len(index)
     wide = (np.bincount(index, pixels.error, minlength=BINS)[populated] / count[populated]).tolist()
-    return Calibration(
-        errors=bins,
-        spearman=spearman(bins),
-        equal_width_errors=wide,
-        equal_width_spearman=spearman(wide),
-        halving=float(error.mean() / error[len(error) // 2 :].mean()),
-        claimed=[float(part.mean()) for part in np.array_split(claims, BINS)],
-    )
-
-
-def row(name: str, bins_of: Calibration) -> str:
-    bins = " ".join(f"{error:5.1f}" for error in bins_of.errors)
-    return f"  {name:<16}{bins}   rho {bins_of.spearman:+.3f}   error / that of the best half {bins_of.halving:.2f}"
+    return Bins(errors, wide, claimed, float(error.mean() / error[len(error) // 2 :].mean()))
 
 
 @pytest.fixture(scope="module", params=SEEDS)
@@ -110,37 +99,26 @@ def all_pixels(request: pytest.FixtureRequest) -> dict[tuple[str, str], Pixels]:
 
 
 @pytest.fixture(scope="module", params=GEOMETRIES)
-def pixels(request: pytest.FixtureRequest, all_pixels: dict[tuple[str, str], Pixels]) -> dict[str, Pixels]:
-    """By vehicle change, for one surface; printed as a table."""
+def bins(request: pytest.FixtureRequest, all_pixels: dict[tuple[str, str], Pixels]) -> Bins:
+    """All changes together, for one surface; printed with each change's."""
     found = {move: all_pixels[request.param, move] for move in MOVES}
-    whole = calibration(together(found))
+    whole = Pixels(*(np.concatenate(part) for part in zip(*found.values(), strict=True)))
     print(f"\nmean absolute error by tenths of confidence, {request.param}")
-    print(row("all", whole))
-    print("  (claimed)       " + " ".join(f"{claim:5.1f}" for claim in whole.claimed))
-    wide = " ".join(f"{error:5.1f}" for error in whole.equal_width_errors)
-    print(f"  (equal width)   {wide}   rho {whole.equal_width_spearman:+.3f}")
-    for move, part in found.items():
-        print(row(move, calibration(part)))
-    return found
+    for move, part in {"all": whole, **found}.items():
+        of_move = binned(part)
+        rho = f"rho {spearman(of_move.errors):+.3f}, 1/{of_move.halving:.1f}"
+        print(f"  {move:<16}{np.round(of_move.errors, 1)} {rho}, claimed {np.round(of_move.claimed, 1)}")
+    return binned(whole)
 
 
-def together(found: dict[str, Pixels]) -> Pixels:
-    return Pixels(*(np.concatenate(part) for part in zip(*found.values(), strict=True)))
-
-
-def test_error_falls_with_confidence(pixels: dict[str, Pixels]) -> None:
-    found = calibration(together(pixels))
-    assert found.spearman <= -0.9
-    assert found.equal_width_spearman <= -0.9
-
-
-def test_the_most_confident_half_has_half_the_error(pixels: dict[str, Pixels]) -> None:
-    assert calibration(together(pixels)).halving >= 2
+def test_error_falls_with_confidence(bins: Bins) -> None:
+    """The most confident half has half the error."""
+    assert spearman(bins.errors) <= -0.9 and spearman(bins.wide) <= -0.9
+    assert bins.halving >= 2
 
 
 @pytest.mark.parametrize("all_pixels", SEEDS[1:], indirect=True)  # of one street the means are too rough
-def test_confidence_claims_the_error_that_there_is(pixels: dict[str, Pixels]) -> None:
+def test_confidence_claims_the_error_that_there_is(bins: Bins) -> None:
     """exp(-e / 10): e is the mean error, within a third in the upper half of it."""
-    found = calibration(together(pixels))
-    for error, claim in list(zip(found.errors, found.claimed, strict=True))[: BINS // 2]:
+    for error, claim in list(zip(bins.errors, bins.claimed, strict=True))[: BINS // 2]:
         assert claim == pytest.approx(error, rel=1 / 3)

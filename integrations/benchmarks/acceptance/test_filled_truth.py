@@ -5,13 +5,10 @@ by 352 pixels. Run with ``-s`` for the numbers.
 """
 
 import functools
-import warnings
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import Neighbours
@@ -135,26 +132,3 @@ def test_what_moved_leaves_nothing(labels: bool, most: float, count: int, step_m
     assert ghosts <= most * pixels
     if count == 4:
         assert filled > (0.75 if labels else 0.4) * missing
-
-
-@pytest.mark.release
-def test_confidence_knows_how_far_away_a_fill_was_recorded() -> None:
-    """Fills from farther along the drive are less right, and trusted less; age counts by the distance travelled."""
-    rig = demo_source_rig((96, 264))
-    target = rig.with_cameras([replace(c.turned(pitch_deg=-15).shifted(0, 0, 0.6), mask=None) for c in rig])
-    near_far: list[list[float]] = []
-    for seed in range(3):
-        drive = SyntheticDrive(rig, num_frames=1, seed=seed, neighbours=Neighbours(count=4, step_m=2.0))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what no camera sees
-            out = RigRetarget(target, keys=SampleKeys(extra=("confidence", "source_frame")), holes="black")(drive[0])
-        truth = drive.render(0, target).images
-        assert isinstance(truth, torch.Tensor)
-        error = (out["images"].float() - truth.float()).abs().mean(1)
-        number = (out["source_frame"] - 1) % 4  # four before, four after, the nearest first
-        filled = out["source_frame"] > 0
-        near, far = filled & (number == 0), filled & (number >= 1)
-        near_far.append([float(v[m].mean()) for v in (error, out["confidence"]) for m in (near, far)])
-    for near_error, far_error, near_trust, far_trust in near_far:
-        assert near_error < far_error and near_trust > far_trust
-    print([[round(value, 2) for value in row] for row in near_far])

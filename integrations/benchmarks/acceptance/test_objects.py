@@ -146,15 +146,14 @@ def measure(seed: int, sums: dict[tuple[str, str, str], Sums]) -> None:
                     into.count["outside box"] += int((shown & ~grown(in_box)).sum())
                     into.count["outside shape"] += int((shown & ~grown(np.isin(true, vehicles))).sum())
                     marked = plans["street"].coverage[m] & ~plan.coverage[m]
-                    modelled = np.isin(truth.classes[m].numpy(), ROAD_AND_OBJECTS)
-                    for name, where in (("", modelled), (" anywhere", np.ones_like(modelled))):
-                        right = int((marked & hidden[m] & where).sum())
-                        into.count["right" + name] += right
-                        wrong = marked & seen[m] & ~grown(~seen[m]) & where
-                        into.count["marked" + name] += right + int(wrong.sum())
-                        missed = hidden[m] & ~marked & ~grown(marked) & where
-                        into.count["within 2 px" + name] += int((hidden[m] & where).sum()) - int(missed.sum())
-                        into.count["hidden" + name] += int((hidden[m] & where).sum())
+                    where = np.isin(truth.classes[m].numpy(), ROAD_AND_OBJECTS)
+                    right = int((marked & hidden[m] & where).sum())
+                    wrong = marked & seen[m] & ~grown(~seen[m]) & where
+                    missed = hidden[m] & ~marked & ~grown(marked) & where
+                    into.count["right"] += right
+                    into.count["marked"] += right + int(wrong.sum())
+                    into.count["within 2 px"] += int((hidden[m] & where).sum()) - int(missed.sum())
+                    into.count["hidden"] += int((hidden[m] & where).sum())
 
 
 def displaced(true: np.ndarray, shown: np.ndarray, seen: np.ndarray, into: Sums) -> None:
