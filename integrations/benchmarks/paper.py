@@ -1,4 +1,4 @@
-"""``python -m integrations.benchmarks.paper``: the paper's Tables 1 and 2, and its figures, by this package's metrics.
+"""``python -m integrations.benchmarks.paper``: the paper's Tables 1 and 2 by this package's metrics.
 
 The rows are baselines, the published stages and ours. Targets are the paper's six configurations, all cameras turned,
 four other vehicles, and the cameras 1 m higher (a truck). Every method gets images and poses alone.
@@ -19,13 +19,11 @@ from itertools import product, starmap
 from pathlib import Path
 from typing import Any
 
-from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import TARGET_SETS, Quality, Reduce
 from arbiview_aug.cli.arguments import (
     add_data,
     add_output,
     count,
-    gathered_warnings,
     named_steps,
     size,
     writable_folder,
@@ -35,17 +33,15 @@ from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import CalibrationError, DataError, SampleError
 from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scores
-from arbiview_aug.evaluate.images import Image, as_arrays
-from arbiview_aug.evaluate.methods import Method, Sample, retargeting
+from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.metrics import mean_of
-from arbiview_aug.evaluate.report.pictures import contact_sheet, left_to_right, save_picture
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
-from arbiview_aug.evaluate.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets, paper_target, spacing_deg
+from arbiview_aug.evaluate.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.generator import Diffusion, load_inpainter
 from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.inpaint.inpainter import Inpainter
-from integrations.benchmarks.baselines import BASELINES, crop_and_slide, method_of, own_camera
+from integrations.benchmarks.baselines import BASELINES, method_of
 from integrations.benchmarks.study import run_study, study_parser
 
 OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")  # presets other than the published method
@@ -254,44 +250,6 @@ def _has_truth(methods: Mapping[str, Mapping[str, Mapping[str, float]]]) -> bool
     return any("true_psnr_db" in row for kinds in methods.values() for row in kinds.values())
 
 
-FIGURES: dict[int, tuple[float, ...]] = {2: (0.5, -0.25), 3: (0.2,), 4: (-0.2,), 5: (0.4,), 6: (-0.4,)}
-"""The paper's figures, and the turns of their cameras as shares of the azimuth spacing."""
-
-
-def figure_methods(generator: Inpainter | None = None) -> dict[str, Method]:
-    """The paper's rows and ours, by caption."""
-    methods = {
-        "DriveSuprim: crop and slide": method_of("crop and slide", crop_and_slide),
-        "geometric: own camera, no fusion": method_of("own camera", own_camera),
-        "FAVS as published": retargeting("paper"),
-        "fast, street": retargeting("fast", "street"),
-    }
-    return methods | {method.name: method for method in generating("fast, street, holes generated", generator)}
-
-
-def draw_figures(sample: Mapping[str, Any], folder: Path, generator: Inpainter | None = None) -> list[Path]:
-    """Write ``figure2.png`` to ``figure6.png`` of a sample; methods that cannot take the rig's lenses have no row."""
-    rig: Rig = sample["rig"]
-    images: list[Image] = as_arrays(sample["images"])
-    order, spacing = left_to_right(rig), spacing_deg(rig)
-    files = []
-    for number, shares in FIGURES.items():
-        rows: list[tuple[str, list[Image], list[str]]] = [
-            ("Recorded", [images[k] for k in order], [rig.names[k] for k in order])
-        ]
-        for share in shares:
-            target = paper_target(rig, share)
-            for name, method in figure_methods(generator).items():
-                try:
-                    views = method.render(sample, target)
-                except (CalibrationError, SampleError):
-                    continue
-                captions = [f"{rig.names[k]} {share * spacing[k]:+.4g} deg" for k in order]
-                rows.append((name, [views[k].image for k in order], captions))
-        files.append(save_picture(folder / f"figure{number}.png", contact_sheet(rows)))
-    return files
-
-
 # --- methods ----------------------------------------------------------------------------------------------------------
 def paper_stages() -> dict[str, PaperConfig]:
     """``paper``, and with each stage switched off.
@@ -338,7 +296,7 @@ def generating(name: str, generator: Inpainter | None) -> list[Method]:
 
 # --- the command ------------------------------------------------------------------------------------------------------
 def main(argv: Sequence[str] | None = None) -> int:
-    """Measure and print the tables, or draw the figures; the exit status."""
+    """Measure and print the tables; the exit status."""
     return run_study(parser(), _run, argv)
 
 
@@ -346,12 +304,10 @@ def parser() -> argparse.ArgumentParser:
     """Create the command's parser."""
     parser = study_parser(
         "paper",
-        "The paper's Tables 1 and 2: baselines, the published stages and ours; about 20 minutes. --figure: its "
-        "Figures 2 to 6 from the first frame, as PNG files.",
+        "The paper's Tables 1 and 2: baselines, the published stages and ours; about 20 minutes.",
         "--data FOLDER",
     )
     add_data(parser, "nuscenes-one and ddad-one below ARBIVIEW_DATA, and synthetic streets")
-    parser.add_argument("--figure", action="store_true", help="draw the figures instead")
     parser.add_argument("--generator", metavar="PATH", help="of the row *generator*; frames are held-out ones")
     parser.add_argument("--frames", type=count, metavar="N", help="frames of tables (default: 1; 3 synthetic ones)")
     parser.add_argument("--size", type=size, metavar="HxW", help="of synthetic images (default: 256x704)")
@@ -363,11 +319,6 @@ def _run(arguments: argparse.Namespace) -> None:
     folder = writable_folder(Path(arguments.output), arguments.output)
     generator = None if arguments.generator is None else load_inpainter(arguments.generator)
     trained_on = generator.generator.trained_on if isinstance(generator, Diffusion) else None
-    if arguments.figure:
-        with gathered_warnings([]):
-            files = draw_figures(_figures_sample(arguments, trained_on), folder, generator)
-        print("\n".join(f"picture: {file}" for file in files))
-        return
     with named_steps([]) as tick:  # warnings of targets half outside the view are expected
         study = measure_paper(
             arguments.data,
@@ -380,18 +331,6 @@ def _run(arguments: argparse.Namespace) -> None:
     study.generator = arguments.generator
     (folder / "paper.json").write_text(json.dumps(study.as_dict(), indent=1) + "\n")
     print(f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}")
-
-
-def _figures_sample(arguments: argparse.Namespace, trained_on: TrainedOn | None) -> Sample:
-    """The first frame that the generator was not trained on, without its points."""
-    (index,) = unseen_frames(trained_on, arguments.data, 1)
-    if arguments.data is not None:
-        data = open_data(arguments.data)
-    else:
-        seed = SYNTHETIC_SEED if trained_on is None or trained_on.unseen(None) is None else trained_on.seed
-        source = demo_source_rig(arguments.size or SYNTHETIC_SIZE)
-        data = SyntheticDrive(source, num_frames=index + 1, seed=seed, lidar=False)
-    return make_frame(data[index], exposures=()).sample
 
 
 if __name__ == "__main__":

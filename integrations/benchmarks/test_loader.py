@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,45 +12,62 @@ import pytest
 from torch.utils.data import DataLoader, Dataset
 
 from arbiview_aug import RetargetedDataset, RigRetarget
+from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench.timing import memory_mib
-from arbiview_aug.datasets.synthetic import demo_target_rig
+from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from integrations.benchmarks import loader
-from integrations.benchmarks.loader import loader_rates
-from integrations.benchmarks.machine import counting
-from tests.helpers import street_sample
-from tests.worker_samples import Frames, rig
+from integrations.benchmarks.loader import PLAIN
+from tests.helpers import street_sample, write_drive
 
-pytestmark = pytest.mark.release
-
-EXPECTED = 1.7
-QUIET = 1.9  # two processes that only count do this much more than one where nobody else is working
-QUIET_LOAD = 1.0  # before the measurement, over a minute
-FRAMES, EPOCHS = 48, 3
 SOAKED, WARM_UP = 2000, 200  # frames
 AT = (WARM_UP, SOAKED // 2, SOAKED - 20)  # frames after which memory is read: workers that have no more to do end
 MOST_GROWTH_MIB = 8.0
+TINY = ("--size", "24x48", "--frames", "3", "--epochs", "1", "--downscale")
 
 
-def test_two_workers_against_one(capsys: pytest.CaptureFixture[str], report_bound: Callable[..., None]) -> None:
-    """Four 800x450 images a frame to four of 704x256."""
-    source = rig((450, 800))
-    retarget = RigRetarget(source.turned(yaw_deg=20), source=source, size=(256, 704))
-    retarget.prepare()
-    dataset = RetargetedDataset(Frames(FRAMES, (450, 800)), retarget)
-    load, machine = os.getloadavg()[0], [counting(2) / counting(1)]
-    rates = loader_rates({"retargeted": dataset}, (0, 1, 2), EPOCHS)
-    machine.append(counting(2) / counting(1))
-    best = {rate["workers"]: rate["best_per_s"] for rate in rates}
-    scaling, given = best[2] / best[1], min(machine)
-    report = (
-        f"frames/s: {', '.join(f'{n} workers {rate:.1f}' for n, rate in best.items())}; two against one {scaling:.2f}; "
-        f"two counting processes against one at least {given:.2f}; load {load:.1f} on {os.cpu_count()} cores"
-    )
-    with capsys.disabled():
-        print("\n" + report)
-    if (os.cpu_count() or 1) < 2 or given < QUIET or load > QUIET_LOAD:
-        pytest.skip(f"the machine is busy, so the bound says nothing: {report}")
-    report_bound("frames/s, two workers over one", scaling, at_least=EXPECTED)
+def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, before = tmp_path / "new" / "loader.json", set(multiprocessing.active_children())
+    arguments = ["--data", str(nuscenes_root), "--geometry", "street", *TINY, "4", "--workers", "0", "1"]
+    assert loader.main([*arguments, "--output", str(path)]) == 0
+    report = json.loads(path.read_text())
+    assert report["data"] == "nuscenes-one" and report["target"] == "waymo" and report["size"] == [24, 48]
+    rates = {(rate["name"], rate["workers"]): rate for rate in report["rates"]}
+    assert list(rates) == [(name, n) for name in (PLAIN, "retargeted, street") for n in (0, 1)]
+    for (name, workers), rate in rates.items():
+        assert 0 < rate["frames_per_s"] <= rate["best_per_s"]
+        assert rate["ms"]["q1_ms"] <= rate["ms"]["median_ms"] <= rate["ms"]["q3_ms"]
+        assert (rate["of_reading"] == 1) == (name == PLAIN)
+        assert (rate["unique_mib"] is None) == (workers == 0)
+    printed = capsys.readouterr().out
+    assert "frames/s" in printed and "load" in printed and f"report: {path}" in printed
+    assert set(multiprocessing.active_children()) <= before, "none is left behind"
+    with pytest.raises(SystemExit, match="2"):
+        loader.main([*arguments, "--workers", "-1"])
+
+
+@pytest.mark.slow
+def test_depth_on_disk_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sample = SyntheticDrive(demo_source_rig((48, 96)), num_frames=3, neighbours=Neighbours())[0]
+    write_drive(tmp_path / "drive", [sample, *sample["neighbours"]])
+    data, path = ["--data", str(tmp_path / "drive")], tmp_path / "a.json"
+    asked = [*data, "--geometry", "motion", "fused", *TINY, "1", "--workers", "0", "--output", str(path)]
+    assert loader.main(asked) == 2
+    assert "depth" in capsys.readouterr().err
+    assert main(["depth", *data]) == 0 and loader.main(asked) == 0
+    names = [rate["name"] for rate in json.loads(path.read_text())["rates"]]
+    assert names == [PLAIN, "retargeted, motion", "retargeted, fused"]
+
+
+@pytest.mark.release
+def test_rates_against_reading(nuscenes_root: Path, tmp_path: Path, report_bound: Callable[..., None]) -> None:
+    """Two workers, a plan a frame over LiDAR and boxes; and the street, whose plan is held."""
+    path = tmp_path / "loader.json"
+    arguments = ["--data", f"nuscenes:{nuscenes_root}", "--workers", "2", "--geometry", "street", "lidar"]
+    assert loader.main([*arguments, "--output", str(path)]) == 0
+    _, street, lidar = json.loads(path.read_text())["rates"]
+    report_bound("rate over the street by that of reading", street["of_reading"], at_least=0.85)
+    report_bound("rate over LiDAR and boxes by that of reading", lidar["of_reading"], at_least=0.30)
 
 
 class Drifting(Dataset[dict[str, Any]]):
@@ -69,16 +85,7 @@ class Drifting(Dataset[dict[str, Any]]):
         return self.sample | moved | {"rig": self.sample["rig"].shifted(x_m=away_m)}
 
 
-def test_rates_against_reading(nuscenes_root: Path, tmp_path: Path, report_bound: Callable[..., None]) -> None:
-    """Two workers, a plan a frame over LiDAR and boxes; and the street, whose plan is held."""
-    path = tmp_path / "loader.json"
-    arguments = ["--data", f"nuscenes:{nuscenes_root}", "--workers", "2", "--geometry", "street", "lidar"]
-    assert loader.main([*arguments, "--output", str(path)]) == 0
-    _, street, lidar = json.loads(path.read_text())["rates"]
-    report_bound("rate over the street by that of reading", street["of_reading"], at_least=0.85)
-    report_bound("rate over LiDAR and boxes by that of reading", lidar["of_reading"], at_least=0.30)
-
-
+@pytest.mark.release
 @pytest.mark.timeout(3600)
 def test_soak(report_bound: Callable[..., None]) -> None:
     """2,000 frames in two workers with a new plan each, over LiDAR and boxes: the workers' memory stays."""

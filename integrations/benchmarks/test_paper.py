@@ -6,7 +6,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -126,12 +125,6 @@ def test_lenses_are_told(fisheye_root: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert "surround-fisheye, row split: row_split: expected pinhole cameras" in paper_report(study)
 
 
-def test_missing_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ARBIVIEW_DATA", str(tmp_path))
-    monkeypatch.setattr(paper, "SETS", ("truck",))
-    assert list(measure_paper(frames=1, size=(16, 44), methods=methods()[:1]).means) == ["synthetic"]
-
-
 @pytest.mark.slow
 def test_the_command(
     no_real_frames: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -141,10 +134,6 @@ def test_the_command(
     printed = capsys.readouterr().out
     assert "| paper without stage 3, objects " in printed and PROTOCOL in printed
     assert set(json.loads((tmp_path / "paper.json").read_text())) == {"means", "published", "protocol", "declined"}
-
-
-def test_an_empty_study() -> None:
-    assert paper_report(Study()) == PROTOCOL
 
 
 @pytest.mark.slow
@@ -191,13 +180,3 @@ def test_baselines_take_targets_in_their_own_frame() -> None:
     views = method_of("row split", row_split).render(sample, target)
     for view, want in zip(views, row_split(rig, as_arrays(sample["images"]), rig), strict=True):
         np.testing.assert_array_equal(view.image, want.image)
-
-
-@pytest.mark.slow
-def test_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--figure", "--size", "40x110", "--output", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.count("picture: ") == 5
-    heights = {k: cv2.imread(str(tmp_path / f"figure{k}.png")).shape[0] for k in range(2, 7)}
-    # Figure 2 has two configurations of four rows each below the recorded row, the others one.
-    assert heights[3] == heights[4] == heights[5] == heights[6]
-    assert heights[2] / heights[3] == pytest.approx(9 / 5, rel=0.02)
