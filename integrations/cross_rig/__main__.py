@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
-from arbiview_aug.cli.arguments import count, device_named, seed
+from arbiview_aug.cli.arguments import count, seed
 from arbiview_aug.errors import ArbiviewError
 from integrations.cross_rig.experiment import Run, run
 from integrations.cross_rig.families import FAMILIES
@@ -32,7 +32,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         if output.exists() and not output.is_dir():
             raise ValueError(f"--output: expected a folder, got the file {output}")
         setup = Run(settings=settings_of(arguments), output=output)
-        device_named(setup.settings.schedule.device)  # before hours of rendering
     except (ValueError, ArbiviewError) as error:
         print(error, file=sys.stderr)
         return 2
@@ -73,7 +72,6 @@ def parser() -> argparse.ArgumentParser:
     change.add_argument("--seeds", nargs="+", type=seed, metavar="SEED")
     for option in ("--train-frames", "--val-frames", "--test-frames", "--steps"):
         change.add_argument(option, type=count, metavar="N")
-    change.add_argument("--device", help="of the trainings, cpu or cuda")
     return parser
 
 
@@ -85,7 +83,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
         settings = recorded(settings, *arguments.real)
         for name in {"changes", "world"} & given.keys():
             raise ValueError(f"--{name} is for synthetic streets: leave it out with --real")
-    schedule = replace(settings.schedule, **{name: given[name] for name in ("steps", "device") if name in given})
+    schedule = replace(settings.schedule, steps=given.get("steps", settings.schedule.steps))
     values: dict[str, Any] = {name: given[name] for name in vars(settings) if name in given}
     values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
     settings = replace(settings, schedule=schedule, **values)

@@ -58,9 +58,9 @@ def box_loss(answer: Tensor, boxes: Tensor, state: Tensor, counts: Tensor, grid:
     frame, row = told.nonzero(as_tuple=True)
     box = boxes[frame, row]
     x, y = _cells(box, coarse).unbind(-1)
-    heat = torch.zeros(len(boxes), side, side, device=answer.device)
+    heat = torch.zeros(len(boxes), side, side)
     if coarse.cell_m < 2:  # cells as wide as a car answer for themselves
-        axis = torch.arange(side, device=answer.device)
+        axis = torch.arange(side)
         apart = (axis - _cells(boxes, coarse)[..., None]).float() ** 2  # [B, n, 2, side]
         away = apart[..., 0, :, None] + apart[..., 1, None, :]
         heat = torch.exp(-away).masked_fill(~told[..., None, None], 0).amax(1)

@@ -14,8 +14,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from integrations.cross_rig.encoders import STRIDE, Residual
 from integrations.cross_rig.labels import Grid
+
+STRIDE = 4
+"""Pixels of an image along a side of a feature."""
 
 VOXEL_HEIGHTS_M = (0.4, 1.2, 2.0, 2.8)
 """Over the road: slices of 0.8 m up to a truck's roof."""
@@ -29,6 +31,26 @@ _LIFTED_M = (-1.0, 4.0)
 _LAYERS, _POINTS, _HEADS = 3, 4, 4
 _REACH_M = 2.0
 """Reach of a query: how far from its reference point it may read."""
+
+
+def conv(into: int, out: int, *, stride: int = 1, dilation: int = 1) -> nn.Sequential:
+    """A convolution of 3×3 with normalisation and ReLU."""
+    return nn.Sequential(
+        nn.Conv2d(into, out, 3, stride, dilation, dilation=dilation, bias=False),
+        nn.BatchNorm2d(out),
+        nn.ReLU(inplace=True),
+    )
+
+
+class Residual(nn.Module):
+    """A convolution and the identity."""
+
+    def __init__(self, channels: int, *, dilation: int = 1) -> None:
+        super().__init__()
+        self.conv = conv(channels, channels, dilation=dilation)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.conv(x)
 
 
 @dataclass(frozen=True)
@@ -79,27 +101,15 @@ class Bags(NamedTuple):
         return F.embedding_bag(self.rows, flat, self.offsets, mode="sum", per_sample_weights=self.weights)
 
 
-class Projected(NamedTuple):
-    """Points in images.
-
-    Attributes:
-        pixel: (T, P, 2).
-        inside: (T, P) bool, in front of the camera and in its image.
-    """
-
-    pixel: Tensor
-    inside: Tensor
-
-
-def project(batch: Batch, points: Tensor) -> Projected:
-    """Project points (T, P, 3) or (P, 3) of the ego frame into every image."""
+def project(batch: Batch, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (T, P, 2) of points (T, P, 3) or (P, 3) of the ego frame, and whether they are in each image (T, P)."""
     height, width = batch.images.shape[-2:]
     ego2cam = torch.linalg.inv(batch.cam2ego)
     cam = points @ ego2cam[:, :3, :3].mT + ego2cam[:, None, :3, 3]
     depth = cam[..., 2]
     pixel = (cam @ batch.K.mT)[..., :2] / depth.clamp(min=0.1)[..., None]
     inside = (depth > 0.1) & (pixel > -0.5).all(-1) & (pixel[..., 0] < width - 0.5) & (pixel[..., 1] < height - 0.5)
-    return Projected(pixel, inside)
+    return pixel, inside
 
 
 def voxel_bags(batch: Batch, voxels: Tensor, feature_size: tuple[int, int], stride: int) -> Bags:
@@ -137,7 +147,7 @@ def voxel_bags(batch: Batch, voxels: Tensor, feature_size: tuple[int, int], stri
             rows.append(row)
             weights.append(wx * wy * in_map * covered[row])
     weight = torch.stack(weights, 1)  # [P / 4, 4]
-    total = torch.zeros(num_frames * num_voxels, device=weight.device).index_add_(0, bag, weight.sum(1))
+    total = torch.zeros(num_frames * num_voxels).index_add_(0, bag, weight.sum(1))
     weight = weight / total[bag].clamp(min=1e-6)[:, None]
     count = torch.bincount(bag, minlength=num_frames * num_voxels) * 4
     return Bags(torch.stack(rows, 1).flatten(), weight.flatten(), count.cumsum(0) - count)
@@ -164,7 +174,7 @@ class Voxels(nn.Module):
 
     def voxel_features(self, features: Tensor, batch: Batch) -> Tensor:
         """(B, heights, side, side, C): what each voxel sees; zero where nothing is covered."""
-        with torch.autocast(features.device.type, enabled=False):  # coordinates are never rounded to bf16
+        with torch.autocast("cpu", enabled=False):  # coordinates are never rounded to bf16
             bags = voxel_bags(batch, self.voxels, (features.shape[-2], features.shape[-1]), STRIDE)
         return bags.sums(features).view(len(batch.state), len(VOXEL_HEIGHTS_M), self.side, self.side, -1)
 
@@ -197,8 +207,8 @@ class Depths(nn.Module):
             probability: (T, depths, h, w).
         """
         fh, fw = probability.shape[-2:]
-        side, device = self.grid.cells, probability.device
-        v, u = torch.meshgrid(torch.arange(fh, device=device), torch.arange(fw, device=device), indexing="ij")
+        side = self.grid.cells
+        v, u = torch.meshgrid(torch.arange(fh), torch.arange(fw), indexing="ij")
         pixel = torch.stack([u, v, torch.ones_like(u)], -1).reshape(-1, 3).float()
         pixel[:, :2] = pixel[:, :2] * STRIDE + (STRIDE - 1) / 2
         rays = pixel @ (batch.cam2ego[:, :3, :3] @ torch.linalg.inv(batch.K)).mT  # [T, h * w, 3]
@@ -218,7 +228,7 @@ class Depths(nn.Module):
     def forward(self, features: Tensor, batch: Batch) -> Tensor:
         """(B, width, side, side) map of features (T, C, h, w)."""
         logits = self.distribution(features)
-        with torch.autocast(features.device.type, enabled=False):
+        with torch.autocast("cpu", enabled=False):
             bags = self.bags(batch, logits.float().softmax(1))
         side = self.grid.cells
         lifted = bags.sums(features).view(len(batch.state), side, side, -1)
@@ -269,7 +279,7 @@ class _QueryLayer(nn.Module):
 
     def forward(self, query: Tensor, references: Tensor, features: Tensor, batch: Batch) -> Tensor:
         offsets = self.offsets(query).float().unflatten(-1, (_POINTS, 3)).tanh() * _REACH_M
-        with torch.autocast(features.device.type, enabled=False):
+        with torch.autocast("cpu", enabled=False):
             points = (references[:, None] + offsets).flatten(1, 2)
             seen = read_at(features.float(), batch, points).unflatten(1, (-1, _POINTS)).flatten(2)
         query = self.norms[0](query + self.value(seen))
@@ -282,11 +292,11 @@ def read_at(features: Tensor, batch: Batch, points: Tensor) -> Tensor:
     fh, fw = features.shape[-2:]
     pixel, inside = project(batch, points[batch.frame])
     at = (pixel - (STRIDE - 1) / 2) / STRIDE
-    place = (2 * (at + 0.5) / torch.tensor([fw, fh], device=at.device) - 1)[:, :, None]
+    place = (2 * (at + 0.5) / torch.tensor([fw, fh]) - 1)[:, :, None]
     covered = batch.covered()[:, None]
     maps = torch.cat([features * covered, covered], 1)
     read = F.grid_sample(maps, place, padding_mode="border", align_corners=False)[..., 0].mT * inside[..., None]
-    summed = torch.zeros(len(points), *read.shape[1:], device=read.device).index_add_(0, batch.frame, read)
+    summed = torch.zeros(len(points), *read.shape[1:]).index_add_(0, batch.frame, read)
     return summed[..., :-1] / summed[..., -1:].clamp(min=1e-6)
 
 

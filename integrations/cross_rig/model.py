@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from integrations.cross_rig.boxes import BOX_CHANNELS
-from integrations.cross_rig.encoders import SmallEncoder, conv
-from integrations.cross_rig.families import FAMILIES, Batch
+from integrations.cross_rig.families import FAMILIES, Batch, Residual, conv
 from integrations.cross_rig.labels import Grid
 
 _MEAN, _STD = 0.45, 0.25
@@ -34,6 +34,22 @@ class Answer(NamedTuple):
 
     occupancy: Tensor
     boxes: Tensor
+
+
+class SmallEncoder(nn.Module):
+    """(T, 3, h, w) to (T, 32, h / 4, w / 4)."""
+
+    channels = 32
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.fine = nn.Sequential(conv(3, 16, stride=2), conv(16, 32, stride=2), Residual(32))
+        self.coarse = nn.Sequential(conv(32, 64, stride=2), Residual(64), Residual(64, dilation=2))
+        self.merge = nn.Conv2d(64, 32, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        fine = self.fine(x)
+        return torch.relu(fine + F.interpolate(self.merge(self.coarse(fine)), fine.shape[-2:], mode="bilinear"))
 
 
 class Heads(nn.Module):

@@ -15,7 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from integrations.cross_rig.boxes import cells_at
-from integrations.cross_rig.encoders import Residual, conv
+from integrations.cross_rig.cache import Arrays
+from integrations.cross_rig.families import Residual, conv
 from integrations.cross_rig.labels import Grid
 from integrations.cross_rig.model import Answer, Heads
 
@@ -44,15 +45,6 @@ class PointBatch:
 
 
 @dataclass(frozen=True)
-class PointFrame:
-    """One scan, its labels and boxes."""
-
-    points: npt.NDArray[np.float16]
-    state: npt.NDArray[np.uint8]
-    boxes: npt.NDArray[np.float32]
-
-
-@dataclass(frozen=True)
 class PointSet:
     """Scans with labels, in memory.
 
@@ -71,28 +63,23 @@ class PointSet:
         """(cells, cells): a scanner looks all around."""
         return np.ones(self.state.shape[1:], bool)
 
-    def frame(self, index: int) -> PointFrame:
-        """One frame."""
-        return PointFrame(self.points[index], self.state[index], self.boxes[index])
+    def frame(self, index: int) -> Arrays:
+        """One scan, its labels and boxes."""
+        return {"points": self.points[index], "state": self.state[index], "boxes": self.boxes[index]}
 
     @staticmethod
-    def joined(frames: Sequence[PointFrame]) -> PointBatch:
+    def joined(frames: Sequence[Arrays]) -> PointBatch:
         """Frames as one batch."""
-        cells = frames[0].state.shape[0]
-        points = np.concatenate([frame.points for frame in frames]).astype(np.float32)
-        frame = np.repeat(np.arange(len(frames)), [len(scan.points) for scan in frames])
+        points = np.concatenate([frame["points"] for frame in frames]).astype(np.float32)
+        state, boxes = (torch.from_numpy(np.stack([frame[name] for frame in frames])) for name in ("state", "boxes"))
+        cells = state.shape[-1]
+        frame = np.repeat(np.arange(len(frames)), [len(frame["points"]) for frame in frames])
         row, column = cells_at(Grid(cells=cells), points[:, :2])
         pillar = (frame * cells + row) * cells + column
-        order = np.argsort(pillar, kind="stable")
-        count = np.bincount(pillar, minlength=len(frames) * cells * cells)
-        state, boxes = (np.stack([getattr(scan, name) for scan in frames]) for name in ("state", "boxes"))
-        return PointBatch(
-            torch.from_numpy(points[order]),
-            torch.from_numpy(np.cumsum(count) - count),
-            torch.from_numpy(state),
-            torch.ones(state.shape, dtype=torch.bool),
-            torch.from_numpy(boxes),
-        )
+        count = np.bincount(pillar, minlength=state.numel())
+        ordered = torch.from_numpy(points[np.argsort(pillar, kind="stable")])
+        offsets = torch.from_numpy(np.cumsum(count) - count)
+        return PointBatch(ordered, offsets, state, torch.ones(state.shape, dtype=torch.bool), boxes)
 
 
 class PillarDetector(nn.Module):
@@ -116,10 +103,9 @@ class PillarDetector(nn.Module):
         xy = batch.points[:, :2]
         place = (xy / self.grid.cell_m) % 1 - 0.5
         rest = torch.stack([batch.points[:, 2] / _HEIGHT_M, batch.points[:, 3] / 255], 1)
-        with torch.autocast(xy.device.type, enabled=False):  # coordinates are never rounded to bf16
+        with torch.autocast("cpu", enabled=False):  # coordinates are never rounded to bf16
             features = self.points(torch.cat([place, rest, 2 * xy / self.grid.side_m], 1))
-            rows = torch.arange(len(features), device=xy.device)
-            highest = F.embedding_bag(rows, features, batch.offsets, mode="max")
+            highest = F.embedding_bag(torch.arange(len(features)), features, batch.offsets, mode="max")
         side = self.grid.cells
         return highest.view(len(batch.state), side, side, -1).permute(0, 3, 1, 2)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from integrations.cross_rig.boxes import box_loss, decode, match, real_boxes
-from integrations.cross_rig.cache import FrameStore
+from integrations.cross_rig.cache import Arrays, FrameStore
 from integrations.cross_rig.families import Batch
 from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid
 from integrations.cross_rig.model import Answer, Detector
@@ -44,7 +44,6 @@ class Schedule:
         batch: Frames a step.
         lr: The peak of a one-cycle schedule; AdamW's default decay.
         precision: ``bf16`` runs the networks in bfloat16 (autocast): twice as fast on CPUs with AMX.
-        device: Device to train on.
     """
 
     steps: int
@@ -52,20 +51,6 @@ class Schedule:
     batch: int = 4
     lr: float = 3e-3
     precision: Literal["bf16", "fp32"] = field(default_factory=fast_precision)
-    device: str = "cpu"
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One frame's images, calibration and labels: a ``Batch`` without its first dimension."""
-
-    images: npt.NDArray[np.uint8]
-    coverage: npt.NDArray[np.bool_]
-    K: npt.NDArray[np.float32]
-    cam2ego: npt.NDArray[np.float32]
-    state: npt.NDArray[np.uint8]
-    counts: npt.NDArray[np.bool_]
-    boxes: npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -88,23 +73,25 @@ class FrameSet:
     counts: npt.NDArray[np.bool_]
     boxes: npt.NDArray[np.float32]
 
-    def frame(self, index: int) -> Frame:
-        """One frame's arrays."""
-        images, K, cam2ego = self.store.images(index), self.K[index], self.cam2ego[index]
-        covered = np.ones((len(images), *images.shape[-2:]), bool)
-        return Frame(images, covered, K, cam2ego, self.state[index], self.counts, self.boxes[index])
+    def frame(self, index: int) -> Arrays:
+        """One frame's arrays: a ``Batch`` without its first dimension."""
+        images = self.store.images(index)
+        calibration = {"K": self.K[index], "cam2ego": self.cam2ego[index]}
+        covered = {"images": images, "coverage": np.ones((len(images), *images.shape[-2:]), bool)}
+        labels = {"state": self.state[index], "counts": self.counts, "boxes": self.boxes[index]}
+        return covered | calibration | labels
 
     @staticmethod
-    def joined(frames: Sequence[Frame]) -> Batch:
+    def joined(frames: Sequence[Arrays]) -> Batch:
         """Frames of any number of cameras as one batch."""
 
-        def of_all(name: str) -> torch.Tensor:
+        def joined(name: str) -> torch.Tensor:
             join = np.stack if name in ("state", "counts", "boxes") else np.concatenate
-            return torch.from_numpy(join([getattr(frame, name) for frame in frames]))
+            return torch.from_numpy(join([frame[name] for frame in frames]))
 
-        lengths = torch.tensor([len(frame.images) for frame in frames])
-        arrays = {name: of_all(name) for name in Frame.__dataclass_fields__}
-        return Batch(frame=torch.arange(len(frames)).repeat_interleave(lengths), **arrays)
+        lengths = torch.tensor([len(frame["images"]) for frame in frames])
+        frame = torch.arange(len(frames)).repeat_interleave(lengths)
+        return Batch(frame=frame, **{name: joined(name) for name in frames[0]})
 
 
 Frames = FrameSet | PointSet
@@ -131,16 +118,16 @@ class Draws:
 
     def batch(self, size: int) -> Batch | PointBatch:
         """The next batch; every frame once before any comes again."""
-        frames: list[Any] = []
+        frames: list[Arrays] = []
         for _ in range(size):
             if not self.left:
                 self.left = [int(k) for k in self.order.permutation(self.num_frames)]
             index = self.left.pop()
             drawn_from = self.raw if self.raw is not None and self.rng.random() < 0.5 else self.frames
-            frame: Any = drawn_from.frame(index)
+            frame = drawn_from.frame(index)
             if self.augmented:
-                images, coverage, K = scaled_and_cropped(frame.images, frame.K, self.rng)
-                frame = replace(frame, images=images, coverage=coverage, K=K)
+                moved = scaled_and_cropped(frame["images"], frame["K"], self.rng)
+                frame |= dict(zip(("images", "coverage", "K"), moved, strict=True))
             frames.append(frame)
         return self.frames.joined(frames)
 
@@ -156,16 +143,15 @@ def loss(answer: Answer, batch: Batch | PointBatch) -> torch.Tensor:
 def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[float]]:
     """A trained detector and its mean loss over each tenth of the steps."""
     torch.manual_seed(seed)
-    device = torch.device(schedule.device)
     pillars = schedule.family == "pillars"
     untrained: nn.Module = PillarDetector(Grid()) if pillars else Detector(Grid(), schedule.family)
-    model = untrained.to(device).to(memory_format=torch.channels_last)
+    model = untrained.to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(model.parameters(), lr=schedule.lr)
     cycle = torch.optim.lr_scheduler.OneCycleLR(optimizer, schedule.lr, total_steps=schedule.steps)
     losses = []
     model.train()
     for _ in range(schedule.steps):
-        batch = _on(device, draws.batch(schedule.batch))
+        batch = draws.batch(schedule.batch)
         with _autocast(schedule):
             answer = model(batch)
         value = loss(answer, batch)
@@ -177,14 +163,8 @@ def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[
     return model.eval(), [float(np.mean(part)) for part in np.array_split(losses, min(10, len(losses)))]
 
 
-def _on(device: torch.device, batch: Batch | PointBatch) -> Batch | PointBatch:
-    """A batch on a device."""
-    return type(batch)(*(getattr(batch, name).to(device) for name in batch.__dataclass_fields__))
-
-
 def _autocast(schedule: Schedule) -> torch.autocast:
-    device = torch.device(schedule.device).type
-    return torch.autocast(device, torch.bfloat16, enabled=schedule.precision == "bf16")
+    return torch.autocast("cpu", torch.bfloat16, enabled=schedule.precision == "bf16")
 
 
 @torch.no_grad()
@@ -195,12 +175,11 @@ def answers(
     cells, detections = [], []
     for start in range(0, num_frames, _EVAL_BATCH):
         indices = range(start, min(start + _EVAL_BATCH, num_frames))
-        read: Any = [frames.frame(k) for k in indices]
-        batch = _on(torch.device(schedule.device), frames.joined(read))
+        batch = frames.joined([frames.frame(k) for k in indices])
         with _autocast(schedule):
             answer = model(batch)
-        cells.append(answer.occupancy.float().sigmoid().cpu().numpy().astype(np.float16))
-        detections.append(decode(answer.boxes, Grid(), apart=schedule.family != "queries").cpu().numpy())
+        cells.append(answer.occupancy.float().sigmoid().numpy().astype(np.float16))
+        detections.append(decode(answer.boxes, Grid(), apart=schedule.family != "queries").numpy())
     return np.concatenate(cells), np.concatenate(detections)
 
 

@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Sequence
-from pathlib import Path
-
-import cv2
 import kornia.augmentation as K
-import numpy as np
 import torch
 from torchvision import tv_tensors
 from torchvision.transforms import v2
@@ -44,26 +38,15 @@ def kornia_pipeline() -> torch.nn.Sequential:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run both on a synthetic street; with ``--output`` write what came of it."""
-    parser = argparse.ArgumentParser(prog="python -m integrations.kornia.example", description=__doc__)
-    parser.add_argument("--output", type=Path, help="picture to write")
-    arguments = parser.parse_args(argv)
+def main() -> int:
+    """Run both on a synthetic street."""
     torch.manual_seed(0)
     sample = SyntheticDrive(demo_source_rig((128, 352)), num_frames=1, lidar=False)[0]
     sample["images"] = tv_tensors.Image(sample["images"])  # else v2 takes the first tensor of the dict for an image
-    rows = []
     for pipeline in (torchvision_pipeline(), kornia_pipeline()):
         out = pipeline(sample)
-        images = out["images"].as_subclass(torch.Tensor)
-        levels = images.float() / (255 if images.dtype == torch.uint8 else 1)
-        rows.append(torch.cat(list(levels), dim=-1))
         fx = ", ".join(f"{f:.1f}" for f in out["K"][:, 0, 0])
-        print(f"{type(pipeline).__name__}: {tuple(images.shape)} {images.dtype}, fx {fx} px")
-    if arguments.output:
-        picture = (torch.cat(rows, dim=-2).permute(1, 2, 0).numpy()[..., ::-1] * 255).round().astype(np.uint8)
-        cv2.imwrite(str(arguments.output), np.ascontiguousarray(picture))
-        print(f"picture: {arguments.output}")
+        print(f"{type(pipeline).__name__}: {tuple(out['images'].shape)} {out['images'].dtype}, fx {fx} px")
     return 0
 
 

@@ -38,6 +38,7 @@ def main() -> int:
         seen = float(np.mean(results["coverage"]))
         error_px = worst_error_px(results, target.in_frame_of(source))
         count = len(results["img_inputs"][0] if "img_inputs" in results else results["img"])
+        assert error_px <= 1e-3, name
         print(f"{name:22} {count} views, {seen:.1%} seen, lidar2img within {error_px:.1e} px of the rig's")
     return 0
 

@@ -1,4 +1,4 @@
-"""Every integration where its framework is: tests and examples in the environments of ``integrations.environments``."""
+"""Every integration where its framework is: examples in the environments of ``integrations.environments``."""
 
 from __future__ import annotations
 
@@ -12,23 +12,7 @@ import pytest
 from integrations.environments import python_of
 
 ROOT = Path(__file__).parents[2]
-FRAMEWORK_TESTS = ("mmdet3d/tests/test_compose.py",)
 EXAMPLES = ("kornia", "lightning", "mmdet3d", "nuscenes", "openpcdet", "webdataset")
-
-
-def run(*arguments: str) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run(
-        [str(python_of("pipelines")), *arguments],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=500,
-    )
-    print(done.stdout[-4000:])
-    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
-    return done.stdout
 
 
 def test_every_folder_has_readme_and_example() -> None:
@@ -68,14 +52,10 @@ def test_examples_check_their_framework_first(name: str) -> None:
 
 
 @pytest.mark.integrations
-@pytest.mark.parametrize("file", FRAMEWORK_TESTS)
-def test_with_its_framework(file: str) -> None:
-    out = run("-m", "pytest", "-q", "-p", "no:cacheprovider", f"integrations/{file}")
-    assert " passed" in out and "skipped" not in out
-
-
-@pytest.mark.integrations
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_example(name: str) -> None:
-    out = run("-m", f"integrations.{name}.example")
-    assert name != "mmdet3d" or out.startswith("mmengine.dataset.Compose")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [str(python_of("pipelines")), "-m", f"integrations.{name}.example"]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    assert name != "mmdet3d" or done.stdout.startswith("mmengine.dataset.Compose")

@@ -166,7 +166,6 @@ def test_settings_of_the_command(tmp_path):
     [
         ("--real A B --world cuboids", "--world is for synthetic streets: leave it out with --real"),
         ("--real A B --changes up70", "--changes is for synthetic streets: leave it out with --real"),
-        ("--device cuda:99", "expected cpu or a CUDA device that is there"),
         *((text, "error: argument") for text in ("--steps 0", "--seeds -1", "--variants nothing", "--workers 0")),
     ],
 )

@@ -8,15 +8,15 @@ import torch
 
 from integrations.cross_rig import scans
 from integrations.cross_rig.labels import VEHICLE, Grid
-from integrations.cross_rig.pillars import PillarDetector, PointFrame, PointSet
+from integrations.cross_rig.pillars import PillarDetector, PointSet
 from integrations.cross_rig.scans import CHANGES, kinds, main, point_set, rig_of, scans_of
 
 CELLS = Grid().cells
 
 
-def frame(*points) -> PointFrame:
-    boxes = np.full((3, 7), np.nan, np.float32)
-    return PointFrame(np.array(points, np.float16), np.zeros((CELLS, CELLS), np.uint8), boxes)
+def frame(*points) -> dict:
+    boxes, state = np.full((3, 7), np.nan, np.float32), np.zeros((CELLS, CELLS), np.uint8)
+    return {"points": np.array(points, np.float16), "state": state, "boxes": boxes}
 
 
 @pytest.fixture

@@ -41,14 +41,6 @@ def _known(rig):
     return rig.with_cameras([camera.crop(8, 16, (40, 120)).resize((20, 60)) for camera in rig])
 
 
-def test_v2s_own_resize_leaves_k_wrong(sample: dict) -> None:
-    """The trap: nothing fails."""
-    out = v2.Compose([RigRetarget(TARGET, geometry="infinity"), v2.Resize((32, 88))])(sample)
-    assert out["images"].shape[-2:] == (32, 88) and torch.allclose(out["K"], torch.from_numpy(TARGET.K))
-    right = v2.Compose([RigRetarget(TARGET, geometry="infinity"), ResizeRig((32, 88))])(sample)
-    assert torch.allclose(right["K"], torch.from_numpy(TARGET.resized((32, 88), "crop").K))
-
-
 def test_a_module_that_writes_into_its_images_leaves_the_sample(sample: dict) -> None:
     before = {**sample, "images": sample["images"].float() / 255}
     out = OnImages(lambda images: images.mul_(0))(before)
@@ -105,17 +97,15 @@ def test_photometric_ones_pass() -> None:
         check_photometric(module)
 
 
-def test_images_keep_their_type_and_shape(sample: dict) -> None:
+def test_images_are_a_tensor_and_keep_their_type_and_shape(sample: dict) -> None:
     assert type(OnImages(K.ColorJiggle())(sample)["images"]) is tv_tensors.Image
-    with pytest.raises(ValueError, match=r"expected images of shape \(6, 3, 64, 176\).*got \(6, 3, 32, 88\)"):
-        OnImages(torch.nn.AvgPool2d(2))(sample)
-
-
-def test_lists_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"got a list in .*; pass size=\(h, w\)"):
-        OnImages(K.ColorJiggle())({"images": [torch.zeros(3, 4, 4)]})
-    with pytest.raises(ValueError, match=r"expected a tensor 'images', of one size, got a NoneType in a sample of K"):
-        OnImages(K.ColorJiggle())({"K": torch.eye(3)})
+    for module, given, message in (
+        (torch.nn.AvgPool2d(2), sample, r"expected images of shape \(6, 3, 64, 176\).*got \(6, 3, 32, 88\)"),
+        (K.ColorJiggle(), {"images": [torch.zeros(3, 4, 4)]}, r"got a list in .*; pass size=\(h, w\)"),
+        (K.ColorJiggle(), {"K": torch.eye(3)}, "expected a tensor 'images', of one size, got a NoneType in a sample"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            OnImages(module)(given)
 
 
 @pytest.mark.parametrize("type_", [torch.uint8, torch.float32])
@@ -137,9 +127,8 @@ def test_floats_of_another_range_are_refused() -> None:
             OnImages(K.ColorJiggle(0.2, 0.2, 0.2, 0.02, p=1.0))({"images": images})
 
 
-def test_example(tmp_path, capsys) -> None:
-    assert main(["--output", str(tmp_path / "out.png")]) == 0
-    assert "(5, 3, 128, 352) torch.float32" in capsys.readouterr().out and (tmp_path / "out.png").is_file()
+def test_example(capsys) -> None:
+    assert main() == 0 and "(5, 3, 128, 352) torch.float32" in capsys.readouterr().out
 
 
 def test_what_was_filled_stays(sample: dict) -> None:

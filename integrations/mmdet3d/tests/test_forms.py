@@ -72,55 +72,36 @@ def psnr(one: np.ndarray, two: np.ndarray) -> float:
 
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 @pytest.mark.parametrize("form", FORMS)
-def test_projection_is_the_new_rigs(given: Recording, form: str) -> None:
+def test_every_form(given: Recording, form: str) -> None:
+    """Cameras where they were when they exposed, not their mounting alone, with which one is up to 0.36 m off; points
+    and boxes; all in one ego frame: that of the LiDAR's time, or BEVDet's."""
     results = FORMS[form](given)
     before = deepcopy({key: value for key, value in results.items() if key not in ("img", "gt_bboxes_3d", "ann_info")})
-    after = step()(results)
+    transform, read = step(geometry="boxes"), {}
+    retarget = transform.retarget
+    transform.retarget = lambda sample, params: read.update(sample) or retarget(sample, params)
+    after = transform(results)
     error_px = worst_error_px(after, TARGET.in_frame_of(SOURCE))
-    print(f"{form}: {error_px:.1e} px")
     assert error_px <= 1e-3
     assert worst_error_px(results, SOURCE) <= 1e-3 or form == "BEVDet"  # as given: BEVDet's images are augmented
     assert str({k: v for k, v in results.items() if k in before}) == str(before)  # the input is as it was
-    assert after["coverage"].shape == (5, *SIZE)
-    for key in ("points", "gt_bboxes_3d"):
-        assert after.get(key) is results.get(key)
-
-
-@pytest.mark.filterwarnings("ignore:retarget. drops")
-@pytest.mark.parametrize("form", FORMS)
-def test_images_are_those_of_the_true_poses(given: Recording, form: str) -> None:
-    """Not of the mounting alone, with which a camera is up to 0.36 m off; of geometry in the LiDAR's frame, moved."""
+    assert all(after.get(key) is results.get(key) for key in ("points", "gt_bboxes_3d"))
     sample = in_key_frame(given) if form == "BEVDet" else given.sample
-    after = step(geometry="boxes")(FORMS[form](given))
-    expected = RigRetarget(TARGET, geometry="boxes")(sample)
-    same = after["coverage"] & expected["coverage"].numpy()
-    level = psnr(pixels(after)[same], expected["images"].permute(0, 2, 3, 1).numpy()[same])
-    print(f"{form}: {level:.1f} dB")
-    # BEVDet's images were resized by PIL and cropped before, which nothing brings back.
-    assert level > (27 if form == "BEVDet" else 45)
-
-
-@pytest.mark.filterwarnings("ignore:retarget. drops")
-@pytest.mark.parametrize("form", FORMS)
-def test_what_the_retargeting_is_given(given: Recording, form: str) -> None:
-    """Cameras where they were when they exposed, points and boxes, all in one ego frame: that of the LiDAR's time, or
-    BEVDet's."""
-    held: dict[str, Any] = {}
-    one = step()
-    retarget = one.retarget
-    one.retarget = lambda sample, params: held.update(sample) or retarget(sample, params)
-    results = FORMS[form](given)
-    one(results)
-    expected = in_key_frame(given) if form == "BEVDet" else given.sample
-    boxes, true_boxes = held["boxes_3d"].numpy(), expected["boxes_3d"].numpy()
+    boxes, true_boxes = read["boxes_3d"].numpy(), sample["boxes_3d"].numpy()
     assert np.allclose(boxes[:, :6], true_boxes[:, :6], atol=1e-4)
     assert np.allclose(np.exp(1j * boxes[:, 6]), np.exp(1j * true_boxes[:, 6]), atol=1e-5)
     if "points" in results:
-        assert np.allclose(held["points"], expected["points"], atol=1e-4)
+        assert np.allclose(read["points"], sample["points"], atol=1e-4)
     if form != "BEVDet":  # whose images are augmented: their cameras are compared by their images
-        assert np.allclose(held["rig"].cam2ego, expected["rig"].cam2ego, atol=1e-5)
-        assert np.abs(held["rig"].cam2ego - given.mounted).max() > 0.3
-        assert np.allclose(held["rig"].K, expected["rig"].K, atol=1e-3)
+        assert np.allclose(read["rig"].cam2ego, sample["rig"].cam2ego, atol=1e-5)
+        assert np.abs(read["rig"].cam2ego - given.mounted).max() > 0.3
+        assert np.allclose(read["rig"].K, sample["rig"].K, atol=1e-3)
+    expected = RigRetarget(TARGET, geometry="boxes")(sample)
+    same = after["coverage"] & expected["coverage"].numpy()
+    level = psnr(pixels(after)[same], expected["images"].permute(0, 2, 3, 1).numpy()[same])
+    print(f"{form}: {error_px:.1e} px, {level:.1f} dB")
+    # BEVDet's images were resized by PIL and cropped before, which nothing brings back.
+    assert after["coverage"].shape == (5, *SIZE) and level > (27 if form == "BEVDet" else 45)
 
 
 @pytest.mark.filterwarnings("ignore:retarget. drops")
@@ -227,16 +208,6 @@ def test_entries_that_are_empty(given: Recording) -> None:
         assert len(step()(FORMS["BEVDet"](given) | {key: None})["img_inputs"][0]) == 5
 
 
-def test_keys_of_a_config_file() -> None:
-    assert RigRetargetMultiView(TARGET, keys={"labels": ["seg"]}).retarget.keys.labels == ("seg",)
-
-
-@pytest.mark.parametrize("is_old", [False, True])
-def test_frames_without_boxes(is_old: bool) -> None:
-    boxes = Boxes(np.zeros((0, 7)), is_old=is_old)
-    assert geometry({"gt_bboxes_3d": boxes}, LIDAR2EGO)["boxes_3d"].shape == (0, 7)
-
-
 def test_geometry_in_plain_numbers() -> None:
     rows = np.float32([[8, 1, 0, 4, 2, 1.5, 0.3], [9, 1, 0, 4, 2, 1.5, 0]])
     expected = geometry({"points": rows, "gt_bboxes_3d": rows}, LIDAR2EGO)
@@ -248,98 +219,75 @@ def test_geometry_in_plain_numbers() -> None:
             geometry({key: np.ones(shape)}, LIDAR2EGO)
     with pytest.raises(SampleTypeError, match="gt_bboxes_3d: expected a tensor of numbers"):
         geometry({"gt_bboxes_3d": "boxes"}, LIDAR2EGO)
-    assert geometry({"gt_bboxes_3d": []}, LIDAR2EGO)["boxes_3d"].shape == (0, 7)
+    empty = np.zeros((0, 7))
+    for boxes in ([], Boxes(empty), Boxes(empty, is_old=True)):
+        assert geometry({"gt_bboxes_3d": boxes}, LIDAR2EGO)["boxes_3d"].shape == (0, 7)
+
+
+AUGMENTED = {
+    **{"img_aug_matrix": [np.diag([0.5, 0.5, 1, 1])] * 6, "pcd_rotation": -torch.eye(3), "pcd_trans": np.ones(3)},
+    **{"flip": True, "pcd_horizontal_flip": True, "scale_factor": np.full(4, 0.5), "pcd_scale_factor": np.nan},
+    **{"global_aug_matrix": 2 * np.eye(4), "bev_flip_matrix": np.diag([1, -1, 1, 1])},
+}
+MALFORMED: list[tuple[str, Any, str]] = [
+    *(("DETR3D", {key: AUGMENTED[key]}, f"{key}: expected a frame as it was recorded") for key in AUGMENTED),
+    ("DETR3D", {"lidar2img": 3.0}, "lidar2img: expected 6 matrices, 3×3 or 4×4, one for each image, got float"),
+    ("DETR3D", {"lidar2img": []}, "lidar2img: expected 6 matrices"),
+    ("DETR3D", {"lidar2cam": [1] * 6}, "lidar2cam: expected 6 matrices"),
+    ("DETR3D", {"cam_intrinsic": np.ones((5, 4, 4))}, "cam_intrinsic: expected 6 matrices, 3×3 or 4×4"),
+    ("DETR3D", {"lidar2img": np.full((6, 4, 4), np.nan)}, "lidar2img: expected K @ lidar2cam, got .* nan%"),
+    ("DETR3D", {"lidar2img": np.ones((6, 4, 4))}, "lidar2img: expected K @ lidar2cam, got matrices that differ by"),
+    ("DETR3D", dict.fromkeys(("lidar2cam", "lidar2img"), np.zeros((6, 4, 4))), "lidar2cam: .* can be inverted"),
+    ("DETR3D", {"lidar2img": np.zeros((6, 4, 4)), "lidar2cam": None}, "lidar2img: .* can be decomposed"),
+    ("DETR3D", {"ori_lidar2img": 3.0}, "ori_lidar2img: expected a matrix of each image"),
+    ("DETR3D", {"img": [np.full((64, 176, 3), -1.0)] * 6}, r"img\[0\]: expected grey levels from 0 to 255, got -"),
+    ("DETR3D", {"img": [np.zeros((64, 176))] * 6}, r"img\[0\]: expected \(H, W, 3\)"),
+    ("DETR3D", {"img": [None] * 6}, r"img\[0\]: expected \(H, W, 3\)"),
+    ("DETR3D", {"img_norm_cfg": {"mean": [1, 2], "std": [1, 1]}}, "img_norm_cfg: expected three means and three pos"),
+    ("mmdet3d", {"img_norm_cfg": {"mean": [1, 2, 3], "std": ["a"]}}, "img_norm_cfg: expected three means"),
+    ("Sparse4D", {"lidar2ego_rotation": [1, 0]}, "lidar2ego_rotation, lidar2ego_translation: expected a quaternion"),
+    ("Sparse4D", {"lidar2ego_translation": [1, 0]}, "lidar2ego_rotation, lidar2ego_translation: expected a quat"),
+    ("mmdet3d", {"flip": "no"}, "flip: expected numbers"),
+    ("mmdet3d", {"pcd_rotation": np.eye(2)}, r"pcd_rotation: expected numbers of shape \(3, 3\)"),
+    ("Sparse4D", {"img_shape": [(64,)] * 6}, r"img_shape: expected \(h, w\) of each image"),
+    ("mmdet3d", {"images": {name: {"height": "x", "width": 3} for name in SOURCE.names}}, "images: expected height"),
+    ("Sparse4D", {"image_wh": 3.0}, "image_wh: expected numbers of each image"),
+    ("PETR", {"img_timestamp": ["a"] * 6, "timestamp": None}, "img_timestamp: expected seconds"),
+    ("BEVDet", lambda e: (e[0] * np.nan, *e[1:]), r"img_inputs: expected 8 bit images .* nan off whole numbers"),
+    ("BEVDet", lambda e: e[:5], r"img_inputs: expected .* got 5 entries"),
+    ("BEVDet", lambda e: (*e[:4], e[4] * 0, *e[5:]), "post_rots that can be inverted, got a singular one"),
+    ("BEVDet", lambda e: tuple(part[:0] for part in e), "expected 6 images a frame, as 'cam_names' says, got 0"),
+    ("BEVDet", lambda e: (e[0].repeat(2, 1, 1, 1), *e[1:]), r"expected 12 cameras in each entry"),
+]
+
+
+@pytest.mark.parametrize(("form", "entries", "message"), MALFORMED)
+@pytest.mark.filterwarnings("ignore:retarget. drops")
+def test_malformed_entries_are_named(given: Recording, form: str, entries: Any, message: str) -> None:
+    results = FORMS[form](given)
+    entries = {"img_inputs": entries(results["img_inputs"])} if callable(entries) else entries
+    with pytest.raises((SampleError, SampleTypeError), match=message):
+        step()(results | entries)
 
 
 @pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_messages(given: Recording) -> None:
-    results = FORMS["DETR3D"](given)
+    results, bevdet = FORMS["DETR3D"](given), FORMS["BEVDet"](given)
+    mixed = Rig([TARGET[0], *(camera.resize((40, 60)) for camera in TARGET.cameras[1:])])
+    for transform, sample, message in (
+        (RigRetargetMultiView(TARGET), results, "lidar2ego: expected the LiDAR's pose"),
+        (step(), {"img": results["img"]}, "expected the cameras' matrices"),
+        (step(), {"filename": []}, "expected 'img', loaded images"),
+        (step(mixed), results, "images of one size"),
+        (step(keys=SampleKeys(frame="target")), results, r"SampleKeys\.frame: expected 'source'"),
+        (step(img_norm=((0, 0, 0), (1, 1, 1))), {"img_inputs": bevdet["img_inputs"]}, r"whole numbers.*img_norm"),
+    ):
+        with pytest.raises(SampleError, match=message):
+            transform(sample)
     with pytest.raises(CalibrationError, match=r"pinhole cameras.*got radtan.*undistorted\(\)"):
         RigRetargetMultiView("waymo")
-    with pytest.raises(SampleError, match="lidar2ego: expected the LiDAR's pose"):
-        RigRetargetMultiView(TARGET)(results)
     with pytest.raises(CalibrationError, match=r"lidar2ego: expected a pose \(4, 4\), got shape \(3, 3\)"):
         RigRetargetMultiView(TARGET, lidar2ego=np.eye(3))
-    with pytest.raises(SampleError, match="lidar2img: expected K @ lidar2cam, got matrices that differ by"):
-        step()({**results, "lidar2img": [np.diag([0.5, 0.5, 1, 1]) @ m for m in results["lidar2img"]]})
-    with pytest.raises(SampleError, match="cam_intrinsic: expected 6 matrices, 3×3 or 4×4"):
-        step()({**results, "cam_intrinsic": results["cam_intrinsic"][:5]})
-    with pytest.raises(SampleError, match="expected the cameras' matrices"):
-        step()({"img": results["img"]})
-    with pytest.raises(SampleError, match="expected 'img', loaded images"):
-        step()({"filename": []})
-    augmented = {"img_aug_matrix": [np.diag([0.5, 0.5, 1, 1])] * 6, "pcd_rotation": -torch.eye(3)}
-    augmented |= {"pcd_trans": np.ones(3), "flip": True, "pcd_horizontal_flip": True, "scale_factor": np.full(4, 0.5)}
-    augmented |= {
-        "global_aug_matrix": 2 * np.eye(4),
-        "bev_flip_matrix": np.diag([1, -1, 1, 1]),
-        "pcd_scale_factor": np.nan,
-    }
-    for key, value in augmented.items():
-        with pytest.raises(SampleError, match=f"{key}: expected a frame as it was recorded, got an augmented one"):
-            step()({**results, key: value})
-    with pytest.raises(SampleError, match=r"img\[0\]: expected grey levels from 0 to 255, got -"):
-        step()({**results, "img": [image / 58 - 2 for image in results["img"]]})
-    with pytest.raises(SampleTypeError, match=r"img\[0\]: expected \(H, W, 3\)"):
-        step()({**results, "img": [image[..., 0] for image in results["img"]]})
-    mixed = Rig([TARGET[0], *(camera.resize((40, 60)) for camera in TARGET.cameras[1:])])
-    with pytest.raises(SampleError, match="images of one size"):
-        step(mixed)(results)
-    with pytest.raises(SampleError, match=r"SampleKeys\.frame: expected 'source'"):
-        step(keys=SampleKeys(frame="target"))(results)
-    entries = FORMS["BEVDet"](given)["img_inputs"]
-    with pytest.raises(SampleError, match=r"whole numbers.*img_norm"):
-        step(img_norm=((0, 0, 0), (1, 1, 1)))({"img_inputs": entries})
-    with pytest.raises(SampleError, match=r"img_inputs: expected 8 bit images .* nan off whole numbers"):
-        step()({"img_inputs": (entries[0] * np.nan, *entries[1:])})
-    with pytest.raises(SampleError, match=r"img_inputs: expected .* got 5 entries"):
-        step()({"img_inputs": entries[:5]})
-    with pytest.raises(SampleError, match="post_rots that can be inverted, got a singular one"):
-        step()({"img_inputs": (*entries[:4], entries[4] * 0, *entries[5:])})
-    with pytest.raises(SampleError, match="expected 6 images a frame, as 'cam_names' says, got 0"):
-        step()({"img_inputs": tuple(entry[:0] for entry in entries), "cam_names": SOURCE.names})
-    with pytest.raises(SampleError, match="img_norm_cfg: expected three means and three positive stds, got"):
-        step()({**results, "img_norm_cfg": {"mean": [1, 2], "std": [1, 1]}})
-    with pytest.raises(SampleTypeError, match=r"img\[0\]: expected \(H, W, 3\)"):
-        step()({**results, "img": [None, *results["img"][1:]]})
-    several = (entries[0].repeat(2, 1, 1, 1), *entries[1:])
-    with pytest.raises(SampleError, match=r"expected 12 cameras in each entry"):
-        step()({"img_inputs": several})
-
-
-@pytest.mark.parametrize(
-    ("form", "entries", "message"),
-    [
-        ("DETR3D", {"lidar2img": 3.0}, "lidar2img: expected 6 matrices, 3×3 or 4×4, one for each image, got float"),
-        ("DETR3D", {"lidar2img": []}, "lidar2img: expected 6 matrices"),
-        ("DETR3D", {"lidar2cam": [1] * 6}, "lidar2cam: expected 6 matrices"),
-        ("DETR3D", {"lidar2img": np.full((6, 4, 4), np.nan)}, "lidar2img: expected K @ lidar2cam, got .* nan%"),
-        ("DETR3D", dict.fromkeys(("lidar2cam", "lidar2img"), np.zeros((6, 4, 4))), "lidar2cam: .* can be inverted"),
-        ("DETR3D", {"lidar2img": np.zeros((6, 4, 4)), "lidar2cam": None}, "lidar2img: .* can be decomposed"),
-        ("DETR3D", {"ori_lidar2img": 3.0}, "ori_lidar2img: expected a matrix of each image"),
-        (
-            "Sparse4D",
-            {"lidar2ego_rotation": [1, 0]},
-            "lidar2ego_rotation, lidar2ego_translation: expected a quaternion",
-        ),
-        ("Sparse4D", {"lidar2ego_translation": [1, 0]}, "lidar2ego_rotation, lidar2ego_translation: expected a quat"),
-        ("mmdet3d", {"flip": "no"}, "flip: expected numbers"),
-        ("mmdet3d", {"pcd_rotation": np.eye(2)}, r"pcd_rotation: expected numbers of shape \(3, 3\)"),
-        ("Sparse4D", {"img_shape": [(64,)] * 6}, r"img_shape: expected \(h, w\) of each image"),
-        (
-            "mmdet3d",
-            {"images": {name: {"height": "x", "width": 3} for name in SOURCE.names}},
-            "images: expected height",
-        ),
-        ("Sparse4D", {"image_wh": 3.0}, "image_wh: expected numbers of each image"),
-        ("PETR", {"img_timestamp": ["a"] * 6, "timestamp": None}, "img_timestamp: expected seconds"),
-        ("mmdet3d", {"img_norm_cfg": {"mean": [1, 2, 3], "std": ["a"]}}, "img_norm_cfg: expected three means"),
-    ],
-)
-@pytest.mark.filterwarnings("ignore:retarget. drops")
-def test_malformed_entries_are_named(given: Recording, form: str, entries: dict[str, Any], message: str) -> None:
-    with pytest.raises(SampleError, match=message):
-        step()(FORMS[form](given) | entries)
 
 
 @pytest.mark.parametrize(
