@@ -13,11 +13,9 @@ from typing import Any, get_args
 
 from arbiview_aug.cli.arguments import count, seed
 from arbiview_aug.errors import ArbiviewError
-from integrations.cross_rig.experiment import Run, run
+from integrations.cross_rig.experiment import LONGER, Length, Run, Settings, fitted, jobs, quick, recorded, run, small
 from integrations.cross_rig.families import FAMILIES
-from integrations.cross_rig.real import fitted
 from integrations.cross_rig.report import summary, write_report
-from integrations.cross_rig.settings import LONGER, Length, Settings, jobs, quick, recorded, small
 from integrations.cross_rig.variants import VARIANTS
 from integrations.cross_rig.worlds import CHANGES, World
 

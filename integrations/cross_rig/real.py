@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import zip_longest
 from pathlib import Path
@@ -28,7 +28,6 @@ from integrations.cross_rig.boxes import boxes_on_grid
 from integrations.cross_rig.cache import Arrays
 from integrations.cross_rig.frames import Source
 from integrations.cross_rig.labels import Grid, box_cells
-from integrations.cross_rig.settings import Settings
 from integrations.cross_rig.variants import Variant
 from integrations.cross_rig.views import ViewMaker, arrays_of
 from integrations.cross_rig.worlds import OF_TESTS, SPLITS, Split
@@ -208,18 +207,3 @@ def vehicles_of(sample: dict[str, Any], data: str) -> tuple[np.ndarray, np.ndarr
         return boxes, np.full(len(boxes), LEAST_POINTS)
     inside = points_in(boxes, np.asarray(sample["points"], np.float64)[:, :3])
     return boxes, np.array([len(found) for found in inside], int)
-
-
-def fitted(settings: Settings) -> Settings:
-    """Settings of as many frames as there are: B's own training frames are no more than A's.
-
-    Raises:
-        DataError: A data set cannot be read, has no labels, or too few drives.
-    """
-    assert settings.recorded is not None
-    a, b = settings.recorded
-    train = min(len(frames_of_a(a, b)), len(frames_of(b, "train")), settings.train_frames)
-    counts: dict[str, Any] = {f"{s}_frames": min(len(frames_of(b, s)), settings.count(s)) for s in OF_TESTS}
-    for data in (a, b):
-        vehicles_of(recording(data)[0], data)
-    return replace(settings, train_frames=train, **counts)

@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from integrations.cross_rig.experiment import Run
+from integrations.cross_rig.experiment import Run, jobs
 from integrations.cross_rig.scoring import Interval, ap_scores, iou_scores, matches_of
-from integrations.cross_rig.settings import jobs
 from integrations.cross_rig.variants import VARIANTS
 
 Results = Mapping[str, Mapping[int, Mapping[str, Any]]]

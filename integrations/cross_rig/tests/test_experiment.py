@@ -11,10 +11,9 @@ import pytest
 from integrations.cross_rig import __main__ as command
 from integrations.cross_rig import cache, experiment
 from integrations.cross_rig.cache import FrameStore
-from integrations.cross_rig.experiment import Run, run
+from integrations.cross_rig.experiment import Run, Settings, jobs, quick, run, small
 from integrations.cross_rig.labels import FREE, HIDDEN, VEHICLE
 from integrations.cross_rig.report import summary, write_report
-from integrations.cross_rig.settings import Settings, jobs, quick, small
 from integrations.cross_rig.training import Schedule
 
 TINY = Settings(

@@ -12,9 +12,8 @@ from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.errors import DataError
 from integrations.cross_rig import __main__ as command
 from integrations.cross_rig import cache, real
-from integrations.cross_rig.experiment import Run
+from integrations.cross_rig.experiment import REAL, Run, Settings, fitted, jobs, recorded
 from integrations.cross_rig.labels import FREE, HIDDEN, VEHICLE
-from integrations.cross_rig.settings import REAL, Settings, jobs, recorded
 from integrations.cross_rig.training import Schedule
 from integrations.cross_rig.worlds import OF_TESTS
 from tests.datasets.nuscenes_root import START_US, Street, streets, tables_of, write_root
@@ -57,7 +56,7 @@ def roots(tmp_path_factory) -> tuple[str, str]:
 
 
 def run_of(a: str, b: str, output: Path) -> Run:
-    return Run(settings=real.fitted(recorded(SMALL, a, b)), output=output)
+    return Run(settings=fitted(recorded(SMALL, a, b)), output=output)
 
 
 @pytest.mark.slow
