@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
-from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from integrations.benchmarks.baselines import BASELINES, SPLIT_DEPTH_M, crop_and_slide, own_camera, row_split
@@ -67,25 +67,13 @@ def test_crop_and_slide_is_a_window_over_strips() -> None:
     assert tuple(back.image[45, 90]) == COLOURS[2], "the panorama is closed"
 
 
-def test_crop_and_slide_of_one_camera() -> None:
-    image = noise()
-    (view,) = crop_and_slide(Rig([camera()]), [image], Rig([camera()]))
-    np.testing.assert_allclose(view.image.astype(int), image, atol=1)
-
-
-def test_row_split_below_the_horizon_is_the_road() -> None:
-    source, target = camera(), camera(position_m=(0.0, 0.0, 3.0))
-    row = np.broadcast_to(np.arange(91, dtype=np.uint8)[:, None, None], (91, 181, 3)).copy()
-    (view,) = row_split(Rig([source]), [row], Rig([target]))
-    # f = 90.5 px, the horizon at row 45. A road point at row 45 + v is at 90.5 · 3 / v m, and there at half of v.
+def test_row_split_is_the_road_below_the_horizon_and_a_plane_above() -> None:
+    """f = 90.5 px, the horizon at row 45."""
+    row, column = (np.broadcast_to(axis[..., None], (91, 181, 3)).astype(np.uint8) for axis in np.indices((91, 181)))
+    (view,) = row_split(Rig([camera()]), [row], Rig([camera(position_m=(0.0, 0.0, 3.0))]))
+    # A road point at row 45 + v is at 90.5 · 3 / v m, and there at half of v; 50 m ahead, 1.5 m are 2.7 px.
     assert view.image[45 + 40, 90, 0] == 45 + 20 and view.image[45 + 20, 90, 0] == 45 + 10
-    # Above: 50 m ahead, 1.5 m are 2.7 px.
-    f = source.K[1, 1]
-    assert view.image[20, 90, 0] == round(20 - f * 1.5 / SPLIT_DEPTH_M)
-
-
-def test_row_split_above_the_horizon_is_a_plane() -> None:
-    column = np.broadcast_to(np.arange(181, dtype=np.uint8)[None, :, None], (91, 181, 3)).copy()
+    assert view.image[20, 90, 0] == round(20 - camera().K[1, 1] * 1.5 / SPLIT_DEPTH_M)
     (view,) = row_split(Rig([camera()]), [column], Rig([camera(position_m=(0.0, 2.0, 1.5))]))
     shift = round(float(camera().K[0, 0]) * 2.0 / SPLIT_DEPTH_M)
     assert shift == 4
@@ -95,17 +83,13 @@ def test_row_split_above_the_horizon_is_a_plane() -> None:
 def test_row_split_the_last_camera_wins_and_masks_hold() -> None:
     mask = np.ones((91, 181), bool)
     mask[:, :60] = False
-    masked = Camera(**{**_fields(camera(name="second")), "mask": mask})
+    masked = replace(camera(name="second"), mask=mask)
     (view,) = row_split(Rig([camera(), masked]), [plain(COLOURS[0]), plain(COLOURS[1])], Rig([camera()]))
     assert tuple(view.image[45, 30]) == COLOURS[0] and tuple(view.image[45, 100]) == COLOURS[1]
     assert view.coverage.all()
 
 
 def test_row_split_refuses_lenses() -> None:
-    lens = Camera(**{**_fields(camera()), "lens": "fisheye", "distortion": (0.0, 0.0, 0.0, 0.0)})
+    lens = replace(camera(), lens="fisheye", distortion=(0.0, 0.0, 0.0, 0.0))
     with pytest.raises(SampleError, match="row_split: expected pinhole cameras"):
         row_split(Rig([lens]), [noise()], Rig([camera()]))
-
-
-def _fields(c: Camera) -> dict:
-    return {name: getattr(c, name) for name in ("name", "width_px", "height_px", "K", "cam2ego")}

@@ -40,25 +40,21 @@ class RetargetDataModule(lightning.LightningDataModule):
 
 
 class MeanColour(lightning.LightningModule):
-    """A model that learns the mean colour of what some camera saw."""
+    """A model that learns the mean colour of the images."""
 
     def __init__(self) -> None:
         super().__init__()
         self.colour = torch.nn.Parameter(torch.full((3, 1, 1), 0.5))
 
-    def _loss(self, batch: dict[str, Any]) -> torch.Tensor:
-        images = batch["images"].float() / 255
-        seen = batch.get("coverage", torch.ones(*images.shape[:2], *images.shape[3:])).to(images)[:, :, None]
-        return ((images - self.colour).square() * seen).sum() / (3 * seen.sum())
-
     def training_step(self, batch: dict[str, Any], index: int) -> torch.Tensor:
         """On retargeted frames."""
         assert batch["coverage"].device == batch["images"].device
-        return self._loss(batch)
+        return (batch["images"].float() / 255 - self.colour).square().mean()
 
     def validation_step(self, batch: dict[str, Any], index: int) -> None:
         """On frames as they are."""
-        self.log("val_loss", self._loss(batch), batch_size=len(batch["images"]))
+        error = (batch["images"].float() / 255 - self.colour).square().mean()
+        self.log("val_loss", error, batch_size=len(batch["images"]))
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam."""

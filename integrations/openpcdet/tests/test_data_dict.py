@@ -209,49 +209,51 @@ def test_frames_of_a_drive_share_a_draw(given: Recording) -> None:
     assert skips[0] == skips[1] and {*skips[0]} == {False, True}
 
 
-def test_points_need_no_pinholes(given: Recording) -> None:
-    lenses = replace(load_rig("waymo"), lidars=[TOP])
-    assert np.array_equal(step(lenses)(kitti(given))["points"], step()(kitti(given))["points"])
+def test_points_need_no_pinholes_and_stay_on_demand(given: Recording) -> None:
+    lenses, data = replace(load_rig("waymo"), lidars=[TOP]), kitti(given)
+    assert np.array_equal(step(lenses)(data)["points"], step()(data)["points"])
     with pytest.raises(CalibrationError, match="target: expected pinhole cameras"):
         step(lenses, lidar2ego=LIDAR2EGO, size=SIZE)(nuscenes(given))
-
-
-def test_points_stay_on_demand(given: Recording) -> None:
-    data = kitti(given)
     assert step(keys={"points": "source"})(data)["points"] is data["points"]
-
-
-def test_messages(given: Recording) -> None:
-    data = kitti(given)
-    with pytest.raises(SampleError, match="noise_rot: expected a frame as it was recorded, got an augmented one"):
-        step()(data | {"noise_rot": np.float32(0.3)})
     assert len(step()(data | {"noise_scale": 1.0, "flip_x": False})["points"])
+
+
+@pytest.mark.parametrize(
+    ("form", "entries", "message"),
+    [
+        (kitti, {"noise_rot": np.float32(0.3)}, "noise_rot: expected a frame as it was recorded, got an augmented one"),
+        (kitti, {"points": [[1.0, 2.0, 0.0, 3.0]]}, r"^points: expected"),
+        (kitti, {"points": torch.ones(2, 4)}, r"^points: expected"),
+        (kitti, {"points": np.ones((2, 2), np.float32)}, r"^points: expected"),
+        (kitti, {"points": None}, r"^points: expected"),
+        (nuscenes, {"lidar2image": None}, "lidar2image: expected beside camera_imgs, found none"),
+        (nuscenes, {"img_process_infos": [[1, (0, 0, 9, 9), True, 0]] * 6}, "before imgaug"),
+        (nuscenes, {"img_process_infos": [(1.0,)] * 6}, r"infos: expected \(resize, crop, flip, rotate\) of each"),
+        (nuscenes, {"img_process_infos": [[1.0, (0, 0, 9, 9), False, 0]] * 5}, r"img_process_infos: expected"),
+        (nuscenes, {"lidar_aug_matrix": np.eye(3)}, r"lidar_aug_matrix: expected numbers of shape \(4, 4\)"),
+        (nuscenes, {"gt_names": np.array(["car"])}, "gt_names: expected one of each of the"),
+    ],
+)
+def test_malformed_entries_are_named(given: Recording, form: Any, entries: dict[str, Any], message: str) -> None:
+    data = {key: value for key, value in (form(given) | entries).items() if value is not None}
+    with pytest.raises(SampleError, match=message):
+        step(lidar2ego=LIDAR2EGO if form is nuscenes else KITTI_LIDAR2EGO, min_points_in_gt=1)(data)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"min_points_in_gt": "x"}, ValueError, "min_points_in_gt: expected a number of points, got 'x'"),
+        ({"target_lidar2ego": np.diag([1.0, -1.0, -1.0, 1.0])}, CalibrationError, "expected a frame whose z points up"),
+        ({"lidar2ego": np.eye(3)}, CalibrationError, r"^lidar2ego: expected"),
+        ({"p": 2}, ValueError, "p: expected a probability"),
+    ],
+)
+def test_malformed_settings_are_named(settings: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        step(**settings)
+
+
+def test_a_target_without_scanners_is_refused(given: Recording) -> None:
     with pytest.raises(SampleError, match="target: expected scanners"):
-        step(replace(TARGET, lidars=()))(data)
-    with pytest.raises(SampleError, match="points: expected"):
-        step()({"frame_id": "1"})
-    for points in (data["points"].tolist(), torch.from_numpy(data["points"]), data["points"][:, :2]):
-        with pytest.raises(SampleError, match=r"^points: expected"):
-            step()(data | {"points": points})
-    with pytest.raises(SampleError, match="lidar2image: expected beside camera_imgs, found none"):
-        cameras = nuscenes(given)
-        del cameras["lidar2image"]
-        step(lidar2ego=LIDAR2EGO)(cameras)
-    with pytest.raises(SampleError, match="stand before imgaug"):
-        step(lidar2ego=LIDAR2EGO)(nuscenes(given) | {"img_process_infos": [[1, (0, 0, 9, 9), True, 0]] * 6})
-    for entries, message in (
-        ({"img_process_infos": [(1.0,)] * 6}, r"img_process_infos: expected \(resize, crop, flip, rotate\) of each"),
-        ({"img_process_infos": [[1.0, (0, 0, 9, 9), False, 0]] * 5}, r"img_process_infos: expected"),
-        ({"lidar_aug_matrix": np.eye(3)}, r"lidar_aug_matrix: expected numbers of shape \(4, 4\)"),
-        ({"gt_names": np.array(["car"])}, "gt_names: expected one of each of the"),
-    ):
-        with pytest.raises(SampleError, match=message):
-            step(lidar2ego=LIDAR2EGO, min_points_in_gt=1)(nuscenes(given) | entries)
-    with pytest.raises(ValueError, match="min_points_in_gt: expected a number of points, got 'x'"):
-        step(min_points_in_gt="x")
-    with pytest.raises(CalibrationError, match="target_lidar2ego: expected a frame whose z points up"):
-        step(target_lidar2ego=np.diag([1.0, -1.0, -1.0, 1.0]))
-    with pytest.raises(CalibrationError, match=r"^lidar2ego: expected"):
-        step(lidar2ego=np.eye(3))
-    with pytest.raises(ValueError, match="p: expected a probability"):
-        step(p=2)
+        step(replace(TARGET, lidars=()))(kitti(given))
