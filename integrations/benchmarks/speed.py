@@ -26,7 +26,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from itertools import chain, cycle, islice
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -91,8 +91,6 @@ def _run(arguments: argparse.Namespace) -> None:
     """Measure, print the table, write the JSON."""
     path = output_file(arguments.output)
     device = None if arguments.device is None else device_named(arguments.device)
-    if device is None and arguments.only:
-        _check_only(arguments.only, arguments.size)
     with recorded(arguments.data or default_data(), size=FULL_SIZE) as data:
         report = measure(data, arguments.repeats, arguments.size, arguments.only, device)
     show(table(report), report, path)
@@ -135,21 +133,8 @@ def measure(
                 row = {"size": [h, w], "target": target, "name": name, **quartiles(taken)._asdict(), "ratio": ratio}
                 rows.append(row | {"bound": BOUNDS.get((h, w), {}).get(name)})
     if not rows:
-        raise _unnamed(only)
+        raise DataError(f"--only {only}: expected part of a call's name, such as boxes or neighbour")
     return {"data": data.name, "rounds": repeats, "ready_s": ready_s, "measures": rows}
-
-
-def _check_only(only: str, sizes: Sequence[tuple[int, int]]) -> None:
-    """Refuse a text that is in no call's name before anything is read; images of twice the size have all calls."""
-    rig = load_rig("nuscenes").resized((2 * max(h for h, _ in sizes), 2 * max(w for _, w in sizes)))
-    sample = {"images": torch.zeros(len(rig), 3, 1, 1, dtype=torch.uint8), "rig": rig}
-    calls = chain.from_iterable(_calls_of(sample, sample, size) for size in sizes)
-    if not any(only in name for _, (_, *names) in calls for name in names):
-        raise _unnamed(only)
-
-
-def _unnamed(only: str) -> DataError:
-    return DataError(f"--only {only}: expected part of a call's name, such as boxes or neighbour")
 
 
 def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tuple[str, Calls]]:

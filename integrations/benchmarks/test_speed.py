@@ -116,7 +116,6 @@ def test_bytes_of_the_floor_on_a_device() -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ("--only WRONG --size 16x44", "--only WRONG: expected part of a call's name, such as boxes"),
         ("--data {folder}", "expected a frame folder (calib.json"),
         ("--device meta", "--device: expected cpu"),
         ("--output {folder}", "expected a file, got a folder"),
