@@ -28,7 +28,19 @@ TINY = ("--size", "24x48", "--frames", "3", "--epochs", "1", "--downscale")
 
 def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, before = tmp_path / "new" / "loader.json", set(multiprocessing.active_children())
-    arguments = ["--data", str(nuscenes_root), "--geometry", "street", *TINY, "4", "--workers", "0", "1"]
+    arguments = [
+        "--data",
+        str(nuscenes_root),
+        "--geometry",
+        "street",
+        *TINY,
+        "4",
+        "--epochs",
+        "2",
+        "--workers",
+        "0",
+        "1",
+    ]
     assert loader.main([*arguments, "--output", str(path)]) == 0
     report = json.loads(path.read_text())
     assert report["data"] == "nuscenes-one" and report["target"] == "waymo" and report["size"] == [24, 48]

@@ -15,9 +15,9 @@ from arbiview_aug.cli.arguments import count, seed
 from arbiview_aug.errors import ArbiviewError
 from integrations.cross_rig.experiment import LONGER, Length, Run, Settings, fitted, jobs, quick, recorded, run, small
 from integrations.cross_rig.families import FAMILIES
+from integrations.cross_rig.frames import CHANGES, World
 from integrations.cross_rig.report import summary, write_report
 from integrations.cross_rig.variants import VARIANTS
-from integrations.cross_rig.worlds import CHANGES, World
 
 PRESETS = {"quick": quick, "small": small}
 

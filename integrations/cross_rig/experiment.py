@@ -15,13 +15,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 from arbiview_aug.atomic_io import write_whole
-from integrations.cross_rig.cache import content_hash
-from integrations.cross_rig.frames import Source, in_processes, make_frames
+from integrations.cross_rig.frames import (
+    CHANGES,
+    OF_TESTS,
+    STREETS,
+    Size,
+    Source,
+    Split,
+    World,
+    content_hash,
+    in_processes,
+    make_frames,
+)
 from integrations.cross_rig.labels import Grid, covered_cells
 from integrations.cross_rig.real import RecordedSource, frames_of, frames_of_a, recording, vehicles_of
 from integrations.cross_rig.training import Draws, FrameSet, Schedule, evaluate, train
 from integrations.cross_rig.variants import VARIANTS, Variant
-from integrations.cross_rig.worlds import CHANGES, OF_TESTS, STREETS, Size, Split, World
 
 Length = Literal["short", "long"]
 """Names of schedules."""
@@ -234,9 +243,11 @@ class Run:
             val, test = (self.frames(true, true) for true in self.tests(change))
             tested[change] = evaluate(model, val, test, schedule)
         cpu_s = time.process_time() - start
-        result = {"losses": losses, "cpu_s": cpu_s, "tested": {name: t.for_json() for name, t in tested.items()}}
+        result = {"losses": losses, "cpu_s": cpu_s, "tested": tested}
         write_whole({self.result_path(job): json.dumps(result).encode()})
-        return f"{job.name}: {cpu_s:.0f} s, " + ", ".join(f"{k} val {100 * t.val_iou:.1f}" for k, t in tested.items())
+        return f"{job.name}: {cpu_s:.0f} s, " + ", ".join(
+            f"{k} val {100 * t['val_iou']:.1f}" for k, t in tested.items()
+        )
 
     # --- results ------------------------------------------------------------------------------------------------------
     def title(self, change: str) -> str:

@@ -1,29 +1,169 @@
-"""The frames of the experiment on disk: A's streets, B's truth, each variant's training set."""
+"""The vehicles, the streets, and the frames of the experiment on disk: A's, B's, each variant's training set.
+
+Frames are chunks of arrays in a folder named after what made them. A chunk is written under another name and renamed
+when it is whole, so that a process may die at any time; the next one makes what is missing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import hashlib
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import cache, lru_cache, partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import cv2
 import numpy as np
 import torch
 
-from arbiview_aug import Rig
-from arbiview_aug.datasets.synthetic import SyntheticDrive
-from integrations.cross_rig import cache
+import arbiview_aug
+from arbiview_aug import Camera, Rig
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_target_rig
 from integrations.cross_rig.boxes import vehicle_boxes
-from integrations.cross_rig.cache import Arrays, FrameStore
 from integrations.cross_rig.cuboids import CuboidDrive
 from integrations.cross_rig.labels import Grid, box_cells, visible_objects
-from integrations.cross_rig.variants import Variant
-from integrations.cross_rig.views import ViewMaker
-from integrations.cross_rig.worlds import CHANGES, STREETS, Size, Split, World, source_rig, street_seed
+from integrations.cross_rig.variants import Arrays, Variant, ViewMaker
+
+Size = tuple[int, int]
+"""(h, w) of every image."""
+
+Split = Literal["train", "val", "test"]
+
+World = Literal["drive", "cuboids"]
+"""Generators of streets: ``SyntheticDrive``, and the one of ``cuboids`` with other shapes, textures and light."""
+
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+OF_TESTS = SPLITS[1:]
+"""Streets of vehicle B: for thresholds, and for tests."""
+
+STREETS = 100
+"""The world that constants of the renderer were chosen on; another hundred is another world."""
+
+
+def street_seed(split: Split, streets: int = STREETS) -> int:
+    """Seed of ``SyntheticDrive`` for a split of a world: datasets with different seeds share no street."""
+    return streets + 1 + SPLITS.index(split)
+
+
+_AZIMUTHS_DEG = (0.0, 55.0, -55.0, 110.0, -110.0, 180.0)
+"""nuScenes' six cameras."""
+_NAMES = ("front", "front_left", "front_right", "back_left", "back_right", "back")
+_RING_RADIUS_M = 0.8
+_RING_CENTRE_X_M = 0.9
+_HEIGHT_M = 1.5
+_FOV_DEG = 65.0
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of vehicle: its title in tables, and vehicle B at a size, in A's ego frame."""
+
+    title: str
+    target: Callable[[Size], Rig]
+
+
+def source_rig(size: Size, *, fov_deg: float = _FOV_DEG, height_m: float = _HEIGHT_M) -> Rig:
+    """Vehicle A: six cameras around a car's roof, all with one field of view."""
+    cameras = []
+    for name, azimuth in zip(_NAMES, _AZIMUTHS_DEG, strict=True):
+        angle = math.radians(azimuth)
+        x, y = _RING_CENTRE_X_M + _RING_RADIUS_M * math.cos(angle), 0.6 * _RING_RADIUS_M * math.sin(angle)
+        cameras.append(
+            Camera.looking(
+                name=name,
+                azimuth_deg=azimuth,
+                position_m=(x, y, height_m),
+                width_px=size[1],
+                height_px=size[0],
+                horizontal_fov_deg=fov_deg,
+            )
+        )
+    return Rig(cameras, name="A")
+
+
+CHANGES: dict[str, Change] = {
+    "fov50": Change("FOV 65° → 50°", lambda size: source_rig(size, fov_deg=50.0)),
+    "up70": Change("+0.7 m", lambda size: source_rig(size, height_m=_HEIGHT_M + 0.7)),
+    "waymo": Change("Waymo-like, 5 at 2.1 m", demo_target_rig),
+}
+"""By name. ``waymo``: Waymo's azimuths and height at A's field of view, so that it stays a change of the layout."""
+
+
+CHUNK_FRAMES = 20
+"""About 10 s of rendering: a killed process loses no more."""
+
+_MOST_MAPS = 256
+"""Chunks whose images are mapped: each holds a file open, of which a process commonly may have 1024."""
+
+
+def content_hash(spec: Any) -> str:
+    """16 hex digits of plain data."""
+    return hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()[:16]
+
+
+@cache
+def code_hash() -> str:
+    """16 hex digits of all sources of the package and of this experiment: after a change, everything is made again."""
+    files = (*Path(arbiview_aug.__file__).parent.rglob("*.py"), *Path(__file__).parent.glob("*.py"))
+    return content_hash([file.read_text() for file in sorted(files)])
+
+
+class FrameStore:
+    """A set of frames below ``root``: each frame a dict of arrays of one shape and type throughout.
+
+    Args:
+        root: Folder of all sets.
+        spec: Plain data that says what the frames are; with the code it names the set's folder.
+    """
+
+    def __init__(self, root: Path, spec: Any) -> None:
+        self.key = content_hash([code_hash(), spec])
+        self.folder = root / self.key
+
+    def missing(self, num_frames: int) -> list[int]:
+        """Chunks that ``num_frames`` need and that are not there."""
+        return [k for k in range(-(-num_frames // CHUNK_FRAMES)) if not self._chunk(k).is_dir()]
+
+    def write(self, chunk: int, frames: Iterable[Arrays]) -> None:
+        """Make a chunk of its ``CHUNK_FRAMES`` frames: all of it or nothing."""
+        rows = list(frames)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(prefix=f".part-{chunk}-", dir=self.folder))
+        for name in rows[0]:
+            np.save(part / f"{name}.npy", np.stack([row[name] for row in rows]))
+        try:
+            part.rename(self._chunk(chunk))
+        except OSError:
+            if not self._chunk(chunk).is_dir():
+                raise
+            shutil.rmtree(part)  # a worker that outlived its killed parent was first, with the same frames
+
+    def images(self, index: int) -> np.ndarray:
+        """Images of one frame, mapped from disk."""
+        chunk, row = divmod(index, CHUNK_FRAMES)
+        return np.asarray(_mapped(self._chunk(chunk) / "images.npy")[row])
+
+    def stacked(self, name: str, num_frames: int) -> np.ndarray:
+        """The first ``num_frames`` of one array, in memory: for small ones."""
+        chunks = [np.load(self._chunk(k) / f"{name}.npy") for k in range(-(-num_frames // CHUNK_FRAMES))]
+        return np.asarray(np.concatenate(chunks)[:num_frames])
+
+    def _chunk(self, chunk: int) -> Path:
+        return self.folder / f"{chunk:05}"
+
+
+@lru_cache(_MOST_MAPS)
+def _mapped(path: Path) -> np.ndarray:
+    array: np.ndarray = np.load(path, mmap_mode="r")
+    return array
+
 
 T = TypeVar("T")
 U = TypeVar("U")
@@ -124,7 +264,7 @@ def make_frames(source: Source, num_frames: int, workers: int) -> int:
 
 
 def _make_chunk(source: Source, chunk: int) -> None:
-    frames = range(chunk * cache.CHUNK_FRAMES, (chunk + 1) * cache.CHUNK_FRAMES)
+    frames = range(chunk * CHUNK_FRAMES, (chunk + 1) * CHUNK_FRAMES)
     source.store().write(chunk, map(_maker(source), frames))
 
 

@@ -15,8 +15,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from integrations.cross_rig.boxes import cells_at
-from integrations.cross_rig.cache import Arrays
 from integrations.cross_rig.families import Residual, conv
+from integrations.cross_rig.frames import Arrays
 from integrations.cross_rig.labels import Grid
 from integrations.cross_rig.model import Answer, Heads
 

@@ -25,12 +25,9 @@ from arbiview_aug.datasets.synthetic import BoxClass
 from arbiview_aug.errors import DataError
 from arbiview_aug.scene.boxes import points_in
 from integrations.cross_rig.boxes import boxes_on_grid
-from integrations.cross_rig.cache import Arrays
-from integrations.cross_rig.frames import Source
+from integrations.cross_rig.frames import OF_TESTS, SPLITS, Arrays, Source, Split
 from integrations.cross_rig.labels import Grid, box_cells
-from integrations.cross_rig.variants import Variant
-from integrations.cross_rig.views import ViewMaker, arrays_of
-from integrations.cross_rig.worlds import OF_TESTS, SPLITS, Split
+from integrations.cross_rig.variants import Variant, ViewMaker, arrays_of
 
 _VEHICLES = {"vehicle", "car", "van", "truck", "bus", "trailer"}
 _NO_VEHICLES = {"bicycle", "motorcycle", "cyclist", "human", "pedestrian", "static", "movable"}

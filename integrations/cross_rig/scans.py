@@ -29,14 +29,12 @@ from arbiview_aug.evaluate.scans import rings_dropped
 from arbiview_aug.scene.boxes import points_by_box
 from arbiview_aug.scene.point_cloud import own_car
 from integrations.cross_rig.boxes import vehicle_boxes
-from integrations.cross_rig.cache import code_hash, content_hash
-from integrations.cross_rig.frames import one_thread
+from integrations.cross_rig.frames import OF_TESTS, Split, code_hash, content_hash, one_thread, street_seed
 from integrations.cross_rig.labels import Grid, box_cells
 from integrations.cross_rig.pillars import PointSet
 from integrations.cross_rig.real import LEAST_POINTS
 from integrations.cross_rig.scoring import ap_scores, iou_scores, matches_of
 from integrations.cross_rig.training import Draws, Schedule, evaluate, train
-from integrations.cross_rig.worlds import OF_TESTS, Split, street_seed
 
 Kind = Literal["raw", "dropped", "retargeted", "below", "oracle"]
 
@@ -150,7 +148,7 @@ def result(settings: Settings, change: str, kind: Kind, seed: int, output: Path)
         tested_on: tuple[Lidar, Lidar, Kind] = (b, scans[0], "dropped") if kind == "below" else (b, b, "raw")
         val, test = (point_set(*tested_on, split, getattr(settings, f"{split}_frames")) for split in OF_TESTS)
         tested = evaluate(model, val, test, settings.schedule)
-        write_whole({path: json.dumps(tested.for_json() | {"losses": losses}).encode()})
+        write_whole({path: json.dumps(tested | {"losses": losses}).encode()})
         print(f"{path.stem}: {time.process_time() - start:.0f} CPU s", file=sys.stderr, flush=True)
     counts: dict[str, Any] = json.loads(path.read_text())
     return counts

@@ -102,7 +102,7 @@ def ap_scores(
 
 
 def matches_of(results: Sequence[Mapping[str, Any]]) -> tuple[Floats, Floats]:
-    """``boxes.match`` (S, F, k, 5), and boxes that count (S, F), of the results of S seeds (``Tested.for_json``)."""
+    """``boxes.match`` (S, F, k, 5), and boxes that count (S, F), of the results of S seeds (``training.evaluate``)."""
     matched, positives = (np.array([result[key] for result in results], float) for key in ("matched", "positives"))
     return np.where(matched < 0, np.nan, matched), positives
 

@@ -13,13 +13,13 @@ import torch.nn.functional as F
 from torch import nn
 
 from integrations.cross_rig.boxes import box_loss, decode, match, real_boxes
-from integrations.cross_rig.cache import Arrays, FrameStore
 from integrations.cross_rig.families import Batch
+from integrations.cross_rig.frames import Arrays, FrameStore
 from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid
 from integrations.cross_rig.model import Answer, Detector
 from integrations.cross_rig.pillars import PillarDetector, PointBatch, PointSet
-from integrations.cross_rig.scoring import Counts, cell_counts, iou
-from integrations.cross_rig.views import scaled_and_cropped
+from integrations.cross_rig.scoring import cell_counts, iou
+from integrations.cross_rig.variants import scaled_and_cropped
 
 THRESHOLDS = tuple(round(0.05 * k, 2) for k in range(1, 20))
 
@@ -190,36 +190,22 @@ def best_threshold(probability: np.ndarray, frames: Frames) -> tuple[float, floa
     return THRESHOLDS[best], float(scores[best])
 
 
-@dataclass(frozen=True)
-class Tested:
-    """Scores that a model reached on vehicle B.
+def evaluate(model: nn.Module, val: Frames, test: Frames, schedule: Schedule) -> dict[str, Any]:
+    """Threshold on validation frames, counts on test frames; both as B sees them, with B's calibration.
 
-    Attributes:
-        threshold, val_iou: Best threshold on validation frames, and the IoU there.
-        counts: (F, 3) counts of cells, at that threshold.
-        matched: (F, k, 5) of ``boxes.match``.
-        positives: (F,) boxes that count.
+    Returns:
+        Plain data: the best ``threshold`` and ``val_iou`` there; ``counts`` (F, 3) of cells at that threshold;
+        ``matched`` (F, k, 5) of ``boxes.match``, with -1 for NaN, which JSON has not; ``positives`` (F,) boxes that
+        count. ``scoring.matches_of`` reads the last two.
     """
-
-    threshold: float
-    val_iou: float
-    counts: Counts
-    matched: npt.NDArray[np.floating]
-    positives: npt.NDArray[np.integer]
-
-    def for_json(self) -> dict[str, Any]:
-        """Plain data without NaN, which JSON has not: in ``matched``, -1 is no matter. ``matches_of`` reads it."""
-        matched = np.nan_to_num(np.round(self.matched, 4), nan=-1)
-        arrays = {"counts": self.counts, "matched": matched, "positives": self.positives}
-        return vars(self) | {name: array.tolist() for name, array in arrays.items()}
-
-
-def evaluate(model: nn.Module, val: Frames, test: Frames, schedule: Schedule) -> Tested:
-    """Threshold on validation frames, counts on test frames; both as B sees them, with B's calibration."""
     threshold, val_iou = best_threshold(answers(model, val, len(val.state), schedule)[0], val)
     probability, detections = answers(model, test, len(test.state), schedule)
-    counts = cell_counts(probability > threshold, test.state, test.counts)
     frames = list(zip(detections, test.boxes, test.state, strict=True))
     matched = np.stack([match(*frame, test.counts) for frame in frames])
-    positives = np.array([real_boxes(boxes, state, test.counts).sum() for _, boxes, state in frames])
-    return Tested(threshold, val_iou, counts, matched, positives)
+    return {
+        "threshold": threshold,
+        "val_iou": val_iou,
+        "counts": cell_counts(probability > threshold, test.state, test.counts).tolist(),
+        "matched": np.nan_to_num(np.round(matched, 4), nan=-1).tolist(),
+        "positives": [int(real_boxes(boxes, state, test.counts).sum()) for _, boxes, state in frames],
+    }

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from integrations.cross_rig import __main__ as command
-from integrations.cross_rig import cache, experiment
-from integrations.cross_rig.cache import FrameStore
+from integrations.cross_rig import experiment, frames
 from integrations.cross_rig.experiment import Run, Settings, jobs, quick, run, small
+from integrations.cross_rig.frames import FrameStore
 from integrations.cross_rig.labels import FREE, HIDDEN, VEHICLE
 from integrations.cross_rig.report import summary, write_report
 from integrations.cross_rig.training import Schedule
@@ -30,7 +30,7 @@ TINY = Settings(
 @pytest.fixture(autouse=True, scope="module")
 def _short_chunks():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cache, "CHUNK_FRAMES", 1)
+        patch.setattr(frames, "CHUNK_FRAMES", 1)
         yield
 
 
@@ -42,27 +42,27 @@ def done(tmp_path_factory) -> Run:
 
 
 def test_frames_are_whole_or_not_there(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "CHUNK_FRAMES", 4)
+    monkeypatch.setattr(frames, "CHUNK_FRAMES", 4)
 
-    def frames(chunk: int, dies_at: int = -1):
+    def made(chunk: int, dies_at: int = -1):
         for index in range(4 * chunk, 4 * chunk + 4):
             if index == dies_at:
                 raise KeyboardInterrupt
             yield {"images": np.full((2, 3), index, np.uint8), "state": np.uint8(index)}
 
     store, save = FrameStore(tmp_path, {"a": 1}), np.save
-    store.write(0, frames(0))
+    store.write(0, made(0))
     with pytest.raises(KeyboardInterrupt):
-        store.write(1, frames(1, dies_at=6))
+        store.write(1, made(1, dies_at=6))
     assert store.missing(9) == [1, 2]
 
     def meanwhile(path, array):  # another process makes the same chunk
         monkeypatch.setattr(np, "save", save)
         save(path, array)
-        FrameStore(tmp_path, {"a": 1}).write(1, frames(1))
+        FrameStore(tmp_path, {"a": 1}).write(1, made(1))
 
     monkeypatch.setattr(np, "save", meanwhile)
-    store.write(1, frames(1))
+    store.write(1, made(1))
     assert store.missing(8) == [] and not list(tmp_path.rglob(".part*"))
     np.testing.assert_array_equal(store.stacked("state", 7), np.arange(7))
     assert (store.images(6) == 6).all() and FrameStore(tmp_path, {"a": 2}).missing(1) == [0]
@@ -72,7 +72,7 @@ def test_any_code_names_what_it_makes(monkeypatch):
     before, read = FrameStore(Path(), {}).key, []
     text = Path.read_text
     monkeypatch.setattr(Path, "read_text", lambda path: (read.append(path.name), text(path) + "# changed")[1])
-    monkeypatch.setattr(cache, "code_hash", cache.code_hash.__wrapped__)
+    monkeypatch.setattr(frames, "code_hash", frames.code_hash.__wrapped__)
     assert FrameStore(Path(), {}).key != before
     assert {"rig_retarget.py", "continued.py", "kernels.py", "reader.py", "training.py"} <= set(read)
 
@@ -179,7 +179,7 @@ def test_command_refuses(given, message, capsys, tmp_path):
 @pytest.mark.release
 @pytest.mark.timeout(1800)
 def test_quick_oracle_is_above_raw(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(cache, "CHUNK_FRAMES", 20)
+    monkeypatch.setattr(frames, "CHUNK_FRAMES", 20)
     assert command.main(["--quick", "--output", str(tmp_path)]) == 0
     changes = json.loads((tmp_path / "report.json").read_text())["changes"]
     assert set(changes) == {"up70", "up70-long"}

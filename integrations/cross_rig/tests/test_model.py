@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from integrations.cross_rig.families import DEPTHS_M, FAMILIES, Batch, Depths, read_at, voxel_bags
+from integrations.cross_rig.frames import source_rig
 from integrations.cross_rig.labels import Grid
 from integrations.cross_rig.model import Detector
-from integrations.cross_rig.worlds import source_rig
 
 SIZE = (32, 64)
 GRID = Grid(side_m=20.0, cells=20)

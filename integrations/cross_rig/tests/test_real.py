@@ -11,11 +11,11 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.errors import DataError
 from integrations.cross_rig import __main__ as command
-from integrations.cross_rig import cache, real
+from integrations.cross_rig import frames, real
 from integrations.cross_rig.experiment import REAL, Run, Settings, fitted, jobs, recorded
+from integrations.cross_rig.frames import OF_TESTS
 from integrations.cross_rig.labels import FREE, HIDDEN, VEHICLE
 from integrations.cross_rig.training import Schedule
-from integrations.cross_rig.worlds import OF_TESTS
 from tests.datasets.nuscenes_root import START_US, Street, streets, tables_of, write_root
 
 SIZE = (24, 64)
@@ -24,7 +24,7 @@ SMALL = Settings(size=SIZE, train_frames=1000, schedule=Schedule(steps=2, batch=
 
 @pytest.fixture(autouse=True)
 def _short_chunks(monkeypatch):
-    monkeypatch.setattr(cache, "CHUNK_FRAMES", 2)
+    monkeypatch.setattr(frames, "CHUNK_FRAMES", 2)
 
 
 def _root(path: Path, rig: Rig, drives: range) -> Path:

@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from arbiview_aug.datasets.synthetic import SyntheticDrive
-from integrations.cross_rig.variants import VARIANTS
-from integrations.cross_rig.views import SCALE, ViewMaker, scaled_and_cropped
-from integrations.cross_rig.worlds import CHANGES, SPLITS, source_rig, street_seed
+from integrations.cross_rig.frames import CHANGES, SPLITS, source_rig, street_seed
+from integrations.cross_rig.variants import SCALE, VARIANTS, ViewMaker, scaled_and_cropped
 
 SIZE = (24, 64)
 
