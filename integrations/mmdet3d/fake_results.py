@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -34,24 +34,27 @@ class Boxes:
 
     def __init__(self, boxes_ego: FloatArray, *, is_old: bool = False) -> None:
         signs = np.array([[-1, -1, -1], [-1, -1, 1], [-1, 1, 1], [-1, 1, -1], [1, -1, -1], [1, -1, 1], [1, 1, 1]])
-        corners = []
-        for box in boxes_ego:
-            places = np.vstack([signs, [1, 1, -1]]) / 2 * box[3:6]
-            corners.append(places @ rotation_z(np.degrees(box[6])).T + box[:3])
-        ego2lidar = np.linalg.inv(LIDAR2EGO)
-        x = np.array(corners).reshape(-1, 8, 3) @ ego2lidar[:3, :3].T + ego2lidar[:3, 3]
+        signs = np.vstack([signs, [1, 1, -1]])
+        corners = [signs / 2 * box[3:6] @ rotation_z(np.degrees(box[6])).T + box[:3] for box in boxes_ego]
+        x = _in_lidar(np.array(corners).reshape(-1, 8, 3))
         yaw = boxes_ego[:, 6] - np.arctan2(LIDAR2EGO[1, 0], LIDAR2EGO[0, 0])
         if is_old:
             x, yaw = x[:, [4, 5, 1, 0, 7, 6, 2, 3]], -yaw - np.pi / 2
         self.tensor = torch.from_numpy(np.column_stack([x.mean(axis=1), boxes_ego[:, 3:6], yaw]))
-        self._corners = torch.from_numpy(x)
-        self._is_old = is_old
+        self._corners, self._is_old = torch.from_numpy(x), is_old
 
     @property
     def corners(self) -> torch.Tensor:
         """(B, 8, 3)."""
         assert len(self.tensor) or not self._is_old
         return self._corners
+
+
+def _in_lidar(points_ego: FloatArray) -> FloatArray:
+    """Points (..., >=3) in the LiDAR's frame."""
+    ego2lidar, moved = np.linalg.inv(LIDAR2EGO), points_ego.copy()
+    moved[..., :3] = points_ego[..., :3] @ ego2lidar[:3, :3].T + ego2lidar[:3, 3]
+    return moved
 
 
 def source_rig(size: tuple[int, int]) -> Rig:
@@ -61,73 +64,53 @@ def source_rig(size: tuple[int, int]) -> Rig:
     return rig.with_cameras([replace(rig[name], name=f"CAM_{name.upper()}") for name in order])
 
 
-@dataclass(frozen=True)
-class Recording:
+class Recording(NamedTuple):
     """A sample and how it was recorded: each camera a little before or after the LiDAR, on a moving vehicle.
 
     Attributes:
         sample: Its ``rig`` has each camera where it was when it exposed.
+        rig: Poses of the cameras.
         moved: (N, 4, 4) the ego then, in the ego frame at the LiDAR's time.
+        mounted: (N, 4, 4) where the cameras are mounted.
         ego2global: (4, 4) the ego at the LiDAR's time.
+        K, lidar2cam: (N, 4, 4).
+        arrays: Images (H, W, 3) BGR.
+        labels: Points and boxes as loaded, in the LiDAR's frame.
     """
 
     sample: dict[str, Any]
+    rig: Rig
     moved: FloatArray
-    ego2global: FloatArray = field(default_factory=EGO2GLOBAL.copy)
-
-    @property
-    def rig(self) -> Rig:
-        """Poses of the cameras."""
-        rig: Rig = self.sample["rig"]
-        return rig
-
-    @property
-    def mounted(self) -> FloatArray:
-        """(N, 4, 4) where they are mounted."""
-        return np.linalg.inv(self.moved) @ self.rig.cam2ego
-
-    @property
-    def lidar2cam(self) -> FloatArray:
-        """(N, 4, 4)."""
-        return np.linalg.inv(self.rig.cam2ego) @ LIDAR2EGO
-
-    @property
-    def K(self) -> FloatArray:
-        """(N, 4, 4)."""
-        K = np.tile(np.eye(4), (len(self.rig), 1, 1))
-        K[:, :3, :3] = self.rig.K
-        return K
-
-    @property
-    def arrays(self) -> list[np.ndarray]:
-        """Images (H, W, 3) BGR."""
-        return [np.ascontiguousarray(image.permute(1, 2, 0).numpy()[..., ::-1]) for image in self.sample["images"]]
-
-    @property
-    def labels(self) -> dict[str, Any]:
-        """Points and boxes as loaded, in the LiDAR's frame."""
-        points = self.sample["points"].double().numpy()
-        ego2lidar = np.linalg.inv(LIDAR2EGO)
-        points[:, :3] = points[:, :3] @ ego2lidar[:3, :3].T + ego2lidar[:3, 3]
-        boxes = Boxes(self.sample["boxes_3d"].double().numpy())
-        return {"points": torch.from_numpy(points).float(), "gt_bboxes_3d": boxes}
+    mounted: FloatArray
+    ego2global: FloatArray
+    K: FloatArray
+    lidar2cam: FloatArray
+    arrays: list[np.ndarray]
+    labels: dict[str, Any]
 
 
-def recording(sample: dict[str, Any]) -> Recording:
+def recording(sample: dict[str, Any], ahead_m: float = 0.0) -> Recording:
     """The sample as of a vehicle at ``SPEED_MPS`` whose cameras exposed up to 40 ms before the LiDAR turned by."""
-    moved = np.tile(np.eye(4), (len(sample["rig"]), 1, 1))
-    moved[:, 0, 3] = -SPEED_MPS * np.linspace(0.005, 0.04, len(moved))
-    return Recording(sample, moved)
+    rig: Rig = sample["rig"]
+    moved, K, ahead = np.tile(np.eye(4), (len(rig), 1, 1)), np.tile(np.eye(4), (len(rig), 1, 1)), np.eye(4)
+    moved[:, 0, 3], K[:, :3, :3], ahead[0, 3] = -SPEED_MPS * np.linspace(0.005, 0.04, len(rig)), rig.K, ahead_m
+    points = torch.from_numpy(_in_lidar(sample["points"].double().numpy())).float()
+    return Recording(
+        sample=sample,
+        rig=rig,
+        moved=moved,
+        mounted=np.linalg.inv(moved) @ rig.cam2ego,
+        ego2global=EGO2GLOBAL @ ahead,
+        K=K,
+        lidar2cam=np.linalg.inv(rig.cam2ego) @ LIDAR2EGO,
+        arrays=[np.ascontiguousarray(image.permute(1, 2, 0).numpy()[..., ::-1]) for image in sample["images"]],
+        labels={"points": points, "gt_bboxes_3d": Boxes(sample["boxes_3d"].double().numpy())},
+    )
 
 
 def recorded_drive(samples: Sequence[dict[str, Any]]) -> list[Recording]:
     """Frames of one drive every 0.5 s, the current one last, straight ahead at ``SPEED_MPS``."""
-    drive = []
-    for t, sample in enumerate(samples):
-        ahead = np.eye(4)
-        ahead[0, 3] = SPEED_MPS * 0.5 * t
-        drive.append(replace(recording(sample), ego2global=EGO2GLOBAL @ ahead))
-    return drive
+    return [recording(sample, SPEED_MPS * 0.5 * t) for t, sample in enumerate(samples)]
 
 
 def mmdet3d(given: Recording) -> dict[str, Any]:
@@ -266,9 +249,7 @@ def bevdet(given: Recording) -> dict[str, Any]:
 def sparse4d(given: Recording) -> dict[str, Any]:
     """After Sparse4D's ``LoadMultiViewImageFromFiles`` and ``LoadPointsFromFile``, in training."""
     quaternion = [np.cos(np.pi / 4), 0.0, 0.0, -np.sin(np.pi / 4)]  # LIDAR2EGO's
-    boxes = given.sample["boxes_3d"].double().numpy()
-    ego2lidar = np.linalg.inv(LIDAR2EGO)
-    boxes[:, :3] = boxes[:, :3] @ ego2lidar[:3, :3].T + ego2lidar[:3, 3]
+    boxes = _in_lidar(given.sample["boxes_3d"].double().numpy())
     boxes[:, 6] += np.pi / 2
     return {
         "img_filename": [f"{name}.jpg" for name in given.rig.names],
@@ -325,11 +306,7 @@ def bevdet4d(drive: Sequence[Recording]) -> dict[str, Any]:
     images = torch.stack([of_frame[0] for of_frame in entries], dim=1).flatten(0, 1)  # by camera, then by frame
     rest = [torch.cat([of_frame[k] for of_frame in entries]) for k in range(1, 6)]
     infos = [{"cams": {}, "ann_infos": frame["ann_infos"], "scene_token": "drive"} for frame in frames]
-    return frames[0] | {
-        "img_inputs": (images, *rest, torch.eye(3)),
-        "curr": infos[0],
-        "adjacent": infos[1:],
-    }
+    return frames[0] | {"img_inputs": (images, *rest, torch.eye(3)), "curr": infos[0], "adjacent": infos[1:]}
 
 
 def streampetr(drive: Sequence[Recording]) -> dict[str, Any]:
