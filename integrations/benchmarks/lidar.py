@@ -12,7 +12,6 @@ import argparse
 import math
 import os
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,6 @@ from arbiview_aug import Lidar, Rig, RigRetarget, retarget_points
 from arbiview_aug.cli.arguments import count, seed
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import ScanErrors, SyntheticDrive, demo_source_rig
-from arbiview_aug.environment import one_thread
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.lidar import lidar_split
 from arbiview_aug.evaluate.report.tables import markdown_table
@@ -71,26 +69,6 @@ def _run(arguments: argparse.Namespace) -> None:
     found = (*synthetic(arguments.frames, arguments.seed), *ddad(folder))
     rows = [[scene, name, *(f"{of[key]:.3f}" if key in of else "" for key in COLUMNS)] for scene, name, of in found]
     print(markdown_table(("scene", "points", *COLUMNS), rows, left=2))
-    print(f"\n{speed(arguments.seed)}")
-
-
-def speed(seed: int) -> str:
-    """CPU times of one scan in this process, without and with boxes."""
-    rig = replace(demo_source_rig((8, 22)), lidars=[scanner(64)])
-    drive = SyntheticDrive(rig, num_frames=1, seed=seed)
-    points, boxes = drive.points(0)[:120_000], drive[0]["boxes_3d"]
-    target = replace(rig, lidars=[replace(scanner(64, UP_M), azimuth_step_deg=360 / 2650)])
-    times = []
-    with one_thread():
-        for labels in (None, boxes):
-            retarget_points(points, target, boxes_3d=labels)
-            starts = [time.process_time()]
-            for _ in range(15):
-                retarget_points(points, target, boxes_3d=labels)
-                starts.append(time.process_time())
-            times.append(1000 * np.median(np.diff(starts)))
-    size = f"{len(points)} points to {' x '.join(map(str, target.lidars[0].shape))} rays"
-    return f"{size}, one thread: {times[0]:.0f} CPU ms; with {len(boxes)} boxes {times[1]:.0f} CPU ms"
 
 
 def synthetic(frames: int, seed: int) -> Iterator[tuple[str, str, dict[str, float]]]:

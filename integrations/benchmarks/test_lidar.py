@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +9,12 @@ from pathlib import Path
 import pytest
 
 from arbiview_aug import retarget_points
+from arbiview_aug.cli.bench.data import recorded
 from arbiview_aug.cli.bench.timing import memory_mib
+from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from integrations.benchmarks.lidar import PAIRS, ddad, main, scanner, speed, synthetic
+from integrations.benchmarks.lidar import PAIRS, ddad, main, scanner, synthetic
+from integrations.benchmarks.speed import measure
 from integrations.benchmarks.test_loader import MOST_GROWTH_MIB
 
 SOAKED, WARM_UP = 500, 50
@@ -46,11 +48,11 @@ def test_command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.release
-def test_120_000_points(report_bound: Callable[..., None]) -> None:
-    runs = [[float(ms) for ms in re.findall(r"(\d+) CPU ms", speed(8000))] for _ in range(3)]
-    alone, boxes = map(min, zip(*runs, strict=True))
-    report_bound("ms of 120,000 points to 64 x 2,650 rays", alone, at_most=80)
-    report_bound("ms with boxes", boxes, at_most=100)
+def test_120_000_points(nuscenes_root: Path, report_bound: Callable[..., None]) -> None:
+    with recorded(nuscenes_root, size=FULL_SIZE) as data:
+        rows = [row for row in measure(data, 5, [SIZE], "rays")["measures"] if "rays" in row["name"]]
+    for row, most_ms in zip(rows, (80, 100), strict=True):
+        report_bound(f"ms, {row['name']}", row["median_ms"], at_most=most_ms)
 
 
 @pytest.mark.release

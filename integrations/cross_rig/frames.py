@@ -26,9 +26,8 @@ import torch
 import arbiview_aug
 from arbiview_aug import Camera, Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_target_rig
-from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.cuboids import CuboidDrive
-from integrations.cross_rig.labels import Grid, box_cells, visible_objects
+from integrations.cross_rig.labels import Grid, box_cells, vehicle_boxes, visible_objects
 from integrations.cross_rig.variants import Arrays, Variant, ViewMaker
 
 Size = tuple[int, int]

@@ -1,4 +1,4 @@
-"""Vehicle occupancy on a bird's-eye-view grid, and which of its cells count.
+"""Labels on a bird's-eye-view grid: occupancy by vehicles, cells that count, boxes; and average precision of boxes.
 
 The grid is square and centred on the ego's origin; row i lies at x = low + (i + 0.5) cells (forward), column j at
 y = low + (j + 0.5) cells (left).
@@ -10,9 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import torch
+import torch.nn.functional as F
+from torch import Tensor
 
 from arbiview_aug import Rig
-from arbiview_aug.datasets.synthetic import BoxClass
+from arbiview_aug.datasets.synthetic import BoxClass, Scene
 
 FREE, VEHICLE, HIDDEN = 0, 1, 2
 """Cells without a vehicle, with one that the rig sees, with one that it does not see (which count for nothing)."""
@@ -91,3 +94,175 @@ def covered_cells(grid: Grid, rig: Rig) -> npt.NDArray[np.bool_]:
         inside = (uv > -0.5).all(-1) & (uv < (camera.width_px - 0.5, camera.height_px - 0.5)).all(-1)
         covered |= valid & (depth > 0) & inside
     return covered
+
+
+Floats = npt.NDArray[np.floating]
+
+MAX_BOXES = 64
+"""Vehicles of a frame within the grid that are kept."""
+
+MATCH_M = (0.5, 1.0, 2.0, 4.0)
+"""Distances of centres, in the plane of the road, up to which a detection is right (nuScenes, Sec. 3.2)."""
+
+BOX_CHANNELS = 9
+"""Logit of a centre, then x and y from the cell's centre in cells, z, logarithms of length, width and height, sine and
+cosine of the yaw."""
+
+_DETECTIONS = 50
+_LEAST = 0.1  # nuScenes leaves out recall and precision below 0.1
+_REGRESSION = 0.25
+_ALPHA, _BETA = 2.0, 4.0  # of the focal loss of centres (CenterNet)
+
+
+def vehicle_boxes(grid: Grid, scene: Scene, ground_z_m: float) -> Floats:
+    """``boxes_on_grid`` of a street's vehicles."""
+    return boxes_on_grid(grid, scene.boxes_ego(ground_z_m)[np.isin(scene.box_classes, VEHICLES)])
+
+
+def boxes_on_grid(grid: Grid, boxes: Floats) -> Floats:
+    """(MAX_BOXES, 7) float32 of boxes (B, 7) with centres on the grid, padded with NaN."""
+    boxes = boxes[(np.abs(boxes[:, :2]) < grid.side_m / 2).all(-1)][:MAX_BOXES]
+    return np.pad(boxes, ((0, MAX_BOXES - len(boxes)), (0, 0)), constant_values=np.nan).astype(np.float32)
+
+
+# --- training ---------------------------------------------------------------------------------------------------------
+def box_loss(answer: Tensor, boxes: Tensor, state: Tensor, counts: Tensor, grid: Grid) -> Tensor:
+    """Focal loss of centres and L1 of the boxes there, by the number of boxes.
+
+    Args:
+        answer: (B, BOX_CHANNELS, side, side).
+        boxes: (B, n, 7), padded with NaN.
+        state: (B, cells, cells) of ``labels``.
+        counts: (B, cells, cells) cells that count.
+        grid: Grid of ``state``.
+    """
+    side = answer.shape[-1]
+    coarse, known = Grid(grid.side_m, side), counts & (state != HIDDEN)
+    fine = _cells(boxes, grid)
+    told = boxes[..., 0].isfinite() & known[torch.arange(len(boxes))[:, None], fine[..., 0], fine[..., 1]]
+    frame, row = told.nonzero(as_tuple=True)
+    box = boxes[frame, row]
+    x, y = _cells(box, coarse).unbind(-1)
+    heat = torch.zeros(len(boxes), side, side)
+    if coarse.cell_m < 2:  # cells as wide as a car answer for themselves
+        axis = torch.arange(side)
+        apart = (axis - _cells(boxes, coarse)[..., None]).float() ** 2  # [B, n, 2, side]
+        away = apart[..., 0, :, None] + apart[..., 1, None, :]
+        heat = torch.exp(-away).masked_fill(~told[..., None, None], 0).amax(1)
+    heat[frame, x, y] = 1
+    weight = F.avg_pool2d(known[:, None].float(), grid.cells // side)[:, 0]
+    weight[frame, x, y] = 1
+    logit = answer[:, 0].float()
+    p = logit.sigmoid()
+    right = (1 - p) ** _ALPHA * F.logsigmoid(logit) * (heat == 1)
+    wrong = (1 - heat) ** _BETA * p**_ALPHA * F.logsigmoid(-logit) * (heat < 1) * weight
+    told = answer[frame, 1:, x, y].float()
+    return (_REGRESSION * (told - _values(box, x, y, coarse)).abs().sum() - right.sum() - wrong.sum()) / max(
+        len(box), 1
+    )
+
+
+def _cells(boxes: Tensor, grid: Grid) -> Tensor:
+    """(..., 2) int64 cell of each centre; 0 of padding."""
+    return ((boxes[..., :2].nan_to_num() + grid.side_m / 2) / grid.cell_m).long().clamp(0, grid.cells - 1)
+
+
+def _values(box: Tensor, x: Tensor, y: Tensor, grid: Grid) -> Tensor:
+    at = (box[:, :2] + grid.side_m / 2) / grid.cell_m - torch.stack([x, y], -1) - 0.5
+    yaw = box[:, 6:]
+    return torch.cat([at, box[:, 2:3], box[:, 3:6].log(), yaw.sin(), yaw.cos()], -1)
+
+
+# --- what a detector says ---------------------------------------------------------------------------------------------
+def decode(answer: Tensor, grid: Grid, *, apart: bool) -> Tensor:
+    """(B, k, 8) score and box of the strongest centres, strongest first.
+
+    Args:
+        answer: (B, BOX_CHANNELS, side, side).
+        grid: Grid of the labels.
+        apart: Whether a centre must be the strongest of its 3×3 cells.
+    """
+    answer = answer.float()
+    side = answer.shape[-1]
+    coarse = Grid(grid.side_m, side)
+    p = answer[:, :1].sigmoid()
+    if apart:
+        p = p * (p == F.max_pool2d(p, 3, 1, 1))
+    score, place = p.flatten(1).topk(_DETECTIONS)
+    told = answer[:, 1:].flatten(2).gather(2, place[:, None].expand(-1, BOX_CHANNELS - 1, -1)).mT
+    cell = torch.stack([place // side, place % side], -1)
+    xy = (cell + 0.5 + told[..., :2]) * coarse.cell_m - grid.side_m / 2
+    yaw = torch.atan2(told[..., 6], told[..., 7])[..., None]
+    return torch.cat([score[..., None], xy, told[..., 2:3], told[..., 3:6].exp(), yaw], -1)
+
+
+def match(detections: Floats, boxes: Floats, state: npt.NDArray[np.uint8], counts: npt.NDArray[np.bool_]) -> Floats:
+    """(k, 1 + len(MATCH_M)) of one frame: scores, and 1 for right detections, 0 for wrong ones, NaN for no matter.
+
+    The strongest detection takes the nearest box that is left. Detections nearest to hidden vehicles, or where nothing
+    counts, do not count.
+
+    Args:
+        detections: (k, 8) score and box, strongest first.
+        boxes: (n, 7), padded with NaN.
+        state: (cells, cells) of ``labels``.
+        counts: (cells, cells).
+    """
+    grid = Grid(cells=state.shape[-1])
+    boxes = boxes[np.isfinite(boxes[:, 0])]
+    known = real_boxes(boxes, state, counts)
+    there = counts[cells_at(grid, detections[:, 1:3])]
+    away = np.linalg.norm(detections[:, None, 1:3] - boxes[None, :, :2], axis=-1)
+    found = np.zeros((len(detections), 1 + len(MATCH_M)))
+    found[:, 0] = detections[:, 0]
+    for column, most in enumerate(MATCH_M, 1):
+        left = away.copy()
+        for k in range(len(detections)):
+            nearest = int(left[k].argmin()) if len(boxes) else -1
+            if nearest >= 0 and left[k, nearest] < most:
+                left[:, nearest] = np.inf
+                found[k, column] = 1.0 if known[nearest] else np.nan
+            elif not there[k]:
+                found[k, column] = np.nan
+    return found
+
+
+def real_boxes(boxes: Floats, state: npt.NDArray[np.uint8], counts: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """(n,) boxes that count: a camera sees them, and their centre is where it counts."""
+    grid = Grid(cells=state.shape[-1])
+    there = np.isfinite(boxes[:, 0])
+    cells = cells_at(grid, np.nan_to_num(boxes[:, :2]))
+    return np.asarray(there & counts[cells] & (state[cells] != HIDDEN))
+
+
+def cells_at(grid: Grid, places: Floats) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Rows and columns (n,) of the cells at places (n, 2), the nearest beyond the grid."""
+    cells = np.clip((places + grid.side_m / 2) // grid.cell_m, 0, grid.cells - 1).astype(np.int64)
+    return cells[:, 0], cells[:, 1]
+
+
+def average_precision(matched: Floats, positives: Floats, weights: Floats) -> Floats:
+    """(R,) average precision over ``MATCH_M``, for R weightings of the frames.
+
+    Args:
+        matched: (F, k, 1 + len(MATCH_M)) of ``match``.
+        positives: (F,) boxes of each frame that count.
+        weights: (R, F) how often each frame counts.
+    """
+    order = np.argsort(-matched[..., 0].ravel(), kind="stable")
+    frame = np.repeat(np.arange(len(matched)), matched.shape[1])[order]
+    total = np.maximum(weights @ positives, 1e-9)
+    recalls = np.linspace(0, 1, 101)
+    out = np.zeros(len(weights))
+    for column in range(1, 1 + len(MATCH_M)):
+        right = matched[..., column].ravel()[order]
+        use = np.isfinite(right)
+        if not use.any():  # no detection counts
+            continue
+        hits, of = right[use], frame[use]
+        for r, weight in enumerate(weights):
+            true = np.cumsum(weight[of] * hits)
+            precision = true / np.maximum(np.cumsum(weight[of]), 1e-9)
+            value = np.interp(recalls, true / total[r], precision, right=0)[recalls > _LEAST]
+            out[r] += (np.maximum(value - _LEAST, 0) / (1 - _LEAST)).mean() / len(MATCH_M)
+    return out

@@ -12,9 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from integrations.cross_rig.boxes import BOX_CHANNELS
 from integrations.cross_rig.families import FAMILIES, Batch, Residual, conv
-from integrations.cross_rig.labels import Grid
+from integrations.cross_rig.labels import BOX_CHANNELS, Grid
 
 _MEAN, _STD = 0.45, 0.25
 """Mean and deviation of the images in [0, 1]."""
@@ -29,7 +28,7 @@ class Answer(NamedTuple):
 
     Attributes:
         occupancy: (B, cells, cells) logits of vehicles.
-        boxes: (B, 1 + 8, side, side) of ``boxes.decode``, on the family's own grid.
+        boxes: (B, 1 + 8, side, side) of ``labels.decode``, on the family's own grid.
     """
 
     occupancy: Tensor

@@ -14,10 +14,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from integrations.cross_rig.boxes import cells_at
 from integrations.cross_rig.families import Residual, conv
 from integrations.cross_rig.frames import Arrays
-from integrations.cross_rig.labels import Grid
+from integrations.cross_rig.labels import Grid, cells_at
 from integrations.cross_rig.model import Answer, Heads
 
 _CHANNELS, _WIDTH = 32, 48

@@ -24,9 +24,8 @@ from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.synthetic import BoxClass
 from arbiview_aug.errors import DataError
 from arbiview_aug.scene.boxes import points_in
-from integrations.cross_rig.boxes import boxes_on_grid
 from integrations.cross_rig.frames import OF_TESTS, SPLITS, Arrays, Source, Split
-from integrations.cross_rig.labels import Grid, box_cells
+from integrations.cross_rig.labels import Grid, box_cells, boxes_on_grid
 from integrations.cross_rig.variants import Variant, ViewMaker, arrays_of
 
 _VEHICLES = {"vehicle", "car", "van", "truck", "bus", "trailer"}

@@ -28,9 +28,8 @@ from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.evaluate.scans import rings_dropped
 from arbiview_aug.scene.boxes import points_by_box
 from arbiview_aug.scene.point_cloud import own_car
-from integrations.cross_rig.boxes import vehicle_boxes
 from integrations.cross_rig.frames import OF_TESTS, Split, code_hash, content_hash, one_thread, street_seed
-from integrations.cross_rig.labels import Grid, box_cells
+from integrations.cross_rig.labels import Grid, box_cells, vehicle_boxes
 from integrations.cross_rig.pillars import PointSet
 from integrations.cross_rig.real import LEAST_POINTS
 from integrations.cross_rig.scoring import ap_scores, iou_scores, matches_of

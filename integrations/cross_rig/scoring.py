@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit
 
-from integrations.cross_rig.boxes import average_precision
-from integrations.cross_rig.labels import HIDDEN, VEHICLE
+from integrations.cross_rig.labels import HIDDEN, VEHICLE, average_precision
 
 MIN_GAP = 0.05
 """Oracle minus raw below which a share says nothing: the intervals of both are about a fifth of it."""
@@ -88,7 +87,7 @@ def iou_scores(counts: Mapping[str, Counts], drives: Sequence[int] | None = None
 def ap_scores(
     detections: Mapping[str, tuple[Floats, Floats]], drives: Sequence[int] | None = None
 ) -> dict[str, VariantScore]:
-    """Scores of the variants of one change, from ``boxes.match`` (S, F, k, 5) and boxes that count (S, F)."""
+    """Scores of the variants of one change, from ``labels.match`` (S, F, k, 5) and boxes that count (S, F)."""
     num_seeds, num_frames = _one_shape({name: matched for name, (matched, _) in detections.items()})
     drawn_seeds, frames = resampled(num_seeds, num_frames, _DRAWS_OF_AP, drives)
     weights = np.concatenate([np.ones((1, num_frames)), frames])
@@ -102,7 +101,7 @@ def ap_scores(
 
 
 def matches_of(results: Sequence[Mapping[str, Any]]) -> tuple[Floats, Floats]:
-    """``boxes.match`` (S, F, k, 5), and boxes that count (S, F), of the results of S seeds (``training.evaluate``)."""
+    """``labels.match`` (S, F, k, 5), and boxes that count (S, F), of the results of S seeds (``training.evaluate``)."""
     matched, positives = (np.array([result[key] for result in results], float) for key in ("matched", "positives"))
     return np.where(matched < 0, np.nan, matched), positives
 

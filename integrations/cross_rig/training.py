@@ -12,10 +12,9 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from integrations.cross_rig.boxes import box_loss, decode, match, real_boxes
 from integrations.cross_rig.families import Batch
 from integrations.cross_rig.frames import Arrays, FrameStore
-from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid
+from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid, box_loss, decode, match, real_boxes
 from integrations.cross_rig.model import Answer, Detector
 from integrations.cross_rig.pillars import PillarDetector, PointBatch, PointSet
 from integrations.cross_rig.scoring import cell_counts, iou
@@ -171,7 +170,7 @@ def _autocast(schedule: Schedule) -> torch.autocast:
 def answers(
     model: nn.Module, frames: Frames, num_frames: int, schedule: Schedule
 ) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.float32]]:
-    """Probabilities of cells (F, cells, cells), and detections (F, k, 8) of ``boxes.decode``."""
+    """Probabilities of cells (F, cells, cells), and detections (F, k, 8) of ``labels.decode``."""
     cells, detections = [], []
     for start in range(0, num_frames, _EVAL_BATCH):
         indices = range(start, min(start + _EVAL_BATCH, num_frames))
@@ -195,7 +194,7 @@ def evaluate(model: nn.Module, val: Frames, test: Frames, schedule: Schedule) ->
 
     Returns:
         Plain data: the best ``threshold`` and ``val_iou`` there; ``counts`` (F, 3) of cells at that threshold;
-        ``matched`` (F, k, 5) of ``boxes.match``, with -1 for NaN, which JSON has not; ``positives`` (F,) boxes that
+        ``matched`` (F, k, 5) of ``labels.match``, with -1 for NaN, which JSON has not; ``positives`` (F,) boxes that
         count. ``scoring.matches_of`` reads the last two.
     """
     threshold, val_iou = best_threshold(answers(model, val, len(val.state), schedule)[0], val)

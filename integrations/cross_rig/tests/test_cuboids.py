@@ -5,10 +5,9 @@ import pytest
 import torch
 
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive
-from integrations.cross_rig.boxes import MAX_BOXES, vehicle_boxes
 from integrations.cross_rig.cuboids import CuboidDrive, make_scene
 from integrations.cross_rig.frames import source_rig
-from integrations.cross_rig.labels import Grid
+from integrations.cross_rig.labels import MAX_BOXES, Grid, vehicle_boxes
 
 
 def test_scenes_depend_on_seed_and_index_alone_and_objects_fill_their_boxes():
