@@ -50,11 +50,11 @@ class Settings:
     Attributes:
         size: (h, w) of every image.
         train_frames, val_frames, test_frames: Sizes of the three sets of frames.
-        streets: The world that all three come from, a whole hundred: ``worlds.street_seed``.
+        streets: The world that all three come from, a whole hundred: ``frames.street_seed``.
         world: Maker of the streets.
         recorded: ``open_data``'s names of the data sets of A and B, instead of streets.
         seeds: Seeds of the trainings; each variant is trained once with each.
-        changes: Names of ``worlds.CHANGES``, or ``REAL`` alone.
+        changes: Names of ``frames.CHANGES``, or ``REAL`` alone.
         variants: Names of ``variants.VARIANTS``.
         families: Names of ``families.FAMILIES``.
         schedules: Every variant is trained on each.

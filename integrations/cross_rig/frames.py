@@ -181,7 +181,7 @@ class Source:
         split: Streets.
         change: Vehicle B by its change; None: vehicle A.
         variant: Whose training set; None: the rig's true frames. Variants that only draw differently share one.
-        streets: The world, by ``worlds.street_seed``.
+        streets: The world, by ``frames.street_seed``.
         world: The generator of the streets.
     """
 
