@@ -75,7 +75,7 @@ def no_numpy_warnings() -> Iterator[None]:
     """Overflow, division by 0 and NaN raise, and so do warnings, but for targets that nobody sees, and odd inputs."""
     with warnings.catch_warnings(), np.errstate(over="raise", divide="raise", invalid="raise"):
         warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message="the target rig")
+        warnings.filterwarnings("ignore", message="the target rig|views are|target cameras|size=")
         warnings.filterwarnings("ignore", message="points: rows with NaN|camera .*: K: a focal length of")
         yield
 
