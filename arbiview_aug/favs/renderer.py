@@ -29,7 +29,8 @@ from arbiview_aug.favs.stage3_objects import AlignmentReport, align_objects, dec
 from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion, source_pixels, warp_perspective
 from arbiview_aug.render.rendered import RenderedFrame, from_winners
 from arbiview_aug.render.requirements import SAME_CENTER_M
-from arbiview_aug.sample.detections import Detection
+from arbiview_aug.sample.detections import Detection, read_detections
+from arbiview_aug.sample.inputs import Frame
 
 
 @dataclass(frozen=True)
@@ -104,8 +105,16 @@ def render_paper(
     return PaperRendering(source, target, tuple(views))
 
 
-def check_settings(geometry: str, backend: str) -> None:
+def render_frame(frame: Frame, source: Rig, target: Rig, config: PaperConfig) -> PaperRendering:
+    """Render a frame, with its detections where the settings use them."""
+    has_detections = any(frame.sample.get(key) is not None for key in ("detections", "boxes_3d"))
+    detections = read_detections(frame) if config.use_detections and has_detections else {}
+    return render_paper(source, target, frame.images, config, detections)
+
+
+def check_settings(target: Rig, geometry: str, backend: str) -> None:
     """Refuse settings of ``RigRetarget`` that the published stages do not have."""
+    check_pinhole(target)
     if geometry not in ("auto", "infinity"):
         raise ValueError(f"geometry: quality='paper' has none: expected auto or infinity, got {geometry!r}")
     if backend == "torch":

@@ -8,19 +8,19 @@
 The diffusion generator's inpainter is ``arbiview_aug.generator.Diffusion``.
 """
 
-from arbiview_aug.inpaint.continued import Continue, Mean
-from arbiview_aug.inpaint.inpainter import Black, CompletedLoader, Inpainter
-from arbiview_aug.inpaint.networks import NetworkInpainter, PipelineInpainter, TorchScriptInpainter
-from arbiview_aug.inpaint.telea import Telea
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "Black",
-    "CompletedLoader",
-    "Continue",
-    "Inpainter",
-    "Mean",
-    "NetworkInpainter",
-    "PipelineInpainter",
-    "Telea",
-    "TorchScriptInpainter",
-]
+from arbiview_aug.environment import lazy_names
+
+if TYPE_CHECKING:
+    from arbiview_aug.inpaint.continued import Continue as Continue
+    from arbiview_aug.inpaint.continued import Mean as Mean
+    from arbiview_aug.inpaint.inpainter import Black as Black
+    from arbiview_aug.inpaint.inpainter import CompletedLoader as CompletedLoader
+    from arbiview_aug.inpaint.inpainter import Inpainter as Inpainter
+    from arbiview_aug.inpaint.networks import NetworkInpainter as NetworkInpainter
+    from arbiview_aug.inpaint.networks import PipelineInpainter as PipelineInpainter
+    from arbiview_aug.inpaint.networks import TorchScriptInpainter as TorchScriptInpainter
+    from arbiview_aug.inpaint.telea import Telea as Telea
+else:
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -1,0 +1,13 @@
+"""Depth from other frames of a drive; imported where a geometry asks for it."""
+
+from typing import TYPE_CHECKING
+
+from arbiview_aug.environment import lazy_names
+
+if TYPE_CHECKING:
+    from arbiview_aug.temporal.motion_depth import MotionDepth as MotionDepth
+    from arbiview_aug.temporal.motion_depth import estimate_motion as estimate_motion
+    from arbiview_aug.temporal.motion_depth import estimates_motion as estimates_motion
+    from arbiview_aug.temporal.motion_depth import warn_of_declined as warn_of_declined
+else:
+    __getattr__, __dir__, __all__ = lazy_names(__name__)

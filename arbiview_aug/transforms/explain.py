@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from arbiview_aug import favs
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.favs.renderer import PaperRendering, SourceReport
 from arbiview_aug.inpaint.neighbours import Fills
 from arbiview_aug.render.harmonise import PhotometricReport
 from arbiview_aug.render.plan import RenderPlan, SourceUse
@@ -88,7 +88,7 @@ class Explanation:
 class PaperExplanation:
     """Record of what the published stages did to a frame; ``str`` prints it, ``as_dict`` gives plain data."""
 
-    rendering: PaperRendering
+    rendering: favs.PaperRendering
     outcome: str  # of pixels that no camera saw
 
     def as_dict(self) -> list[dict[str, Any]]:
@@ -98,7 +98,7 @@ class PaperExplanation:
             for camera, view in zip(self.rendering.target, self.rendering.targets, strict=True)
         ]
 
-    def _source(self, report: SourceReport, center_m: FloatArray) -> dict[str, Any]:
+    def _source(self, report: favs.SourceReport, center_m: FloatArray) -> dict[str, Any]:
         camera = self.rendering.source[report.source]
         return {
             "camera": camera.name,

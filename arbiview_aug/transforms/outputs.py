@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from arbiview_aug import transforms
 from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError, shown
@@ -18,7 +19,6 @@ from arbiview_aug.inpaint.inpainter import SOURCES_KEY
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
 from arbiview_aug.sample.batching import gathered, is_readable, lens_names, like, rewrapped, split, stacked
 from arbiview_aug.sample.inputs import CALIBRATION_KEYS, CAMERA_KEYS, PIXEL_BOUND_KEYS, Frame
-from arbiview_aug.transforms.scans import RetargetedPoints, entries_of
 from arbiview_aug.transforms.settings import SampleKeys
 
 
@@ -40,7 +40,7 @@ class SampleWriter:
         labels: Sequence[str],
         target: Rig,
         params: Mapping[str, float],
-        points: Sequence[RetargetedPoints] = (),
+        points: Sequence[transforms.RetargetedPoints] = (),
     ) -> dict[str, Any]:
         """Write the output sample of a sample's frames; the input is not changed.
 
@@ -48,7 +48,7 @@ class SampleWriter:
         of its scanners.
         """
         sample, lead = frames[0].sample, frames[0].lead
-        out = self._passed_on(sample, labels) | (entries_of(points, lead) if points else {})
+        out = self._passed_on(sample, labels) | (transforms.entries_of(points, lead) if points else {})
         out["images"] = rewrapped(gathered([stacked(frame.images) for frame in rendered], lead), sample["images"])
         rigs, device = [frame.rig for frame in rendered], rendered[0].images[0].device
         entries = calibration_entries(rigs, device, lead, lenses=self.lenses, masks=self.masks)

@@ -9,6 +9,7 @@ from operator import attrgetter
 
 import numpy as np
 
+from arbiview_aug import temporal
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rays import RayCache
 from arbiview_aug.cameras.rig import Rig
@@ -23,7 +24,6 @@ from arbiview_aug.render.view_planner import build_plan, plan_key
 from arbiview_aug.sample.inputs import Frame, focal_mistake
 from arbiview_aug.sample.neighbours import Neighbour
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
-from arbiview_aug.temporal.motion_depth import MotionDepth
 
 Coverages = Sequence[BoolArray]
 """Coverage (h, w) of each target camera."""
@@ -149,7 +149,7 @@ class FramePlan:
     plan: RenderPlan
     neighbours: Sequence[Neighbour] = ()  # other frames of the drive that may fill holes, the nearest first
     overlap: OverlapDepth | None = None  # depth from overlap, if it was estimated
-    motion: MotionDepth | None = None  # depth from motion, if it was estimated
+    motion: temporal.MotionDepth | None = None  # depth from motion, if it was estimated
 
     @property
     def harm(self) -> str | None:

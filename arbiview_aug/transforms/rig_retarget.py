@@ -15,15 +15,13 @@ import cv2
 import numpy as np
 import torch
 
+from arbiview_aug import favs, temporal, transforms
 from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Quality, choice
 from arbiview_aug.environment import compilation_announced, warn_about_cv2_wheels
 from arbiview_aug.errors import GeometryWarning, SampleError, WarnOnce
-from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.favs.renderer import PaperRendering, as_rendered, check_settings, render_paper
-from arbiview_aug.favs.stage1_geometry import check_pinhole
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
 from arbiview_aug.inpaint.neighbours import Fills, Reach, fill_from_neighbours, plan_fills
 from arbiview_aug.lru_cache import LRUCache
@@ -32,7 +30,6 @@ from arbiview_aug.render.overlap_depth import estimate_overlap, overlap_cache
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, RenderedFrame, Renderer, resize_only
 from arbiview_aug.render.requirements import harm_remedies
-from arbiview_aug.sample.detections import read_detections
 from arbiview_aug.sample.inputs import (
     LEARNED_KEY,
     LEARNED_WORDS_KEY,
@@ -47,11 +44,8 @@ from arbiview_aug.sample.inputs import (
 )
 from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
-from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion, warn_of_declined
-from arbiview_aug.transforms.explain import Explanation, PaperExplanation
 from arbiview_aug.transforms.outputs import SampleWriter
 from arbiview_aug.transforms.plan_cache import FramePlan, PlanCache, Plans, check_reach
-from arbiview_aug.transforms.scans import RetargetedPoints, retarget_frames, words_of
 from arbiview_aug.transforms.settings import (
     SampleKeys,
     checked_instance,
@@ -127,7 +121,7 @@ class RigRetarget(torch.nn.Module):
         source: Rig | str | Path | None = None,
         geometry: GeometryName = "auto",
         holes: Holes | Inpainter = "continue",
-        quality: Quality | RenderConfig | PaperConfig = "fast",
+        quality: Quality | RenderConfig | favs.PaperConfig = "fast",
         neighbours: Reach | None = "road",
         match_exposure: Harmonise = True,
         size: tuple[int, int] | None = None,
@@ -188,8 +182,7 @@ class RigRetarget(torch.nn.Module):
     def _check_paper(self) -> None:
         if not self._is_paper:
             return
-        check_pinhole(self._base)
-        check_settings(self.geometry, self.renderer.backend)
+        favs.check_settings(self._base, self.geometry, self.renderer.backend)
         if self.harmoniser.is_on:
             raise ValueError(
                 f"match_exposure: quality='paper' is as published: expected True or False, got {self.harmoniser!r}"
@@ -272,11 +265,11 @@ class RigRetarget(torch.nn.Module):
         points = self._scanned(frames, target, skip)
         return self._writer.write(frames, rendered, labels, target, draws, points)
 
-    def _scanned(self, frames: Sequence[Frame], target: Rig, skip: bool = False) -> list[RetargetedPoints]:
+    def _scanned(self, frames: Sequence[Frame], target: Rig, skip: bool = False) -> list[transforms.RetargetedPoints]:
         """Points of the frames by the target's scanners, if it has any and they are wanted."""
         if not target.lidars or self.keys.points != "target":
             return []
-        return retarget_frames(frames, target, skip, self._warn, neighbours=self.neighbours is not None)
+        return transforms.retarget_frames(frames, target, skip, self._warn, neighbours=self.neighbours is not None)
 
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
         """Check the sample's further keys, and return those that hold label maps."""
@@ -298,7 +291,9 @@ class RigRetarget(torch.nn.Module):
         """Read a frame's scene, estimate the depth that its geometry asks for, and plan how it is rendered."""
         pair = self._plans.pair(frame.rig, target)
         has_neighbours, fills = frame.sample.get("neighbours") is not None, self.neighbours is not None
-        from_motion = self._row.needs == "motion" and pair.needs_geometry and estimates_motion(frame, self.geometry)
+        from_motion = (
+            self._row.needs == "motion" and pair.needs_geometry and temporal.estimates_motion(frame, self.geometry)
+        )
         neighbours = read_neighbours(frame, self._warn) if has_neighbours and (fills or from_motion) else []
         reads_scene = pair.needs_geometry or self.geometry != "auto" or bool(neighbours)  # objects limit what they fill
         scene = (reads_scene and read_scene(frame, self.geometry)) or pair.road
@@ -306,10 +301,10 @@ class RigRetarget(torch.nn.Module):
         if pair.needs_geometry and self.config.overlap_depth:
             overlap = estimate_overlap(frame, scene, self.geometry, self.cache.share_overlap, self.overlaps)
         if from_motion:
-            motion = estimate_motion(frame, scene, neighbours, self._warn)
+            motion = temporal.estimate_motion(frame, scene, neighbours, self._warn)
         elif pair.needs_geometry and self._row.needs in ("motion", LEARNED_KEY):
             if scene.geometry(self._row.needs) == ():
-                warn_of_declined(frame, scene.motion is not None, self._warn)
+                temporal.warn_of_declined(frame, scene.motion is not None, self._warn)
         if overlap is not None:
             scene = replace(scene, corrections=overlap.corrections)
         if fills and neighbours and scene.points is not None and pair.needs_geometry:
@@ -341,7 +336,7 @@ class RigRetarget(torch.nn.Module):
     def _rendered(self, frames: Sequence[Frame], target: Rig) -> list[RenderedFrame]:
         """Render the frames; what sources do not see is filled from neighbouring frames alone."""
         if self._is_paper:
-            return [as_rendered(self._published(frame, target), self.keys.extra) for frame in frames]
+            return [favs.as_rendered(self._published(frame, target), self.keys.extra) for frame in frames]
         planned = [self.plan_frame(frame, target) for frame in frames]
         self._warn_of_harm(planned)
         outputs = (*self.keys.extra, "confidence") if self.config.certainty else self.keys.extra
@@ -352,12 +347,10 @@ class RigRetarget(torch.nn.Module):
                 rendered[k] = fill_from_neighbours(rendered[k], fills, one.frame.images, self.renderer, self._warn)
         return rendered
 
-    def _published(self, frame: Frame, target: Rig) -> PaperRendering:
+    def _published(self, frame: Frame, target: Rig) -> favs.PaperRendering:
         """Render a frame by the paper's stages."""
-        pair, sample = self._plans.pair(frame.rig, target), frame.sample
-        has_detections = any(sample.get(key) is not None for key in ("detections", "boxes_3d"))
-        detections = read_detections(frame) if self.config.use_detections and has_detections else {}
-        rendering = render_paper(pair.source, pair.target, frame.images, self.config, detections)
+        pair = self._plans.pair(frame.rig, target)
+        rendering = favs.render_frame(frame, pair.source, pair.target, self.config)
         self._check_reach(pair.source, pair.target, rendering.coverage)
         return rendering
 
@@ -434,7 +427,7 @@ class RigRetarget(torch.nn.Module):
         return self.plan(source, self._fixed_target)
 
     # --- reports ----------------------------------------------------------------------------------------------------
-    def explain(self, sample: Mapping[str, Any]) -> Explanation | PaperExplanation:
+    def explain(self, sample: Mapping[str, Any]) -> transforms.Explanation | transforms.PaperExplanation:
         """How a sample would be rendered: sources, surfaces and why, coverage, expected parallax; print it.
 
         With ``quality="paper"``: what each stage made of each source. A random target is explained for one draw. Like a
@@ -443,14 +436,14 @@ class RigRetarget(torch.nn.Module):
         frame = read_frames(sample, self.source)[0]
         target, _, _ = self._make_params([frame], None)
         if self._is_paper:
-            return PaperExplanation(self._published(frame, target), self.inpainter.outcome)
+            return transforms.PaperExplanation(self._published(frame, target), self.inpainter.outcome)
         planned = self.plan_frame(frame, target)
         gains = self.harmoniser.report(frame.rig, frame.images) if self.harmoniser.is_on else None
         keys = ("motion", MOTION_WORDS_KEY), (LEARNED_KEY, LEARNED_WORDS_KEY)
         words = [frame.name(key) for read, key in keys if read in self._row.reads and sample.get(key) is not None]
-        points = [words_of(part, frame, target) for part in self._scanned([frame], target)]
+        points = [transforms.words_of(part, frame, target) for part in self._scanned([frame], target)]
         depth, fills = "\n".join(words) or None, self.plan_fills(planned)
-        return Explanation(planned, self.inpainter.outcome, gains, depth, fills, *points)
+        return transforms.Explanation(planned, self.inpainter.outcome, gains, depth, fills, *points)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; for a batch, its first frame's."""

@@ -8,16 +8,15 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from arbiview_aug import favs
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.choices import choice, is_number
+from arbiview_aug.environment import imported
 from arbiview_aug.errors import SampleError, shown
-from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.inpaint.continued import Continue, Mean
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY, Black, Inpainter
-from arbiview_aug.inpaint.telea import Telea
 from arbiview_aug.render.plan import PRESETS, RenderConfig
 from arbiview_aug.sample.inputs import CALIBRATION_KEYS
 
@@ -78,13 +77,14 @@ def render_config(quality: Any) -> Any:
     Raises:
         ValueError: Anything else.
     """
-    if isinstance(quality, RenderConfig | PaperConfig):
+    if isinstance(quality, str) and quality in PRESETS:
+        return PRESETS[quality]
+    if isinstance(quality, RenderConfig) or isinstance(quality, favs.PaperConfig):
         return quality
-    presets = {**PRESETS, "paper": PaperConfig()}
-    if isinstance(quality, str) and quality in presets:
-        return presets[quality]
+    if isinstance(quality, str) and quality == "paper":
+        return favs.PaperConfig()
     raise ValueError(
-        f"quality: expected one of {', '.join(presets)}, a RenderConfig or a PaperConfig, got {shown(quality)}"
+        f"quality: expected one of {', '.join(PRESETS)}, paper, a RenderConfig or a PaperConfig, got {shown(quality)}"
     )
 
 
@@ -92,17 +92,19 @@ def inpainter_of(holes: Any) -> Inpainter:
     """The inpainter of a name, or the inpainter itself; ValueError for anything else."""
     if isinstance(holes, Inpainter):
         return holes
-    name = choice("holes", holes, (*_INPAINTERS, "diffusion")) if isinstance(holes, str) else None
-    if name is None:
+    if not isinstance(holes, str):
         raise ValueError(f"holes: expected a name or an arbiview_aug.inpaint.Inpainter, got {type(holes).__name__}")
-    if name != "diffusion":
-        return _INPAINTERS[name]()
-    from arbiview_aug.generator.inpainter import Diffusion
-
-    return Diffusion()
+    inpainter: Inpainter = imported(f"arbiview_aug.{_INPAINTERS[choice('holes', holes, _INPAINTERS)]}")()
+    return inpainter
 
 
-_INPAINTERS: dict[str, type[Inpainter]] = {"continue": Continue, "telea": Telea, "mean": Mean, "black": Black}
+_INPAINTERS = {
+    "continue": "inpaint.continued:Continue",
+    "telea": "inpaint.telea:Telea",
+    "mean": "inpaint.continued:Mean",
+    "black": "inpaint.inpainter:Black",
+    "diffusion": "generator.inpainter:Diffusion",
+}
 
 
 def unseen_note(inpainter: Inpainter) -> str:
