@@ -343,7 +343,6 @@ class RenderPlan:
     layout: AtlasLayout  # the sources' places in the atlas
     targets: tuple[ViewPlan, ...]  # one plan for each target camera
     config: RenderConfig  # its settings
-    counters: dict[str, int] = field(default_factory=dict)  # pairs by surface, cells, dense pixels, bands
     # The maps as tensors, by device (``torch_backend.maps_on``); not pickled.
     on_devices: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 

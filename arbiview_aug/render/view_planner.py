@@ -127,12 +127,11 @@ class ViewPlanner:
         surface: str,
         scene: Scene,
         config: RenderConfig,
-        counters: Counter[str],
         maps: RayCache,
         wanted: BoolArray | None = None,
     ) -> None:
         self.sources, self.camera, self.surface, self.config = source.cameras, camera, surface, config
-        self.scene, self.ground_z_m, self.counters, self.maps = scene, source.ground_z_m, counters, maps
+        self.scene, self.ground_z_m, self.maps = scene, source.ground_z_m, maps
         self.baselines_m = [math.dist(camera.center_m, one.center_m) for one in self.sources]
         self.parallax_px = worst_parallax_px(np.array(self.baselines_m), float(camera.K[0, 0]))
         self.rays = maps.rays(camera)
@@ -226,7 +225,6 @@ class ViewPlanner:
             return wide
 
         q = np.ascontiguousarray(widened(background.image(camera, rays, memory), 0))  # kernels know no other order
-        self.counters["dense_pixels"] += (y1 - y0) * (x1 - x0) if background.is_dense else 0
         behind = q[self.at_nodes]
         face = np.zeros((0, 0), np.int32)
         if surface.is_layered:
@@ -299,7 +297,6 @@ class ViewPlanner:
         score = source_weight(edge_px, min(source.size) / 2, parallax, resolution, is_primary).astype(np.float32)
         on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
         clear_unseen(*on_nodes, (*kernel[:-1], positions), score)
-        self.counters[f"pairs_{name}"] += 1
         certain = 255 * certainty(parallax / focal_px, resolution) if self.config.certainty else None
         return _Region(
             source=index,
@@ -369,7 +366,6 @@ class ViewPlanner:
         seconds = SecondBest(weights if self.config.seam_width else weights[:0], self.step, size, memory)
         for region, weight in zip(self.regions, weights, strict=True):
             slot = layout.slot(region.source, region.level)
-            self.counters["cells"] += int((region.columns[:, 1] - region.columns[:, 0]).sum())
             put_source(
                 *self._target(region), region.kernel, (region.source, slot.x, slot.y), weight, self.step,
                 region.columns, seconds.shared, best, winner, packed, fixed.frac, in_image, *seconds.images,
@@ -639,11 +635,10 @@ def _built(
     maps: RayCache,
     wanted: Sequence[BoolArray | None],
 ) -> RenderPlan:
-    counters: Counter[str] = Counter()
     order = content_order(source.cameras)
     # Targets at one centre share panoramas: their order must not tell which of them makes one.
     by_target = {
-        k: ViewPlanner(source, order, target[k], surface, scene, config, counters, maps, wanted[k])
+        k: ViewPlanner(source, order, target[k], surface, scene, config, maps, wanted[k])
         for k in content_order(target.cameras)
     }
     planners = [by_target[k] for k in range(len(target))]
@@ -656,5 +651,4 @@ def _built(
         read |= {(region.source, region.level) for region in planner.regions if region.source in sources}
     # The same places for what is read: images that win no pixel are not copied.
     layout = AtlasLayout(tuple(slot for slot in layout.slots if (slot.source, slot.level) in read))
-    counters["bands"] = sum(len(t.bands) for t in targets)
-    return RenderPlan(source, target, layout, targets, config, dict(counters))
+    return RenderPlan(source, target, layout, targets, config)

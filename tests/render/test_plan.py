@@ -120,15 +120,8 @@ def test_only_what_the_scene_requires_is_evaluated() -> None:
     source = half_size("nuscenes")
     one_center = source.with_cameras([source[0]])
     plan = build_plan(one_center, one_center.turned(yaw_deg=10))
-    assert plan.counters["pairs_infinity"] == 1
-    assert plan.counters["bands"] == 0
-
-
-def test_no_cell_outside_an_image_circle_is_evaluated() -> None:
-    rig = load_rig("fisheye_surround").resized((256, 704))
-    plan = build_plan(half_size("nuscenes"), rig.with_cameras([rig[1]]))
-    assert plan.counters["pairs_street"] == 6
-    assert plan.counters["cells"] < 0.2 * 6 * 32 * 88
+    (view,) = plan.targets
+    assert [pair.surface for pair in view.pairs] == ["infinity"] and not view.bands
 
 
 def test_exact_source_wins_wherever_it_sees() -> None:
@@ -193,7 +186,7 @@ def test_sources_that_win_nothing_have_no_place_in_the_atlas() -> None:
     waymo = half_size("waymo")
     plan = build_plan(half_size("nuscenes"), waymo.with_cameras([waymo[0]]))
     (view,) = plan.targets
-    assert plan.counters["pairs_street"] == 3 and view.sources == {0}
+    assert view.sources == {0}
     assert [slot.source for slot in plan.layout.slots] == [0] and plan.layout.is_stack
 
 
