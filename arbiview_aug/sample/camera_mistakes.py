@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations, pairwise
+from itertools import combinations, islice, pairwise
 from typing import NamedTuple
 
 import cv2
@@ -27,7 +27,7 @@ from arbiview_aug.scene.surface import Points
 
 Gray = npt.NDArray[np.float32]
 
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+MIRROR = np.diag([1.0, -1.0, 1.0])
 """From a left-handed frame, y to the right, to the ego frame."""
 
 # --- poses and names --------------------------------------------------------------------------------------------------
@@ -48,11 +48,15 @@ def _opposes(name: str, cam2ego: FloatArray) -> list[str]:
     return [side for side in sides if np.dot(_SIDES[side], cam2ego[:2, 2]) < _AGAINST]
 
 
-def pose_readings(cam2ego: FloatArray) -> Iterator[tuple[str, str, FloatArray]]:
-    """What a pose may be instead, the fix, and the pose that is then meant, the likeliest first."""
-    R, body = cam2ego[:3, :3], CAMERA_AXES_IN_EGO
+def likely_readings(camera: Camera) -> Iterator[tuple[str, str, FloatArray]]:
+    """What a pose may be instead, the fix, and the pose that is then meant, the likeliest first.
+
+    The camera is upright and level in it, and looks to the side in its name.
+    """
+    R, body = camera.cam2ego[:3, :3], CAMERA_AXES_IN_EGO
     w, x, y, z = quaternion_from_rotation(R)
     axes = f"by {body.astype(int).tolist()} from the"
+    mirrored = MIRROR @ R * (-1, 1, 1)
     for found, fix, meant in (
         (BODY_AXES, f"multiply cam2ego[:3, :3] {axes} right", R @ body),
         ("OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]", R * (1, -1, -1)),
@@ -60,22 +64,12 @@ def pose_readings(cam2ego: FloatArray) -> Iterator[tuple[str, str, FloatArray]]:
         ("a quaternion w x y z read as x y z w", "reorder it", rotation_from_quaternion((x, y, z, w))),
         ("ego2cam's rotation, the inverse", "transpose cam2ego[:3, :3]", R.T),
         ("an ego frame with a camera's axes (z forward)", f"multiply cam2ego[:3] {axes} left", body @ R),
-        (
-            "y to the right (a left-handed frame)",
-            "negate cam2ego[1] and cam2ego[:, 0]",
-            MIRROR[:3, :3] @ R * (-1, 1, 1),
-        ),
+        ("y to the right (a left-handed frame)", "negate cam2ego[1] and cam2ego[:, 0]", mirrored),
     ):
-        yield found, fix, np.vstack([np.hstack([meant, cam2ego[:3, 3:]]), cam2ego[3:]])
-
-
-def likely_readings(camera: Camera) -> Iterator[tuple[str, str, FloatArray]]:
-    """``pose_readings`` in which the camera is upright and level, and looks to the side in its name."""
-    for found, fix, meant in pose_readings(camera.cam2ego):
-        is_other = np.trace(meant[:3, :3].T @ camera.cam2ego[:3, :3]) < 1 + 2 * _SAME_COSINE
+        is_other = np.trace(meant.T @ R) < 1 + 2 * _SAME_COSINE
         is_level = abs(meant[2, 0]) < _LEVEL[0] and abs(meant[2, 2]) < _LEVEL[1]
-        if is_other and is_level and is_upright(meant) and not _opposes(camera.name, meant):
-            yield found, fix, meant
+        if is_other and is_level and _is_upright(meant) and not _opposes(camera.name, meant):
+            yield found, fix, np.vstack([np.hstack([meant, camera.cam2ego[:3, 3:]]), camera.cam2ego[3:]])
 
 
 def _set_finding(rig: Rig) -> Finding | None:
@@ -113,18 +107,18 @@ def pose_findings(rig: Rig) -> Iterator[Finding]:
     for camera in rig:
         pose, sides = camera.cam2ego, _opposes(camera.name, camera.cam2ego)
         expected, found = f"a camera that looks to the {''.join(sides[:1])}", f"{camera.azimuth_deg:+.0f} degrees"
-        if not is_upright(pose):
+        if not _is_upright(pose):
             roll = np.degrees(np.arctan2(pose[2, 0], -pose[2, 1]))
             expected = "an upright image"
             found = f"rolled by {roll:.0f} degrees, looking {camera.elevation_deg:.0f} degrees up"
         elif not sides:
             continue
         unknown = "", "turn the image, or mend its pose; ignore this if it is mounted like that"
-        how, fix = next(((how, fix) for how, fix, _ in likely_readings(camera)), unknown)
-        yield Finding(f"camera {camera.name!r}: cam2ego", expected, f"{found}{how and ': ' + how}", fix)
+        how, fix = next(((f": {how}", fix) for how, fix, _ in likely_readings(camera)), unknown)
+        yield Finding(f"camera {camera.name!r}: cam2ego", expected, found + how, fix)
 
 
-def is_upright(cam2ego: FloatArray) -> bool:
+def _is_upright(cam2ego: FloatArray) -> bool:
     """Whether an image's lower edge is down and it does not show the sky, or it shows the road from above."""
     return bool((cam2ego[2, 1] < -0.5 and cam2ego[2, 2] < 0.5) or cam2ego[2, 2] < -0.8)
 
@@ -200,19 +194,17 @@ def fit_findings(views: Sequence[tuple[Camera, Gray]], points: Points) -> Iterat
     fits = [edge_fit(camera, ranks, points) for camera, ranks in views]
     for k, (camera, ranks) in enumerate(views):
         others = total(fits[:k] + fits[k + 1 :])
-        is_doubted = not is_upright(camera.cam2ego) or _opposes(camera.name, camera.cam2ego)
+        is_doubted = not _is_upright(camera.cam2ego) or _opposes(camera.name, camera.cam2ego)
         if is_doubted or fits[k].gain > CLEAR_FIT or others.gain < CLEAR_FIT:
             continue
         where, expected = f"camera {camera.name!r}", "points on the edges of its image"
-        for other, image in views:
-            if other is not camera and image.shape == ranks.shape and edge_fit(camera, image, points).beats(fits[k]):
-                yield Finding(where, expected, f"they fit that of {other.name!r}", "are the images in another order?")
-                break
-        else:
-            for found, fix, meant in likely_readings(camera):
-                if edge_fit(replace(camera, cam2ego=meant), ranks, points).beats(fits[k]):
-                    yield Finding(f"{where}: cam2ego", expected, found, fix)
-                    break
+        order = "are the images in another order?"
+        tries = [(where, f"they fit that of {other.name!r}", order, camera, image) for other, image in views]
+        tries = [way for way in tries if way[-1] is not ranks and way[-1].shape == ranks.shape]
+        for found, fix, meant in likely_readings(camera):
+            tries.append((f"{where}: cam2ego", found, fix, replace(camera, cam2ego=meant), ranks))
+        better = (way for way in tries if edge_fit(*way[3:], points).beats(fits[k]))
+        yield from (Finding(at, expected, found, fix) for at, found, fix, *_ in islice(better, 1))
 
 
 # --- neighbouring cameras ---------------------------------------------------------------------------------------------

@@ -41,7 +41,7 @@ _MOST_POINTS = 50  # near boxes count as much as others
 _BETTER = 1.3  # times as many points: a box of another reading holds clearly more
 _LEAST_WINS, _WIN_RATIO = 3, 4
 """Boxes that must hold more points in another reading, and how many for each that holds fewer. No other reading passes
-on 820 right frames: one of nuScenes and 40 streets, turned, thinned, with jittered labels."""
+this on right frames, turned, thinned and with jittered labels."""
 
 _LONG_M, _LEAST_LONG, _MOST_LONG = 3.0, 3, 0.75
 """Boxes longer than this are vehicles, longest along their length: 3 of them at least, three quarters of all."""
@@ -53,7 +53,6 @@ _HALVES, _ALONE, _TWICE = 0.35, 1.2, 0.6
 """Shares of the points in boxes twice as large that other readings hold; points a third farther out, where objects
 stand alone; shares in boxes' inner halves, where right ones are hollow."""
 
-_LEAST_BOXES, _LEAST_HELD = 5, 0.65  # near boxes with points around, and the least share of them with points inside
 _MOST_LONG_M = 30.0  # the median of the boxes' longest sides: no street has so many trains
 _NEAR_M = 40.0  # boxes farther away stand on another height of the road
 ELSEWHERE_M = 200.0  # nothing nearer than this: another frame, or another unit
@@ -68,6 +67,10 @@ class Reading(NamedTuple):
     fix_of_boxes: str
     pose: FloatArray  # (4, 4) to the ego frame; it may mirror
     is_camera: bool = False  # boxes then turn about the camera's y axis
+
+    @property
+    def keeps_size(self) -> bool:
+        return bool(abs(np.linalg.det(self.pose)) > 0.99)
 
 
 def label_findings(
@@ -102,14 +105,16 @@ def label_findings(
             objects = points[(points[:, 2] > level_m + _OVER_ROAD_M) & ~own_car(points)]
             if abs(level_m - rig.ground_z_m) > _LIDAR_HEIGHT_M:
                 objects = None  # these points are elsewhere, and tell nothing of the boxes
-        findings += _first_of_boxes(rig, boxes, objects, ego2world, is_sure)
+        single = _order_finding(boxes, objects) or (objects is not None and _size_finding(boxes, objects))
+        single = single or _elsewhere(rig, boxes, objects, ego2world, is_sure)
+        findings += [single] if single else _box_findings(rig, boxes, objects)
     if road_m is not None and abs(road_m - rig.ground_z_m) > ROAD_M:
         findings.append(_road_finding(rig, boxes, road_m))
     return findings
 
 
 _FLIPS: tuple[tuple[str, FloatArray, str, str], ...] = (
-    ("mirrored (y to the right)", MIRROR[:3, :3], "negate y", "negate y and yaw"),
+    ("mirrored (y to the right)", MIRROR, "negate y", "negate y and yaw"),
     ("with x backward", np.diag([-1.0, 1, 1]), "negate x", "negate x, and pass pi - yaw"),
     ("with x and y swapped", np.eye(3)[[1, 0, 2]], "swap x and y", "swap x and y, and pass pi / 2 - yaw"),
     ("with y to the right and z down", np.diag([1.0, -1, -1]), "negate y and z", "negate y, z and yaw"),
@@ -118,51 +123,31 @@ _FLIPS: tuple[tuple[str, FloatArray, str, str], ...] = (
 )
 """What is found, the way to the ego frame, and the fix of points and of boxes."""
 
-
-def _first_of_boxes(
-    rig: Rig, boxes: FloatArray, objects: Points | None, ego2world: FloatArray | None, is_sure: bool
-) -> list[Finding]:
-    """Mistakes in boxes, the simplest that explains them."""
-    single = _order_finding(boxes, objects) or (None if objects is None else _size_finding(boxes, objects))
-    if single := single or _elsewhere(rig, boxes, objects, ego2world, is_sure):
-        return [single]
-    several = list(_box_findings(rig, boxes, objects))
-    if several or objects is None or (empty := _emptiness(boxes, objects)) is None:
-        return several
-    return [empty]
-
-
-def _readings(rig: Rig, ego2world: FloatArray | None) -> list[Reading]:
-    """Frames that can be told without a calibration of a further sensor."""
-    readings = []
-    for found, A, fix, fix_of_boxes in _FLIPS:
-        pose = np.eye(4)
-        pose[:3, :3] = A
-        readings.append(Reading(found, fix, fix_of_boxes, pose))
-    for camera in rig:
-        found, fix = f"in the frame of camera {camera.name!r}", f"apply the cam2ego of {camera.name!r}"
-        readings.append(Reading(found, fix, f"{fix}, to yaw too", camera.cam2ego, is_camera=True))
-    if ego2world is not None:
-        inverse = np.asarray(np.linalg.inv(ego2world), np.float64)
-        fix = "apply inv(ego2world)"
-        readings.append(Reading("in the world's frame", fix, f"{fix}, to yaw too", inverse))
-    return readings
-
-
-def _turned_readings(lift_m: float) -> list[Reading]:
-    """Frames of a LiDAR over the same road, turned by quarters, once they are lifted."""
-    readings = []
-    for quarters, turn in enumerate(("", "turned by -90 degrees", "turned by 180 degrees", "turned by 90 degrees")):
-        if quarters == 0 and abs(lift_m) < _LIDAR_HEIGHT_M:
-            continue
-        pose = np.eye(4)
-        pose[:3, :3], pose[2, 3] = rotation_z(90 * quarters).round(), lift_m
-        lower = f"{abs(lift_m):.1f} m {'lower' if lift_m > 0 else 'higher'}" if abs(lift_m) > ROAD_M else ""
-        readings.append(Reading(" and ".join(filter(None, (turn, lower))), _OF_LIDAR, f"{_OF_LIDAR}, to yaw too", pose))
-    return readings
-
-
 _OF_LIDAR = "are they in the LiDAR's frame? Apply lidar2ego to them"
+
+
+def _readings(rig: Rig, ego2world: FloatArray | None, lift_m: float) -> Iterator[Reading]:
+    """Frames that can be told without a calibration of a further sensor; the last are a LiDAR's, once it is lifted."""
+    for found, A, fix, fix_of_boxes in _FLIPS:
+        yield Reading(found, fix, fix_of_boxes, _pose(A))
+    for camera in rig:
+        fix = f"apply the cam2ego of {camera.name!r}"
+        found = f"in the frame of camera {camera.name!r}"
+        yield Reading(found, fix, f"{fix}, to yaw too", camera.cam2ego, is_camera=True)
+    if ego2world is not None:
+        fix, inverse = "apply inv(ego2world)", np.asarray(np.linalg.inv(ego2world), np.float64)
+        yield Reading("in the world's frame", fix, f"{fix}, to yaw too", inverse)
+    lower = f"{abs(lift_m):.1f} m {'lower' if lift_m > 0 else 'higher'}" if abs(lift_m) > ROAD_M else ""
+    for quarters, turn in enumerate(("", "turned by -90 degrees", "turned by 180 degrees", "turned by 90 degrees")):
+        if quarters or abs(lift_m) >= _LIDAR_HEIGHT_M:
+            found, pose = " and ".join(filter(None, (turn, lower))), _pose(rotation_z(90 * quarters).round(), lift_m)
+            yield Reading(found, _OF_LIDAR, f"{_OF_LIDAR}, to yaw too", pose)
+
+
+def _pose(A: FloatArray, up_m: float = 0.0) -> FloatArray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[2, 3] = A, up_m
+    return pose
 
 
 def _points_finding(
@@ -171,32 +156,28 @@ def _points_finding(
     """A frame in which the points fit the images' edges better; the points in it, and whether the images are clear."""
     if points is None or not len(images):
         return [], points, False
-    views = [
-        (small, edge_ranks(pixels))
-        for small, pixels in (gray(c, i, EDGE_WIDTH_PX) for c, i in zip(rig, images, strict=True))
-    ]
+    small = [gray(camera, image, EDGE_WIDTH_PX) for camera, image in zip(rig, images, strict=True)]
+    views = [(camera, edge_ranks(pixels)) for camera, pixels in small]
     xyz = points[:, :3].astype(np.float64)
     fit = total([edge_fit(*view, xyz) for view in views])
     road_m = road_height_m(points)
     off_m = 0.0 if road_m is None else rig.ground_z_m - road_m
-    readings = _readings(rig, ego2world)
-    # Another frame is costly to try: it must put the road in its place, and the points fit badly, or mirrored.
-    readings = (
-        [*readings, *_turned_readings(off_m)] if fit.gain < CLEAR_FIT or abs(off_m) > _LIDAR_HEIGHT_M else readings[:1]
-    )
+    readings = list(_readings(rig, ego2world, off_m))
+    if fit.gain >= CLEAR_FIT and abs(off_m) <= _LIDAR_HEIGHT_M:
+        readings = readings[:1]  # another frame is costly to try: only mirrored points may fit as well
     best, chosen, moved = fit, None, points
     for reading in readings:
         there = xyz @ reading.pose[:3, :3].T + reading.pose[:3, 3]
         level_m = road_height_m(there)
         if level_m is not None and abs(level_m - rig.ground_z_m) > 2 * ROAD_M:
-            continue
+            continue  # another frame must put the road in its place
         other = total([edge_fit(*view, there) for view in views])
         if other.beats(fit) and other.gain > best.gain:
             best, chosen, moved = other, reading, there
-    if chosen is not None:
-        seen = f"points {chosen.found}, by the edges of the images"
-        return [Finding("points", "points in the ego frame", seen, f"{chosen.fix}")], moved, True
-    return list(fit_findings(views, xyz)), points, fit.edges > 0 and fit.gain > CLEAR_FIT
+    if chosen is None:
+        return list(fit_findings(views, xyz)), points, fit.gain > CLEAR_FIT
+    seen = f"points {chosen.found}, by the edges of the images"
+    return [Finding("points", "points in the ego frame", seen, chosen.fix)], moved, True
 
 
 def _elsewhere(
@@ -205,8 +186,7 @@ def _elsewhere(
     """Boxes in another frame, which hold more points in it, or stand on the road in it alone."""
     bottoms = _bottoms_m(rig, boxes)
     height_m, spread_m = (0.0, 0.0) if bottoms is None else _spread(bottoms[0])
-    turned = _turned_readings(-height_m if abs(height_m) > _LIDAR_HEIGHT_M and spread_m < _ALIKE_M else 0.0)
-    readings = [*_readings(rig, ego2world), *turned]
+    readings = _readings(rig, ego2world, -height_m if abs(height_m) > _LIDAR_HEIGHT_M and spread_m < _ALIKE_M else 0.0)
     moved = [(reading, other) for reading in readings for other in _moved(boxes, reading)]
     chosen = None
     if objects is not None:
@@ -215,7 +195,9 @@ def _elsewhere(
     if chosen is None and bottoms is not None and (abs(height_m) > _LIDAR_HEIGHT_M or spread_m > 2 * _OFF_ROAD_M):
         low, high = np.percentile(bottoms[0], [10, 90])
         hang = f"bottoms {low:+.1f} to {high:+.1f} m over it"
-        stand = [(_bottoms_m(rig, other), reading) for reading, other in moved if _keeps_size(reading)]
+        stand = [
+            (_bottoms_m(rig, other), reading) for reading, other in moved if abs(np.linalg.det(reading.pose)) > 0.99
+        ]
         fits = [(sum(np.abs(_spread(there[0]))), reading) for there, reading in stand if there is not None]
         off_m, reading = min(fits, key=lambda fit: fit[0], default=(np.inf, None))
         if reading is not None and off_m < _ALIKE_M:
@@ -230,10 +212,6 @@ def _elsewhere(
     if is_sure:
         return Finding("boxes_3d", "boxes in the ego frame", found, chosen.fix_of_boxes)
     return Finding("boxes_3d or points", "both in the ego frame", found, f"{chosen.fix_of_boxes}; or mend the points")
-
-
-def _keeps_size(reading: Reading) -> bool:
-    return bool(abs(abs(np.linalg.det(reading.pose[:3, :3])) - 1) < 0.01)
 
 
 def _moved(boxes: FloatArray, reading: Reading) -> Iterator[FloatArray]:
@@ -269,8 +247,7 @@ def _road_finding(rig: Rig, boxes: FloatArray | None, road_m: float) -> Finding:
     seen = f"{road_m:+.2f} in the points"
     stand = None if boxes is None else _bottoms_m(rig, boxes)
     if road_m - rig.ground_z_m < -_LIDAR_HEIGHT_M and (stand is None or abs(float(np.median(stand[0]))) < ROAD_M * 2):
-        fix = "are the points in the LiDAR's frame? Apply lidar2ego to them"
-        return Finding("points", f"the road at z = {rig.ground_z_m:+.2f} m, as ground_z_m says", seen, fix)
+        return Finding("points", f"the road at z = {rig.ground_z_m:+.2f} m, as ground_z_m says", seen, _OF_LIDAR)
     fix = f"set ground_z_m={road_m:.2f}; or, if points and boxes are in the LiDAR's frame, apply lidar2ego to both"
     return Finding("ground_z_m", f"the road's height, {seen}", f"{rig.ground_z_m:+.2f}", fix)
 
@@ -284,8 +261,7 @@ def _bottoms_m(rig: Rig, boxes: FloatArray) -> tuple[FloatArray, FloatArray] | N
 def _box_findings(rig: Rig, boxes: FloatArray, objects: Points | None) -> Iterator[Finding]:
     """Another yaw, another height of the centre."""
     if objects is not None:
-        readings = {name: np.column_stack([boxes[:, :6], yaw]) for name, yaw in _yaws(boxes).items()}
-        leads = {n: _lead(other, boxes, objects, _informative(boxes, other)) for n, other in readings.items()}
+        leads = {n: _lead(other, boxes, objects, _informative(boxes, other)) for n, other in _yaws(boxes).items()}
         best = max(leads, key=lambda name: leads[name])
         if leads[best]:
             expected, seen = "yaw counter-clockwise from the x axis", f"more points in the boxes of {best}"
@@ -307,43 +283,30 @@ def _box_findings(rig: Rig, boxes: FloatArray, objects: Points | None) -> Iterat
 
 def _size_finding(boxes: FloatArray, objects: Points) -> Finding | None:
     """Sizes that are halves, as simulators give extents, or twice what they should be."""
-    factors = 0.55, 1.0, 2.0, 2.6
-    inner, held, double, beyond = (_counts(boxes * ([1] * 3 + [k] * 3 + [1]), objects) for k in factors)
-    lift = np.array([0, 0, 0.5, 0, 0, 0, 0]) * boxes[:, 5:6]
-    others = [boxes + lift, boxes - lift, *(np.column_stack([boxes[:, :6], yaw]) for yaw in _yaws(boxes).values())]
-    speak = double >= 4 * _LEAST_POINTS
-    if speak.sum() >= _LEAST_WINS and np.median(beyond[speak] / double[speak]) < _ALONE:
-        best = max(float(np.median(_counts(other, objects)[speak] / double[speak])) for other in (boxes, *others))
-        if best < _HALVES:
+
+    def share(of: FloatArray, whole: FloatArray) -> float:
+        """The median share of the points in larger boxes that others hold; NaN where too few boxes speak."""
+        speak = whole >= 4 * _LEAST_POINTS
+        return float(np.median(of[speak] / whole[speak])) if speak.sum() >= _LEAST_WINS else np.nan
+
+    inner, held, double, beyond = (_counts(boxes * ([1] * 3 + [k] * 3 + [1]), objects) for k in (0.55, 1.0, 2.0, 2.6))
+    expected, seen = "whole lengths, widths and heights", "the size of what the points show"
+    if share(beyond, double) < _ALONE:
+        lift = np.array([0, 0, 0.5, 0, 0, 0, 0]) * boxes[:, 5:6]
+        others = boxes, boxes + lift, boxes - lift, *_yaws(boxes).values()
+        if max(share(_counts(other, objects), double) for other in others) < _HALVES:
             fix = "are they extents from the centre? Double them"
-            return Finding(
-                "boxes_3d", "whole lengths, widths and heights", "half the size of what the points show", fix
-            )
-    speak = held >= 4 * _LEAST_POINTS
-    if speak.sum() >= _LEAST_WINS and np.median(inner[speak] / held[speak]) > _TWICE:
-        return Finding(
-            "boxes_3d", "lengths, widths and heights", "twice the size of what the points show", "halve them"
-        )
+            return Finding("boxes_3d", expected, f"half {seen}", fix)
+    if share(inner, held) > _TWICE:
+        return Finding("boxes_3d", expected, f"twice {seen}", "halve them")
     return None
 
 
-def _emptiness(boxes: FloatArray, objects: Points) -> Finding | None:
-    """Boxes of which many are empty, though points are around them and nothing else explains it."""
-    near = np.hypot(boxes[:, 0], boxes[:, 1]) < _NEAR_M
-    held = _counts(boxes[near], objects)
-    # Points around a box tell that the scan is dense enough there to fill it.
-    around = _counts(boxes[near] * ([1] * 3 + [3] * 3 + [1]), objects) >= _LEAST_POINTS
-    if around.sum() < _LEAST_BOXES or (held[around] > 0).mean() >= _LEAST_HELD:
-        return None
-    fix = "no usual frame or unit fits: are they of one moment, and in one frame?"
-    return Finding(
-        "boxes_3d and points", "boxes that hold points", f"none in many of {around.sum()} with points around", fix
-    )
-
-
 def _yaws(boxes: FloatArray) -> dict[str, FloatArray]:
+    """The boxes with another yaw, by its formula."""
     yaw, quarter = boxes[:, 6], math.pi / 2
-    return {"-yaw": -yaw, "yaw + pi / 2": yaw + quarter, "pi / 2 - yaw": quarter - yaw}
+    yaws = {"-yaw": -yaw, "yaw + pi / 2": yaw + quarter, "pi / 2 - yaw": quarter - yaw}
+    return {formula: np.column_stack([boxes[:, :6], other]) for formula, other in yaws.items()}
 
 
 def _order_finding(boxes: FloatArray, objects: Points | None) -> Finding | None:

@@ -87,13 +87,12 @@ def check_own_car(frames: Sequence[Frame]) -> list[Finding]:
 
 def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
     """Mistakes in poses, intrinsics and, where ``masks``, masks alone."""
-    findings = []
     mistake = pose_mistake(rig.cam2ego, rig.ground_z_m)
     if mistake is not None:
         expected = "cameras upright over the road: cam2ego with axes right, down, forward, in metres"
-        findings.append(Finding("cam2ego", expected, *mistake))
+        findings = [Finding("cam2ego", expected, *mistake)]
     else:
-        findings += pose_findings(rig)
+        findings = list(pose_findings(rig))
     for camera, mounted in zip(rig, is_mounted(rig.cam2ego, rig.ground_z_m), strict=True):
         if mistake is None and not mounted:
             at = ", ".join(f"{x:.1f}" for x in camera.center_m)
@@ -105,19 +104,13 @@ def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
             findings.append(Finding(f"camera {camera.name!r}: K", "a focal length in pixels", *found))
         if camera.mask is None or not masks:
             continue
-        turned = int((without_specks(camera.mask) != camera.mask).sum())
-        if turned:
-            fix = f"clean it: {CLEANING}"
-            findings.append(
-                Finding(f"camera {camera.name!r}: mask", "whole regions", f"specks of {turned} pixels", fix)
-            )
-        upper, hidden = camera.mask[: camera.height_px // 3].mean(), 1 - camera.mask.mean()
-        if hidden > _MOST_HIDDEN:
-            seen = f"{hidden:.0%} of the image hidden"
-            findings.append(Finding(f"camera {camera.name!r}: mask", "True on the scene", seen, "pass ~mask"))
-        elif upper < 0.2 and hidden < 0.8:
-            seen = f"{1 - upper:.0%} of the upper third hidden"
-            findings.append(Finding(f"camera {camera.name!r}: mask", "True on the scene", seen, "pass ~mask"))
+        where = f"camera {camera.name!r}: mask"
+        if turned := int((without_specks(camera.mask) != camera.mask).sum()):
+            findings.append(Finding(where, "whole regions", f"specks of {turned} pixels", f"clean it: {CLEANING}"))
+        hidden, upper = (1 - mask.mean() for mask in (camera.mask, camera.mask[: camera.height_px // 3]))
+        if hidden > _MOST_HIDDEN or (upper > 0.8 > hidden):
+            share = f"{hidden:.0%} of the image" if hidden > _MOST_HIDDEN else f"{upper:.0%} of the upper third"
+            findings.append(Finding(where, "True on the scene", f"{share} hidden", "pass ~mask"))
     return findings
 
 
