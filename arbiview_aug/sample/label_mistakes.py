@@ -68,10 +68,6 @@ class Reading(NamedTuple):
     pose: FloatArray  # (4, 4) to the ego frame; it may mirror
     is_camera: bool = False  # boxes then turn about the camera's y axis
 
-    @property
-    def keeps_size(self) -> bool:
-        return bool(abs(np.linalg.det(self.pose)) > 0.99)
-
 
 def label_findings(
     rig: Rig,

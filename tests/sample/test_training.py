@@ -35,7 +35,7 @@ def sample(**further: Any) -> dict[str, Any]:
 def test_boxes_are_seen_before_others_within_the_image_and_where_it_is_covered() -> None:
     np.testing.assert_array_equal(visible_boxes(sample()), [True, False, False])
     black = torch.zeros((1, 64, 96), dtype=torch.bool)
-    assert not visible_boxes(sample(coverage=black), 0).any()
+    assert not visible_boxes(sample(coverage=black)).any()
     out = RigRetarget(sample()["rig"].turned(yaw_deg=60), geometry="infinity")(sample())
     assert not visible_boxes(out).any()
     with pytest.raises(SampleError, match="expected a sample with 'boxes_3d'"):
@@ -72,12 +72,10 @@ def test_cells_are_lifted_that_are_covered_and_no_own_car() -> None:
     assert torch.equal(lift_mask({"coverage": coverage}, np.int64(4)), expected)  # type: ignore[arg-type]
 
 
-def test_what_is_no_sample_or_share_is_named() -> None:
-    for function in (lambda *a: lift_mask(a[0], 4, *a[1:]), visible_boxes):
+def test_what_is_no_sample_is_named() -> None:
+    for function in (lambda value: lift_mask(value, 4), visible_boxes):
         with pytest.raises(SampleTypeError, match="expected an output of RigRetarget, got list"):
             function([1])  # type: ignore[arg-type]
-        with pytest.raises(ValueError, match="least: expected a share from 0 to 1, got 'a'"):
-            function(sample(coverage=torch.ones(1, 64, 96) > 0), "a")  # type: ignore[arg-type]
 
 
 # --- batches in a DataLoader; of source samples: the tests of the Lightning adapter -----------------------------------
