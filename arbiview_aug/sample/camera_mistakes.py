@@ -305,24 +305,11 @@ _ROAD_AHEAD_M, _FLOW_PX, _GRADIENT, _STEADY = 12.0, 3.0, 3.0, 0.85
 """An edge of the own car is in all frames, where the road nearer than the first would have moved across it by the
 second; its gradient is so many grey levels a pixel, and so much of the mean of the frames' gradients."""
 
-_LEAST_WIDTH, _LEAST_FRAMES = 0.2, 3
+_LEAST_WIDTH = 0.2
 """Length of such an edge as a share of the width: 0.28 to 0.63 on a roof, up to 0.13 on 16 views of moving traffic."""
 
 
-def own_car_findings(
-    rig: Rig, images: Sequence[Sequence[torch.Tensor]], ego2world: Sequence[FloatArray]
-) -> Iterator[Finding]:
-    """Cameras without a mask that see the own car: parts of the images (frames, cameras) stay while the road moves."""
-    for k, camera in enumerate(rig if len(images) >= _LEAST_FRAMES else ()):
-        if camera.mask is None and (
-            share := _own_car(camera, [frame[k] for frame in images], ego2world, rig.ground_z_m)
-        ):
-            found = f"no mask, and edges that stay while the road moves: about {share:.0%} of the image"
-            fix = "mask it in the rig file: True on the scene"
-            yield Finding(f"camera {camera.name!r}: mask", "a mask that hides the own car", found, fix)
-
-
-def _own_car(
+def own_car_share(
     camera: Camera, images: Sequence[torch.Tensor], ego2world: Sequence[FloatArray], ground_z_m: float
 ) -> float:
     """Share of the images below edges of the own car; 0 where there are none."""

@@ -12,7 +12,7 @@ from arbiview_aug.cameras.validation import is_mounted, pose_mistake
 from arbiview_aug.sample.camera_mistakes import (
     neighbour_errors,
     neighbour_findings,
-    own_car_findings,
+    own_car_share,
     pose_findings,
 )
 from arbiview_aug.sample.findings import CheckReport, Finding
@@ -27,6 +27,7 @@ _OFF_CENTER, _OFF_CENTER_ALONE, _ALIKE = 0.04, 0.08, 0.06
 the height, are another resolution's. Real ones are off by up to 0.02 of the width, in both directions."""
 
 _MOVED = 0.5  # largest change of one vehicle's poses: some data sets add its way between the cameras' times
+_LEAST_FRAMES = 3  # that show the own car
 _MOST_HIDDEN = 0.9  # of an image by its mask; a fisheye's rim hides up to a half
 
 
@@ -80,9 +81,14 @@ def check_own_car(frames: Sequence[Frame]) -> list[Finding]:
         and np.allclose(frame.rig.cam2ego, first.cam2ego, atol=_MOVED)
         for frame in frames
     )
-    if not same or len(poses) < len(frames):
-        return []
-    return list(own_car_findings(first, [frame.images for frame in frames], poses))
+    findings = []
+    for k, camera in enumerate(first if same and len(poses) == len(frames) >= _LEAST_FRAMES else ()):
+        images = [frame.images[k] for frame in frames]
+        if camera.mask is None and (share := own_car_share(camera, images, poses, first.ground_z_m)):
+            found = f"no mask, and edges that stay while the road moves: about {share:.0%} of the image"
+            fix = "mask it in the rig file: True on the scene"
+            findings.append(Finding(f"camera {camera.name!r}: mask", "a mask that hides the own car", found, fix))
+    return findings
 
 
 def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
