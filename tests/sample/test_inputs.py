@@ -155,7 +155,7 @@ def test_entries_that_say_nothing_of_their_shape() -> None:
     for odd in (nested, SimpleNamespace(shape=None)):
         assert check_other_keys(sample(mine=odd), [(H, W)], (), ()) == []
     (frame,) = read_frames(sample(images=torch.zeros(1, 2, 3, H, W), rig=rig(), scene=torch.arange(1)), None)
-    assert frame.name("scene") == "[0]"
+    assert frame.name("scene") == "0"
     frame = read_frames(sample(images=torch.zeros(2, 2, 3, H, W), rig=rig(), scene=torch.arange(3)), None)[0]
     with pytest.raises(SampleError, match="scene: expected a name for each of 2 frames, got Tensor"):
         frame.name("scene")
