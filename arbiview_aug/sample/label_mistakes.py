@@ -184,30 +184,26 @@ def _elsewhere(
     height_m, spread_m = (0.0, 0.0) if bottoms is None else _spread(bottoms[0])
     readings = _readings(rig, ego2world, -height_m if abs(height_m) > _LIDAR_HEIGHT_M and spread_m < _ALIKE_M else 0.0)
     moved = [(reading, other) for reading in readings for other in _moved(boxes, reading)]
-    chosen = None
-    if objects is not None:
-        leads = [_lead(other, boxes, objects) for _, other in moved]
-        chosen = moved[int(np.argmax(leads))][0] if max(leads) else None
-    if chosen is None and bottoms is not None and (abs(height_m) > _LIDAR_HEIGHT_M or spread_m > 2 * _OFF_ROAD_M):
-        low, high = np.percentile(bottoms[0], [10, 90])
-        hang = f"bottoms {low:+.1f} to {high:+.1f} m over it"
-        stand = [
-            (_bottoms_m(rig, other), reading) for reading, other in moved if abs(np.linalg.det(reading.pose)) > 0.99
-        ]
-        fits = [(sum(np.abs(_spread(there[0]))), reading) for there, reading in stand if there is not None]
-        off_m, reading = min(fits, key=lambda fit: fit[0], default=(np.inf, None))
-        if reading is not None and off_m < _ALIKE_M:
-            or_ground = ", or is ground_z_m wrong?" if reading.fix == _OF_LIDAR else ""
-            seen = f"{hang}: boxes {reading.found}"
-            return Finding("boxes_3d", "boxes on the road", seen, f"{reading.fix_of_boxes}{or_ground}")
-        if abs(height_m) > _OFF_ROAD_M or spread_m > 2 * _OFF_ROAD_M:
-            return Finding("boxes_3d", "boxes on the road", hang, "are they in another sensor's frame, or other units?")
-    if chosen is None:
+    leads = [0 if objects is None else _lead(other, boxes, objects) for _, other in moved]
+    if max(leads):
+        chosen = moved[int(np.argmax(leads))][0]
+        found, fix = f"boxes {chosen.found}: they hold more points elsewhere", chosen.fix_of_boxes
+        if is_sure:
+            return Finding("boxes_3d", "boxes in the ego frame", found, fix)
+        return Finding("boxes_3d or points", "both in the ego frame", found, f"{fix}; or mend the points")
+    hangs = abs(height_m) > _OFF_ROAD_M or spread_m > 2 * _OFF_ROAD_M
+    if bottoms is None or not (hangs or abs(height_m) > _LIDAR_HEIGHT_M):
         return None
-    found = f"boxes {chosen.found}: they hold more points elsewhere"
-    if is_sure:
-        return Finding("boxes_3d", "boxes in the ego frame", found, chosen.fix_of_boxes)
-    return Finding("boxes_3d or points", "both in the ego frame", found, f"{chosen.fix_of_boxes}; or mend the points")
+    low, high = np.percentile(bottoms[0], [10, 90])
+    hang, fix = f"bottoms {low:+.1f} to {high:+.1f} m over it", "are they in another sensor's frame, or other units?"
+    kept = [(reading, other) for reading, other in moved if abs(np.linalg.det(reading.pose)) > 0.99]
+    stand = [(reading, there[0]) for reading, other in kept if (there := _bottoms_m(rig, other)) is not None]
+    off_m = [sum(np.abs(_spread(heights_m))) for _, heights_m in stand]
+    if min(off_m, default=np.inf) < _ALIKE_M:
+        chosen = stand[int(np.argmin(off_m))][0]
+        fix = chosen.fix_of_boxes + (", or is ground_z_m wrong?" if chosen.fix == _OF_LIDAR else "")
+        return Finding("boxes_3d", "boxes on the road", f"{hang}: boxes {chosen.found}", fix)
+    return Finding("boxes_3d", "boxes on the road", hang, fix) if hangs else None
 
 
 def _moved(boxes: FloatArray, reading: Reading) -> Iterator[FloatArray]:
