@@ -16,8 +16,6 @@ from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from arbiview_aug.atomic_io import file_name, inside
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
@@ -38,14 +36,14 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, dem
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.displaced import COPY, displaced_frames, surfaces_for
 from arbiview_aug.evaluate.frames import EXPOSURES, Evaluation, Look, ScoredFrame, evaluate, make_frame
-from arbiview_aug.evaluate.images import RenderedView, as_arrays
+from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.judges import load_detector, load_segmenter
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
-from arbiview_aug.evaluate.report.tables import evaluation_tables, judge_tables, text_table
+from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table, verdict_tables
 from arbiview_aug.evaluate.targets import named_targets
-from arbiview_aug.evaluate.verdicts import SOURCES, TRUTH, Panel, numbers
+from arbiview_aug.evaluate.verdicts import FEWEST, Panel, too_few
 from arbiview_aug.generator import load_inpainter
 from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import GEOMETRIES
@@ -59,8 +57,13 @@ def run(arguments: argparse.Namespace) -> None:
         evaluate_scans(arguments, folder)
         return
     notes: list[str] = []
-    panel = _panel(arguments)
-    look = panel.look if arguments.detector or arguments.segmenter else None
+    device, panel = device_named(None), Panel()  # networks are loaded before anything is rendered
+    if arguments.detector:
+        weights, classes = arguments.detector_weights, arguments.detector_classes
+        panel.detector = load_detector(arguments.detector, weights, classes, device)
+    if arguments.segmenter:
+        panel.segmenter = load_segmenter(arguments.segmenter, device)
+    look = panel.look if panel.detector or panel.segmenter else None
     if arguments.displaced:
         methods, done = _displaced(arguments, notes, look)
     else:
@@ -74,9 +77,13 @@ def run(arguments: argparse.Namespace) -> None:
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
     scored = evaluation_tables(done, names)
     whole = [name for name in names if name not in done.declined]  # the others were judged on fewer frames
-    judged = {name: numbers(row) for name, row in panel.rows(whole, list(done.targets)).items()}
-    tables = scored + judge_tables(judged)
-    notes.extend(panel.notes(whole, arguments.detector_classes))
+    verdicts = panel.rows(whole, list(done.targets))
+    tables = scored + verdict_tables(verdicts)
+    if too_few(verdicts.values()):
+        fewest = " or ".join(f"{fewest} {unit}" for unit, fewest in FEWEST.items())
+        notes.append(f"rows of fewer than {fewest} are too few to tell methods apart; add frames")
+    if arguments.detector and not any("objects" in row for row in verdicts.values()):
+        notes.append("--detector: no labels (boxes_3d) and no true images: nothing to compare its detections with")
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
     title = f"{source}: {frames_text(len({view['frame'] for view in done.views}))}"
     for note in notes:
@@ -84,16 +91,16 @@ def run(arguments: argparse.Namespace) -> None:
     print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
     report: dict[str, Any] = {"arguments": vars(arguments), "scored_on_other_points": done.first.held_out}
     report |= dict(zip(("means", "agreement"), (rows for _, rows, *_ in scored), strict=False))
-    report |= {"views": done.views, "pairs": done.pairs} | ({"judges": judged} if judged else {})
+    report |= {"views": done.views, "pairs": done.pairs} | ({"judges": verdicts} if verdicts else {})
     (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
-    _save_pictures(folder, done, panel)
-    page = html_report(title, done, names, tables, notes, panel.pictures)
+    _save_pictures(folder, done)
+    page = html_report(title, done, names, tables, notes)
     (folder / "report.html").write_text(page, encoding="utf-8")
     print(f"report: {folder / 'report.html'}\nnumbers: {folder / 'evaluate.json'}")
 
 
-def _save_pictures(folder: Path, done: Evaluation, panel: Panel) -> None:
-    """Save the first frame's views of each method and target, and what a detector sees in them."""
+def _save_pictures(folder: Path, done: Evaluation) -> None:
+    """Save the first frame's views of each method and target."""
     assert done.first is not None
     sample = done.first.sample
     for (target, method), views in done.pictures.items():
@@ -102,21 +109,6 @@ def _save_pictures(folder: Path, done: Evaluation, panel: Panel) -> None:
         file = file if len(file.encode()) <= 200 else file_name(file)
         sheet = frame_sheet(sample["rig"], as_arrays(sample["images"]), rig, views, done.first.true_images(rig))
         save_picture(folder / f"{file}.png", sheet)
-        if (target, method) in panel.pictures:
-            seen = [RenderedView(image, np.ones(image.shape[:2], bool)) for image in panel.pictures[target, method]]
-            sources, truth = panel.pictures[SOURCES, SOURCES], panel.pictures.get((target, TRUTH))
-            save_picture(folder / f"{file}-judged.png", frame_sheet(sample["rig"], sources, rig, seen, truth))
-
-
-def _panel(arguments: argparse.Namespace) -> Panel:
-    """Load the judges, before anything is rendered."""
-    device, panel = device_named(None), Panel()
-    if arguments.detector:
-        weights, classes = arguments.detector_weights, arguments.detector_classes
-        panel.detector = load_detector(arguments.detector, weights, classes, device)
-    if arguments.segmenter:
-        panel.segmenter = load_segmenter(arguments.segmenter, device)
-    return panel
 
 
 def _displaced(arguments: argparse.Namespace, notes: list[str], look: Look | None) -> tuple[list[Method], Evaluation]:

@@ -195,17 +195,16 @@ def evaluate() -> argparse.ArgumentParser:
     )
     add("--lidar", action="store_true", help=lidar)
     detector = (
-        "judge views by a detector: a hub id or folder of transformers' object detection, a torchvision detector's "
-        "name, or FILE.py:function (RGB (H, W, 3) uint8 to boxes (n, 4) xyxy, scores, labels). Scores labelled "
-        "objects, and true images where there are some (docs/benchmarks.md)"
+        "AP and recall of a detector in the views, against true images or labels: FILE.py:function (RGB (H, W, 3) "
+        "uint8 to boxes (n, 4) xyxy, scores, labels), or a torchvision detector's name (docs/benchmarks.md)"
     )
     add("--detector", type=path, metavar="MODEL", help=detector)
     add("--detector-weights", type=path, metavar="FILE", help="weights of a torchvision detector")
     classes = "labels that count (default: names of vehicles and people; all numbers)"
     add("--detector-classes", nargs="+", default=[], metavar="LABEL", help=classes)
     segmenter = (
-        "judge views by drivable area and lane marks, against true images: TorchScript of TwinLiteNet's kind, or "
-        "FILE.py:function (RGB (H, W, 3) uint8 to masks (2, H, W))"
+        "IoU of a segmenter's masks in the views with those in true images: FILE.py:function (RGB (H, W, 3) uint8 to "
+        "masks (n, H, W)), or TorchScript of TwinLiteNet's kind"
     )
     add("--segmenter", type=path, metavar="MODEL", help=segmenter)
     return parser

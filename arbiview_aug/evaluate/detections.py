@@ -1,80 +1,66 @@
-"""Metrics of a detector's boxes: against labelled objects, against its own in a true image, and on generated pixels.
-
-NTA-IoU is that of DriveDreamer4D (2024): over the labelled vehicles and people that lie within an image, the mean IoU
-with their detections; 0 without one. It has no test of occlusion; ``Labels.clear`` has one.
-"""
+"""Detections in an image against true objects: hits, average precision and recall."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.judges import Detections, is_road_user
 from arbiview_aug.sample.boxes_2d import project_boxes_3d
-from arbiview_aug.scene.boxes import checked_boxes, points_in
 
 CONFIDENCE = 0.5
-"""Least score of a detection that counts (NTA-IoU); AP counts all."""
+"""Least score of a sure detection: recall counts no others, and in true images they are the objects."""
 
-REACH_PX, REACH_SIZE = 10.0, (480, 320)
-"""Greatest distance of a detection's centre from its object's, in an image resized to this width and height."""
+OVERLAP = 0.5
+"""Least IoU of a hit, as in PASCAL VOC."""
 
-CLEAR_SHARE, CLEAR_POINTS = 0.5, 4
-"""Least share of a clear object that no other labelled one hides, and its LiDAR points, where there are any."""
-
-OVERLAPS = (0.5, 0.7)
-"""IoUs of hits, for AP."""
-
-GHOST_IOU, GHOST_SHARE = 0.1, 0.5
-"""A false alarm has less IoU with all that is there (TIDE, Bolya et al. 2020), and more of its box is generated."""
-
-Integers = npt.NDArray[np.int64]
+VISIBLE = 0.5
+"""Least visible share of a labelled object that counts."""
 
 
-# --- labelled objects -------------------------------------------------------------------------------------------------
-class Labels(NamedTuple):
-    """Labelled vehicles and people in an image, with 2D extents of their 3D boxes.
+class Objects(NamedTuple):
+    """What the detections in an image are compared with.
 
     Attributes:
-        rows: (n,) rows of ``boxes_3d``.
-        boxes: (n, 4) x0 y0 x1 y1 in pixels, cut at the border; pixel k reaches from k to k + 1, as in detections.
-        whole: (n,) bool, within the image: those that NTA-IoU counts.
-        clear: (n,) bool, whole, and neither hidden by other labelled objects nor by what only LiDAR knows.
+        boxes: (n, 4) x0 y0 x1 y1 in pixels; pixel k reaches from k to k + 1.
+        counts: (n,) bool. A detection of an object that does not count is neither a hit nor a miss.
     """
 
-    rows: Integers
     boxes: FloatArray
-    whole: BoolArray
-    clear: BoolArray
+    counts: BoolArray
 
 
-def labels_of(frame: ScoredFrame, rig: Rig) -> list[Labels] | None:
-    """A frame's labels in the cameras of a rig in its ego frame, whose masks hide objects; None without ``boxes_3d``.
+class Matches(NamedTuple):
+    """Detections in an image that are hits or misses.
 
-    Objects that ``box_names`` calls neither vehicles nor people do not count, but hide others.
+    Attributes:
+        scores: (d,).
+        hits: (d,) bool; each object is hit once.
+        num_true: Number of true objects.
     """
-    sample = frame.sample
+
+    scores: FloatArray
+    hits: BoolArray
+    num_true: int
+
+
+def labelled_objects(sample: Mapping[str, Any], rig: Rig) -> list[Objects] | None:
+    """A sample's labels in the cameras of a rig in its ego frame, whose masks hide them; None without ``boxes_3d``.
+
+    Vehicles and people count if others hide no more than half of them; without ``box_names`` all objects are such.
+    """
     if sample.get("boxes_3d") is None:
         return None
-    boxes, names = checked_boxes(sample["boxes_3d"]), sample.get("box_names")
-    counts = np.ones(len(boxes), bool) if names is None else np.array(list(map(is_road_user, names)), bool)
-    measured = np.ones(len(boxes), bool)
-    if frame.points is not None:
-        points = frame.points.double().numpy()[:, :3]
-        measured = np.array([len(rows) for rows in points_in(boxes, points)], int) >= CLEAR_POINTS
-    labels = []
-    for seen in project_boxes_3d(boxes, rig):
-        whole = seen.truncation < 1e-6
-        clear = whole & (seen.visibility >= CLEAR_SHARE) & measured[seen.rows]
+    names, objects = sample.get("box_names"), []
+    for seen in project_boxes_3d(sample["boxes_3d"], rig):
+        users = [names is None or is_road_user(names[row]) for row in seen.rows]
         edges = seen.boxes + 0.5  # those of 3D boxes refer to pixel centres
-        labels.append(Labels(*(part[counts[seen.rows]] for part in (seen.rows, edges, whole, clear))))
-    return labels
+        objects.append(Objects(edges, (seen.visibility >= VISIBLE) & np.array(users, bool)))
+    return objects
 
 
 def ious(one: FloatArray, two: FloatArray) -> FloatArray:
@@ -86,101 +72,32 @@ def ious(one: FloatArray, two: FloatArray) -> FloatArray:
     return np.asarray(both / np.maximum(one_px[:, None] + two_px - both, 1e-9))
 
 
-def nta_ious(boxes: FloatArray, detections: FloatArray, size: tuple[int, int]) -> FloatArray:
-    """(n,) IoU of labelled boxes (n, 4) with their detections out of (m, 4) in an image (h, w); NaN without one.
+def match(detections: Detections, objects: Objects) -> Matches:
+    """Match detections, the surest first, each with the free object that it overlaps most."""
+    true, others = objects.boxes[objects.counts], objects.boxes[~objects.counts]
+    hits, free = np.zeros(len(detections.boxes), bool), np.ones(len(true), bool)
+    overlaps = ious(detections.boxes, true)
+    for k in np.argsort(-detections.scores, kind="stable") if len(true) else ():
+        best = np.where(free, overlaps[k], 0).argmax()
+        hits[k] = free[best] and overlaps[k, best] >= OVERLAP
+        free[best] &= not hits[k]
+    chosen = hits | (ious(detections.boxes, others).max(axis=1, initial=0) < OVERLAP)
+    return Matches(detections.scores[chosen], hits[chosen], len(true))
 
-    A detection belongs to the box whose centre is the nearest, within ``REACH_PX``; the nearest one counts.
+
+def precision_and_recall(matches: Sequence[Matches], weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(R,) AP and recall of images (n) together, for R weightings (R, n) of these; NaN without true objects.
+
+    AP is the area under the envelope of precision over recall; recall is that of detections from ``CONFIDENCE`` on.
     """
-    values = np.full(len(boxes), np.nan)
-    if not len(boxes) or not len(detections):
-        return values
-    scale = np.array(REACH_SIZE) / size[::-1]
-    labelled, detected = ((b[:, :2] + b[:, 2:]) / 2 * scale for b in (boxes, detections))
-    apart = np.linalg.norm(labelled[:, None] - detected, axis=-1)  # [n, m]
-    apart[np.arange(len(boxes))[:, None] != apart.argmin(axis=0)] = np.inf
-    nearest, overlap = apart.argmin(axis=1), ious(boxes, detections)
-    belongs = apart.min(axis=1) <= REACH_PX
-    values[belongs] = overlap[belongs, nearest[belongs]]
-    return values
-
-
-# --- detections in true images ----------------------------------------------------------------------------------------
-def hits(detections: Detections, boxes: FloatArray, overlap: float) -> Integers:
-    """(n,) box (m, 4) that each detection takes: the free one of the largest IoU, by descending scores; -1 for none."""
-    taken, matched = np.zeros(len(boxes), bool), np.full(len(detections.boxes), -1)
-    overlaps = ious(detections.boxes, boxes)
-    for k in np.argsort(-detections.scores, kind="stable") if len(boxes) else ():
-        free = np.where(taken, 0, overlaps[k])
-        if free.max() >= overlap:
-            matched[k] = free.argmax()
-            taken[matched[k]] = True
-    return matched
-
-
-class Pooled(NamedTuple):
-    """Detections of several images.
-
-    Attributes:
-        scores: (d,).
-        matched: (d,) which of all the true objects each hits, or -1 for a miss; each object at most once.
-        num_true: Number of true objects.
-    """
-
-    scores: FloatArray
-    matched: Integers
-    num_true: int
-
-    @property
-    def num_misses(self) -> int:
-        """Number of detections that hit nothing."""
-        return int((self.matched < 0).sum())
-
-
-def pooled(
-    detections: Sequence[Detections], true: Sequence[FloatArray], doubtful: Sequence[FloatArray], overlap: float
-) -> Pooled:
-    """Match the detections of images with their true boxes (t, 4); those that hit doubtful ones alone are left out."""
-    ends = np.cumsum([0, *map(len, true)])
-    scores, matched = [np.zeros(0)], [np.zeros(0, np.int64)]
-    for of_image, boxes, unsure, start in zip(detections, true, doubtful, ends[:-1], strict=True):
-        taken = hits(of_image, boxes, overlap)
-        counts = (taken >= 0) | (ious(of_image.boxes, unsure).max(axis=1, initial=0) < overlap)
-        matched.append(np.where(taken < 0, -1, taken + start)[counts])
-        scores.append(of_image.scores[counts])
-    return Pooled(np.concatenate(scores), np.concatenate(matched), int(ends[-1]))
-
-
-def average_precision(found: Pooled, weights: FloatArray | None = None, misses: FloatArray | None = None) -> FloatArray:
-    """(R,) AP, the area under the envelope of precision over recall, for R weightings; NaN without true objects.
-
-    Args:
-        found: The detections and what they hit.
-        weights: (R, num_true) how often each true object counts; once by default.
-        misses: (R, num_misses) how often each miss counts; once by default.
-    """
-    weights = np.ones((1, found.num_true)) if weights is None else weights
-    misses = np.ones((len(weights), found.num_misses)) if misses is None else misses
-    if not found.num_true:
-        return np.full(len(weights), np.nan)
-    hit, index = found.matched >= 0, found.matched.copy()
-    index[~hit] = np.arange(found.num_misses)
-    order = np.argsort(-found.scores, kind="stable")
-    hit, index = hit[order], index[order]
-    true, every = np.zeros((2, len(weights), len(order)))
-    true[:, hit] = every[:, hit] = weights[:, index[hit]]
-    every[:, ~hit] = misses[:, index[~hit]]
-    true, every = true.cumsum(axis=1), every.cumsum(axis=1)
-    precision = np.maximum.accumulate((true / np.maximum(every, 1))[:, ::-1], axis=1)[:, ::-1]
-    gained = np.diff(true / weights.sum(axis=1, keepdims=True), axis=1, prepend=0)
-    return np.asarray((gained * precision).sum(axis=1))
-
-
-def false_alarms(detections: Detections, there: FloatArray, generated: BoolArray) -> int:
-    """Count detections that lie on generated pixels (h, w) and touch none of the boxes (m, 4) that are there."""
-    count = 0
-    for box in detections.boxes[detections.scores >= CONFIDENCE]:
-        (x0, y0), (x1, y1) = np.floor(box[:2]).astype(int), np.ceil(box[2:]).astype(int)
-        within = generated[y0:y1, x0:x1]
-        touched = len(there) and ious(box[None], there).max() >= GHOST_IOU
-        count += bool(within.size and within.mean() > GHOST_SHARE and not touched)
-    return count
+    image = np.repeat(np.arange(len(matches)), [len(found.scores) for found in matches])
+    scores, hits = (np.concatenate(parts) for parts in zip(*(found[:2] for found in matches), strict=True))
+    order = np.argsort(-scores, kind="stable")
+    scores, hits, weights_of = scores[order], hits[order], weights[:, image[order]]
+    num_true = weights @ np.array([found.num_true for found in matches], float)
+    num_true[num_true == 0] = np.nan
+    recall = (weights_of * hits).cumsum(axis=1) / num_true[:, None]
+    precision = recall * num_true[:, None] / np.maximum(weights_of.cumsum(axis=1), 1)
+    precision = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
+    average = np.where(np.isnan(num_true), np.nan, (np.diff(recall, axis=1, prepend=0) * precision).sum(axis=1))
+    return average, (weights_of * (hits & (scores >= CONFIDENCE))).sum(axis=1) / num_true

@@ -51,8 +51,8 @@ def displaced_frames(
             rig = later.rig.with_cameras([without_objects(camera, moved) for camera in later.rig])
             photographs = _photographs(rig, later.images(frame.images))
             sample = {**frame.sample, **({"neighbours": others} if others else {})}
-        points, rig = sample.get("points"), photographs.rig
-        yield str(sample.get("token", index)), ScoredFrame(sample, truth=photographs.of_rig, target=rig, points=points)
+        name = str(sample.get("token", index))
+        yield name, ScoredFrame(sample, truth=photographs.of_rig, target=photographs.rig)
         found = True
     if problems and not found:
         raise DataError(problems[0])

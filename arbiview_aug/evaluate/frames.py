@@ -64,7 +64,6 @@ class ScoredFrame:
     held_out: bool = False  # whether ``sample`` has points, and others score
     truth: Callable[[Rig], RenderedViews | Photographs] | None = None  # the true views of a rig; None if unknown
     target: Rig | None = None  # the rig that alone has a truth, that of photographs; None for any rig
-    points: torch.Tensor | None = None  # (P, >= 3) all that the frame has, those that score too
 
     @property
     def scored_sample(self) -> dict[str, Any]:
@@ -92,7 +91,7 @@ def make_frame(
     inputs = {key: value for key, value in sample.items() if key != "points"}
     points_3d = sample.get("points")
     if points_3d is None or not exposures:
-        return ScoredFrame(dict(sample) if hand_over_points else inputs, truth=truth, points=points_3d)
+        return ScoredFrame(dict(sample) if hand_over_points else inputs, truth=truth)
     rig, images = rig_of(sample), as_arrays(sample["images"])  # masked: made-up pixels colour no points
     cloud = points_3d.numpy().astype(np.float64)
     if inputs.get("neighbours"):  # their points lie in the sectors that score, too; their images stay unread
@@ -106,7 +105,7 @@ def make_frame(
         if hand_over_points:
             points = points.subset(lidar_split(points.points)[1])
         lidar[exposure] = LidarReference({**inputs, "images": as_tensors(exposed)}, points)
-    return ScoredFrame(inputs, lidar, hand_over_points, truth, points=points_3d)
+    return ScoredFrame(inputs, lidar, hand_over_points, truth)
 
 
 def scores(

@@ -1,6 +1,6 @@
 """Networks that judge views: detectors and segmenters that were trained on photographs, by the names of the options.
 
-Detectors take an RGB image (H, W, 3) uint8 and return ``Detections``; segmenters return two masks of the image's size.
+Detectors take an RGB image (H, W, 3) uint8 and return ``Detections``; segmenters return masks (n, H, W).
 """
 
 from __future__ import annotations
@@ -20,12 +20,10 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError, described, one_line, shown
 from arbiview_aug.evaluate.report.pictures import Picture
 from arbiview_aug.files import open_regular
 from arbiview_aug.inpaint.networks import load_torchscript
-from arbiview_aug.temporal.transformers_depth import load_pretrained
 
 
 class Detections(NamedTuple):
@@ -78,28 +76,23 @@ def load_detector(
     """Load the detector that ``--detector`` names; it returns the detections that count.
 
     Args:
-        name: ``FILE.py:function``, the name of a torchvision detector, or a folder or hub id of transformers. All are
-            asked for detections from ``LEAST_SCORE`` on, a function by its parameter ``score`` if it has one.
+        name: ``FILE.py:function``, or with ``weights`` the name of a torchvision detector. Both are asked for
+            detections from ``LEAST_SCORE`` on, a function by its parameter ``score`` if it has one.
         weights: File of a torchvision detector's weights.
         classes: Labels that count, names or numbers as text. By default names of vehicles and people, and all numbers.
-        device: The device of a network of transformers or torchvision.
+        device: The device of a torchvision detector.
 
     Raises:
         DataError: No such detector, or one that does not fit; its calls raise it for outputs of other shapes.
     """
     option = f"--detector {name}"
-    if names_a_function(name):
-        if weights is not None:
-            raise DataError(f"--detector-weights: expected it with a torchvision detector alone, got {option}")
-        detect, names = _asked_for_all(_function(option, name)), None
-    elif weights is not None or name in _torchvision_detectors():
-        detect, names = _of_torchvision(option, name, weights, device)
+    if weights is None:
+        detect = _asked_for_all(_function(option, name))
     else:
-        detect, names = _of_transformers(option, name, device)
-    if names is not None and (unknown := {*classes} - {*names}):
-        raise DataError(f"--detector-classes: expected names that {name} has, {shown(names)}, got {sorted(unknown)}")
-    if names is not None and not classes and not any(map(is_road_user, names)):
-        raise DataError(f"{option}: no class is a vehicle or person: {shown(names)}; choose by --detector-classes")
+        detect, names = _of_torchvision(option, name, weights, device)
+        if unknown := {*classes} - {*names}:
+            expected = f"names that {name} has, {shown(names)}"
+            raise DataError(f"--detector-classes: expected {expected}, got {sorted(unknown)}")
 
     def detector(image: Picture) -> Detections:
         found: Detections = _called(option, lambda rgb: checked_detections(option, detect(rgb), image), image)
@@ -150,34 +143,23 @@ def _host(part: Any) -> Any:
     return part.detach().cpu() if isinstance(part, torch.Tensor) else part
 
 
-def _torchvision_detectors() -> list[str]:
-    from torchvision import models
-
-    return list(models.list_models(module=models.detection))
-
-
 def _of_torchvision(
-    option: str, name: str, weights: str | None, device: torch.device | str
+    option: str, name: str, weights: str, device: torch.device | str
 ) -> tuple[Callable[[Picture], Any], list[str]]:
     from torchvision import models
 
-    if name not in _torchvision_detectors():
-        known = ", ".join(_torchvision_detectors())
-        raise DataError(f"{option}: expected a torchvision detector with --detector-weights: {known}")
-    if weights is None:
-        raise DataError(f"{option}: expected --detector-weights FILE with a torchvision detector, found none")
+    known = list(models.list_models(module=models.detection))
+    if name not in known:
+        raise DataError(f"{option}: expected a torchvision detector with --detector-weights: {', '.join(known)}")
     names = list(models.get_model_weights(name).DEFAULT.meta["categories"])
     model = models.get_model(name, weights=None, weights_backbone=None)
-    file = f"--detector-weights {weights}"
     try:
         with open_regular(weights) as content:
             state = torch.load(content, map_location="cpu", weights_only=True)
         model.load_state_dict(state["model"] if "model" in state else state)  # torchvision's references save more
-    except FileNotFoundError:
-        raise DataError(f"{file}: expected a file, found none") from None
-    except Exception as error:  # pickle, zip, torch and mappings each have their own
+    except Exception as error:  # files, pickle, zip, torch and mappings each have their own
         fix = f"expected weights of torchvision's {name} for its {len(names)} classes (others: FILE.py:function)"
-        raise DataError(f"{file}: {fix}: {one_line(error)}") from None
+        raise DataError(f"--detector-weights {weights}: {fix}: {one_line(error)}") from None
     model.eval().to(device)
     getattr(model, "roi_heads", model).score_thresh = LEAST_SCORE  # some ask for more: FCOS for 0.2
 
@@ -190,39 +172,14 @@ def _of_torchvision(
     return detect, names
 
 
-def _of_transformers(option: str, name: str, device: torch.device | str) -> tuple[Callable[[Picture], Any], list[str]]:
-    try:
-        transformers = optional_package("transformers", "depth")
-    except ImportError as error:
-        raise DataError(f"{option}: {error}") from None
-    expected = "FILE.py:function, a torchvision detector's name, or a folder with config.json or a model of the Hub"
-    config = load_pretrained(transformers.AutoConfig, option, name, expected)
-    if type(config) not in transformers.MODEL_FOR_OBJECT_DETECTION_MAPPING:
-        kind = type(config).__name__
-        raise DataError(f"{option}: expected a model that detects objects, such as facebook/detr-resnet-50, got {kind}")
-    beside = "preprocessor_config.json beside the model"
-    processor = load_pretrained(transformers.AutoImageProcessor, option, name, beside)
-    loaded = load_pretrained(transformers.AutoModelForObjectDetection, option, name, "weights of the model")
-    model, names = loaded.float().eval().to(device), [str(one) for one in config.id2label.values()]
-
-    @torch.inference_mode()
-    def detect(image: Picture) -> Any:
-        inputs = processor(images=image, return_tensors="pt").to(device)
-        sizes = [image.shape[:2]]
-        (out,) = processor.post_process_object_detection(model(**inputs), threshold=LEAST_SCORE, target_sizes=sizes)
-        return out["boxes"], out["scores"], [str(config.id2label[label]) for label in out["labels"].tolist()]
-
-    return detect, names
-
-
 # --- segmenters -------------------------------------------------------------------------------------------------------
 def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
-    """Load the segmenter that ``--segmenter`` names; it returns (2, H, W) bool: drivable area, lane marks.
+    """Load the segmenter that ``--segmenter`` names; it returns masks (n, H, W) bool, one for each class.
 
     Args:
         name: ``FILE.py:function``, which returns the same masks; or a TorchScript file of TwinLiteNet's kind: of images
-            (1, 3, 360, 640), RGB in [0, 1], it returns two (1, 2, 360, 640) logits: area and lanes, against others. It
-            sees the 16:9 part of an image that is left when the top or the sides are cut; the rest has no masks.
+            (1, 3, 360, 640), RGB in [0, 1], it returns n logits (1, 2, 360, 640): each mask against the rest. It sees
+            the 16:9 part of an image that is left when the top or the sides are cut; the rest has no masks.
         device: Where TorchScript runs.
 
     Raises:
@@ -237,10 +194,10 @@ def load_segmenter(name: str, device: torch.device | str = "cpu") -> Segmenter:
             array = np.asarray(_host(masks))
         except (TypeError, ValueError, RuntimeError):
             array = np.zeros(0)
-        expected = (2, *image.shape[:2])
-        if array.shape != expected or not np.isin(array, (0, 1)).all():
+        h, w = image.shape[:2]
+        if not array.size or array.ndim != 3 or array.shape[1:] != (h, w) or not np.isin(array, (0, 1)).all():
             got = f"{array.dtype} {array.shape}" if array.shape and array.size else type(masks).__name__
-            raise DataError(f"{option}: expected masks {expected} of 0 and 1: drivable area and lane marks, got {got}")
+            raise DataError(f"{option}: expected masks (n, {h}, {w}) of 0 and 1, got {got}")
         return array.astype(bool)
 
     return partial(_called, option, masks_of)
@@ -256,11 +213,11 @@ def _of_torchscript(option: str, name: str, device: torch.device | str) -> Calla
         small = cv2.resize(image[part], SEGMENTED[::-1], interpolation=cv2.INTER_AREA)
         pixels = torch.from_numpy(small).to(device).permute(2, 0, 1)[None].float() / 255
         out = network(pixels)
-        shapes = [tuple(one.shape) for one in out if isinstance(one, torch.Tensor)]
-        if not isinstance(out, tuple | list) or shapes != [logits, logits]:
+        shapes = [tuple(one.shape) if isinstance(one, torch.Tensor) else one for one in out]
+        if not isinstance(out, tuple | list) or {*shapes} != {logits}:
             got = shapes if isinstance(out, tuple | list) else type(out).__name__
-            raise DataError(f"{option}: expected two outputs {logits} for {tuple(pixels.shape)}, got {got}")
-        masks = np.zeros((2, *image.shape[:2]), bool)
+            raise DataError(f"{option}: expected outputs {logits} for {tuple(pixels.shape)}, got {got}")
+        masks = np.zeros((len(out), *image.shape[:2]), bool)
         for mask, one in zip(masks, out, strict=True):
             h, w = mask[part].shape
             mask[part] = cv2.resize(one[0].argmax(0).byte().cpu().numpy(), (w, h), interpolation=cv2.INTER_NEAREST) > 0
@@ -283,9 +240,9 @@ def names_a_function(name: str) -> bool:
 
 def _function(option: str, name: str) -> Callable[[Picture], Any]:
     """Import the function that ``FILE.py:function`` names."""
-    file, _, wanted = (name, "", "") if name.endswith(".py") else name.rpartition(":")
-    if not wanted:
-        raise DataError(f"{option}: expected FILE.py:function, got no function; add its name, such as {file}:detect")
+    file, _, wanted = name.rpartition(":") if names_a_function(name) else ("", "", "")
+    if not wanted or name.endswith(".py"):
+        raise DataError(f"{option}: expected FILE.py:function, found no function's name; add it, such as own.py:detect")
     if not os.path.isfile(file):  # unlike Path.is_file, False for a name that is too long
         raise DataError(f"{option}: expected a file {file}, found none")
     spec = importlib.util.spec_from_file_location(f"arbiview_aug_judge_{Path(file).stem}", file)

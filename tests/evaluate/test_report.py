@@ -58,7 +58,7 @@ def test_text_is_escaped_and_numbers_are_there(page: str, done: Evaluation) -> N
 
 def test_layers(done: Evaluation) -> None:
     shown = {name: done.pictures["van", name] for name in NAMES}
-    found = layers(0, done.targets["van"], done, shown, {})
+    found = layers(0, done.targets["van"], done, shown)
     expected = ["nearest source camera"]
     for name in NAMES:
         expected += [name] if shown[name][0].coverage.all() else [name, f"{name}: unseen"]

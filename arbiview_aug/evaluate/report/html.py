@@ -21,7 +21,6 @@ from arbiview_aug.evaluate.report.pictures import (
     shrunk,
 )
 from arbiview_aug.evaluate.report.tables import Columns, Table, cell
-from arbiview_aug.evaluate.verdicts import SOURCES
 
 SOURCE_LAYER = "nearest source camera"
 TRUTH_LAYER = "truth"
@@ -36,20 +35,18 @@ def html_report(
     methods: Sequence[str],
     tables: Sequence[Table],
     notes: Sequence[str] = (),
-    judged: Mapping[tuple[str, str], Sequence[Picture]] | None = None,
 ) -> str:
     """Build the page: title, notes as paragraphs, tables, and the first frame's views.
 
     For each target rig it shows one picture per camera, with a slider between two layers (source, methods in their
-    order, holes, confidence, truth, and those of ``judged``, as ``Panel.pictures``), and both rigs from above.
+    order, holes, confidence, truth), and both rigs from above.
     """
     parts = [f"<h1>{escape(title)}</h1>", *(f"<p>{escape(note)}</p>" for note in notes)]
     parts += [_table(*table) for table in tables]
     for target, rig in done.targets.items():
         shown = {m: done.pictures[target, m] for m in methods if (target, m) in done.pictures}
         if shown:
-            boxes = {row: pictures for (of, row), pictures in (judged or {}).items() if of in (SOURCES, target)}
-            parts.append(_target_section(target, rig, done, shown, boxes))
+            parts.append(_target_section(target, rig, done, shown))
     page = _PAGE.replace("{title}", escape(title)).replace("{body}", "\n".join(parts))
     return page.encode(errors="backslashreplace").decode()  # names of files that are not UTF-8
 
@@ -59,7 +56,6 @@ def layers(
     rig: Rig,
     done: Evaluation,
     shown: Mapping[str, Sequence[RenderedView]],
-    judged: Mapping[str, Sequence[Picture]],
 ) -> dict[str, Picture]:
     """Pictures that the slider of one target camera can show, by name."""
     assert done.first is not None
@@ -77,9 +73,6 @@ def layers(
     true = done.first.true_images(rig)
     if true is not None:
         pictures[TRUTH_LAYER] = shrunk(true[camera], _HEIGHT_PX)
-    for row, images in judged.items():
-        name, index = (SOURCE_LAYER, nearest) if row == SOURCES else (row, camera)
-        pictures[f"{name}: judged"] = shrunk(images[index], _HEIGHT_PX)
     return pictures
 
 
@@ -88,11 +81,10 @@ def _target_section(
     rig: Rig,
     done: Evaluation,
     shown: Mapping[str, Sequence[RenderedView]],
-    judged: Mapping[str, Sequence[Picture]],
 ) -> str:
     assert done.first is not None
     source: Rig = done.first.sample["rig"]
-    by_camera = [layers(camera, rig, done, shown, judged) for camera in range(len(rig))]
+    by_camera = [layers(camera, rig, done, shown) for camera in range(len(rig))]
     # Every camera offers the same layers: a view without holes stands for its own holes.
     names = list(dict.fromkeys(name for of_camera in by_camera for name in of_camera))
     after = next(iter(shown))

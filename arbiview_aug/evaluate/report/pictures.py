@@ -39,8 +39,6 @@ _CAPTION_PX, _CAPTION_SCALE = 20, 0.42
 _TITLE_PX = 28
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
-_LABELLED, _DETECTED = (0, 230, 255), (255, 220, 0)  # colours of boxes that judges are shown, and that they see
-
 
 def put_text(picture: Picture, text: str, xy: tuple[int, int], scale: float) -> None:
     """Write ASCII text in place, its baseline starting at ``xy``."""
@@ -163,15 +161,6 @@ def save_picture(path: str | Path, picture: Picture) -> Path:
         raise DataError(f"picture {path}: expected a name ending in .png or .jpg, got {path.name!r}")
     write_whole({path: encoded(np.ascontiguousarray(picture[..., ::-1]), path.suffix)})
     return path
-
-
-def draw_rectangles(image: Image, labelled: FloatArray, detected: FloatArray) -> Picture:
-    """Draw labelled boxes (n, 4) x0 y0 x1 y1 in cyan, and a detector's in yellow, into an image (h, w, 3)."""
-    picture = to_bytes(image).copy()
-    for boxes, colour in ((labelled, _LABELLED), (detected, _DETECTED)):
-        for x0, y0, x1, y1 in np.round(boxes).astype(int).tolist():
-            cv2.rectangle(picture, (x0, y0), (x1, y1), colour, max(1, len(picture) // 128))
-    return picture
 
 
 def _paper(height: int, width: int) -> Picture:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -75,41 +76,16 @@ OVERLAP_NOTES = (
     "to their half-way view over the street's surface. Compare methods of one surface: views rendered over the street "
     "agree there even where the street is wrong."
 )
-LABEL_COLUMNS = (
-    ("labelled", "{objects:.0f}"),
-    ("recall", "{recall:.2f} [{recall_low:.2f}, {recall_high:.2f}]"),
-    ("IoU", "{iou:.2f} [{iou_low:.2f}, {iou_high:.2f}]"),
-    ("clear", "{clear_objects:.0f}"),
-    ("clear recall", "{clear_recall:.2f} [{clear_recall_low:.2f}, {clear_recall_high:.2f}]"),
-    ("clear IoU", "{clear_iou:.2f} [{clear_iou_low:.2f}, {clear_iou_high:.2f}]"),
-)
-LABEL_NOTES = (
-    "labelled: vehicles and people within the images, by their labels. recall: share with a detection of score above "
-    "0.5 whose centre is nearest to theirs, within 10 pixels of 480 x 320. IoU: mean with their labels, 0 without one "
-    "(NTA-IoU). clear: those that other labelled objects hide by no more than half, with 4 LiDAR points or more where "
-    "the data has points. Intervals: 95 %, bootstrap over objects."
-)
 DETECTION_COLUMNS = (
-    ("true objects", "{true_objects:.0f}"),
-    ("AP .5", "{ap_50:.2f} [{ap_50_low:.2f}, {ap_50_high:.2f}]"),
-    ("AP .7", "{ap_70:.2f} [{ap_70_low:.2f}, {ap_70_high:.2f}]"),
+    ("objects", "{objects:.0f}"),
+    ("AP", "{ap:.2f} [{ap_low:.2f}, {ap_high:.2f}]"),
+    ("recall", "{recall:.2f} [{recall_low:.2f}, {recall_high:.2f}]"),
 )
 DETECTION_NOTES = (
-    "true objects: detections of score 0.5 or more in the true images, whatever their class. AP: of the detections in "
-    "the views against them, at these IoUs; less sure ones there neither count nor cost. Intervals: 95 %, bootstrap "
-    "over objects and misses."
+    "objects: detections of score 0.5 or more in the true images; without true images, labelled vehicles and people "
+    "that others hide by no more than half. AP, recall: at IoU 0.5; recall: of detections of score 0.5 or more. "
 )
-ALARM_COLUMNS = (("false alarms", "{false_alarms:.0f}"), ("views", "{filled:.0f}"))
-ALARM_NOTES = "Detections on generated pixels that touch no label and no true object (IoU below 0.1)."
-ROAD_COLUMNS = (
-    ("views", "{road_views:.0f}"),
-    ("drivable area IoU", "{area_iou:.2f} [{area_iou_low:.2f}, {area_iou_high:.2f}]"),
-    ("lane marks IoU", "{lanes_iou:.2f} [{lanes_iou_low:.2f}, {lanes_iou_high:.2f}]"),
-)
-ROAD_NOTES = (
-    "IoU of the segmenter's masks in the views with those in the true images, over all pixels; intervals 95 %, "
-    "bootstrap over views."
-)
+INTERVAL_NOTES = "Intervals: 95 %, bootstrap over images."
 SCAN_COLUMNS = (
     ("recall", "{recall:.1%}"),
     ("precision", "{precision:.1%}"),
@@ -157,16 +133,16 @@ def evaluation_tables(done: Evaluation, methods: Sequence[str]) -> list[Table]:
     return [table, ("Agreement of neighbours", agreement, OVERLAP_COLUMNS, OVERLAP_NOTES)]
 
 
-def judge_tables(rows: Mapping[str, Mapping[str, float]]) -> list[Table]:
-    """Tabulate judges' figures, by row, for the rows that have them."""
-    tables: list[tuple[str, str, Columns, str]] = [
-        ("objects", "Labelled objects that the detector finds", LABEL_COLUMNS, LABEL_NOTES),
-        ("true_objects", "Detections in views and true images", DETECTION_COLUMNS, DETECTION_NOTES),
-        ("false_alarms", "Detections of what was filled", ALARM_COLUMNS, ALARM_NOTES),
-        ("road_views", "Road in views and true images", ROAD_COLUMNS, ROAD_NOTES),
+def verdict_tables(rows: Mapping[str, Mapping[str, float]]) -> list[Table]:
+    """Tabulate a detector's and a segmenter's figures, by row, for the rows that have them."""
+    detected, segmented = ({name: row for name, row in rows.items() if key in row} for key in ("objects", "images"))
+    masks = sorted({int(key[4:]) for row in segmented.values() for key in row if re.fullmatch(r"iou_\d+", key)})
+    columns = [(f"IoU of mask {k}", f"{{iou_{k}:.2f}} [{{iou_{k}_low:.2f}}, {{iou_{k}_high:.2f}}]") for k in masks]
+    tables: list[Table] = [
+        ("Objects that the detector finds", detected, DETECTION_COLUMNS, DETECTION_NOTES + INTERVAL_NOTES),
+        ("Masks in views and true images", segmented, [("images", "{images:.0f}"), *columns], INTERVAL_NOTES),
     ]
-    having = {key: {name: row for name, row in rows.items() if key in row} for key, *_ in tables}
-    return [(title, having[key], columns, notes) for key, title, columns, notes in tables if having[key]]
+    return [table for table in tables if table[1]]
 
 
 def text_table(title: str, rows: Mapping[str, Mapping[str, float]], columns: Columns, notes: str = "") -> str:
