@@ -40,7 +40,15 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Reduce
 from arbiview_aug.cli.arguments import add_data, count, device_named, output_file, size
 from arbiview_aug.cli.bench.data import Recorded, lidar_maps, recorded
-from arbiview_aug.cli.bench.timing import benchmark, clock_of, machine_line, quartiles, remap_floor, show, timed_rounds
+from arbiview_aug.cli.bench.timing import (
+    benchmark,
+    machine_line,
+    process_ms,
+    quartiles,
+    remap_floor,
+    show,
+    timed_rounds,
+)
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive
@@ -135,6 +143,24 @@ def measure(
     if not rows:
         raise DataError(f"--only {only}: expected part of a call's name, such as boxes or neighbour")
     return {"data": data.name, "rounds": repeats, "ready_s": ready_s, "measures": rows}
+
+
+def clock_of(device: torch.device | None) -> Callable[[Callable[[], Any]], float]:
+    """Clock of a device: CUDA events on a GPU, else the process's CPU time."""
+    if device is None or device.type != "cuda":
+        return process_ms
+
+    def clock(run: Callable[[], Any]) -> float:
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        torch.cuda.synchronize(device)
+        stream = torch.cuda.current_stream(device)
+        start.record(stream)
+        run()
+        end.record(stream)
+        end.synchronize()
+        return start.elapsed_time(end)
+
+    return clock
 
 
 def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tuple[str, Calls]]:

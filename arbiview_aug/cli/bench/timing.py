@@ -54,24 +54,6 @@ def process_ms(run: Callable[[], Any]) -> float:
     return 1e3 * (time.process_time() - start)
 
 
-def clock_of(device: torch.device | None) -> Clock:
-    """Clock of a device: CUDA events on a GPU, else the process's CPU time."""
-    if device is None or device.type != "cuda":
-        return process_ms
-
-    def clock(run: Callable[[], Any]) -> float:
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        torch.cuda.synchronize(device)
-        stream = torch.cuda.current_stream(device)
-        start.record(stream)
-        run()
-        end.record(stream)
-        end.synchronize()
-        return start.elapsed_time(end)
-
-    return clock
-
-
 def timed_rounds(
     candidates: Mapping[str, Callable[[], Any]],
     rounds: int,
