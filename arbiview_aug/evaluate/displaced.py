@@ -105,7 +105,7 @@ def own_index(source: Rig, camera: Camera) -> int:
     return source.names.index(camera.name) if camera.name in source.names else nearest
 
 
-COPY = Method("copy", _copy, plans=False)
+COPY = Method("copy", _copy)
 """The source image itself."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -15,7 +15,6 @@ from arbiview_aug.errors import WarnOnce
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
-from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.sample.inputs import DEPTH_KEYS, MOTION_KEY, read_frames, read_scene
@@ -44,7 +43,6 @@ class Method:
     render: Callable[[Sample, Rig], list[RenderedView]]
     reads_points: bool = False  # may use the sample's ``points``, so that only a part of them can score it
     render_alone: Callable[[Sample, int, Rig], RenderedView] | None = None
-    plans: bool = True  # whether the first call plans and takes longer
 
     def alone(self, sample: Sample, camera: int, target: Rig) -> RenderedView:
         """Render a one-camera target from one source camera alone."""
@@ -60,19 +58,18 @@ def retargeting(
     name: str = "",
     *,
     holes: Holes | Inpainter = "black",
-    match_exposure: Harmonise = False,
     **settings: Any,
 ) -> Method:
     """Wrap ``RigRetarget`` as a method, with its arguments.
 
-    Exposures stay as recorded by default: metrics compare with them. The name is by default made of quality, geometry
-    and what fills holes. A source camera alone is never completed.
+    Exposures stay as recorded: metrics compare with them. The name is by default made of quality, geometry and what
+    fills holes. A source camera alone is never completed.
     """
     inpainter = inpainter_of(holes)  # once, not for each target
     fills = not isinstance(inpainter, Black)
     settings = dict[str, Any](cache=PlanCache(max_bytes=0)) | settings
     images_alone = replace(settings.get("keys", SampleKeys()), points="source")
-    settings |= {"holes": inpainter, "match_exposure": match_exposure, "keys": images_alone}
+    settings |= {"holes": inpainter, "match_exposure": False, "keys": images_alone}
 
     @lru_cache(_CACHED_TRANSFORMS)
     def transform(target: Rig) -> RigRetarget:
@@ -82,17 +79,17 @@ def retargeting(
         return views_of(transform(target)(sample))
 
     def render_alone(sample: Sample, camera: int, target: Rig) -> RenderedView:
-        """Render with the depth and the gain estimated from all cameras, their overlaps and their neighbours."""
+        """Render with the depth estimated from all cameras, their overlaps and their neighbours."""
         if not estimates or estimates[0][0] is not sample:  # several views of a sample are rendered in a row
             known = _with_motion(sample, geometry) if from_motion else sample
-            estimates[:] = [(sample, known, *_overlap_estimates(sample, corrected, harmoniser))]
-        _, known, depth, gains = estimates[0]
+            estimates[:] = [(sample, known, _overlap_depth(sample, geometry) if learns else None)]
+        _, known, depth = estimates[0]
         alone = one_camera(known, camera)
         retarget = RigRetarget(
             target,
             quality=quality,
             geometry=geometry,
-            match_exposure=False if gains is None else gains[camera : camera + 1],
+            match_exposure=False,
             cache=PlanCache(share_overlap=depth is not None, max_bytes=0),
             holes="black",
             keys=SampleKeys(points="source"),
@@ -109,26 +106,19 @@ def retargeting(
         label += f", {holes if isinstance(holes, str) else type(holes).__name__}" + (f" {steps}" if steps else "")
     is_paper = not isinstance(config, RenderConfig)
     learns = not is_paper and config.overlap_depth
-    corrected, harmoniser = geometry if learns else None, Harmoniser(match_exposure)
     from_motion = not is_paper and GEOMETRIES[geometry].needs == "motion"
-    estimates: list[tuple[Sample, Sample, OverlapDepth | None, Sequence[float] | None]] = []
+    estimates: list[tuple[Sample, Sample, OverlapDepth | None]] = []
     reads_points = "points" in GEOMETRIES[geometry].reads and not is_paper
-    alone = render_alone if learns or from_motion or harmoniser.is_on or fills else None
-    return Method(label, render, reads_points, alone, plans=not is_paper)
+    alone = render_alone if learns or from_motion or fills else None
+    return Method(label, render, reads_points, alone)
 
 
-def _overlap_estimates(
-    sample: Sample, surface: GeometryName | None, harmoniser: Harmoniser
-) -> tuple[OverlapDepth | None, Sequence[float] | None]:
-    """Depth (with a surface to correct) and gains (if harmonising is on) from a sample's overlaps."""
-    rig, images = sample["rig"], list(sample["images"])
-    gains = harmoniser.report(rig, images).gains if harmoniser.is_on else None
-    if surface is None:
-        return None, gains
+def _overlap_depth(sample: Sample, surface: GeometryName) -> OverlapDepth:
+    """Depth from a sample's overlaps, as ``estimate_overlap`` measures it."""
     scene = read_scene(read_frames(sample, None)[0], surface) or Scene()
     row = GEOMETRIES[scene.best if surface == "auto" else surface]
     boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
-    return overlap_depth(rig, images, boxes), gains  # as ``estimate_overlap`` measures it
+    return overlap_depth(sample["rig"], list(sample["images"]), boxes)
 
 
 def _with_motion(sample: Sample, surface: GeometryName) -> Sample:

@@ -109,22 +109,6 @@ def test_a_camera_alone_knows_the_depth_that_all_together_use(monkeypatch: pytes
     assert street is None and [len(boxes) for boxes in with_boxes] == [len(sample["boxes_3d"])] * 2
 
 
-@pytest.mark.filterwarnings("ignore:the target rig")
-def test_a_camera_alone_has_the_gain_that_all_together_give_it() -> None:
-    sample = SyntheticDrive(demo_source_rig((128, 352)), num_frames=1, lidar=False)[0]
-    sample["images"][0] //= 2  # the others are twice as bright
-    rig: Rig = sample["rig"]
-    view = rig.with_cameras([half_way_view(rig[0], rig[1], (28, 50))])
-    harmonised = retargeting("fast", "street", match_exposure=True)
-    gains = RigRetarget(rig, match_exposure=True).harmonisation(sample).gains
-    assert gains[0] > 1.2 * gains[1]
-    for k in (0, 1):
-        out = RigRetarget(view, geometry="street", match_exposure=[gains[k]], holes="black")(one_camera(sample, k))
-        np.testing.assert_array_equal(harmonised.alone(sample, k, view).image, as_arrays(out["images"])[0])
-    as_it_is = retargeting("fast", "street").alone(sample, 0, view).image
-    assert harmonised.alone(sample, 0, view).image.mean() > 1.2 * as_it_is.mean()
-
-
 def test_confidence_comes_along() -> None:
     out = {"images": torch.zeros(1, 3, 4, 5), "coverage": torch.ones(1, 4, 5, dtype=torch.bool)}
     assert views_of(out)[0].confidence is None
