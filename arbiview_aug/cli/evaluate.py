@@ -43,7 +43,7 @@ from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table, verdict_tables
 from arbiview_aug.evaluate.targets import named_targets
-from arbiview_aug.evaluate.verdicts import FEWEST, Panel, too_few
+from arbiview_aug.evaluate.verdicts import TOO_FEW, Panel, too_few
 from arbiview_aug.generator import load_inpainter
 from arbiview_aug.sample.inputs import LEARNED_KEY
 from arbiview_aug.scene.scene import GEOMETRIES
@@ -80,8 +80,7 @@ def run(arguments: argparse.Namespace) -> None:
     verdicts = panel.rows(whole, list(done.targets))
     tables = scored + verdict_tables(verdicts)
     if too_few(verdicts.values()):
-        fewest = " or ".join(f"{fewest} {unit}" for unit, fewest in FEWEST.items())
-        notes.append(f"rows of fewer than {fewest} are too few to tell methods apart; add frames")
+        notes.append(TOO_FEW)
     if arguments.detector and not any("objects" in row for row in verdicts.values()):
         notes.append("--detector: no labels (boxes_3d) and no true images: nothing to compare its detections with")
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"

@@ -11,6 +11,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -87,7 +88,10 @@ def load_detector(
     """
     option = f"--detector {name}"
     if weights is None:
-        detect = _asked_for_all(_function(option, name))
+        detect: Callable[..., Any] = _function(option, name)
+        with suppress(TypeError, ValueError):  # compiled functions have no signature
+            if "score" in inspect.signature(detect).parameters:
+                detect = partial(detect, score=LEAST_SCORE)
     else:
         detect, names = _of_torchvision(option, name, weights, device)
         if unknown := {*classes} - {*names}:
@@ -100,15 +104,6 @@ def load_detector(
         return found.subset(np.array(counts, bool) & (found.scores >= LEAST_SCORE))
 
     return detector
-
-
-def _asked_for_all(detect: Callable[..., Any]) -> Callable[[Picture], Any]:
-    """A function that returns detections from ``LEAST_SCORE`` on, where it has a parameter for it: AP counts them."""
-    try:
-        asks = "score" in inspect.signature(detect).parameters
-    except (TypeError, ValueError):  # of a compiled function
-        asks = False
-    return partial(detect, score=LEAST_SCORE) if asks else detect
 
 
 def checked_detections(option: str, output: Any, image: Picture) -> Detections:
@@ -209,7 +204,9 @@ def _of_torchscript(option: str, name: str, device: torch.device | str) -> Calla
 
     @torch.inference_mode()
     def segment(image: Picture) -> BoolArray:
-        part = _wide_part(*image.shape[:2])
+        h, w = image.shape[:2]
+        wide, high = min(w, h * 16 // 9), min(h, max(1, w * 9 // 16))
+        part = slice(h - high, h), slice((w - wide) // 2, (w - wide) // 2 + wide)
         small = cv2.resize(image[part], SEGMENTED[::-1], interpolation=cv2.INTER_AREA)
         pixels = torch.from_numpy(small).to(device).permute(2, 0, 1)[None].float() / 255
         out = network(pixels)
@@ -217,19 +214,13 @@ def _of_torchscript(option: str, name: str, device: torch.device | str) -> Calla
         if not isinstance(out, tuple | list) or {*shapes} != {logits}:
             got = shapes if isinstance(out, tuple | list) else type(out).__name__
             raise DataError(f"{option}: expected outputs {logits} for {tuple(pixels.shape)}, got {got}")
-        masks = np.zeros((len(out), *image.shape[:2]), bool)
+        masks = np.zeros((len(out), h, w), bool)
         for mask, one in zip(masks, out, strict=True):
-            h, w = mask[part].shape
-            mask[part] = cv2.resize(one[0].argmax(0).byte().cpu().numpy(), (w, h), interpolation=cv2.INTER_NEAREST) > 0
+            small = one[0].argmax(0).byte().cpu().numpy()
+            mask[part] = cv2.resize(small, (wide, high), interpolation=cv2.INTER_NEAREST) > 0
         return masks
 
     return segment
-
-
-def _wide_part(h: int, w: int) -> tuple[slice, slice]:
-    """Rows and columns of an image's 16:9 part, cut at the top or on both sides."""
-    wide, high = min(w, h * 16 // 9), min(h, max(1, w * 9 // 16))
-    return slice(h - high, h), slice((w - wide) // 2, (w - wide) // 2 + wide)
 
 
 # --- functions in files -----------------------------------------------------------------------------------------------
@@ -240,8 +231,8 @@ def names_a_function(name: str) -> bool:
 
 def _function(option: str, name: str) -> Callable[[Picture], Any]:
     """Import the function that ``FILE.py:function`` names."""
-    file, _, wanted = name.rpartition(":") if names_a_function(name) else ("", "", "")
-    if not wanted or name.endswith(".py"):
+    file, _, wanted = name.rpartition(":")
+    if not wanted or not file.endswith(".py"):
         raise DataError(f"{option}: expected FILE.py:function, found no function's name; add it, such as own.py:detect")
     if not os.path.isfile(file):  # unlike Path.is_file, False for a name that is too long
         raise DataError(f"{option}: expected a file {file}, found none")

@@ -30,6 +30,8 @@ SOURCES = "sources"
 FEWEST = {"objects": 100, "images": 10}
 """95 % intervals of a share of 100 objects are 0.2 wide at most. Of fewer than 10 images a bootstrap says little."""
 
+TOO_FEW = "rows of fewer than 100 objects or 10 images are too few to tell methods apart; add frames"
+
 _DRAWS = 1000
 
 
