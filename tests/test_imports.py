@@ -27,7 +27,7 @@ MOST_AT_TOP = 50
 """Files of the package that importing ``RigRetarget`` reads."""
 
 HEAVY = (
-    "arbiview_aug.cameras.formats",
+    "arbiview_aug.cameras.formats.calibration",
     "numba",
     "diffusers",
     "safetensors",

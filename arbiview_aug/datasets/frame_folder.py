@@ -17,6 +17,7 @@ import torch
 
 from arbiview_aug.atomic_io import check_name, inside
 from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.formats.fields import unread_lens
 from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, misnamed
 from arbiview_aug.cameras.lens import LENSES, BoolArray, canonical_name
 from arbiview_aug.cameras.plain_yaml import parse_json
@@ -34,7 +35,6 @@ from arbiview_aug.datasets.drive import (
     warn_of_unfinished,
 )
 from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, encoded_image, reduced_rig
-from arbiview_aug.datasets.lens_keys import unread_lens
 from arbiview_aug.datasets.lidar_files import read_cloud
 from arbiview_aug.datasets.registry import CALIBRATION_FILE
 from arbiview_aug.errors import (

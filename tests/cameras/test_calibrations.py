@@ -437,7 +437,7 @@ def test_kalibr_camchain(tmp_path: Path) -> None:
         (
             "distortion_coeffs: []",
             "distortion_coeffs: [0.1, 0.0]",
-            r"'cam0': distortion: expected 2 coefficients for a double_sphere lens, got 4",
+            r"'cam0': expected 2 coefficients of double_sphere, got 4",
         ),
     ):
         assert old in CAMCHAIN

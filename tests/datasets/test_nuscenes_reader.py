@@ -227,8 +227,14 @@ def put(table: str, row: int, key: str, value: Any) -> Change:
         (lambda data: data["sample_data"].pop(2), "table sample_data: .*LIDAR_TOP for sample t0, got none"),
         (put("calibrated_sensor", 0, "rotation", [0, 0, 0, 0]), "expected unit quaternions w x y z, got .*'cs-front'"),
         (put("ego_pose", 0, "translation", [1, 2]), r"table ego_pose: expected translation of shape \(3,\), .*finite"),
-        (put("calibrated_sensor", 0, "camera_intrinsic", []), r"intrinsic of shape \(3, 3\), .*finite, got \[\]"),
-        (put("calibrated_sensor", 0, "camera_intrinsic", [[float("nan")] * 3] * 3), "finite, got .*nan.*'cs-front'"),
+        (
+            put("calibrated_sensor", 0, "camera_intrinsic", []),
+            r"camera_intrinsic: expected a camera matrix of 3x3 finite numbers, .*, got \[\]",
+        ),
+        (
+            put("calibrated_sensor", 0, "camera_intrinsic", [[float("nan")] * 3] * 3),
+            "'cs-front'.*finite numbers, .*nan",
+        ),
     ],
 )
 def test_broken_tables(tmp_path: Path, change: Change, message: str) -> None:

@@ -133,12 +133,24 @@ def test_own_tables_are_read_and_converted(title: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (put("calibrated_sensor", camera_distortion=[0.1, 0.2, 0.3]), "expected camera_distortion of k1 k2 p1 p2"),
-        (put("calibrated_sensor", camera_distortion=[0.1, 0.2, 0, 0]), r"distortion_model \(plumb_bob or fisheye\)"),
-        (put("calibrated_sensor", camera_distortion=[0.1, 0, 0, 0, 0, 0.2]), r"got camera_distortion: \[0.1, .*in row"),
-        (put("calibrated_sensor", lens_model="omni", xi=0.9), "got lens_model: 'omni' in row"),
-        (put("calibrated_sensor", camera_model="cylindrical"), "got camera_model: 'cylindrical' in row"),
-        (put("calibrated_sensor", rectified=False), "got rectified: False in row"),
+        (
+            put("calibrated_sensor", camera_distortion=[0.1, 0.2, 0.3]),
+            "expected 4 or 5 or 8 coefficients of radtan, got 3",
+        ),
+        (
+            put("calibrated_sensor", camera_distortion=[0.1, 0.2, 0, 0]),
+            "a lens for its coefficients, .*write distortion_model",
+        ),
+        (
+            put("calibrated_sensor", camera_distortion=[0.1, 0, 0, 0, 0, 0.2]),
+            "4 or 5 or 8 coefficients of radtan, got 6; undistort",
+        ),
+        (put("calibrated_sensor", lens_model="omni", xi=0.9, D=[0.1] * 4), "MEI or omni without distortion, got"),
+        (
+            put("calibrated_sensor", camera_model="cylindrical"),
+            "camera_model: expected plumb_bob, .*, got 'cylindrical'",
+        ),
+        (put("calibrated_sensor", rectified=False), "keys that are read, got 'rectified': False"),
         (put("sample_data", camera_intrinsic=[[1, 0, 0], [0, 1, 0], [0, 0, 1]]), "each image's calibration in cal"),
         (put("sample_data", is_undistorted=False), "got is_undistorted: False in row"),
         (put("sample_data", timestamp=lambda row: row["timestamp"] // 1000), "are they in milliseconds or seconds"),

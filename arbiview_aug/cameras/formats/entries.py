@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.lens import LENSES, FloatArray
 from arbiview_aug.errors import CalibrationError
 
 WAY_OUT = (
@@ -22,21 +22,28 @@ def refusal(name: str, expected: str, got: str, fix: str = "", *, key: str = "")
     return CalibrationError(f"camera {name!r}: {where}expected {expected}, got {got}{end}")
 
 
+def fitted(name: str, lens: str, coefficients: Any) -> tuple[str, list[float]]:
+    """A lens and as many coefficients as it has, without zeros behind them; a polynomial of zeros is a pinhole."""
+    numbers = [float(k) for k in np.ravel(coefficients)]
+    if lens == "radtan" and not any(numbers):
+        return "pinhole", []
+    counts = LENSES[lens].coefficient_counts
+    for count in reversed(counts):
+        if len(numbers) >= count and not any(numbers[count:]):
+            return lens, numbers[:count]
+    got = f"{len(numbers)}{' (thin prism or tilt)' if lens == 'radtan' and len(numbers) > 8 else ''}"
+    raise refusal(name, f"{' or '.join(map(str, counts))} coefficients of {lens}", got, WAY_OUT)
+
+
 def camera_entry(
     name: str, size: tuple[Any, Any], K: Any, cam2ego: FloatArray, lens: str = "pinhole", coefficients: Any = ()
 ) -> dict[str, Any]:
-    """A camera as in a rig file, of (width, height); polynomials of zeros are no distortion."""
-    coefficients = [float(k) for k in np.ravel(coefficients)]
-    most = {"radtan": 8, "fisheye": 4}.get(lens, len(coefficients))
-    if any(coefficients[most:]):
-        got = f"{len(coefficients)} (thin prism or tilt)" if lens == "radtan" else len(coefficients)
-        raise refusal(name, f"at most {most} coefficients of {lens}", str(got), WAY_OUT)
-    coefficients = coefficients[:most]  # zeros fill a message up
-    has_lens = lens != "pinhole" and (lens != "radtan" or any(coefficients))
+    """A camera as in a rig file, of (width, height)."""
+    lens, coefficients = fitted(name, lens, coefficients)
     return {
         **{"name": name, "width": size[0], "height": size[1]},
         **{"K": np.asarray(K, float).tolist(), "cam2ego": cam2ego.tolist()},
-        "distortion": {"model": lens, "coeffs": coefficients} if has_lens else None,
+        "distortion": {"model": lens, "coeffs": coefficients} if lens != "pinhole" else None,
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -31,39 +31,29 @@ _SPELLINGS = {
     "shape": "imageshape imgshape shape",
     **{"binning x": "binningx", "binning y": "binningy", "window": "roi"},
     **{"fx": "fx gamma1 mu", "fy": "fy gamma2 mv", "cx": "cx u0 ppx", "cy": "cy v0 ppy"},
-    **{key: key for key in ("xi", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")},
 }
+_COEFFICIENTS = {"xi", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"}
 _MEANINGS = {spelling: meaning for meaning, spellings in _SPELLINGS.items() for spelling in spellings.split()}
+_MEANINGS |= {key: key for key in _COEFFICIENTS}
 _WINDOW = ("width", "height", "x_offset", "y_offset")
 _PINHOLE = ("fx", "fy", "cx", "cy")
-_SCALARS = {
-    *_PINHOLE,
-    "width",
-    "height",
-    "binning x",
-    "binning y",
-    "xi",
-    "k1",
-    "k2",
-    "k3",
-    "k4",
-    "k5",
-    "k6",
-    "p1",
-    "p2",
-}
+_SCALARS = {*_PINHOLE, *_COEFFICIENTS, "width", "height", "binning x", "binning y"}
 _GROUPS = {*_K.split(), *_D.split(), "projectionparameters", "distortionparameters", "mirrorparameters"}
 
-# Words of keys that say something of the lens or the image, and of those that say how the calibration was made.
+# Words of keys that say something of the lens, or of the image too, and of those that say how a calibration was made.
+_OF_LENS = re.compile(
+    "dist|lens|fisheye|rectif|skew|mirror|prism|tangential|radial|poly|omni|cylind|(camera|intrinsics?|projection)(model|"
+    r"type)|^[kpd]\d$"
+)
 _MATTERS = re.compile(
-    "dist|lens|fisheye|rectif|crop|binning|skew|alpha|mirror|flip|rotate|prism|tangential|radial|poly|projection|omni|"
-    "(camera|intrinsics?)(model|type|mat)|offset|scale|intrin|coef|resol|unit|^order|order$|major|optimal|aspect|"
-    r"^[kpstrd]\d$|^tau"
+    _OF_LENS.pattern + "|crop|binning|alpha|flip|rotate|projection|(camera|intrinsics?)mat|offset|scale|intrin|coef|"
+    r"resol|unit|^order|order$|major|optimal|aspect|^[str]\d$|^tau"
 )
 _NEUTRAL = re.compile(
     "distance|polygon|depth|error|rms|std|date|time|square|board|pattern|grid|guess|covar|points|extrin|pose|"
     "aspectratio$|^fix|^calib"
 )
+_ANY = re.compile("")
 _NO_EFFECT = {"", "0", "00", "px", "pixel", "pixels", "row", "rowmajor", "opencv", "none", "false", "no"}
 _CHOICE = "for raw images remove R and P; for rectified ones write P's left 3x3 as camera matrix, without coefficients"
 _NAME_IT = "write distortion_model: plumb_bob (k1 k2 p1 p2), or equidistant (k1 to k4 of a fisheye), to the file"
@@ -111,10 +101,12 @@ def read_fields(name: str, data: Mapping[Any, Any]) -> tuple[str, FloatArray, An
         K = np.array([values[key] for key in _PINHOLE])
     if K.size == 4:
         K = np.array(matrix(*K.ravel()))
-    elif K.size == 9 or (K.shape in ((3, 4), (4, 4)) and not K[:3, 3].any()):
-        K = K.reshape(3, 3) if K.size == 9 else K[:3, :3]
-    else:
-        raise refusal(name, "a camera matrix of 3x3, or fx, fy, cx, cy", shown(found.get("K", "none")))
+    elif K.shape in ((3, 4), (4, 4)) and not K[:3, 3].any():
+        K = K[:3, :3]
+    if K.size != 9 or not np.isfinite(K).all():
+        expected = "a camera matrix of 3x3 finite numbers, or fx, fy, cx, cy"
+        raise refusal(name, expected, shown(values.get("K", "none")), key=found.get("K", ("", None))[0])
+    K = K.reshape(3, 3)
     lens, coefficients = _lens(name, found, D)
     if lens == "unified":  # (x, y) / (z + ξ d) is 1 + ξ times EUCM's with α = ξ / (1 + ξ) and β = 1
         xi, *bent = coefficients or [math.nan]
@@ -122,8 +114,9 @@ def read_fields(name: str, data: Mapping[Any, Any]) -> tuple[str, FloatArray, An
             raise refusal(name, "MEI or omni without distortion", f"{shown(coefficients)} with xi first", WAY_OUT)
         lens, coefficients, K = "eucm", [xi / (1 + xi), 1.0], K / [[1 + xi, 1, 1], [1, 1 + xi, 1], [1, 1, 1]]
     for key, value in found.values():
-        if plain(key) not in _MEANINGS:
-            _refuse_meaningful(name, key, value, is_straight=not D.any())
+        if plain(key) not in _MEANINGS and _is_meaningful(name, key, value, _MATTERS, is_straight=lens == "pinhole"):
+            fix = f"remove the key if K and the coefficients describe the images as they are stored, or {WAY_OUT}"
+            raise refusal(name, "keys that are read", f"{key!r}: {shown(value)}", fix)
     width, height = size = _size(name, values) or (0, 0)
     window = values.get("window") or {}
     sides = [int(window.get(key, 0)) if isinstance(window, Mapping) else -1 for key in _WINDOW]
@@ -140,22 +133,36 @@ def read_fields(name: str, data: Mapping[Any, Any]) -> tuple[str, FloatArray, An
     return lens, K, coefficients, size if width and height else None, bool(np.abs(P[:, 3]).max() > 1e-6)
 
 
-def _refuse_meaningful(name: str, key: str, value: Any, *, is_straight: bool) -> None:
-    """Refuse a key that is not read and could change the views."""
+def unread_lens(data: Mapping[Any, Any], read: Collection[str]) -> str:
+    """``KEY: VALUE`` of a lens in an entry from which none is read, under a key that is not ``read``; or nothing."""
+    for key, value in data.items():
+        meaning = _MEANINGS.get(plain(key))
+        if meaning in ("model", "distortion model"):  # others, for example a camera's make, are notes
+            lens = lens_called(value)
+            is_lens = lens not in ("pinhole", "radtan") and bool(lens or _OF_LENS.search(plain(value)))
+        else:
+            is_known = meaning in _COEFFICIENTS or meaning in ("D", "is fisheye")
+            words = _ANY if is_known else _OF_LENS
+            is_lens = (is_known or meaning is None) and _is_meaningful("", key, value, words, is_straight=True)
+        if is_lens and key not in read:
+            return f"{key}: {shown(value)}"
+    return ""
+
+
+def _is_meaningful(name: str, key: str, value: Any, words: re.Pattern[str], *, is_straight: bool) -> bool:
+    """Whether a key that is not read could change the views; ``is_straight``: those of a pinhole."""
     word = plain(key)
-    if value is None or not _MATTERS.search(word) or _NEUTRAL.search(word) or plain(value) in _NO_EFFECT:
-        return
-    if value is True and is_straight and re.search("rect|undist", word):
-        return  # K is that of the images
-    if value == 1 and value is not True and re.search("scale|aspect", word):
-        return
+    if value is None or not words.search(word) or _NEUTRAL.search(word):
+        return False
+    if isinstance(value, bool) and re.search("rect|undist", word):  # if straight, K is that of the images
+        return not is_straight if value else is_straight and word.endswith("ed")
+    if plain(value) in _NO_EFFECT or (value == 1 and value is not True and re.search("scale|aspect", word)):
+        return False
     try:
         numbers = _array(name, key, value)
     except ValueError:
-        numbers = np.ones(1)
-    if numbers.any() and not np.array_equal(numbers, np.eye(3)):
-        fix = f"remove the key if K and the coefficients describe the images as they are stored, or {WAY_OUT}"
-        raise refusal(name, "keys that are read", f"{key!r}: {shown(value)}", fix)
+        return True
+    return bool(numbers.any()) and not np.array_equal(numbers, np.eye(3))
 
 
 def _array(name: str, key: str, value: Any) -> FloatArray:

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.cameras.lens import LENSES, FloatArray
+from arbiview_aug.cameras.formats.entries import fitted
+from arbiview_aug.cameras.formats.fields import read_fields, unread_lens
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rotations import poses_from
 from arbiview_aug.datasets.drive import clock_message
-from arbiview_aug.datasets.lens_keys import is_neutral, unread_lens
 from arbiview_aug.datasets.nuscenes import tables as kinds
 from arbiview_aug.datasets.nuscenes.tables import TOKENS, Row, Tables, Tokens
-from arbiview_aug.errors import DataError, shown, warn
+from arbiview_aug.errors import CalibrationError, DataError, shown, warn
 
 LIDAR = "LIDAR_TOP"  # nuScenes' only LiDAR
 MAX_APART_S = 0.1  # maximum time to a sweep's nearest image; cameras record every 50 to 100 ms
@@ -31,10 +32,6 @@ _COLUMNS = (
     *("is_key_frame", "height", "width", "filename", "prev", "next"),
 )
 """Columns of ``sample_data`` in nuScenes."""
-_COEFFICIENTS = ("camera_distortion", "distortion", "distortion_coefficients", "dist_coeffs", "D")
-_MODELS = ("camera_distortion_model", "distortion_model", "camera_model", "lens")
-"""Columns of a lens in tables of the same layout; T4 and nuImages have camera_distortion."""
-_FISHEYES = ("fisheye", "opencv_fisheye", "equidistant", "kannala_brandt", "kannala_brandt4", "kb4")
 _OF_IMAGES = ("camera_intrinsic", "intrinsic", "intrinsics", "K", "translation", "rotation")
 """Columns that would give an image another calibration than its sensor has."""
 
@@ -222,29 +219,15 @@ def _calibrations(
     sensor2ego = poses_from(tables.poses("calibrated_sensor", rows))
     K = np.tile(np.eye(3), (len(rows), 1, 1))
     cameras = [k for k, channel in enumerate(channel_of) if channel < len(wanted) - 1]
-    K[cameras] = tables.numbers("calibrated_sensor", [rows[k] for k in cameras], "camera_intrinsic", (3, 3))
-    lenses = [_lens(tables, row) if k in cameras else ("pinhole", []) for k, row in enumerate(rows)]
+    lenses: list[tuple[str, list[float]]] = [("pinhole", [])] * len(rows)
+    for k in cameras:
+        try:
+            lens, K[k], coefficients, *_ = read_fields(rows[k]["token"], rows[k])
+            lenses[k] = fitted(rows[k]["token"], lens, coefficients)
+        except CalibrationError as error:
+            fix = "undistort the images, or write frame folders"
+            raise tables.error("calibrated_sensor", "a camera's intrinsics and lens", str(error), fix) from None
     return calibrated, channel_of, sensor2ego, K, lenses
-
-
-def _lens(tables: Tables, row: Row) -> tuple[str, list[float]]:
-    """Model and coefficients of a camera's lens; DataError for columns of a lens that are not read."""
-    there = [key for key in _COEFFICIENTS if row.get(key)]
-    key = next((key for key in there if not is_neutral(row[key])), there[0] if there else "")
-    model = next((name for name in _MODELS if not is_neutral(row.get(name))), "")
-    values, word = row.get(key, []), row[model].lower() if isinstance(row.get(model), str) else ""
-    lens = "fisheye" if word in _FISHEYES else "radtan"
-    read = (key, model) if lens == "fisheye" else (key,)
-    if (odd := unread_lens(row, read)) is None and isinstance(values, list | tuple):
-        numbers = tables.numbers("calibrated_sensor", [row], key, (len(values),))[0].tolist() if key else []
-        if lens == "radtan" and not any(numbers):
-            return "pinhole", []
-        for count in LENSES[lens].coefficient_counts if len(numbers) > 4 or word else ():  # four may be a fisheye's
-            if len(numbers) >= count and not any(numbers[count:]):
-                return lens, numbers[:count]
-    expected = "camera_distortion of k1 k2 p1 p2 k3 [k4 k5 k6], or distortion_model (plumb_bob or fisheye) with it"
-    got = f"{odd or f'{key or model}: {shown(values or word)}'} in row {row.get('token')!r}"
-    raise tables.error("calibrated_sensor", expected, got, "undistort the images, or write frame folders")
 
 
 def _refuse_calibrations(tables: Tables, rows: Sequence[Row]) -> None:
@@ -252,8 +235,8 @@ def _refuse_calibrations(tables: Tables, rows: Sequence[Row]) -> None:
     if others := {key for keys in {*map(tuple, rows)} for key in keys} - {*_COLUMNS}:
         for row in rows:
             entry = {key: row[key] for key in others if row.get(key) is not None}
-            own = next((f"{key}: {shown(entry[key])}" for key in _OF_IMAGES if not is_neutral(entry.get(key))), None)
-            if odd := unread_lens(entry) or own:
+            other = next((f"{key}: {shown(entry[key])}" for key in _OF_IMAGES if entry.get(key)), "")
+            if odd := other or unread_lens(entry, ()):
                 expected = "each image's calibration in calibrated_sensor alone"
                 raise tables.error("sample_data", expected, f"{odd} in row {row.get('token')!r}")
 
