@@ -145,16 +145,8 @@ class Camera:
         cam2ego = np.eye(4)
         cam2ego[:3, :3] = rotation_z(azimuth) @ CAMERA_AXES_IN_EGO @ rotation_x(elevation) @ rotation_z(roll)
         cam2ego[:3, 3] = position
-        camera = cls(
-            name=name,
-            width_px=width_px,
-            height_px=height_px,
-            K=np.eye(3) if K is None else K,
-            cam2ego=cam2ego,
-            lens=lens,
-            distortion=distortion,
-            mask=mask,
-        )
+        fields: dict[str, Any] = {"lens": lens, "distortion": distortion, "mask": mask, "cam2ego": cam2ego}
+        camera = cls(name=name, width_px=width_px, height_px=height_px, K=np.eye(3) if K is None else K, **fields)
         if horizontal_fov_deg is None:
             return camera
         return replace(camera, K=intrinsics_for_fov(name, horizontal_fov_deg, camera.size, camera.lens_model))

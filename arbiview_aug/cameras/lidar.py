@@ -80,12 +80,8 @@ class Lidar:
             if not is_valid:
                 raise CalibrationError(f"camera {shown(name)}: {field}: expected {expected}, got {got}")
         return {
-            "name": str(name),  # numpy's text is no plain YAML
-            "lidar2ego": pose,
-            "elevations_deg": table,
-            "azimuth_step_deg": step,
-            "range_m": (least, most),
-            "azimuth_deg": (first, end),
+            **{"name": str(name), "lidar2ego": pose, "elevations_deg": table},  # numpy's text is no plain YAML
+            **{"azimuth_step_deg": step, "range_m": (least, most), "azimuth_deg": (first, end)},
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -152,14 +148,8 @@ class Lidar:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the rig file's format."""
-        return {
-            "name": self.name,
-            "lidar2ego": self.lidar2ego.tolist(),
-            "elevations_deg": list(self.elevations_deg),
-            "azimuth_step_deg": self.azimuth_step_deg,
-            "range_m": list(self.range_m),
-            "azimuth_deg": list(self.azimuth_deg),
-        }
+        values = {key: getattr(self, key) for key in (*_KEYS, "azimuth_deg")} | {"lidar2ego": self.lidar2ego.tolist()}
+        return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
     @classmethod
     def from_dict(cls, entry: Any, where: str) -> Lidar:

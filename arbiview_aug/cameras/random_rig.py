@@ -99,15 +99,8 @@ class RandomRig(Epochs):
         if per not in ("sample", "sequence"):
             raise CalibrationError(f"RandomRig: per: expected 'sample' or 'sequence', got {shown(per)}")
         self.per, self.sequence_key = per, sequence_key
-        ranges = {
-            "yaw_deg": yaw_deg,
-            "pitch_deg": pitch_deg,
-            "roll_deg": roll_deg,
-            "height_m": height_m,
-            "forward_m": forward_m,
-            "lateral_m": lateral_m,
-            "focal_scale": focal_scale,
-        }
+        ranges = {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg, "roll_deg": roll_deg, "height_m": height_m}
+        ranges |= {"forward_m": forward_m, "lateral_m": lateral_m, "focal_scale": focal_scale}
         self.ranges = {name: _range(name, value) for name, value in ranges.items()}
 
     def draw(self, rng: torch.Generator | None = None) -> dict[str, float]:
@@ -120,11 +113,7 @@ class RandomRig(Epochs):
         return self.draw(self.rng_for(sample, rng))
 
     def rng_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> torch.Generator | None:
-        """Generator of a sample's draws, following ``per``: ``rng``, or that of its sequence.
-
-        Raises:
-            SampleError: The sample names no sequence, or is a batch of several.
-        """
+        """Generator of a sample's draws: ``rng``, or that of its sequence; SampleError unless it names just one."""
         if self.per == "sample":
             return rng
         key = self.sequence_key
@@ -143,9 +132,8 @@ class RandomRig(Epochs):
             CalibrationError: Unknown or missing parameters.
         """
         if set(params) != set(self.ranges):
-            raise CalibrationError(
-                f"RandomRig: expected the parameters {', '.join(self.ranges)}, got {', '.join(map(str, params))}"
-            )
+            expected, got = ", ".join(self.ranges), ", ".join(map(str, params))
+            raise CalibrationError(f"RandomRig: expected the parameters {expected}, got {got}")
         p = {name: float(value) for name, value in params.items()}
         rig = self._unmasked.turned(yaw_deg=p["yaw_deg"], pitch_deg=p["pitch_deg"], roll_deg=p["roll_deg"])
         rig = rig.shifted(p["forward_m"], p["lateral_m"], p["height_m"])

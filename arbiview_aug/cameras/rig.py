@@ -85,10 +85,8 @@ class Rig:
         except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: tensors of several heights
             ground = math.nan
         if not abs(ground) <= MOST_M:
-            raise CalibrationError(
-                f"{where}: ground_z_m: expected a finite height in metres, got {shown(self.ground_z_m)}; at "
-                f"most {MOST_M:g} m"
-            )
+            got = f"{shown(self.ground_z_m)}; at most {MOST_M:g} m"
+            raise CalibrationError(f"{where}: ground_z_m: expected a finite height in metres, got {got}")
         object.__setattr__(self, "name", str(self.name or ""))  # numpy's text is no plain YAML
         object.__setattr__(self, "cameras", cameras)
         object.__setattr__(self, "lidars", lidars)
@@ -216,34 +214,21 @@ class Rig:
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the rig file's format, without masks, which ``save`` writes as files."""
         lidars = {"lidars": [lidar.to_dict() for lidar in self.lidars]} if self.lidars else {}
-        return {
-            "name": self.name,
-            "ground_z_m": self.ground_z_m,
-            **lidars,
-            "cameras": [
-                {
-                    "name": c.name,
-                    "width": c.width_px,
-                    "height": c.height_px,
-                    "K": c.K.tolist(),
-                    "distortion": None if c.is_rectilinear else {"model": c.lens, "coeffs": list(c.distortion)},
-                    "cam2ego": c.cam2ego.tolist(),
-                }
-                for c in self.cameras
-            ],
-        }
+        cameras = [
+            {
+                **{"name": c.name, "width": c.width_px, "height": c.height_px, "K": c.K.tolist()},
+                "distortion": None if c.is_rectilinear else {"model": c.lens, "coeffs": list(c.distortion)},
+                "cam2ego": c.cam2ego.tolist(),
+            }
+            for c in self.cameras
+        ]
+        return {"name": self.name, "ground_z_m": self.ground_z_m, **lidars, "cameras": cameras}
 
     @classmethod
     def from_dict(cls, data: Any, *, folder: Path | None = None, where: str = "rig") -> Rig:
-        """A rig from plain data in the rig file's format.
+        """A rig from plain data in the rig file's format, with masks from ``folder``; ``where`` is named in errors.
 
-        Args:
-            data: The parsed file.
-            folder: The folder of the mask files.
-            where: Named in error messages.
-
-        Raises:
-            CalibrationError: Missing keys or impossible values, by camera.
+        CalibrationError for missing keys or impossible values, by camera.
         """
         if not isinstance(data, Mapping) or not isinstance(data.get("cameras"), list):
             raise CalibrationError(f"{where}: expected a mapping with a list 'cameras', got {type(data).__name__}")
@@ -311,9 +296,8 @@ def read_rig(path: Path) -> tuple[Rig, str]:
     """
     where = f"rig file {path}"
     if not os.path.exists(path):  # unlike Path.exists, False for a name that is too long
-        raise CalibrationError(
-            f"{where}: expected a file or one of the shipped rigs ({', '.join(shipped_rigs())}), found neither"
-        )
+        expected = f"a file or one of the shipped rigs ({', '.join(shipped_rigs())})"
+        raise CalibrationError(f"{where}: expected {expected}, found neither")
     from arbiview_aug.cameras.formats.calibration import read_calibration
 
     data = read_calibration(path, where)
@@ -407,10 +391,8 @@ def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
         value = entries[wrong]
         is_zero = not any(value) if isinstance(value, list) else not value
         if (key == "mask" or isinstance(value, Mapping | list | int | float)) and not is_zero:
-            raise CalibrationError(
-                f"{label}: {key!r} is absent or null, and {wrong!r} is not read: did you mean {key!r}? Rename it, or "
-                "remove it if it is something else"
-            )
+            fix = f"did you mean {key!r}? Rename it, or remove it if it is something else"
+            raise CalibrationError(f"{label}: {key!r} is absent or null, and {wrong!r} is not read: {fix}")
 
 
 def read_mask(file: Any, folder: Path | None, label: str) -> np.ndarray:

@@ -49,12 +49,8 @@ def checked_calibration(
     w, h = checked_pixels(name, "width_px", width_px), checked_pixels(name, "height_px", height_px)
     K, cam2ego, lens = checked_intrinsics(name, K), checked_pose(name, cam2ego), checked_lens(name, lens)
     return {
-        "name": str(name),  # numpy's text is no plain YAML
-        "width_px": w,
-        "height_px": h,
-        "K": K,
-        "cam2ego": cam2ego,
-        "lens": lens,
+        **{"name": str(name), "width_px": w, "height_px": h},  # numpy's text is no plain YAML
+        **{"K": K, "cam2ego": cam2ego, "lens": lens},
         "distortion": checked_distortion(name, lens, distortion),
         "mask": None if mask is None else checked_mask(name, mask, (h, w)),
     }

@@ -58,11 +58,7 @@ class DepthFolder:
         return None
 
     def write(self, token: str, rig: Rig, depth: MotionDepth, origin: Sequence[str] = ()) -> None:
-        """Write a frame's depth atomically, with its token, rig and origin: its neighbours, or a model.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
+        """Write a frame's depth atomically, with its token, rig and origin: its neighbours, or a model. OutputError."""
         maps: dict[str, Any] = {f"depth_{k:02}": one.astype(np.float16) for k, one in enumerate(depth.depth_m)}
         with whole_file(self.path(token)) as file:
             kind = "learned" if isinstance(depth, LearnedDepth) else "motion"
@@ -71,19 +67,11 @@ class DepthFolder:
             np.savez_compressed(file, **facts, neighbours=origins, **_calibration(rig), **maps)
 
     def read(self, token: str, rig: Rig) -> MotionDepth:
-        """Read a frame's depth, of either kind.
-
-        Raises:
-            DataError: The file is missing, broken, or of another frame or calibration.
-        """
+        """A frame's depth, of either kind; DataError for a file that is missing, broken, or of another calibration."""
         return self._read(token, rig)[0]
 
     def find(self, token: str, rig: Rig, origin: Sequence[str], kind: str = "motion") -> MotionDepth | None:
-        """Read a frame's depth if it exists, fits the rig, and has this origin; None otherwise.
-
-        Raises:
-            DataError: The folder holds depth of the other kind.
-        """
+        """A frame's depth, if it fits the rig and has this origin, else None; DataError for depth of the other kind."""
         try:
             depth, origin_there = self._read(token, rig)
         except DataError:

@@ -51,12 +51,7 @@ def warn_of_unfinished(root: Path, found: int) -> None:
 
 
 def checked_index(index: Any, count: int) -> int:
-    """The place from 0 of one of ``count`` samples.
-
-    Raises:
-        TypeError: No whole number, such as a slice.
-        IndexError: A number beyond them.
-    """
+    """The place from 0 of one of ``count`` samples; TypeError for a slice, IndexError for a number beyond them."""
     try:
         return range(count)[operator.index(index)]
     except TypeError:
@@ -86,10 +81,8 @@ class Recording(Dataset[dict[str, Any]]):
     def by_token(self, token: str) -> dict[str, Any]:
         """The sample with this token; DataError if there is none."""
         if not isinstance(token, str) or token not in self._index:
-            some = ", ".join(self.tokens[:3])
-            raise DataError(
-                f"{self.root}: expected the token of one of {len(self)} samples, got {shown(token)}; they are {some} …"
-            )
+            got = f"{shown(token)}; they are {', '.join(self.tokens[:3])} …"
+            raise DataError(f"{self.root}: expected the token of one of {len(self)} samples, got {got}")
         return self[self._index[token]]
 
 

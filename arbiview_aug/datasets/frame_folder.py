@@ -57,9 +57,7 @@ POINTS_FILE = "lidar.npy"
 MOST_BYTES = 1 << 26  # of a frame's or a sequence's JSON: 64 MiB, 200,000 boxes
 
 _COLUMNS = 'say them in calib.json: "lidar": {"file": NAME, "columns": ["x", "y", "z", "intensity"]}'
-_OF_POINTS = re.compile(
-    r"2ego|2world|pose|transl|rotat|transf|extrin|unit|scale|type|order|layout|field", re.IGNORECASE
-)
+_OF_POINTS = re.compile("(?i)2ego|2world|pose|transl|rotat|transf|extrin|unit|scale|type|order|layout|field")
 """Keys of ``lidar`` that would give its points another meaning, and are not read."""
 _CLOCK = re.compile(r"^(?!time_s$)(?:time|stamp|t$|n?sec)", re.IGNORECASE)  # other keys of a sequence's times
 
@@ -369,14 +367,12 @@ def _view_mask_files(
     calib: Mapping[str, Any], frame: _Frame, keys: Sequence[str] = VIEW_MASKS
 ) -> dict[str, list[Path | None]]:
     """The masks beside converted views that are named and there, for each camera."""
-    return {key: [_view_mask_file(entry, key, frame) for entry in calib["cameras"]] for key in keys}
 
+    def find(entry: Mapping[str, Any], key: str) -> Path | None:
+        path = None if entry.get(key) is None else frame.file(*_named(entry, key, frame, DataError))
+        return path if path is not None and os.path.lexists(path) else None
 
-def _view_mask_file(entry: Mapping[str, Any], key: str, frame: _Frame) -> Path | None:
-    if entry.get(key) is None:
-        return None
-    path = frame.file(*_named(entry, key, frame, DataError))
-    return path if os.path.lexists(path) else None
+    return {key: [find(entry, key) for entry in calib["cameras"]] for key in keys}
 
 
 def _view_masks(
@@ -442,9 +438,8 @@ def _read_points(calib: Mapping[str, Any], frame: _Frame) -> torch.Tensor | None
     unread = [key for key in entry if _OF_POINTS.search(key) and entry[key]]
     if unread or "ego" not in str(entry.get("frame") or "ego").lower():
         got = ", ".join(f"{key}: {shown(entry[key])}" for key in unread or ["frame"])
-        raise DataError(
-            f"{frame.where}: lidar: expected file and columns of float32 points in the ego frame, got {got}"
-        )
+        expected = "file and columns of float32 points in the ego frame"
+        raise DataError(f"{frame.where}: lidar: expected {expected}, got {got}")
     return checked_points(read_cloud(path, entry.get("columns"), _COLUMNS), str(path))
 
 

@@ -30,11 +30,8 @@ ByteArray = npt.NDArray[np.uint8]
 _MOST_BYTES = 1 << 28  # of an image file: more than 9,000 by 9,000 pixels take, uncompressed
 
 # The reduced flags without their BGR bit, which excludes IMREAD_COLOR_RGB.
-_REDUCED_FLAGS = {
-    1: 0,
-    2: cv2.IMREAD_REDUCED_COLOR_2 & ~cv2.IMREAD_COLOR,
-    4: cv2.IMREAD_REDUCED_COLOR_4 & ~cv2.IMREAD_COLOR,
-}
+_REDUCED = {1: 0, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
+_REDUCED_FLAGS = {reduce: flag & ~cv2.IMREAD_COLOR for reduce, flag in _REDUCED.items()}
 # From OpenCV 4.11 on; for older versions channels are swapped after decoding.
 _RGB_FLAG: int | None = getattr(cv2, "IMREAD_COLOR_RGB", None)
 _FLAGS = cv2.IMREAD_IGNORE_ORIENTATION | (cv2.IMREAD_COLOR if _RGB_FLAG is None else _RGB_FLAG)
@@ -155,14 +152,9 @@ def decode_view_masks(
 ) -> dict[str, torch.Tensor | list[torch.Tensor]]:
     """Read some of ``VIEW_MASKS``, given a file for each camera, or None; ``sizes`` are (h, w) of the full images.
 
-    Pixels without a file are covered and not generated. With ``reduce``, a pixel is covered if all of its pixels are,
-    and generated if any is. Masks without any file are left out.
-
-    Returns:
-        (N, h, w) bool by name, or a list of (h_i, w_i) if the sizes differ.
-
-    Raises:
-        DataError: A file that is no image, or of another size, by camera and file.
+    Returns (N, h, w) bool by name, or a list of (h_i, w_i) if the sizes differ; DataError for a file that is no image,
+    or of another size. Pixels without a file are covered and not generated. With ``reduce``, a pixel is covered if all
+    of its pixels are, and generated if any is. Masks without any file are left out.
     """
     masks = {}
     for key, of_key in files.items():
@@ -296,9 +288,8 @@ def encoded_image(image: torch.Tensor, suffix: str = ".jpg") -> bytes:
     SampleTypeError for images of another type.
     """
     if image.dtype != torch.uint8:
-        raise SampleTypeError(
-            f"images: expected uint8 to write, got {image.dtype}; convert [0, 1] by (images * 255).round().byte()"
-        )
+        fix = "convert [0, 1] by (images * 255).round().byte()"
+        raise SampleTypeError(f"images: expected uint8 to write, got {image.dtype}; {fix}")
     planes = [np.ascontiguousarray(image[channel].numpy()) for channel in (2, 1, 0)]
     return encoded(np.asarray(cv2.merge(planes), np.uint8), suffix)
 

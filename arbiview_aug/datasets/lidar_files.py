@@ -33,26 +33,18 @@ _PCD_DATA = re.compile(rb"^DATA[ \t]+(\w+)[^\n]*\n", re.MULTILINE)
 
 
 def read_cloud(path: Path, columns: Any, how: str, assumed: Sequence[str] | None = None) -> Array:
-    """Points (P, >=3) of a file: x y z, intensity if there is one, then its other columns.
+    """Points (P, >=3) of a .npy or .pcd file or of rows of numbers: x y z, intensity if any, then the other columns.
 
-    Args:
-        path: A .npy file, a .pcd file, or rows of numbers; its first bytes tell which.
-        columns: Their names, as ``row_type`` takes them; None if nobody stated them.
-        how: How a user states them, for messages.
-        assumed: Columns of rows that nobody stated; the file must look like them.
-
-    Raises:
-        DataError: No such file, one of another format, or of other columns.
+    ``columns`` are as ``row_type`` takes them, None if nobody stated them; ``how`` tells users how to. Rows that nobody
+    stated must look like those ``assumed``. DataError for no such file, one of another format, or of other columns.
     """
     where = f"points {path}"
     stated = None if columns is None else row_type(columns, f"{where}: columns")
     try:
         data = read_bytes(path, MOST_BYTES)
-    except FileNotFoundError:
-        fix = "check the data root, or pass load_points=False"
-        raise DataError(f"{where}: expected the LiDAR's file, found none; {fix}") from None
     except OSError as error:
-        raise DataError(f"{where}: expected a readable file, got {error.strerror}") from None
+        got = f"{error.strerror}; check the data root, or pass load_points=False"
+        raise DataError(f"{where}: expected the LiDAR's file, got {got}") from None
     if data.startswith(b"\x93NUMPY"):
         return _array(data, where, stated)
     if data.startswith((b"# .PCD", b"VERSION", b"FIELDS")):

@@ -262,10 +262,8 @@ def _camera(metadata: Any, where: str) -> Camera:
     elif model == "ftheta" and metadata.intrinsics is not None:
         lens, (K, distortion) = "ftheta", _ftheta(metadata.intrinsics, where)
     else:
-        raise CalibrationError(
-            f"{where}: expected a calibrated pinhole, fisheye MEI or f-theta lens, got {model}; name the other "
-            f"cameras, cameras="
-        )
+        fix = "name the other cameras, cameras="
+        raise CalibrationError(f"{where}: expected a calibrated pinhole, MEI or f-theta lens, got {model}; {fix}")
     optics: dict[str, Any] = {"K": K, "lens": lens, "distortion": tuple(map(float, distortion))}
     optics |= {"width_px": int(metadata.width), "height_px": int(metadata.height)}
     with calibration_of(where):
@@ -288,9 +286,8 @@ def _fisheye(metadata: Any, where: str) -> tuple[FloatArray, FloatArray]:
     coefficients = np.linalg.lstsq(powers, wanted, rcond=None)[0]
     error_px = float(np.abs(powers @ coefficients - wanted).max() / (1 + xi) * max(to.gamma1, to.gamma2))
     if not error_px <= _MEI_ERROR_PX:
-        raise CalibrationError(
-            f"{where}: expected a MEI lens within {_MEI_ERROR_PX} px of a fisheye lens, got {error_px:.2f} px"
-        )
+        expected = f"a MEI lens within {_MEI_ERROR_PX} px of a fisheye lens"
+        raise CalibrationError(f"{where}: expected {expected}, got {error_px:.2f} px")
     return np.array([[to.gamma1 / (1 + xi), 0, to.u0], [0, to.gamma2 / (1 + xi), to.v0], [0, 0, 1]]), coefficients
 
 

@@ -12,10 +12,7 @@ from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.sample.batching import lens_names, rewrapped, stacked
 from arbiview_aug.sample.inputs import DEPTH_KEYS
 
-STACKED = (
-    *("images", "K", "cam2ego", "coverage", "ego_mask", "distortion", "ego2world", "ego2ego"),
-    *DEPTH_KEYS,
-)
+STACKED = ("images", "K", "cam2ego", "coverage", "ego_mask", "distortion", "ego2world", "ego2ego", *DEPTH_KEYS)
 """Keys of one shape in all frames of a rig; so have maps over the images. All else is a list: of points and boxes
 each frame has its own number."""
 
@@ -121,10 +118,10 @@ def _rigs(rigs: Sequence[Any]) -> dict[str, Any]:
     for rig in rigs:
         for camera in rig:
             if not camera.is_rectilinear or camera.mask is not None:
-                raise SampleError(
-                    f"collate: camera {camera.name!r}: rigs that differ within a batch must be of pinhole cameras "
-                    "without masks; retarget in the dataset (RetargetedDataset) instead"
+                expected = (
+                    "pinhole cameras without masks where rigs differ; retarget in the dataset (RetargetedDataset)"
                 )
+                raise SampleError(f"collate: camera {camera.name!r}: expected {expected}")
     return {
         "K": torch.stack([torch.from_numpy(rig.K) for rig in rigs]),
         "cam2ego": torch.stack([torch.from_numpy(rig.cam2ego) for rig in rigs]),

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.sample.boxes_2d import outline
 from arbiview_aug.sample.inputs import Frame, numbers
@@ -44,7 +42,11 @@ def read_detections(frame: Frame) -> OfCameras:
     names = [UNNAMED_TYPE] * len(boxes)
     if sample.get("box_names") is not None:
         names = _names("box_names", frame.entry("box_names"), len(boxes))
-    return {k: _projected(camera, boxes, names) for k, camera in enumerate(frame.rig)}
+    of_cameras = {}
+    for k, camera in enumerate(frame.rig):
+        outlines = [(outline(camera, box), name) for box, name in zip(boxes, names, strict=True)]
+        of_cameras[k] = [Detection(tuple(seen.inside.tolist()), name) for seen, name in outlines if seen is not None]
+    return of_cameras
 
 
 def _of_cameras(detections: Any, frame: Frame) -> OfCameras:
@@ -67,9 +69,8 @@ def _of_cameras(detections: Any, frame: Frame) -> OfCameras:
 
 def _entries(key: str, value: Any, count: int, of_what: str) -> list[Any]:
     if not isinstance(value, list | tuple):
-        raise SampleTypeError(
-            f"{key}: expected a list of {count}, one for each of the {of_what}, got {type(value).__name__}"
-        )
+        expected = f"a list of {count}, one for each of the {of_what}"
+        raise SampleTypeError(f"{key}: expected {expected}, got {type(value).__name__}")
     if len(value) != count:
         raise SampleError(f"{key}: expected one for each of the {count} {of_what}, got {len(value)}")
     return list(value)
@@ -80,9 +81,3 @@ def _names(key: str, value: Any, count: int) -> list[str]:
     if not all(isinstance(name, str) for name in names):
         raise SampleTypeError(f"{key}: expected names such as 'vehicle', got {names[:3]}; look them up in your classes")
     return names
-
-
-def _projected(camera: Camera, boxes: FloatArray, kinds: Sequence[str]) -> list[Detection]:
-    """Image boxes of (B, 7) boxes in the ego frame, cut at the image's border."""
-    outlines = [(outline(camera, box), kind) for box, kind in zip(boxes, kinds, strict=True)]
-    return [Detection(tuple(seen.inside.tolist()), kind) for seen, kind in outlines if seen is not None]

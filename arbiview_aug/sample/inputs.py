@@ -33,21 +33,8 @@ MOTION_WORDS_KEY, LEARNED_WORDS_KEY = "motion_depth_words", "learned_depth_words
 """How they were made, or why they were declined, for ``explain`` and warnings."""
 
 CALIBRATION_KEYS = (
-    "images",
-    "rig",
-    "K",
-    "cam2ego",
-    "distortion",
-    "lens",
-    "ground_z_m",
-    "coverage",
-    "ego_mask",
-    "neighbours",
-    MOTION_KEY,
-    LEARNED_KEY,
-    MOTION_WORDS_KEY,
-    LEARNED_WORDS_KEY,
-    "retarget_params",
+    *("images", "rig", "K", "cam2ego", "distortion", "lens", "ground_z_m", "coverage", "ego_mask", "neighbours"),
+    *(MOTION_KEY, LEARNED_KEY, MOTION_WORDS_KEY, LEARNED_WORDS_KEY, "retarget_params"),
 )
 """Keys that describe the source's images; they are replaced by the target's or consumed."""
 
@@ -122,9 +109,7 @@ class Frame:
 def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
     """Read and check the frames of a sample, one for each element of its leading dimensions.
 
-    Args:
-        sample: The sample dict; see ``RigRetarget``.
-        source: The rig of samples that carry none; one that carries another calibration is refused.
+    ``source`` is the rig of samples that carry none; one that carries another calibration is refused.
 
     Raises:
         SampleError: Missing calibration, mismatched counts or sizes, values out of range.
@@ -265,10 +250,8 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
     """The rig of the sample's K, cam2ego and, where present, lens, distortion and ground_z_m."""
     missing = [key for key in ("K", "cam2ego") if sample.get(key) is None]
     if missing:
-        raise SampleError(
-            f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', missing {', '.join(missing)}"
-            f"{hint(sample, missing)}; or give RigRetarget the rig as source="
-        )
+        got = f"missing {', '.join(missing)}{hint(sample, missing)}; or give RigRetarget the rig as source="
+        raise SampleError(f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', {got}")
     K, cam2ego = (numbers(key, sample[key], index) for key in ("K", "cam2ego"))
     for key, array, expected in (("K", K, (len(images), 3, 3)), ("cam2ego", cam2ego, (len(images), 4, 4))):
         if array.shape != expected:
@@ -403,17 +386,8 @@ PROJECTION_KEYS = (
 PIXEL_BOUND_KEYS = (
     *("boxes_2d", "boxes2d", "bboxes_2d", "bboxes2d", "gt_boxes_2d", "gt_bboxes_2d", "gt_bboxes"),
     *("labels_2d", "labels2d", "centers_2d", "centers2d"),
-    "detections",
-    "depths",
-    "depth",
-    "depth_m",
-    "gt_depth",
-    "keypoints_2d",
-    "source_camera",
-    "source_frame",
-    "confidence",
-    "generated",
-    "sources",
+    *("detections", "depths", "depth", "depth_m", "gt_depth", "keypoints_2d"),
+    *("source_camera", "source_frame", "confidence", "generated", "sources"),
     *("img_metas", "img_aug_matrix", "post_rots", "post_trans"),
     *USUAL_NAMES["K"],
     *PROJECTION_KEYS,
@@ -437,9 +411,7 @@ _MAX_ENTRIES = 64  # checked per list: longer lists are tokens or numbers
 _CAMERA_VALUE = re.compile(r"(.*_)?(depths?|disparity|flow|normals?)(_?(gt|m|maps?))*", re.IGNORECASE)
 _DEPENDS = "depth, disparity, flow and normals have other values in other cameras"
 _DEPTH = "depth_maps(points, views) makes depth maps of the views (docs/lidar.md)"
-_OTHER_FRAMES = (
-    "frames of other times belong into 'neighbours' or samples of their own (docs/formats.md, Several frames)"
-)
+_OTHER_FRAMES = "frames of other times belong into 'neighbours' or other samples (docs/formats.md, Several frames)"
 
 
 def refuse_camera_values(labels: Sequence[Any]) -> None:
@@ -457,11 +429,9 @@ def check_other_keys(
     ``sizes`` are (h, w) of the images; ``label_keys`` and ``pass_keys`` are the user's. SampleError for a tensor of the
     images' height and width, or a torchvision tv_tensor, under another key.
     """
-    absent = [key for key in label_keys if key not in sample]
-    if absent:
-        raise SampleError(
-            f"SampleKeys.labels: expected {', '.join(absent)} in the sample, got {', '.join(map(str, sample))}"
-        )
+    if absent := [key for key in label_keys if key not in sample]:
+        got = ", ".join(map(str, sample))
+        raise SampleError(f"SampleKeys.labels: expected {', '.join(absent)} in the sample, got {got}")
     labels = list(label_keys)
     for key, value in sample.items():
         if key in (*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *EGO_KEYS, *labels, *pass_keys):

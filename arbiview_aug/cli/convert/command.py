@@ -21,7 +21,7 @@ from torch.utils.data import Dataset
 from arbiview_aug.atomic_io import checksum, inside, remove_parts, write_whole
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import gathered_warnings, told_once, writable_folder
-from arbiview_aug.cli.convert.job import Done, Jobs, State, checksum_once, coverage_of
+from arbiview_aug.cli.convert.job import Done, Jobs, State, checksum_once
 from arbiview_aug.cli.convert.manifest import Manifest, differences
 from arbiview_aug.cli.convert.ray_runner import ray_results
 from arbiview_aug.cli.convert.settings import FOLDER, READING, RETARGET_OPTIONS, Settings, check_output
@@ -155,10 +155,9 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         depth = None if not there else there[0] if len(there) == 1 else root  # with both kinds in it
         if depth is None and not (needed == "motion" and arguments.neighbours):
             model, motion = (" --model MODEL", "") if needed != "motion" else ("", ", or estimate it (--neighbours 2)")
-            raise DataError(
-                f"--geometry {arguments.geometry}: expected depth in {defaults[0]}, found none; make it with "
-                f"python -m arbiview_aug depth --data DIR{model}, or name its folder (--depth){motion}"
-            )
+            fix = f"make it with python -m arbiview_aug depth --data DIR{model}, or name its folder (--depth){motion}"
+            raise DataError(f"--geometry {arguments.geometry}: expected depth in {defaults[0]}, found none; {fix}")
+    named = "version", *RETARGET_OPTIONS, "holes", "steps", *READING, "neighbours"
     return Settings(
         root=root,
         kind=kind,
@@ -169,10 +168,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
         link=arguments.link,
         points=arguments.points,
-        **{
-            name: getattr(arguments, name)
-            for name in ("version", *RETARGET_OPTIONS, "holes", "steps", *READING, "neighbours")
-        },
+        **{name: getattr(arguments, name) for name in named},
     )
 
 
@@ -221,17 +217,16 @@ def _verify(jobs: Jobs, arguments: argparse.Namespace) -> int:
 
 
 def _run(jobs: Jobs, arguments: argparse.Namespace) -> Iterator[Done]:
+    def note(done: Done) -> str:
+        return f"coverage {done.coverage:.1%}"
+
     if arguments.runner == "ray":
-        yield from ray_results(jobs, arguments.workers, "convert", _note)
+        yield from ray_results(jobs, arguments.workers, "convert", note)
     else:
         with one_thread():
             if min(arguments.workers, len(jobs)) > 1:
                 compile_kernels(matching=False)  # here, once, and not in every worker
-            yield from results(jobs, min(arguments.workers, len(jobs)), "convert", _note)
-
-
-def _note(done: Done) -> str:
-    return f"coverage {done.coverage:.1%}"
+            yield from results(jobs, min(arguments.workers, len(jobs)), "convert", note)
 
 
 def _summary(output: Path, records: Sequence[Done], wall_s: float) -> str:
@@ -264,10 +259,8 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: in
             converted.append(record["token"])
     missing = len(tokens) - len(converted) - len(left_out)
     if missing and shards == 1:
-        raise OutputError(
-            f"{settings.output}: expected the records of all {len(tokens)} samples, found {missing} missing; do all "
-            "machines see this folder under this path?"
-        )
+        got = f"found {missing} missing; do all machines see this folder under this path?"
+        raise OutputError(f"{settings.output}: expected the records of all {len(tokens)} samples, {got}")
     if missing:
         print(f"{missing} samples of other shards are missing so far; the last shard finishes the output")
         return
@@ -301,8 +294,8 @@ def converted(settings: Settings) -> Method:
             return anew.render(sample, rig)
         stored = written.by_token(sample["token"])
         images = dict(zip(stored["rig"].names, as_arrays(stored["images"]), strict=True))  # the reader's own order
-        files = {camera["name"]: settings.output / camera["file"] for camera in record["cameras"]}
-        return [RenderedView(images[name], coverage_of(files[name])) for name in rig.names]
+        seen = dict(zip(stored["rig"].names, stored["coverage"], strict=True))
+        return [RenderedView(images[name], seen[name].numpy()) for name in rig.names]
 
     return Method(CONVERTED, render, anew.reads_points, anew.render_alone)
 

@@ -17,7 +17,6 @@ import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import checksum, inside, link_whole, write_whole, writing
-from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import OnError
 from arbiview_aug.cli.arguments import gathered_warnings
@@ -26,7 +25,7 @@ from arbiview_aug.cli.convert.settings import Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.drive import Recording, WritableRecording
-from arbiview_aug.datasets.image_io import decode_grey, encoded, encoded_image
+from arbiview_aug.datasets.image_io import encoded, encoded_image
 from arbiview_aug.datasets.registry import find_reader
 from arbiview_aug.environment import repeatable_opencv, working_s
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError, described
@@ -60,12 +59,6 @@ def rig_of(target: Rig, out: Mapping[str, Any], source: Rig) -> Rig:
     cameras = [replace(camera, K=K[k], cam2ego=poses[k]) for k, camera in enumerate(target)]
     lidars = target.in_frame_of(source).lidars if RINGS_KEY in out else source.lidars
     return Rig(cameras, ground_z_m=float(out["ground_z_m"]), name=target.name, lidars=lidars)
-
-
-def coverage_of(image: Path) -> BoolArray:
-    """Read the (h, w) coverage beside a view's image."""
-    path = image.with_suffix(".coverage.png")
-    return decode_grey(path, f"coverage {path}") > 0
 
 
 def _as_bytes(key: str, values: torch.Tensor) -> Any:

@@ -35,12 +35,9 @@ class Manifest:
         path, text = self.folder / BEGUN_FILE, _text(facts)
         if not path.is_file():
             write_new(path, text)
-        differ = list(differences(_read(path), json.loads(text)))
-        if differ:
-            raise DataError(
-                f"--output {self.output}: expected what it was begun with, got {'; '.join(differ[:3])}; "
-                "name another folder, or go on as it was begun"
-            )
+        if differ := list(differences(_read(path), json.loads(text))):
+            got = f"{'; '.join(differ[:3])}; name another folder, or go on as it was begun"
+            raise DataError(f"--output {self.output}: expected what it was begun with, got {got}")
 
     def path(self, token: str) -> Path:
         return self.folder / "samples" / f"{file_name(token)}.json"

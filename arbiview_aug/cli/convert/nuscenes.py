@@ -24,21 +24,10 @@ from arbiview_aug.cli.convert.manifest import Record
 from arbiview_aug.cli.convert.nuscenes_rows import NewSensors, Remaining, kept_sensors, view_stem, visible_shares
 from arbiview_aug.cli.convert.settings import FOLDER, Settings
 from arbiview_aug.cli.convert.writer import Converted, Writer
+from arbiview_aug.datasets.nuscenes import tables as kinds
 from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING, NuScenesDataset
 from arbiview_aug.datasets.nuscenes.recordings import IntArray
-from arbiview_aug.datasets.nuscenes.tables import (
-    COUNTS,
-    FILES,
-    FLAGS,
-    LINKS,
-    MICROSECONDS,
-    TOKENS,
-    Kind,
-    Row,
-    Tables,
-    Tokens,
-    on_circle,
-)
+from arbiview_aug.datasets.nuscenes.tables import Kind, Row, Tables, Tokens, on_circle
 from arbiview_aug.errors import CalibrationError, DataError
 from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
@@ -68,16 +57,14 @@ _REFERENCES = (
 """Table, column, and the table whose rows it names. An empty token means unknown; columns may be missing."""
 
 _NEEDED: Mapping[str, Mapping[str, Kind]] = {
-    "sample": {"timestamp": MICROSECONDS},
-    "sample_annotation": {"sample_token": TOKENS, "instance_token": TOKENS},
+    "sample": {"timestamp": kinds.MICROSECONDS},
+    "sample_annotation": {"sample_token": kinds.TOKENS, "instance_token": kinds.TOKENS},
     "sample_data": {
-        **dict.fromkeys(("sample_token", "ego_pose_token", "calibrated_sensor_token"), TOKENS),
-        "is_key_frame": FLAGS,
-        "filename": FILES,
-        "timestamp": MICROSECONDS,
+        **dict.fromkeys(("sample_token", "ego_pose_token", "calibrated_sensor_token"), kinds.TOKENS),
+        **{"is_key_frame": kinds.FLAGS, "filename": kinds.FILES, "timestamp": kinds.MICROSECONDS},
     },
-    "lidarseg": {"filename": FILES},
-    "panoptic": {"filename": FILES},
+    "lidarseg": {"filename": kinds.FILES},
+    "panoptic": {"filename": kinds.FILES},
 }
 """Columns without which rows cannot be kept."""
 
@@ -96,8 +83,7 @@ class NuScenes(Writer):
         self.moment = data.lidar_channel or data.channels[0]
         self.there = [name for name in _TABLES if self.tables.path(name).is_file()]  # in writing order
         self.written = [name for name in self.there if not (self.scanned and name in _OF_POINTS)]
-        lenses = [f"{camera.name} ({camera.lens})" for camera in self.target if not camera.is_rectilinear]
-        if lenses:
+        if lenses := [f"{camera.name} ({camera.lens})" for camera in self.target if not camera.is_rectilinear]:
             name = self.target.name or "the target"
             raise CalibrationError(
                 f"rig {name!r}: expected pinhole cameras, since nuScenes tables know no lenses, got "
@@ -105,12 +91,9 @@ class NuScenes(Writer):
                 f"load_rig('{name}').undistorted().save('pinhole.yaml')\" and --target pinhole.yaml; frame folders "
                 "carry lenses"
             )
-        taken = sorted(set(self.target.names) & set(data.other_channels))
-        if taken:
-            raise CalibrationError(
-                f"rig {self.target.name!r}: expected cameras of other names than the sensors that are kept, got "
-                f"{', '.join(taken)}; rename them in the rig file"
-            )
+        if taken := sorted(set(self.target.names) & set(data.other_channels)):
+            expected, got = "cameras of other names than the sensors that are kept", ", ".join(taken)
+            raise CalibrationError(f"rig {self.target.name!r}: expected {expected}, got {got}; rename them (--names)")
 
     def facts(self) -> dict[str, Any]:
         tables = {name: checksum(self.tables.path(name)) for name in self.there}
@@ -155,11 +138,11 @@ class NuScenes(Writer):
                 for key, kind in needed.items():
                     tables.column(table, rows, key, kind)
                 if table == "instance":
-                    tables.column(table, rows, "nbr_annotations", COUNTS, default=0)
+                    tables.column(table, rows, "nbr_annotations", kinds.COUNTS, default=0)
                 if table in known_tokens:
                     known_tokens[table].add(rows)
                 for column in columns:
-                    column.add(rows, LINKS, default="")
+                    column.add(rows, kinds.LINKS, default="")
                 for row in rows if table == "map" or "filename" in needed else ():
                     name = row.get("filename") or ""
                     if (name or table != "map") and (table != "sample_data" or row["calibrated_sensor_token"] in kept):
@@ -230,7 +213,11 @@ class NuScenes(Writer):
             link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"), how=self.how)
         for name in self.written:
             of_table = rows.get(name, partial(source.rows, name))
-            _write_table(self.kept_path(f"{self.data.version}/{name}.json"), of_table())
+            with whole_file(self.kept_path(f"{self.data.version}/{name}.json")) as file:
+                file.write(b"[")
+                for k, row in enumerate(of_table()):
+                    file.write((b",\n" if k else b"\n") + json.dumps(row).encode())
+                file.write(b"\n]\n")
         notes = []
         if self._missing:
             notes.append(f"{self._missing} files that sample_data names are not in the source: were sweeps not copied?")
@@ -278,11 +265,3 @@ def _scan_file(points: FloatArray, rings: IntArray, lidar2ego: FloatArray) -> by
     xyz = (points[:, :3] - lidar2ego[:3, 3]) @ lidar2ego[:3, :3]
     intensity = points[:, 3] if points.shape[1] > 3 else np.zeros(len(points))
     return np.column_stack([xyz, intensity, rings]).astype("<f4").tobytes()
-
-
-def _write_table(path: Path, rows: Iterable[Row]) -> None:
-    with whole_file(path) as file:
-        file.write(b"[")
-        for k, row in enumerate(rows):
-            file.write((b",\n" if k else b"\n") + json.dumps(row).encode())
-        file.write(b"\n]\n")

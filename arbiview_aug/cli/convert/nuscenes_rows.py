@@ -41,7 +41,9 @@ def visible_shares(rig: Rig, coverage: Sequence[BoolArray], boxes: FloatArray) -
     for camera, covered in zip(rig, coverage, strict=True):
         step = max(1, round(max(camera.size) / _RASTER_PX))
         wide, (top, left) = _widened(camera, step)
-        angle = _solid_angles(wide)
+        (fx, _, cx), (_, fy, cy), _ = wide.K
+        x, y = (np.arange(wide.width_px) - cx) / fx, (np.arange(wide.height_px) - cy) / fy
+        angle = (x * x + (y * y)[:, None] + 1) ** -1.5 / (fx * fy)  # (h, w) solid angles of pixels, steradians
         total = np.maximum(total, silhouette_sums(wide, boxes, angle))
         _, face = draw_boxes(wide, boxes)
         y, x = np.nonzero(face >= 0)
@@ -59,13 +61,6 @@ def level(share: float, source: str) -> str:
     if source not in LEVELS:
         return ""
     return min(source, LEVELS[int(np.searchsorted(_BOUNDS, share, side="right"))])
-
-
-def _solid_angles(camera: Camera) -> FloatArray:
-    """(h, w) solid angles of a pinhole camera's pixels, steradians."""
-    (fx, _, cx), (_, fy, cy), _ = camera.K
-    x, y = (np.arange(camera.width_px) - cx) / fx, (np.arange(camera.height_px) - cy) / fy
-    return (x * x + (y * y)[:, None] + 1) ** -1.5 / (fx * fy)
 
 
 def _widened(camera: Camera, step: int) -> tuple[Camera, tuple[int, int]]:
@@ -148,12 +143,9 @@ class Remaining:
             first, last = (row.get(f"{end}_annotation_token", "") for end in ("first", "last"))
             remaining_first = self._remaining(first, 1)
             if remaining_first or not first:
-                values = {
-                    "first_annotation_token": remaining_first,
-                    "last_annotation_token": self._remaining(last, 0),
-                    "nbr_annotations": (row.get("nbr_annotations") or 0) - fewer[row["token"]],
-                }
-                yield self._changed(row, values)
+                values = {"first_annotation_token": remaining_first, "last_annotation_token": self._remaining(last, 0)}
+                count = (row.get("nbr_annotations") or 0) - fewer[row["token"]]
+                yield self._changed(row, {**values, "nbr_annotations": count})
 
     def sample_annotation(self, visible: Mapping[str, float], num_lidar_pts: Mapping[str, int]) -> Iterator[Row]:
         """``visible``: share of each annotation's box that the new cameras show; ``num_lidar_pts``: its new points."""
@@ -254,15 +246,10 @@ class NewSensors:
                     yield {**moment, **calibrated, **dict(zip(("prev", "next"), around, strict=True))}
                 for name, view in self._views[sample]:
                     yield {
-                        "token": token_of(sample, name),
-                        "sample_token": sample,
-                        "ego_pose_token": moment["ego_pose_token"],
-                        "timestamp": moment["timestamp"],
-                        "fileformat": self.suffix.removeprefix("."),
-                        "is_key_frame": True,
-                        **view,
-                        "prev": before and token_of(before, name),
-                        "next": after and token_of(after, name),
+                        **{"token": token_of(sample, name), "sample_token": sample},
+                        **{key: moment[key] for key in ("ego_pose_token", "timestamp")},
+                        **{"fileformat": self.suffix.removeprefix("."), "is_key_frame": True, **view},
+                        **{"prev": before and token_of(before, name), "next": after and token_of(after, name)},
                     }
 
     def _view(self, camera: Mapping[str, Any]) -> tuple[str, Row]:
@@ -275,11 +262,8 @@ class NewSensors:
         """Token of a calibration, which is collected."""
         token, pose = token_of("calibrated_sensor", name, json.dumps([K, sensor2ego])), np.array(sensor2ego)
         self._calibrations[token] = {
-            "token": token,
-            "sensor_token": sensor,
-            "translation": pose[:3, 3].tolist(),
-            "rotation": quaternion_from_rotation(pose[:3, :3]).tolist(),
-            "camera_intrinsic": K,
+            **{"token": token, "sensor_token": sensor, "translation": pose[:3, 3].tolist()},
+            **{"rotation": quaternion_from_rotation(pose[:3, :3]).tolist(), "camera_intrinsic": K},
         }
         return token
 

@@ -15,7 +15,6 @@ from arbiview_aug.datasets.drive import BEGUN_FILE, CONVERSION_FOLDER, Neighbour
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.errors import DataError
 from arbiview_aug.generator import load_inpainter
-from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys
 
@@ -69,15 +68,10 @@ class Settings:
         """The transform; each process or actor makes one."""
         return RigRetarget(
             self.target,
-            holes=self._inpainter(),
+            holes=load_inpainter(self.generator, steps=self.steps) if self.holes == "diffusion" else self.holes,
             keys=SampleKeys(extra=() if self.quality == "paper" else ("confidence",), points=self.points),
             **{name: getattr(self, name) for name in RETARGET_OPTIONS},
         )
-
-    def _inpainter(self) -> Holes | Inpainter:
-        if self.holes != "diffusion":
-            return self.holes
-        return load_inpainter(self.generator, steps=self.steps)
 
     def rendering(self) -> dict[str, Any]:
         """All settings that decide the output, as plain data."""
@@ -122,7 +116,5 @@ def check_output(settings: Settings) -> None:
         return
     foreign = next((path.name for path in output.rglob("*") if not path.is_dir() and not is_part(path)), None)
     if foreign is not None:
-        raise DataError(
-            f"--output {settings.output}: expected an empty folder, or a conversion to go on with, got {foreign} "
-            f"and no {FOLDER}/{BEGUN_FILE}; name another folder"
-        )
+        got = f"{foreign} and no {FOLDER}/{BEGUN_FILE}; name another folder"
+        raise DataError(f"--output {output}: expected an empty folder, or a conversion to go on with, got {got}")

@@ -62,17 +62,15 @@ def _are_whole(values: list[Any]) -> bool:
     return kinds <= {int, float} and all(abs(value) < _LARGEST_WHOLE and value % 1 == 0 for value in values)
 
 
-def _are_times(values: list[Any]) -> bool:
-    in_us = [value // 1000 if type(value) is int and value >= NANOSECONDS else value for value in values]
-    return _are_whole(in_us)
-
-
 TEXTS = Kind("as text", _are_texts)
 FILES = Kind("as text", lambda values: {*map(type, values)} <= {str})  # ``inside`` refuses impossible names
 LINKS = Kind("as a token or an empty text", _are_links)
 TOKENS = Kind(f"as a token of 1 to {_LONGEST_TOKEN} letters", lambda values: _are_links(values) and all(values))
 FLAGS = Kind("as true or false", lambda values: {*map(type, values)} <= {bool, int, float} and {*values} <= {0, 1})
-MICROSECONDS = Kind("as a whole number of microseconds", _are_times)
+MICROSECONDS = Kind(
+    "as a whole number of microseconds",
+    lambda values: _are_whole([v // 1000 if type(v) is int and v >= NANOSECONDS else v for v in values]),
+)
 COUNTS = Kind(
     "as a whole number from 0",
     lambda values: _are_whole(values) and 0 <= min(values, default=0) and max(values, default=0) < 1 << 31,

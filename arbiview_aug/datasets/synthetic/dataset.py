@@ -153,9 +153,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
     def render(self, index: int, rig: Rig | None = None) -> RenderedViews:
         """Render the true views of scene ``index`` for any rig, put on the scene's road; by default the dataset's own.
 
-        Raises:
-            IndexError: Past the end.
-            TypeError: ``rig`` is not a ``Rig``.
+        IndexError past the end, TypeError if ``rig`` is not a ``Rig``.
         """
         rig = self.rig if rig is None else _checked_rig(rig)
         views = self._renderer.render(self.scene(index), rig.cameras, rig.ground_z_m)
@@ -167,9 +165,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         They are those of the rig's ``lidars``, by default the dataset's own; a rig without any has a scanner like an
         HDL-32E.
 
-        Raises:
-            IndexError: Past the end.
-            TypeError: ``rig`` is not a ``Rig``.
+        IndexError past the end, TypeError if ``rig`` is not a ``Rig``.
         """
         index = checked_index(index, len(self))
         return self._points(self.scene(index), (self.seed, index, 1), None if rig is None else _checked_rig(rig))

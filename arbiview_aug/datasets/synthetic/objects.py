@@ -1,4 +1,4 @@
-"""Objects built from primitives: vehicles, two-wheelers, people, trees, lamp posts, signs, buildings.
+"""Objects built from primitives: vehicles, people, trees, lamp posts, signs, buildings.
 
 Every labelled object touches all six sides of its 3D box.
 """
@@ -6,7 +6,6 @@ Every labelled object touches all six sides of its 3D box.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from arbiview_aug.datasets.synthetic.scene import (
     BoxClass,
     Look,
     Material,
-    Placed,
     Range,
     SceneBuilder,
     SceneClass,
@@ -109,37 +107,6 @@ def add_vehicle(
             place.cylinder(center, (radius, radius), 0.11, Look(Material.WHEEL, TIRE), lateral=True)
 
 
-class Clothes(NamedTuple):
-    """Colours of a person."""
-
-    trousers: Color
-    jacket: Color
-    sleeve: Color
-    skin: Color
-
-
-def pick_clothes(rng: np.random.Generator) -> Clothes:
-    """Colours of a person's clothes."""
-    trousers, jacket = pick(rng, _TROUSERS), pick(rng, _CLOTHES)
-    skin = pick(rng, ((0.80, 0.62, 0.52), (0.55, 0.38, 0.28), (0.35, 0.24, 0.18)), 0.02)
-    return Clothes(trousers, jacket, (jacket[0] * 0.85, jacket[1] * 0.85, jacket[2] * 0.85), skin)
-
-
-def add_trunk(place: Placed, hip: float, shoulder: float, width: float, wears: Clothes) -> None:
-    """Torso, shoulders and neck along the z axis of ``place``."""
-    middle, half = (hip + shoulder) / 2, (shoulder - hip) / 2
-    radii = (0.14 * 0.9, (width / 2 - 0.08) * 0.88)
-    place.cylinder((0.0, 0.0, middle), radii, half, Look(Material.ROUGH, wears.jacket, (0.1, 0.06, 0, 0)))
-    place.ellipsoid((0, 0, shoulder - 0.03), (0.085, width / 2 - 0.03, 0.075), plain(wears.sleeve))
-    place.cylinder((0, 0, shoulder + 0.04), (0.055, 0.055), 0.09, plain(wears.skin))
-
-
-def add_head(place: Placed, x: float, top: float, skin: Color) -> None:
-    """An upright head below ``top``."""
-    half = 0.115
-    place.ellipsoid((x, 0, top - half), (0.10, 0.085, half), plain(skin))
-
-
 def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
     """A standing or walking person and their box."""
     height = rng.uniform(1.5, 1.92)
@@ -147,19 +114,25 @@ def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector,
     center = np.array([xyz[0], xyz[1], xyz[2] + height / 2])
     row = builder.add_box(center, (length, width, height), yaw, BoxClass.PEDESTRIAN)
     place = builder.place(xyz, yaw, SceneClass.PEDESTRIAN, row)
-    wears = pick_clothes(rng)
+    trousers, jacket = pick(rng, _TROUSERS), pick(rng, _CLOTHES)
+    skin = pick(rng, ((0.80, 0.62, 0.52), (0.55, 0.38, 0.28), (0.35, 0.24, 0.18)), 0.02)
+    sleeve: Color = (jacket[0] * 0.85, jacket[1] * 0.85, jacket[2] * 0.85)
     hip, shoulder = 0.48 * height, 0.83 * height
     stride = length / 2 - 0.075
     for side in (-1, 1):
         leg = (side * stride * 0.9, side * width * 0.17, hip / 2)
-        place.cylinder(leg, (0.075, 0.07), hip / 2, plain(wears.trousers))
-    add_trunk(place, hip, shoulder, width, wears)
+        place.cylinder(leg, (0.075, 0.07), hip / 2, plain(trousers))
+    torso = Look(Material.ROUGH, jacket, (0.1, 0.06, 0, 0))
+    radii = (0.14 * 0.9, (width / 2 - 0.08) * 0.88)
+    place.cylinder((0.0, 0.0, (hip + shoulder) / 2), radii, (shoulder - hip) / 2, torso)
+    place.ellipsoid((0, 0, shoulder - 0.03), (0.085, width / 2 - 0.03, 0.075), plain(sleeve))
+    place.cylinder((0, 0, shoulder + 0.04), (0.055, 0.055), 0.09, plain(skin))
     for side in (-1, 1):
         # The swinging arms carry the box's length and width.
         arm = (-side * (length / 2 - 0.055), side * (width / 2 - 0.055), (hip + shoulder) / 2)
-        place.cylinder(arm, (0.055, 0.055), (shoulder - hip) / 2 * 0.92, plain(wears.sleeve))
-        place.ellipsoid((arm[0], arm[1], hip - 0.03), (0.045, 0.045, 0.08), plain(wears.skin))
-    add_head(place, 0, height, wears.skin)
+        place.cylinder(arm, (0.055, 0.055), (shoulder - hip) / 2 * 0.92, plain(sleeve))
+        place.ellipsoid((arm[0], arm[1], hip - 0.03), (0.045, 0.045, 0.08), plain(skin))
+    place.ellipsoid((0, 0, height - 0.115), (0.10, 0.085, 0.115), plain(skin))
 
 
 def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, reach_m: float = math.inf) -> None:

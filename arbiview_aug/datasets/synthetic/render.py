@@ -126,10 +126,6 @@ def _from_tiles(a: Tensor, size: tuple[int, int]) -> Tensor:
     return a[: size[0], : size[1]]
 
 
-def _nbytes(rays: CameraRays) -> int:
-    return sum(tensor.nbytes for tensor in rays)
-
-
 class Renderer:
     """Renders scenes; keeps the rays of the last cameras."""
 
@@ -138,7 +134,9 @@ class Renderer:
 
     def __init__(self, *, supersampling: int = 2, device: torch.device | str = "cpu") -> None:
         self.supersampling, self.device = supersampling, torch.device(device)
-        self._rays: LRUCache[bytes, CameraRays] = LRUCache(_CACHED_BYTES, _nbytes)
+        self._rays: LRUCache[bytes, CameraRays] = LRUCache(
+            _CACHED_BYTES, lambda rays: sum(part.nbytes for part in rays)
+        )
 
     def __reduce__(self) -> tuple[Any, tuple[()]]:
         return partial(type(self), supersampling=self.supersampling, device=self.device), ()  # without the caches

@@ -67,19 +67,9 @@ def scan_scene(
     errors: ScanErrors,
     seed: tuple[int, ...],
 ) -> FloatArray:
-    """Scan a scene from a position (3,) over the ego origin's road.
+    """(P, 4) x y z and intensity, 0 to 255, of rays (columns, beams, 3) in the ego frame, unit vectors.
 
-    Args:
-        scene: The scene.
-        renderer: Device and threads.
-        position: (3,) of the scanner; z is over the road.
-        rays: (columns, beams, 3) unit rays in the ego frame.
-        range_m: Least and largest distance of returns.
-        errors: The scanner's errors.
-        seed: Seed of its noise.
-
-    Returns:
-        (P, 4) x y z and intensity, 0 to 255.
+    They leave ``position`` (3,), whose z is over the road, and return from distances between both of ``range_m``.
     """
     R = scene.ego2street[:3, :3]
     origin = R @ position + scene.ego2street[:3, 3]

@@ -19,7 +19,7 @@ from arbiview_aug import Rig, RigRetarget, SampleKeys, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli import parsers
 from arbiview_aug.cli.convert import command as command_module
-from arbiview_aug.cli.convert.job import Jobs, coverage_of
+from arbiview_aug.cli.convert.job import Jobs
 from arbiview_aug.cli.convert.manifest import Manifest
 from arbiview_aug.datasets import FrameFolder, Neighbours, WithDepth
 from arbiview_aug.datasets.depth_folder import DepthFolder
@@ -69,6 +69,10 @@ def test_the_reader_finds_what_was_rendered(source: Path, output: Path) -> None:
             assert (image.parent / camera["confidence"]).is_file()
             made_up = cv2.imread(str(image.parent / camera["generated"]), cv2.IMREAD_GRAYSCALE) > 0
             assert np.array_equal(made_up, out["generated"][k].numpy())
+
+
+def coverage_of(image: Path) -> np.ndarray:
+    return np.asarray(cv2.imread(str(image.with_suffix(".coverage.png")), cv2.IMREAD_GRAYSCALE) > 0)
 
 
 def test_coverage_is_read_back(output: Path, tmp_path: Path) -> None:
