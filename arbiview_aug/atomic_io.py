@@ -56,11 +56,9 @@ def check_name(name: Any, what: str) -> None:
             return
     except (TypeError, AttributeError, UnicodeEncodeError):  # not a string, or a lone surrogate
         pass
-    got = ascii(name)
-    raise DataError(
-        f"{what}: expected a file name relative to the folder of the data, without '..', in UTF-8, at most "
-        f"{LONGEST_NAME} bytes a part, got {got if len(got) <= LONGEST_NAME else got[:80] + '…'}"
-    )
+    got = ascii(name) if len(ascii(name)) <= LONGEST_NAME else f"{ascii(name)[:80]}…"
+    expected = f"a file name relative to the folder of the data, without '..', in UTF-8, {LONGEST_NAME} bytes a part"
+    raise DataError(f"{what}: expected {expected}, got {got}")
 
 
 def inside(root: Path, name: Any, what: str) -> Path:
@@ -92,11 +90,9 @@ def _followed(root: Path, path: Path, name: str, what: str) -> int:
     """Mode of a path's target, which must lie below the folder."""
     base, real = os.path.realpath(root), os.path.realpath(path)
     if real != base and not real.startswith(os.path.join(base, "")):
-        raise DataError(
-            f"{what}: expected a file in {root}, got {name}, which a link leads to {real}: links must not leave the "
-            "folder; pass the folder that holds the files themselves, move them into it, or pass a copy without links "
-            "(cp -rL; on one disk cp -rlL, which takes no space)"
-        )
+        fix = "pass the folder that holds the files themselves, move them into it, or pass a copy (cp -rL)"
+        got = f"{name}, which a link leads to {real}: links must not leave the folder; {fix}"
+        raise DataError(f"{what}: expected a file in {root}, got {got}")
     return os.stat(real).st_mode
 
 

@@ -43,10 +43,9 @@ def framing(name: str, size: tuple[int, int], to: tuple[int, int], fit: Fit) -> 
     by_height = (h * size[1] >= w * size[0]) == (fit == "crop")
     scaled = (h, max(1, _rounded(h * size[1], size[0]))) if by_height else (max(1, _rounded(w * size[0], size[1])), w)
     if max(scaled) > MAX_SIZE_PX:
-        raise CalibrationError(
-            f"camera {name!r}: size={to}, fit={fit!r}: expected at most {MAX_SIZE_PX} px a side before cropping, got "
-            f"{scaled}, scaled from {size}; use fit='pad' or 'stretch', or a size of the image's shape"
-        )
+        got = f"{scaled}, scaled from {size}; use fit='pad' or 'stretch', or a size of the image's shape"
+        expected = f"expected at most {MAX_SIZE_PX} px a side before cropping"
+        raise CalibrationError(f"camera {name!r}: size={to}, fit={fit!r}: {expected}, got {got}")
     return Framing(scaled, scaled[0] - h, (scaled[1] - w) // 2, to)
 
 

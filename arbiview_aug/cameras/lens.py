@@ -157,10 +157,8 @@ class RadTan(Lens):
         k1, k2, p1, p2, k3, k4, k5, k6 = self._all
         r2 = a * a + b * b
         radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        return (
-            a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a),
-            b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b,
-        )
+        x = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
+        return x, b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
 
     def _jacobian(self, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Derivatives (x by a, x by b = y by a, y by b): the Jacobian is symmetric."""

@@ -375,11 +375,8 @@ def _check_order(distortion: Mapping[str, Any], label: str) -> None:
     unknown, order = unknown_key(distortion, ("model", "coeffs", "order")), distortion.get("order")
     usual = _ORDERS.get(canonical_name(str(distortion["model"])), "").split()
     named = re.findall(r"[a-z]+\d", str(order).partition("(")[0])  # k1..k4 (cv2.fisheye)
-    if (
-        not unknown
-        and order is not None
-        and not (named == usual[: len(named)] or (named == ["k1", "k4"] and usual[3:]))
-    ):
+    is_usual = order is None or named == usual[: len(named)] or (named == ["k1", "k4"] and len(usual) > 3)
+    if not unknown and not is_usual:
         unknown = f"order: expected {' '.join(usual)}, got {shown(order)}"
     if unknown:
         raise CalibrationError(f"{label}: distortion: {unknown}")

@@ -314,7 +314,8 @@ def _read_calibration(frame: _Frame) -> dict[str, Any]:
     path = frame.file(CALIBRATION_FILE)
     try:
         text = read_text(path, MOST_BYTES)
-        _check_count(text.count('"cam2ego"') // 2, path)  # before millions of entries are parsed; notes may name it too
+        if (count := text.count('"cam2ego"') // 2) > MOST_CAMERAS:  # of which each may name it in a note, too
+            raise CalibrationError(f"{path}: expected at most {MOST_CAMERAS} cameras, got {count} or more")
         calib = parse_json(text)
     except CalibrationError:
         raise
@@ -325,7 +326,6 @@ def _read_calibration(frame: _Frame) -> dict[str, Any]:
     if not isinstance(calib, dict) or not isinstance(calib.get("cameras"), list):
         got = type(calib).__name__ + (hint(calib, ("cameras",)) if isinstance(calib, dict) else "")
         raise DataError(f"{path}: expected an object with a list 'cameras', got {got}")
-    _check_count(len(calib["cameras"]), path)
     for k, entry in enumerate(calib["cameras"]):
         if not isinstance(entry, dict):
             raise CalibrationError(f"{path}: camera {k}: expected a mapping, got {type(entry).__name__}")
@@ -334,11 +334,6 @@ def _read_calibration(frame: _Frame) -> dict[str, Any]:
             fix = "write distortion: {model, coeffs} (docs/formats.md), or remove it"
             raise CalibrationError(f"{path}: camera {shown(entry.get('name', k))}: {lens} is not read; {fix}")
     return calib
-
-
-def _check_count(cameras: int, path: Path) -> None:
-    if cameras > MOST_CAMERAS:
-        raise CalibrationError(f"{path}: expected at most {MOST_CAMERAS} cameras, got {cameras} or more")
 
 
 def _calibration_of(entry: Mapping[str, Any]) -> dict[str, Any]:

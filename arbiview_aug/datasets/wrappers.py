@@ -78,9 +78,8 @@ class MixedDataset(Dataset[Any]):
 
     def __init__(self, raw: Any, retargeted: Any, share: float = 0.5) -> None:
         name = type(self).__name__
-        self.raw, self.retargeted = (
-            checked_map_style(dataset, name, "pass two that have __getitem__") for dataset in (raw, retargeted)
-        )
+        fix = "pass two that have __getitem__"
+        self.raw, self.retargeted = (checked_map_style(dataset, name, fix) for dataset in (raw, retargeted))
         if len(raw) != len(retargeted):
             got = f"got {len(raw)} and {len(retargeted)}; take those that both have with torch.utils.data.Subset"
             raise DataError(f"{name}: expected the same samples untouched and retargeted, {got}")
@@ -119,10 +118,8 @@ class RetargetedIterable(IterableDataset[Any]):
             fix = "use RetargetedDataset" if hasattr(dataset, "__getitem__") else "pass the dataset first"
             raise SampleTypeError(f"{name}: expected an iterable dataset, got {type(dataset).__name__}; {fix}")
         if isinstance(dataset, Iterator):
-            raise SampleTypeError(
-                f"{name}: expected a dataset that can be iterated again, got {type(dataset).__name__}, which ends "
-                "after one epoch; pass an IterableDataset, whose __iter__ starts a new one"
-            )
+            got = f"{type(dataset).__name__}, which ends after one epoch; pass an IterableDataset"
+            raise SampleTypeError(f"{name}: expected a dataset that can be iterated again, got {got}")
         self.dataset = dataset
         self.retarget = _checked_retarget(retarget, name)
 

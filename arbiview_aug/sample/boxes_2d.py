@@ -62,11 +62,7 @@ def project_boxes_3d(boxes_3d: Any, cameras: Rig | Mapping[str, Any]) -> list[Im
 
 
 def rig_of(cameras: Rig | Mapping[str, Any]) -> Rig:
-    """The rig itself, or an unbatched sample's, whose ``coverage`` and ``ego_mask`` mask pixels.
-
-    Raises:
-        SampleError: A batch of samples.
-    """
+    """The rig itself, or an unbatched sample's, masked by ``coverage`` and ``ego_mask``; SampleError for a batch."""
     if isinstance(cameras, Rig):
         return cameras
     frames = read_frames(cameras, None)
@@ -94,12 +90,8 @@ def outline(camera: Camera, box: FloatArray) -> Outline | None:
     both = valid[:-1] & valid[1:]
     border = np.array(list(product(*zip((0.0, 0.0), limits, strict=True))))
     rays = camera.unproject(border)
-    within = np.concatenate(
-        [
-            _clipped(pixels[:-1][both], pixels[1:][both], limits),
-            border[rays.valid & meets(box, camera.center_m, rays.directions)],
-        ]
-    )
+    corners = border[rays.valid & meets(box, camera.center_m, rays.directions)]
+    within = np.concatenate([_clipped(pixels[:-1][both], pixels[1:][both], limits), corners])
     if not len(within) or not (within.max(axis=0) > within.min(axis=0)).all():
         return None
     around = [pixels[valid], within]

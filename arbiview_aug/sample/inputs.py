@@ -285,10 +285,8 @@ def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None
         return
     where = "inside the image" if outside else "near the middle of the image"
     fix = "height and width are swapped" if swapped else "K of another image size? Camera.resize scales K"
-    raise SampleError(
-        f"K[{k}]: expected a principal point {where} of (h, w) = {(h, w)}, got ({K[0, 2]:g}, {K[1, 2]:g}); "
-        f"{fix}; pass rig= if the camera is really like this"
-    )
+    got = f"({K[0, 2]:g}, {K[1, 2]:g}); {fix}; pass rig= if the camera is really like this"
+    raise SampleError(f"K[{k}]: expected a principal point {where} of (h, w) = {(h, w)}, got {got}")
 
 
 def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> list[tuple[Any, tuple[float, ...]]]:
@@ -344,10 +342,8 @@ def _with_masks(rig: Rig, sample: Mapping[str, Any], lead: tuple[int, ...], inde
                     visible, mask = ~pixels.cpu().numpy(), masks[k]
                     masks[k] = visible if mask is None else mask & visible
         except (TypeError, ValueError, AttributeError, RuntimeError) as error:  # RuntimeError: meta, sparse
-            raise SampleError(
-                f"{key}: expected a bool tensor of each image's size, as an earlier retargeting gives it ({error}); "
-                "rename the key if it is something else"
-            ) from None
+            expected = f"a bool tensor of each image's size, as an earlier retargeting gives it ({error})"
+            raise SampleError(f"{key}: expected {expected}; rename the key if it is something else") from None
     if all(mask is camera.mask for mask, camera in zip(masks, rig, strict=True)):
         return rig
     return rig.with_cameras([replace(camera, mask=mask) for camera, mask in zip(rig, masks, strict=True)])

@@ -281,7 +281,7 @@ def test_missing_and_broken_files(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="points: rows with NaN"):
         assert dataset[0]["points"].shape == (0, 5)
     (tmp_path / "samples/lidar/0.bin").unlink()
-    with pytest.raises(DataError, match=r"points .*0\.bin: expected the LiDAR's file, got No such file.*load_points=False"):
+    with pytest.raises(DataError, match=r"points .*0\.bin: expected the LiDAR's file, got No such.*load_points=False"):
         dataset[0]
     (tmp_path / "samples/CAM_BACK/0.png").unlink()
     with pytest.raises(DataError, match=r"camera 'CAM_BACK': image .*0\.png: expected an image file, found none"):

@@ -201,10 +201,8 @@ def write_calibration(data: Mapping[str, Any], folder: Path, name: str) -> Path:
     files = files_of(data)
     there = {path for form in FORMATS.values() for pattern in form.files for path in folder.glob(pattern)}
     if others := {path.name for path in (*there, *camera_files.camera_files(folder))} - files.keys():
-        fix = "which would be read with the new one or in its place: remove them, or name another folder"
-        raise CalibrationError(
-            f"save_rig: {folder}: expected no other calibration, got {', '.join(sorted(others))}, {fix}"
-        )
+        got = f"{', '.join(sorted(others))}, which would be read instead or too: remove them, or name another folder"
+        raise CalibrationError(f"save_rig: {folder}: expected no other calibration, got {got}")
     texts = {folder / file: one if isinstance(one, str) else dump_yaml(one) for file, one in files.items()}
     write_whole({path: text.encode() for path, text in texts.items()})
     return folder

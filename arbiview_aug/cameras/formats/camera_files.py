@@ -32,10 +32,7 @@ _WOODSCAPE_KEYS = set("aspect_ratio cx_offset cy_offset height width k1 k2 k3 k4
 _DEFAULT_NAME = "narrow_stereo"  # of camera_calibration, for every camera
 
 _UNREAD = {
-    "KITTI's text": (
-        r"(?m)^P(_rect_)?\d{1,2}:",
-        "K is P's left 3x3, cam2ego inv(R0_rect @ Tr_velo_to_cam) to the LiDAR",
-    ),
+    "KITTI's text": (r"(?m)^P(_rect_)?\d\d?:", "K is P's left 3x3, cam2ego inv(R0_rect @ Tr_velo_to_cam) to the LiDAR"),
     "ORB-SLAM": (r"(?m)^\s*Camera1?[._](type|fx)", "PinHole has radtan k1 k2 p1 p2, KannalaBrandt8 fisheye k1 to k4"),
     "basalt": ('"camera_type"', "kb4 is fisheye k1 to k4, ds is double_sphere"),
     "nerfstudio": (r"\bfl_x\b", "K of fl_x fl_y cx cy; negate columns 2 and 3 of transform_matrix (OpenGL's axes)"),
@@ -143,9 +140,8 @@ def _woodscape(name: str, data: Mapping[Any, Any], mounting: Mounting) -> dict[s
     """
     lens, extrinsic = data["intrinsic"], data["extrinsic"]
     if (unread := lens.keys() - _WOODSCAPE_KEYS) or lens.get("poly_order", 4) != 4:
-        raise refusal(
-            name, f"intrinsic {', '.join(sorted(_WOODSCAPE_KEYS))} 4", ", ".join(unread) or "another poly_order"
-        )
+        got = ", ".join(unread) or "another poly_order"
+        raise refusal(name, f"intrinsic {', '.join(sorted(_WOODSCAPE_KEYS))} 4", got)
     width, height, k1 = lens["width"], lens["height"], lens["k1"]
     K = matrix(k1, k1 * lens["aspect_ratio"], width / 2 - 0.5 + lens["cx_offset"], height / 2 - 0.5 + lens["cy_offset"])
     x, y, z, w = extrinsic["quaternion"]
@@ -177,11 +173,9 @@ def _read(file: Path, name: str, data: Any, mounting: Mounting, frames: Mapping[
             if frame_id:
                 instead = f"{frame.removesuffix('_link')}_optical_frame"
                 fix = f"write frame_id: {instead} to {file.name}, and add that frame, if it is not there,"
-            raise CalibrationError(
-                f"camera {name!r}: expected an optical frame (x right, y down, z forward), got {frame}, which seems to "
-                f"have {BODY_AXES}: the camera would look up by {up_deg:.0f} degrees; {fix} to "
-                f"{TF} below {frame}, with rotation {{x: -0.5, y: 0.5, z: -0.5, w: 0.5}}"
-            )
+            got = f"{frame}, which seems to have {BODY_AXES}: the camera would look up by {up_deg:.0f} degrees"
+            fix += f" to {TF} below {frame}, with rotation {{x: -0.5, y: 0.5, z: -0.5, w: 0.5}}"
+            raise refusal(name, "an optical frame (x right, y down, z forward)", got, fix)
         if is_shifted:
             fix = f"its frame may be the left camera's: write its own pose to {MOUNTING}, poses: {{{name}: ...}}"
             raise refusal(name, "a projection matrix without a baseline", "one with", fix)
@@ -272,9 +266,7 @@ def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
         transform = {"translation": dict(zip("xyz", at, strict=True)), "rotation": dict(zip("wxyz", wxyz, strict=True))}
         frame = f"{name.strip('/')}_optical_frame"
         if any(one["child_frame_id"] == frame for one in transforms):
-            raise CalibrationError(
-                f"camera {name!r}: expected a frame of its own for {TF}, got {frame} twice: rename it"
-            )
+            raise refusal(name, f"another camera's frame for {TF}", f"{frame} twice: rename it")
         frames = {"header": {"frame_id": _EGO_FRAMES[0]}, "child_frame_id": frame}
         transforms.append({**frames, "transform": transform})
     names = {camera["name"]: camera["name"] for camera in data["cameras"]}  # files come in alphabetical order

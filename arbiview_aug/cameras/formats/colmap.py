@@ -56,10 +56,8 @@ def read_colmap(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     models, images = dict(cameras_of(folder / f"cameras{end}")), list(images_of(folder / f"images{end}"))
     if not mounting.images and len({image.camera for image in images}) < len(images):
         camera, times = Counter(image.camera for image in images).most_common(1)[0]
-        raise CalibrationError(
-            f"camera {camera} has {times} images: which were taken at one moment? Write one for each camera of the rig "
-            f"to {MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
-        )
+        fix = f"Write one for each camera to {MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
+        raise CalibrationError(f"camera {camera} has {times} images: which were taken at one moment? {fix}")
     by_file = {image.name: image for image in images}
     if len(by_file) < len(images):
         (file, times), *_ = Counter(image.name for image in images).most_common(1)
@@ -72,16 +70,13 @@ def read_colmap(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     if len({*names}) < len(by_file):  # several cameras in a folder
         names = [Path(file).stem for file in by_file]
     if not mounting.images and len({*names}) < len(by_file):
-        raise CalibrationError(
-            f"expected images with different names for the cameras, got {', '.join(names[:8])}: write one for each to "
-            f"{MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
-        )
+        fix = f"write one for each to {MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
+        raise CalibrationError(f"expected images with different names, got {', '.join(names[:8])}: {fix}")
     chosen = {name: by_file[file] for name, file in (mounting.images or dict(zip(names, by_file, strict=True))).items()}
     if mounting.metres_per_unit is None:
-        raise CalibrationError(
-            f"how many metres is a unit of the reconstruction? Write it and the pose of one camera to {MOUNTING} "
-            f"beside the files: metres_per_unit: 1.0, poses: {{{next(iter(chosen), 'front')}: [[r, r, r, x], ...]}}"
-        )
+        example = f"poses: {{{next(iter(chosen), 'front')}: [[r, r, r, x], ...]}}"
+        fix = f"Write it and the pose of one camera to {MOUNTING} beside the files: metres_per_unit: 1.0, {example}"
+        raise CalibrationError(f"how many metres is a unit of the reconstruction? {fix}")
     scale = np.ones((4, 4))
     scale[:3, 3] = mounting.metres_per_unit
     poses = mounting.mounted({name: image.pose * scale for name, image in chosen.items()})

@@ -83,20 +83,17 @@ class Mounting:
     def pose(self, name: str, instead: str = "") -> FloatArray:
         """A camera's pose, or CalibrationError with the question where it is."""
         if name not in self.poses:
-            raise CalibrationError(
-                f"camera {name!r}: where is it on the vehicle? Write its pose, camera to ego, to {MOUNTING} beside the "
-                f"calibration, poses: {{{name}: [[r, r, r, x], [r, r, r, y], [r, r, r, z], [0, 0, 0, 1]]}}{instead}"
-            )
+            rows = "[[r, r, r, x], [r, r, r, y], [r, r, r, z], [0, 0, 0, 1]]"
+            fix = f"Write its pose, camera to ego, to {MOUNTING} beside the calibration, poses: {{{name}: {rows}}}"
+            raise CalibrationError(f"camera {name!r}: where is it on the vehicle? {fix}{instead}")
         return self.poses[name]
 
     def size(self, name: str) -> tuple[Any, Any]:
         """Width and height of a camera's images, or CalibrationError with the question how large they are."""
         size = self.sizes if "width" in self.sizes else self.sizes.get(name)
         if not isinstance(size, Mapping) or size.keys() != {"width", "height"}:
-            raise CalibrationError(
-                f"camera {name!r}: how large are its images? Write it to {MOUNTING} beside the calibration: "
-                f"sizes: {{{name}: {{width: 1600, height: 900}}}}, or sizes: {{width: 1600, height: 900}} for all"
-            )
+            fix = f"Write it to {MOUNTING} beside the calibration: sizes: {{{name}: {{width: 1600, height: 900}}}}"
+            raise CalibrationError(f"camera {name!r}: how large are its images? {fix}; without the name it is for all")
         return size["width"], size["height"]
 
     def named(self, cameras: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

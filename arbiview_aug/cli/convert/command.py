@@ -279,9 +279,8 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], report_frames: int, shards: in
 def converted(settings: Settings) -> Method:
     """Wrap the written views as a method; for other rigs than the target it renders anew."""
     # Scored frames hold their points back, and depth on disk is not read again.
-    anew = retargeting(
-        settings.quality, "auto" if GEOMETRIES[settings.geometry].needs in ("points", *FOLDERS) else settings.geometry
-    )
+    is_held_back = GEOMETRIES[settings.geometry].needs in ("points", *FOLDERS)
+    anew = retargeting(settings.quality, "auto" if is_held_back else settings.geometry)
     manifest, target = Manifest(settings.output), settings.sized_target
     kept = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
     kind = "nuscenes" if settings.version else kept  # its tables may have any name

@@ -126,11 +126,8 @@ class LogFrames(FrameFolders):
         self._remove(left_out)
         if not self.data.is_one_drive:
             return [f"no {SEQUENCE_FILE}, which holds one drive: convert each log alone for neighbours"]
-        frames = [
-            {"name": token, "time_s": self.data.time_s(k)}
-            for k, token in enumerate(self.data.tokens)
-            if token not in left_out
-        ]
+        kept = [(k, token) for k, token in enumerate(self.data.tokens) if token not in left_out]
+        frames = [{"name": token, "time_s": self.data.time_s(k)} for k, token in kept]
         write_whole({self.output / SEQUENCE_FILE: json.dumps({"frames": frames}, indent=1).encode()})
         return []
 

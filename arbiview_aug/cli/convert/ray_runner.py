@@ -41,12 +41,7 @@ def ray_results(jobs: Jobs, workers: int, label: str, note: Callable[[Done], str
     data.DataContext.get_current().enable_progress_bars = False
     gpus = float(ray.cluster_resources().get("GPU", 0)) if jobs.settings.holes == "diffusion" else 0.0
     rows = data.range(len(jobs), override_num_blocks=max(1, min(len(jobs), 4 * workers)))
-    done = rows.map(
-        Actor,
-        fn_constructor_args=(jobs,),
-        compute=data.ActorPoolStrategy(size=workers),
-        num_cpus=1,
-        num_gpus=min(1.0, gpus / workers),
-    )
+    share = {"num_cpus": 1, "num_gpus": min(1.0, gpus / workers)}
+    done = rows.map(Actor, fn_constructor_args=(jobs,), compute=data.ActorPoolStrategy(size=workers), **share)
     results: Iterator[Done] = (pickle.loads(row["done"]) for row in done.iter_rows())
     yield from with_progress(results, len(jobs), label, note)

@@ -133,10 +133,8 @@ def read_recordings(
         of_samples = tables.column(table, kept, "sample_token", TOKENS)
         kept = [row for row, token in zip(kept, of_samples, strict=True) if token in samples]  # of the chosen scenes
         sensors = tables.follow(table, kept, "calibrated_sensor_token", "calibrated_sensor", calibrated)
-        is_wanted = [
-            sensor >= 0 and (row["is_key_frame"] or wanted[channel_of[sensor]] in sweeps)
-            for row, sensor in zip(kept, sensors, strict=True)
-        ]
+        pairs = zip(kept, sensors, strict=True)
+        is_wanted = [k >= 0 and (row["is_key_frame"] or wanted[channel_of[k]] in sweeps) for row, k in pairs]
         kept, sensors = [*compress(kept, is_wanted)], [*compress(sensors, is_wanted)]
         _refuse_calibrations(tables, kept)
         part = np.zeros(len(kept), _ROW)
@@ -185,6 +183,7 @@ def read_recordings(
         got, fix = f"keyframes {step_us:g} apart", "are they in milliseconds or seconds?"
         raise tables.error("sample_data", "timestamps in microseconds", got, fix)
     count = max(scenes, default=-1) + 1
+    group = rows["channel"].astype(np.int64) * count + rows["scene"]
     order = rows["token"][: len(tokens)]
     tokens, previous = [tokens[k] for k in order], [previous[k] for k in order]
     return Recordings(
@@ -193,9 +192,7 @@ def read_recordings(
         K=K,
         lenses=lenses,
         rows=rows,
-        first=np.searchsorted(
-            rows["channel"].astype(np.int64) * count + rows["scene"], np.arange(len(wanted) * count + 1)
-        ),
+        first=np.searchsorted(group, np.arange(len(wanted) * count + 1)),
         keyframes=keyframes,
         poses=_ego_poses(tables, poses),
         file_names=list(files),
@@ -209,9 +206,8 @@ def _calibrations(
 ) -> tuple[dict[str, int], list[int], FloatArray, FloatArray, list[tuple[str, list[float]]]]:
     """Number of each calibrated sensor, -1 for others such as radars; channels, sensor2ego, K and lenses by number."""
     by_token = tables.by_token("calibrated_sensor")
-    sensors = tables.follow(
-        "calibrated_sensor", [*by_token.values()], "sensor_token", "sensor", tables.by_token("sensor")
-    )
+    calibrated_rows, by_sensor = [*by_token.values()], tables.by_token("sensor")
+    sensors = tables.follow("calibrated_sensor", calibrated_rows, "sensor_token", "sensor", by_sensor)
     channels = {token: sensor["channel"] for token, sensor in zip(by_token, sensors, strict=True)}
     read = [token for token in by_token if channels[token] in wanted]
     calibrated = dict.fromkeys(by_token, -1) | {token: k for k, token in enumerate(read)}

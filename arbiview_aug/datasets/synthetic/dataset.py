@@ -125,10 +125,9 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
             sample |= {"ego2world": self._ego2world(scene), "time_s": 0.0}
             steps = [sign * k for sign in self.neighbours.signs for k in range(1, self.neighbours.count + 1)]
             moments = [step * self.neighbours.step_m / scene.speed_mps for step in steps]
-            sample["neighbours"] = [
-                self._neighbour(scene.after(s), s, sample["token"], (self.seed, index, 2 + k))
-                for k, s in enumerate(moments)
-            ]
+            noise = [(self.seed, index, 2 + k) for k in range(len(moments))]
+            near = [(scene.after(s), s, sample["token"], seed) for s, seed in zip(moments, noise, strict=True)]
+            sample["neighbours"] = [self._neighbour(*frame) for frame in near]
         return sample
 
     def _neighbour(self, scene: Scene, seconds: float, token: str, noise: tuple[int, ...]) -> LazyFrame:

@@ -9,15 +9,7 @@ import math
 
 import numpy as np
 
-from arbiview_aug.datasets.synthetic.scene import (
-    BoxClass,
-    Look,
-    Material,
-    Range,
-    SceneBuilder,
-    SceneClass,
-    Vector,
-)
+from arbiview_aug.datasets.synthetic.scene import BoxClass, Look, Material, Range, SceneBuilder, SceneClass, Vector
 
 Color = Vector
 
