@@ -176,12 +176,7 @@ def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") ->
     """Link a file, or copy it, also where its disk allows no such links; a source that is a link is followed.
 
     An existing file of the same content stays, unless it is of another kind: a link instead of a copy. So does the
-    source itself.
-
-    Raises:
-        FileNotFoundError: There is no such source.
-        DataError: The source is a folder, or cannot be read.
-        OutputError: The link cannot be made.
+    source itself. FileNotFoundError without a source, DataError for one that cannot be read, OutputError for the link.
     """
     try:
         status = source.stat()

@@ -38,11 +38,7 @@ TRAINING_PRESETS = ("paper", "inpaint", "small", "compact", "tiny")
 
 
 def choice(option: str, value: object, choices: Iterable[str]) -> Any:
-    """``value`` as one of the choices of an option.
-
-    Raises:
-        ValueError: Another value.
-    """
+    """``value`` as one of the choices of an option; ValueError for another."""
     allowed = tuple(choices)
     if isinstance(value, str) and value in allowed:
         return value

@@ -83,11 +83,7 @@ def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[st
 
 
 def optional_package(name: str, extra: str | None = None) -> Any:
-    """Import an optional package, which an ``extra`` of this package installs if given.
-
-    Raises:
-        MissingPackageError: It is not installed.
-    """
+    """Import an optional package, which an ``extra`` of this package installs if given, or MissingPackageError."""
     try:
         return import_module(name)
     except ModuleNotFoundError as error:

@@ -12,9 +12,7 @@ from typing import BinaryIO
 def open_regular(path: str | Path) -> BinaryIO:
     """Open a regular file to read its bytes.
 
-    Raises:
-        OSError: No such file, a folder, pipe, socket or device, or a name that no file can have. Its ``strerror`` says
-            which.
+    OSError, whose ``strerror`` says which, for no such file, a folder, pipe or device, or an impossible name.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))

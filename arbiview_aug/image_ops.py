@@ -135,8 +135,7 @@ class Scratch:
 class Memory:
     """Memory for arrays, used again when nothing refers to them any more: page faults cost more than filling it.
 
-    Args:
-        limit: Bytes that are kept for the next array of the same size; 0 keeps none.
+    ``limit`` bytes are kept for the next array of the same size; 0 keeps none.
     """
 
     def __init__(self, limit: int = 512 * 2**20) -> None:

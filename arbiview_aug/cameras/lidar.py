@@ -47,12 +47,10 @@ class Lidar:
     azimuth_deg: tuple[float, float] = (-180.0, 180.0)
 
     def __post_init__(self) -> None:
-        name = self.name
-        if not isinstance(name, str) or not name:
-            raise CalibrationError(f"lidar name: expected a non-empty string, got {shown(name)}")
+        if not isinstance(self.name, str) or not self.name:
+            raise CalibrationError(f"lidar name: expected a non-empty string, got {shown(self.name)}")
         with _of_lidar():
-            checked = self._checked()
-        self.__dict__.update(checked)
+            self.__dict__.update(self._checked())
 
     def _checked(self) -> dict[str, Any]:
         name, elevations = self.name, self.elevations_deg

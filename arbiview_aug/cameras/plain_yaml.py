@@ -98,11 +98,9 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def parse_yaml(text: str) -> Any:
-    """Plain data of a YAML document.
+    """Plain data of a YAML document; YAMLError for anything else.
 
-    Raises:
-        ValueError: A key that stands twice, aliases that lead back or multiply to too many values, a wrong tag.
-        yaml.YAMLError: Anything else that is no plain YAML.
+    ValueError for a key that stands twice, aliases that lead back or multiply to too many values, or a wrong tag.
     """
     loader = _Loader(text)
     try:

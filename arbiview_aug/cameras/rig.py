@@ -289,11 +289,7 @@ def load_rig(name_or_path: Rig | str | Path) -> Rig:
 
 
 def read_rig(path: Path) -> tuple[Rig, str]:
-    """The rig of a file, or of another tool's file or folder, and how that was read; one warning names likely mistakes.
-
-    Raises:
-        CalibrationError: As ``load_rig``.
-    """
+    """As ``load_rig``, of a file or folder, and how that was read; one warning names likely mistakes."""
     where = f"rig file {path}"
     if not os.path.exists(path):  # unlike Path.exists, False for a name that is too long
         expected = f"a file or one of the shipped rigs ({', '.join(shipped_rigs())})"

@@ -109,12 +109,8 @@ class Frame:
 def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
     """Read and check the frames of a sample, one for each element of its leading dimensions.
 
-    ``source`` is the rig of samples that carry none; one that carries another calibration is refused.
-
-    Raises:
-        SampleError: Missing calibration, mismatched counts or sizes, values out of range.
-        SampleTypeError: PIL images, numpy arrays and the like, with the conversion to use.
-        CalibrationError: Impossible K, cam2ego or lens.
+    ``source`` is the rig of samples that carry none; one that carries another calibration is refused. SampleError for
+    missing calibration, counts, sizes or values; SampleTypeError for PIL images, arrays and the like; CalibrationError.
     """
     if not isinstance(sample, Mapping):
         raise SampleTypeError(f"sample: expected a dict, got {type(sample).__name__}")
@@ -140,8 +136,7 @@ def read_frames(sample: Any, source: Rig | None) -> list[Frame]:
 def read_scene(frame: Frame, surface: str) -> Scene | None:
     """Read the geometry that a surface of ``GEOMETRIES`` uses, in the source's ego frame; None without any.
 
-    Raises:
-        SampleError: The sample lacks what the surface needs, or it is impossible.
+    SampleError for a sample that lacks what the surface needs, or in which it is impossible.
     """
     row, sample = GEOMETRIES[surface], frame.sample
     arrays: dict[str, Geometry] = {}

@@ -253,16 +253,12 @@ def test_ros_questions(tmp_path: Path) -> None:
         ("metres_per_unit: -1", "metres_per_unit: expected a positive number, got -1"),
         (f"ground_z_m: low\nposes: {{front: {ROWS}}}", "ground_z_m: expected a finite height"),
         ("poses: !!python/name:os.system ''", "mounting.yaml: expected plain YAML"),
-        (f"poses: {{front: {ROWS}, frnt: {ROWS}}}", "poses: expected cameras of front, got frnt: rename or remove it"),
+        (
+            f"poses: {{front: {ROWS}, frnt: {ROWS}}}",
+            "poses: expected cameras of front, got frnt: write names as in the files",
+        ),
         (f"poses: {{front: {ROWS}}}\nnames: {{0: left}}", "names: expected cameras of front, got 0: "),
-        (
-            f"poses: {{cam: {ROWS}}}\nnames: {{front: cam}}",
-            "poses: expected .* in the files, got its new one, cam: write fr",
-        ),
-        (
-            "sizes: {cam: {width: 3}}\nnames: {front: cam}",
-            "sizes: expected a camera's name in the files, got its new o",
-        ),
+        ("sizes: {cam: {width: 3}}\nnames: {front: cam}", "camera 'front': where is it on the vehicle"),
         (f"poses: {{front: {ROWS}}}\nsizes: {{left: {{width: 3}}}}", "sizes: expected cameras of front, got left: "),
         ("tokens: c2", "mounting.yaml: tokens: expected a list, got 'c2'"),
     ],

@@ -96,10 +96,8 @@ _BROKEN = (
 def read_calibration(path: Path, where: str) -> Any:
     """Plain data in the rig file's format of a rig file, or of a tool's file or folder, then with ``notes``.
 
-    Raises:
-        CalibrationError: A file that is not as its tool writes it, or that lacks what ``mounting.yaml`` could say; a
-            folder with a camera that is not read.
-        ImportError: Argoverse 2's files without pyarrow.
+    CalibrationError for a file that is not as its tool writes it or lacks what ``mounting.yaml`` could say, and for a
+    folder with a camera that is not read; ImportError for Argoverse 2's files without pyarrow.
     """
     is_folder = os.path.isdir(path)
     try:

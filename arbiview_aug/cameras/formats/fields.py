@@ -83,8 +83,7 @@ def _meanings(data: Mapping[Any, Any], name: str = "") -> dict[str, tuple[str, A
 def read_fields(name: str, data: Mapping[Any, Any]) -> tuple[str, FloatArray, Any, tuple[float, float] | None, bool]:
     """A camera's lens, (3, 3) intrinsics, coefficients and (width, height), and whether P has a baseline.
 
-    Raises:
-        CalibrationError: No camera matrix, an unknown lens, or a key that would change the views and is not read.
+    CalibrationError without a camera matrix, and for an unknown lens or an unread key that would change the views.
     """
     found = {meaning: (key, value) for meaning, (key, value) in _meanings(data, name).items() if value is not None}
     for meaning in found.keys() & _SCALARS:

@@ -43,11 +43,7 @@ class Mounting:
 
     @classmethod
     def read(cls, folder: Path) -> Mounting:
-        """The file in a folder; empty without one.
-
-        Raises:
-            CalibrationError: Unknown keys or impossible values.
-        """
+        """The file in a folder, empty without one; CalibrationError for unknown keys or impossible values."""
         path = folder / MOUNTING
         data = read_plain(path, MOUNTING) if path.is_file() else {}
         keys = cls.__dataclass_fields__
@@ -60,12 +56,6 @@ class Mounting:
             data[key] = {str(name): value for name, value in data[key].items()}
         if not isinstance(data.get("tokens", []), list):
             raise CalibrationError(f"{MOUNTING}: tokens: expected a list, got {shown(data['tokens'])}")
-        names = data.get("names", {})
-        for key in {"poses", "sizes"} & set(data):
-            for old, new in names.items():
-                if new in [*data[key]] and new not in [*names]:
-                    got = f"its new one, {new}: write {old}"
-                    raise CalibrationError(f"{MOUNTING}: {key}: expected a camera's name in the files, got {got}")
         poses = {name: pose_of(name, value) for name, value in data.get("poses", {}).items()}
         scale = data.get("metres_per_unit")
         if scale is not None and not (type(scale) in (int, float) and 0 < scale < math.inf):
@@ -77,7 +67,7 @@ class Mounting:
         sizes = {} if "width" in self.sizes else self.sizes
         for key, values in (("poses", self.poses), ("sizes", sizes), ("names", self.names)):
             if unknown := [name for name in values if name not in cameras]:
-                got = f"{', '.join(unknown)}: rename or remove it"
+                got = f"{', '.join(unknown)}: write names as in the files, or remove it"
                 raise CalibrationError(f"{MOUNTING}: {key}: expected cameras of {', '.join(cameras)}, got {got}")
 
     def pose(self, name: str, instead: str = "") -> FloatArray:

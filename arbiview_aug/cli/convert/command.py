@@ -106,8 +106,7 @@ def _difference(path: Path, recorded: str | None, fix: str) -> Iterator[str]:
 def run(arguments: argparse.Namespace) -> int:
     """Convert this shard's missing samples; the shard that completes them all finishes the output.
 
-    Returns:
-        0; 1 if samples could not be read or rendered (unless skipped), or files could not be written.
+    Returns 0; 1 if samples could not be read or rendered (unless skipped), or files could not be written.
     """
     if arguments.motion_depth is not None:
         _check_depth(arguments.motion_depth, arguments.geometry)

@@ -180,8 +180,7 @@ class Jobs(Dataset[Done]):
         sources = self.source_files(index)
         sums = {path: checksum_once(path) for path in sources.values()}
         record: dict[str, Any] = {
-            "token": self.data.tokens[index],
-            "ground_z_m": rig.ground_z_m,
+            **{"token": self.data.tokens[index], "ground_z_m": rig.ground_z_m},
             "cameras": [{**camera, "file": image} for camera, image in zip(cameras, images, strict=True)],
             "coverage": coverage,
             "files": {name: len(content) for name, content in files.items()}
@@ -192,8 +191,7 @@ class Jobs(Dataset[Done]):
             "source_bytes": _sizes(sources),
             **facts,
         }
-        without = [frame["token"] for frame in sample.get("neighbours", ()) if frame.is_broken]
-        if without:
+        if without := [frame["token"] for frame in sample.get("neighbours", ()) if frame.is_broken]:
             record["without"] = without
         self._remove_former(record["token"], record["files"])
         self.manifest.write(record, owner=str(index))

@@ -97,15 +97,13 @@ def check_output(settings: Settings) -> None:
     """Raise DataError if the output overlaps the source, or holds files that no conversion wrote."""
     try:
         source, output = (Path(os.path.realpath(path)) for path in (settings.root, settings.output))  # links may loop
-    except ValueError:
-        raise DataError(f"--output {str(settings.output)!a}: expected a folder's name, got a NUL in it") from None
+        str(output).encode()
+    except ValueError:  # NUL, or a lone surrogate
+        name = f"{str(settings.output)!a}"
+        raise DataError(f"--output {name}: expected a folder whose name is UTF-8, without NUL") from None
     if source == output or source in output.parents or output in source.parents:
         where = "the source itself" if source == output else "in it" if source in output.parents else "around it"
         raise DataError(f"--output {settings.output}: expected a folder apart from the source {source}, got {where}")
-    try:
-        str(output).encode()
-    except UnicodeEncodeError:
-        raise DataError(f"--output: expected a folder whose name is UTF-8, got {str(output)!a}") from None
     if not os.path.lexists(output):
         return
     if not output.is_dir():

@@ -80,9 +80,7 @@ COUNTS = Kind(
 class Tables:
     """The tables of one version, from its JSON files below ``root`` or from a devkit ``NuScenes`` object.
 
-    Raises:
-        DataError: No such folder, or both or none of root and nusc.
-        SampleTypeError: ``nusc`` is no devkit object.
+    DataError for no such folder, or both or none of root and nusc; SampleTypeError if ``nusc`` is no devkit object.
     """
 
     def __init__(self, root: str | Path | None, version: str, nusc: Any) -> None:
