@@ -8,7 +8,7 @@ import pytest
 
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.errors import CalibrationError
-from arbiview_aug.favs.stage1_geometry import check_homography, h_geom
+from arbiview_aug.favs.stage1_geometry import check_homography, h_geom, h_planar
 from tests import helpers
 
 camera = partial(helpers.camera, "c", size=(360, 640), horizontal_fov_deg=70.0)
@@ -33,6 +33,18 @@ def test_turning_left_moves_the_scene_right() -> None:
     assert apply(np.linalg.inv(H), center)[0, 0] < 319.5 - 50
 
 
+def test_h_planar_is_exact_on_its_plane_and_tends_to_h_geom() -> None:
+    source, target = camera(0), camera(12, position_m=(0.8, 0.3, 2.2))
+    down_in_camera = source.cam2ego[:3, :3].T @ np.array([0.0, 0.0, -1.0])
+    road = np.array([[8.0, 1.0, 0.0], [15.0, -3.0, 0.0], [30.0, 4.0, 0.0]])
+    H = h_planar(source, target, -down_in_camera, source.center_m[2])  # normal towards the camera: up
+    assert np.allclose(apply(H, source.project(road).uv), target.project(road).uv, atol=1e-6)
+    wrong = h_planar(source, target, down_in_camera, source.center_m[2])
+    assert np.abs(apply(wrong, source.project(road).uv) - target.project(road).uv).max() > 5
+    far = h_planar(source, target, -down_in_camera, 1e12)
+    assert np.allclose(far / far[2, 2], h_geom(source, target) / h_geom(source, target)[2, 2], atol=1e-6)
+
+
 def test_check_homography() -> None:
     size = (360, 640)
     assert check_homography(np.eye(3), size)
@@ -51,3 +63,5 @@ def test_messages() -> None:
     radtan = load_rig("waymo")[0]
     with pytest.raises(CalibrationError, match=r"'FRONT': a homography .* needs a pinhole lens.*undistorted"):
         h_geom(radtan, camera())
+    with pytest.raises(CalibrationError, match="distance_m: expected a positive distance"):
+        h_planar(camera(), camera(), np.array([0.0, -1.0, 0.0]), 0.0)
