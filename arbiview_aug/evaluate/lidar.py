@@ -20,7 +20,6 @@ import numpy.typing as npt
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import Image
 from arbiview_aug.evaluate.metrics import errors, ssim_map
 from arbiview_aug.scene.point_cloud import own_car
@@ -98,7 +97,6 @@ def coloured_points(rig: Rig, images: Sequence[Image], points: FloatArray) -> Co
 
     Drops returns of the own car and points that no camera sees outside its car-body mask.
     """
-    _check_images(rig, images)
     points = points[~own_car(points), :3].astype(np.float64)
     colours, best_cosine = np.zeros((len(points), 3)), np.full(len(points), -1.0)
     for camera, image in zip(rig, images, strict=True):
@@ -119,7 +117,6 @@ def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray) -> F
     Least squares on log-gains g: g_a - g_b = -median(log brightness_a - log brightness_b) for each pair of cameras with
     at least 20 shared points that are neither dark nor saturated, with weak priors g = 0 and sum g = 0.
     """
-    _check_images(rig, images)
     count = len(rig)
     light = np.full((count, len(points)), np.nan)  # log brightness
     for k, (camera, image) in enumerate(zip(rig, images, strict=True)):
@@ -163,8 +160,6 @@ def sparse_metrics(
         but at the points; ``coverage``, the share of points on covered pixels; and ``points``, their number. None if
         no point is visible.
     """
-    if image.shape[:2] != camera.size:
-        raise SampleError(f"camera {camera.name!r}: expected an image of {camera.size}, got {image.shape[:2]}")
     h, w = camera.size
     index, uv, _ = visible_points(camera, points.points)
     if len(index) == 0:
@@ -187,11 +182,3 @@ def _unmasked(camera: Camera, seen: VisiblePoints) -> VisiblePoints:
         return seen
     keep = colours_at(camera.mask.astype(np.float32), seen.uv) > 0.99
     return VisiblePoints(seen.indices[keep], seen.uv[keep], seen.depth_m[keep])
-
-
-def _check_images(rig: Rig, images: Sequence[Image]) -> None:
-    if len(images) != len(rig):
-        raise SampleError(f"images: expected one for each of the rig's {len(rig)} cameras, got {len(images)}")
-    for camera, image in zip(rig, images, strict=True):
-        if image.shape != (*camera.size, 3):
-            raise SampleError(f"camera {camera.name!r}: expected an image of {(*camera.size, 3)}, got {image.shape}")

@@ -10,7 +10,6 @@ import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray
-from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import Image
 
 _PEAK = 255.0
@@ -111,14 +110,7 @@ def truth_metrics(
         ``spectrum_distance_db``. ``share`` is the region's part of the valid pixels. A region without pixels has a
         share of 0 and no other entries.
     """
-    shape = image.shape[:2]
-    if image.shape != truth.shape:
-        raise SampleError(f"truth: expected the rendered image's shape {image.shape}, got {truth.shape}")
-    masks = {"coverage": coverage, "valid": valid, **(classes or {})}
-    for name, mask in masks.items():
-        if mask is not None and (mask.shape != shape or mask.dtype != np.bool_):
-            raise SampleError(f"{name}: expected a bool mask of {shape}, got {mask.dtype} of {mask.shape}")
-    everywhere = np.ones(shape, bool) if valid is None else valid
+    everywhere = np.ones(image.shape[:2], bool) if valid is None else valid
     regions = {"": everywhere}
     if coverage is not None:
         regions |= {"covered_": everywhere & coverage, "hole_": everywhere & ~coverage}

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.lidar import (
     ColouredPoints,
     coloured_points,
@@ -169,14 +168,3 @@ def test_lidar_split_alternates_by_azimuth() -> None:
     fit, test = lidar_split(np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], 1) * 20)
     assert fit.tolist() == [True, False, True, False, True, False]
     np.testing.assert_array_equal(test, ~fit)
-
-
-def test_messages() -> None:
-    rig = Rig([camera()])
-    with pytest.raises(SampleError, match=r"expected one for each of the rig's 1 cameras, got 2"):
-        coloured_points(rig, [plain((1, 1, 1))] * 2, wall())
-    with pytest.raises(SampleError, match=r"camera 'front': expected an image of \(81, 101, 3\), got \(101, 81, 3\)"):
-        coloured_points(rig, [plain((1, 1, 1)).transpose(1, 0, 2)], wall())
-    points = coloured_points(rig, [plain((1, 1, 1))], wall())
-    with pytest.raises(SampleError, match=r"camera 'front': expected an image of \(81, 101\), got \(40, 50\)"):
-        sparse_metrics(np.zeros((40, 50, 3), np.uint8), camera(), points)

@@ -48,21 +48,6 @@ def test_float_images_are_scored_with_their_fractions() -> None:
     assert truth_metrics(truth + 0.25, truth)["mae"] == pytest.approx(0.25)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"truth": np.zeros((8, 9, 3), np.uint8)}, r"truth: expected the rendered image's shape \(8, 8, 3\)"),
-        ({"coverage": np.ones((8, 8), np.uint8)}, r"coverage: expected a bool mask of \(8, 8\), got uint8"),
-        ({"valid": np.ones((8, 9), bool)}, r"valid: expected a bool mask of \(8, 8\), got bool of \(8, 9\)"),
-        ({"classes": {"sky": np.ones((9, 8), bool)}}, r"sky: expected a bool mask"),
-    ],
-)
-def test_messages(changes: dict, message: str) -> None:
-    image = np.zeros((8, 8, 3), np.uint8)
-    with pytest.raises(SampleError, match=message):
-        truth_metrics(**{"image": image, "truth": image, **changes})
-
-
 def test_errors_by_hand() -> None:
     found = errors(np.array([[10, 20, 30]], np.uint8), np.array([[13, 16, 30]], np.uint8), "a_")
     expected = {"a_psnr_db": 10 * np.log10(255**2 / (25 / 3)), "a_mae": 7 / 3, "a_rmse": (25 / 3) ** 0.5}
