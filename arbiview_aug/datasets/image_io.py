@@ -162,23 +162,20 @@ def decode_view_masks(
             is_filled = key == "coverage"  # a reduced pixel is as its filled ones are only if all of its pixels are
             views = []
             for name, size, path in zip(names, sizes, of_key, strict=True):
-                mask = np.full(size, is_filled) if path is None else _view_mask(path, f"camera {name!r}: {key}", size)
+                mask = np.full(size, is_filled)
+                if path is not None:
+                    mask = _view_mask(path, f"camera {name!r}: {key} {path}", size)
                 views.append(mask if reduce == 1 else _reduced_mask(mask == is_filled, reduce) == is_filled)
             masks[key] = stacked([torch.from_numpy(view) for view in views])
     return masks
 
 
 def _view_mask(path: Path, label: str, size: tuple[int, int]) -> BoolArray:
-    image = decode_grey(path, label)
+    image = _decoded(_content(path, label), label, "file", cv2.IMREAD_GRAYSCALE)
     if image.shape != size:
-        got = f"{image.shape[1]}x{image.shape[0]}"
-        raise DataError(f"{label}: expected an image {path} of {size[1]}x{size[0]} (w x h), got {got}; convert again")
+        got = f"{image.shape[1]}x{image.shape[0]}; convert again"
+        raise DataError(f"{label}: expected an image of {size[1]}x{size[0]} (w x h), got {got}")
     return image > 0
-
-
-def decode_grey(path: Path, label: str) -> ByteArray:
-    """Decode an image file as grey levels (h, w); DataError by ``label`` for one that is missing or broken."""
-    return _decoded(_content(path, label), label, "file", cv2.IMREAD_GRAYSCALE)
 
 
 def _content(path: Path, label: str) -> bytes:
