@@ -206,7 +206,7 @@ def test_view_masks_that_are_no_images(tmp_path: Path) -> None:
     (tmp_path / "text.png").write_text("none")
     (tmp_path / "empty.png").touch()
     for name in ("pipe", "text", "empty", "none"):
-        with pytest.raises(DataError, match="camera 'left': coverage .*: expected"):
+        with pytest.raises(DataError, match=r"camera 'left': coverage .*: expected"):
             decode_view_masks({"coverage": [tmp_path / f"{name}.png"]}, names=["left"], sizes=[(4, 6)])
 
 
