@@ -25,13 +25,13 @@ from arbiview_aug.scene.depth_map import motion_camera
 PACKAGE = str(Path(arbiview_aug.__file__).parent)
 BOUNDS = {
     "street, plan cached": (15, 47),
-    "LiDAR + boxes": (25, 600),
-    "LiDAR + boxes, points scanned": (31, 650),
-    "learned depth": (27, 600),
-    "generated": (28, 1500),
-    "neighbours, all": (33, 2500),
-    "motion": (41, 2600),
-    "paper": (19, 180),
+    "LiDAR + boxes": (27, 600),
+    "LiDAR + boxes, points scanned": (32, 650),
+    "learned depth": (28, 600),
+    "generated": (29, 1500),
+    "neighbours, all": (35, 2500),
+    "motion": (43, 2600),
+    "paper": (20, 180),
 }
 """Most files and crossings that a call may have."""
 

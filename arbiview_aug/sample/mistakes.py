@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_mounted, pose_mistake
 from arbiview_aug.sample.camera_mistakes import (
@@ -57,13 +58,12 @@ def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
         of_rig = check_rig(frame.rig, masks=is_recorded and sample.get("ego_mask") is None)
         findings += of_rig
         findings += _image_findings(frame)
-        given = {key: frame.array(key) for key in ("boxes_3d", "points", "ego2world")}
+        given = {key: frame.array(key) for key in ("boxes_3d", "points")}
         boxes = None if given["boxes_3d"] is None else checked_boxes(given["boxes_3d"])
         points = None if given["points"] is None else checked_points(given["points"])
-        ego2world = None if given["ego2world"] is None else np.asarray(given["ego2world"], np.float64)
         # Images tell nothing through poses that are all wrong.
         is_clear = is_recorded and all(finding.where != "cam2ego" for finding in of_rig)
-        findings += label_findings(frame.rig, frame.images if is_clear else (), boxes, points, ego2world)
+        findings += label_findings(frame.rig, frame.images if is_clear else (), boxes, points, _pose(frame))
         if is_clear:
             findings += neighbour_findings(neighbour_errors(frame.rig, frame.images))
     if is_recorded and sample.get("ego_mask") is None:
@@ -74,7 +74,7 @@ def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
 def check_own_car(frames: Sequence[Frame]) -> list[Finding]:
     """Cameras of one moving vehicle that see it, in frames that know their poses."""
     first = frames[0].rig
-    poses = [np.asarray(pose, np.float64) for frame in frames if (pose := frame.array("ego2world")) is not None]
+    poses = [pose for frame in frames if (pose := _pose(frame)) is not None]
     same = all(
         frame.rig.names == first.names
         and frame.rig.sizes == first.sizes
@@ -89,6 +89,12 @@ def check_own_car(frames: Sequence[Frame]) -> list[Finding]:
             fix = "mask it in the rig file: True on the scene"
             findings.append(Finding(f"camera {camera.name!r}: mask", "a mask that hides the own car", found, fix))
     return findings
+
+
+def _pose(frame: Frame) -> FloatArray | None:
+    """The frame's ``ego2world`` (4, 4); None without one, or for other shapes, which only neighbours need refuse."""
+    pose = frame.array("ego2world")
+    return None if pose is None or np.shape(pose) != (4, 4) else np.asarray(pose, np.float64)
 
 
 def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:

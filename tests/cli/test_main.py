@@ -227,6 +227,8 @@ def test_every_option_that_names_a_file_refuses_what_no_file_is_called(command: 
 )
 def test_folders_that_are_not_utf_8(command: str, tmp_path: Path) -> None:
     """In processes of their own, which OpenCV would end."""
+    if command.startswith("view"):
+        pytest.importorskip("rerun", reason="Rerun is not installed: pip install 'arbiview_aug[viewer]'")
     root = latin(tmp_path)
     write_frame(root / "data", street_sample((48, 72)))
     names = {"DATA": f"{root}/data", "OUT": f"{root}/out", "PLAIN": f"{tmp_path}/plain"}

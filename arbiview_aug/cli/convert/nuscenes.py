@@ -82,6 +82,12 @@ class NuScenes(Writer):
         self.tables = Tables(data.root, data.version, None)
         self.moment = data.lidar_channel or data.channels[0]
         self.there = [name for name in _TABLES if self.tables.path(name).is_file()]  # in writing order
+        labels = {"instance", "sample_annotation"}
+        if len(lacking := labels - {*self.there}) == 1:  # its rows name those of the other one
+            missing = self.tables.path(*lacking)
+            raise DataError(
+                f"nuScenes {data.root}: expected the tables {' and '.join(sorted(labels))} or neither, got no {missing}"
+            )
         self.written = [name for name in self.there if not (self.scanned and name in _OF_POINTS)]
         if lenses := [f"{camera.name} ({camera.lens})" for camera in self.target if not camera.is_rectilinear]:
             name = self.target.name or "the target"
