@@ -1,4 +1,4 @@
-"""Reading of files: regular, of bounded size, by bytes. OpenCV and numpy never open a path themselves."""
+"""Reading of files: regular and of bounded size, before a library sees their paths or bytes."""
 
 from __future__ import annotations
 
