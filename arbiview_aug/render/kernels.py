@@ -16,7 +16,7 @@ from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_ro
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.environment import called, compiled, inlined
 from arbiview_aug.render.plan import OUTSIDE
-from arbiview_aug.scene.boxes import PARTS, PIECES, RIM_PART, TOP_PART
+from arbiview_aug.scene.boxes import PIECES
 from arbiview_aug.scene.kernels import upsampled_row
 
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
@@ -29,9 +29,6 @@ SAME_OBJECT_M = np.float32(0.15)
 
 WHOLE = 0.97
 """Share of an object's nodes, among those of the source that sees most, from which a source sees it whole."""
-
-RIM_PX = 3
-"""Height of a rim: roofs have frames of some centimetres, below which windows begin."""
 
 _BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
@@ -638,147 +635,6 @@ def cut_bands(
             for x in range(out.shape[0]):
                 out_frac[x] = fraction[x] if out[x] > _ZERO else np.uint16(0)
             at += x1 - x0
-
-
-@compiled
-def farthest_occluded(q: Any, face: Any, layers: Any, cell: int, farthest: Any) -> None:
-    """Least inverse distance (ny, nx) of the occluded background in each cell; infinity without any.
-
-    Args:
-        q: (h, w) inverse distances, 0 where unknown.
-        face: (h, w) int32 faces of objects, -1 elsewhere; (0, 0) without any.
-        layers: (h, w) uint8, 1 (``plan.OCCLUDED``) where a pixel is a hole in a source's image.
-        cell: Side of a cell, pixels.
-        farthest: (ny, nx) float32, written.
-    """
-    (h, w), (ny, nx) = q.shape, farthest.shape
-    low, lower = np.empty(w, np.float32), np.empty(w, np.float32)
-    for j in range(ny):
-        low[:] = np.inf
-        for y in range(j * cell, min(j * cell + cell, h)):
-            row, layer = q[y], layers[y]
-            if face.shape[0]:
-                faces = face[y]
-                for x in range(w):
-                    occluded = (layer[x] == 1) & (faces[x] < 0) & (row[x] > _ZERO)
-                    lower[x] = min(low[x], row[x]) if occluded else low[x]
-            else:
-                for x in range(w):
-                    lower[x] = min(low[x], row[x]) if (layer[x] == 1) & (row[x] > _ZERO) else low[x]
-            low, lower = lower, low
-        for i in range(nx):
-            least = low[i * cell]
-            for x in range(i * cell, min(i * cell + cell, w)):
-                least = min(least, low[x])
-            farthest[j, i] = least
-
-
-@compiled
-def mark_objects(q: Any, face: Any, winner: Any, limit: Any, cell: int, layers: Any) -> None:
-    """Mark objects, and what is nearer than occluded background beside it.
-
-    Args:
-        q: (h, w) inverse distances.
-        face: (h, w) int32 faces of objects, -1 elsewhere; (0, 0) without any.
-        winner: (h, w) int8 source, -1 for none.
-        limit: (ny, nx) float32 inverse distances above which seen pixels of a cell are nearer.
-        cell: Side of a cell, pixels.
-        layers: (h, w) uint8, updated to ``plan.OBJECT``.
-    """
-    (h, w), nx = q.shape, limit.shape[1]
-    limits = np.empty(w, np.float32)
-    for y in range(h):
-        row, who, out = q[y], winner[y], layers[y]
-        for i in range(nx):
-            limits[i * cell : i * cell + cell] = limit[y // cell, i]
-        for x in range(w):
-            out[x] = np.uint8(2) if (row[x] > limits[x]) & (who[x] >= 0) else out[x]
-        if face.shape[0]:
-            faces = face[y]
-            for x in range(w):
-                out[x] = np.uint8(2) if faces[x] >= 0 else out[x]
-
-
-@compiled
-def find_paint(face: Any, part: Any, winner: Any, step: int, margin: int, table: Any) -> tuple[int, int]:
-    """Find the unseen pixels of objects, and a sample of seen ones; return their numbers.
-
-    The first ``RIM_PX`` seen pixels of the cabin below each column of an unseen roof are samples of its rim. Vehicles
-    without another sample give all their seen pixels.
-
-    Args:
-        face: (h, w) int32 faces of objects, -1 elsewhere.
-        part: (F,) int32 ``scene.boxes.BoxSurface.face_parts``.
-        winner: (h, w) int8 source, -1 for none.
-        step: Distance of samples.
-        margin: Distance at which pixels around a sample must be of its face.
-        table: (4, 2 h w) int32, written: the first four attributes of ``plan.Paint``.
-    """
-    h, w = face.shape
-    hidden, sampled, is_known = 0, 0, np.ones(part.shape[0], np.bool_)
-    for number in range(part.shape[0]):
-        if part[number] % PARTS:
-            is_known[part[number] // PARTS] = False
-    for y in range(h):
-        for x in range(w):
-            number = face[y, x]
-            if number < 0:
-                continue
-            if winner[y, x] < 0:
-                table[0, hidden], table[1, hidden] = y * w + x, part[number]
-                hidden += 1
-                first, below = part[number] - TOP_PART, face[min(y + 1, h - 1), x]
-                if first % PARTS or below < 0 or part[below] != first:
-                    continue  # no top, or no cabin of the same object below it
-                for yy in range(y + 1, min(y + 1 + RIM_PX, h)):
-                    if face[yy, x] != below or winner[yy, x] < 0:
-                        break
-                    table[2, sampled], table[3, sampled] = yy * w + x, first + RIM_PART
-                    sampled += 1
-            elif y % step == 0 and x % step == 0 and min(y, x, h - 1 - y, w - 1 - x) >= margin:
-                if (
-                    face[y - margin, x] == number
-                    and face[y + margin, x] == number
-                    and face[y, x - margin] == number
-                    and face[y, x + margin] == number
-                ):
-                    table[2, sampled], table[3, sampled] = y * w + x, part[number]
-                    is_known[part[number] // PARTS] = True
-                    sampled += 1
-    for y in range(h):
-        for x in range(w):
-            number = face[y, x]
-            if number >= 0 and winner[y, x] >= 0 and not is_known[part[number] // PARTS]:
-                table[2, sampled], table[3, sampled] = y * w + x, part[number]
-                sampled += 1
-    return hidden, sampled
-
-
-@compiled
-def nearest_seen(face: Any, part: Any, winner: Any, pixel: Any, nearest: Any) -> None:
-    """Find the seen pixels next to unseen ones in their row and column, across unseen ones of the same body or cabin.
-
-    Args:
-        face: (h, w) int32 faces of objects.
-        part: (F,) int32 ``scene.boxes.BoxSurface.face_parts``.
-        winner: (h, w) int8 source, -1 for none.
-        pixel: (n,) int32 unseen pixels of objects, into the flattened view, ascending.
-        nearest: (4, n) int32, written: seen pixels to the left, above, to the right, below; -1 for none.
-    """
-    h, w = face.shape
-    number = np.empty((h, w), np.int32)
-    for k in range(pixel.shape[0]):
-        number[pixel[k] // w, pixel[k] % w] = k
-    for way in range(4):
-        dy, dx = (way == 3) - (way == 1), (way == 2) - (way == 0)
-        for n in range(pixel.shape[0]):
-            k = pixel.shape[0] - 1 - n if way > 1 else n
-            y, x = pixel[k] // w + dy, pixel[k] % w + dx
-            nearest[way, k] = -1
-            if 0 <= y < h and 0 <= x < w and face[y, x] >= 0:
-                one, two = part[face[pixel[k] // w, pixel[k] % w]], part[face[y, x]]
-                if one // PARTS == two // PARTS and (one % PARTS > 0) == (two % PARTS > 0):
-                    nearest[way, k] = y * w + x if winner[y, x] >= 0 else nearest[way, number[y, x]]
 
 
 @compiled

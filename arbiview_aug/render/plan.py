@@ -242,7 +242,7 @@ class Paint:
     part: npt.NDArray[np.int32]  # (n,) int32 what they show: ``scene.boxes.BoxSurface.face_parts``
     sample: npt.NDArray[np.int32]  # (m,) int32 seen pixels of objects, a sample
     sample_part: npt.NDArray[np.int32]  # (m,) int32 what those show
-    nearest: npt.NDArray[np.int32]  # (4, n) int32 seen pixels next to the unseen ones, ``kernels.nearest_seen``
+    nearest: npt.NDArray[np.int32]  # (4, n) int32 seen pixels next to the unseen ones, ``paint_kernels.nearest_seen``
 
     @property
     def nbytes(self) -> int:

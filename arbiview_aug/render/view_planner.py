@@ -54,8 +54,6 @@ from arbiview_aug.scene.surface import FAR_PARALLAX_PX, OcclusionMap, is_within_
 
 SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
-_SAMPLES = 64  # colours of objects are read so many times along a view's shorter side
-_INSIDE_PX = 2  # this far inside their faces: pixels at a border mix two colours
 MAGNIFIED = 0.8
 """A view is read by cubics where it has at most this many source pixels per pixel, and is mostly read at its own
 centre: docs/benchmarks.md (Ablation)."""
@@ -406,7 +404,7 @@ class ViewPlanner:
         self, geometry: _Geometry, winner: npt.NDArray[np.int8], layers: npt.NDArray[np.uint8]
     ) -> Paint | None:
         """Complete a view's layers by what is near."""
-        from arbiview_aug.render.kernels import farthest_occluded, mark_objects
+        from arbiview_aug.render.paint_kernels import farthest_occluded, find_paint, mark_objects
 
         farthest = np.empty(self._open.shape, np.float32)
         farthest_occluded(geometry.q, geometry.face, layers, self.step, farthest)
@@ -548,19 +546,6 @@ def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:
     known = np.where(valid, values, 0).astype(np.float32)
     total, count = (cv2.blur(p, (5, 5), borderType=cv2.BORDER_REPLICATE) for p in (known, valid.astype(np.float32)))
     return np.where(valid, known, total / np.maximum(count, np.float32(1e-6)))
-
-
-def find_paint(face: npt.NDArray[np.int32], winner: npt.NDArray[np.int8], parts: npt.NDArray[np.int32]) -> Paint:
-    """Find the unseen parts of objects in a view of faces (h, w), winning sources, and the parts (n,) of faces."""
-    from arbiview_aug.render import kernels
-
-    step = max(1, min(face.shape) // _SAMPLES)
-    columns = np.empty((4, 2 * face.size), np.int32)
-    hidden, sampled = kernels.find_paint(face, parts, winner, step, _INSIDE_PX, columns)
-    (pixel, part), (sample, sample_part) = columns[:2, :hidden].copy(), columns[2:, :sampled].copy()
-    nearest = np.empty((4, hidden), np.int32)
-    kernels.nearest_seen(face, parts, winner, pixel, nearest)
-    return Paint(pixel, part, sample, sample_part, nearest)
 
 
 # --- all views of a rig -----------------------------------------------------------------------------------------------

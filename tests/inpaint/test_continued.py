@@ -17,9 +17,9 @@ from arbiview_aug.inpaint import continued as holes_module
 from arbiview_aug.inpaint.continued import Continue, Mean, _line_directions, fill_holes, mean_colour, object_colours
 from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.inpaint.telea import Telea
-from arbiview_aug.render.kernels import farthest_occluded, mark_objects
+from arbiview_aug.render.paint_kernels import farthest_occluded, find_paint, mark_objects
 from arbiview_aug.render.plan import BACKGROUND, OBJECT, OCCLUDED, Paint
-from arbiview_aug.render.view_planner import build_plan, find_paint
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.boxes import PARTS, RIM_PART, TOP_PART
 from arbiview_aug.scene.scene import Scene
