@@ -34,16 +34,13 @@ from arbiview_aug.image_ops import at_level, level_size, some_of_cells
 from arbiview_aug.render.confidence import certainty
 from arbiview_aug.render.plan import (
     GRID_STEP_PX,
-    NEARER,
     ROAD_M,
     AtlasLayout,
     FixedMap,
-    Paint,
     RenderConfig,
     RenderPlan,
     SourceUse,
     ViewPlan,
-    nearer_cells,
 )
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.render.weights import SecondBest, seam_weights, source_weight
@@ -53,6 +50,7 @@ from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.scene.surface import FAR_PARALLAX_PX, OcclusionMap, is_within_wall, worst_parallax_px
 
 SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
+_NO_PARTS = np.zeros(0, np.int32)
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
 MAGNIFIED = 0.8
 """A view is read by cubics where it has at most this many source pixels per pixel, and is mostly read at its own
@@ -352,6 +350,7 @@ class ViewPlanner:
     def finish(self, layout: AtlasLayout) -> ViewPlan:
         """Winners, maps into the atlas, and blended bands."""
         from arbiview_aug.render.kernels import put_source, upsample_where
+        from arbiview_aug.render.paint_kernels import find_paint
 
         size, memory = self.camera.size, self.maps.memory
         fixed = FixedMap.outside(size, memory)
@@ -390,7 +389,8 @@ class ViewPlanner:
             geometry = self._geometry(name)
             road = self._road(geometry.behind)
             if geometry.face.size or layers.any():
-                paint = self._mark_objects(geometry, winner, layers)
+                parts = geometry.surface.face_parts if geometry.face.size else _NO_PARTS
+                paint = find_paint(geometry.q, geometry.face, parts, winner, self.step, layers)
         marked = layers if layers.any() else None
         return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, marked, paint, road)
 
@@ -399,19 +399,6 @@ class ViewPlanner:
         down = self._directions[..., 2] / np.maximum(behind, np.float32(1e-9))
         height_m = self.camera.center_m[2] - self.ground_z_m + down
         return np.asarray((height_m < ROAD_M) & (behind > 0))
-
-    def _mark_objects(
-        self, geometry: _Geometry, winner: npt.NDArray[np.int8], layers: npt.NDArray[np.uint8]
-    ) -> Paint | None:
-        """Complete a view's layers by what is near."""
-        from arbiview_aug.render.paint_kernels import farthest_occluded, find_paint, mark_objects
-
-        farthest = np.empty(self._open.shape, np.float32)
-        farthest_occluded(geometry.q, geometry.face, layers, self.step, farthest)
-        side = 2 * nearer_cells(self.camera.size, self.step) + 1
-        limit = cv2.erode(NEARER * farthest, np.ones((side, side), np.uint8))
-        mark_objects(geometry.q, geometry.face, winner, limit, self.step, layers)
-        return find_paint(geometry.face, winner, geometry.surface.face_parts) if geometry.face.size else None
 
     def _weights(self) -> npt.NDArray[np.float32]:
         """Weights (K, ny + 1, nx + 1) of the sources: their scores, for one source or hard seams."""

@@ -17,7 +17,7 @@ from arbiview_aug.inpaint import continued as holes_module
 from arbiview_aug.inpaint.continued import Continue, Mean, _line_directions, fill_holes, mean_colour, object_colours
 from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.inpaint.telea import Telea
-from arbiview_aug.render.paint_kernels import farthest_occluded, find_paint, mark_objects
+from arbiview_aug.render.paint_kernels import find_paint
 from arbiview_aug.render.plan import BACKGROUND, OBJECT, OCCLUDED, Paint
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.inputs import read_frames
@@ -457,15 +457,18 @@ def test_unlabelled_things_before_a_hole_are_found_by_their_distance() -> None:
     q[:, 20:30] = 0.2  # a post, and the background that it hides to its right
     winner, layers = np.zeros((64, 64), np.int8), np.zeros((64, 64), np.uint8)
     winner[:, 30:33], layers[:, 30:33] = -1, OCCLUDED
-    nothing, farthest = np.zeros((0, 0), np.int32), np.empty((16, 16), np.float32)
-    farthest_occluded(q, nothing, layers, 4, farthest)
-    assert (farthest[:, 7:9] == np.float32(0.05)).all() and np.isinf(np.delete(farthest, [7, 8], 1)).all()
-    mark_objects(q, nothing, winner, 1.5 * np.where(np.isinf(farthest), np.float32(0.05), farthest), 4, layers)
+    assert find_paint(q, np.zeros((0, 0), np.int32), FACE_PARTS, winner, 4, layers) is None
     assert (layers[:, 20:30] == OBJECT).all() and (layers[:, 30:33] == OCCLUDED).all()
     assert not layers[:, :20].any() and not layers[:, 33:].any()
 
 
 FACE_PARTS = np.array([1, 2, 3, 4, 0, 5, 8, 9, 10, 11, 7, 12], np.int32)  # two boxes, whose last faces are tops
+
+
+def paint_of(face: np.ndarray, winner: np.ndarray, parts: np.ndarray = FACE_PARTS) -> Paint:
+    paint = find_paint(np.ones(face.shape, np.float32), face, parts, winner, 8, np.zeros(face.shape, np.uint8))
+    assert paint is not None
+    return paint
 
 
 def painted(top_seen: bool, scale: float = 1.0) -> tuple[torch.Tensor, Paint, torch.Tensor]:
@@ -480,7 +483,7 @@ def painted(top_seen: bool, scale: float = 1.0) -> tuple[torch.Tensor, Paint, to
     seen = torch.ones((64, 64), dtype=torch.bool)
     seen[10:20, 36 if not top_seen else 54 : 60] = False
     view = (view * seen * scale).to(torch.uint8 if scale == 1 else torch.float32)
-    paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), FACE_PARTS)
+    paint = paint_of(face, np.where(seen.numpy(), 0, -1).astype(np.int8))
     return view, paint, seen
 
 
@@ -530,7 +533,7 @@ def test_roofs_take_their_bodies_paint_unless_the_rim_has_another(rim: Any, expe
     view[:, 35:50, 36:60] = torch.tensor([160, 60, 60])[:, None, None]
     view[:, 20:35, 36:60] = 30
     view[:, 20:23, 36:60] = torch.tensor(np.broadcast_to(rim, 3).copy())[:, None, None]
-    paint = find_paint(face, np.where(face == 11, -1, 0).astype(np.int8), parts)
+    paint = paint_of(face, np.where(face == 11, -1, 0).astype(np.int8), parts)
     edge = paint.sample[paint.sample_part == PARTS + RIM_PART] // 64
     assert sorted(set(edge.tolist())) == [20, 21, 22] and len(edge) == 3 * 24
     np.testing.assert_allclose(object_colours([view.numpy()], [paint])[PARTS + TOP_PART], expected, atol=1e-2)
@@ -562,7 +565,7 @@ def test_cracks_in_objects_take_the_colour_beside_them() -> None:
     seen = torch.ones((64, 64), dtype=torch.bool)
     seen[:, 20] = False
     view[:, ~seen] = 0
-    paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), FACE_PARTS)
+    paint = paint_of(face, np.where(seen.numpy(), 0, -1).astype(np.int8))
     (out,) = fill_holes([view], [seen], [np.full((64, 64), OBJECT, np.uint8)], [paint])
     assert (out[:, :, 20].int() - expected.int()).abs().max() <= 3  # a 33rd of it is the object's own colour
 
@@ -575,7 +578,7 @@ def test_sides_take_the_seen_pixels_in_their_row_and_column() -> None:
     seen = torch.ones((64, 64), dtype=torch.bool)
     seen[20:50, 22:54] = False  # up to the object's right end
     view *= seen
-    paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), FACE_PARTS)
+    paint = paint_of(face, np.where(seen.numpy(), 0, -1).astype(np.int8))
     layers = np.where(face >= 0, OBJECT, 0).astype(np.uint8)
     (out,) = fill_holes([view.clone()], [seen], [layers], [paint])
     assert abs(int(out[0, 27, 35]) - 40) <= abs(int(out[0, 27, 50]) - 40) < 80
@@ -593,7 +596,7 @@ def test_unseen_sides_take_no_colour_of_what_stands_before_them() -> None:
     seen[20:50, 30:54] = False
     view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
     view[:, 20:50, 10:26], view[:, 10:50, 26:30], view[:, 10:20, 30:54] = 180, 10, 90
-    paint = find_paint(face, np.where(seen, 0, -1).astype(np.int8), FACE_PARTS)
+    paint = paint_of(face, np.where(seen, 0, -1).astype(np.int8))
     assert len(paint.pixel) == 30 * 24 and (paint.nearest == -1).all()
     layers = np.where(face >= 0, OBJECT, 0).astype(np.uint8)
     (out,) = fill_holes([view * torch.from_numpy(seen)], [torch.from_numpy(seen)], [layers], [paint])
@@ -606,11 +609,11 @@ def test_unseen_cabins_and_bodies_have_colours_of_their_own() -> None:
     view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
     view[:, 10:30, 4:60], view[:, 30:50, 4:60] = 30, 150
     right = np.tile(np.where(np.arange(64) < 56, 0, -1), (64, 1)).astype(np.int8)  # its end is hidden
-    paint = find_paint(face, right, FACE_PARTS)
+    paint = paint_of(face, right)
     np.testing.assert_array_equal(object_colours([view.numpy()], [paint])[:5, 0], [30, 150, 150, 150, 150])
     red = torch.tensor([180, 50, 10], dtype=torch.uint8)[:, None, None]
     view[:, 10:30, 4:60], view[:, 12:20, 4:60] = torch.tensor([40, 60, 90])[:, None, None], red  # windows in red paint
-    paint = find_paint(face, np.where((face == 4) | (face < 0), 0, -1).astype(np.int8), FACE_PARTS)
+    paint = paint_of(face, np.where((face == 4) | (face < 0), 0, -1).astype(np.int8))
     np.testing.assert_array_equal(object_colours([view.numpy()], [paint])[1], red[:, 0, 0])  # no mixture of the two
 
 
@@ -621,9 +624,9 @@ def test_vehicles_of_which_only_an_edge_is_seen_are_painted() -> None:
     seen[21:50, 10:54] = False  # one row remains
     view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
     view[:, 20, 10:54] = 60
-    paint = find_paint(face, np.where(seen, 0, -1).astype(np.int8), FACE_PARTS)
+    paint = paint_of(face, np.where(seen, 0, -1).astype(np.int8))
     assert len(paint.sample) == 44 and object_colours([view.numpy()], [paint])[1, 0] == 60
-    small = find_paint(face, np.where(seen, 0, -1).astype(np.int8), np.zeros(1, np.int32))
+    small = paint_of(face, np.where(seen, 0, -1).astype(np.int8), np.zeros(1, np.int32))
     assert len(small.sample) == 0  # of a barrier or a head, an edge may be anything
 
 
@@ -633,7 +636,7 @@ def test_objects_that_nobody_sees_are_background() -> None:
     view = torch.full((3, 64, 64), 120, dtype=torch.uint8)
     view[:, 20:50, 10:30] = 10
     seen = torch.from_numpy(face != 6)
-    paint = find_paint(face, np.where(seen.numpy(), 0, -1).astype(np.int8), FACE_PARTS)
+    paint = paint_of(face, np.where(seen.numpy(), 0, -1).astype(np.int8))
     layers = np.where(face >= 0, OBJECT, 0).astype(np.uint8)
     (out,) = fill_holes([view * seen], [seen], [layers], [paint])
     assert (out[:, 22:48, 31:42].float() - 120).abs().max() <= 1
