@@ -454,12 +454,12 @@ def test_few_seen_pixels_have_a_mean_colour() -> None:
 
 def test_unlabelled_things_before_a_hole_are_found_by_their_distance() -> None:
     q = np.full((64, 64), 0.05, np.float32)
-    q[:, 20:30] = 0.2  # a post, and the background that it hides to its right
+    q[:, 26:30] = 0.2  # a post, and the background that it hides to its right
     winner, layers = np.zeros((64, 64), np.int8), np.zeros((64, 64), np.uint8)
     winner[:, 30:33], layers[:, 30:33] = -1, OCCLUDED
     assert find_paint(q, np.zeros((0, 0), np.int32), FACE_PARTS, winner, 4, layers) is None
-    assert (layers[:, 20:30] == OBJECT).all() and (layers[:, 30:33] == OCCLUDED).all()
-    assert not layers[:, :20].any() and not layers[:, 33:].any()
+    assert (layers[:, 26:30] == OBJECT).all() and (layers[:, 30:33] == OCCLUDED).all()
+    assert not layers[:, :26].any() and not layers[:, 33:].any()
 
 
 FACE_PARTS = np.array([1, 2, 3, 4, 0, 5, 8, 9, 10, 11, 7, 12], np.int32)  # two boxes, whose last faces are tops
