@@ -3,8 +3,8 @@
 Needs diffusers and safetensors, imported where they are used: ``pip install arbiview_aug[generator]``.
 
 - ``correspondence``, ``attention``: geometry-guided cross-view attention; ``conditioning``: conditions and cameras;
-- ``denoiser``: the networks; ``sampler``: the reverse process; ``completion``: inference on frames;
-- ``generator``: ``Generator``, which loads and saves them; ``inpainter``: ``Diffusion``, which fills views by one.
+- ``denoiser``: the networks; ``sampler``: the reverse process; ``completion``: views from their conditions;
+- ``generator``: ``Generator``, which loads and saves them; ``inpainter``: ``Diffusion``, which fills frames by one.
 """
 
 from typing import TYPE_CHECKING
@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from arbiview_aug.environment import lazy_names
 
 if TYPE_CHECKING:
-    from arbiview_aug.generator.completion import Completed as Completed
     from arbiview_aug.generator.config import GeneratorConfig as GeneratorConfig
     from arbiview_aug.generator.config import compact as compact
     from arbiview_aug.generator.config import inpaint as inpaint

@@ -13,7 +13,7 @@ invariant to rotations of the whole rig and to the order of its cameras.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -143,11 +143,7 @@ class FrameGeometry(NamedTuple):
 
     def to(self, device: torch.device | str) -> FrameGeometry:
         tensors = (value.to(device, non_blocking=True) for value in self[:4])
-        return FrameGeometry._make([*tensors, *self[4:]]).with_reads(lambda reads: reads.to(device))
-
-    def with_reads(self, change: Callable[[Correspondence], Correspondence]) -> FrameGeometry:
-        """Replace each correspondence by ``change`` of it."""
-        return FrameGeometry._make([*self[:4], *([change(grid) for grid in reads] for reads in self[4:])])
+        return FrameGeometry._make([*tensors, *([grid.to(device) for grid in reads] for reads in self[4:])])
 
     def target_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
         """The targets' conditions: latents (B, N, C, h, w), coverage and confidence (B, N, H, W) at any resolution."""

@@ -23,7 +23,7 @@ from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator.attention import CrossViewAttention
 from arbiview_aug.generator.conditioning import PoseContext, Views, input_channels
-from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig, TrainedOn
+from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
 from arbiview_aug.generator.correspondence import LEVELS, TokenWindow
 
 REGRESSION = TIMESTEPS  # predicts x0 in one step, from the pre-filled latent instead of a noisy one
@@ -310,26 +310,3 @@ class Autoencoder(nn.Module):
                 "autoencoder: expected float32 or bfloat16, got float16, in which Stable Diffusion's overflows; use "
                 "generator.to(torch.bfloat16)"
             )
-
-
-class GeneratorNetworks(nn.Module):
-    """Denoiser and autoencoder of one configuration (Sec. CVC-SSL); ``calls`` counts those of the denoiser.
-
-    Made of diffusers' networks, ``vae`` None without one; ``signal`` as for ``Denoiser``.
-    """
-
-    def __init__(self, config: GeneratorConfig, unet: Any, vae: Any | None, signal: torch.Tensor | None = None) -> None:
-        super().__init__()
-        self.config = config
-        self.denoiser = Denoiser(unet, config, signal)
-        self.autoencoder = Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch)
-        if config.frozen_unet:
-            self.requires_grad_(False)
-            for parameter in self.denoiser.own_parameters():
-                parameter.requires_grad_(True)
-        self.calls = 0
-        self.trained_on: TrainedOn | None = None  # set by the training, and read from a folder
-
-    @property
-    def device(self) -> torch.device:
-        return self.denoiser.regression.weight.device

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from arbiview_aug.choices import is_number
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError, one_line, shown
 from arbiview_aug.files import check_regular
 from arbiview_aug.generator.checkpoint import load_weights, read_checkpoint, write_checkpoint
-from arbiview_aug.generator.completion import complete
 from arbiview_aug.generator.conditioning import input_channels
 from arbiview_aug.generator.config import GeneratorConfig, TrainedOn, from_plain, paper
-from arbiview_aug.generator.denoiser import GeneratorNetworks
+from arbiview_aug.generator.denoiser import Autoencoder, Denoiser
 from arbiview_aug.generator.sampler import noise_schedule
 
 _SHIPPED = Path(__file__).with_name("weights")
@@ -32,12 +32,28 @@ def _networks() -> tuple[Any, Any]:
     return diffusers.UNet2DConditionModel, diffusers.AutoencoderKL
 
 
-class Generator(GeneratorNetworks):
-    """Generator of the pixels that no camera saw (Sec. CVC-SSL).
+class Generator(nn.Module):
+    """Generator of the pixels that no camera saw: a denoiser and an autoencoder (Sec. CVC-SSL).
 
     ``from_pretrained`` loads one, ``from_config`` and ``from_stable_diffusion`` create untrained ones. ``to`` moves it
-    to a GPU or to bfloat16.
+    to a GPU or to bfloat16. ``unet`` and ``vae`` (or None) are diffusers' networks, ``signal`` is as for ``Denoiser``.
     """
+
+    def __init__(self, config: GeneratorConfig, unet: Any, vae: Any | None, signal: torch.Tensor | None = None) -> None:
+        super().__init__()
+        self.config = config
+        self.denoiser = Denoiser(unet, config, signal)
+        self.autoencoder = Autoencoder(vae, config.autoencoder.scale, config.autoencoder.patch)
+        if config.frozen_unet:
+            self.requires_grad_(False)
+            for parameter in self.denoiser.own_parameters():
+                parameter.requires_grad_(True)
+        self.calls = 0  # of the denoiser, while sampling
+        self.trained_on: TrainedOn | None = None  # set by the training, and read from a folder
+
+    @property
+    def device(self) -> torch.device:
+        return self.denoiser.regression.weight.device
 
     # --- creation -----------------------------------------------------------------------------------------------------
     @classmethod
@@ -48,8 +64,8 @@ class Generator(GeneratorNetworks):
         unet = unet_class(**config.unet.arguments(input_channels(latent), latent))
         vae = vae_class(**config.autoencoder.arguments()) if config.autoencoder.widths else None
         with torch.device("cpu"):  # also where the weights are on meta
-            schedule = noise_schedule(prediction=config.prediction, zero_snr=config.zero_snr)
-        signal = schedule.alphas_cumprod.double().sqrt().float() if config.residual else None
+            alphas = noise_schedule(config).alphas_cumprod
+        signal = alphas.double().sqrt().float() if config.residual else None
         return cls(config, unet, vae, signal)
 
     @classmethod
@@ -137,9 +153,6 @@ class Generator(GeneratorNetworks):
         if self.trained_on is not None:
             config["trained_on"] = asdict(self.trained_on)
         write_checkpoint(Path(folder), config, self.state_dict())
-
-    # --- use ----------------------------------------------------------------------------------------------------------
-    complete_views = complete
 
 
 # --- Stable Diffusion's weights ---------------------------------------------------------------------------------------

@@ -13,24 +13,24 @@ from typing import Any
 import torch
 
 from arbiview_aug.environment import optional_package
-from arbiview_aug.generator.config import TIMESTEPS
+from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
 from arbiview_aug.generator.denoiser import REGRESSION
 
 Predict = Callable[[torch.Tensor, int], torch.Tensor]  # maps (x_t, t) to the prediction, or to x0 at ``REGRESSION``
 
 
-def noise_schedule(*, prediction: str, zero_snr: bool) -> Any:
+def noise_schedule(config: GeneratorConfig) -> Any:
     """Stable Diffusion's schedule (scaled linear, β from 0.00085 to 0.012, 1000 steps).
 
-    ``zero_snr`` rescales it to zero terminal SNR (Lin et al. 2023); only with ``v_prediction``.
+    ``zero_snr`` rescales it to zero terminal SNR (Lin et al. 2023).
     """
     return optional_package("diffusers", "generator").DPMSolverMultistepScheduler(
         num_train_timesteps=TIMESTEPS,
         beta_start=0.00085,
         beta_end=0.012,
         beta_schedule="scaled_linear",
-        prediction_type=prediction,
-        rescale_betas_zero_snr=zero_snr,
+        prediction_type=config.prediction,
+        rescale_betas_zero_snr=config.zero_snr,
         timestep_spacing="trailing",
     )
 
@@ -42,35 +42,23 @@ def timesteps(steps: int, strength: float) -> list[int]:
 
 
 def sample(
-    predict: Predict,
-    prefilled: torch.Tensor,
-    noise: torch.Tensor,
-    schedule: Any,
-    *,
-    steps: int,
-    strength: float,
-    temperature: float = 1.0,
-    warm_start: bool = False,
+    predict: Predict, prefilled: torch.Tensor, noise: torch.Tensor, config: GeneratorConfig
 ) -> torch.Tensor:
     """Sample x0 (B, N, C, h, w) float32 from pre-filled latents and standard normal noise of that shape.
 
-    Args:
-        predict: The denoiser with its conditions; called once per step.
-        schedule: From ``noise_schedule``; its state changes.
-        steps: 1 is the one-step regression, without noise.
-        strength: Share of the diffusion by which the pre-filled latent is noised, in (0, 1].
-        temperature: Factor of the noise.
-        warm_start: Make the first step the regression, and noise its result.
+    ``predict``, the denoiser with its conditions, is called once per step. A single step is the one-step regression,
+    without noise. A ``residual`` generator's first step is the regression too, whose result is then noised.
     """
     prefilled = prefilled.float()
-    if steps == 1 or warm_start:
+    if config.steps == 1 or config.residual:
         prefilled = predict(prefilled, REGRESSION).float()
-    if steps == 1:
+    if config.steps == 1:
         return prefilled
-    schedule.set_timesteps(timesteps=timesteps(steps - warm_start, strength))
+    schedule = noise_schedule(config)
+    schedule.set_timesteps(timesteps=timesteps(config.steps - config.residual, config.strength))
     schedule.set_begin_index(0)
     times = schedule.timesteps.tolist()
-    x = schedule.add_noise(prefilled, temperature * noise.float(), torch.tensor(times[:1]))
+    x = schedule.add_noise(prefilled, config.temperature * noise.float(), torch.tensor(times[:1]))
     for t in times:
         x = schedule.step(predict(x, t).float(), t, x, return_dict=False)[0]
     return x

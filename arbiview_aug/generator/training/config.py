@@ -83,7 +83,6 @@ class TrainConfig:
     max_grad_norm: float = 1.0  # 0 switches clipping off
     ema: float = 0.999  # decay of diffusers' EMAModel; step / (9 + step) after each step while that is smaller
     cond_drop_prob: float = 0.1  # of condition, pose and sources together, for classifier-free guidance
-    attention: bool = True  # whether views read each other; off for the ablation only
     precision: Literal["no", "bf16"] = "no"
     checkpointing: bool = False  # gradient checkpointing: recompute blocks in the backward pass
     scenes: int = 240  # synthetic streets

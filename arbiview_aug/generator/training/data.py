@@ -79,15 +79,6 @@ class Frames:
                 frame = frame._replace(images=[image.clone() for image in frame.images])
             self._cache.get(index, partial(unchanged, frame))
 
-    def check_fits(self, indices: Sequence[int]) -> None:
-        """Raise TrainingError if these frames do not fit into memory together."""
-        needed = len(indices) * _bytes_of(self[indices[0]])
-        if needed > CACHE_BYTES:
-            raise TrainingError(
-                f"scenes: expected frames of at most {CACHE_BYTES / 2**30:g} GiB together, since workers cannot render "
-                f"on a GPU, got {needed / 2**30:.1f} GiB; take fewer, or workers=0"
-            )
-
     def split(self, seed: int = 0) -> Split:
         """Split 60/20/20 by whole scenes; depends on the seed and the scenes' names alone.
 
@@ -122,28 +113,19 @@ def one_thread_worker(worker: int) -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def open_frames(
-    data: str,
-    size: tuple[int, int],
-    *,
-    scenes: int,
-    seed: int = 0,
-    points: bool = False,
-    device: torch.device | str = "cpu",
-) -> Frames:
+def open_frames(data: str, size: tuple[int, int], *, scenes: int, seed: int = 0) -> Frames:
     """Open the frames (h, w) that ``--data`` names: ``KIND:PATH``, or a number of synthetic ``scenes``.
 
-    Streets are rendered on ``device``; workers cannot render on a GPU. Real samples have LiDAR ``points`` only if asked
-    for. TrainingError for an unknown kind, DataError for a folder without such data.
+    TrainingError for an unknown kind, DataError for a folder without such data.
     """
     kind, _, folder = data.partition(":")
     if data == "synthetic":
-        drive = SyntheticDrive(demo_source_rig(size), num_frames=scenes, seed=seed, lidar=False, device=device)
+        drive = SyntheticDrive(demo_source_rig(size), num_frames=scenes, seed=seed, lidar=False)
         return Frames(drive, size, [str(k) for k in range(scenes)], data)
     if kind not in READERS or not folder:
         raise TrainingError(f"--data {data}: expected synthetic, {' or '.join(f'{name}:PATH' for name in READERS)}")
     dataset = open_data(data)
-    dataset.load_points = points
+    dataset.load_points = False
     is_drive, names = (dataset.root / SEQUENCE_FILE).is_file(), dataset.tokens
     if kind == "py123d":
         names = [token.rpartition("-")[0] for token in names]  # of the logs

@@ -17,8 +17,8 @@ from torch import nn
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.files import open_regular
-from arbiview_aug.generator.conditioning import FrameGeometry, pooled
-from arbiview_aug.generator.config import TIMESTEPS, Prediction
+from arbiview_aug.generator.conditioning import pooled
+from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, Denoiser, Rows
 from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.training.config import GeoMode, TrainConfig
@@ -29,11 +29,12 @@ LATENT_BYTES = 4 * 2**30  # memory for latents of real views: 190,000 of 224 x 4
 
 
 class ForwardProcess:
-    """The noising x_t = a x0 + s ε, a = √ᾱ_t, s = √(1 − ᾱ_t), of a schedule's ᾱ (T,) float32."""
+    """The noising x_t = a x0 + s ε, a = √ᾱ_t, s = √(1 − ᾱ_t), of a generator's schedule ᾱ."""
 
-    def __init__(self, alphas_cumprod: torch.Tensor, prediction: Prediction) -> None:
-        self.signal, self.noise = alphas_cumprod.double().sqrt().float(), (1 - alphas_cumprod.double()).sqrt().float()
-        self.prediction = prediction
+    def __init__(self, config: GeneratorConfig) -> None:
+        alphas = noise_schedule(config).alphas_cumprod.double()
+        self.signal, self.noise = alphas.sqrt().float(), (1 - alphas).sqrt().float()
+        self.prediction = config.prediction
 
     def _at(self, t: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """a and s at t (B,), (B, 1, 1, 1, 1)."""
@@ -152,11 +153,6 @@ class Draws(NamedTuple):
     rng: torch.Generator  # for the crop of the perceptual loss
 
 
-def without_attention(geometry: FrameGeometry) -> FrameGeometry:
-    """The geometry with all correspondences masked: no view reads another one."""
-    return geometry.with_reads(lambda reads: reads._replace(valid=torch.zeros_like(reads.valid)))
-
-
 def draw(config: TrainConfig, batch: Batch, rng: torch.Generator) -> Draws:
     """Draw times, noise and dropped conditions for a batch, on the CPU: the same on every device."""
     latent, count, device = config.generator, len(batch.tokens), batch.truth.device
@@ -177,14 +173,13 @@ class Step(nn.Module):
         self.config, self.denoiser = config, denoiser
         self._frozen = (autoencoder, perceptual)  # a tuple: not among this module's parameters
         self._cache: dict[tuple[int, int], torch.Tensor] = {}  # x0 of real views, by frame and camera
-        schedule = noise_schedule(prediction=config.generator.prediction, zero_snr=config.generator.zero_snr)
-        self.diffusion = ForwardProcess(schedule.alphas_cumprod, config.generator.prediction)
+        self.diffusion = ForwardProcess(config.generator)
 
     def forward(self, batch: Batch, draws: Draws, perceptual: bool = False) -> dict[str, torch.Tensor]:
         """Compute ``main``, ``regression``, ``geo`` and, if asked for, ``perceptual``: without their weights."""
         config, loss = self.config, self.config.loss
         autoencoder, vgg = self._frozen
-        geometry = batch.geometry if config.attention else without_attention(batch.geometry)
+        geometry = batch.geometry
         with torch.no_grad():
             x0 = self._latents(batch)
             views, source_views = batch.conditions.encoded(config.generator, autoencoder, geometry)

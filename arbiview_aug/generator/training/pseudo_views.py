@@ -24,11 +24,12 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.favs.renderer import render_paper
-from arbiview_aug.generator.completion import Conditions, seeded, unit, valid_pixels
+from arbiview_aug.generator.completion import Conditions, unit, valid_pixels
 from arbiview_aug.generator.conditioning import FrameGeometry, batched, frame_geometry, nearest_sources
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.training.config import PseudoQuality, PseudoViewConfig
 from arbiview_aug.generator.training.data import Frames
+from arbiview_aug.inpaint.inpainter import seeded
 from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.render.rendered import Renderer

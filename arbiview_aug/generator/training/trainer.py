@@ -22,9 +22,9 @@ from arbiview_aug.generator.config import TrainedOn
 from arbiview_aug.generator.training.checkpointing import averaged, has_state, load_state, save_state, stop_requests
 from arbiview_aug.generator.training.config import TrainConfig
 from arbiview_aug.generator.training.data import Frames, item_workers
-from arbiview_aug.generator.training.held_out import mean_hole_psnr, picture, sampled
 from arbiview_aug.generator.training.losses import Perceptual, Step, draw
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate, mask_bank
+from arbiview_aug.generator.training.validation import hole_psnr, picture, sampled
 from arbiview_aug.inpaint.inpainter import digest_of
 
 _LOG_EVERY = 10
@@ -260,7 +260,8 @@ class Trainer:
                 if config.loss.regression:
                     methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
                 methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)
-            scores, image = mean_hole_psnr(methods, batch), picture(batch, samples)
+            inside = {name: hole_psnr(made, batch.truth, batch.holes) for name, made in methods.items()}
+            scores, image = {name: float(psnr.nanmean()) for name, psnr in inside.items()}, picture(batch, samples)
             self._log({f"hole_psnr/{name}": value for name, value in scores.items()}, image)
             try:
                 save_picture(self.output / "validation" / f"{self.done:06d}.png", image)
