@@ -231,19 +231,15 @@ def train() -> argparse.ArgumentParser:
         program="python -m arbiview_aug.train",
     )
     add = parser.add_argument
-    add("command", nargs="?", choices=("train", "evaluate"), default="train", help="what to do (default: %(default)s)")
     add("--config", choices=TRAINING_PRESETS, default="tiny", help="preset of all settings")
     kinds = " or ".join(f"{kind}:PATH" for kind in READERS)
-    text = f"synthetic, or real frames with their kind: {kinds} (default: synthetic; evaluate: the run's)"
+    text = f"synthetic, or real frames with their kind: {kinds} (default: synthetic)"
     add("--data", type=path, metavar="DATA", help=text)
     add_output(parser, "folder of the run")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
     weights = "config paper or inpaint: Stable Diffusion 1.5, or its inpainting model: a folder or hub id"
     add("--weights", type=path, metavar="DIR", help=weights)
     add("--vgg-weights", type=path, metavar="FILE", help="torchvision's vgg16 weights (default: cache or download)")
-    add("--views", type=count, default=64, metavar="N", help="number of held-out views to score")
-    add("--seeds", type=count, default=1, metavar="N", help="evaluate: targets a scene")
-    add("--steps", type=count, metavar="N", help="evaluate: steps of a sample (default: the run's own)")
     add("--quiet", action="store_true", help="no progress bars")
     return parser
 
@@ -311,9 +307,6 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
             parser.error(f"argument --geometry: quality paper knows infinity alone, got {', '.join(surfaces)}")
     if name == "depth" and not arguments.model:
         refuse(("device", "batch", "reference"), "expected it with --model alone: depth from motion needs no network")
-    if name == "train":
-        others = ("views", "seeds", "steps") if arguments.command == "train" else ("weights", "vgg_weights")
-        refuse(others, f"{arguments.command} reads none")
     if name == "check" and is_rig(arguments.data):
         if arguments.data in shipped_rigs() or os.path.exists(arguments.data):
             refuse(("frames", "reduce", "clean_masks"), "expected frames with it, got a rig")

@@ -32,9 +32,7 @@ _MOST_BYTES = 1 << 28  # of an image file: more than 9,000 by 9,000 pixels take,
 # The reduced flags without their BGR bit, which excludes IMREAD_COLOR_RGB.
 _REDUCED = {1: 0, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
 _REDUCED_FLAGS = {reduce: flag & ~cv2.IMREAD_COLOR for reduce, flag in _REDUCED.items()}
-# From OpenCV 4.11 on; for older versions channels are swapped after decoding.
-_RGB_FLAG: int | None = getattr(cv2, "IMREAD_COLOR_RGB", None)
-_FLAGS = cv2.IMREAD_IGNORE_ORIENTATION | (cv2.IMREAD_COLOR if _RGB_FLAG is None else _RGB_FLAG)
+_FLAGS = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_COLOR_RGB
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
@@ -94,7 +92,7 @@ def decode_images(
             image = area_reduced(image, reduce)
         if image.shape != out.shape:
             raise DataError(f"{label}: expected {out.shape} as its header says, decoded {image.shape}; write it again")
-        out[...] = _as_rgb(image)
+        out[...] = image
     if is_block:
         return torch.from_numpy(images).permute(0, 3, 1, 2)
     return [torch.from_numpy(image).permute(2, 0, 1) for image in images]
@@ -212,7 +210,7 @@ def decode_bytes(data: bytes, label: str) -> ByteArray:
     if not isinstance(data, bytes | bytearray):
         raise DataError(f"{label}: expected a file's bytes, got {type(data).__name__}; do not decode before")
     format, _ = _header(data, label)
-    return _as_rgb(_decoded(data, label, format, _FLAGS))
+    return _decoded(data, label, format, _FLAGS)
 
 
 def _decoded(data: bytes, label: str, format: str, flags: int) -> ByteArray:
@@ -223,10 +221,6 @@ def _decoded(data: bytes, label: str, format: str, flags: int) -> ByteArray:
     if image is None:
         raise DataError(f"{label}: expected an image, got a {format} that cannot be decoded; copy it again")
     return image  # type: ignore[no-any-return]
-
-
-def _as_rgb(image: ByteArray) -> ByteArray:
-    return image if _RGB_FLAG is not None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _jpeg_size(data: bytes) -> tuple[tuple[int, int], bool]:
@@ -267,11 +261,7 @@ def _decode_jpeg_in_place(out: ByteArray, path: Path) -> bool:
         image = cv2.imread(str(path), out, _FLAGS)
     except (UnicodeEncodeError, cv2.error):  # cv2.error: the decoded size is not the header's
         return False
-    if image is None or not np.may_share_memory(image, out) or (out[0] == mark).all() or (out[-1] == mark).all():
-        return False
-    if _RGB_FLAG is None:
-        cv2.cvtColor(out, cv2.COLOR_BGR2RGB, out)
-    return True
+    return image is not None and np.may_share_memory(image, out) and not any((out[k] == mark).all() for k in (0, -1))
 
 
 JPEG_QUALITY = 96  # quality at 4:4:4 chroma; costs at most 0.08 dB (acceptance/test_converted.py)

@@ -41,9 +41,7 @@ def timesteps(steps: int, strength: float) -> list[int]:
     return sorted({t for t in spaced if t >= 0}, reverse=True) or [0]
 
 
-def sample(
-    predict: Predict, prefilled: torch.Tensor, noise: torch.Tensor, config: GeneratorConfig
-) -> torch.Tensor:
+def sample(predict: Predict, prefilled: torch.Tensor, noise: torch.Tensor, config: GeneratorConfig) -> torch.Tensor:
     """Sample x0 (B, N, C, h, w) float32 from pre-filled latents and standard normal noise of that shape.
 
     ``predict``, the denoiser with its conditions, is called once per step. A single step is the one-step regression,

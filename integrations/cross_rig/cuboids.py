@@ -70,7 +70,7 @@ class CuboidDrive(SyntheticDrive):
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         super().__init__(rig, **options)
-        self._renderer = CuboidRenderer(supersampling=self._renderer.supersampling, device=self._renderer.device)
+        self._renderer = CuboidRenderer(supersampling=self._renderer.supersampling)
 
     def scene(self, index: int) -> CuboidScene:
         return make_scene(self.seed, checked_index(index, len(self)))

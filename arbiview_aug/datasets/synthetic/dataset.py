@@ -71,11 +71,10 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         supersampling: Rays across a pixel at outlines; 1 for no antialiasing.
         lidar: Whether samples carry ``points``; or how the scanners err.
         neighbours: Which other frames of the drive come with a sample; None for none.
-        device: Device to render on; samples lie on the CPU. Different kinds of device agree up to rounding.
 
     Raises:
         TypeError: A ``rig``, ``lidar`` or ``neighbours`` of another type.
-        ValueError: A count or seed out of range, or an unknown device.
+        ValueError: A count or seed out of range.
     """
 
     def __init__(
@@ -87,7 +86,6 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         supersampling: int = 2,
         lidar: bool | ScanErrors = True,
         neighbours: Neighbours | None = None,
-        device: torch.device | str = "cpu",
     ) -> None:
         self.rig = _checked_rig(rig)
         self.num_frames = _checked_count("num_frames", num_frames, 1, 1 << 40)
@@ -98,11 +96,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         self._errors = lidar if isinstance(lidar, ScanErrors) else ScanErrors()
         check_neighbours(neighbours)
         self.neighbours = neighbours
-        supersampling = _checked_count("supersampling", supersampling, 1, 8)
-        try:
-            self._renderer = Renderer(supersampling=supersampling, device=device)
-        except (RuntimeError, TypeError):
-            raise ValueError(f"SyntheticDrive device: expected cpu, cuda or cuda:1, got {device!r}") from None
+        self._renderer = Renderer(supersampling=_checked_count("supersampling", supersampling, 1, 8))
 
     def __len__(self) -> int:
         return self.num_frames
@@ -176,7 +170,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         scanners = [(lidar.center_m - road, lidar.rays.T, lidar.range_m) for lidar in rig.lidars]
         points = np.concatenate(
             [
-                scan_scene(scene, self._renderer, *scanner, self._errors, (*noise, k) if k else noise)
+                scan_scene(scene, *scanner, self._errors, (*noise, k) if k else noise)
                 for k, scanner in enumerate(scanners or [(np.array(LIDAR_POSITION_M), _usual_rays(), LIDAR_RANGE_M)])
             ]
         )

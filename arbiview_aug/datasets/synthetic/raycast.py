@@ -120,8 +120,7 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
     """Find the first hits of packets of unit rays (n, 3, R) from ``start`` (n or 1, 3), in the street frame.
 
     ``local`` may be several scenes, one after the other, each relative to the origin of other packets. Gives (n, R)
-    distance, infinite for the sky, and (n, R) int64 row in the scene, ``GROUND_ID`` or ``SKY_ID``. The intersections
-    run on the CPU, wherever the tensors lie.
+    distance, infinite for the sky, and (n, R) int64 row in the scene, ``GROUND_ID`` or ``SKY_ID``.
     """
     from arbiview_aug.datasets.synthetic.kernels import cast_packets, chord_squares
 
@@ -129,7 +128,7 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
     curved = (~local.is_box[candidates.primitive]).nonzero()[:, 0]
     ends = torch.bincount(candidates.packet, minlength=len(rays)).cumsum(0)
     row, first, box, normals, offsets, *quadric, packets, packet, primitive, end, out_t, out_hit = (
-        tensor.cpu().contiguous().numpy()
+        tensor.contiguous().numpy()
         for tensor in (
             *(local.order, local.distance, local.is_box, local.normals, local.offsets),
             *(local.to_unit, local.origin, local.round_z, rays),
@@ -137,11 +136,11 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
         )
     )
     roots = np.empty((len(packet), rays.shape[2]), np.float32)
-    chord_squares(*quadric, packets, packet, primitive[curved.cpu().numpy()], roots)
+    chord_squares(*quadric, packets, packet, primitive[curved.numpy()], roots)
     # torch's square roots, whose last bit numba's need not have: streets stay the same.
-    halves = torch.sqrt(torch.as_tensor(roots, device="cpu").clamp_min(0)).numpy()
+    halves = torch.sqrt(torch.as_tensor(roots).clamp_min(0)).numpy()
     cast_packets(row, first, box, normals, offsets, *quadric, packets, end, primitive, halves, out_t, out_hit)
-    return torch.as_tensor(out_t, device=rays.device), torch.as_tensor(out_hit, device=rays.device)
+    return torch.as_tensor(out_t), torch.as_tensor(out_hit)
 
 
 def _ground(height_m: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,7 +40,7 @@ _BATCH_PX = 1_500_000
 """Maximum number of pixels shaded together, with 150 MB of intermediate results."""
 _CACHED_BYTES = 512 << 20
 """Memory of rays that are kept: six cameras of 1600x900 have 350 MB."""
-_TABLES: LRUCache[tuple[int, torch.device], SceneTables] = LRUCache(4)
+_TABLES: LRUCache[int, SceneTables] = LRUCache(4)
 """Tables of the last scenes, which they keep, so that no other scene has the same id."""
 
 
@@ -126,27 +126,28 @@ def _from_tiles(a: Tensor, size: tuple[int, int]) -> Tensor:
     return a[: size[0], : size[1]]
 
 
+@contextmanager
+def small_steps() -> Iterator[None]:
+    """Make tensors on the CPU, without gradients, on one thread: most steps are too small for more."""
+    is_default = torch.empty(0).device.type == "cpu"  # a device's context would slow every step down
+    with torch.no_grad(), one_thread(), nullcontext() if is_default else torch.device("cpu"):
+        yield
+
+
 class Renderer:
     """Renders scenes; keeps the rays of the last cameras."""
 
     shade = staticmethod(shade)
     """Colours of hits; a subclass may have others."""
 
-    def __init__(self, *, supersampling: int = 2, device: torch.device | str = "cpu") -> None:
-        self.supersampling, self.device = supersampling, torch.device(device)
+    def __init__(self, *, supersampling: int = 2) -> None:
+        self.supersampling = supersampling
         self._rays: LRUCache[bytes, CameraRays] = LRUCache(
             _CACHED_BYTES, lambda rays: sum(part.nbytes for part in rays)
         )
 
     def __reduce__(self) -> tuple[Any, tuple[()]]:
-        return partial(type(self), supersampling=self.supersampling, device=self.device), ()  # without the caches
-
-    @contextmanager
-    def run(self) -> Iterator[None]:
-        """Make new tensors on the device, without gradients, on one thread: most steps are too small for more."""
-        is_default = torch.empty(0).device == self.device  # a device's context would slow every step down
-        with torch.no_grad(), one_thread(), nullcontext() if is_default else self.device:
-            yield
+        return partial(type(self), supersampling=self.supersampling), ()  # without the caches
 
     def render(self, scene: Scene, cameras: Sequence[Camera], ground_z_m: float) -> list[CameraView]:
         """Render ``scene``, whose road lies at ``ground_z_m`` in the cameras' ego frame."""
@@ -155,11 +156,11 @@ class Renderer:
             if batches[-1] and sum(c.width_px * c.height_px for c in (*batches[-1], camera)) > _BATCH_PX:
                 batches.append([])
             batches[-1].append(camera)
-        with self.run():
+        with small_steps():
             return [view for batch in batches for view in self._render_batch(scene, batch, ground_z_m)]
 
     def _render_batch(self, scene: Scene, cameras: list[Camera], ground_z_m: float) -> list[CameraView]:
-        tables = _TABLES.get((id(scene), self.device), partial(SceneTables.build, scene))
+        tables = _TABLES.get(id(scene), partial(SceneTables.build, scene))
         first = self._cast(scene, cameras, ground_z_m)
         hits = first.hits
         face = faces(tables, hits.point, hits.primitive)
@@ -243,7 +244,7 @@ class Renderer:
         views = []
         for camera, *parts in zip(first.cameras, *(a.split(first.tiles) for a in maps), strict=True):
             image, *rest = (_from_tiles(a, camera.size) for a in parts)
-            views.append(CameraView(*(a.contiguous().cpu() for a in (image.permute(2, 0, 1), *rest))))
+            views.append(CameraView(*(a.contiguous() for a in (image.permute(2, 0, 1), *rest))))
         return views
 
 

@@ -6,20 +6,19 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
-from arbiview_aug.datasets.synthetic.render import Renderer
+from arbiview_aug.datasets.synthetic.render import small_steps
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, FloatArray, IntArray, Material, Scene
 
 PULSE_M = 0.5
 """Surfaces of one beam within this distance return one echo from between them: pulses last 3 to 5 ns."""
 
-Echo = Literal["first", "last"]
 Rays = npt.NDArray[np.float32] | FloatArray
 
 
@@ -30,9 +29,7 @@ class ScanErrors:
     Attributes:
         noise_m: One sigma of the range, not negative.
         divergence_deg: Angle between the edges of a beam, 0 to 5: it returns from what its middle and four rays at its
-            edge meet. 0 for a single ray.
-        echo: Whether the ``first`` or the ``last`` surface in a beam returns; surfaces within ``PULSE_M`` of it are
-            mixed.
+            edge meet first, mixed over ``PULSE_M``. 0 for a single ray.
         reach_m: Distance at which 63 % of the rays return from a white surface that faces the scanner. Others return
             with a probability of 1 - exp(-albedo cos(incidence) (reach_m / distance)²). Infinite: all return.
 
@@ -42,25 +39,22 @@ class ScanErrors:
 
     noise_m: float = 0.02
     divergence_deg: float = 0.0
-    echo: Echo = "first"
     reach_m: float = math.inf
 
     def __post_init__(self) -> None:
         checks: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
             ("noise_m", lambda value: 0 <= value < math.inf, "metres from 0"),
             ("divergence_deg", lambda value: 0 <= value <= 5, "0 to 5 degrees"),
-            ("echo", lambda value: value in get_args(Echo), "first or last"),
             ("reach_m", lambda value: value > 0, "metres above 0, or infinity"),
         )
         for field, is_valid, expected in checks:
             value = getattr(self, field)
-            if (field != "echo" and not isinstance(value, Real)) or not is_valid(value):
+            if not isinstance(value, Real) or not is_valid(value):
                 raise ValueError(f"scan errors: {field}: expected {expected}, got {value!r}")
 
 
 def scan_scene(
     scene: Scene,
-    renderer: Renderer,
     position: FloatArray,
     rays: Rays,
     range_m: tuple[float, float],
@@ -75,7 +69,7 @@ def scan_scene(
     origin = R @ position + scene.ego2street[:3, 3]
     beam = _beam(rays.astype(np.float64), math.radians(errors.divergence_deg / 2))  # [columns, beams, S, 3]
     street = (beam @ R.T).astype(np.float32).reshape(len(rays), -1, 3)
-    t, row = _echoes(*_cast(scene, renderer, origin, street), beam.shape[2], errors.echo)
+    t, row = _echoes(*_cast(scene, origin, street), beam.shape[2])
     ego = beam[:, :, 0].reshape(-1, 3)
     rng = np.random.default_rng(np.random.SeedSequence(seed))
     noise_m, gain = rng.normal(0, errors.noise_m, len(t)), rng.uniform(0.8, 1.2, len(t))
@@ -101,21 +95,21 @@ def _beam(rays: FloatArray, half_rad: float) -> FloatArray:
     return np.asarray(beam / np.linalg.norm(beam, axis=-1, keepdims=True))
 
 
-def _cast(scene: Scene, renderer: Renderer, origin: FloatArray, street: Rays) -> tuple[FloatArray, IntArray]:
+def _cast(scene: Scene, origin: FloatArray, street: Rays) -> tuple[FloatArray, IntArray]:
     """Distances and rows (n,) of what rays (columns, m, 3) of the street frame meet; columns are neighbours."""
     columns, m, _ = street.shape
     packets = np.pad(street, ((0, -columns % 8), (0, 0), (0, 0)), mode="edge").reshape(-1, 8 * m, 3)
-    with renderer.run():
+    with small_steps():
         directions = torch.as_tensor(packets).transpose(1, 2).contiguous()
         local = scene_from(scene, origin)
         start = torch.as_tensor(origin[None].astype(np.float32))
         distance, hit = cast(local, start, directions, find_candidates(local, directions))
-    t, row = (a.cpu().numpy().ravel()[: columns * m] for a in (distance.double(), hit))  # without the padding
+    t, row = (a.numpy().ravel()[: columns * m] for a in (distance.double(), hit))  # without the padding
     return t, row
 
 
-def _echoes(t: FloatArray, row: IntArray, rays: int, echo: Echo) -> tuple[FloatArray, IntArray]:
-    """Distances and rows (n,) of the echoes of beams of so many rays (n * rays,)."""
+def _echoes(t: FloatArray, row: IntArray, rays: int) -> tuple[FloatArray, IntArray]:
+    """Distances and rows (n,) of the first echoes of beams of ``rays`` rays (n * rays,)."""
     if rays == 1:
         return t, row
     t, row = t.reshape(-1, rays), row.reshape(-1, rays)
@@ -123,8 +117,7 @@ def _echoes(t: FloatArray, row: IntArray, rays: int, echo: Echo) -> tuple[FloatA
     # One surface has one echo, from its middle: at grazing incidence its part of the beam is longer than a pulse.
     same = row[:, :, None] == row[:, None]
     t = np.where(finite, (np.where(finite, t, 0)[:, None] * same).sum(2) / same.sum(2), np.inf)
-    order = (t if echo == "first" else np.where(finite, -t, np.inf)).argmin(1)
-    n = np.arange(len(t))
+    n, order = np.arange(len(t)), t.argmin(1)
     chosen = t[n, order]
     with np.errstate(invalid="ignore"):  # of the sky
         together = finite & (np.abs(t - chosen[:, None]) <= PULSE_M)
