@@ -16,7 +16,7 @@ from arbiview_aug.errors import DataError
 def table(root: Path, text: str) -> Tables:
     (root / "v1.0-mini").mkdir()
     (root / "v1.0-mini" / "sample.json").write_text(text)
-    return Tables(root, "v1.0-mini", None)
+    return Tables(root, "v1.0-mini")
 
 
 @pytest.mark.parametrize("indent", [None, 0, 4])

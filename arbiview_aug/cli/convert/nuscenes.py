@@ -79,7 +79,7 @@ class NuScenes(Writer):
         self.output, self.data, self.suffix, self.how = settings.output, data, settings.suffix, settings.link
         self.target, self.scanned = settings.target, bool(settings.target.lidars) and settings.points == "target"
         self.scanned &= data.lidar_channel is not None
-        self.tables = Tables(data.root, data.version, None)
+        self.tables = Tables(data.root, data.version)
         self.moment = data.lidar_channel or data.channels[0]
         self.there = [name for name in _TABLES if self.tables.path(name).is_file()]  # in writing order
         labels = {"instance", "sample_annotation"}

@@ -47,7 +47,7 @@ class NuScenesDataset(WritableRecording):
     A sample is a dict, everything in the ego frame at the LiDAR's time: ``images`` (N, 3, h, w) uint8 RGB; ``rig``;
     ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token``, ``scene_token``; ``ego2world`` (4, 4) float64;
     ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring, or other columns after x y z;
-    with ``load_boxes`` the ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians,
+    ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians,
     velocity x y in m/s over the ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The
     numbers of points and boxes vary: batch with ``collate_fn=arbiview_aug.collate``. If no sample is annotated, they
     have no boxes, with a warning; boxes without a size are left out, with a warning. Cameras have the lens of
@@ -64,15 +64,13 @@ class NuScenesDataset(WritableRecording):
     The ego's origin is on the road (``ground_z_m`` = 0). Boxes stand upright: roll and pitch of the ego are left out.
 
     Args:
-        root: The folder with ``samples`` and the folder of tables. Either this or ``nusc``.
+        root: The folder with ``samples`` and the folder of tables.
         version: The folder of tables.
-        nusc: A loaded devkit ``NuScenes`` object, whose tables are used.
         split_scenes: Names or tokens of the scenes to keep; None keeps all.
         channels: Camera channels in the order wanted; None takes all in the order of ``CAMERA_RING``.
         compensate_ego_motion: Pose each camera as at its exposure, in the ego frame at the LiDAR's time. Without, its
             pose is the mounting alone, which at 9 m/s is 0.4 m away from the pixels.
         load_points: Whether to read the LiDAR's points.
-        load_boxes: Whether to read the boxes.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
         neighbours: Which other frames of the drive come with a sample; None for none. Sweeps make opening half as long
             again. If no sweep's file exists, only keyframes are neighbours, with a warning; if none of the LiDAR's
@@ -90,23 +88,21 @@ class NuScenesDataset(WritableRecording):
 
     def __init__(
         self,
-        root: str | Path | None = None,
+        root: str | Path,
         version: str = "v1.0-mini",
         *,
-        nusc: Any = None,
         split_scenes: Iterable[str] | None = None,
         channels: Sequence[str] | None = None,
         compensate_ego_motion: bool = True,
         load_points: bool = True,
-        load_boxes: bool = True,
         reduce: Reduce = 1,
         neighbours: Neighbours | None = None,
         lidar_channel: str | None = None,
         lidar_columns: Sequence[str] | None = None,
     ) -> None:
-        super().__init__(root or "", reduce, load_points, neighbours)
-        tables = Tables(root, version, nusc)
-        self.root, self.version, self.compensate_ego_motion = tables.root, tables.version, compensate_ego_motion
+        super().__init__(root, reduce, load_points, neighbours)
+        tables = Tables(root, version)
+        self.version, self.compensate_ego_motion = version, compensate_ego_motion
         self._view_masks = VIEW_MASKS if is_converted(self.root) else ()
         samples = _chosen_samples(tables, split_scenes)
         self.tokens = [row["token"] for row in samples]
@@ -124,10 +120,9 @@ class NuScenesDataset(WritableRecording):
         sweeps = [] if neighbours is None else [*self.channels, *lidars]
         self._recordings = read_recordings(tables, self._index, scenes, self.channels, self.lidar_channel, sweeps)
         times_s = self._recordings.time_s(self._recordings.keyframes[:, -1])
-        if load_boxes and (missing := [table for table in _LABELS if not tables.has(table)]):
+        if missing := [table for table in _LABELS if not tables.path(table).is_file()]:
             warn(f"nuScenes {self.root} {self.version}: no table {', '.join(missing)}: samples come without boxes_3d")
-            load_boxes = False
-        self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
+        self._annotations = None if missing else read_annotations(tables, self._index, times_s, np.array(scenes))
         if self._annotations is not None and self.tokens and not len(self._annotations.tokens):
             self._annotations = None  # an empty list of boxes would mean an empty street
             lacks = "has no rows of these samples (a test split?): they come without boxes_3d"

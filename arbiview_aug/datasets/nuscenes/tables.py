@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from arbiview_aug.atomic_io import inside
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.errors import DataError, SampleTypeError
+from arbiview_aug.errors import DataError
 
 _QUATERNION_NORM_TOLERANCE = 1e-3
 
@@ -78,21 +78,11 @@ COUNTS = Kind(
 
 
 class Tables:
-    """The tables of one version, from its JSON files below ``root`` or from a devkit ``NuScenes`` object.
+    """The tables of one version, from its JSON files below ``root``; DataError for no such folder."""
 
-    DataError for no such folder, or both or none of root and nusc; SampleTypeError if ``nusc`` is no devkit object.
-    """
-
-    def __init__(self, root: str | Path | None, version: str, nusc: Any) -> None:
-        if (root is None) == (nusc is None):
-            raise DataError("NuScenesDataset: expected either root or nusc, got both or none")
-        needed = ("dataroot", "sample", "sample_data", "ego_pose")
-        if nusc is not None and (missing := [name for name in needed if not hasattr(nusc, name)]):
-            got = f"{type(nusc).__name__} without {', '.join(missing)}"
-            raise SampleTypeError(f"nusc: expected a devkit NuScenes object, got {got}; pass a folder as root=")
-        self.nusc, self.root = nusc, Path(nusc.dataroot if root is None else root)
-        self.version = str(getattr(nusc, "version", version))
-        if nusc is None and not os.path.isdir(self.root / self.version):
+    def __init__(self, root: str | Path, version: str) -> None:
+        self.root, self.version = Path(root), version
+        if not os.path.isdir(self.root / version):
             tables = self.root.glob("*/sample.json") if os.path.isdir(self.root) else ()  # a name may be too long
             there = ", ".join(sorted(p.parent.name for p in tables)) or "none"
             expected = f"expected a folder of tables {version!r}, found none"
@@ -102,22 +92,11 @@ class Tables:
         """Path of a table's file; DataError for a link that leaves the root."""
         return inside(self.root, f"{self.version}/{table}.json", f"nuScenes {self.root}: table {table}")
 
-    def has(self, table: str) -> bool:
-        return self.path(table).is_file() if self.nusc is None else getattr(self.nusc, table, None) is not None
-
     def rows(self, table: str) -> list[Row]:
         return [row for batch in self.batches(table) for row in batch]
 
     def batches(self, table: str) -> Iterator[list[Row]]:
         """Yield a table's rows in batches; DataError if it is missing, or no JSON list of objects."""
-        if self.nusc is not None:
-            rows = getattr(self.nusc, table, None)
-            if not isinstance(rows, list | tuple):
-                got = "no such attribute of the NuScenes object" if rows is None else type(rows).__name__
-                raise self.error(table, "a list of rows", got)
-            for k in range(0, len(rows), _BATCH):
-                yield self._objects(table, list(rows[k : k + _BATCH]), k)
-            return
         path, count = self.path(table), 0
         try:
             with path.open(encoding="utf-8-sig") as file:

@@ -13,11 +13,12 @@ _PARALLEL, _TINY = np.float32(1e-9), np.float32(1e-12)
 
 
 @compiled
-def chord_squares(to_unit: Any, origin: Any, round_z: Any, rays: Any, packets: Any, primitives: Any, root: Any) -> None:
+def chord_squares(local: Any, rays: Any, packets: Any, primitives: Any, root: Any) -> None:
     """Write ``root`` (m, R): squares of half the chords of rays of ``packets`` (m,) through ``primitives``, times a.
 
     It is |d|^2 - |o x d|^2 instead of b^2 - a c, which cancels for distant, thin primitives.
     """
+    to_unit, origin, round_z = local.to_unit, local.origin, local.round_z
     for m in range(len(root)):
         p, out = primitives[m], root[m]
         A, w = to_unit[p], round_z[p]
@@ -32,27 +33,14 @@ def chord_squares(to_unit: Any, origin: Any, round_z: Any, rays: Any, packets: A
 
 
 @compiled
-def cast_packets(
-    order: Any,
-    distance: Any,
-    is_box: Any,
-    normals: Any,
-    offsets: Any,
-    to_unit: Any,
-    origin: Any,
-    round_z: Any,
-    rays: Any,
-    ends: Any,
-    primitives: Any,
-    halves: Any,
-    t: Any,
-    hit: Any,
-) -> None:
+def cast_packets(local: Any, rays: Any, ends: Any, primitives: Any, halves: Any, t: Any, hit: Any) -> None:
     """Lower distances ``t`` (n, R) and rows ``hit`` of packets of rays (n, 3, R) to those of their candidates.
 
-    The first eight arguments are of a ``LocalScene``; ``ends`` (n,) are the ends of each packet's ``primitives``, and
-    ``halves`` the square roots of the curved ones' ``chord_squares``. Each loop writes one array: it is vectorised.
+    ``local`` is a ``LocalScene`` of arrays; ``ends`` (n,) are the ends of each packet's ``primitives``, and ``halves``
+    the square roots of the curved ones' ``chord_squares``. Each loop writes one array: it is vectorised.
     """
+    order, distance, is_box, normals, offsets = local.order, local.distance, local.is_box, local.normals, local.offsets
+    to_unit, origin, round_z = local.to_unit, local.origin, local.round_z
     size = rays.shape[2]
     enter, leave, speed = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
     a, b, dz = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)

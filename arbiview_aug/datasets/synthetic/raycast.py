@@ -127,19 +127,16 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
     t, hit = _ground(start[:, 2:], rays)
     curved = (~local.is_box[candidates.primitive]).nonzero()[:, 0]
     ends = torch.bincount(candidates.packet, minlength=len(rays)).cumsum(0)
-    row, first, box, normals, offsets, *quadric, packets, packet, primitive, end, out_t, out_hit = (
-        tensor.contiguous().numpy()
-        for tensor in (
-            *(local.order, local.distance, local.is_box, local.normals, local.offsets),
-            *(local.to_unit, local.origin, local.round_z, rays),
-            *(candidates.packet[curved], candidates.primitive, ends, t, hit),
-        )
+    rest = rays, candidates.packet[curved], candidates.primitive[curved], ends, candidates.primitive, t, hit
+    *arrays, packets, packet, primitive, ends, primitives, out_t, out_hit = (
+        tensor.contiguous().numpy() for tensor in (*local, *rest)
     )
+    scene = LocalScene(*arrays)
     roots = np.empty((len(packet), rays.shape[2]), np.float32)
-    chord_squares(*quadric, packets, packet, primitive[curved.numpy()], roots)
-    # torch's square roots, whose last bit numba's need not have: streets stay the same.
+    chord_squares(scene, packets, packet, primitive, roots)
+    # torch's square roots, whose last bit is another than numba's: streets stay the same.
     halves = torch.sqrt(torch.as_tensor(roots).clamp_min(0)).numpy()
-    cast_packets(row, first, box, normals, offsets, *quadric, packets, end, primitive, halves, out_t, out_hit)
+    cast_packets(scene, packets, ends, primitives, halves, out_t, out_hit)
     return torch.as_tensor(out_t), torch.as_tensor(out_hit)
 
 

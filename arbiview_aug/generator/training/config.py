@@ -112,29 +112,19 @@ def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
     data = asdict(config)
     for setting in settings:
         name, equals, text = setting.partition("=")
-        if not equals:
-            raise TrainingError(f"--set {setting}: expected KEY=VALUE, such as loss.geo=0")
+        *groups, last = name.strip().split(".")
+        group: Any = data
+        for part in groups:
+            group = group.get(part) if isinstance(group, dict) else None
+        if not equals or not isinstance(group, dict) or isinstance(group.get(last, {}), dict):
+            keys = (group if isinstance(group, dict) else data).items()
+            known = ", ".join(f"{key}.…" if isinstance(value, dict) else key for key, value in keys)
+            raise TrainingError(f"--set {setting}: expected KEY=VALUE, such as loss.geo=0, with a key of {known}")
         try:
-            value = json.loads(text)
+            group[last] = json.loads(text)
         except ValueError:
-            value = text.strip()  # a string without quotes
-        _override(data, name.strip().split("."), value, setting)
+            group[last] = text.strip()  # a string without quotes
     return from_plain(TrainConfig, data, "config", TrainingError)
-
-
-def _override(data: dict[str, Any], path: Sequence[str], value: Any, setting: str) -> None:
-    name = path[0]
-    if name not in data:
-        raise TrainingError(f"--set {setting}: expected one of {', '.join(data)}, got {name!r}")
-    default = data[name]
-    if len(path) > 1:
-        if not isinstance(default, dict):
-            raise TrainingError(f"--set {setting}: {name} has no settings of its own")
-        _override(default, path[1:], value, setting)
-        return
-    if isinstance(default, dict):
-        raise TrainingError(f"--set {setting}: expected one of its settings, such as {name}.{next(iter(default))}")
-    data[name] = value
 
 
 # --- configurations ---------------------------------------------------------------------------------------------------

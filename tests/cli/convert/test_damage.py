@@ -14,7 +14,6 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -84,7 +83,7 @@ class Range:
         verdicts: list[Verdict] = []
 
         def read_and_convert() -> None:
-            verdicts.extend((self._read(), self._read_devkit(), self._converted("skip"), self._converted("report")))
+            verdicts.extend((self._read(), self._converted("skip"), self._converted("report")))
 
         try:
             assert works(read_and_convert)
@@ -104,20 +103,6 @@ class Range:
             for index in {0, len(dataset) - 1} if len(dataset) else ():
                 for neighbour in dataset[index]["neighbours"]:
                     _ = neighbour["images"], neighbour.get("boxes_3d")
-        except ArbiviewError as error:
-            return Verdict("refused", str(error))
-        return Verdict("read", "")
-
-    def _read_devkit(self) -> Verdict:
-        """As far as the devkit would have read it: lists of rows."""
-        try:
-            tables = read_tables(self.source)
-        except (ValueError, RecursionError):
-            return Verdict("read", "")
-        nusc = SimpleNamespace(dataroot=str(self.source), version=VERSION, **tables)
-        try:
-            dataset = NuScenesDataset(nusc=nusc, neighbours=Neighbours())
-            _ = len(dataset) and dataset[0]
         except ArbiviewError as error:
             return Verdict("refused", str(error))
         return Verdict("read", "")
@@ -284,15 +269,6 @@ def test_tables_that_cannot_be_parsed(tried: Range, table: str, content: bytes) 
     """Those that are only handed on are read before the first image is written, too."""
     kind, words = tried.try_out(table, content)
     assert kind == "refused" and f"table {table}: expected JSON, got" in words
-
-
-def test_a_devkit_object_whose_tables_are_no_lists(tried: Range) -> None:
-    class Devkit:
-        dataroot, version = str(tried.source), VERSION
-        sample, sample_data, ego_pose = 3, [], []
-
-    with pytest.raises(DataError, match="table sample: expected a list of rows, got int"):
-        NuScenesDataset(nusc=Devkit())
 
 
 def test_nothing_is_wrong_with_sound_tables(tried: Range) -> None:
