@@ -11,10 +11,8 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.generator.conditioning import (
     PoseContext,
-    Views,
     batched,
     frame_geometry,
-    input_channels,
     nearest_sources,
     plucker_rays,
     pooled,
@@ -77,18 +75,6 @@ def test_masks_are_means_over_latent_pixels() -> None:
     expected = torch.tensor([[[1, 0], [0, 0]], [[1 / 6, 0], [0, 0]]])
     assert torch.allclose(pooled(mask, (2, 2)), expected)
     assert pooled(mask, (3, 5)).shape == (2, 3, 5)  # odd sizes
-
-
-def test_dropped_conditions_are_gone_together() -> None:
-    one = lambda *shape: torch.rand(2, 3, *shape) + 0.1  # noqa: E731
-    views = Views(one(4, 2, 5), one(1, 2, 5), one(1, 2, 5), one(6, 2, 5), one(16))
-    dropped = views.dropped(torch.tensor([True, False]))
-    assert all(not value[0].any() for value in dropped)
-    assert all(torch.equal(value[1], kept[1]) for value, kept in zip(dropped, views, strict=True))
-    noisy = torch.randn(2, 3, 4, 2, 5)
-    channels = dropped.channels(noisy)
-    assert channels.shape[2] == input_channels(4) == 16
-    assert torch.equal(channels[:, :, :4], noisy)
 
 
 def test_the_pose_token_follows_the_prompt() -> None:

@@ -13,16 +13,12 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.favs.stage1_geometry import h_geom, h_planar
 from arbiview_aug.generator.correspondence import (
     FACING_M,
-    Correspondence,
     correspond,
     correspondences,
     plane_vectors,
     ray_map,
-    stacked,
-    token_sizes,
     window,
 )
-from tests.generator.small import ring
 
 GRID = (14, 25)
 LEFT = Camera.looking(
@@ -173,38 +169,11 @@ def test_bilinear_rows_interpolate() -> None:
     assert (rows > 0).sum(1).max() == 4
 
 
-@pytest.mark.parametrize("grid", [(1, 1), (1, 2), (3, 5)])
-def test_the_smallest_grids(grid: tuple[int, int]) -> None:
-    rig = ring(12)
-    for reads in correspondences(list(rig), list(rig), range(12), token_sizes(grid, 3), 0.0):
-        at = window(reads, 12)
-        assert torch.isfinite(reads.centre).all()
-        assert ((at.tap >= 0) & (at.tap < 12 * reads.valid[0, 0, 0, 0].numel())).all()
-        assert bool(at.inside[:, 4].all())  # the nearest token is always there
-
-
 def test_far_away_and_huge_calibrations_stay_finite() -> None:
     cameras = [LEFT, LEFT.shifted(x_m=9e8), LEFT.shifted(y_m=1e6), replace(LEFT, K=np.diag([1e6, 1e6, 1.0]))]
     for ground in (0.0, 1e300, -1e300):
         reads = correspondences(cameras, cameras, range(4), [(3, 5)], ground)[0]
         assert torch.isfinite(reads.centre).all()
-
-
-def test_batches_pad_with_what_is_not_valid() -> None:
-    one = correspondences([LEFT], [LEFT, LEFT.turned(yaw_deg=5)], [0], [GRID], 0.0)[0]
-    many = correspondences([LEFT], [LEFT, RIGHT, LEFT.turned(yaw_deg=5)], [0], [GRID], 0.0)[0]
-    both = stacked([one, many])
-    assert both.valid.shape == (2, 1, 2, 3, *GRID)
-    assert torch.equal(both.valid[1:], many.valid) and torch.equal(both.centre[1:], many.centre)
-    assert torch.equal(both.valid[0, :, :1, :1], one.valid[0]) and int(both.valid[0].sum()) == int(one.valid.sum())
-
-
-def test_dropped_frames_do_not_read_sources() -> None:
-    reads = correspondences([LEFT], [RIGHT, LEFT.turned(yaw_deg=5), LEFT], [2], [GRID], 0.0)[0]
-    both = stacked([reads, reads])
-    dropped: Correspondence = both.without(1, torch.tensor([True, False]))
-    assert not dropped.valid[0, 0, 0].any() and torch.equal(dropped.valid[0, 0, 1], both.valid[0, 0, 1])
-    assert torch.equal(dropped.valid[1], both.valid[1])
 
 
 def test_no_overlap_keeps_one_empty_slot() -> None:

@@ -85,19 +85,6 @@ def test_every_parameter_takes_part_in_every_step(generator: Generator) -> None:
         assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in denoiser.parameters())
 
 
-def test_sources_can_be_held_over_the_steps(generator: Generator, geometry: FrameGeometry) -> None:
-    """Their keys and values depend neither on the step nor on the targets."""
-    denoiser = generator.denoiser
-    sources = views(geometry, "source", 1)
-    with torch.no_grad():
-        read = denoiser.read_sources(sources, geometry.source_windows())
-        assert len(read) == len(denoiser.cross_view) == 5
-        kept = [k.clone() for k, _ in read]
-        run(denoiser, geometry, 10)
-        again = denoiser.read_sources(sources, geometry.source_windows())
-    assert all(torch.equal(a, b) and torch.equal(a, c) for a, (b, _), (c, _) in zip(kept, read, again, strict=True))
-
-
 def test_targets_read_sources_and_targets(generator: Generator, geometry: FrameGeometry) -> None:
     denoiser, t = generator.denoiser, torch.tensor([400])
     targets, sources = views(geometry, "target"), views(geometry, "source", 1)
@@ -167,19 +154,6 @@ def test_regression_starts_from_the_prefilled_latent(generator: Generator, geome
         assert not torch.equal(run(generator.denoiser, geometry, REGRESSION), start)
 
 
-def test_it_trains_under_autocast(generator: Generator, geometry: FrameGeometry) -> None:
-    """bfloat16 with float32 weights, as accelerate has it."""
-    denoiser, rows = copy.deepcopy(generator.denoiser).train(), []
-    with torch.autocast("cpu", torch.bfloat16):
-        out = run(denoiser, geometry, rows=rows)
-        loss = out.float().square().mean() + sum(r.predicted.square().mean() for r in rows)
-    loss.backward()
-    assert all(p.grad is None or torch.isfinite(p.grad).all() for p in denoiser.parameters())
-    with torch.no_grad():
-        exact = run(denoiser, geometry)
-    assert (out.float() - exact).abs().mean() < 0.05 * exact.abs().mean()
-
-
 def test_rows_for_the_geometric_loss(generator: Generator, geometry: FrameGeometry) -> None:
     """One entry a block; rows sum to 1; of untrained attention they are about uniform (1/3 off for a whole window)."""
     torch.manual_seed(0)
@@ -211,22 +185,6 @@ def test_parameter_counts() -> None:
     assert millions["small"][1] == pytest.approx(63, rel=0.01) and millions["small"][2] == pytest.approx(10, rel=0.03)
     assert millions["compact"][0] <= 7
     assert millions["tiny"][1] == pytest.approx(1.7, rel=0.01)
-
-
-@pytest.mark.slow
-def test_it_is_one_graph_for_torch_compile(generator: Generator) -> None:
-    """No graph breaks, for one rig after another; the default backend, minutes of compiling, was 3e-6 off."""
-    torch.compiler.reset()
-    denoiser, config = generator.denoiser, small_config()
-    compiled = torch.compile(denoiser, fullgraph=True, backend="aot_eager")
-    for yaw_deg in (20, 30, -10):
-        targets = list(ring(4, horizontal_fov_deg=120, yaw_deg=yaw_deg, name="t"))[:2]
-        geometry = frame_geometry(targets, list(ring(4, horizontal_fov_deg=100)), 0.0, config)
-        noisy = torch.randn(1, 2, 3, 6, 10)
-        with torch.no_grad():
-            read = denoiser.read_sources(views(geometry, "source", 1), geometry.source_windows())
-            arguments = (noisy, torch.tensor([400]), views(geometry, "target"), geometry.target_windows(), read)
-            assert torch.allclose(compiled(*arguments), denoiser(*arguments), atol=1e-4)
 
 
 # --- what the condition lacks -----------------------------------------------------------------------------------------

@@ -31,18 +31,6 @@ class Pictures(Dataset[dict[str, Any]]):
         return {"images": (images * 255).byte(), "rig": self.rig, "token": f"frame {index}"}
 
 
-class OneColour(Pictures):
-    """Frames whose cameras show one colour each, and a wall of LiDAR points around them."""
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        sample = super().__getitem__(index)
-        for k, image in enumerate(sample["images"]):
-            image[:] = 40 * k + 10
-        azimuth, height = torch.meshgrid(torch.linspace(-3.1, 3.1, 800), torch.linspace(-15, 15, 150), indexing="ij")
-        points = torch.stack([20 * azimuth.cos(), 20 * azimuth.sin(), height], -1).reshape(-1, 3)
-        return sample | {"points": points}
-
-
 def frames(count: int = 5) -> Frames:
     return Frames(Pictures(count), SIZE, [str(k) for k in range(count)])
 

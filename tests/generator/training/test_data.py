@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
 
-from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator.training import data
 from arbiview_aug.generator.training.data import Frames, open_frames
 from tests.generator.training.small import SIZE, Pictures, frames
@@ -35,12 +33,6 @@ def test_few_scenes_are_for_training_first(count: int, sizes: list[int]) -> None
     assert [len(part) for part in frames(count).split()] == sizes
 
 
-def test_unknown_data_are_refused(tmp_path: Path) -> None:
-    for where in ("kitti", "frames:", "nuscenes"):
-        with pytest.raises(TrainingError, match="expected synthetic, frames:PATH or nuscenes:PATH"):
-            open_frames(where, SIZE, scenes=1)
-
-
 @pytest.mark.parametrize("logs", [1, 3])
 def test_logs_are_never_split_and_one_alone_is_cut_into_blocks(
     logs: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -50,9 +42,3 @@ def test_logs_are_never_split_and_one_alone_is_cut_into_blocks(
     monkeypatch.setattr(data, "open_data", lambda _: drives)
     names = open_frames("py123d:/logs", SIZE, scenes=1).scenes
     assert names == [f"val-2021-07-{k % 3}" if logs == 3 else f"block {k // 3}" for k in range(30)]
-
-
-def test_streets() -> None:
-    found = open_frames("synthetic", (8, 14), scenes=2)
-    assert len(found) == 2 and len(found[0].images) == 6
-    assert found[0].images[0].dtype == torch.uint8

@@ -18,11 +18,11 @@ from arbiview_aug.generator.training.losses import (
     load_perceptual,
     masked_mse,
 )
+from tests.generator.small import small_config
 
 
 def diffusion(prediction: str = "v_prediction", zero_snr: bool = True) -> ForwardProcess:
-    schedule = noise_schedule(prediction=prediction, zero_snr=zero_snr)
-    return ForwardProcess(schedule.alphas_cumprod, prediction)  # type: ignore[arg-type]
+    return ForwardProcess(small_config(prediction=prediction, zero_snr=zero_snr, residual=zero_snr))
 
 
 @pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
@@ -36,7 +36,7 @@ def test_the_target_gives_x0_back(prediction: str) -> None:
 
 
 def test_the_forward_process_is_the_samplers() -> None:
-    schedule = noise_schedule(prediction="v_prediction", zero_snr=True)
+    schedule = noise_schedule(small_config())
     process = diffusion()
     x0, eps = torch.randn(2, 2, 1, 3, 4, 5).unbind(0)
     for t in (10, 600, 999):
@@ -93,20 +93,10 @@ def test_geo_has_finite_gradients_at_zero_and_without_rows(mode: str) -> None:
 def features() -> nn.Sequential:
     """VGG16's layout with two channels."""
     layers: list[nn.Module] = []
-    before = 3
-    for k in range(31):
-        kind = (
-            "conv"
-            if k in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
-            else "pool"
-            if k in (4, 9, 16, 23, 30)
-            else ""
-        )
-        if kind == "conv":
-            layers.append(nn.Conv2d(before, 2, 3, padding=1))
-            before = 2
-        else:
-            layers.append(nn.MaxPool2d(2) if kind else nn.ReLU(inplace=True))
+    for convolutions in (2, 2, 3, 3, 3):
+        for _ in range(convolutions):
+            layers += [nn.Conv2d(2 if layers else 3, 2, 3, padding=1), nn.ReLU(inplace=True)]
+        layers.append(nn.MaxPool2d(2))
     return nn.Sequential(*layers)
 
 

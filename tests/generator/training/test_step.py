@@ -36,7 +36,7 @@ def test_each_item_is_noised_at_its_own_time_and_compared_with_its_own_truth(mon
     times = [3, 400, 950, REGRESSION]
     step, batch, draws = step_of(config(loss=LossConfig(geo=0.0, perceptual=0.0)), times)
     x0 = batch.truth * 2 - 1
-    share = noise_schedule(prediction="v_prediction", zero_snr=True).alphas_cumprod
+    share = noise_schedule(config().generator).alphas_cumprod
     signal, noise = ([float(part[min(t, 999)]) ** 0.5 for t in times] for part in (share, 1 - share))
     noisy, answer = [], []
     for b in range(3):

@@ -93,13 +93,6 @@ def test_a_stopped_run_goes_on_bit_for_bit(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_workers_change_nothing(tmp_path: Path) -> None:
-    for workers in (0, 2):
-        run(tmp_path / str(workers), steps=2, workers=workers).train()
-    assert same(tensors(tmp_path / "0"), tensors(tmp_path / "2"))
-
-
-@pytest.mark.slow
 def test_a_full_disk_leaves_the_last_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made = run(tmp_path, steps=2)
     made.train()
@@ -165,16 +158,8 @@ def test_a_state_of_other_settings_is_refused(tmp_path: Path) -> None:
         run(tmp_path, lr=0.5)
     with pytest.raises(TrainingError, match=r"a run with other loss.known_weight \(0.5 instead of 0.2\); .* --output$"):
         run(tmp_path, steps=2, loss=replace(config().loss, known_weight=0.5))
-    many = {
-        "batch": 3,
-        "warmup": 3,
-        "weight_decay": 0.5,
-        "ema": 0.5,
-        "cond_drop_prob": 0.5,
-        "scenes": 3,
-        "attention": False,
-    }
-    with pytest.raises(TrainingError, match=r"attention \(False instead of True\), and 1 more; resume"):
+    many = {"batch": 3, "warmup": 3, "weight_decay": 0.5, "ema": 0.5, "cond_drop_prob": 0.5, "scenes": 3, "lr": 1}
+    with pytest.raises(TrainingError, match=r"cond_drop_prob \(0.5 instead of 0.1\), and 1 more; resume"):
         run(tmp_path, steps=2, **many)
     run(tmp_path, steps=2, workers=1, save_every=7)  # those may change
 
@@ -197,13 +182,6 @@ def test_a_state_of_other_data_weights_or_processes_is_refused(tmp_path: Path, m
     monkeypatch.setattr("accelerate.Accelerator.num_processes", 2)
     with pytest.raises(TrainingError, match=r"a run with other number of processes \(2 instead of 1\);"):
         run(tmp_path, generator=frozen)
-
-
-def test_the_deviation_of_a_resumed_run_is_not_measured_again(tmp_path: Path) -> None:
-    made = run(tmp_path)
-    made.generator.denoiser.deviation.copy_(torch.tensor([0.7, 0.4]))
-    made.save()
-    assert torch.equal(run(tmp_path).generator.denoiser.deviation, torch.tensor([0.7, 0.4]))
 
 
 def test_a_state_that_is_no_state_is_refused(tmp_path: Path) -> None:
@@ -323,32 +301,6 @@ def test_signals_that_are_ignored_stay_so(in_thread: bool) -> None:
     assert found[0] == signal.SIG_IGN and (found[1] == before[1]) == in_thread
 
 
-def test_signals_of_workers_are_left_to_the_trainer() -> None:
-    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
-    threads = torch.get_num_threads()
-    try:
-        one_thread_worker(0)
-        assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
-    finally:
-        torch.set_num_threads(threads)
-        for number, handler in zip((signal.SIGTERM, signal.SIGINT), before, strict=True):
-            signal.signal(number, handler)
-
-
-@pytest.mark.slow
-def test_a_frozen_unet_stays_as_it_is(tmp_path: Path) -> None:
-    frozen = replace(config().generator, frozen_unet=True)
-    made = run(tmp_path, generator=frozen, steps=2)
-    before = {name: value.clone() for name, value in made.generator.denoiser.state_dict().items()}
-    made.train()
-    moved = {
-        name for name, value in made.generator.denoiser.state_dict().items() if not torch.equal(value, before[name])
-    }
-    assert moved and all(name.startswith(("cross_view", "context", "regression", "unet.conv_in")) for name in moved)
-    assert not any("down_blocks" in name for name in tensors(tmp_path))
-    assert run(tmp_path, generator=frozen, steps=2).done == 2
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("checkpointing", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_bfloat16_and_recomputed_blocks_train(tmp_path: Path, checkpointing: bool) -> None:
@@ -385,15 +337,6 @@ def test_bfloat16_as_on_a_gpu_trains(tmp_path: Path) -> None:
         assert all(math.isfinite(value) for value in made.train_step(next(made._batches())).values())
 
 
-def test_what_was_trained_is_said_to_whoever_loads_it(tmp_path: Path) -> None:
-    for share in (0.0, 0.3):
-        made = run(tmp_path / str(share), steps=1, loss=LossConfig(perceptual=0.0, regression=share))
-        made.save()
-        loaded = Generator.from_pretrained(tmp_path / str(share) / "generator")
-        assert loaded.config.one_step == (share > 0)
-        assert not any(parameter.requires_grad for parameter in loaded.parameters())
-
-
 def test_a_generator_of_other_settings_is_refused(tmp_path: Path) -> None:
     """It would say that it was trained as it was not: with inpainted conditions, say."""
     settings = config()
@@ -419,15 +362,6 @@ def test_others_are_not_left_waiting_where_saving_fails(tmp_path: Path, monkeypa
     monkeypatch.setattr("arbiview_aug.generator.training.trainer.save_state", full)
     made._save_or_warn()
     assert waited == [1]
-
-
-@pytest.mark.slow
-def test_recomputing_blocks_changes_no_step(tmp_path: Path) -> None:
-    plain, again = run(tmp_path / "a", steps=1), run(tmp_path / "b", steps=1, checkpointing=True)
-    for made in (plain, again):
-        made.train_step(next(made._batches()))
-    for a, b in zip(plain.generator.denoiser.parameters(), again.generator.denoiser.parameters(), strict=True):
-        assert torch.allclose(a, b, atol=1e-6)
 
 
 @pytest.mark.slow
@@ -482,3 +416,24 @@ def test_an_untrained_network_errs_by_one_unit_at_all_times(tmp_path: Path, monk
         unit = made.generator.denoiser.output_scale(times, views)
         found.append(float((((got - wanted) / unit) ** 2)[batch.valid[:, :, None].expand_as(got)].mean()))
     assert 0.4 < min(found) and max(found) < 2.5, found
+
+
+def test_signals_of_workers_are_left_to_the_trainer() -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
+    threads = torch.get_num_threads()
+    try:
+        one_thread_worker(0)
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_IGN
+    finally:
+        torch.set_num_threads(threads)
+        for number, handler in zip((signal.SIGTERM, signal.SIGINT), before, strict=True):
+            signal.signal(number, handler)
+
+
+def test_what_was_trained_is_said_to_whoever_loads_it(tmp_path: Path) -> None:
+    for share in (0.0, 0.3):
+        made = run(tmp_path / str(share), steps=1, loss=LossConfig(perceptual=0.0, regression=share))
+        made.save()
+        loaded = Generator.from_pretrained(tmp_path / str(share) / "generator")
+        assert loaded.config.one_step == (share > 0)
+        assert not any(parameter.requires_grad for parameter in loaded.parameters())
