@@ -10,7 +10,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import synthetic
-from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig, demo_target_rig
+from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, SKY_ID, cast, find_candidates, scene_from
 from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, BoxClass
 
@@ -94,45 +94,6 @@ def test_ground_depth_is_the_plane_intersection():
     np.testing.assert_allclose(views.depth_m[0].numpy()[ground], expected, rtol=1e-4)
 
 
-@pytest.mark.slow
-def test_depth_and_color_agree_between_two_rigs():
-    a = Rig([forward_camera()])
-    b = Rig([forward_camera(position_m=(2.3, 0.3, 2.1), azimuth_deg=6.0, elevation_deg=-4.0)])
-    drive = SyntheticDrive(a, num_frames=4, seed=3)
-    exact, errors = [], []
-    for index in range(4):
-        views = [drive.render(index, rig) for rig in (a, b)]
-        depth, depth_b = (v.depth_m[0].numpy() for v in views)
-        rays = a[0].unproject(a[0].pixel_grid()).directions
-        scale = depth / (rays @ a[0].cam2ego[:3, 2])
-        points = a[0].center_m + rays * np.where(np.isfinite(scale), scale, 0)[..., None]
-        uv, z, valid = b[0].project(points)
-        seen = valid & b[0].contains(uv) & np.isfinite(depth)
-        x, y = uv[seen].round().astype(int).T
-        difference = depth_b[y, x] / z[seen] - 1
-        same = (np.abs(difference) < 0.03) & (views[1].classes[0].numpy()[y, x] == views[0].classes[0].numpy()[seen])
-        # A point seen by a is seen by b or hidden by something nearer: never in front of what b sees.
-        exact.append((difference < 0.03).mean())
-        colors = [v.images[0].permute(1, 2, 0).numpy().astype(float) for v in views]
-        errors.append(np.abs(colors[0][seen][same] - colors[1][y, x][same]).mean())
-        assert same.mean() > 0.6
-    assert np.mean(exact) > 0.97  # the rest are outlines and slanted surfaces, met half a pixel away
-    assert np.mean(errors) < 8  # grey levels; nearest-pixel sampling and view-dependent reflections included
-
-
-@pytest.mark.slow
-def test_a_rig_on_another_ground_height_sees_the_same_pixels():
-    rig = demo_source_rig(SIZE)
-    raised = Rig([c.shifted(z_m=0.7) for c in rig], ground_z_m=0.7)
-    drive = SyntheticDrive(rig, num_frames=1, seed=4)
-    one, other = drive.render(0, rig), drive.render(0, raised)
-    difference = (one.images.int() - other.images.int()).abs()
-    assert (difference > 2).float().mean() < 1e-3  # rounding of the camera's height moves single outlines
-    low, high = SyntheticDrive(rig, num_frames=1, seed=4)[0], SyntheticDrive(raised, num_frames=1, seed=4)[0]
-    torch.testing.assert_close(low["boxes_3d"][:, 2] + 0.7, high["boxes_3d"][:, 2])
-    torch.testing.assert_close(low["points"][:, 2] + 0.7, high["points"][:, 2])
-
-
 def in_box(box: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Points (n, 3) along a box's own axes, from its centre."""
     c, s = np.cos(box[6]), np.sin(box[6])
@@ -156,39 +117,6 @@ def test_instances_fill_their_boxes():
                 assert (np.abs(in_box(boxes[row], points)) <= boxes[row, 3:6] / 2 + 0.01).all()
                 checked += 1
     assert checked > 40
-
-
-@pytest.mark.slow
-def test_isolated_vehicles_outlines_agree_with_their_boxes():
-    """Far and whole in the image: the silhouette's bounds are those of the projected corners within 2 pixels.
-
-    Near by they need not be: bumpers overhang the wheels and roofs are shorter than the box, as on real vehicles.
-    """
-    camera = forward_camera(width_px=704, height_px=160, horizontal_fov_deg=30.0)
-    drive = SyntheticDrive(Rig([camera]), num_frames=16, seed=2)
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
-    errors = []
-    for index in range(16):
-        boxes, classes = drive.scene(index).boxes_ego(0.0), drive.scene(index).box_classes
-        views = drive.render(index)
-        instances, depth = views.instances[0].numpy(), views.depth_m[0].numpy()
-        for row in np.flatnonzero((boxes[:, 0] > 40) & (classes != BoxClass.PEDESTRIAN)):
-            c, s = np.cos(boxes[row, 6]), np.sin(boxes[row, 6])
-            corners = boxes[row, :3] + (signs * boxes[row, 3:6]) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-            uv, z, valid = camera.project(corners)
-            low, high = uv.min(0), uv.max(0)
-            if not valid.all() or (low < 4).any() or (high > np.array(camera.size[::-1]) - 5).any():
-                continue
-            window = np.s_[int(low[1]) - 2 : int(high[1]) + 4, int(low[0]) - 2 : int(high[0]) + 4]
-            # Isolated: nothing but the ground in front of its far end.
-            others = (instances[window] != row) & (depth[window] < z.max())
-            if (others & (views.classes[0].numpy()[window] != SceneClass.GROUND)).any():
-                continue
-            ys, xs = np.nonzero(instances == row)
-            bounds = np.array([xs.min() - 0.5, ys.min() - 0.5, xs.max() + 0.5, ys.max() + 0.5])
-            errors.append(np.abs(bounds - np.array([*low, *high])))
-    assert len(errors) >= 4
-    assert np.max(errors) <= 2.0
 
 
 @pytest.mark.slow
@@ -238,15 +166,6 @@ def test_lidar_points_lie_on_what_the_cameras_see():
     assert np.concatenate(agreeing).mean() > 0.9
 
 
-def test_boxes_are_where_the_lidar_sees_objects():
-    drive = SyntheticDrive(demo_target_rig(SIZE), num_frames=1, seed=11)
-    sample = drive[0]
-    points, inside = sample["points"][:, :3].numpy(), 0
-    for box in sample["boxes_3d"].numpy():
-        inside += (np.abs(in_box(box, points)) < box[3:6] / 2 + 0.08).all(1).sum() > 5
-    assert inside >= 5
-
-
 def test_nothing_stands_where_the_cameras_are():
     for index in range(12):
         scene = make_scene(2, index)
@@ -263,8 +182,3 @@ def test_nothing_stands_where_the_cameras_are():
             & (low[:, 1] < 1.3)
         )
         assert not (near & (low[:, 2] < 4)).any()
-
-
-def test_vehicles_vary_in_height():
-    heights = np.concatenate([make_scene(2, i).boxes[make_scene(2, i).box_classes < 4][:, 5] for i in range(12)])
-    assert heights.min() < 1.5 and heights.max() > 3.2 and heights.std() > 0.4

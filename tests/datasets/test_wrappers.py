@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch.utils.data import DataLoader, IterableDataset, Subset, get_worker_info
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from arbiview_aug.datasets import MixedDataset, RetargetedDataset, RetargetedIterable, WithDepth
 from arbiview_aug.errors import DataError, SampleError, SampleTypeError
@@ -71,13 +71,6 @@ def test_map_style_in_a_data_loader(workers: int) -> None:
         RetargetedDataset(BatchedNumbers(), add_ten), batch_size=2, sampler=range(4), num_workers=workers
     )
     assert [batch["images"].tolist() for batch in batched] == [[110, 111], [112, 113]]
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_iterable_in_a_data_loader(workers: int) -> None:
-    loader = DataLoader(RetargetedIterable(Stream(), add_ten), batch_size=None, num_workers=workers)
-    for _ in range(2):
-        assert sorted(int(sample["images"]) for sample in loader) == [10, 11, 12, 13, 14, 15]
 
 
 def test_length_of_a_stream() -> None:
@@ -175,29 +168,6 @@ def test_mixed_items_are_the_same_samples_in_one_form_or_the_other() -> None:
     assert cameras_of([mixed[i] for _ in range(25) for i in range(40)]) == cameras_of(drawn)
     assert {*cameras_of([MixedDataset(Views(6), Views(5), 0)[i] for i in range(40)])} == {6}
     assert {*cameras_of([MixedDataset(Views(6), Views(5), 1)[i] for i in range(40)])} == {5}
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-@pytest.mark.parametrize("batch", [{"batch_size": None}, {"batch_size": 4, "collate_fn": list}])
-def test_mixed_in_a_data_loader(workers: int, batch: dict[str, Any]) -> None:
-    """Every sample once an epoch, whatever the sampler; other coins in each worker and epoch; the seed repeats them."""
-    dataset = Subset(MixedDataset(Views(6), Views(5), 0.5), range(32))
-
-    def epochs() -> list[list[dict[str, Any]]]:
-        torch.manual_seed(3)
-        loader = DataLoader(dataset, shuffle=True, num_workers=workers, **batch)
-        batches = [list(loader) for _ in range(2)]
-        return batches if "collate_fn" not in batch else [[s for part in epoch for s in part] for epoch in batches]
-
-    one, again = epochs(), epochs()
-    forms = []
-    for epoch, repeated in zip(one, again, strict=True):
-        assert sorted(sample["index"] for sample in epoch) == list(range(32))
-        assert cameras_of(epoch) == cameras_of(repeated) and {*cameras_of(epoch)} == {5, 6}
-        forms.append({sample["index"]: len(sample["images"]) for sample in epoch})
-    assert forms[0] != forms[1]
-    first, second = cameras_of(one[0])[::2], cameras_of(one[0])[1::2]  # single samples: the workers in turn
-    assert batch["batch_size"] or first != second
 
 
 def test_wrong_mixtures() -> None:

@@ -20,15 +20,11 @@ from torch.overrides import TorchFunctionMode
 from arbiview_aug.errors import OutputError, TrainingError
 from arbiview_aug.generator import Generator, checkpoint
 from arbiview_aug.generator.checkpoint import read_checkpoint
-from arbiview_aug.generator.denoiser import REGRESSION
 from arbiview_aug.generator.training import checkpointing, trainer
 from arbiview_aug.generator.training.config import LossConfig
 from arbiview_aug.generator.training.data import one_thread_worker
-from arbiview_aug.generator.training.losses import Perceptual
-from arbiview_aug.generator.training.pseudo_views import collate
 from arbiview_aug.generator.training.trainer import Trainer, learning_rate
 from tests.generator.training.small import config, frames
-from tests.generator.training.test_losses import features
 
 
 @pytest.fixture(autouse=True)
@@ -255,22 +251,6 @@ def test_what_was_logged_before_a_stop_is_kept(tmp_path: Path, monkeypatch: pyte
     assert purged == [5]  # that step and later ones are deleted
 
 
-def test_the_average_follows_what_is_trained(tmp_path: Path) -> None:
-    """Decay 0 after the first step and 2/11 after the second, which is below that of the settings."""
-    made = run(tmp_path, steps=3)
-    parameters = dict(made.generator.denoiser.named_parameters())
-    expected = {name: value.detach().clone() for name, value in parameters.items()}
-    for step, batch in zip(range(2), made._batches(), strict=False):
-        made.train_step(batch)
-        made.done += 1
-        for name, value in parameters.items():
-            expected[name] = torch.lerp(value.detach(), expected[name], (0, 2 / 11)[step])
-    moved = [name for name, value in parameters.items() if not torch.equal(value, expected[name])]
-    averages = dict(zip(made.trained, made.average.shadow_params, strict=True))
-    assert moved and all(torch.allclose(averages[name], expected[name], atol=1e-6) for name in averages)
-    assert any(not torch.allclose(averages[name], parameters[name], atol=1e-6) for name in moved)
-
-
 def test_the_learning_rate_warms_up_and_falls_to_nothing() -> None:
     settings = config(steps=100, warmup=10, lr=1.0)
     rates = [learning_rate(settings, step) for step in range(101)]
@@ -365,23 +345,6 @@ def test_others_are_not_left_waiting_where_saving_fails(tmp_path: Path, monkeypa
 
 
 @pytest.mark.slow
-def test_the_perceptual_term_comes_every_nth_step(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    settings = config(loss=LossConfig(perceptual=0.01, perceptual_every=2, perceptual_below_t=1000, regression=0.0))
-    vgg = Perceptual(features())
-    generator = Generator.from_config(settings.generator)
-    made = Trainer(settings, frames(), generator, tmp_path, perceptual=vgg, show=False, say=lambda _: None)
-    batches = made._batches()
-    terms = []
-    for _ in range(3):
-        terms.append(made.train_step(next(batches)))
-        made.done += 1
-    assert [("perceptual" in of_step) for of_step in terms] == [True, False, True]
-    weighted = terms[0]["main"] + 0.1 * terms[0]["geo"] + 0.01 * terms[0]["perceptual"]
-    assert terms[0]["total"] == pytest.approx(weighted, rel=1e-5)
-
-
-@pytest.mark.slow
 def test_what_the_condition_lacks_is_measured_and_shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It sets the scale of a residual generator's diffusion: the same for the same data; it is saved."""
     monkeypatch.setattr(trainer, "_DEVIATION_ITEMS", 32)
@@ -392,30 +355,6 @@ def test_what_the_condition_lacks_is_measured_and_shipped(tmp_path: Path, monkey
     assert one.train()
     kept = Generator.from_pretrained(tmp_path / "one" / "generator").denoiser.deviation
     assert torch.equal(kept, one.generator.denoiser.deviation)
-
-
-def test_an_untrained_network_errs_by_one_unit_at_all_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In its unit the error of the linear guess does not depend on t: no time starves."""
-    monkeypatch.setattr(trainer, "_DEVIATION_ITEMS", 32)
-    made = run(tmp_path, batch=8, loss=LossConfig(perceptual=0.0, known_weight=1.0))
-    batch = collate([made.items[k] for k in range(8)])
-    truth, condition = batch.truth * 2 - 1, batch.condition * 2 - 1
-    views = batch.geometry.target_views(condition, batch.known, batch.confidence)
-    read = made.generator.denoiser.read_sources(
-        batch.geometry.source_views(batch.sources, batch.seen, batch.seen), batch.geometry.source_windows()
-    )
-    eps = torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
-    found = []
-    for t in (50, 300, 600, 999, REGRESSION):
-        times = torch.full((8,), t)
-        at = times.clamp(max=999)
-        x = condition if t == REGRESSION else made.step.diffusion.noisy(truth, eps, at)
-        with torch.no_grad():
-            got = made.generator.denoiser(x, times, views, batch.geometry.target_windows(), read)
-        wanted = truth if t == REGRESSION else made.step.diffusion.target(truth, eps, at)
-        unit = made.generator.denoiser.output_scale(times, views)
-        found.append(float((((got - wanted) / unit) ** 2)[batch.valid[:, :, None].expand_as(got)].mean()))
-    assert 0.4 < min(found) and max(found) < 2.5, found
 
 
 def test_signals_of_workers_are_left_to_the_trainer() -> None:
