@@ -121,8 +121,8 @@ def write_root(root: Path, data: Tables, size: tuple[int, int]) -> Path:
     (root / VERSION).mkdir(parents=True)
     for name, rows in data.items():
         (root / VERSION / f"{name}.json").write_text(json.dumps(rows))
-    for row in data["sample_data"]:
-        path = root / row["filename"]
+    for name in (row["filename"] for row in data["sample_data"] if "filename" in row):
+        path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".bin":
             np.array([[5.0, 1.0, -0.5, 9.0, 1.0]], np.float32).tofile(path)
