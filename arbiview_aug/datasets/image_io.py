@@ -1,8 +1,7 @@
 """Decoding of a frame's images into one block, in the renderer's memory layout, and encoding.
 
-OpenCV crashes on paths that are not UTF-8, so files are read here and it gets their bytes. It hides three failures,
-which are checked here: it fills truncated JPEGs with grey, rotates images by their EXIF orientation, and may leave the
-output array untouched if decoding into it fails.
+OpenCV crashes on paths that are not UTF-8, so files are read here and it gets their bytes. It fills truncated JPEGs
+with grey and rotates images by their EXIF orientation, which is prevented here.
 """
 
 from __future__ import annotations
@@ -29,9 +28,8 @@ ByteArray = npt.NDArray[np.uint8]
 
 _MOST_BYTES = 1 << 28  # of an image file: more than 9,000 by 9,000 pixels take, uncompressed
 
-# The reduced flags without their BGR bit, which excludes IMREAD_COLOR_RGB.
-_REDUCED = {1: 0, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
-_REDUCED_FLAGS = {reduce: flag & ~cv2.IMREAD_COLOR for reduce, flag in _REDUCED.items()}
+# Without the bit of BGR, which excludes IMREAD_COLOR_RGB.
+_REDUCED_FLAGS = {1: 0, 2: cv2.IMREAD_REDUCED_GRAYSCALE_2, 4: cv2.IMREAD_REDUCED_GRAYSCALE_4}
 _FLAGS = cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_COLOR_RGB
 
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
@@ -84,9 +82,7 @@ def decode_images(
     shapes = [(*reduced_size(size, reduce), 3) for _, size in headers]
     is_block = len(set(shapes)) == 1
     images: Any = np.empty((len(files), *shapes[0]), np.uint8) if is_block else [np.empty(s, np.uint8) for s in shapes]
-    for file, content, label, (format, _), out in zip(files, contents, labels, headers, images, strict=True):
-        if format == "JPEG" and reduce == 1 and _decode_jpeg_in_place(out, file):
-            continue
+    for content, label, (format, _), out in zip(contents, labels, headers, images, strict=True):
         image = _decoded(content, label, format, _FLAGS | (_REDUCED_FLAGS[reduce] if format == "JPEG" else 0))
         if format == "PNG":  # cv2's reduced flags round sizes down, to another scale than for JPEGs
             image = area_reduced(image, reduce)
@@ -247,21 +243,6 @@ def area_reduced(image: npt.NDArray[Any], reduce: int) -> npt.NDArray[Any]:
     h, w = image.shape[:2]
     image = cv2.copyMakeBorder(image, 0, -h % reduce, 0, -w % reduce, cv2.BORDER_REPLICATE)
     return cv2.resize(image, reduced_size((h, w), reduce)[::-1], interpolation=cv2.INTER_AREA)
-
-
-def _decode_jpeg_in_place(out: ByteArray, path: Path) -> bool:
-    """Decode a file that was read before into ``out``, which bytes cannot: their copy costs a tenth of the time.
-
-    Returns False on failure, which a mark detects that was left untouched, and for a path that OpenCV crashes on.
-    """
-    mark = np.resize(np.array([0, 255, 0, 255, 0, 255, 255], np.uint8), out[0].shape)
-    out[0] = out[-1] = mark
-    try:
-        str(path).encode()
-        image = cv2.imread(str(path), out, _FLAGS)
-    except (UnicodeEncodeError, cv2.error):  # cv2.error: the decoded size is not the header's
-        return False
-    return image is not None and np.may_share_memory(image, out) and not any((out[k] == mark).all() for k in (0, -1))
 
 
 JPEG_QUALITY = 96  # quality at 4:4:4 chroma; costs at most 0.08 dB (acceptance/test_converted.py)

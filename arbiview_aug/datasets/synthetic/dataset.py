@@ -132,7 +132,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
     def _images(self, scene: Scene) -> Tensor | list[Tensor]:
         views = self._renderer.render(scene, self.rig.cameras, self.rig.ground_z_m)
-        return stacked([view.image for view in views])
+        return stacked([image for image, *_ in views])
 
     def _ego2world(self, scene: Scene) -> Tensor:
         """(4, 4) pose of the rig's ego frame; the road is at z = 0 of the world, for every rig."""
@@ -150,7 +150,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         """
         rig = self.rig if rig is None else _checked_rig(rig)
         views = self._renderer.render(self.scene(index), rig.cameras, rig.ground_z_m)
-        return RenderedViews(*(stacked([v[k] for v in views]) for k in range(4)))
+        return RenderedViews(*(stacked(list(maps)) for maps in zip(*views, strict=True)))
 
     def points(self, index: int, rig: Rig | None = None) -> Tensor:
         """(P, 4) float32 LiDAR-like points x y z intensity (0 to 255) of scene ``index``, in the rig's ego frame.

@@ -44,15 +44,6 @@ _TABLES: LRUCache[int, SceneTables] = LRUCache(4)
 """Tables of the last scenes, which they keep, so that no other scene has the same id."""
 
 
-class CameraView(NamedTuple):
-    """One camera's part of ``RenderedViews``."""
-
-    image: Tensor
-    depth_m: Tensor
-    classes: Tensor
-    instances: Tensor
-
-
 class CameraRays(NamedTuple):
     """A camera's rays by tile, in the ego frame."""
 
@@ -149,8 +140,11 @@ class Renderer:
     def __reduce__(self) -> tuple[Any, tuple[()]]:
         return partial(type(self), supersampling=self.supersampling), ()  # without the caches
 
-    def render(self, scene: Scene, cameras: Sequence[Camera], ground_z_m: float) -> list[CameraView]:
-        """Render ``scene``, whose road lies at ``ground_z_m`` in the cameras' ego frame."""
+    def render(self, scene: Scene, cameras: Sequence[Camera], ground_z_m: float) -> list[tuple[Tensor, ...]]:
+        """Image, depth, classes and instances of each camera, as of ``RenderedViews``.
+
+        The road of ``scene`` lies at ``ground_z_m`` in the cameras' ego frame.
+        """
         batches: list[list[Camera]] = [[]]
         for camera in cameras:  # small cameras are shaded together, in longer tensor operations
             if batches[-1] and sum(c.width_px * c.height_px for c in (*batches[-1], camera)) > _BATCH_PX:
@@ -159,7 +153,7 @@ class Renderer:
         with small_steps():
             return [view for batch in batches for view in self._render_batch(scene, batch, ground_z_m)]
 
-    def _render_batch(self, scene: Scene, cameras: list[Camera], ground_z_m: float) -> list[CameraView]:
+    def _render_batch(self, scene: Scene, cameras: list[Camera], ground_z_m: float) -> list[tuple[Tensor, ...]]:
         tables = _TABLES.get(id(scene), partial(SceneTables.build, scene))
         first = self._cast(scene, cameras, ground_z_m)
         hits = first.hits
@@ -228,7 +222,7 @@ class Renderer:
         start = first.start[tile].repeat_interleave(s * s, 0)
         return tile * outline.shape[1] + slot, _hits(start, direction, t, hit, pitch)
 
-    def _views(self, scene: Scene, first: _Cast, color: Tensor) -> list[CameraView]:
+    def _views(self, scene: Scene, first: _Cast, color: Tensor) -> list[tuple[Tensor, ...]]:
         hit, rays = first.hit, first.rays
         axis = rays.directions[:, 0] * rays.axis[:, :1] + rays.directions[:, 1] * rays.axis[:, 1:2]
         depth = first.t * (axis + rays.directions[:, 2] * rays.axis[:, 2:])
@@ -244,7 +238,7 @@ class Renderer:
         views = []
         for camera, *parts in zip(first.cameras, *(a.split(first.tiles) for a in maps), strict=True):
             image, *rest = (_from_tiles(a, camera.size) for a in parts)
-            views.append(CameraView(*(a.contiguous() for a in (image.permute(2, 0, 1), *rest))))
+            views.append(tuple(a.contiguous() for a in (image.permute(2, 0, 1), *rest)))
         return views
 
 

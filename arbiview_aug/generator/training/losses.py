@@ -6,7 +6,6 @@ reconstruct the real one; FAVS's image has the very holes that the model is to f
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +24,6 @@ from arbiview_aug.generator.training.config import GeoMode, TrainConfig
 from arbiview_aug.generator.training.pseudo_views import Batch
 
 VGG_LAYERS = (3, 8, 15, 22)  # relu1_2, 2_2, 3_3, 4_3 of torchvision's vgg16 (Johnson et al. 2016); λ_l = 1/4
-LATENT_BYTES = 4 * 2**30  # memory for latents of real views: 190,000 of 224 x 400 pixels
 
 
 class ForwardProcess:
@@ -172,7 +170,6 @@ class Step(nn.Module):
         super().__init__()
         self.config, self.denoiser = config, denoiser
         self._frozen = (autoencoder, perceptual)  # a tuple: not among this module's parameters
-        self._cache: dict[tuple[int, int], torch.Tensor] = {}  # x0 of real views, by frame and camera
         self.diffusion = ForwardProcess(config.generator)
 
     def forward(self, batch: Batch, draws: Draws, perceptual: bool = False) -> dict[str, torch.Tensor]:
@@ -181,7 +178,7 @@ class Step(nn.Module):
         autoencoder, vgg = self._frozen
         geometry = batch.geometry
         with torch.no_grad():
-            x0 = self._latents(batch)
+            x0 = autoencoder.encode(batch.truth).float()
             views, source_views = batch.conditions.encoded(config.generator, autoencoder, geometry)
         size = (x0.shape[-2], x0.shape[-1])
         valid = (pooled(batch.valid, size) > 0.99).float()[:, :, None]
@@ -216,21 +213,6 @@ class Step(nn.Module):
             image, truth, known = (value[..., y : y + side, x : x + side].flatten(0, 1) for value in compared)
             terms["perceptual"] = vgg(torch.where(known, image, truth), truth).sum() / valid.shape[:2].numel()
         return terms
-
-    def _latents(self, batch: Batch) -> torch.Tensor:
-        """x0 (B, N, C, h, w) of the truth; a VAE encodes each real view once, and alone: the same bits in any batch."""
-        autoencoder, _ = self._frozen
-        if autoencoder.vae is None:
-            return autoencoder.encode(batch.truth).float()
-        latents = []
-        for image, view in zip(batch.truth.flatten(0, 1), itertools.chain(*batch.views), strict=True):
-            latent = self._cache.get(view)
-            if latent is None:
-                latent = autoencoder.encode(image[None])[0].float().cpu()
-                if len(self._cache) * latent.nbytes < LATENT_BYTES:
-                    self._cache[view] = latent
-            latents.append(latent)
-        return torch.stack(latents).unflatten(0, batch.truth.shape[:2]).to(batch.truth.device)
 
     def total(self, terms: dict[str, torch.Tensor]) -> torch.Tensor:
         """L_total = L_main + α L_geo + β L_perceptual; the one-step head's loss counts as L_main."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.config import AutoencoderConfig
 from arbiview_aug.generator.denoiser import REGRESSION
 from arbiview_aug.generator.sampler import noise_schedule
 from arbiview_aug.generator.training.config import LossConfig, PseudoViewConfig, TrainConfig
@@ -71,28 +69,3 @@ def test_the_perceptual_term_is_a_mean_over_targets() -> None:
     step, batch, draws = step_of(settings, [300, 600])
     step._frozen = step._frozen[0], lambda predicted, _: torch.ones(len(predicted))  # type: ignore[assignment]
     assert batch.truth.shape[:2] == (2, 2) and float(step(batch, draws, perceptual=True)["perceptual"]) == 1
-
-
-def test_a_vae_encodes_each_real_view_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And alone, so that a resumed run, whose batches are others, has the same bits."""
-    shape = AutoencoderConfig(widths=(16, 16), latent_channels=4, layers=1)
-    settings = config(
-        generator=replace(config().generator, autoencoder=shape),
-        loss=LossConfig(geo=0.0, perceptual=0.0, regression=0.0),
-    )
-    step, batch, _ = step_of(settings, [300] * 4)
-    autoencoder, _ = step._frozen
-    encoded: list[int] = []
-    plain = autoencoder.encode
-
-    def encode(images: torch.Tensor) -> torch.Tensor:
-        encoded.append(len(images))
-        return plain(images)
-
-    monkeypatch.setattr(autoencoder, "encode", encode)
-    views = {view for of_item in batch.views for view in of_item}
-    with torch.no_grad():
-        first = step._latents(batch)
-        assert len(encoded) == len(views)
-        assert torch.equal(step._latents(batch), first) and len(encoded) == len(views)
-        assert all(torch.allclose(first[b, 0], plain(batch.truth[b])[0], atol=1e-5) for b in range(4))
