@@ -23,7 +23,7 @@ PUBLIC = {
     "arbiview_aug.datasets.synthetic": """
         GROUND_CLASSES BoxClass RenderedViews Scene SceneClass SyntheticDrive demo_source_rig demo_target_rig
         make_scene""",
-    "arbiview_aug.generator": "Completed Diffusion Generator GeneratorConfig compact paper small tiny",
+    "arbiview_aug.generator": "Diffusion Generator GeneratorConfig compact paper small tiny",
 }
 
 

@@ -159,8 +159,6 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ),
         ("evaluate --lidar --displaced --data frame --size 8x8", "argument --size: --displaced has its own"),
         ("evaluate --steps 3", "argument --steps: expected it with --holes diffusion"),
-        *((f"train --{option} 3", f"argument --{option}: train reads none") for option in ("views", "steps", "seeds")),
-        ("train evaluate --vgg-weights a", "argument --vgg-weights: evaluate reads none"),
         ("view --output d\udce9/a.rrd", "expected a name in UTF-8, which Rerun's writer needs"),
         ("view --output a.mp4", r"expected a name ending in \.rrd, got 'a\.mp4'"),
         *(
