@@ -16,6 +16,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.rotations import quaternion_from_rotation
 from arbiview_aug.datasets.synthetic import Scene, make_scene
+from arbiview_aug.datasets.synthetic.render import Renderer
 
 VERSION = "v1.0-mini"
 START_US = 1_532_402_927_000_000
@@ -129,6 +130,18 @@ def write_root(root: Path, data: Tables, size: tuple[int, int]) -> Path:
         else:
             cv2.imwrite(str(path), np.full((*size, 3), 90, np.uint8))
     return root
+
+
+def write_views(root: Path, rig: Rig, street: Street, files: set[str]) -> None:
+    """Overwrite some images with what their cameras saw when they recorded them."""
+    renderer = Renderer(supersampling=1)
+    for channel, camera in zip(CHANNELS, rig, strict=True):
+        for row in recorded(street, channel, "camera", camera.size):
+            if row["filename"] in files:
+                ((image, *_),) = renderer.render(street.at(seconds(row["timestamp"])), [camera], rig.ground_z_m)
+                cv2.imwrite(
+                    str(root / row["filename"]), np.ascontiguousarray(image.permute(1, 2, 0).numpy()[..., ::-1])
+                )
 
 
 def _annotations(street: Street, k: int) -> list[dict[str, Any]]:

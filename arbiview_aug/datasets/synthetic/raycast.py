@@ -128,15 +128,15 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
     curved = (~local.is_box[candidates.primitive]).nonzero()[:, 0]
     ends = torch.bincount(candidates.packet, minlength=len(rays)).cumsum(0)
     rest = rays, candidates.packet[curved], candidates.primitive[curved], ends, candidates.primitive, t, hit
-    *arrays, packets, packet, primitive, ends, primitives, out_t, out_hit = (
+    *arrays, packets, packet, primitive, end, primitives, out_t, out_hit = (
         tensor.contiguous().numpy() for tensor in (*local, *rest)
     )
-    scene = LocalScene(*arrays)
+    scene = LocalScene(*arrays)  # type: ignore[arg-type]  # of arrays, for compiled functions
     roots = np.empty((len(packet), rays.shape[2]), np.float32)
     chord_squares(scene, packets, packet, primitive, roots)
     # torch's square roots, whose last bit is another than numba's: streets stay the same.
     halves = torch.sqrt(torch.as_tensor(roots).clamp_min(0)).numpy()
-    cast_packets(scene, packets, ends, primitives, halves, out_t, out_hit)
+    cast_packets(scene, packets, end, primitives, halves, out_t, out_hit)
     return torch.as_tensor(out_t), torch.as_tensor(out_hit)
 
 
