@@ -91,7 +91,6 @@ class Diffusion(Inpainter, torch.nn.Module):
     def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         raise NotImplementedError("a generator needs whole frames: call fill")
 
-    @torch.no_grad()
     def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
         """Fill rendered frames; ``frames`` hold their source images.
 
@@ -99,6 +98,14 @@ class Diffusion(Inpainter, torch.nn.Module):
         they agree. Frames with as many views and sources share the denoiser's calls. GeneratorError for generated
         pixels that are not finite.
         """
+        images, holes = self._completed(rendered, frames)
+        return [put(*frame) for frame in zip(rendered, images, holes, strict=True)]
+
+    @torch.no_grad()
+    def _completed(
+        self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]
+    ) -> tuple[list[list[torch.Tensor]], list[list[torch.Tensor]]]:
+        """Images of each frame that are right in the holes, and the holes."""
         check_device(self.generator)
         names, images, holes = frame_names(frames), [list(frame.images) for frame in rendered], []
         alike: dict[tuple[int, int], list[tuple[int, list[int], _Inputs]]] = {}
@@ -124,7 +131,7 @@ class Diffusion(Inpainter, torch.nn.Module):
                             fix = "pass finite images, no float16, less guidance"
                             raise GeneratorError(f"{where}: expected {expected}, got NaN or infinity: {fix}")
                         images[n][m] = _like(image, images[n][m])
-        return [put(*frame) for frame in zip(rendered, images, holes, strict=True)]
+        return images, holes
 
     def _inputs(self, rendered: RenderedFrame, source: Frame, known: Tensors, left: list[int], name: str) -> _Inputs:
         """Conditions, cameras and noise of a frame's views ``left``, on the CPU."""

@@ -217,17 +217,13 @@ def test_bad_points(tmp_path: Path) -> None:
     for array, message in (
         (np.zeros((5, 2)), r"points .*expected shape \(P, >= 3\), x y z in the ego frame, got \(5, 2\)"),
         (np.zeros((4, 500)), r"got \(4, 500\); transpose them: points\.T"),
+        (np.array([{}]), r"lidar\.npy: expected a \.npy array of numbers"),
         (np.zeros((5, 3), int), r"got int64 \(5, 3\)"),
     ):
-        np.save(tmp_path / "lidar.npy", array)
+        np.save(tmp_path / "lidar.npy", array, allow_pickle=True)
         with pytest.raises(DataError, match=message):
             dataset[0]
-    np.save(tmp_path / "lidar.npy", np.array([{}]), allow_pickle=True)
-    with pytest.raises(DataError, match=r"lidar\.npy: expected a \.npy array of numbers"):
-        dataset[0]
-    np.save(tmp_path / "lidar.npy", np.zeros((500, 3)))
-    data = (tmp_path / "lidar.npy").read_bytes()
-    (tmp_path / "lidar.npy").write_bytes(data[:1000])
+    (tmp_path / "lidar.npy").write_bytes((tmp_path / "lidar.npy").read_bytes()[:-9])
     with pytest.raises(DataError, match=r"lidar\.npy: expected a \.npy array of numbers"):
         dataset[0]
     for make in (Path.mkdir, partial(Path.symlink_to, target=tmp_path / "gone.npy")):

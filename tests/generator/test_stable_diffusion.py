@@ -260,35 +260,32 @@ def test_missing_folders_and_prompts_are_named(folder: Path, tmp_path: Path) -> 
 def test_the_text_encoder_is_loaded_completely_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     transformers = pytest.importorskip("transformers")
     size = {"hidden_size": 24, "intermediate_size": 32, "num_attention_heads": 2, "num_hidden_layers": 2}
-    encoder = transformers.CLIPTextModel(transformers.CLIPTextConfig(**size, vocab_size=49408))
-    encoder.save_pretrained(folder / "text_encoder")
-    file = folder / "text_encoder" / "model.safetensors"
+
+    def saved_encoder(**sizes: int) -> Any:
+        encoder = transformers.CLIPTextModel(transformers.CLIPTextConfig(**size, **{"vocab_size": 49408, **sizes}))
+        encoder.save_pretrained(folder / "text_encoder")
+        return encoder.eval()
+
+    encoder, file = saved_encoder(), folder / "text_encoder" / "model.safetensors"
     good = safetensors.torch.load_file(file)
-
-    def save(tensors: dict[str, torch.Tensor]) -> None:
-        safetensors.torch.save_file(tensors, file, metadata={"format": "pt"})
-
     published = {f"text_model.{name}": value for name, value in good.items()}
-    save({**published, "text_model.embeddings.position_ids": torch.arange(77)[None]})  # as in Stable Diffusion 1.5
-    tokens = torch.tensor([[49406, *[49407] * 76]])
+    published["text_model.embeddings.position_ids"] = torch.arange(77)[None]  # as in Stable Diffusion 1.5
+    safetensors.torch.save_file(published, file, metadata={"format": "pt"})
     with torch.no_grad():
-        expected = encoder.eval()(tokens).last_hidden_state[0]
-        assert torch.allclose(embedded_empty_prompt(folder), expected, atol=1e-5)
-    layer = {name: value for name, value in good.items() if "layers.1." in name}
-    save({name: value for name, value in good.items() if name not in layer})
-    expected = r"text_encoder: expected exactly the weights of this CLIPTextModel; "
-    with pytest.raises(GeneratorError, match=rf"{expected}{len(layer)} missing: encoder.layers.1"):
-        embedded_empty_prompt(folder)
-    save({**good, "lora.up": torch.zeros(2)})
-    with pytest.raises(GeneratorError, match=f"{expected}1 that do not belong: lora.up"):
-        embedded_empty_prompt(folder)
-    save({**good, next(iter(layer)): torch.zeros(7)})
-    with pytest.raises(GeneratorError, match="text_encoder: expected the weights of this CLIPTextModel as safetensors"):
-        embedded_empty_prompt(folder)
-    for other in ({"vocab_size": 1000}, {"vocab_size": 49408, "max_position_embeddings": 40}):
-        transformers.CLIPTextModel(transformers.CLIPTextConfig(**size, **other)).save_pretrained(
-            folder / "text_encoder"
-        )
+        expected = encoder(torch.tensor([[49406, *[49407] * 76]])).last_hidden_state[0]
+    assert torch.allclose(embedded_empty_prompt(folder), expected, atol=1e-5)
+    layer = [name for name in good if "layers.1." in name]
+    exactly = "text_encoder: expected exactly the weights of this CLIPTextModel; "
+    for tensors, match in (
+        ({n: t for n, t in good.items() if n not in layer}, rf"{exactly}{len(layer)} missing: encoder.layers.1"),
+        ({**good, "lora.up": torch.zeros(2)}, f"{exactly}1 that do not belong: lora.up"),
+        ({**good, layer[0]: torch.zeros(7)}, "expected the weights of this CLIPTextModel as safetensors"),
+    ):
+        safetensors.torch.save_file(tensors, file, metadata={"format": "pt"})
+        with pytest.raises(GeneratorError, match=match):
+            embedded_empty_prompt(folder)
+    for other in ({"vocab_size": 1000}, {"max_position_embeddings": 40}):
+        saved_encoder(**other)
         with pytest.raises(GeneratorError, match="text_encoder: expected CLIP's, which reads 77 of 49408 tokens"):
             embedded_empty_prompt(folder)
     monkeypatch.setitem(sys.modules, "transformers", None)

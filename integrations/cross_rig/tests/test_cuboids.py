@@ -44,5 +44,5 @@ def test_views_have_the_truth_of_this_world_in_other_colours():
     assert torch.equal(torch.isinf(views.depth_m), views.classes == SceneClass.SKY)
     # The package's own renderer colours these scenes as its streets.
     plain = SyntheticDrive(drive.rig, num_frames=1, lidar=False)._renderer.render(drive.scene(0), drive.rig.cameras, 0)
-    assert (plain[0].image != views.images[0]).float().mean() > 0.8
-    assert torch.equal(plain[0].depth_m, views.depth_m[0])
+    assert (plain[0][0] != views.images[0]).float().mean() > 0.8
+    assert torch.equal(plain[0][1], views.depth_m[0])

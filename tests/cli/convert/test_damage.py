@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import Neighbours, NuScenesDataset
-from arbiview_aug.errors import ArbiviewError, DataError
+from arbiview_aug.errors import ArbiviewError
 from arbiview_aug.transforms.warm_up import compile_kernels
 from tests import mutations
 from tests.cli.convert.drives import SURROUND, command, read_tables, tree, write_nuscenes
