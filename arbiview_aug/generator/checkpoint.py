@@ -70,14 +70,12 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tenso
     except Exception as error:  # safetensors has its own errors
         raise GeneratorError(f"{folder}: expected readable weights in {weights}: {error}") from None
     if found not in weights:
-        raise GeneratorError(
-            f"{folder}/{weights}: expected the checksum in its name, got {found}: copy or save it anew"
-        )
+        raise GeneratorError(f"{folder}/{weights}: expected the checksum in its name, got {found}: copy it again")
     return config, tensors
 
 
-def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder: Path, assign: bool = False) -> None:
-    """Load exactly the weights of a module; ``assign`` replaces its tensors instead of copying into them.
+def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder: Path) -> None:
+    """Replace the tensors of a module by exactly its weights.
 
     GeneratorError for names that are missing, extra or of another shape, and for values that are no finite numbers.
     """
@@ -88,7 +86,7 @@ def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder:
         if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
             raise GeneratorError(f"{folder}: {name}: expected finite weights, got NaN or infinity: training diverged")
     try:
-        module.load_state_dict(tensors, assign=assign)
+        module.load_state_dict(tensors, assign=True)
     except RuntimeError as error:
         text = one_line(error, _MAX_MESSAGE)
         raise GeneratorError(f"{folder}: expected the weights of this configuration: {text}") from None

@@ -128,7 +128,7 @@ class Generator(nn.Module):
         with torch.device("meta"):
             generator = cls.from_config(config)
         weights = {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}
-        load_weights(generator, weights, folder, assign=True)
+        load_weights(generator, weights, folder)
         if data.get("trained_on") is not None:
             generator.trained_on = from_plain(TrainedOn, data["trained_on"], f"{folder}/config.json")
         # Inside a user's module its parameters must not be found by the optimiser or DDP.

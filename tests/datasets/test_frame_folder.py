@@ -15,8 +15,6 @@ import torch
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import FrameFolder, open_data
-from arbiview_aug.datasets.frame_folder import write_frame
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import CalibrationError, DataError
 from arbiview_aug.sample.masks import without_specks
 from tests.helpers import camera
@@ -120,16 +118,6 @@ def test_reduce_takes_the_rig_along(tmp_path: Path) -> None:
     assert not sample["rig"]["back"].mask[20:].any() and sample["rig"]["back"].mask[:20].all()
     with pytest.raises(ValueError, match="reduce: expected 1, 2 or 4, got 8"):
         FrameFolder(tmp_path, reduce=8)  # type: ignore[arg-type]
-
-
-def test_a_written_street_comes_back(tmp_path: Path) -> None:
-    sample = SyntheticDrive(demo_source_rig((48, 132)), num_frames=1)[0]
-    write_frame(tmp_path / "frame", sample)
-    again = FrameFolder(tmp_path)[0]
-    assert again["rig"] == sample["rig"] and again["token"] == "frame"
-    assert (again["images"].float() - sample["images"].float()).abs().mean() < 4  # JPEG
-    for key in ("boxes_3d", "points"):
-        assert np.array_equal(again[key].numpy(), sample[key].numpy())
 
 
 # --- real frames ------------------------------------------------------------------------------------------------------

@@ -141,25 +141,6 @@ def test_neighbours_come_from_overlap_not_from_the_list() -> None:
         assert all(one in read[other] for other in others)
 
 
-def test_windows_are_the_nine_tokens_around() -> None:
-    reads = correspondences([LEFT], [LEFT, RIGHT], [0], [GRID], 0.0)[0]
-    at = window(reads, 2)
-    h, w = GRID
-    centre = reads.centre.reshape(-1, 2)[at.place]
-    assert len(at.place) == int(reads.valid.sum()) and bool(reads.valid.reshape(-1)[at.place].all())
-    local = at.tap - h * w  # of view 1
-    for entry in range(0, len(at.place), 17):
-        x, y = (int(v) for v in centre[entry].round())
-        taps = [(x + dx, y + dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-        for k, (tx, ty) in enumerate(taps):
-            inside = 0 <= tx < w and 0 <= ty < h
-            assert bool(at.inside[entry, k]) == inside
-            if inside:
-                assert int(local[entry, k]) == ty * w + tx
-            assert torch.allclose(at.delta()[entry, k], torch.tensor([float(tx), float(ty)]) - centre[entry], atol=1e-5)
-    assert ((local >= 0) & (local < h * w)).all()
-
-
 def test_bilinear_rows_interpolate() -> None:
     at = window(correspondences([LEFT], [LEFT, RIGHT], [0], [GRID], 0.0)[0], 2)
     rows = at.bilinear()

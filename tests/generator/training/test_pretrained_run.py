@@ -3,7 +3,6 @@ to a filler of holes."""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from pathlib import Path
@@ -21,7 +20,6 @@ from arbiview_aug.generator.training.data import Frames
 from arbiview_aug.generator.training.trainer import Trainer
 from arbiview_aug.train import main
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from integrations.benchmarks import paper
 from tests.generator.test_stable_diffusion import saved
 from tests.generator.training.small import Pictures
 
@@ -103,12 +101,3 @@ def test_from_pretrained_weights_to_filled_holes(
     known = seen["coverage"][:, None].expand_as(seen["images"])
     assert torch.equal(filled["images"][known], seen["images"][known])
     assert float(filled["images"][~known].float().std()) > 0
-    # --- scored in the paper's tables
-    if name == "paper":
-        monkeypatch.setattr(paper, "SETS", ("truck",))
-        monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
-        scored = ["--generator", str(tmp_path / "whole" / "generator")]
-        assert paper.main([*scored, "--size", "24x66", "--frames", "1", "--output", str(tmp_path / "paper")]) == 0
-        printed = capsys.readouterr().out
-        assert "| generator " in printed and "Frames of the data that it was trained on are held-out ones" in printed
-        assert "generator" in json.loads((tmp_path / "paper" / "paper.json").read_text())["means"]["synthetic"]
