@@ -106,10 +106,9 @@ class Batch(NamedTuple):
     seen: torch.Tensor  # (B, S, H, W) bool, valid pixels of the sources
     geometry: FrameGeometry  # of their cameras
     tokens: tuple[str, ...]  # names of the items
-    views: tuple[tuple[tuple[int, int], ...], ...]  # (B, N) frame and camera of the truth
 
     def to(self, device: torch.device | str) -> Batch:
-        return Batch._make([*(value.to(device) for value in self[:-2]), *self[-2:]])
+        return Batch._make([*(value.to(device) for value in self[:-1]), self.tokens])
 
     @property
     def conditions(self) -> Conditions:
@@ -128,9 +127,8 @@ def collate(items: Sequence[Batch]) -> Batch:
         if got != expected:
             fix = "train on frames of as many cameras, or with pseudo_views.targets=1"
             raise TrainingError(f"frame {item.tokens[0]}: expected {expected} cameras as in others, got {got}: {fix}")
-    *tensors, geometries, tokens, views = zip(*items, strict=True)
-    names = (tuple(itertools.chain(*of_items)) for of_items in (tokens, views))
-    return Batch._make([*map(torch.cat, tensors), batched(geometries), *names])
+    *tensors, geometries, tokens = zip(*items, strict=True)
+    return Batch._make([*map(torch.cat, tensors), batched(geometries), tuple(itertools.chain(*tokens))])
 
 
 class Rendered(NamedTuple):
@@ -181,8 +179,7 @@ class PseudoViews(Dataset[Batch]):
 
     def __getitem__(self, k: int) -> Batch:
         config, rng = self.config, seeded(self.seed, "view", k)
-        index = self.indices[one_of(rng, len(self.indices))]
-        frame = self.frames[index]
+        frame = self.frames[self.indices[one_of(rng, len(self.indices))]]
         frame = frame._replace(images=[image.to(self.device) for image in frame.images])
         first = one_of(rng, len(frame.rig))
         axes = [camera.cam2ego[:3, 2] for camera in frame.rig]
@@ -225,7 +222,6 @@ class PseudoViews(Dataset[Batch]):
             seen[None],
             geometry,
             (f"{frame.token}/{frame.rig[first].name}/{k}",),
-            (tuple((index, i) for i in places),),
         )
 
     def _pair(self, target: Camera, rng: torch.Generator) -> list[Camera]:
