@@ -11,8 +11,7 @@ from arbiview_aug.generator import Generator
 from arbiview_aug.generator.training.config import overridden, tiny
 from arbiview_aug.generator.training.data import open_frames
 from arbiview_aug.generator.training.pseudo_views import PseudoViews, collate
-from arbiview_aug.generator.training.trainer import Trainer
-from arbiview_aug.generator.training.validation import hole_psnr, sampled
+from arbiview_aug.generator.training.trainer import Trainer, hole_psnr, sampled
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from arbiview_aug.evaluate.report.pictures import save_picture
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
-from arbiview_aug.generator.training.validation import hole_psnr, picture, sampled
+from arbiview_aug.generator.training.trainer import hole_psnr, picture, sampled
 from tests.generator.small import stirred
 from tests.generator.training.small import config, frames
 from tests.generator.training.test_pseudo_views import HOLE
