@@ -38,7 +38,7 @@ def test_one_rig_by_heart(tmp_path: Path) -> None:
 @pytest.mark.release
 @pytest.mark.timeout(3600)
 def test_tiny_beats_telea_on_held_out_streets(tmp_path: Path) -> None:
-    """The command of docs/holes.md: one step at least Telea's, four steps at most 1 dB below."""
+    """The command of docs/holes.md: one step at least Telea's, four steps at most 0.5 dB below."""
     settings = tiny()
     frames = open_frames("synthetic", settings.generator.image_size, scenes=settings.scenes)
     torch.manual_seed(0)
@@ -53,4 +53,4 @@ def test_tiny_beats_telea_on_held_out_streets(tmp_path: Path) -> None:
     db = {name: float(hole_psnr(images, batch.truth, batch.holes).nanmean()) for name, images in made.items()}
     print(db)
     assert db["1"] >= db["telea"]
-    assert db["4"] >= db["telea"] - 1
+    assert db["4"] >= db["telea"] - 0.5
