@@ -1,4 +1,4 @@
-"""Compiled completion of points around a centre: z-buffer, nearest values, both sides of a step, hidden depths."""
+"""Compiled completion of the points around a centre: which of them are seen, made dense, and what they hide."""
 
 from __future__ import annotations
 
@@ -6,173 +6,199 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.kernels import angle_row
-from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
-from arbiview_aug.environment import called, compiled, inlined
-from arbiview_aug.scene import panorama
+from arbiview_aug.environment import borrowing, compiled, inlined
 from arbiview_aug.scene.kernels import upsampled_row
-from arbiview_aug.scene.panorama import NEAREST_M
+from arbiview_aug.scene.panorama import NEAREST_M, STEP, STEP_PER_M, THIN_CELLS
+from arbiview_aug.scene.panorama_kernels import cells_row
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
-_MOST = np.float32(MAX_INVERSE_DISTANCE)
-_HALF_PI = np.float32(np.pi / 2)
 _NEAREST = np.float32(1 / NEAREST_M)
-BLOCK, _LANES = 1024, 64
-"""Points worked on at once, and left out together."""
-CONES_M = 1.5, 0.0, 1.5
-"""A place among a vehicle's cameras and scanners, in the ego frame: cones are seen from there."""
-_CONES, _TINY = tuple(np.float32(part) for part in CONES_M), np.float32(1e-30)
+_BLOCK = 1024
+"""Points worked on at once."""
+
+PLANES = 9
+"""Scratch of a panorama, as planes of at least (h + 4) * (w + 4) float32 each: the largest inverse distance in each
+cell, which point's that is (int32), the maximum of the first over a window, rays of seen points (3), their flat cells
+(int32), whether they are thin (int32), and nearest seeds (int32). ``complete`` writes over what it does not need."""
+Q, NUMBER, _MOST, RAYS, CELLS, _THIN, _CODE = 0, 1, 2, 3, 6, 7, 8
+_RESIDUALS, _R, _NEAR_Q, _HIGH, _LOW = 1, 2, 3, 4, 5
 
 # A cell's nearest seed in one int32, so that the nearer of two is their minimum: distance in 1/1024 cell (from bit 14),
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
 _ROW, _OWN, _NO_SEED = 1 << 7, np.int32(64 * 128 + 64), np.int32(1 << 30)
 _SIDE, _CORNER, _KNIGHT = 1024 << 14, 1434 << 14, 2250 << 14
-_STEP, _STEP_PER_M, LEAST_WEIGHT = np.float32(panorama.STEP), np.float32(panorama.STEP_PER_M), np.float32(1e-3)
+_FAR = 54  # cells along a row that one step of the last four looks back; all four together 80, beyond any reach
+_STEP, _STEP_PER_M, _LEAST_WEIGHT = np.float32(STEP), np.float32(STEP_PER_M), np.float32(1e-3)
 
 
-@called
-def cells_row(x: Any, y: Any, z: Any, place: Any, level: Any, row: Any, column: Any) -> None:
-    """Rows and columns (n,) in a panorama (``Window.place``) of ego-frame vectors; ``level`` is scratch."""
-    first, lead, low, per_rad, turn = place[0], place[1], place[2], place[3], place[4]
-    n = x.shape[0]
-    for i in range(n):
-        level[i] = abs(y[i])
-    angle_row(level, x, column)
-    for i in range(n):
-        azimuth = (column[i] if y[i] >= _ZERO else -column[i]) - first
-        column[i] = azimuth * per_rad - lead
-    for i in range(n):
-        column[i] += lead - np.floor(column[i] / turn) * turn
-    for i in range(n):
-        level[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
-    angle_row(level, z, row)
-    for i in range(n):
-        row[i] = (_HALF_PI - row[i] - low) * per_rad
-
-
+# --- which points are seen --------------------------------------------------------------------------------------------
 @compiled
-def block_cones(points: Any) -> Any:
-    """Cones (n, 5) around each ``BLOCK`` of consecutive points (P, 3), as seen from ``CONES_M``.
-
-    Their axes (3), the angle that holds the points, radians, and the distance of the nearest one, metres.
-    """
-    n, work, lanes = points.shape[0], np.empty((4, BLOCK), np.float32), np.empty((5, _LANES), np.float32)
-    x, y, z, length = work[0], work[1], work[2], work[3]
-    cones = np.zeros(((n + BLOCK - 1) // BLOCK, 5), np.float32)
-    for block in range(cones.shape[0]):
-        cone, part = cones[block], points[block * BLOCK : block * BLOCK + BLOCK]
-        for i in range(BLOCK):
-            k = min(i, part.shape[0] - 1)
-            x[i], y[i], z[i] = part[k, 0] - _CONES[0], part[k, 1] - _CONES[1], part[k, 2] - _CONES[2]
-        for i in range(BLOCK):
-            length[i] = max(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i]), _TINY)
-        for i in range(BLOCK):
-            x[i], y[i], z[i] = x[i] / length[i], y[i] / length[i], z[i] / length[i]
-        lanes[:3], lanes[3], lanes[4] = _ZERO, np.float32(np.inf), _ONE
-        for start in range(0, BLOCK, _LANES):  # side by side, as vector instructions do
-            for i in range(_LANES):
-                lanes[0, i] += x[start + i]
-            for i in range(_LANES):
-                lanes[1, i] += y[start + i]
-            for i in range(_LANES):
-                lanes[2, i] += z[start + i]
-            for i in range(_LANES):
-                lanes[3, i] = min(lanes[3, i], length[start + i])
-        for i in range(_LANES):
-            cone[0], cone[1], cone[2] = cone[0] + lanes[0, i], cone[1] + lanes[1, i], cone[2] + lanes[2, i]
-        size = max(np.sqrt(cone[0] * cone[0] + cone[1] * cone[1] + cone[2] * cone[2]), _TINY)
-        cone[0], cone[1], cone[2] = cone[0] / size, cone[1] / size, cone[2] / size
-        for start in range(0, BLOCK, _LANES):
-            for i in range(_LANES):
-                k = start + i
-                lanes[4, i] = min(lanes[4, i], x[k] * cone[0] + y[k] * cone[1] + z[k] * cone[2])
-        cone[3], cone[4] = np.arccos(max(lanes[4].min(), -_ONE)) + np.float32(1e-3), lanes[3].min()
-    return cones
-
-
-@inlined
-def _may_meet(cone: Any, origin: Any, bounds: Any) -> bool:
-    """Whether points of a cone (5,) may lie within a window's ``bounds`` around ``origin``."""
-    x, y, z = origin[0] - _CONES[0], origin[1] - _CONES[1], origin[2] - _CONES[2]
-    sine = np.sqrt(x * x + y * y + z * z) / cone[4]  # of the angle between a point's two directions, by the sine rule
-    if not sine < 1:
-        return True
-    spread, elevation = cone[3] + np.arcsin(sine), np.arcsin(min(max(cone[2], -1.0), 1.0))
-    if elevation - spread > np.arcsin(bounds[1]) or elevation + spread < np.arcsin(bounds[0]):
-        return False
-    level = np.sqrt(cone[0] * cone[0] + cone[1] * cone[1])
-    if spread + abs(elevation) >= np.pi / 2:
-        return True
-    off = np.arccos(min(max((cone[0] * bounds[2] + cone[1] * bounds[3]) / level, -1.0), 1.0))
-    return off - np.arcsin(min(np.sin(spread) / level, 1.0)) <= np.arccos(bounds[4])
-
-
-@compiled
-def elevations(points: Any, origin: Any) -> Any:
-    """Lowest and highest elevation (2,) of the points (P, 3) as seen from ``origin``, radians."""
+def elevations(points: Any, origin: Any) -> tuple[float, float]:
+    """Lowest and highest elevation of the points (3, P) as seen from ``origin``, radians."""
     low, high = 1.0, -1.0
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+    for i in range(points.shape[1]):
+        x, y, z = points[0, i] - origin[0], points[1, i] - origin[1], points[2, i] - origin[2]
         length2 = x * x + y * y + z * z
         if length2 >= NEAREST_M * NEAREST_M:
             sine2 = z * abs(z) / length2
             low, high = min(low, sine2), max(high, sine2)
-    ends = np.array([low, high])
-    return np.arcsin(np.sign(ends) * np.sqrt(np.abs(ends)))
+    return np.arcsin(np.sign(low) * np.sqrt(abs(low))), np.arcsin(np.sign(high) * np.sqrt(abs(high)))
 
 
 @compiled
-def nearest_points(points: Any, cones: Any, origin: Any, bounds: Any, place: Any, q: Any, number: Any) -> None:
-    """Z-buffer the points (P, 3) around ``origin`` in a window (``Window.bounds``, ``Window.place``).
+def find_visible(points: Any, mapped: int, origin: Any, window: Any, planes: Any) -> int:
+    """Find the points that ``origin`` sees in a ``Window``, the nearest one in each cell; return their number n.
 
-    ``cones`` are those of ``block_cones``. ``q`` (h, w), 0 before, becomes the largest inverse distance of points
-    in a cell, ``number`` (h, w) int32 whose it is, of equally near ones the last's.
+    Args:
+        points: (3, P) float32 in the ego frame.
+        mapped: Number of the last points that are of depth maps.
+        origin: (3,) float64.
+        window: The window.
+        planes: (PLANES, size) float32 scratch, written. The rays (3, n) of the points lie at the beginning of the
+            third to fifth plane.
     """
-    (h, w), turn = q.shape, np.int32(place[4])
-    work, row, column = np.empty((7, BLOCK), np.float32), np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
-    x, y, z, near = work[0], work[1], work[2], work[3]
-    for block in range(cones.shape[0]):
-        if not _may_meet(cones[block], origin, bounds):
-            continue
-        start = block * BLOCK
-        n = min(BLOCK, points.shape[0] - start)
-        part = points[start : start + n]
+    side, h, w = window.cells.side, _height(window), _width(window)
+    q, number, most = _plane(planes, Q, h, w), _ints(planes, NUMBER, h, w), _plane(planes, _MOST, h, w)
+    cells, thin = planes[CELLS].view(np.int32), planes[_THIN].view(np.int32)
+    work, exact, index = np.empty((7, _BLOCK), np.float32), np.empty((4, _BLOCK)), np.empty((2, _BLOCK), np.int32)
+    between = np.empty(w + 2 * side, np.float32)
+    _nearest_points(points, origin, window, q, number, work, exact, index)
+    _window_max(q, 2 * side, 2 * side, _ONE, between, most)
+    n = _drop_hidden(q, most, number, window.cells.see_through, side, points.shape[1], mapped, between, cells, thin)
+    rays, flat_q, flat_number = planes[RAYS:CELLS].reshape(-1)[: 3 * n].reshape(3, n), planes[Q], number.reshape(-1)
+    for axis in range(3):
         for i in range(n):
-            a, b, c = part[i, 0] - origin[0], part[i, 1] - origin[1], part[i, 2] - origin[2]
-            length = np.sqrt(a * a + b * b + c * c)
-            x[i], y[i], z[i], near[i] = a / length, b / length, c / length, 1 / length
-        cells_row(x[:n], y[:n], z[:n], place, work[4, :n], work[5, :n], work[6, :n])
-        for i in range(n):
-            row[i] = np.int32(np.rint(work[5, i])) if near[i] <= _NEAREST else np.int32(-1)
-        for i in range(n):
-            column[i] = np.int32(np.rint(work[6, i]))
-        for i in range(n):
-            at, k = row[i], column[i] if column[i] < turn else column[i] - turn
-            while 0 <= at < h and k < w:  # the halo of a whole turn holds some points twice
-                if near[i] >= q[at, k]:
-                    q[at, k], number[at, k] = near[i], start + i
-                k += turn
+            rays[axis, i] = (points[axis, flat_number[cells[i]]] - origin[axis]) * flat_q[cells[i]]
+    return n
 
 
-@compiled
-def drop_hidden(
-    q: Any, most: Any, number: Any, points: Any, origin: Any, away: int, side: int, sparse: int
-) -> tuple[Any, Any, Any]:
+def rays_of(planes: Any, n: int) -> Any:
+    """Rays (3, 1, n) of the points that ``find_visible`` found, in the ego frame."""
+    return planes[RAYS:CELLS].reshape(-1)[: 3 * n].reshape(3, 1, n)
+
+
+@inlined
+def _height(window: Any) -> int:
+    return window.rows + 2 * window.cells.halo + 1
+
+
+@inlined
+def _width(window: Any) -> int:
+    return window.columns + 2 * window.cells.halo + 1
+
+
+@inlined
+def _plane(planes: Any, k: int, h: int, w: int) -> Any:
+    return planes[k, : h * w].reshape(h, w)
+
+
+@inlined
+def _ints(planes: Any, k: int, h: int, w: int) -> Any:
+    return planes[k].view(np.int32)[: h * w].reshape(h, w)
+
+
+@borrowing
+def _nearest_points(
+    points: Any, origin: Any, window: Any, q: Any, number: Any, work: Any, exact: Any, index: Any
+) -> None:
+    """Z-buffer the points (3, P) around ``origin``.
+
+    ``q`` (h, w) becomes the largest inverse distance of the points in each cell, 0 without any; ``number`` (h, w) int32
+    tells which point's it is, of equally near ones the last. ``work``, ``exact`` and ``index`` are scratch.
+    """
+    (h, w), turn, rad, ahead = q.shape, np.int32(window.cells.turn), window.cells.rad, window.cells.halo + 2
+    low, high = (window.row - ahead) * rad, (window.row + window.rows + ahead) * rad  # two cells beyond the halo
+    middle, half = (window.column + window.columns / 2) * rad, min((window.columns / 2 + ahead) * rad, np.pi)
+    low_c, low_s = np.float32(np.cos(low) if low > -np.pi / 2 else 0.0), np.float32(np.sin(max(low, -np.pi / 2)))
+    high_c, high_s = np.float32(np.cos(high) if high < np.pi / 2 else 0.0), np.float32(np.sin(min(high, np.pi / 2)))
+    c, s, inner = np.float32(np.cos(middle)), np.float32(np.sin(middle)), np.float32(np.cos(half))
+    ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
+    x, y, z, near, inside, those = work[0], work[1], work[2], work[3], index[0], index[1]
+    q[:] = _ZERO
+    for start in range(0, points.shape[1], _BLOCK):
+        m, n = min(_BLOCK, points.shape[1] - start), 0
+        px, py, pz = points[0, start : start + m], points[1, start : start + m], points[2, start : start + m]
+        for i in range(m):
+            a, b, up = px[i] - ox, py[i] - oy, pz[i] - oz
+            level = np.sqrt(a * a + b * b)
+            is_inside = (up * low_c >= low_s * level) & (up * high_c <= high_s * level)
+            inside[i] = is_inside & (a * c + b * s >= inner * level)
+        for i in range(m):
+            those[n] = i
+            n += inside[i]
+        for i in range(n):
+            exact[0, i] = px[those[i]] - origin[0]
+        for i in range(n):
+            exact[1, i] = py[those[i]] - origin[1]
+        for i in range(n):
+            exact[2, i] = pz[those[i]] - origin[2]
+        a, b, up, length = exact[0], exact[1], exact[2], exact[3]
+        for i in range(n):
+            length[i] = np.sqrt(a[i] * a[i] + b[i] * b[i] + up[i] * up[i])
+        for i in range(n):
+            x[i] = a[i] / length[i]
+        for i in range(n):
+            y[i] = b[i] / length[i]
+        for i in range(n):
+            z[i] = up[i] / length[i]
+        for i in range(n):
+            near[i] = 1 / length[i]
+        cells_row(x[:n], y[:n], z[:n], window, work[4, :n], work[5, :n], work[6, :n])
+        for i in range(n):
+            row, column = np.int32(np.rint(work[5, i])), np.int32(np.rint(work[6, i]))
+            column = column if column < turn else column - turn
+            while near[i] <= _NEAREST and 0 <= row < h and column < w:  # the halo of a whole turn holds some twice
+                if near[i] >= q[row, column]:
+                    q[row, column], number[row, column] = near[i], start + those[i]
+                column += turn
+
+
+@borrowing
+def _window_max(a: Any, rows: int, columns: int, sign: Any, line: Any, out: Any) -> None:
+    """Largest of ``sign`` times each cell of ``a`` (h, w) and those up to so many rows and columns on.
+
+    ``line`` (w + columns,) is scratch.
+    """
+    h, w = a.shape
+    line[w:] = -np.inf
+    for y in range(h):
+        values, row, done = a[y], out[y], 1
+        for x in range(w):
+            row[x] = sign * values[x]
+        while done <= columns:  # three times as many cells at each step
+            one, two = line[min(done, columns + 1 - done) :], line[min(2 * done, columns + 1 - done) :]
+            for x in range(w):
+                line[x] = row[x]
+            for x in range(w):
+                row[x] = max(line[x], max(one[x], two[x]))
+            done *= 3
+    done = 1
+    while done <= rows:
+        for y in range(h):
+            row, one = out[y], out[min(y + min(done, rows + 1 - done), h - 1)]
+            two = out[min(y + min(2 * done, rows + 1 - done), h - 1)]
+            for x in range(w):
+                row[x] = max(row[x], max(one[x], two[x]))
+        done *= 3
+
+
+@borrowing
+def _drop_hidden(
+    q: Any, most: Any, number: Any, away: int, side: int, points: int, mapped: int, between: Any, cells: Any, thin: Any
+) -> int:
     """Drop points that shine through gaps of what is nearer on both sides of them, and find thin things.
 
-    ``q`` and ``number`` are those of ``nearest_points``, ``most`` is ``window_max`` of ``q`` over ``2 * side`` cells,
-    ``away`` and ``side`` are ``SEE_THROUGH_RAD`` and ``SIDE_RAD`` in cells. Points from number ``sparse`` on are of
-    depth maps, which show gaps as they are: only cells next to them count. Returns the flat indices (n,) of cells that
-    keep their point, its ray (3, 1, n) in the ego frame, float32, and whether it lies clearly before all points above
-    and below it, within ``away`` and not next to it: such as a tape that one scan line met.
+    ``q`` and ``number`` are those of ``_nearest_points``, ``most`` is ``_window_max`` of ``q`` over ``2 * side`` cells,
+    ``away`` and ``side`` are ``SEE_THROUGH_RAD`` and ``SIDE_RAD`` in cells. The last ``mapped`` of all ``points`` are of
+    depth maps, which show gaps as they are: only cells next to them count. Writes the flat indices of cells that keep
+    their point, and whether it lies clearly before all points above and below it, within ``away`` and not next to it,
+    as on a tape that one scan line met. Returns their number; ``between`` (w,) is scratch.
     """
-    h, w = q.shape
-    more = away - 1 - 2 * side  # windows are longer than wide
-    cells, n, rays, thin = np.empty(h * w, np.int64), 0, np.empty((3, h * w), np.float32), np.empty(h * w, np.bool_)
-    between, inner = np.zeros(w, np.float32), w - 2
+    (h, w), n = q.shape, 0
+    more, inner = away - 1 - 2 * side, w - 2  # windows are longer than wide
     for y in range(h):
         inside = away <= y < h - away
-        if sparse < points.shape[0] and 0 < y < h - 1 and inner > 0:
+        if mapped and 0 < y < h - 1 and inner > 0:
             left, right, up, down = q[y, :inner], q[y, 2:], q[y - 1, 1 : w - 1], q[y + 1, 1 : w - 1]
             hidden = between[1 : w - 1]
             for x in range(inner):
@@ -182,8 +208,8 @@ def drop_hidden(
         for x in range(w):
             if q[y, x] <= _ZERO:
                 continue
-            thin[n] = False
-            if number[y, x] >= sparse:
+            thin[n] = 0
+            if number[y, x] >= points - mapped:
                 if q[y, x] < between[x]:
                     continue
             elif inside and away <= x < w - away:
@@ -195,64 +221,118 @@ def drop_hidden(
                 above, below = max(above, most[top + more, column]), max(below, most[bottom, column])
                 if q[y, x] < hidden_below(max(across, min(above, below))):
                     continue
-            point, near = points[number[y, x]], q[y, x]
-            for axis in range(3):
-                rays[axis, n] = (point[axis] - origin[axis]) * near
             cells[n] = y * w + x
             n += 1
-    return cells[:n].copy(), rays[:, :n].copy().reshape(3, 1, n), thin[:n].copy()
+    return n
 
 
 @compiled
-def seen_through(q: Any, rows: Any, columns: Any, most: Any, up: int, side: int, contradicted: Any) -> None:
-    """Find the points of other scans that lie clearly before all of a scan's own points around them.
+def find_contradicted(
+    points: Any, others: Any, origin: Any, window: Any, up: int, side: int, contradicted: Any
+) -> None:
+    """Find the points of other scans (3, Q) that lie clearly before all of a scan's own points (3, P) around them.
 
     Args:
-        q: (n,) inverse distances of the others.
-        rows: (n,) their rows in the panorama.
-        columns: (n,) their columns.
-        most: (h, w) ``window_max`` of the scan's largest inverse distance in each cell, 0 without points.
-        up: Cells of the window above and below.
-        side: ... and on each side.
-        contradicted: (n,) bool, written.
+        points: The scan's own points.
+        others: Those of the others.
+        origin: (3,) float64, the centre of the panorama.
+        window: Its ``Window``.
+        up: Cells above and below that are around a point.
+        side: Cells on each side.
+        contradicted: (Q,) bool, written.
     """
-    (h, w), (height, width) = most.shape, (2 * up, 2 * side)
-    for i in range(q.shape[0]):
-        row, column = int(np.rint(rows[i])) - up, int(np.rint(columns[i])) - side
-        known = most[row, column] if 0 <= row < h - height and 0 <= column < w - width else _ZERO
-        contradicted[i] = known > _ZERO and hidden_below(q[i]) > known
+    h, w, n = _height(window), _width(window), others.shape[1]
+    q, number, most = np.empty((h, w), np.float32), np.empty((h, w), np.int32), np.empty((h, w), np.float32)
+    work, exact, index = np.empty((7, _BLOCK), np.float32), np.empty((4, _BLOCK)), np.empty((2, _BLOCK), np.int32)
+    _nearest_points(points, origin, window, q, number, work, exact, index)
+    _window_max(q, 2 * up, 2 * side, _ONE, np.empty(w + 2 * side, np.float32), most)
+    at = np.empty((6, n), np.float32)
+    for k in range(3):
+        for i in range(n):
+            at[k, i] = others[k, i] - np.float32(origin[k])
+    cells_row(at[0], at[1], at[2], window, at[3], at[4], at[5])
+    for i in range(n):
+        row, column = int(np.rint(at[4, i])) - up, int(np.rint(at[5, i])) - side
+        known = most[row, column] if 0 <= row < h - 2 * up and 0 <= column < w - 2 * side else _ZERO
+        distance = np.sqrt(at[0, i] * at[0, i] + at[1, i] * at[1, i] + at[2, i] * at[2, i])
+        near = _ONE / max(distance, np.float32(NEAREST_M))
+        contradicted[i] = known > _ZERO and hidden_below(near) > known
 
 
+@inlined
+def hidden_below(known: Any) -> Any:
+    """The evaluation protocol's tolerance, in inverse distance: nearer by a tenth of the distance and 0.3 m."""
+    known = max(known, _ZERO)
+    return known / (np.float32(1.1) + np.float32(0.3) * known)
+
+
+# --- made dense -------------------------------------------------------------------------------------------------------
 @compiled
-def nearest_residuals(
-    cells: Any, own_q: Any, residuals: Any, reach: float, support: float, code: Any, r: Any, q: Any, layers: Any
-) -> None:
+def complete(n: int, static: Any, window: Any, planes: Any, layers: Any) -> None:
+    """Make the ``n`` points of ``find_visible`` dense over a static surface.
+
+    Args:
+        n: Number of points.
+        static: (n,) inverse distances of the static surface along their rays.
+        window: The window.
+        planes: Those of ``find_visible``.
+        layers: (5, h, w) float32 ``Panorama.layers``, written.
+    """
+    (_, h, w), cells = layers.shape, window.cells
+    at, thin = planes[CELLS].view(np.int32)[:n], planes[_THIN].view(np.int32)[:n]
+    residuals, q, work = planes[_RESIDUALS, :n], planes[Q], np.empty((10 + 6 * cells.smooth, w), np.float32)
+    line, wide = np.empty(w + 2 * _FAR, np.int32), np.empty(w + 2 * cells.smooth, np.float32)
+    r, near_q, code = _plane(planes, _R, h, w), _plane(planes, _NEAR_Q, h, w), _ints(planes, _CODE, h + 4, w + 4)
+    high, low = _plane(planes, _HIGH, h, w), _plane(planes, _LOW, h, w)
+    for i in range(n):
+        residuals[i] = q[at[i]] - static[i]
+    _spread_nearest(at, thin, q, residuals, cells.reach, cells.support, code, work[0], line, r, near_q, layers)
+    _window_max(r, 2 * cells.smooth, 2 * cells.smooth, _ONE, wide, high)
+    _window_max(r, 2 * cells.smooth, 2 * cells.smooth, -_ONE, wide, low)
+    _average_sides(r, near_q, high, low, cells.smooth, work, layers)
+    _draw_thin(at, thin, residuals, code, layers)
+    for y in range(h - 1):
+        near, far, near_above, far_above, level = (
+            layers[0, y],
+            layers[1, y],
+            layers[0, y + 1],
+            layers[1, y + 1],
+            layers[4, y],
+        )
+        for x in range(w - 1):
+            is_level = (near[x] == far[x]) & (near_above[x] == far_above[x])
+            is_level &= (near[x + 1] == far[x + 1]) & (near_above[x + 1] == far_above[x + 1])
+            level[x] = _ONE if is_level else _ZERO
+
+
+@borrowing
+def _spread_nearest(
+    cells: Any, thin: Any, own_q: Any, residuals: Any, reach: float, support: float, code: Any, away: Any,
+    line: Any, r: Any, q: Any, layers: Any,
+) -> None:  # fmt: skip
     """Give every cell of ``r`` and ``q`` (h, w) the residual and inverse distance of the nearest point.
 
-    The residual fades towards ``reach``. ``layers[3]`` becomes 1 within ``support``; ``code`` (h + 4, w + 4) int32 and
-    the other layers are scratch.
+    The residual fades towards ``reach``. ``layers[3]`` becomes 1 within ``support``; the other layers, ``code``
+    (h + 4, w + 4) int32, ``away`` (w,) and ``line`` (w + 2 * _FAR,) int32 are scratch.
     """
     _, h, w = layers.shape
-    size = h * w
     code[:] = _NO_SEED
-    seeds = layers[:2].reshape(2, size)  # until the layers are known
-    seeds[:] = _ZERO
-    row, end = 0, w
+    layers[:2] = _ZERO
+    residual, nearest = layers[0].reshape(h * w), layers[1].reshape(h * w)  # at seeds, until the layers are known
     for i in range(cells.shape[0]):
-        while cells[i] >= end:  # they are in order
-            row, end = row + 1, end + w
-        code[row + 2, cells[i] - end + w + 2] = _OWN
-        seeds[0, cells[i]], seeds[1, cells[i]] = residuals[i], own_q[i]
-    spread(code)
-    away, place, residual, nearest = np.empty(w, np.float32), np.empty(w, np.int32), seeds[0], seeds[1]
+        if not thin[i]:
+            code[cells[i] // w + 2, cells[i] % w + 2] = _OWN
+            residual[cells[i]], nearest[cells[i]] = residuals[i], own_q[cells[i]]
+    _spread(code, line)
+    place = line[:w]
     for y in range(h):
-        line, measured, to_r, to_q, first = code[y + 2, 2 : w + 2], layers[3, y], r[y], q[y], np.int32(y * w)
+        seeds, measured, to_r, to_q, first = code[y + 2, 2 : w + 2], layers[3, y], r[y], q[y], np.int32(y * w)
         for x in range(w):
-            away[x] = np.float32(line[x] >> 14) * np.float32(1 / 1024)
+            away[x] = np.float32(seeds[x] >> 14) * np.float32(1 / 1024)
         for x in range(w):
             measured[x] = _ONE if away[x] <= support else _ZERO
         for x in range(w):
-            rows, columns = seed(line[x])
+            rows, columns = ((seeds[x] >> 7) & 127) - 64, (seeds[x] & 127) - 64
             place[x] = first + np.int32(x) + (np.int32(rows * w + columns) if away[x] < reach else np.int32(0))
         for x in range(w):  # nothing is known at cells far from all points
             to_q[x] = nearest[place[x]]
@@ -262,12 +342,16 @@ def nearest_residuals(
             to_r[x] *= max(min(_TWO - _TWO * away[x] / reach, _ONE), _ZERO)
 
 
-@inlined
-def spread(code: Any) -> None:
-    """Find every cell's nearest seed; codes (h + 4, w + 4) int32 are those of ``_NO_SEED``, two around the cells."""
+@borrowing
+def _spread(code: Any, line: Any) -> None:
+    """Find every cell's nearest seed; codes (h + 4, w + 4) int32 are those of ``_NO_SEED``, two around the cells.
+
+    ``line`` (w + 2 * _FAR,) int32 is scratch.
+    """
     h, w = code.shape
+    line[:] = _NO_SEED
     for s in (1, -1):
-        beside, above = np.int32(_SIDE - s), -s * _ROW
+        above = -s * _ROW
         c0, c1, c2 = np.int32(_SIDE + above), np.int32(_CORNER + above - 1), np.int32(_CORNER + above + 1)
         c3, c4 = np.int32(_KNIGHT + above - 2), np.int32(_KNIGHT + above + 2)
         c5, c6 = np.int32(_KNIGHT + 2 * above - 1), np.int32(_KNIGHT + 2 * above + 1)
@@ -281,21 +365,17 @@ def spread(code: Any) -> None:
                 b = min(np.int32(one0[x] + c3), np.int32(one4[x] + c4))
                 c = min(np.int32(two1[x] + c5), np.int32(two3[x] + c6))
                 row[x] = min(min(row[x], a), min(b, c))
-            last = _NO_SEED
-            for i in range(w - 4):
-                x = i if s == 1 else w - 5 - i
-                last = min(row[x], np.int32(last + beside))
-                row[x] = last
+            for away in (1, 3, 9, 27):  # along the row, from up to three times as many cells at each step
+                here, next, after = line[_FAR:], line[_FAR - s * away :], line[_FAR - 2 * s * away :]
+                to_next, to_after = np.int32(away * (_SIDE - s)), np.int32(2 * away * (_SIDE - s))
+                for x in range(w - 4):
+                    here[x] = row[x]
+                for x in range(w - 4):
+                    row[x] = min(row[x], min(np.int32(next[x] + to_next), np.int32(after[x] + to_after)))
 
 
-@inlined
-def seed(code: int) -> tuple[int, int]:
-    """Rows and columns from a cell to its nearest seed."""
-    return ((code >> 7) & 127) - 64, (code & 127) - 64
-
-
-@compiled
-def average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, layers: Any) -> None:
+@borrowing
+def _average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, work: Any, layers: Any) -> None:
     """Average residuals over ``SMOOTH_RAD`` on both sides of steps; sides are told apart over twice that window.
 
     All that is averaged about a step then knows of it. Near the border, which only filters read, nothing is averaged.
@@ -303,9 +383,10 @@ def average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, layers: Any)
     Args:
         r: (h, w) residuals, 1/m.
         q: (h, w) inverse distances of the cells' nearest points.
-        high: ``window_max`` of ``r`` over ``2 * smooth`` cells.
-        low: ``window_max`` of ``-r``.
+        high: ``_window_max`` of ``r`` over ``2 * smooth`` cells.
+        low: ``_window_max`` of ``-r``.
         smooth: Half the window, cells.
+        work: (10 + 6 * smooth, w) scratch.
         layers: Those of ``Panorama``; the first three are written.
     """
     h, w = r.shape
@@ -319,9 +400,9 @@ def average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, layers: Any)
             near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
         for x in range(w - edge, w):
             near[y, x], far[y, x], share[y, x] = r[y, x], r[y, x], _ONE
-    wide, nearer, of_near = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-    sums, total = np.zeros((3, size, m), np.float32), np.zeros((3, m), np.float32)
-    per, flat = np.float32(1 / (size * size)), np.empty(m, np.float32)
+    wide, nearer, of_near, flat, per = work[0, :n], work[1, :n], work[2, :n], work[3, :m], np.float32(1 / (size * size))
+    total, sums = work[4:7], work[7:]  # of windows, and of their rows
+    work[4:] = _ZERO
     for y in range(side, h - side):
         above, below, here = high[y - side], high[y], r[y, side : w - side]
         h0, h1, h2, h3 = above[:n], above[side : side + n], below[:n], below[side : side + n]
@@ -334,7 +415,7 @@ def average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, layers: Any)
         for x in range(n):
             of_near[x] = here[x] * nearer[x]
         for k in range(3):
-            _slide(nearer if k == 0 else here if k == 1 else of_near, sums[k, y % size], total[k])
+            _slide(nearer if k == 0 else here if k == 1 else of_near, sums[k * size + y % size, :m], total[k, :m])
         if y < 2 * side:
             continue
         y0 = y - smooth
@@ -346,60 +427,56 @@ def average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, layers: Any)
             flat[x] = total[1, x] * per if h0[x] + l0[x] <= _STEP * q0[x] + _STEP_PER_M else np.nan
         out, part = near[y0, edge : w - edge], total[2]
         for x in range(m):
-            one = part[x] * per / max(share0[x], LEAST_WEIGHT) if share0[x] > LEAST_WEIGHT else r0[x]
+            one = part[x] * per / max(share0[x], _LEAST_WEIGHT) if share0[x] > _LEAST_WEIGHT else r0[x]
             out[x] = flat[x] if flat[x] == flat[x] else one
         out, part, every = far[y0, edge : w - edge], total[2], total[1]
         for x in range(m):
             rest = _ONE - share0[x]
-            one = (every[x] - part[x]) * per / max(rest, LEAST_WEIGHT) if rest > LEAST_WEIGHT else r0[x]
+            one = (every[x] - part[x]) * per / max(rest, _LEAST_WEIGHT) if rest > _LEAST_WEIGHT else r0[x]
             out[x] = flat[x] if flat[x] == flat[x] else one
 
 
-@compiled
-def draw_thin(cells: Any, residuals: Any, up: int, side: int, code: Any, layers: Any) -> None:
+@borrowing
+def _draw_thin(cells: Any, thin: Any, residuals: Any, code: Any, layers: Any) -> None:
     """Draw thin things' points on layers made of all others: each takes the cells nearer to it than to another point.
 
     Neighbouring cells blend, so three rings of cells around are prepared. In the outermost both sides of a step become
     what is shown; the next one shows the farther side; the innermost has the point's residual on the nearer side.
 
     Args:
-        cells: (n,) flat indices of the points' cells.
+        cells: (n,) flat indices of all points' cells.
+        thin: (n,) which of them are of thin things.
         residuals: (n,) their residuals.
-        up: Most cells above and below that a point takes.
-        side: ... on both sides.
-        code: That of ``nearest_residuals``, of the other points.
+        code: That of ``_spread_nearest``, of the other points.
         layers: ``Panorama.layers``; the first three are updated.
     """
-    _, h, w = layers.shape
+    (_, h, w), (up, side) = layers.shape, THIN_CELLS
     near, far, share = layers[0], layers[1], layers[2]
-    taken, n = np.empty((cells.shape[0] * (2 * up + 1) * (2 * side + 1), 3), np.int64), 0  # row, column, point
-    for i in range(cells.shape[0]):
-        y0, x0 = cells[i] // w, cells[i] % w
-        for y in range(max(y0 - up, 3), min(y0 + up + 1, h - 3)):
-            for x in range(max(x0 - side, 3), min(x0 + side + 1, w - 3)):
-                other = np.float32(code[y + 2, x + 2] >> 14) * np.float32(1 / 1024)
-                if (y - y0) ** 2 + (x - x0) ** 2 <= other * other:
-                    taken[n, 0], taken[n, 1], taken[n, 2] = y, x, i
-                    n += 1
-    for m in range(n):
-        y, x = taken[m, 0], taken[m, 1]
-        for j in range(y - 3, y + 4):
-            for k in range(x - 3, x + 4):
-                shows_near = share[j, k] > _HALF
-                near[j, k] = far[j, k] = near[j, k] if shows_near else far[j, k]
-                share[j, k] = _ONE if shows_near else _ZERO
-    for m in range(n):
-        y, x = taken[m, 0], taken[m, 1]
-        share[y - 2 : y + 3, x - 2 : x + 3] = _ZERO
-    for m in range(n):
-        y, x = taken[m, 0], taken[m, 1]
-        near[y - 1 : y + 2, x - 1 : x + 2] = residuals[taken[m, 2]]
-    for m in range(n):
-        y, x = taken[m, 0], taken[m, 1]
-        near[y, x], share[y, x] = residuals[taken[m, 2]], _ONE
+    for ring in (3, 2, 1, 0):
+        for i in range(cells.shape[0]):
+            if not thin[i]:
+                continue
+            y0, x0 = cells[i] // w, cells[i] % w
+            for y in range(max(y0 - up, 3), min(y0 + up + 1, h - 3)):
+                for x in range(max(x0 - side, 3), min(x0 + side + 1, w - 3)):
+                    other = np.float32(code[y + 2, x + 2] >> 14) * np.float32(1 / 1024)
+                    if (y - y0) ** 2 + (x - x0) ** 2 > other * other:
+                        continue
+                    for j in range(y - ring, y + ring + 1):
+                        for k in range(x - ring, x + ring + 1):
+                            if ring == 3:
+                                shows_near = share[j, k] > _HALF
+                                near[j, k] = far[j, k] = near[j, k] if shows_near else far[j, k]
+                                share[j, k] = _ONE if shows_near else _ZERO
+                            elif ring == 2:
+                                share[j, k] = _ZERO
+                            elif ring == 1:
+                                near[j, k] = residuals[i]
+                            else:
+                                near[j, k], share[j, k] = residuals[i], _ONE
 
 
-@inlined
+@borrowing
 def _slide(row: Any, oldest: Any, total: Any) -> None:
     """Replace the oldest row of windows' sums (m,) by those of a new row, and update their total over rows."""
     m = total.shape[0]
@@ -415,24 +492,23 @@ def _slide(row: Any, oldest: Any, total: Any) -> None:
         total[x] += oldest[x]
 
 
-@inlined
-def hidden_below(known: Any) -> Any:
-    """The evaluation protocol's tolerance, in inverse distance: nearer by a tenth of the distance and 0.3 m."""
-    known = max(known, _ZERO)
-    return known / (np.float32(1.1) + np.float32(0.3) * known)
-
-
+# --- what it hides ----------------------------------------------------------------------------------------------------
 @compiled
-def hidden_depths(layers: Any, silent: Any, base: Any, step: int, shrink: int, out: Any) -> None:
+def hidden_depths(layers: Any, base: Any, step: int, shrink: int, out: Any) -> None:
     """Inverse distances (h, w) below which points are hidden by a panorama's layers; 0 where nothing was measured.
 
-    ``silent`` is ``window_max`` of what was not measured, over ``2 * shrink`` cells. ``base`` (ny + 1,
-    nx + 1) is the static surface, on every ``step``-th cell; ``shrink`` is ``SHRINK_RAD`` in cells.
+    ``base`` (ny + 1, nx + 1) is the static surface, on every ``step``-th cell; ``shrink`` is ``SHRINK_RAD`` in cells.
     """
     h, w = out.shape
+    silent, work = np.empty((h, w), np.float32), np.empty((2, w + 2 * shrink), np.float32)
+    _window_max(layers[3], 2 * shrink, 2 * shrink, -_ONE, work[0], silent)  # -1 where all is measured
+    _hidden_depths(layers, silent, base, step, shrink, np.empty(base.shape[1], np.float32), work, out)
+
+
+@borrowing
+def _hidden_depths(layers: Any, silent: Any, base: Any, step: int, shrink: int, line: Any, work: Any, out: Any) -> None:
+    (h, w), side, static, known = out.shape, 2 * shrink, work[0, : out.shape[1]], work[1, : out.shape[1]]
     near, far, share = layers[0], layers[1], layers[2]
-    side, line = 2 * shrink, np.empty(base.shape[1], np.float32)
-    static, known = np.empty(w, np.float32), np.empty(w, np.float32)
     for y in range(h):
         upsampled_row(base, step, y, np.int64(0), line, static)
         one, two, part = near[y], far[y], share[y]
@@ -443,140 +519,4 @@ def hidden_depths(layers: Any, silent: Any, base: Any, step: int, shrink: int, o
             row[x] = _ZERO
         row = row[shrink:]
         for x in range(w - side):  # closes gaps between scan lines, but not outwards
-            row[x] = hidden_below(inner[x]) if hidden[x] == _ZERO else _ZERO
-
-
-@compiled
-def cells_of(rays: Any, R: Any, place: Any, rows: Any, columns: Any) -> None:
-    """Rows and columns (ny, nx) in a panorama (``Window.place``) of rays (3, ny, nx) turned by ``R``."""
-    work = np.empty((4, rays.shape[2]), np.float32)
-    for y in range(rays.shape[1]):
-        _turned_row(R, rays[0, y], rays[1, y], rays[2, y], work[0], work[1], work[2])
-        cells_row(work[0], work[1], work[2], place, work[3], rows[y], columns[y])
-
-
-@called
-def _blocks_row(rows: Any, columns: Any, h: int, w: int, first: Any, down: Any, right: Any) -> None:
-    """Flat index (n,) of the first of the 2 x 2 cells around each position in (h, w), and what it is off that one."""
-    last_row, last_column = np.float32(h - 2), np.float32(w - 2)
-    for x in range(first.shape[0]):
-        r, c = np.int32(min(max(rows[x], _ZERO), last_row)), np.int32(min(max(columns[x], _ZERO), last_column))
-        first[x] = r * np.int32(w) + c
-    for x in range(first.shape[0]):
-        a = min(max(rows[x], _ZERO), last_row + _ONE)
-        down[x] = a - np.floor(min(a, last_row))
-    for x in range(first.shape[0]):
-        a = min(max(columns[x], _ZERO), last_column + _ONE)
-        right[x] = a - np.floor(min(a, last_column))
-
-
-@inlined
-def _mixed(layer: Any, i: Any, w: Any, s: float, t: float) -> float:
-    """Bilinear value in the 2 x 2 cells from flat index ``i`` on, in rows of ``w``."""
-    i, one, w = np.uint64(i), np.uint64(1), np.uint64(w)  # signed sums are slower
-    above = layer[i] + (layer[i + one] - layer[i]) * t
-    return above + (layer[i + w] + (layer[i + w + one] - layer[i + w]) * t - above) * s
-
-
-@compiled
-def read_layer(rows: Any, columns: Any, layer: Any, out: Any) -> None:
-    """Bilinear values (n,) of a panorama's layer at rows and columns (n,); its border beyond it."""
-    (h, w), n, flat = layer.shape, out.shape[0], layer.reshape(layer.size)
-    first, down, right = np.empty(n, np.uint32), np.empty(n, np.float32), np.empty(n, np.float32)
-    _blocks_row(rows, columns, h, w, first, down, right)
-    for x in range(n):
-        out[x] = _mixed(flat, first[x], w, down[x], right[x])
-
-
-@called
-def between_nodes(nodes: Any, step: int, out: Any) -> None:
-    """Values (n,) between nodes ``step`` apart; the last ones lie on the last pixel."""
-    whole = nodes.shape[0] - 2
-    for k in range(step):
-        part, t = out[k : whole * step : step], np.float32(k) / np.float32(step)
-        for i in range(part.shape[0]):
-            part[i] = nodes[i] + (nodes[i + 1] - nodes[i]) * t
-    last = out[whole * step :]
-    for k in range(last.shape[0]):
-        t = np.float32(k) / np.float32(max(last.shape[0] - 1, 1))
-        last[k] = nodes[whole] + (nodes[whole + 1] - nodes[whole]) * t
-
-
-@called
-def _between_rows(nodes: Any, step: int, y: int, h: int, around: Any, out: Any) -> None:
-    """Values (w,) in row ``y`` of h between nodes (ny + 1, nx + 1).
-
-    ``around`` (2, w + 1) holds the rows of nodes around it, odd ones second, and in its last column which is the upper.
-    """
-    j, w = y // step, out.shape[0]
-    if step == 1:
-        for x in range(w):
-            out[x] = nodes[y, x]
-        return
-    if around[0, w] != j:
-        if around[0, w] != j - 1:
-            between_nodes(nodes[j], step, around[j % 2, :w])
-        between_nodes(nodes[j + 1], step, around[(j + 1) % 2, :w])
-        around[0, w] = j
-    t = np.float32(y - j * step) / np.float32(max(min(step, h - 1 - j * step), 1))
-    above, below = around[j % 2], around[(j + 1) % 2]
-    for x in range(w):
-        out[x] = above[x] + (below[x] - above[x]) * t
-
-
-@compiled
-def add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any) -> None:
-    """Add a panorama's residuals to inverse distances (h, w), clipped to what a surface may say.
-
-    Args:
-        rows: (ny + 1, nx + 1) rows of the panorama at nodes.
-        columns: (ny + 1, nx + 1) its columns.
-        step: Distance of the nodes, pixels; the last ones lie on the last pixel.
-        layers: ``Panorama.layers``.
-        q: (h, w) float32, updated.
-    """
-    h, w = q.shape
-    _, height, width = layers.shape
-    flat = layers.reshape(4, height * width)
-    near, far, share = flat[0], flat[1], flat[2]
-    around, first, work = np.full((2, 2, w + 1), -2, np.float32), np.empty(w, np.uint32), np.empty((4, w), np.float32)
-    v, u, down, right = work[0], work[1], work[2], work[3]
-    for y in range(h):
-        _between_rows(rows, step, y, h, around[0], v)
-        _between_rows(columns, step, y, h, around[1], u)
-        _blocks_row(v, u, height, width, first, down, right)
-        out = q[y]
-        for x in range(w):
-            i, s, t = first[x], down[x], right[x]
-            if _mixed(share, i, width, s, t) > _HALF:
-                value = _mixed(near, i, width, s, t)
-            else:
-                value = _mixed(far, i, width, s, t)
-            out[x] = min(max(out[x] + value, _ZERO), _MOST)
-
-
-@compiled
-def interpolate_layer(rows: Any, columns: Any, step: int, layer: Any, apart: int, out: Any) -> None:
-    """Values (h, w) between those of a panorama's layer every ``apart`` pixels; the rest is as in ``add_residuals``."""
-    h, w = out.shape
-    around, v, u = np.full((3, 2, w + 1), -2, np.float32), np.empty(w + 1, np.float32), np.empty(w + 1, np.float32)
-    nodes = np.empty((-(-h // apart) + 1, -(-w // apart) + 1), np.float32)
-    for j in range(nodes.shape[0]):
-        y = min(j * apart, h - 1)
-        _between_rows(rows, step, y, h, around[0], v[:w])
-        _between_rows(columns, step, y, h, around[1], u[:w])
-        for i in range(nodes.shape[1]):
-            x = min(i * apart, w - 1)
-            v[i], u[i] = v[x], u[x]
-        read_layer(v[: nodes.shape[1]], u[: nodes.shape[1]], layer, nodes[j])
-    for y in range(h):
-        _between_rows(nodes, apart, y, h, around[2], out[y])
-
-
-@called
-def _turned_row(R: Any, x: Any, y: Any, z: Any, u: Any, v: Any, w: Any) -> None:
-    """Vectors (n,) turned by ``R`` (3, 3)."""
-    for k, out in enumerate((u, v, w)):
-        a, b, c = R[k, 0], R[k, 1], R[k, 2]
-        for i in range(out.shape[0]):
-            out[i] = a * x[i] + b * y[i] + c * z[i]
+            row[x] = hidden_below(inner[x]) if hidden[x] == -_ONE else _ZERO

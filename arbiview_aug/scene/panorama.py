@@ -10,9 +10,15 @@ between the cells too.
 from __future__ import annotations
 
 import math
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.image_ops import FRESH, Memory
+from arbiview_aug.scene.surface import StaticSurface
 
 Layer = npt.NDArray[np.float32]
 
@@ -58,3 +64,130 @@ HALO_RAD = math.radians(4.0)
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
+
+ROOM_CELLS = 5
+"""Cells by which panoramas are wider than what is asked: nodes of plans lie on the border."""
+
+THIN_CELLS = 1, 5
+"""Most cells above and below, and aside, that a thin thing's point takes: 5 bridge gaps of 1 degree. A tape that one
+scan line met would else take what lies beside it to its own distance, in ovals as high as the lines are apart."""
+
+_BLOCK = 1 << 16  # cells by which scratch grows
+
+
+class Cells(NamedTuple):
+    """The side of a panorama's cells, radians, and lengths in cells."""
+
+    rad: float
+    turn: int
+    halo: int
+    see_through: int
+    side: int
+    smooth: int
+    shrink: int
+    reach: np.float32
+    support: np.float32
+
+    @classmethod
+    def of(cls, rad: float) -> Cells:
+        """Cell counts for a cell side of ``rad`` radians."""
+        angles = 2 * math.pi, HALO_RAD, SEE_THROUGH_RAD, SIDE_RAD, (SMOOTH_RAD - rad) / 2
+        turn, halo, see_through, side, smooth = (round(angle / rad) for angle in angles)
+        reach, support = np.float32(REACH_RAD / rad), np.float32(SUPPORT_RAD / rad)
+        shrink = round(SHRINK_RAD / rad)
+        return cls(rad, turn, halo, see_through, side, smooth, shrink, reach, support)
+
+    @property
+    def beyond(self) -> float:
+        """Angle below and above all points beyond which a window's halo shows the static surface too, radians."""
+        return (math.ceil(self.reach) + 4 * self.smooth + 1 - self.halo) * self.rad
+
+
+class Window(NamedTuple):
+    """A part of the sphere, in cells: row 0 begins at the horizon, column 0 straight ahead."""
+
+    row: int
+    column: int
+    rows: int
+    columns: int
+    cells: Cells
+
+    @classmethod
+    def around(
+        cls, rays: Layer, R: FloatArray, cells: Cells, low: float = -4.0, high: float = 4.0
+    ) -> tuple[Window, bool]:
+        """The smallest window, and some room, that holds rays (3, ny, nx), and whether positions may be interpolated.
+
+        ``R`` (3, 3) turns the rays to the ego frame; those of elevations below ``low`` and above ``high``, radians, do
+        not count if there are others. Azimuths bend near the zenith, and jump in a window all around.
+        """
+        from arbiview_aug.scene.panorama_kernels import span_of
+
+        row, column, rows, columns, is_smooth = span_of(rays, np.ascontiguousarray(R), cells.rad, low, high)
+        bottom, top = max(row - ROOM_CELLS, -cells.turn // 4), min(row + rows + ROOM_CELLS, cells.turn // 4)
+        column, columns = column - ROOM_CELLS, columns + 2 * ROOM_CELLS
+        if columns + cells.halo > cells.turn:
+            column, columns, is_smooth = 0, cells.turn, False
+        return cls(bottom, column, top - bottom, columns, cells), is_smooth
+
+    def holds(self, other: Window) -> bool:
+        """Whether another window lies within this one."""
+        turn = self.cells.turn
+        aside = self.columns >= turn or (other.column - self.column) % turn + other.columns <= self.columns
+        return aside and self.row <= other.row and other.row + other.rows <= self.row + self.rows
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns, with the halo."""
+        return self.rows + 2 * self.cells.halo + 1, self.columns + 2 * self.cells.halo + 1
+
+    def scratch(self, memory: Memory) -> tuple[Any, Any]:
+        """Planes for the kernels of ``completion``, and ``Panorama.layers``."""
+        from arbiview_aug.scene.completion import PLANES
+
+        h, w = self.shape  # windows differ by some rows from frame to frame: blocks of few sizes are found again
+        block = -(-(h + 4) * (w + 4) // _BLOCK) * _BLOCK
+        planes, layers = memory.empty((PLANES, block), np.float32), memory.empty((5 * block,), np.float32)
+        return planes, layers[: 5 * h * w].reshape(5, h, w)
+
+
+class Panorama:
+    """Depth by points within a window of the view from one centre, made dense over a static surface.
+
+    Nearest point first in each cell, none within ``NEAREST_M``; points that shine through gaps of what is nearer are
+    dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart.
+    What one scan line alone met is drawn last (``THIN_CELLS``).
+
+    Attributes:
+        window: The window.
+        layers: (5, rows, columns) residual of the nearer side of a step, or of everything where there is none, 1/m;
+            that of the farther side; the nearer side's share of the neighbourhood; 1 where a point lies within
+            ``SUPPORT_RAD``, else 0; 1 where no step lies between a cell and those above and next to it, else 0.
+    """
+
+    def __init__(
+        self, window: Window, origin: FloatArray, points: Layer, mapped: int, street: StaticSurface,
+        memory: Memory = FRESH,
+    ) -> None:  # fmt: skip
+        """Complete the points (3, P), of which the last ``mapped`` are of depth maps, around ``origin`` (3,)."""
+        from arbiview_aug.scene.completion import complete, find_visible, rays_of
+
+        self.window, self._origin, self._street = window, origin, street
+        planes, self.layers = window.scratch(memory)
+        n = find_visible(points, mapped, origin, window, planes)
+        complete(n, street.along(origin, rays_of(planes, n))[0], window, planes, self.layers)
+
+    @cached_property
+    def hidden_below(self) -> Layer:
+        """Points of a smaller inverse distance are hidden by what was certainly measured; 0 where it is silent."""
+        from arbiview_aug.scene.completion import hidden_depths
+
+        (rad, _, halo, *_), shape = self.window.cells, self.layers.shape[1:]
+        rows, columns = (np.arange(0, n + BASE_STEP, BASE_STEP, dtype=np.float32) * np.float32(rad) for n in shape)
+        azimuth = np.float32((self.window.column - halo) * rad) + columns
+        elevation = (np.float32((self.window.row - halo) * rad) + rows)[:, None]
+        level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(rows), len(columns)))
+        static = self._street.along(self._origin, np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up]))
+        hidden = np.empty(shape, np.float32)
+        hidden_depths(self.layers, static, BASE_STEP, self.window.cells.shrink, hidden)
+        return hidden

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.errors import CalibrationError
-from arbiview_aug.scene.panorama import SUPPORT_RAD, Layer
-from arbiview_aug.scene.point_cloud import FINE, Window, own_car, window_max
+from arbiview_aug.image_ops import FRESH
+from arbiview_aug.scene.panorama import SUPPORT_RAD, Layer, Window
+from arbiview_aug.scene.point_cloud import FINE, own_car
 from arbiview_aug.scene.surface import Points
 
 SIDE_SUPPORT_RAD = math.radians(0.3)
@@ -65,8 +65,9 @@ def scan(lidars: Sequence[Lidar], points: Points, ground_z_m: float, swept: int 
     """
     points = np.ascontiguousarray(points, np.float32)
     numbers, first = np.flatnonzero(~own_car(points)).astype(np.int32), 0
-    scene, own = points[numbers], int(np.searchsorted(numbers, len(points) - swept))
-    scenes = [scene[:own], scene] if own < len(scene) else [scene]
+    own = int(np.searchsorted(numbers, len(points) - swept))
+    counts = [own, len(numbers)] if own < len(numbers) else [own]
+    scenes = [np.ascontiguousarray(points[numbers[:count]].T) for count in counts]
     parts: list[tuple[Layer, Numbers, Numbers]] = []
     silent = 0
     for lidar in lidars:
@@ -92,46 +93,33 @@ def scan(lidars: Sequence[Lidar], points: Points, ground_z_m: float, swept: int 
     return Scan(hits, nearest, rings, silent / total)
 
 
-def _returns(lidar: Lidar, rays: Layer, scenes: Sequence[Points], ground_z_m: float) -> tuple[Layer, Numbers]:
+def _returns(lidar: Lidar, rays: Layer, scenes: Sequence[Layer], ground_z_m: float) -> tuple[Layer, Numbers]:
     """Inverse distances of a scanner's rays (3, ny, nx), 1/m, and the number of the point next to each, or -1.
 
-    Each of ``scenes`` (P, 3) begins with the points of the one before it, and fills rays that this did not.
+    Each of ``scenes`` (3, P) begins with the points of the one before it, and fills rays that this did not.
     """
-    from arbiview_aug.scene.completion import cells_of, elevations
-    from arbiview_aug.scene.scan_kernels import continue_road, meet_points
+    from arbiview_aug.scene.completion import elevations, find_visible
+    from arbiview_aug.scene.panorama_kernels import cells_of
+    from arbiview_aug.scene.scan_kernels import continue_road, meet_points, place_points
 
-    size, origin = rays.shape[1:], lidar.center_m.copy()
+    size, origin, ahead = rays.shape[1:], lidar.center_m.copy(), np.eye(3)
     q, nearest = np.zeros(size, np.float32), np.full(size, -1, np.int32)
-    if not len(scenes[-1]):
+    if not scenes[-1].size:
         return q, nearest
     low, high = elevations(scenes[-1], origin)
-    some = rays[..., :: max(1, int(_ROOM_DEG / lidar.azimuth_step_deg))].reshape(3, -1).T.astype(np.float64)
-    window = Window.around(some, SCANNED, (low - SUPPORT_RAD, high + SUPPORT_RAD)).roomy
+    some = np.ascontiguousarray(rays[..., :: max(1, int(_ROOM_DEG / lidar.azimuth_step_deg))])
+    window, _ = Window.around(some, ahead, SCANNED, low - SUPPORT_RAD, high + SUPPORT_RAD)
     at = np.empty((2, *size), np.float32)
-    cells_of(rays, np.eye(3, dtype=np.float32), window.place, *at)
+    cells_of(rays, ahead.astype(np.float32), window, *at)
     lengths = ground_z_m - origin[2], SCANNED.rad, SUPPORT_RAD / SCANNED.rad, SIDE_SUPPORT_RAD / SCANNED.rad
     ground, rad, reach, side = np.array(lengths, np.float32)
     for points in scenes:
-        seen = _visible(window, origin, points)
+        planes, _ = window.scratch(FRESH)
+        n, index = find_visible(points, 0, origin, window, planes), np.full(window.shape, -1, np.int32)
+        seen = index, *place_points(n, window, planes, index)
         meet_points(*at, rays, *seen, ground, rad, reach, side, q, nearest)
     continue_road(*at, rays, *seen, ground, side, q, nearest)
     return q, nearest
-
-
-def _visible(window: Window, origin: FloatArray, points: Points) -> tuple[Numbers, Layer, Numbers]:
-    """The visible points of (P, 3): the one in each cell, or -1, their ``seeds`` (4, n) of ``meet_points``, numbers."""
-    from arbiview_aug.scene.completion import block_cones, cells_of, drop_hidden, nearest_points
-    from arbiview_aug.scene.scan_kernels import place_points
-
-    closest, number = np.zeros(window.shape, np.float32), np.empty(window.shape, np.int32)
-    nearest_points(points, block_cones(points), origin, window.bounds, window.place, closest, number)
-    most = window_max(closest, 2 * SCANNED.side, 2 * SCANNED.side)
-    visible = SCANNED.see_through, SCANNED.side, len(points)
-    cell, directions, _ = drop_hidden(closest, most, number, points, origin, *visible)
-    at = np.empty((2, 1, len(cell)), np.float32)
-    cells_of(directions, np.eye(3, dtype=np.float32), window.place, *at)
-    index = np.full(window.shape, -1, np.int32)
-    return index, *place_points(cell, directions[:, 0], closest, number, *at[:, 0], np.float32(SCANNED.turn), index)
 
 
 def warm_up() -> None:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.environment import compiled, inlined
+from arbiview_aug.scene.completion import CELLS, NUMBER, RAYS, Q
+from arbiview_aug.scene.panorama_kernels import cells_row
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _LOW_M, _LOW = np.float32(0.2), np.float32(0.01)
@@ -23,30 +25,27 @@ _JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
 
 
 @compiled
-def place_points(
-    cells: Any, rays: Any, q: Any, number: Any, rows: Any, columns: Any, turn: Any, index: Any
-) -> tuple[Any, Any]:
-    """``seeds`` (4, n) and ``numbers`` (n,) of ``meet_points``, of points in flat cells (n,); writes ``index`` (h, w).
+def place_points(n: int, window: Any, planes: Any, index: Any) -> tuple[Any, Any]:
+    """``seeds`` (4, n) and ``numbers`` (n,) of ``meet_points`` for the points that ``find_visible`` found.
 
     Args:
-        cells: (n,) those of ``drop_hidden``.
-        rays: (3, n) float32 to the points.
-        q: (h, w) inverse distances of cells.
-        number: (h, w) int32 the points' own numbers.
-        rows: (n,) of the points.
-        columns: (n,) of the points, up to whole turns.
-        turn: Columns of a turn.
-        index: (h, w) int32, -1.
+        n: Number of points.
+        window: The window.
+        planes: Those of ``find_visible``.
+        index: (h, w) int32, -1; written: the point in each cell.
     """
-    n, w = cells.shape[0], q.shape[1]
-    seeds, numbers = np.empty((4, n), np.float32), np.empty(n, np.int32)
+    (_, w), cells = index.shape, planes[CELLS].view(np.int32)
+    q, number, rays = planes[Q], planes[NUMBER].view(np.int32), planes[RAYS:CELLS].reshape(-1)[: 3 * n].reshape(3, n)
+    at, seeds, numbers = np.empty((3, n), np.float32), np.empty((4, n), np.float32), np.empty(n, np.int32)
+    cells_row(rays[0], rays[1], rays[2], window, at[0], at[1], at[2])
+    turn = np.float32(window.cells.turn)
     for i in range(n):
-        y, x = cells[i] // w, cells[i] % w
-        index[y, x], numbers[i] = i, number[y, x]
-        aside = columns[i] - np.float32(x)  # a halo holds some twice
-        seeds[0, i], seeds[1, i] = rows[i], columns[i] - turn * np.rint(aside / turn)
-        seeds[2, i] = q[y, x] / np.sqrt(max(rays[0, i] * rays[0, i] + rays[1, i] * rays[1, i], np.float32(1e-12)))
-        seeds[3, i] = rays[2, i] / q[y, x]
+        y, x, near = cells[i] // w, cells[i] % w, q[cells[i]]
+        index[y, x], numbers[i] = i, number[cells[i]]
+        aside = at[2, i] - np.float32(x)  # a halo holds some twice
+        seeds[0, i], seeds[1, i] = at[1, i], at[2, i] - turn * np.rint(aside / turn)
+        seeds[2, i] = near / np.sqrt(max(rays[0, i] * rays[0, i] + rays[1, i] * rays[1, i], np.float32(1e-12)))
+        seeds[3, i] = rays[2, i] / near
     return seeds, numbers
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from arbiview_aug.cameras.kernels import rays_row
 from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
 from arbiview_aug.environment import called, compiled, inlined
-from arbiview_aug.scene.completion import between_nodes
+from arbiview_aug.scene.panorama_kernels import between_nodes
 
 MOST_OFF_M, LEAST_OF_FACE = 0.6, 8
 """Farthest from a face that a point tells its place, as glass may lie within a label; fewest points that move it."""

@@ -1,0 +1,251 @@
+"""Compiled reading of panoramas: where rays meet their cells, and values between the cells."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from arbiview_aug.cameras.kernels import angle_row
+from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
+from arbiview_aug.environment import borrowing, called, compiled, inlined
+
+_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
+_MOST = np.float32(MAX_INVERSE_DISTANCE)
+_HALF_PI = np.float32(np.pi / 2)
+_STEEP = 0.9
+"""Sine of the elevation up to which azimuths are interpolated: 64 degrees."""
+
+
+@compiled
+def span_of(rays: Any, R: Any, rad: float, lowest: float, highest: float) -> tuple[int, int, int, int, bool]:
+    """First row and column, and numbers of both, of the smallest ``Window`` that holds rays (3, ny, nx).
+
+    Only those of elevations from ``lowest`` to ``highest`` count, if there are any. ``R`` (3, 3) turns the rays to the
+    ego frame; rays of zeros are missing. The last value says whether none is, and none is steep.
+    """
+    turned, n, least, most = np.empty((3, rays.shape[1] * rays.shape[2])), 0, 1.0, -1.0
+    x, y, z = turned[0], turned[1], turned[2]
+    for j in range(rays.shape[1]):
+        for i in range(rays.shape[2]):
+            a, b, c = np.float64(rays[0, j, i]), np.float64(rays[1, j, i]), np.float64(rays[2, j, i])
+            x[n], y[n] = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c, R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+            z[n] = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+            if a != 0 or b != 0 or c != 0:
+                least, most, n = min(least, z[n]), max(most, z[n]), n + 1
+    if n == 0:
+        return 0, 0, 1, 1, False
+    is_smooth = n == rays.shape[1] * rays.shape[2] and max(-least, most) <= _STEEP
+    for bottom, top in ((lowest, highest), (-4.0, 4.0)):
+        ends = np.arcsin(max(least, -1.0)), np.arcsin(min(most, 1.0))
+        low, high = int(np.floor(max(ends[0], bottom) / rad)), int(np.ceil(min(ends[1], top) / rad))
+        under = np.sin(low * rad) if low * rad > ends[0] else -2.0
+        over = np.sin(high * rad) if high * rad < ends[1] else 2.0
+        ahead, left, inside = 0.0, 0.0, 0
+        for i in range(n):
+            if under <= z[i] <= over:
+                ahead, left, inside = ahead + x[i], left + y[i], inside + 1
+        if inside:
+            break
+    middle, first, last = np.arctan2(left, ahead), 2.0, -2.0
+    c, s = np.cos(middle), np.sin(middle)
+    for i in range(n):
+        if under <= z[i] <= over:
+            a, b = c * x[i] + s * y[i], c * y[i] - s * x[i]
+            part = b / max(abs(a) + abs(b), 1e-30)  # grows with the azimuth, and costs no arctangent
+            part = part if a >= 0 else np.copysign(2.0, b) - part
+            first, last = min(first, part), max(last, part)
+    column = int(np.floor((middle + _azimuth(first)) / rad))
+    return low, column, high - low, int(np.ceil((middle + _azimuth(last)) / rad)) - column, is_smooth
+
+
+@inlined
+def _azimuth(part: float) -> float:
+    """The angle whose direction (a, b) has this b / (|a| + |b|) where it points ahead, and 2 less it elsewhere."""
+    ahead = 1.0 - abs(part)
+    return np.arctan2(part if ahead >= 0 else np.copysign(2.0, part) - part, ahead)
+
+
+@called
+def cells_row(x: Any, y: Any, z: Any, window: Any, level: Any, row: Any, column: Any) -> None:
+    """Rows and columns (n,) of ego-frame vectors in a panorama of a window; ``level`` is scratch.
+
+    They are counted from the halo. A halo of a whole turn lacks at its start what lies before it; at its end it has
+    both.
+    """
+    rad, halo, n = window.cells.rad, window.cells.halo, x.shape[0]
+    first, low = np.float32((window.column - halo) * rad), np.float32((window.row - halo) * rad)
+    per_rad, turn = np.float32(1 / rad), np.float32(window.cells.turn)
+    lead = np.float32(halo if window.columns >= window.cells.turn else 0)
+    for i in range(n):
+        level[i] = abs(y[i])
+    angle_row(level, x, column)
+    for i in range(n):
+        azimuth = (column[i] if y[i] >= _ZERO else -column[i]) - first
+        column[i] = azimuth * per_rad - lead
+    for i in range(n):
+        column[i] += lead - np.floor(column[i] / turn) * turn
+    for i in range(n):
+        level[i] = np.sqrt(x[i] * x[i] + y[i] * y[i])
+    angle_row(level, z, row)
+    for i in range(n):
+        row[i] = (_HALF_PI - row[i] - low) * per_rad
+
+
+@compiled
+def cells_of(rays: Any, R: Any, window: Any, rows: Any, columns: Any) -> None:
+    """Rows and columns (ny, nx) in a panorama of a window of rays (3, ny, nx) turned by ``R`` (3, 3) float32."""
+    work = np.empty((4, rays.shape[2]), np.float32)
+    for y in range(rays.shape[1]):
+        _turned_row(R, rays[0, y], rays[1, y], rays[2, y], work[0], work[1], work[2])
+        cells_row(work[0], work[1], work[2], window, work[3], rows[y], columns[y])
+
+
+@called
+def _turned_row(R: Any, x: Any, y: Any, z: Any, u: Any, v: Any, w: Any) -> None:
+    """Vectors (n,) turned by ``R`` (3, 3)."""
+    for k, out in enumerate((u, v, w)):
+        a, b, c = R[k, 0], R[k, 1], R[k, 2]
+        for i in range(out.shape[0]):
+            out[i] = a * x[i] + b * y[i] + c * z[i]
+
+
+@called
+def _blocks_row(rows: Any, columns: Any, h: int, w: int, first: Any, down: Any, right: Any) -> None:
+    """Flat index (n,) of the first of the 2 x 2 cells around each position in (h, w), and what it is off that one."""
+    last_row, last_column = np.float32(h - 2), np.float32(w - 2)
+    for x in range(first.shape[0]):
+        r, c = np.int32(min(max(rows[x], _ZERO), last_row)), np.int32(min(max(columns[x], _ZERO), last_column))
+        first[x] = r * np.int32(w) + c
+    for x in range(first.shape[0]):
+        a = min(max(rows[x], _ZERO), last_row + _ONE)
+        down[x] = a - np.floor(min(a, last_row))
+    for x in range(first.shape[0]):
+        a = min(max(columns[x], _ZERO), last_column + _ONE)
+        right[x] = a - np.floor(min(a, last_column))
+
+
+@inlined
+def _mixed(layer: Any, i: Any, w: Any, s: float, t: float) -> float:
+    """Bilinear value in the 2 x 2 cells from flat index ``i`` on, in rows of ``w``."""
+    i, one, w = np.uint64(i), np.uint64(1), np.uint64(w)  # signed sums are slower
+    above = layer[i] + (layer[i + one] - layer[i]) * t
+    return above + (layer[i + w] + (layer[i + w + one] - layer[i + w]) * t - above) * s
+
+
+@borrowing
+def _read_row(rows: Any, columns: Any, layer: Any, first: Any, down: Any, right: Any, out: Any) -> None:
+    """Bilinear values (n,) of a panorama's layer (h, w) at rows and columns (n,); its border beyond it."""
+    h, w = layer.shape
+    flat = layer.reshape(h * w)
+    _blocks_row(rows, columns, h, w, first, down, right)
+    for x in range(out.shape[0]):
+        out[x] = _mixed(flat, first[x], w, down[x], right[x])
+
+
+@compiled
+def read_layer(rays: Any, window: Any, layer: Any, out: Any) -> None:
+    """Bilinear values (n,) of a panorama's layer (h, w) along ego-frame rays (3, n); its border beyond it."""
+    n = out.shape[0]
+    first, work = np.empty(n, np.uint32), np.empty((5, n), np.float32)
+    cells_row(rays[0], rays[1], rays[2], window, work[0], work[1], work[2])
+    _read_row(work[1], work[2], layer, first, work[3], work[4], out)
+
+
+@called
+def between_nodes(nodes: Any, step: int, out: Any) -> None:
+    """Values (n,) between nodes ``step`` apart; the last ones lie on the last pixel."""
+    whole = nodes.shape[0] - 2
+    for k in range(step):
+        part, t = out[k : whole * step : step], np.float32(k) / np.float32(step)
+        for i in range(part.shape[0]):
+            part[i] = nodes[i] + (nodes[i + 1] - nodes[i]) * t
+    last = out[whole * step :]
+    for k in range(last.shape[0]):
+        t = np.float32(k) / np.float32(max(last.shape[0] - 1, 1))
+        last[k] = nodes[whole] + (nodes[whole + 1] - nodes[whole]) * t
+
+
+@borrowing
+def _between_rows(nodes: Any, step: int, y: int, h: int, around: Any, out: Any) -> None:
+    """Values (w,) in row ``y`` of h between nodes (ny + 1, nx + 1).
+
+    ``around`` (2, w + 1) holds the rows of nodes around it, odd ones second, and in its last column which is the upper.
+    """
+    j, w = y // step, out.shape[0]
+    if step == 1:
+        for x in range(w):
+            out[x] = nodes[y, x]
+        return
+    if around[0, w] != j:
+        if around[0, w] != j - 1:
+            between_nodes(nodes[j], step, around[j % 2, :w])
+        between_nodes(nodes[j + 1], step, around[(j + 1) % 2, :w])
+        around[0, w] = j
+    t = np.float32(y - j * step) / np.float32(max(min(step, h - 1 - j * step), 1))
+    above, below = around[j % 2], around[(j + 1) % 2]
+    for x in range(w):
+        out[x] = above[x] + (below[x] - above[x]) * t
+
+
+@compiled
+def add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any) -> None:
+    """Add a panorama's residuals to inverse distances (h, w), clipped to what a surface may say.
+
+    Args:
+        rows: (ny + 1, nx + 1) rows of the panorama at nodes.
+        columns: (ny + 1, nx + 1) its columns.
+        step: Distance of the nodes, pixels; the last ones lie on the last pixel.
+        layers: ``Panorama.layers``.
+        q: (h, w) float32, updated.
+    """
+    w = q.shape[1]
+    around, first, work = np.full((2, 2, w + 1), -2, np.float32), np.empty(w, np.uint32), np.empty((4, w), np.float32)
+    _add_residuals(rows, columns, step, layers, q, around, first, work)
+
+
+@borrowing
+def _add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any, around: Any, first: Any, work: Any) -> None:
+    (h, w), (_, height, width) = q.shape, layers.shape
+    flat = layers.reshape(5, height * width)
+    near, far, share, level = flat[0], flat[1], flat[2], flat[4]
+    v, u, down, right = work[0], work[1], work[2], work[3]
+    for y in range(h):
+        _between_rows(rows, step, y, h, around[0], v)
+        _between_rows(columns, step, y, h, around[1], u)
+        _blocks_row(v, u, height, width, first, down, right)
+        out = q[y]
+        for x in range(w):
+            i, s, t = first[x], down[x], right[x]
+            if level[i] > _ZERO or _mixed(share, i, width, s, t) > _HALF:
+                value = _mixed(near, i, width, s, t)
+            else:
+                value = _mixed(far, i, width, s, t)
+            out[x] = min(max(out[x] + value, _ZERO), _MOST)
+
+
+@compiled
+def interpolate_layer(rows: Any, columns: Any, step: int, layer: Any, apart: int, out: Any) -> None:
+    """Values (h, w) between those of a panorama's layer every ``apart`` pixels; the rest is as in ``add_residuals``."""
+    h, w = out.shape
+    around, work = np.full((3, 2, w + 1), -2, np.float32), np.empty((4, w + 1), np.float32)
+    nodes, first = np.empty((-(-h // apart) + 1, -(-w // apart) + 1), np.float32), np.empty(w + 1, np.uint32)
+    _interpolate_layer(rows, columns, step, layer, apart, out, around, work, nodes, first)
+
+
+@borrowing
+def _interpolate_layer(
+    rows: Any, columns: Any, step: int, layer: Any, apart: int, out: Any, around: Any, work: Any, nodes: Any, first: Any
+) -> None:
+    (h, w), n = out.shape, nodes.shape[1]
+    v, u, down, right = work[0], work[1], work[2], work[3]
+    for j in range(nodes.shape[0]):
+        y = min(j * apart, h - 1)
+        _between_rows(rows, step, y, h, around[0], v[:w])
+        _between_rows(columns, step, y, h, around[1], u[:w])
+        for i in range(n):
+            x = min(i * apart, w - 1)
+            v[i], u[i] = v[x], u[x]
+        _read_row(v[:n], u[:n], layer, first[:n], down[:n], right[:n], nodes[j])
+    for y in range(h):
+        _between_rows(nodes, apart, y, h, around[2], out[y])
