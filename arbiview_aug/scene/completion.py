@@ -16,13 +16,6 @@ _NEAREST = np.float32(1 / NEAREST_M)
 _BLOCK = 1024
 """Points worked on at once."""
 
-PLANES = 9
-"""Scratch of a panorama, as planes of at least (h + 4) * (w + 4) float32 each: the largest inverse distance in each
-cell, which point's that is (int32), the maximum of the first over a window, rays of seen points (3), their flat cells
-(int32), whether they are thin (int32), and nearest seeds (int32). ``complete`` writes over what it does not need."""
-Q, NUMBER, _MOST, RAYS, CELLS, _THIN, _CODE = 0, 1, 2, 3, 6, 7, 8
-_RESIDUALS, _R, _NEAR_Q, _HIGH, _LOW = 1, 2, 3, 4, 5
-
 # A cell's nearest seed in one int32, so that the nearer of two is their minimum: distance in 1/1024 cell (from bit 14),
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
 _ROW, _OWN, _NO_SEED = 1 << 7, np.int32(64 * 128 + 64), np.int32(1 << 30)
@@ -46,7 +39,7 @@ def elevations(points: Any, origin: Any) -> tuple[float, float]:
 
 
 @compiled
-def find_visible(points: Any, mapped: int, origin: Any, window: Any, planes: Any) -> int:
+def find_visible(points: Any, mapped: int, origin: Any, window: Any, scratch: Any) -> int:
     """Find the points that ``origin`` sees in a ``Window``, the nearest one in each cell; return their number n.
 
     Args:
@@ -54,47 +47,20 @@ def find_visible(points: Any, mapped: int, origin: Any, window: Any, planes: Any
         mapped: Number of the last points that are of depth maps.
         origin: (3,) float64.
         window: The window.
-        planes: (PLANES, size) float32 scratch, written. The rays (3, n) of the points lie at the beginning of the
-            third to fifth plane.
+        scratch: ``Scratch`` of the window, written.
     """
-    side, h, w = window.cells.side, _height(window), _width(window)
-    q, number, most = _plane(planes, Q, h, w), _ints(planes, NUMBER, h, w), _plane(planes, _MOST, h, w)
-    cells, thin = planes[CELLS].view(np.int32), planes[_THIN].view(np.int32)
+    q, number, side, n = scratch.q, scratch.number, window.cells.side, 0
     work, exact, index = np.empty((7, _BLOCK), np.float32), np.empty((4, _BLOCK)), np.empty((2, _BLOCK), np.int32)
-    between = np.empty(w + 2 * side, np.float32)
+    line = np.empty(q.shape[1] + 2 * side, np.float32)
     _nearest_points(points, origin, window, q, number, work, exact, index)
-    _window_max(q, 2 * side, 2 * side, _ONE, between, most)
-    n = _drop_hidden(q, most, number, window.cells.see_through, side, points.shape[1], mapped, between, cells, thin)
-    rays, flat_q, flat_number = planes[RAYS:CELLS].reshape(-1)[: 3 * n].reshape(3, n), planes[Q], number.reshape(-1)
+    _window_max(q, 2 * side, 2 * side, _ONE, line, scratch.most)
+    n = _drop_hidden(scratch, window.cells.see_through, side, points.shape[1], mapped, line)
+    rays, flat_q, flat_number = scratch.rays[: 3 * n].reshape(3, n), q.reshape(q.size), number.reshape(q.size)
     for axis in range(3):
         for i in range(n):
-            rays[axis, i] = (points[axis, flat_number[cells[i]]] - origin[axis]) * flat_q[cells[i]]
+            cell = scratch.cells[i]
+            rays[axis, i] = (points[axis, flat_number[cell]] - origin[axis]) * flat_q[cell]
     return n
-
-
-def rays_of(planes: Any, n: int) -> Any:
-    """Rays (3, 1, n) of the points that ``find_visible`` found, in the ego frame."""
-    return planes[RAYS:CELLS].reshape(-1)[: 3 * n].reshape(3, 1, n)
-
-
-@inlined
-def _height(window: Any) -> int:
-    return window.rows + 2 * window.cells.halo + 1
-
-
-@inlined
-def _width(window: Any) -> int:
-    return window.columns + 2 * window.cells.halo + 1
-
-
-@inlined
-def _plane(planes: Any, k: int, h: int, w: int) -> Any:
-    return planes[k, : h * w].reshape(h, w)
-
-
-@inlined
-def _ints(planes: Any, k: int, h: int, w: int) -> Any:
-    return planes[k].view(np.int32)[: h * w].reshape(h, w)
 
 
 @borrowing
@@ -183,17 +149,16 @@ def _window_max(a: Any, rows: int, columns: int, sign: Any, line: Any, out: Any)
 
 
 @borrowing
-def _drop_hidden(
-    q: Any, most: Any, number: Any, away: int, side: int, points: int, mapped: int, between: Any, cells: Any, thin: Any
-) -> int:
+def _drop_hidden(scratch: Any, away: int, side: int, points: int, mapped: int, between: Any) -> int:
     """Drop points that shine through gaps of what is nearer on both sides of them, and find thin things.
 
-    ``q`` and ``number`` are those of ``_nearest_points``, ``most`` is ``_window_max`` of ``q`` over ``2 * side`` cells,
-    ``away`` and ``side`` are ``SEE_THROUGH_RAD`` and ``SIDE_RAD`` in cells. The last ``mapped`` of all ``points`` are of
-    depth maps, which show gaps as they are: only cells next to them count. Writes the flat indices of cells that keep
-    their point, and whether it lies clearly before all points above and below it, within ``away`` and not next to it,
-    as on a tape that one scan line met. Returns their number; ``between`` (w,) is scratch.
+    ``scratch.most`` is ``_window_max`` of ``q`` over ``2 * side`` cells, ``away`` and ``side`` are ``SEE_THROUGH_RAD``
+    and ``SIDE_RAD`` in cells. The last ``mapped`` of all ``points`` are of depth maps, which show gaps as they are: only
+    cells next to them count. Writes ``cells`` that keep their point, and whether it is ``thin``: clearly before all
+    points above and below it, within ``away`` and not next to it, as on a tape that one scan line met. Returns their
+    number; ``between`` (w,) is scratch.
     """
+    q, number, most, cells, thin = scratch.q, scratch.number, scratch.most, scratch.cells, scratch.thin
     (h, w), n = q.shape, 0
     more, inner = away - 1 - 2 * side, w - 2  # windows are longer than wide
     for y in range(h):
@@ -228,7 +193,7 @@ def _drop_hidden(
 
 @compiled
 def find_contradicted(
-    points: Any, others: Any, origin: Any, window: Any, up: int, side: int, contradicted: Any
+    points: Any, others: Any, origin: Any, window: Any, scratch: Any, up: int, side: int, contradicted: Any
 ) -> None:
     """Find the points of other scans (3, Q) that lie clearly before all of a scan's own points (3, P) around them.
 
@@ -237,14 +202,14 @@ def find_contradicted(
         others: Those of the others.
         origin: (3,) float64, the centre of the panorama.
         window: Its ``Window``.
+        scratch: Its ``Scratch``, written.
         up: Cells above and below that are around a point.
         side: Cells on each side.
         contradicted: (Q,) bool, written.
     """
-    h, w, n = _height(window), _width(window), others.shape[1]
-    q, number, most = np.empty((h, w), np.float32), np.empty((h, w), np.int32), np.empty((h, w), np.float32)
+    q, most, (h, w), n = scratch.q, scratch.most, scratch.q.shape, others.shape[1]
     work, exact, index = np.empty((7, _BLOCK), np.float32), np.empty((4, _BLOCK)), np.empty((2, _BLOCK), np.int32)
-    _nearest_points(points, origin, window, q, number, work, exact, index)
+    _nearest_points(points, origin, window, q, scratch.number, work, exact, index)
     _window_max(q, 2 * up, 2 * side, _ONE, np.empty(w + 2 * side, np.float32), most)
     at = np.empty((6, n), np.float32)
     for k in range(3):
@@ -268,29 +233,29 @@ def hidden_below(known: Any) -> Any:
 
 # --- made dense -------------------------------------------------------------------------------------------------------
 @compiled
-def complete(n: int, static: Any, window: Any, planes: Any, layers: Any) -> None:
+def complete(n: int, static: Any, window: Any, scratch: Any, layers: Any) -> None:
     """Make the ``n`` points of ``find_visible`` dense over a static surface.
 
     Args:
         n: Number of points.
         static: (n,) inverse distances of the static surface along their rays.
         window: The window.
-        planes: Those of ``find_visible``.
+        scratch: That of ``find_visible``; written over.
         layers: (5, h, w) float32 ``Panorama.layers``, written.
     """
-    (_, h, w), cells = layers.shape, window.cells
-    at, thin = planes[CELLS].view(np.int32)[:n], planes[_THIN].view(np.int32)[:n]
-    residuals, q, work = planes[_RESIDUALS, :n], planes[Q], np.empty((10 + 6 * cells.smooth, w), np.float32)
-    line, wide = np.empty(w + 2 * _FAR, np.int32), np.empty(w + 2 * cells.smooth, np.float32)
-    r, near_q, code = _plane(planes, _R, h, w), _plane(planes, _NEAR_Q, h, w), _ints(planes, _CODE, h + 4, w + 4)
-    high, low = _plane(planes, _HIGH, h, w), _plane(planes, _LOW, h, w)
+    (_, h, w), cells, thin, code = layers.shape, scratch.cells[:n], scratch.thin[:n], scratch.code
+    # What is known by now gives its place to residuals and inverse distances of all cells, and their maxima.
+    planes, low, smooth = scratch.rays[: 3 * h * w].reshape(3, h, w), scratch.most, window.cells.smooth
+    r, near_q, high, q = planes[0], planes[1], planes[2], scratch.q.reshape(h * w)
+    residuals, work = np.empty(n, np.float32), np.empty((10 + 6 * smooth, w), np.float32)
+    line, wide = np.empty(w + 2 * _FAR, np.int32), np.empty(w + 2 * smooth, np.float32)
     for i in range(n):
-        residuals[i] = q[at[i]] - static[i]
-    _spread_nearest(at, thin, q, residuals, cells.reach, cells.support, code, work[0], line, r, near_q, layers)
-    _window_max(r, 2 * cells.smooth, 2 * cells.smooth, _ONE, wide, high)
-    _window_max(r, 2 * cells.smooth, 2 * cells.smooth, -_ONE, wide, low)
-    _average_sides(r, near_q, high, low, cells.smooth, work, layers)
-    _draw_thin(at, thin, residuals, code, layers)
+        residuals[i] = q[cells[i]] - static[i]
+    _spread_nearest(cells, thin, q, residuals, window.cells, code, work[0], line, r, near_q, layers)
+    _window_max(r, 2 * smooth, 2 * smooth, _ONE, wide, high)
+    _window_max(r, 2 * smooth, 2 * smooth, -_ONE, wide, low)
+    _average_sides(r, near_q, high, low, smooth, work, layers)
+    _draw_thin(cells, thin, residuals, code, layers)
     for y in range(h - 1):
         near, far, near_above, far_above, level = (
             layers[0, y],
@@ -307,15 +272,15 @@ def complete(n: int, static: Any, window: Any, planes: Any, layers: Any) -> None
 
 @borrowing
 def _spread_nearest(
-    cells: Any, thin: Any, own_q: Any, residuals: Any, reach: float, support: float, code: Any, away: Any,
-    line: Any, r: Any, q: Any, layers: Any,
+    cells: Any, thin: Any, own_q: Any, residuals: Any, lengths: Any, code: Any, away: Any, line: Any,
+    r: Any, q: Any, layers: Any,
 ) -> None:  # fmt: skip
     """Give every cell of ``r`` and ``q`` (h, w) the residual and inverse distance of the nearest point.
 
-    The residual fades towards ``reach``. ``layers[3]`` becomes 1 within ``support``; the other layers, ``code``
+    The residual fades towards ``lengths.reach``. ``layers[3]`` becomes 1 within ``lengths.support``; the other layers, ``code``
     (h + 4, w + 4) int32, ``away`` (w,) and ``line`` (w + 2 * _FAR,) int32 are scratch.
     """
-    _, h, w = layers.shape
+    (_, h, w), reach, support = layers.shape, lengths.reach, lengths.support
     code[:] = _NO_SEED
     layers[:2] = _ZERO
     residual, nearest = layers[0].reshape(h * w), layers[1].reshape(h * w)  # at seeds, until the layers are known

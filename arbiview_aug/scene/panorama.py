@@ -141,14 +141,37 @@ class Window(NamedTuple):
         """Rows and columns, with the halo."""
         return self.rows + 2 * self.cells.halo + 1, self.columns + 2 * self.cells.halo + 1
 
-    def scratch(self, memory: Memory) -> tuple[Any, Any]:
-        """Planes for the kernels of ``completion``, and ``Panorama.layers``."""
-        from arbiview_aug.scene.completion import PLANES
 
-        h, w = self.shape  # windows differ by some rows from frame to frame: blocks of few sizes are found again
-        block = -(-(h + 4) * (w + 4) // _BLOCK) * _BLOCK
-        planes, layers = memory.empty((PLANES, block), np.float32), memory.empty((5 * block,), np.float32)
-        return planes, layers[: 5 * h * w].reshape(5, h, w)
+class Scratch(NamedTuple):
+    """Arrays for a panorama of (h, w) cells, which kernels write into.
+
+    Attributes:
+        q: (h, w) largest inverse distance of the points in each cell, 0 without any.
+        number: (h, w) int32 the point that is so near.
+        most: (h, w) maximum of ``q`` over a window.
+        rays: (3 h w,) or more: rays (3, n) to the n points that are seen, ego frame.
+        cells: (h w,) int32 or more: flat indices of their cells.
+        thin: (h w,) int32 or more: 1 for those on thin things, else 0.
+        code: (h + 4, w + 4) int32 the nearest point around each cell.
+    """
+
+    q: Layer
+    number: npt.NDArray[np.int32]
+    most: Layer
+    rays: Layer
+    cells: npt.NDArray[np.int32]
+    thin: npt.NDArray[np.int32]
+    code: npt.NDArray[np.int32]
+
+    @classmethod
+    def of(cls, window: Window, memory: Memory = FRESH) -> Scratch:
+        """Scratch for a window; blocks of few sizes are found again, as windows differ by some rows."""
+        (h, w), around = window.shape, (window.shape[0] + 4, window.shape[1] + 4)
+        size, room = h * w, math.prod(around)
+        planes = memory.empty((9, _BLOCK * math.ceil(room / _BLOCK)), np.float32)
+        q, most, ints = planes[0, :size].reshape(h, w), planes[1, :size].reshape(h, w), planes.view(np.int32)
+        number, code = ints[2, :size].reshape(h, w), ints[3, :room].reshape(around)
+        return cls(q, number, most, planes[4:7].reshape(-1), ints[7], ints[8], code)
 
 
 class Panorama:
@@ -170,12 +193,14 @@ class Panorama:
         memory: Memory = FRESH,
     ) -> None:  # fmt: skip
         """Complete the points (3, P), of which the last ``mapped`` are of depth maps, around ``origin`` (3,)."""
-        from arbiview_aug.scene.completion import complete, find_visible, rays_of
+        from arbiview_aug.scene.completion import complete, find_visible
 
         self.window, self._origin, self._street = window, origin, street
-        planes, self.layers = window.scratch(memory)
-        n = find_visible(points, mapped, origin, window, planes)
-        complete(n, street.along(origin, rays_of(planes, n))[0], window, planes, self.layers)
+        scratch, size = Scratch.of(window, memory), 5 * math.prod(window.shape)
+        self.layers = memory.empty((_BLOCK * math.ceil(size / _BLOCK),), np.float32)[:size].reshape(5, *window.shape)
+        n = find_visible(points, mapped, origin, window, scratch)
+        static = street.along(origin, scratch.rays[: 3 * n].reshape(3, 1, n))[0]
+        complete(n, static, window, scratch, self.layers)
 
     @cached_property
     def hidden_below(self) -> Layer:

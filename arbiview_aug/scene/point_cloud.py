@@ -22,7 +22,7 @@ from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.depth_map import DepthMap, hidden_by
-from arbiview_aug.scene.panorama import CELL_RAD, OWN_CAR_M, SIDE_RAD, Cells, Layer, Panorama, Window
+from arbiview_aug.scene.panorama import CELL_RAD, OWN_CAR_M, SIDE_RAD, Cells, Layer, Panorama, Scratch, Window
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
 
 NODES_RAD = 4 * CELL_RAD
@@ -254,7 +254,7 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
     origin, contradicted = origin.copy(), np.empty(len(others), bool)
     low, high = (end / CELL_RAD for end in elevations(rows, origin))
     window = Window(math.floor(low), 0, max(math.ceil(high) - math.floor(low), 0), FINE.turn, FINE)
-    find_contradicted(rows, of_others, origin, window, *AROUND_CELLS, contradicted)
+    find_contradicted(rows, of_others, origin, window, Scratch.of(window), *AROUND_CELLS, contradicted)
     return contradicted
 
 

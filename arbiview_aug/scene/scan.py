@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.errors import CalibrationError
-from arbiview_aug.image_ops import FRESH
-from arbiview_aug.scene.panorama import SUPPORT_RAD, Layer, Window
+from arbiview_aug.scene.panorama import SUPPORT_RAD, Layer, Scratch, Window
 from arbiview_aug.scene.point_cloud import FINE, own_car
 from arbiview_aug.scene.surface import Points
 
@@ -114,9 +113,9 @@ def _returns(lidar: Lidar, rays: Layer, scenes: Sequence[Layer], ground_z_m: flo
     lengths = ground_z_m - origin[2], SCANNED.rad, SUPPORT_RAD / SCANNED.rad, SIDE_SUPPORT_RAD / SCANNED.rad
     ground, rad, reach, side = np.array(lengths, np.float32)
     for points in scenes:
-        planes, _ = window.scratch(FRESH)
-        n, index = find_visible(points, 0, origin, window, planes), np.full(window.shape, -1, np.int32)
-        seen = index, *place_points(n, window, planes, index)
+        scratch, index = Scratch.of(window), np.full(window.shape, -1, np.int32)
+        n = find_visible(points, 0, origin, window, scratch)
+        seen = index, *place_points(n, window, scratch, index)
         meet_points(*at, rays, *seen, ground, rad, reach, side, q, nearest)
     continue_road(*at, rays, *seen, ground, side, q, nearest)
     return q, nearest

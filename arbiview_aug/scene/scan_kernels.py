@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.environment import compiled, inlined
-from arbiview_aug.scene.completion import CELLS, NUMBER, RAYS, Q
 from arbiview_aug.scene.panorama_kernels import cells_row
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
@@ -25,17 +24,17 @@ _JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
 
 
 @compiled
-def place_points(n: int, window: Any, planes: Any, index: Any) -> tuple[Any, Any]:
+def place_points(n: int, window: Any, scratch: Any, index: Any) -> tuple[Any, Any]:
     """``seeds`` (4, n) and ``numbers`` (n,) of ``meet_points`` for the points that ``find_visible`` found.
 
     Args:
         n: Number of points.
         window: The window.
-        planes: Those of ``find_visible``.
+        scratch: That of ``find_visible``.
         index: (h, w) int32, -1; written: the point in each cell.
     """
-    (_, w), cells = index.shape, planes[CELLS].view(np.int32)
-    q, number, rays = planes[Q], planes[NUMBER].view(np.int32), planes[RAYS:CELLS].reshape(-1)[: 3 * n].reshape(3, n)
+    (h, w), cells, rays = index.shape, scratch.cells, scratch.rays[: 3 * n].reshape(3, n)
+    q, number = scratch.q.reshape(h * w), scratch.number.reshape(h * w)
     at, seeds, numbers = np.empty((3, n), np.float32), np.empty((4, n), np.float32), np.empty(n, np.int32)
     cells_row(rays[0], rays[1], rays[2], window, at[0], at[1], at[2])
     turn = np.float32(window.cells.turn)

@@ -6,7 +6,8 @@ import numpy as np
 
 from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
 from arbiview_aug.scene.boxes import BoxSurface
-from arbiview_aug.scene.point_cloud import COARSE, Panorama, PointCloudSurface, PointCloudWithBoxes
+from arbiview_aug.scene.panorama import Panorama
+from arbiview_aug.scene.point_cloud import COARSE, PointCloudSurface, PointCloudWithBoxes
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import StaticSurface, Surface
 
@@ -60,7 +61,8 @@ def occlusion_depth(
 
 def layer_at(view: Panorama, layer: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Bilinear values (...,) of a panorama's layer along unit rays (..., 3); its border beyond it."""
-    (first, lead, low), rad = view.window.place[:3].astype(np.float64), view.window.cells.rad
+    row, column, _, columns, (rad, turn, halo, *_) = view.window
+    first, lead, low = (column - halo) * rad, halo if columns >= turn else 0, (row - halo) * rad
     azimuth, elevation = (
         np.arctan2(directions[..., 1], directions[..., 0]),
         np.arcsin(np.clip(directions[..., 2], -1, 1)),
