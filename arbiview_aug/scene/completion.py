@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.environment import borrowing, compiled, inlined
+from arbiview_aug.environment import borrowing, called, compiled, inlined
 from arbiview_aug.scene.kernels import upsampled_row
 from arbiview_aug.scene.panorama import NEAREST_M, STEP, STEP_PER_M, THIN_CELLS
 from arbiview_aug.scene.panorama_kernels import cells_row
@@ -50,9 +50,8 @@ def find_visible(points: Any, mapped: int, origin: Any, window: Any, scratch: An
         scratch: ``Scratch`` of the window, written.
     """
     q, number, side, n = scratch.q, scratch.number, window.cells.side, 0
-    work, exact, index = np.empty((7, _BLOCK), np.float32), np.empty((4, _BLOCK)), np.empty((2, _BLOCK), np.int32)
     line = np.empty(q.shape[1] + 2 * side, np.float32)
-    _nearest_points(points, origin, window, q, number, work, exact, index)
+    _nearest_points(points, origin, window, q, number)
     _window_max(q, 2 * side, 2 * side, _ONE, line, scratch.most)
     n = _drop_hidden(scratch, window.cells.see_through, side, points.shape[1], mapped, line)
     rays, flat_q, flat_number = scratch.rays[: 3 * n].reshape(3, n), q.reshape(q.size), number.reshape(q.size)
@@ -63,14 +62,12 @@ def find_visible(points: Any, mapped: int, origin: Any, window: Any, scratch: An
     return n
 
 
-@borrowing
-def _nearest_points(
-    points: Any, origin: Any, window: Any, q: Any, number: Any, work: Any, exact: Any, index: Any
-) -> None:
+@called
+def _nearest_points(points: Any, origin: Any, window: Any, q: Any, number: Any) -> None:
     """Z-buffer the points (3, P) around ``origin``.
 
     ``q`` (h, w) becomes the largest inverse distance of the points in each cell, 0 without any; ``number`` (h, w) int32
-    tells which point's it is, of equally near ones the last. ``work``, ``exact`` and ``index`` are scratch.
+    tells which point's it is, of equally near ones the last.
     """
     (h, w), turn, rad, ahead = q.shape, np.int32(window.cells.turn), window.cells.rad, window.cells.halo + 2
     low, high = (window.row - ahead) * rad, (window.row + window.rows + ahead) * rad  # two cells beyond the halo
@@ -79,6 +76,7 @@ def _nearest_points(
     high_c, high_s = np.float32(np.cos(high) if high < np.pi / 2 else 0.0), np.float32(np.sin(min(high, np.pi / 2)))
     c, s, inner = np.float32(np.cos(middle)), np.float32(np.sin(middle)), np.float32(np.cos(half))
     ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
+    work, exact, index = np.empty((7, _BLOCK), np.float32), np.empty((4, _BLOCK)), np.empty((2, _BLOCK), np.int32)
     x, y, z, near, inside, those = work[0], work[1], work[2], work[3], index[0], index[1]
     q[:] = _ZERO
     for start in range(0, points.shape[1], _BLOCK):
@@ -89,6 +87,8 @@ def _nearest_points(
             level = np.sqrt(a * a + b * b)
             is_inside = (up * low_c >= low_s * level) & (up * high_c <= high_s * level)
             inside[i] = is_inside & (a * c + b * s >= inner * level)
+        if not inside[:m].any():
+            continue
         for i in range(m):
             those[n] = i
             n += inside[i]
@@ -152,11 +152,11 @@ def _window_max(a: Any, rows: int, columns: int, sign: Any, line: Any, out: Any)
 def _drop_hidden(scratch: Any, away: int, side: int, points: int, mapped: int, between: Any) -> int:
     """Drop points that shine through gaps of what is nearer on both sides of them, and find thin things.
 
-    ``scratch.most`` is ``_window_max`` of ``q`` over ``2 * side`` cells, ``away`` and ``side`` are ``SEE_THROUGH_RAD``
-    and ``SIDE_RAD`` in cells. The last ``mapped`` of all ``points`` are of depth maps, which show gaps as they are: only
-    cells next to them count. Writes ``cells`` that keep their point, and whether it is ``thin``: clearly before all
-    points above and below it, within ``away`` and not next to it, as on a tape that one scan line met. Returns their
-    number; ``between`` (w,) is scratch.
+    ``scratch.most`` is ``_window_max`` of ``q`` over ``2 * side`` cells; ``away`` and ``side`` are ``SEE_THROUGH_RAD``
+    and ``SIDE_RAD`` in cells. The last ``mapped`` of all ``points`` are of depth maps, which show gaps as they are:
+    only cells next to them count. Writes ``cells`` that keep their point, and whether it is ``thin``: clearly before
+    all points above and below it within ``away``, but for those next to it, as on a tape that one scan line met.
+    Returns their number; ``between`` (w,) is scratch.
     """
     q, number, most, cells, thin = scratch.q, scratch.number, scratch.most, scratch.cells, scratch.thin
     (h, w), n = q.shape, 0
@@ -189,39 +189,6 @@ def _drop_hidden(scratch: Any, away: int, side: int, points: int, mapped: int, b
             cells[n] = y * w + x
             n += 1
     return n
-
-
-@compiled
-def find_contradicted(
-    points: Any, others: Any, origin: Any, window: Any, scratch: Any, up: int, side: int, contradicted: Any
-) -> None:
-    """Find the points of other scans (3, Q) that lie clearly before all of a scan's own points (3, P) around them.
-
-    Args:
-        points: The scan's own points.
-        others: Those of the others.
-        origin: (3,) float64, the centre of the panorama.
-        window: Its ``Window``.
-        scratch: Its ``Scratch``, written.
-        up: Cells above and below that are around a point.
-        side: Cells on each side.
-        contradicted: (Q,) bool, written.
-    """
-    q, most, (h, w), n = scratch.q, scratch.most, scratch.q.shape, others.shape[1]
-    work, exact, index = np.empty((7, _BLOCK), np.float32), np.empty((4, _BLOCK)), np.empty((2, _BLOCK), np.int32)
-    _nearest_points(points, origin, window, q, scratch.number, work, exact, index)
-    _window_max(q, 2 * up, 2 * side, _ONE, np.empty(w + 2 * side, np.float32), most)
-    at = np.empty((6, n), np.float32)
-    for k in range(3):
-        for i in range(n):
-            at[k, i] = others[k, i] - np.float32(origin[k])
-    cells_row(at[0], at[1], at[2], window, at[3], at[4], at[5])
-    for i in range(n):
-        row, column = int(np.rint(at[4, i])) - up, int(np.rint(at[5, i])) - side
-        known = most[row, column] if 0 <= row < h - 2 * up and 0 <= column < w - 2 * side else _ZERO
-        distance = np.sqrt(at[0, i] * at[0, i] + at[1, i] * at[1, i] + at[2, i] * at[2, i])
-        near = _ONE / max(distance, np.float32(NEAREST_M))
-        contradicted[i] = known > _ZERO and hidden_below(near) > known
 
 
 @inlined
@@ -277,8 +244,8 @@ def _spread_nearest(
 ) -> None:  # fmt: skip
     """Give every cell of ``r`` and ``q`` (h, w) the residual and inverse distance of the nearest point.
 
-    The residual fades towards ``lengths.reach``. ``layers[3]`` becomes 1 within ``lengths.support``; the other layers, ``code``
-    (h + 4, w + 4) int32, ``away`` (w,) and ``line`` (w + 2 * _FAR,) int32 are scratch.
+    The residual fades towards ``lengths.reach``. ``layers[3]`` becomes 1 within ``lengths.support``; the other layers,
+    ``away`` (w,) and ``line`` (w + 2 * _FAR,) int32 are scratch. ``code`` (h + 4, w + 4) int32 is written, too.
     """
     (_, h, w), reach, support = layers.shape, lengths.reach, lengths.support
     code[:] = _NO_SEED
@@ -464,15 +431,10 @@ def hidden_depths(layers: Any, base: Any, step: int, shrink: int, out: Any) -> N
 
     ``base`` (ny + 1, nx + 1) is the static surface, on every ``step``-th cell; ``shrink`` is ``SHRINK_RAD`` in cells.
     """
-    h, w = out.shape
+    (h, w), side = out.shape, 2 * shrink
     silent, work = np.empty((h, w), np.float32), np.empty((2, w + 2 * shrink), np.float32)
     _window_max(layers[3], 2 * shrink, 2 * shrink, -_ONE, work[0], silent)  # -1 where all is measured
-    _hidden_depths(layers, silent, base, step, shrink, np.empty(base.shape[1], np.float32), work, out)
-
-
-@borrowing
-def _hidden_depths(layers: Any, silent: Any, base: Any, step: int, shrink: int, line: Any, work: Any, out: Any) -> None:
-    (h, w), side, static, known = out.shape, 2 * shrink, work[0, : out.shape[1]], work[1, : out.shape[1]]
+    line, static, known = np.empty(base.shape[1], np.float32), work[0, :w], work[1, :w]
     near, far, share = layers[0], layers[1], layers[2]
     for y in range(h):
         upsampled_row(base, step, y, np.int64(0), line, static)

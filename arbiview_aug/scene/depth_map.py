@@ -177,7 +177,7 @@ def joined(maps: Iterable[DepthMap]) -> list[DepthMap]:
 def points_of(maps: Sequence[DepthMap], before: Points | None = None) -> tuple[Layer, npt.NDArray[np.int32]]:
     """(P, 3) ego-frame points of the maps behind others (Q, 3), and their pixels (P - Q,), counted on from map to map.
 
-    Points that lie side by side follow one another. Pixels within ``OWN_CAR_M`` become unknown.
+    Pixels within ``OWN_CAR_M`` become unknown.
     """
     from arbiview_aug.scene.map_kernels import put_points
 

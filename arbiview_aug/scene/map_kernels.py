@@ -11,7 +11,6 @@ from arbiview_aug.environment import compiled, inlined
 from arbiview_aug.scene.completion import hidden_below
 
 _ZERO, _ONE, _TWO, _THIRD = np.float32(0), np.float32(1), np.float32(2), np.float32(1 / 3)
-_TILE = 32  # side of the tiles of pixels whose points follow one another
 _LEAST_Z = np.float32(1e-6)
 
 
@@ -72,7 +71,7 @@ def compare_maps(depth: Any, other: Any, side: int, share: float, sums: Any) -> 
 def put_points(
     planes: Any, P: Any, depth: Any, pose: Any, car: Any, first: int, points: Any, pixels: Any, count: int
 ) -> int:
-    """Put the points of a depth map (h, w), tile by tile, behind the first ``count``; return how many there are then.
+    """Put the points of a depth map (h, w) behind the first ``count``; return how many there are then.
 
     Args:
         planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
@@ -85,36 +84,31 @@ def put_points(
         pixels: (n,) int32 numbers of their pixels, written.
         count: Points that are there.
     """
-    h, w = depth.shape
-    work, is_known, tiles = np.empty((4, _TILE), np.float32), np.empty(_TILE, np.bool_), (w + _TILE - 1) // _TILE
+    (h, w), work, is_known = depth.shape, np.empty((4, depth.shape[1]), np.float32), np.empty(depth.shape[1], np.bool_)
     x0, x1, y0, y1 = np.float32(car[0]), np.float32(car[1]), np.float32(car[2]), np.float32(car[3])
-    for top in range(0, h, _TILE):
-        for k in range(tiles):
-            left = (tiles - 1 - k if top // _TILE % 2 else k) * _TILE  # there and back
-            n = min(_TILE, w - left)
-            a, b, c, far = work[0, :n], work[1, :n], work[2, :n], work[3, :n]
-            for y in range(top, min(top + _TILE, h)):
-                line = depth[y, left : left + n]
-                rays_row(planes, P, y, left, a, b, c)
-                for i in range(n):
-                    is_known[i] = (line[i] > _ZERO) & (c[i] > _LEAST_Z)
-                    far[i] = line[i] / max(c[i], _LEAST_Z)
-                for i in range(n):
-                    a[i], b[i], c[i] = far[i] * a[i], far[i] * b[i], line[i]
-                for i in range(n):
-                    far[i] = pose[0, 0] * a[i] + pose[0, 1] * b[i] + pose[0, 2] * c[i] + pose[0, 3]
-                for i in range(n):
-                    y_m = pose[1, 0] * a[i] + pose[1, 1] * b[i] + pose[1, 2] * c[i] + pose[1, 3]
-                    c[i] = pose[2, 0] * a[i] + pose[2, 1] * b[i] + pose[2, 2] * c[i] + pose[2, 3]
-                    a[i], b[i] = far[i], y_m
-                for i in range(n):
-                    is_car = (x0 < a[i]) & (a[i] < x1) & (y0 < b[i]) & (b[i] < y1)
-                    line[i] = _ZERO if is_car & is_known[i] else line[i]
-                    is_known[i] &= not is_car
-                for i in range(n):
-                    points[count, 0], points[count, 1], points[count, 2] = a[i], b[i], c[i]
-                    pixels[count] = first + y * w + left + i
-                    count += is_known[i]  # else written over, or left out
+    a, b, c, far = work[0], work[1], work[2], work[3]
+    for y in range(h):
+        line = depth[y]
+        rays_row(planes, P, y, np.int64(0), a, b, c)
+        for i in range(w):
+            is_known[i] = (line[i] > _ZERO) & (c[i] > _LEAST_Z)
+            far[i] = line[i] / max(c[i], _LEAST_Z)
+        for i in range(w):
+            a[i], b[i], c[i] = far[i] * a[i], far[i] * b[i], line[i]
+        for i in range(w):
+            far[i] = pose[0, 0] * a[i] + pose[0, 1] * b[i] + pose[0, 2] * c[i] + pose[0, 3]
+        for i in range(w):
+            y_m = pose[1, 0] * a[i] + pose[1, 1] * b[i] + pose[1, 2] * c[i] + pose[1, 3]
+            c[i] = pose[2, 0] * a[i] + pose[2, 1] * b[i] + pose[2, 2] * c[i] + pose[2, 3]
+            a[i], b[i] = far[i], y_m
+        for i in range(w):
+            is_car = (x0 < a[i]) & (a[i] < x1) & (y0 < b[i]) & (b[i] < y1)
+            line[i] = _ZERO if is_car & is_known[i] else line[i]
+            is_known[i] &= not is_car
+        for i in range(w):
+            points[count, 0], points[count, 1], points[count, 2] = a[i], b[i], c[i]
+            pixels[count] = first + y * w + i
+            count += is_known[i]  # else written over, or left out
     return count
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,54 +23,54 @@ from arbiview_aug.scene.surface import StaticSurface
 Layer = npt.NDArray[np.float32]
 
 CELL_RAD = math.radians(0.2)
-"""Two pixels of a camera of 800 px and 65 degrees; spinning LiDARs sample 0.1 to 0.4 degrees along their lines.
-0.15 to 0.21 degrees lie within 1 dB of each other on nuScenes, in no order: that much depends on where cells fall."""
+"""Side of a fine cell: two pixels of a camera of 800 px and 65 degrees. Spinning LiDARs sample 0.1 to 0.4 degrees."""
 
 SEE_THROUGH_RAD = math.radians(2.0)
-"""A point is occluded where nearer ones lie on both sides of it within this angle: one and a half of the spacing of 32
-scan lines. 1 degree loses 0.2 to 1.2 dB on moved views of nuScenes and DDAD, 2.5 is as good."""
+"""A point is occluded where nearer ones lie on both sides of it within this angle: 1.5 spacings of 32 scan lines."""
 
 SIDE_RAD = math.radians(0.75)
 """... and off that line by no more than this: half the spacing of 32 scan lines."""
 
 SMOOTH_RAD = math.radians(1.3)
 """Window in which residuals are averaged and outlines straightened: the spacing of 32 scan lines, over which an average
-of nearest values is linear interpolation. 0.75 degrees gains 0.1 dB, but walls wave by 4 % between the lines; 1.6 loses
-0.7 dB on nuScenes."""
+of nearest values is linear interpolation."""
 
 STEP = 0.1
-"""Relative change of inverse distance within that window that makes an outline; 0.2 is as good."""
+"""Relative change of inverse distance within that window that makes an outline."""
 
 STEP_PER_M = 0.003
 """... and the least absolute one, 1/m: two pixels of parallax for 1 m of baseline."""
 
 REACH_RAD = math.radians(12.0)
 """Beyond this angle from any point the static surface is all that is known. From half of it the points fade out: above
-the highest scan line houses and trees go on, and a fade over a few degrees bends them (seen on both frames)."""
+the highest scan line houses and trees continue, and a fade over a few degrees bends them."""
 
 SUPPORT_RAD = math.radians(0.75)
 """A ray this near to a point is measured: just over half the spacing of 32 scan lines."""
 
 SHRINK_RAD = math.radians(0.4)
 """A measured surface hides what is behind it; this closes gaps between scan lines without widening outlines by all of
-``SUPPORT_RAD``. With 0.2 degrees false holes cost 0.1 to 1 dB on nuScenes and DDAD."""
+``SUPPORT_RAD``."""
 
 NEAREST_M = 0.5
-"""Nearer to a centre than this nothing of the scene stands: such points are the vehicle's, or the camera itself."""
+"""Points nearer than this to a centre are the vehicle's, or the camera itself."""
 
-BASE_STEP = 4  # cells, 0.8 or 1.6 degrees: a static surface is smooth
+BASE_STEP = 4  # cells between nodes of the static surface, which is smooth
 HALO_RAD = math.radians(4.0)
 """Room around a window that its filters need."""
+
+STEEP_RAD = math.radians(64.0)
+"""Elevation up to which azimuths are interpolated."""
 
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
 
 ROOM_CELLS = 5
-"""Cells by which panoramas are wider than what is asked: nodes of plans lie on the border."""
+"""Cells by which a window is wider than the rays that it must hold: nodes of plans lie on its border."""
 
 THIN_CELLS = 1, 5
-"""Most cells above and below, and aside, that a thin thing's point takes: 5 bridge gaps of 1 degree. A tape that one
-scan line met would else take what lies beside it to its own distance, in ovals as high as the lines are apart."""
+"""Most cells above and below, and to each side, that a thin thing's point takes: 5 bridge gaps of 1 degree. A tape that
+one scan line met would else take its surroundings, in ovals as high as the spacing of the lines."""
 
 _BLOCK = 1 << 16  # cells by which scratch grows
 
@@ -121,9 +121,22 @@ class Window(NamedTuple):
         ``R`` (3, 3) turns the rays to the ego frame; those of elevations below ``low`` and above ``high``, radians, do
         not count if there are others. Azimuths bend near the zenith, and jump in a window all around.
         """
-        from arbiview_aug.scene.panorama_kernels import span_of
-
-        row, column, rows, columns, is_smooth = span_of(rays, np.ascontiguousarray(R), cells.rad, low, high)
+        turned = R @ rays.reshape(3, -1).astype(np.float64)
+        x, y, z = turned[:, rays.any(axis=0).ravel()]
+        if not len(z):
+            return cls(0, 0, 1, 1, cells), False
+        least, most = math.asin(max(z.min(), -1)), math.asin(min(z.max(), 1))
+        row, end = math.floor(max(least, low) / cells.rad), math.ceil(min(most, high) / cells.rad)
+        sines = np.sin(np.clip([row * cells.rad, end * cells.rad], -math.pi / 2, math.pi / 2))
+        inside = (z >= sines[0] - 1e-9) & (z <= sines[1] + 1e-9)
+        if not inside.any():
+            return cls.around(rays, R, cells)
+        x, y = x[inside], y[inside]
+        middle = math.atan2(y.sum(), x.sum())
+        azimuth = middle + (np.arctan2(y, x) - middle + math.pi) % (2 * math.pi) - math.pi  # half a turn on both sides
+        column = math.floor(azimuth.min() / cells.rad)
+        rows, columns = end - row, math.ceil(azimuth.max() / cells.rad) - column
+        is_smooth = len(z) == turned.shape[1] and max(-least, most) <= STEEP_RAD
         bottom, top = max(row - ROOM_CELLS, -cells.turn // 4), min(row + rows + ROOM_CELLS, cells.turn // 4)
         column, columns = column - ROOM_CELLS, columns + 2 * ROOM_CELLS
         if columns + cells.halo > cells.turn:

@@ -8,62 +8,11 @@ import numpy as np
 
 from arbiview_aug.cameras.kernels import angle_row
 from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
-from arbiview_aug.environment import borrowing, called, compiled, inlined
+from arbiview_aug.environment import called, compiled, inlined
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 _HALF_PI = np.float32(np.pi / 2)
-_STEEP = 0.9
-"""Sine of the elevation up to which azimuths are interpolated: 64 degrees."""
-
-
-@compiled
-def span_of(rays: Any, R: Any, rad: float, lowest: float, highest: float) -> tuple[int, int, int, int, bool]:
-    """First row and column, and numbers of both, of the smallest ``Window`` that holds rays (3, ny, nx).
-
-    Only those of elevations from ``lowest`` to ``highest`` count, if there are any. ``R`` (3, 3) turns the rays to the
-    ego frame; rays of zeros are missing. The last value says whether none is, and none is steep.
-    """
-    turned, n, least, most = np.empty((3, rays.shape[1] * rays.shape[2])), 0, 1.0, -1.0
-    x, y, z = turned[0], turned[1], turned[2]
-    for j in range(rays.shape[1]):
-        for i in range(rays.shape[2]):
-            a, b, c = np.float64(rays[0, j, i]), np.float64(rays[1, j, i]), np.float64(rays[2, j, i])
-            x[n], y[n] = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c, R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
-            z[n] = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
-            if a != 0 or b != 0 or c != 0:
-                least, most, n = min(least, z[n]), max(most, z[n]), n + 1
-    if n == 0:
-        return 0, 0, 1, 1, False
-    is_smooth = n == rays.shape[1] * rays.shape[2] and max(-least, most) <= _STEEP
-    for bottom, top in ((lowest, highest), (-4.0, 4.0)):
-        ends = np.arcsin(max(least, -1.0)), np.arcsin(min(most, 1.0))
-        low, high = int(np.floor(max(ends[0], bottom) / rad)), int(np.ceil(min(ends[1], top) / rad))
-        under = np.sin(low * rad) if low * rad > ends[0] else -2.0
-        over = np.sin(high * rad) if high * rad < ends[1] else 2.0
-        ahead, left, inside = 0.0, 0.0, 0
-        for i in range(n):
-            if under <= z[i] <= over:
-                ahead, left, inside = ahead + x[i], left + y[i], inside + 1
-        if inside:
-            break
-    middle, first, last = np.arctan2(left, ahead), 2.0, -2.0
-    c, s = np.cos(middle), np.sin(middle)
-    for i in range(n):
-        if under <= z[i] <= over:
-            a, b = c * x[i] + s * y[i], c * y[i] - s * x[i]
-            part = b / max(abs(a) + abs(b), 1e-30)  # grows with the azimuth, and costs no arctangent
-            part = part if a >= 0 else np.copysign(2.0, b) - part
-            first, last = min(first, part), max(last, part)
-    column = int(np.floor((middle + _azimuth(first)) / rad))
-    return low, column, high - low, int(np.ceil((middle + _azimuth(last)) / rad)) - column, is_smooth
-
-
-@inlined
-def _azimuth(part: float) -> float:
-    """The angle whose direction (a, b) has this b / (|a| + |b|) where it points ahead, and 2 less it elsewhere."""
-    ahead = 1.0 - abs(part)
-    return np.arctan2(part if ahead >= 0 else np.copysign(2.0, part) - part, ahead)
 
 
 @called
@@ -133,7 +82,7 @@ def _mixed(layer: Any, i: Any, w: Any, s: float, t: float) -> float:
     return above + (layer[i + w] + (layer[i + w + one] - layer[i + w]) * t - above) * s
 
 
-@borrowing
+@called
 def _read_row(rows: Any, columns: Any, layer: Any, first: Any, down: Any, right: Any, out: Any) -> None:
     """Bilinear values (n,) of a panorama's layer (h, w) at rows and columns (n,); its border beyond it."""
     h, w = layer.shape
@@ -166,7 +115,7 @@ def between_nodes(nodes: Any, step: int, out: Any) -> None:
         last[k] = nodes[whole] + (nodes[whole + 1] - nodes[whole]) * t
 
 
-@borrowing
+@called
 def _between_rows(nodes: Any, step: int, y: int, h: int, around: Any, out: Any) -> None:
     """Values (w,) in row ``y`` of h between nodes (ny + 1, nx + 1).
 
@@ -199,14 +148,8 @@ def add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any) -> No
         layers: ``Panorama.layers``.
         q: (h, w) float32, updated.
     """
-    w = q.shape[1]
-    around, first, work = np.full((2, 2, w + 1), -2, np.float32), np.empty(w, np.uint32), np.empty((4, w), np.float32)
-    _add_residuals(rows, columns, step, layers, q, around, first, work)
-
-
-@borrowing
-def _add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any, around: Any, first: Any, work: Any) -> None:
     (h, w), (_, height, width) = q.shape, layers.shape
+    around, first, work = np.full((2, 2, w + 1), -2, np.float32), np.empty(w, np.uint32), np.empty((4, w), np.float32)
     flat = layers.reshape(5, height * width)
     near, far, share, level = flat[0], flat[1], flat[2], flat[4]
     v, u, down, right = work[0], work[1], work[2], work[3]
@@ -229,15 +172,8 @@ def interpolate_layer(rows: Any, columns: Any, step: int, layer: Any, apart: int
     """Values (h, w) between those of a panorama's layer every ``apart`` pixels; the rest is as in ``add_residuals``."""
     h, w = out.shape
     around, work = np.full((3, 2, w + 1), -2, np.float32), np.empty((4, w + 1), np.float32)
-    nodes, first = np.empty((-(-h // apart) + 1, -(-w // apart) + 1), np.float32), np.empty(w + 1, np.uint32)
-    _interpolate_layer(rows, columns, step, layer, apart, out, around, work, nodes, first)
-
-
-@borrowing
-def _interpolate_layer(
-    rows: Any, columns: Any, step: int, layer: Any, apart: int, out: Any, around: Any, work: Any, nodes: Any, first: Any
-) -> None:
-    (h, w), n = out.shape, nodes.shape[1]
+    n, first = -(-w // apart) + 1, np.empty(w + 1, np.uint32)
+    nodes = np.empty((-(-h // apart) + 1, n), np.float32)
     v, u, down, right = work[0], work[1], work[2], work[3]
     for j in range(nodes.shape[0]):
         y = min(j * apart, h - 1)

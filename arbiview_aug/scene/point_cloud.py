@@ -1,7 +1,7 @@
 """Measured points as a surface: LiDAR or depth maps, with labelled boxes before them and the street behind.
 
-No sensor's place is assumed: points are z-buffered and made dense anew for each centre that is asked about
-(``arbiview_aug.scene.panorama``), a target's to find what it sees and a source's to find what is hidden from it.
+No sensor's place is assumed: points are z-buffered and made dense for each centre (``arbiview_aug.scene.panorama``), a
+target's to find what it sees and a source's to find what is hidden from it.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -22,7 +23,17 @@ from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.depth_map import DepthMap, hidden_by
-from arbiview_aug.scene.panorama import CELL_RAD, OWN_CAR_M, SIDE_RAD, Cells, Layer, Panorama, Scratch, Window
+from arbiview_aug.scene.panorama import (
+    CELL_RAD,
+    NEAREST_M,
+    OWN_CAR_M,
+    SIDE_RAD,
+    Cells,
+    Layer,
+    Panorama,
+    Scratch,
+    Window,
+)
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
 
 NODES_RAD = 4 * CELL_RAD
@@ -40,18 +51,15 @@ KNOWN_SHARE = 0.9
 
 FINE, COARSE = Cells.of(CELL_RAD), Cells.of(2 * CELL_RAD)
 MAPPED = FINE._replace(smooth=1)
-"""Cells where there are depth maps: their outlines are seen, not guessed between scan lines, and rounding them costs
-1 dB on the synthetic street."""
+"""Cells where there are depth maps: their outlines are seen, not guessed between scan lines, and are not rounded."""
 MAPPED_COARSE = Cells.of(1.5 * CELL_RAD)._replace(smooth=1)
-"""... for coarse views: fisheye views of synthetic streets differ by -0.1 to +0.1 dB, with cells twice as wide they
-lose up to 0.3."""
+"""... for coarse views: cells twice as wide as fine ones lose detail."""
 SWEPT = MAPPED._replace(see_through=round(math.radians(1.4) / CELL_RAD), side=round(SIDE_RAD / CELL_RAD / 2))
-"""Cells where neighbouring frames add their scan lines: with gaps half as wide, outlines need less rounding. On DDAD a
-see-through angle of 1 degree and sides of 0.2 lose 1 dB, and gain 0.4 dB on synthetic streets."""
+"""Cells where neighbouring frames add their scan lines: with gaps half as wide, outlines need less rounding."""
 
 AROUND_CELLS = 5, 2
-"""Half the height and width of the window in which a scan's own points speak against those of another frame: 1 by 0.4
-degrees. 0.6 to 1.4 by 0.2 to 0.8 degrees lie within 0.2 dB of each other."""
+"""Half the height and width of the window in which a scan's own points contradict those of another frame: 1 by 0.4
+degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,10 +98,7 @@ class PointCloudSurface(DenseSurface):
         return np.ascontiguousarray(self.points.T)
 
     def _cells(self, camera: Camera | None = None) -> Cells:
-        """Cells that suit the points and a camera: coarse where its pixels are wider than fine ones.
-
-        Fisheye views of 256 x 704 gain 0 to 0.2 dB by coarse ones.
-        """
+        """Cells that suit the points and a camera: coarse where its pixels are wider than fine ones."""
         is_fine = camera is None or CELL_RAD * camera.K[0, 0] >= 1
         if self.swept:
             return SWEPT
@@ -112,8 +117,7 @@ class PointCloudSurface(DenseSurface):
         """Find what is hidden from a source; kept for the next target.
 
         Points farther by a tenth of their distance and 0.3 m than what was measured, as in the evaluation's visibility,
-        and only within measured outlines: nothing hides where the LiDAR is silent. Coarse cells gain 0.2 dB on nuScenes
-        and DDAD, -0.1 to +0.4 by view.
+        and only within measured outlines: nothing hides where the LiDAR is silent.
         """
         key = camera.content_key
         if key not in self._shadows:
@@ -248,14 +252,23 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
 
     They lie clearly before all points around them, as seen from ``origin`` near the sensor: something moved away.
     """
-    from arbiview_aug.scene.completion import elevations, find_contradicted
+    from arbiview_aug.scene.completion import elevations, find_visible
+    from arbiview_aug.scene.panorama_kernels import cells_of
 
-    rows, of_others = (np.ascontiguousarray(part.T, np.float32) for part in (points[~own_car(points)], others))
-    origin, contradicted = origin.copy(), np.empty(len(others), bool)
+    rows, origin = np.ascontiguousarray(points[~own_car(points)].T, np.float32), origin.copy()
     low, high = (end / CELL_RAD for end in elevations(rows, origin))
     window = Window(math.floor(low), 0, max(math.ceil(high) - math.floor(low), 0), FINE.turn, FINE)
-    find_contradicted(rows, of_others, origin, window, Scratch.of(window), *AROUND_CELLS, contradicted)
-    return contradicted
+    scratch, (up, side) = Scratch.of(window), AROUND_CELLS
+    find_visible(rows, 0, origin, window, scratch)
+    most = cv2.dilate(scratch.q, np.ones((2 * up + 1, 2 * side + 1), np.uint8))
+    rays = np.ascontiguousarray(others.T, np.float32)[:, None] - origin.astype(np.float32)[:, None, None]
+    y, x = np.empty((2, 1, len(others)), np.float32)
+    cells_of(rays, np.eye(3, dtype=np.float32), window, y, x)
+    q = 1 / np.maximum(np.linalg.norm(rays[:, 0], axis=0), np.float32(NEAREST_M))
+    (h, w), y, x = most.shape, np.rint(y[0]).astype(int), np.rint(x[0]).astype(int)
+    inside = (y >= up) & (y < h - up) & (x >= side) & (x < w - side)
+    known = np.where(inside, most[np.clip(y, 0, h - 1), np.clip(x, 0, w - 1)], 0)
+    return np.asarray((known > 0) & (q / (np.float32(1.1) + np.float32(0.3) * q) > known))  # as ``hidden_below``
 
 
 def own_car(points: Points) -> BoolArray:
