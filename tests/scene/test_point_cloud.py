@@ -42,22 +42,12 @@ def towards(points: np.ndarray, eye: np.ndarray = EYE) -> tuple[np.ndarray, np.n
 NEAR, FAR = wall(12.0, (-2, 2), (0.0, 2.0)), wall(32.0, (-20, 20), (-1.0, 8.0))
 
 
-def test_a_wall_is_where_its_points_are() -> None:
-    rays, q = towards(np.array([[12.0, y, z] for y in (-1.33, 0.01, 1.47) for z in (0.6, 1.02, 1.63)]))
-    assert np.allclose(inverse_distance(PointCloudSurface(Street(), NEAR), EYE, rays), q, rtol=0.02)
-
-
 @pytest.mark.parametrize("eye", [EYE, EYE + np.array([0.5, 0.3, 0.7]), np.array([-2.0, 0.0, 1.5])])
-def test_any_centre_sees_the_same_wall(eye: np.ndarray) -> None:
-    rays, q = towards(np.array([[12.0, y, 1.02] for y in (-1.33, 0.01, 1.47)]), eye)
-    assert np.allclose(inverse_distance(PointCloudSurface(Street(), NEAR), eye, rays), q, rtol=0.02)
-
-
-def test_walls_behind_are_as_good_as_walls_ahead() -> None:
-    """Azimuth wraps there."""
-    mirrored = NEAR * np.array([-1.0, 1.0, 1.0])
-    rays, q = towards(np.array([[-12.0, y, 1.02] for y in (-1.33, -0.01, 0.01, 1.47)]))
-    assert np.allclose(inverse_distance(PointCloudSurface(Street(), mirrored), EYE, rays), q, rtol=0.02)
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["ahead", "behind, where azimuths jump"])
+def test_any_centre_sees_a_wall_where_its_points_are(eye: np.ndarray, side: float) -> None:
+    across = [(y, z) for y in (-1.33, -0.01, 0.01, 1.47) for z in (0.6, 1.02, 1.63)]
+    rays, q = towards(np.array([[side * 12.0, y, z] for y, z in across]), eye)
+    assert np.allclose(inverse_distance(PointCloudSurface(Street(), NEAR * [side, 1, 1]), eye, rays), q, rtol=0.02)
 
 
 def test_a_road_stays_a_plane_between_scan_lines() -> None:
@@ -190,14 +180,6 @@ def test_points_of_every_bad_kind() -> None:
     assert inverse_distance(surface, EYE, np.zeros((0, 3))).shape == (0,)
 
 
-def test_duplicates_and_order_change_nothing() -> None:
-    rng, rays = np.random.default_rng(0), towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))[0]
-    points = np.concatenate([NEAR, FAR])
-    once = inverse_distance(PointCloudSurface(Street(), points), EYE, rays)
-    shuffled = rng.permutation(np.concatenate([points, points]))
-    assert np.allclose(inverse_distance(PointCloudSurface(Street(), shuffled), EYE, rays), once, atol=1e-6)
-
-
 def test_the_order_of_targets_at_one_place_changes_nothing() -> None:
     """Neither positions nor, when they are asked for again, how sure these are."""
     source, scene = demo_source_rig((64, 128)), Scene(points=np.concatenate([NEAR, FAR]))
@@ -219,29 +201,18 @@ def test_the_order_of_targets_at_one_place_changes_nothing() -> None:
     assert np.array_equal(surface.uncertainty(EYE, rays, q), before) and (before < 0.06 * q).all()
 
 
-def test_parts_of_a_view_agree_with_the_whole() -> None:
-    surface = PointCloudSurface(Street(), np.concatenate([NEAR, FAR]))
-    rays = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.08))[0]
-    parts = np.concatenate(
-        [inverse_distance(PointCloudSurface(Street(), surface.points), EYE, r) for r in rays[:, None]]
-    )
-    around = np.random.default_rng(0).normal(size=(500, 3))
-    around /= np.linalg.norm(around, axis=-1, keepdims=True)
-    whole = inverse_distance(surface, EYE, np.concatenate([around, rays]))[500:]
-    assert np.allclose(parts, whole, rtol=0.02)
-
-
 def test_only_the_nearest_point_of_a_direction_counts() -> None:
     """However many lie behind it, in whatever order; more points than are worked on at once."""
     rng = np.random.default_rng(0)
     azimuth, elevation = rng.uniform(-np.pi, np.pi, 50_000), rng.uniform(-0.4, 0.4, 50_000)
-    rays = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1)
+    rays = seen_at(azimuth, elevation, np.cos(azimuth))
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
     away = rays * rng.uniform(6, 30, (len(rays), 1))  # outside the own car
     near, behind = EYE + away, EYE + 2 * away
     asked = rays[:2000]
     for part in (asked, asked[asked[:, 0] > 0.8]):  # a narrow window too
         once = inverse_distance(PointCloudSurface(Street(), near), EYE, part)
-        many = PointCloudSurface(Street(), rng.permutation(np.concatenate([behind, near, behind])))
+        many = PointCloudSurface(Street(), rng.permutation(np.concatenate([behind, near, near])))
         assert np.array_equal(inverse_distance(many, EYE, part), once)
 
 
@@ -271,12 +242,6 @@ def test_points_are_taken_as_they_were_recorded() -> None:
         inverse_distance(PointCloudSurface(Street(), cloud), EYE, rays) for cloud in (points, points.astype(float))
     )
     assert np.array_equal(one, two)
-
-
-def test_millions_of_points() -> None:
-    points = np.random.default_rng(0).uniform((-60, -60, 0), (60, 60, 5), (2_000_000, 3))
-    rays, _ = towards(wall(12.0, (-3, 3), (0.0, 3.0), 0.02))
-    assert np.isfinite(inverse_distance(PointCloudSurface(Street(), points), EYE, rays)).all()
 
 
 def test_points_are_checked() -> None:

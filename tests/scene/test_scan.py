@@ -179,11 +179,15 @@ def test_returns_name_their_point_and_ring() -> None:
     assert result.points.dtype == np.float32
 
 
-def test_beams_in_any_order() -> None:
+def test_beams_in_any_order_and_scanners_upside_down() -> None:
     points, usual = measured(scanner(32, at())), scanner(16, at())
-    mixed = Lidar("top", at(), usual.elevations_deg[::-1], 0.25, usual.range_m, usual.azimuth_deg)
-    one, two = scan([usual], points, 0.0), scan([mixed], points, 0.0)
+    mixed = replace(usual, elevations_deg=usual.elevations_deg[::-1])
+    hanging = Lidar(
+        "h", at() @ np.diag([1.0, -1, -1, 1]), tuple(-np.array(usual.elevations_deg)), 0.25, (0.5, 60), (-60, 60)
+    )
+    one, two, three = (scan([lidar], points, 0.0) for lidar in (usual, mixed, hanging))
     np.testing.assert_array_equal(ranges(usual, one), ranges(mixed, two)[::-1])
+    assert abs(len(one.points) - len(three.points)) < 0.02 * len(one.points)
 
 
 def test_own_car_and_range_limits_leave_no_points() -> None:
@@ -221,14 +225,6 @@ def test_a_near_wall_hides_a_far_one_all_around(half_deg: float) -> None:
     lidar = Lidar("top", at(), tuple(np.arange(-5.5, 6)), 0.5, (0.5, 100.0), (-half_deg, half_deg))
     away = np.linalg.norm(scan([lidar], points, 0.0).points - lidar.center_m, axis=1)
     assert len(away) > 1000 and away.max() < 10
-
-
-def test_upside_down() -> None:
-    a = scanner(32, at())
-    turned = at() @ np.diag([1.0, -1, -1, 1])
-    usual, hanging = scanner(16, at()), Lidar("h", turned, tuple(-np.linspace(-25, 10, 16)), 0.25, (0.5, 60), (-60, 60))
-    one, two = (scan([lidar], measured(a), 0.0).points for lidar in (usual, hanging))
-    assert abs(len(one) - len(two)) < 0.02 * len(one)
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.array([[-20.0, 0, 1]]), np.full((5, 3), [0.0, 0.0, 1.9])])
