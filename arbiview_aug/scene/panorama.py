@@ -59,9 +59,6 @@ BASE_STEP = 4  # cells between nodes of the static surface, which is smooth
 HALO_RAD = math.radians(4.0)
 """Room around a window that its filters need."""
 
-STEEP_RAD = math.radians(64.0)
-"""Elevation up to which azimuths are interpolated."""
-
 OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 """(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
 
@@ -121,33 +118,14 @@ class Window(NamedTuple):
         ``R`` (3, 3) turns the rays to the ego frame; those of elevations below ``low`` and above ``high``, radians, do
         not count if there are others. Azimuths bend near the zenith, and jump in a window all around.
         """
-        turned = R @ rays.reshape(3, -1).astype(np.float64)
-        x, y, z = turned[:, rays.any(axis=0).ravel()]
-        if not len(z):
-            return cls(0, 0, 1, 1, cells), False
-        least, most = math.asin(max(z.min(), -1)), math.asin(min(z.max(), 1))
-        row, end = math.floor(max(least, low) / cells.rad), math.ceil(min(most, high) / cells.rad)
-        sines = np.sin(np.clip([row * cells.rad, end * cells.rad], -math.pi / 2, math.pi / 2))
-        inside = (z >= sines[0] - 1e-9) & (z <= sines[1] + 1e-9)
-        if not inside.any():
-            return cls.around(rays, R, cells)
-        x, y = x[inside], y[inside]
-        middle = math.atan2(y.sum(), x.sum())
-        azimuth = middle + (np.arctan2(y, x) - middle + math.pi) % (2 * math.pi) - math.pi  # half a turn on both sides
-        column = math.floor(azimuth.min() / cells.rad)
-        rows, columns = end - row, math.ceil(azimuth.max() / cells.rad) - column
-        is_smooth = len(z) == turned.shape[1] and max(-least, most) <= STEEP_RAD
+        from arbiview_aug.scene.panorama_kernels import span_of
+
+        row, column, rows, columns, is_smooth = span_of(rays, np.ascontiguousarray(R), cells.rad, low, high)
         bottom, top = max(row - ROOM_CELLS, -cells.turn // 4), min(row + rows + ROOM_CELLS, cells.turn // 4)
         column, columns = column - ROOM_CELLS, columns + 2 * ROOM_CELLS
         if columns + cells.halo > cells.turn:
             column, columns, is_smooth = 0, cells.turn, False
         return cls(bottom, column, top - bottom, columns, cells), is_smooth
-
-    def holds(self, other: Window) -> bool:
-        """Whether another window lies within this one."""
-        turn = self.cells.turn
-        aside = self.columns >= turn or (other.column - self.column) % turn + other.columns <= self.columns
-        return aside and self.row <= other.row and other.row + other.rows <= self.row + self.rows
 
     @property
     def shape(self) -> tuple[int, int]:

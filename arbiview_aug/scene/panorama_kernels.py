@@ -13,6 +13,56 @@ from arbiview_aug.environment import called, compiled, inlined
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _MOST = np.float32(MAX_INVERSE_DISTANCE)
 _HALF_PI = np.float32(np.pi / 2)
+_STEEP = np.sin(np.radians(64.0))  # of elevations up to which azimuths are interpolated
+
+
+@compiled
+def span_of(rays: Any, R: Any, rad: float, lowest: float, highest: float) -> tuple[int, int, int, int, bool]:
+    """First row and column, and numbers of both, of the smallest ``Window`` that holds rays (3, ny, nx).
+
+    Only those of elevations from ``lowest`` to ``highest`` count, if there are any. ``R`` (3, 3) turns the rays to the
+    ego frame; rays of zeros are missing. The last value says whether none is, and none is steep.
+    """
+    turned, n, least, most = np.empty((3, rays.shape[1] * rays.shape[2])), 0, 1.0, -1.0
+    x, y, z = turned[0], turned[1], turned[2]
+    for j in range(rays.shape[1]):
+        for i in range(rays.shape[2]):
+            a, b, c = np.float64(rays[0, j, i]), np.float64(rays[1, j, i]), np.float64(rays[2, j, i])
+            x[n], y[n] = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c, R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+            z[n] = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+            if a != 0 or b != 0 or c != 0:
+                least, most, n = min(least, z[n]), max(most, z[n]), n + 1
+    if n == 0:
+        return 0, 0, 1, 1, False
+    is_smooth = n == rays.shape[1] * rays.shape[2] and max(-least, most) <= _STEEP
+    for bottom, top in ((lowest, highest), (-4.0, 4.0)):
+        ends = np.arcsin(max(least, -1.0)), np.arcsin(min(most, 1.0))
+        low, high = int(np.floor(max(ends[0], bottom) / rad)), int(np.ceil(min(ends[1], top) / rad))
+        under = np.sin(low * rad) if low * rad > ends[0] else -2.0
+        over = np.sin(high * rad) if high * rad < ends[1] else 2.0
+        ahead, left, inside = 0.0, 0.0, 0
+        for i in range(n):
+            if under <= z[i] <= over:
+                ahead, left, inside = ahead + x[i], left + y[i], inside + 1
+        if inside:
+            break
+    middle, first, last = np.arctan2(left, ahead), 2.0, -2.0
+    c, s = np.cos(middle), np.sin(middle)
+    for i in range(n):
+        if under <= z[i] <= over:
+            a, b = c * x[i] + s * y[i], c * y[i] - s * x[i]
+            part = b / max(abs(a) + abs(b), 1e-30)  # grows with the azimuth, and costs no arctangent
+            part = part if a >= 0 else np.copysign(2.0, b) - part
+            first, last = min(first, part), max(last, part)
+    column = int(np.floor((middle + _azimuth(first)) / rad))
+    return low, column, high - low, int(np.ceil((middle + _azimuth(last)) / rad)) - column, is_smooth
+
+
+@inlined
+def _azimuth(part: float) -> float:
+    """The angle whose direction (a, b) has this b / (|a| + |b|) where it points ahead, and 2 less it elsewhere."""
+    ahead = 1.0 - abs(part)
+    return np.arctan2(part if ahead >= 0 else np.copysign(2.0, part) - part, ahead)
 
 
 @called
@@ -93,12 +143,16 @@ def _read_row(rows: Any, columns: Any, layer: Any, first: Any, down: Any, right:
 
 
 @compiled
-def read_layer(rays: Any, window: Any, layer: Any, out: Any) -> None:
-    """Bilinear values (n,) of a panorama's layer (h, w) along ego-frame rays (3, n); its border beyond it."""
-    n = out.shape[0]
+def read_layer(rays: Any, window: Any, layer: Any, out: Any) -> int:
+    """Bilinear values (n,) of a panorama's layer (h, w) along ego-frame rays (3, n); its border beyond it.
+
+    Returns how many rays lie between its first and last column.
+    """
+    n, last = out.shape[0], layer.shape[1] - 1
     first, work = np.empty(n, np.uint32), np.empty((5, n), np.float32)
     cells_row(rays[0], rays[1], rays[2], window, work[0], work[1], work[2])
     _read_row(work[1], work[2], layer, first, work[3], work[4], out)
+    return ((work[2] >= 0) & (work[2] <= last)).sum()
 
 
 @called

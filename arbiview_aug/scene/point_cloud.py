@@ -150,24 +150,32 @@ class PointCloudSurface(DenseSurface):
         """Small where a point is near, the street's elsewhere: 1/m (...,)."""
         from arbiview_aug.scene.panorama_kernels import read_layer
 
-        rays = directions.reshape(-1, 3).T.astype(np.float32, order="C")
-        panorama, near = self.view(origin, directions), np.empty(rays.shape[1], np.float32)
-        read_layer(rays, panorama.window, panorama.layers[3], near)
+        key, rays = origin.tobytes(), directions.reshape(-1, 3).T.astype(np.float32, order="C")
+        if not self._panoramas.get(key):
+            self.panorama(origin, rays[:, None], np.eye(3), self._cells())
+        readings = []
+        for window, panorama in self._panoramas[key].items():
+            near = np.empty(rays.shape[1], np.float32)
+            readings.append((read_layer(rays, window, panorama.layers[3], near), -window.columns, near))
+        near = max(readings, key=lambda reading: reading[:2])[2]  # of the narrowest one that shows most of the rays
         unknown = self.street.uncertainty(origin, directions, inverse_distance)
         return np.where(near.reshape(unknown.shape) > 0.5, MEASURED_SPREAD * inverse_distance, unknown)
 
-    def view(self, origin: FloatArray, directions: FloatArray, cells: Cells | None = None) -> Panorama:
-        """The narrowest panorama around a centre that holds unit rays (..., 3), or a new one; of any cells for None."""
-        rays = directions.reshape(1, -1, 3).transpose(2, 0, 1).astype(np.float32, order="C")
-        around = lambda of: self._window(origin, rays, np.eye(3), of)[0]  # noqa: E731
-        known = [
-            panorama
-            for window, panorama in self._panoramas.get(origin.tobytes(), {}).items()
-            if cells in (None, window.cells) and window.holds(around(window.cells))
-        ]
-        if known:
-            return min(known, key=lambda panorama: panorama.window.columns * panorama.window.cells.rad)
-        return self._panorama(origin, around(cells or self._cells()))
+    def panorama(
+        self, origin: FloatArray, rays: Layer, R: FloatArray, cells: Cells, memory: Memory = FRESH
+    ) -> tuple[Panorama, bool]:
+        """The panorama around a centre that shows rays (3, ny, nx) turned by ``R``, kept; see ``Window.around``."""
+        from arbiview_aug.scene.completion import elevations
+
+        key, origin = origin.tobytes(), origin.copy()  # a copy has one layout: kernels are compiled for each
+        if key not in self._ends:
+            self._ends[key] = (-math.pi, math.pi) if self.mapped else elevations(self._rows, origin)
+        low, high = self._ends[key]
+        window, is_smooth = Window.around(rays, R, cells, low - cells.beyond, high + cells.beyond)
+        known = self._panoramas.setdefault(key, {})
+        if window not in known:
+            known[window] = Panorama(window, origin, self._rows, self.mapped, self.street, memory)
+        return known[window], is_smooth
 
     def _located(
         self, camera: Camera, rays: PixelRays, cells: Cells, memory: Memory
@@ -180,32 +188,15 @@ class PointCloudSurface(DenseSurface):
 
         key = camera.content_key, cells
         if key not in self._nodes:
-            R, origin = camera.cam2ego[:3, :3], camera.center_m
+            R = camera.cam2ego[:3, :3]
             step = max(1, int(min(NODES_RAD * float(rays.parameters[0]), max(rays.size))))  # two nodes span any image
-            window, is_smooth = self._window(origin, rays.nodes(step), R, cells)
+            panorama, is_smooth = self.panorama(camera.center_m, rays.nodes(step), R, cells, memory)
             step = step if is_smooth else 1
             local = rays.planes if step == 1 and rays.planes.size else rays.nodes(step)
             rows, columns = np.empty((2, *local.shape[1:]), np.float32)
-            cells_of(local, R.astype(np.float32), window, rows, columns)
-            self._nodes[key] = self._panorama(origin, window, memory), rows, columns, step
+            cells_of(local, R.astype(np.float32), panorama.window, rows, columns)
+            self._nodes[key] = panorama, rows, columns, step
         return self._nodes[key]
-
-    def _panorama(self, origin: FloatArray, window: Window, memory: Memory = FRESH) -> Panorama:
-        """The panorama of a window around a centre, kept."""
-        known = self._panoramas.setdefault(origin.tobytes(), {})
-        if window not in known:
-            known[window] = Panorama(window, origin.copy(), self._rows, self.mapped, self.street, memory)
-        return known[window]
-
-    def _window(self, origin: FloatArray, rays: Layer, R: FloatArray, cells: Cells) -> tuple[Window, bool]:
-        """``Window.around`` for rays at a centre, as far as points reach."""
-        from arbiview_aug.scene.completion import elevations
-
-        key = origin.tobytes()
-        if key not in self._ends:  # a copy has one layout: kernels are compiled for each
-            self._ends[key] = (-math.pi, math.pi) if self.mapped else elevations(self._rows, origin.copy())
-        low, high = self._ends[key]
-        return Window.around(rays, R, cells, low - cells.beyond, high + cells.beyond)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE, pixel_rays
+from arbiview_aug.image_ops import FRESH
 from arbiview_aug.scene.boxes import BoxSurface
-from arbiview_aug.scene.panorama import Panorama
+from arbiview_aug.scene.panorama import Cells, Panorama
 from arbiview_aug.scene.point_cloud import COARSE, PointCloudSurface, PointCloudWithBoxes
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import StaticSurface, Surface
@@ -20,7 +22,7 @@ def points_and_boxes(points: np.ndarray, boxes: np.ndarray) -> PointCloudWithBox
 
 
 def inverse_distance(
-    surface: Surface, origin: np.ndarray, directions: np.ndarray, pixel_rad: float = 0.0
+    surface: Surface, origin: np.ndarray, directions: np.ndarray, pixel_rad: float = 0.0, camera: Camera | None = None
 ) -> np.ndarray:
     """1/m (...,) at which unit rays (..., 3) meet a surface, as a camera of such pixels shows it."""
     if isinstance(surface, StaticSurface):
@@ -32,7 +34,7 @@ def inverse_distance(
             shown &= first >= occlusion_depth(surface.street, origin, directions, coarse=False)
         return np.where(shown, first, inverse_distance(surface.street, origin, directions))
     assert isinstance(surface, PointCloudSurface)
-    view = surface.view(np.asarray(origin, np.float64), directions)
+    view = panorama(surface, origin, directions, surface._cells(camera), camera)
     near, far, share = (layer_at(view, layer, directions) for layer in view.layers[:3])
     q = surface.street.inverse_distance(origin, directions) + np.where(share > 0.5, near, far)
     return np.clip(q, 0.0, MAX_INVERSE_DISTANCE)
@@ -52,11 +54,25 @@ def occludes(
 
 
 def occlusion_depth(
-    surface: PointCloudSurface, origin: np.ndarray, directions: np.ndarray, coarse: bool = True
+    surface: PointCloudSurface,
+    origin: np.ndarray,
+    directions: np.ndarray,
+    coarse: bool = True,
+    camera: Camera | None = None,
 ) -> np.ndarray:
     """Inverse distances (...,) beyond which points hide what is behind them."""
-    view = surface.view(np.asarray(origin, np.float64), directions, COARSE if coarse else None)
+    view = panorama(surface, origin, directions, COARSE if coarse else surface._cells(camera), camera)
     return layer_at(view, view.hidden_below, directions)
+
+
+def panorama(
+    surface: PointCloudSurface, origin: np.ndarray, directions: np.ndarray, cells: Cells, camera: Camera | None
+) -> Panorama:
+    """The panorama that shows unit rays (..., 3), or the one that a camera's image is read from."""
+    if camera is not None:
+        return surface._located(camera, pixel_rays(camera), cells, FRESH)[0]
+    rays = directions.reshape(1, -1, 3).transpose(2, 0, 1).astype(np.float32, order="C")
+    return surface.panorama(np.asarray(origin, np.float64), rays, np.eye(3), cells)[0]
 
 
 def layer_at(view: Panorama, layer: np.ndarray, directions: np.ndarray) -> np.ndarray:

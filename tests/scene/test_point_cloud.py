@@ -283,7 +283,8 @@ def test_images_say_what_single_rays_say(name: str) -> None:
     surface = PointCloudSurface(Street(), points)
     rays, valid = view.unproject(view.pixel_grid())
     image, shadow = surface.image(view, pixel_rays(view)), surface.occlusion_map(view, pixel_rays(view))
-    q, before = inverse_distance(surface, EYE, rays[valid]), occlusion_depth(surface, EYE, rays[valid])
+    q = inverse_distance(surface, EYE, rays[valid], camera=view)
+    before = occlusion_depth(surface, EYE, rays[valid], camera=view)
     # Rounding decides on which side of an outline a pixel lies.
     off = np.abs(image[valid] - q)
     assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003

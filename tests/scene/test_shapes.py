@@ -223,10 +223,12 @@ def test_images_say_what_single_rays_say() -> None:
     surface = points_and_boxes(np.concatenate([near, wall]), boxes)
     rays, valid = view.unproject(view.pixel_grid())
     rays, street = rays[valid], surface.street
-    off = np.abs(street.image(view, pixel_rays(view))[valid] - inverse_distance(street, view.center_m, rays))
+    off = np.abs(
+        street.image(view, pixel_rays(view))[valid] - inverse_distance(street, view.center_m, rays, camera=view)
+    )
     assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003
     for coarse in (False, True):
-        before = occlusion_depth(street, view.center_m, rays, coarse=coarse)
+        before = occlusion_depth(street, view.center_m, rays, coarse=coarse, camera=view)
         off = np.abs(street.hidden(view, pixel_rays(view), coarse=coarse)[valid] - before)
         assert np.median(off) < 1e-5 and (off > 1e-3).mean() < 0.03
 
