@@ -20,7 +20,6 @@ _BLOCK = 1024
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
 _ROW, _OWN, _NO_SEED = 1 << 7, np.int32(64 * 128 + 64), np.int32(1 << 30)
 _SIDE, _CORNER, _KNIGHT = 1024 << 14, 1434 << 14, 2250 << 14
-_FAR = 54  # cells along a row that one step of the last four looks back; all four together 80, beyond any reach
 _STEP, _STEP_PER_M, _LEAST_WEIGHT = np.float32(STEP), np.float32(STEP_PER_M), np.float32(1e-3)
 
 
@@ -215,37 +214,31 @@ def complete(n: int, static: Any, window: Any, scratch: Any, layers: Any) -> Non
     planes, low, smooth = scratch.rays[: 3 * h * w].reshape(3, h, w), scratch.most, window.cells.smooth
     r, near_q, high, q = planes[0], planes[1], planes[2], scratch.q.reshape(h * w)
     residuals, work = np.empty(n, np.float32), np.empty((10 + 6 * smooth, w), np.float32)
-    line, wide = np.empty(w + 2 * _FAR, np.int32), np.empty(w + 2 * smooth, np.float32)
+    place, wide = np.empty(w, np.int32), np.empty(w + 2 * smooth, np.float32)
     for i in range(n):
         residuals[i] = q[cells[i]] - static[i]
-    _spread_nearest(cells, thin, q, residuals, window.cells, code, work[0], line, r, near_q, layers)
+    _spread_nearest(cells, thin, q, residuals, window.cells, code, work[0], place, r, near_q, layers)
     _window_max(r, 2 * smooth, 2 * smooth, _ONE, wide, high)
     _window_max(r, 2 * smooth, 2 * smooth, -_ONE, wide, low)
     _average_sides(r, near_q, high, low, smooth, work, layers)
     _draw_thin(cells, thin, residuals, code, layers)
+    near, far, level = layers[0], layers[1], layers[4]
     for y in range(h - 1):
-        near, far, near_above, far_above, level = (
-            layers[0, y],
-            layers[1, y],
-            layers[0, y + 1],
-            layers[1, y + 1],
-            layers[4, y],
-        )
         for x in range(w - 1):
-            is_level = (near[x] == far[x]) & (near_above[x] == far_above[x])
-            is_level &= (near[x + 1] == far[x + 1]) & (near_above[x + 1] == far_above[x + 1])
-            level[x] = _ONE if is_level else _ZERO
+            is_level = (near[y, x] == far[y, x]) & (near[y, x + 1] == far[y, x + 1])
+            is_level &= (near[y + 1, x] == far[y + 1, x]) & (near[y + 1, x + 1] == far[y + 1, x + 1])
+            level[y, x] = _ONE if is_level else _ZERO
 
 
 @borrowing
 def _spread_nearest(
-    cells: Any, thin: Any, own_q: Any, residuals: Any, lengths: Any, code: Any, away: Any, line: Any,
+    cells: Any, thin: Any, own_q: Any, residuals: Any, lengths: Any, code: Any, away: Any, place: Any,
     r: Any, q: Any, layers: Any,
 ) -> None:  # fmt: skip
     """Give every cell of ``r`` and ``q`` (h, w) the residual and inverse distance of the nearest point.
 
     The residual fades towards ``lengths.reach``. ``layers[3]`` becomes 1 within ``lengths.support``; the other layers,
-    ``away`` (w,) and ``line`` (w + 2 * _FAR,) int32 are scratch. ``code`` (h + 4, w + 4) int32 is written, too.
+    ``away`` (w,) and ``place`` (w,) int32 are scratch. ``code`` (h + 4, w + 4) int32 is written, too.
     """
     (_, h, w), reach, support = layers.shape, lengths.reach, lengths.support
     code[:] = _NO_SEED
@@ -255,8 +248,7 @@ def _spread_nearest(
         if not thin[i]:
             code[cells[i] // w + 2, cells[i] % w + 2] = _OWN
             residual[cells[i]], nearest[cells[i]] = residuals[i], own_q[cells[i]]
-    _spread(code, line)
-    place = line[:w]
+    _spread(code)
     for y in range(h):
         seeds, measured, to_r, to_q, first = code[y + 2, 2 : w + 2], layers[3, y], r[y], q[y], np.int32(y * w)
         for x in range(w):
@@ -275,15 +267,11 @@ def _spread_nearest(
 
 
 @borrowing
-def _spread(code: Any, line: Any) -> None:
-    """Find every cell's nearest seed; codes (h + 4, w + 4) int32 are those of ``_NO_SEED``, two around the cells.
-
-    ``line`` (w + 2 * _FAR,) int32 is scratch.
-    """
+def _spread(code: Any) -> None:
+    """Find every cell's nearest seed; codes (h + 4, w + 4) int32 are those of ``_NO_SEED``, two around the cells."""
     h, w = code.shape
-    line[:] = _NO_SEED
     for s in (1, -1):
-        above = -s * _ROW
+        aside, above = np.int32(_SIDE - s), -s * _ROW
         c0, c1, c2 = np.int32(_SIDE + above), np.int32(_CORNER + above - 1), np.int32(_CORNER + above + 1)
         c3, c4 = np.int32(_KNIGHT + above - 2), np.int32(_KNIGHT + above + 2)
         c5, c6 = np.int32(_KNIGHT + 2 * above - 1), np.int32(_KNIGHT + 2 * above + 1)
@@ -297,13 +285,11 @@ def _spread(code: Any, line: Any) -> None:
                 b = min(np.int32(one0[x] + c3), np.int32(one4[x] + c4))
                 c = min(np.int32(two1[x] + c5), np.int32(two3[x] + c6))
                 row[x] = min(min(row[x], a), min(b, c))
-            for away in (1, 3, 9, 27):  # along the row, from up to three times as many cells at each step
-                here, next, after = line[_FAR:], line[_FAR - s * away :], line[_FAR - 2 * s * away :]
-                to_next, to_after = np.int32(away * (_SIDE - s)), np.int32(2 * away * (_SIDE - s))
-                for x in range(w - 4):
-                    here[x] = row[x]
-                for x in range(w - 4):
-                    row[x] = min(row[x], min(np.int32(next[x] + to_next), np.int32(after[x] + to_after)))
+            last = _NO_SEED
+            for i in range(w - 4):
+                x = i if s == 1 else w - 5 - i
+                last = min(row[x], np.int32(last + aside))
+                row[x] = last
 
 
 @borrowing
