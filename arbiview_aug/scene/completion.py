@@ -8,8 +8,20 @@ import numpy as np
 
 from arbiview_aug.environment import borrowing, called, compiled, inlined
 from arbiview_aug.scene.kernels import upsampled_row
-from arbiview_aug.scene.panorama import NEAREST_M, STEP, STEP_PER_M, THIN_CELLS
 from arbiview_aug.scene.panorama_kernels import cells_row
+
+_STEP = np.float32(0.1)
+"""Relative change of inverse distance within ``SMOOTH_RAD`` that makes an outline."""
+
+_STEP_PER_M = np.float32(0.003)
+"""... and the least absolute one, 1/m: two pixels of parallax for 1 m of baseline."""
+
+NEAREST_M = 0.5
+"""Points nearer than this to a centre are the vehicle's, or the camera itself."""
+
+_THIN_CELLS = 1, 5
+"""Most cells above and below, and to each side, that a thin thing's point takes: 5 bridge gaps of 1 degree. A tape that
+one scan line met would else take its surroundings, in ovals as high as the spacing of the lines."""
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _NEAREST = np.float32(1 / NEAREST_M)
@@ -20,7 +32,7 @@ _BLOCK = 1024
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
 _ROW, _OWN, _NO_SEED = 1 << 7, np.int32(64 * 128 + 64), np.int32(1 << 30)
 _SIDE, _CORNER, _KNIGHT = 1024 << 14, 1434 << 14, 2250 << 14
-_STEP, _STEP_PER_M, _LEAST_WEIGHT = np.float32(STEP), np.float32(STEP_PER_M), np.float32(1e-3)
+_LEAST_WEIGHT = np.float32(1e-3)
 
 
 # --- which points are seen --------------------------------------------------------------------------------------------
@@ -76,7 +88,7 @@ def _nearest_points(points: Any, origin: Any, window: Any, q: Any, number: Any) 
     c, s, inner = np.float32(np.cos(middle)), np.float32(np.sin(middle)), np.float32(np.cos(half))
     ox, oy, oz = np.float32(origin[0]), np.float32(origin[1]), np.float32(origin[2])
     work, exact, index = np.empty((7, _BLOCK), np.float32), np.empty((4, _BLOCK)), np.empty((2, _BLOCK), np.int32)
-    x, y, z, near, inside, those = work[0], work[1], work[2], work[3], index[0], index[1]
+    near, inside, those = work[3], index[0], index[1]
     q[:] = _ZERO
     for start in range(0, points.shape[1], _BLOCK):
         m, n = min(_BLOCK, points.shape[1] - start), 0
@@ -91,24 +103,18 @@ def _nearest_points(points: Any, origin: Any, window: Any, q: Any, number: Any) 
         for i in range(m):
             those[n] = i
             n += inside[i]
+        for axis in range(3):
+            for i in range(n):
+                exact[axis, i] = points[axis, start + those[i]] - origin[axis]
+        away, length = exact[:3], exact[3]
         for i in range(n):
-            exact[0, i] = px[those[i]] - origin[0]
-        for i in range(n):
-            exact[1, i] = py[those[i]] - origin[1]
-        for i in range(n):
-            exact[2, i] = pz[those[i]] - origin[2]
-        a, b, up, length = exact[0], exact[1], exact[2], exact[3]
-        for i in range(n):
-            length[i] = np.sqrt(a[i] * a[i] + b[i] * b[i] + up[i] * up[i])
-        for i in range(n):
-            x[i] = a[i] / length[i]
-        for i in range(n):
-            y[i] = b[i] / length[i]
-        for i in range(n):
-            z[i] = up[i] / length[i]
+            length[i] = np.sqrt(away[0, i] * away[0, i] + away[1, i] * away[1, i] + away[2, i] * away[2, i])
+        for axis in range(3):
+            for i in range(n):
+                work[axis, i] = away[axis, i] / length[i]
         for i in range(n):
             near[i] = 1 / length[i]
-        cells_row(x[:n], y[:n], z[:n], window, work[4, :n], work[5, :n], work[6, :n])
+        cells_row(work[0, :n], work[1, :n], work[2, :n], window, work[4, :n], work[5, :n], work[6, :n])
         for i in range(n):
             row, column = np.int32(np.rint(work[5, i])), np.int32(np.rint(work[6, i]))
             column = column if column < turn else column - turn
@@ -368,7 +374,7 @@ def _draw_thin(cells: Any, thin: Any, residuals: Any, code: Any, layers: Any) ->
         code: That of ``_spread_nearest``, of the other points.
         layers: ``Panorama.layers``; the first three are updated.
     """
-    (_, h, w), (up, side) = layers.shape, THIN_CELLS
+    (_, h, w), (up, side) = layers.shape, _THIN_CELLS
     near, far, share = layers[0], layers[1], layers[2]
     for ring in (3, 2, 1, 0):
         for i in range(cells.shape[0]):

@@ -23,17 +23,15 @@ MOTION_WIDTH_PX = 450
 """Images are halved until their width is nearest to this, by ratio: to 318 to 636 px."""
 
 ANCHOR_RAD = math.radians(1.0)
-"""Distance over which a depth map follows points, as a Gaussian's sigma: with 32 scan lines 0.5 to 1 degree are as
-good, 2 lose 1 dB."""
+"""Distance over which a depth map follows points, as a Gaussian's sigma."""
 
 ANCHOR_SHARE = 0.25
 """Points and a map that differ by more than this share show different things: one is hidden, moved, or wrong."""
 
-_UNANCHORED = 0.1  # points to the square of ``ANCHOR_RAD``, below which a map is believed more than they
+_UNANCHORED = 0.1  # points in a square of ``ANCHOR_RAD``; where there are fewer, the map counts more
 
 GAP_RAD = (SUPPORT_RAD - SHRINK_RAD) / 2
-"""Angle by which a map's pixels hide beyond their border: half that of measured points. The whole angle costs good
-pixels of depth from motion; without any, hidden things show."""
+"""Angle by which a map's pixels hide beyond their border: half that of measured points."""
 
 
 class DepthMap(NamedTuple):
@@ -221,9 +219,9 @@ def hidden_by(maps: Sequence[DepthMap], camera: Camera) -> Layer | None:
 
 
 def _warped(one: Camera, layer: Layer, two: Camera, interpolation: int, border: int) -> Layer:
-    """A layer of a camera at the size of another one with the same rays; 0 over a pixel beyond its image.
+    """A layer of a camera at the size of another one with the same rays; 0 more than a pixel beyond its image.
 
-    So much a halved layer may lack at the far borders.
+    A halved layer may lack one pixel at the far borders.
     """
     if one.size == two.size and np.array_equal(one.K, two.K):
         return layer

@@ -35,12 +35,6 @@ SMOOTH_RAD = math.radians(1.3)
 """Window in which residuals are averaged and outlines straightened: the spacing of 32 scan lines, over which an average
 of nearest values is linear interpolation."""
 
-STEP = 0.1
-"""Relative change of inverse distance within that window that makes an outline."""
-
-STEP_PER_M = 0.003
-"""... and the least absolute one, 1/m: two pixels of parallax for 1 m of baseline."""
-
 REACH_RAD = math.radians(12.0)
 """Beyond this angle from any point the static surface is all that is known. From half of it the points fade out: above
 the highest scan line houses and trees continue, and a fade over a few degrees bends them."""
@@ -52,9 +46,6 @@ SHRINK_RAD = math.radians(0.4)
 """A measured surface hides what is behind it; this closes gaps between scan lines without widening outlines by all of
 ``SUPPORT_RAD``."""
 
-NEAREST_M = 0.5
-"""Points nearer than this to a centre are the vehicle's, or the camera itself."""
-
 BASE_STEP = 4  # cells between nodes of the static surface, which is smooth
 HALO_RAD = math.radians(4.0)
 """Room around a window that its filters need."""
@@ -64,10 +55,6 @@ OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
 
 ROOM_CELLS = 5
 """Cells by which a window is wider than the rays that it must hold: nodes of plans lie on its border."""
-
-THIN_CELLS = 1, 5
-"""Most cells above and below, and to each side, that a thin thing's point takes: 5 bridge gaps of 1 degree. A tape that
-one scan line met would else take its surroundings, in ovals as high as the spacing of the lines."""
 
 _BLOCK = 1 << 16  # cells by which scratch grows
 
@@ -168,9 +155,9 @@ class Scratch(NamedTuple):
 class Panorama:
     """Depth by points within a window of the view from one centre, made dense over a static surface.
 
-    Nearest point first in each cell, none within ``NEAREST_M``; points that shine through gaps of what is nearer are
+    Nearest point first in each cell, none next to the centre; points that shine through gaps of what is nearer are
     dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart.
-    What one scan line alone met is drawn last (``THIN_CELLS``).
+    What one scan line alone met is drawn last.
 
     Attributes:
         window: The window.

@@ -23,17 +23,7 @@ from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
 from arbiview_aug.scene.boxes import BoxSurface
 from arbiview_aug.scene.depth_map import DepthMap, hidden_by
-from arbiview_aug.scene.panorama import (
-    CELL_RAD,
-    NEAREST_M,
-    OWN_CAR_M,
-    SIDE_RAD,
-    Cells,
-    Layer,
-    Panorama,
-    Scratch,
-    Window,
-)
+from arbiview_aug.scene.panorama import CELL_RAD, OWN_CAR_M, SIDE_RAD, Cells, Layer, Panorama, Scratch, Window
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
 
 NODES_RAD = 4 * CELL_RAD
@@ -243,7 +233,7 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
 
     They lie clearly before all points around them, as seen from ``origin`` near the sensor: something moved away.
     """
-    from arbiview_aug.scene.completion import elevations, find_visible
+    from arbiview_aug.scene.completion import NEAREST_M, elevations, find_visible
     from arbiview_aug.scene.panorama_kernels import cells_of
 
     rows, origin = np.ascontiguousarray(points[~own_car(points)].T, np.float32), origin.copy()

@@ -21,13 +21,11 @@ from arbiview_aug.scene.point_cloud import FINE, own_car
 from arbiview_aug.scene.surface import Points
 
 SIDE_SUPPORT_RAD = math.radians(0.3)
-"""A measured point supports rays this far aside of it, above and below at most ``SUPPORT_RAD``. 0.2 degrees lose 0.3 %
-of the recall on synthetic streets and 2 % on DDAD's next scan, and gain 0.1 % of precision on the former."""
+"""A measured point supports rays this far to its sides, and at most ``SUPPORT_RAD`` above and below."""
 
 SCANNED = FINE._replace(see_through=round(math.radians(1.0) / FINE.rad), side=1)
-"""Cells of scans. Another scanner mostly meets what one shows through gaps, too: with the see-through angle of
-images, 2 degrees, a scan misses an eighth of the static returns of DDAD's next one, and synthetic ones lose 1 to 2 %
-of their recall. 0.6 to 1.4 degrees are within 2 % of each other."""
+"""Cells of scans. Another scanner mostly meets what shows through gaps, so the see-through angle is half that of
+images."""
 
 _ROOM_DEG = 0.8  # panoramas are wider by 1 degree than what is asked
 
@@ -39,8 +37,8 @@ class Scan(NamedTuple):
 
     Attributes:
         points: (n, 3) float32, ego frame, metres.
-        nearest: (n,) numbers of the measured points whose surfaces they are of.
-        rings: (n,) beams, counted on from scanner to scanner.
+        nearest: (n,) numbers of the measured points on whose surfaces they lie.
+        rings: (n,) beams; those of a scanner follow the ones of the scanner before it.
         unsupported: Share of all rays that meet nothing measured; the sky's are among them.
     """
 
@@ -57,7 +55,7 @@ def scan(lidars: Sequence[Lidar], points: Points, ground_z_m: float, swept: int 
         lidars: The scanners, in the frame's ego frame.
         points: (P, 3) finite measured points; those within ``OWN_CAR_M`` are the own car's and are left out.
         ground_z_m: Height of the road.
-        swept: So many of the last points are of other frames. They fill rays that the frame's own do not support.
+        swept: Number of trailing points from other frames. They fill rays that the frame's own do not support.
 
     Raises:
         CalibrationError: A scanner on or under the road.
