@@ -96,17 +96,10 @@ def cells_of(rays: Any, R: Any, window: Any, rows: Any, columns: Any) -> None:
     """Rows and columns (ny, nx) in a panorama of a window of rays (3, ny, nx) turned by ``R`` (3, 3) float32."""
     work = np.empty((4, rays.shape[2]), np.float32)
     for y in range(rays.shape[1]):
-        _turned_row(R, rays[0, y], rays[1, y], rays[2, y], work[0], work[1], work[2])
+        for k in range(3):
+            for i in range(rays.shape[2]):
+                work[k, i] = R[k, 0] * rays[0, y, i] + R[k, 1] * rays[1, y, i] + R[k, 2] * rays[2, y, i]
         cells_row(work[0], work[1], work[2], window, work[3], rows[y], columns[y])
-
-
-@called
-def _turned_row(R: Any, x: Any, y: Any, z: Any, u: Any, v: Any, w: Any) -> None:
-    """Vectors (n,) turned by ``R`` (3, 3)."""
-    for k, out in enumerate((u, v, w)):
-        a, b, c = R[k, 0], R[k, 1], R[k, 2]
-        for i in range(out.shape[0]):
-            out[i] = a * x[i] + b * y[i] + c * z[i]
 
 
 @called

@@ -58,8 +58,6 @@ def test_points_are_those_of_single_pixels(camera: Camera) -> None:
     expected = np.concatenate([of.reshape(-1, 3) for of in every])
     assert set(pixels) == set(np.flatnonzero(np.isfinite(expected[:, 0])))
     np.testing.assert_allclose(points[3:], expected[pixels], atol=2e-4)
-    # Points that follow one another lie side by side.
-    assert np.median(np.linalg.norm(np.diff(points[3:], axis=0), axis=1)) < 2.0
 
 
 def test_pixels_of_the_own_car_and_of_objects_become_unknown() -> None:
@@ -82,6 +80,7 @@ def test_maps_are_checked_and_as_fine_as_a_panorama() -> None:
     assert np.allclose(points[:, 0], EYE[0] + 10) and len(points) == 320 * 131
     with pytest.raises(SampleError, match=r"depth_m: camera 'front': expected a map of \(192, 320\), got \(3, 4\)"):
         DepthMap.of(view, np.zeros((3, 4)))
+    assert DepthMap.of(SMALL, np.asfortranarray(np.ones(SMALL.size, np.float32))).depth_m.flags.c_contiguous
     large = view.resize((1000, 1600))
     mask = np.ones(large.size, bool)
     mask[:300] = False
@@ -138,11 +137,6 @@ def test_a_map_follows_the_other_map_of_its_camera() -> None:
     (from_large,) = anchored_maps([one], [(DepthMap(large, np.repeat(np.repeat(other.depth_m, 2, 0), 2, 1)),)])
     assert np.allclose(from_large.depth_m[known], other.depth_m[known], rtol=0.02)
     assert anchored_maps([one._replace(depth_m=np.zeros_like(one.depth_m))], []) == ()
-
-
-def test_kernels_read_maps_of_any_order() -> None:
-    of_columns = np.asfortranarray(np.ones(SMALL.size, np.float32))
-    assert DepthMap.of(SMALL, of_columns).depth_m.flags.c_contiguous
 
 
 def test_the_nearest_of_what_maps_know_is_joined() -> None:
