@@ -24,7 +24,7 @@ from arbiview_aug.render.plan import OBJECT, Paint
 from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import Frame
-from arbiview_aug.scene.boxes import PARTS, TOP_PART
+from arbiview_aug.scene.boxes import PARTS
 
 CELLS = 64  # cells along a view's shorter side; the pyramid starts with half as many
 
@@ -42,20 +42,6 @@ _STEP_PX = 4  # distance of the nodes at which views without a plan know the roa
 _WIDE = 2  # halvings of the columns alone: what is hidden looks like what is beside it, not above or below
 _SWEEPS = 2
 """Sweeps of smoothing at each size of the cells. Synthetic streets: 0 to 0.08 dB of whole views; 4 sweeps: +0.03."""
-
-_TOP_SHARE, _RIM_SHARE, _PAINT_SHARE = 0.9, 0.6, 0.8
-"""Quantiles nearest to the paint: of tops, which are seen at grazing angles; of their rims, below which windows begin;
-of windows and the paint around them, by their largest channel, from which on all is paint."""
-
-_SURE_SAMPLES, _SAME_HUE, _LEAST_HUE = 6, 0.06, 0.3
-"""Samples of a seen top that weigh as much as its paint; largest difference of their hues, as shares of the channels'
-sum; share of the paint's hue that reflected sky leaves at least. Others show what stands behind a top."""
-
-_LEAST_SAMPLES = 3
-"""Samples of a part that suffice for its colour."""
-
-_GAMMA = 2.2
-"""Exponent of displayed colours in linear light, as sRGB's on average."""
 
 Colour = npt.NDArray[np.float32]
 """(3,), or (n, 3) samples, in the images' unit."""
@@ -159,83 +145,17 @@ def mean_colour(views: Sequence[npt.NDArray[Any]], coverage: Sequence[npt.NDArra
 
 
 def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | None]) -> Colour:
-    """Colours (P, 3) of the parts of objects by their numbers in ``Paint``; -1 where unknown.
+    """Colours (P, 3) of the parts of objects by their numbers in ``Paint``; -1 where unknown."""
+    from arbiview_aug.inpaint.kernels import colour_objects
 
-    Sides take the median of what sources see of the body, or of the cabin. A body of which nothing is seen takes the
-    paint around the windows. Tops take their paint in the light that lies on the frame's seen tops, and what sources
-    see of them, the more the larger the part that they see.
-    """
     painted = [(view.reshape(3, -1), p) for view, p in zip(views, paint, strict=True) if p is not None]
     if not any(len(p.pixel) for _, p in painted):
         return np.zeros((0, 3), np.float32)
-    colour = np.concatenate([view[:, p.sample] for view, p in painted], 1).T.astype(np.float32)
+    samples = np.concatenate([view[:, p.sample] for view, p in painted], 1).T.astype(np.float32)
     part = np.concatenate([p.sample_part for _, p in painted])
-    ends = np.bincount(part, minlength=PARTS * (part.max(initial=0) // PARTS + 1)).cumsum().tolist()
-    colour = colour[np.argsort(part, kind="stable")]
-    samples = [colour[start:end] for start, end in zip([0, *ends], ends, strict=False)]  # np.split takes 3 ms
-    colours, of_tops = np.full((len(ends), 3), -1, np.float32), []
-    for first in range(0, len(ends), PARTS):
-        cabin, *sides, top, rim = samples[first : first + PARTS]
-        parts = (cabin, 0.5), (np.concatenate(sides), 0.5), (rim, _RIM_SHARE)
-        windows, body, edge = (_quantile(*part) if len(part[0]) >= _LEAST_SAMPLES else None for part in parts)
-        paint_of_top = _paint_of_top(windows, body, edge)
-        if body is None and windows is not None:
-            body = _brightest(cabin)
-        if body is not None:
-            colours[first], colours[first + 1 : first + TOP_PART] = body if windows is None else windows, body
-        seen = _quantile(top, _TOP_SHARE) if len(top) else None
-        known = [colour for colour in (paint_of_top, body, seen) if colour is not None]
-        if known:
-            of_known = known[0] if body is None else body, known[0] if seen is None else seen
-            of_tops.append((first + TOP_PART, len(top), known[0], *of_known))
-    if of_tops:
-        white = 255 if views[0].dtype == np.uint8 else 1
-        number, count, *of_all = (np.asarray(column) for column in zip(*of_tops, strict=True))
-        shades = np.float32(1 / white) * np.asarray(of_all, np.float32)
-        colours[number] = white * _top_colours(count / (count + _SURE_SAMPLES), *shades)
+    colours = np.empty((PARTS * (part.max(initial=0) // PARTS + 1), 3), np.float32)
+    colour_objects(samples, part, 255.0 if views[0].dtype == np.uint8 else 1.0, colours)
     return colours
-
-
-def _paint_of_top(windows: Colour | None, body: Colour | None, rim: Colour | None) -> Colour | None:
-    """Paint (3,) of a top: its body's, or its rim's where that is neither body, nor window, nor a mixture of both."""
-    if windows is None or body is None or rim is None:
-        return rim if body is None else body
-    across = body - windows
-    share = np.clip((rim - windows) @ across / max(across @ across, 1e-9), 0, 1)
-    return rim if np.linalg.norm(rim - windows - share * across) > np.linalg.norm(across) / 2 else body
-
-
-def _top_colours(sure: Colour, paint: Colour, body: Colour, seen: Colour) -> Colour:
-    """Colours (n, 3) of tops by their paint, their bodies and what is seen of them, which counts ``sure`` (n,) of 1.
-
-    The light on tops is a line from bodies to seen tops in linear light. Its slope is light over that on bodies, and
-    its offset is reflected sky. A black and a white top that are as bright as their bodies count as one seen top each.
-    """
-    of_paint, of_body = sure * _same_hue(paint, seen), sure * _same_hue(body, seen)
-    paint, body, seen = paint**_GAMMA, body**_GAMMA, seen**_GAMMA
-    weight = np.append(np.repeat(np.sqrt(of_body), 3), (1, 1))
-    slope, offset = np.polyfit(np.append(body, (0, 1)), np.append(seen, (0, 1)), 1, w=weight)
-    light = max(slope, 0) * paint + offset
-    light += of_paint[:, None] * (seen - light)
-    return np.asarray(np.clip(light, 0, 1) ** (1 / _GAMMA), np.float32)
-
-
-def _same_hue(paint: Colour, top: Colour) -> BoolArray:
-    """Whether tops (n, 3), shares of white, have the hue of their paint, perhaps paler by reflected sky."""
-    one, two = ((c + 1 / 50) / (c + 1 / 50).sum(1, keepdims=True) - 1 / 3 for c in (paint, top))
-    kept = np.clip((one * two).sum(1) / np.maximum((one * one).sum(1), 1e-9), _LEAST_HUE, 1)
-    return np.asarray(np.abs(two - kept[:, None] * one).sum(1) < _SAME_HUE)
-
-
-def _brightest(values: Colour) -> Colour:
-    """Colour (3,) of the brightest samples (n, 3): windows are darker than the paint around them."""
-    level = values.max(1)  # saturated paint has little luminance
-    return _quantile(values[level >= _quantile(level, _PAINT_SHARE)], 0.5)
-
-
-def _quantile(values: Colour, share: float) -> Colour:
-    """A quantile of samples (n, ...) along the first axis; numpy's own interpolates, and takes three times as long."""
-    return np.asarray(np.sort(values, 0)[int(share * len(values))])
 
 
 # --- one view ---------------------------------------------------------------------------------------------------------

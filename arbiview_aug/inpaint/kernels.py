@@ -7,10 +7,25 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.environment import called, compiled, inlined
+from arbiview_aug.scene.boxes import PARTS, RIM_PART, TOP_PART
 
 _ZERO, _ONE, _HALF, _QUARTER = np.float32(0), np.float32(1), np.float32(0.5), np.float32(0.25)
 _TINY = np.float32(1e-12)
 _LEAST_KNOWN = np.float32(0.25)  # a cell of less known area says nothing of its line
+
+_MEDIAN, _TOP_SHARE, _RIM_SHARE, _PAINT_SHARE = 0.5, 0.9, 0.6, 0.8
+"""Quantiles nearest to the paint: of sides; of tops, which are seen at grazing angles; of their rims, below which
+windows begin; of windows and the paint around them, by their largest channel, from which on all is paint."""
+
+_SURE_SAMPLES, _SAME_HUE, _LEAST_HUE = 6, 0.06, 0.3
+"""Samples of a seen top that weigh as much as its paint; largest difference of their hues, as shares of the channels'
+sum; share of the paint's hue that reflected sky leaves at least. Others show what is behind a top."""
+
+_LEAST_SAMPLES = 3
+"""Samples of a part that suffice for its colour."""
+
+_GAMMA = 2.2
+"""Exponent of displayed colours in linear light, as sRGB's on average."""
 
 
 @compiled
@@ -318,6 +333,121 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
                     view[c, y, x] = rows[c, i] + t * (rows[c, i + 1] - rows[c, i])
 
 
+@called
+def _quantile(samples: Any, share: float, colour: Any) -> bool:
+    """Write a quantile of each channel of samples (n, 3), not interpolated; False for too few of them."""
+    k = int(share * samples.shape[0])
+    for c in range(3 if samples.shape[0] else 0):
+        colour[c] = np.partition(samples[:, c].copy(), k)[k]
+    return samples.shape[0] >= _LEAST_SAMPLES
+
+
+@called
+def _brightest(samples: Any, colour: Any) -> bool:
+    """Write the median colour of the brightest samples (n, 3): windows are darker than the paint around them."""
+    level, k = np.empty(samples.shape[0], np.float32), int(_PAINT_SHARE * samples.shape[0])
+    for n in range(samples.shape[0]):
+        level[n] = max(samples[n, 0], samples[n, 1], samples[n, 2])  # saturated paint has little luminance
+    _quantile(samples[level >= np.partition(level, k)[k]], _MEDIAN, colour)
+    return True
+
+
+@called
+def _is_of_rim(windows: Any, body: Any, rim: Any) -> bool:
+    """Whether a top has its rim's paint, which is neither the body, nor the windows, nor a mixture of both."""
+    along = across = apart = 0.0
+    for c in range(3):
+        along += (rim[c] - windows[c]) * (body[c] - windows[c])
+        across += (body[c] - windows[c]) ** 2
+    share = min(max(along / max(across, 1e-9), 0.0), 1.0)
+    for c in range(3):
+        apart += (rim[c] - windows[c] - share * (body[c] - windows[c])) ** 2
+    return apart > across / 4
+
+
+@called
+def _same_hue(paint: Any, top: Any) -> bool:
+    """Whether a top (3,), shares of white, has the hue of its paint, perhaps paler by reflected sky."""
+    white = np.float64(1 / 50)
+    one, two = paint[0] + paint[1] + paint[2] + 3 * white, top[0] + top[1] + top[2] + 3 * white
+    along = across = apart = 0.0
+    for c in range(3):
+        along += ((paint[c] + white) / one - 1 / 3) * ((top[c] + white) / two - 1 / 3)
+        across += ((paint[c] + white) / one - 1 / 3) ** 2
+    kept = min(max(along / max(across, 1e-9), _LEAST_HUE), 1.0)
+    for c in range(3):
+        apart += abs((top[c] + white) / two - 1 / 3 - kept * ((paint[c] + white) / one - 1 / 3))
+    return apart < _SAME_HUE
+
+
+@compiled
+def colour_objects(sample: Any, part: Any, white: float, colours: Any) -> None:
+    """Find the colours of objects' parts by what sources see of them.
+
+    Sides take the median of what is seen of the body, or of the cabin. A body of which nothing is seen takes the paint
+    around the windows. Tops take their paint in the light that lies on the frame's seen tops, and what is seen of them,
+    the more the larger the part that is seen. That light is a line from bodies to seen tops in linear light: its slope
+    is light over that on bodies, and its offset is reflected sky. A black and a white top that are as bright as their
+    bodies count as one seen top each.
+
+    Args:
+        sample: (n, 3) float32 colours.
+        part: (n,) int32 part that each shows, as in ``plan.Paint``.
+        white: Largest value.
+        colours: (P, 3) float32, written, P a multiple of ``PARTS``; -1 where unknown.
+    """
+    ends = np.zeros(colours.shape[0] + 1, np.int64)
+    for k in range(part.shape[0]):
+        ends[part[k] + 1] += 1
+    ends[:] = np.cumsum(ends)
+    place, ordered = ends.copy(), np.empty_like(sample)
+    for k in range(part.shape[0]):
+        ordered[place[part[k]]] = sample[k]
+        place[part[k]] += 1
+    objects = colours.shape[0] // PARTS
+    tops, seen_share = np.empty((objects, 3, 3)), np.empty(objects)  # paint, body, seen top; in linear light
+    weight, x_sum, y_sum, xx, xy = 2.0, 1.0, 1.0, 1.0, 1.0  # sums over a black and a white top
+    colours[:] = -1
+    windows, body, rim, top = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for n in range(objects):
+        first = PARTS * n
+        cabin, above = ordered[ends[first] : ends[first + 1]], ordered[ends[first + TOP_PART] : ends[first + RIM_PART]]
+        has_windows = _quantile(cabin, _MEDIAN, windows)
+        has_body = _quantile(ordered[ends[first + 1] : ends[first + TOP_PART]], _MEDIAN, body)
+        has_rim = _quantile(ordered[ends[first + RIM_PART] : ends[first + PARTS]], _RIM_SHARE, rim)
+        _quantile(above, _TOP_SHARE, top)
+        is_rim = has_rim and (not has_body or (has_windows and _is_of_rim(windows, body, rim)))
+        if not has_body and has_windows:
+            has_body = _brightest(cabin, body)
+        if has_body:
+            colours[first] = windows if has_windows else body
+            colours[first + 1 : first + TOP_PART] = body
+        seen_share[n] = above.shape[0] / (above.shape[0] + _SURE_SAMPLES)
+        if not (is_rim or has_body or above.shape[0]):
+            seen_share[n] = -1
+            continue
+        paint = rim if is_rim else body if has_body else top
+        tops[n, 0], tops[n, 1], tops[n, 2] = paint, body if has_body else paint, top if above.shape[0] else paint
+        tops[n] /= white
+        of_body, of_paint = _same_hue(tops[n, 1], tops[n, 2]), _same_hue(tops[n, 0], tops[n, 2])
+        tops[n] **= _GAMMA
+        for c in range(3 if of_body else 0):
+            x, y = tops[n, 1, c], tops[n, 2, c]
+            weight += seen_share[n]
+            x_sum += seen_share[n] * x
+            y_sum += seen_share[n] * y
+            xx += seen_share[n] * x * x
+            xy += seen_share[n] * x * y
+        seen_share[n] *= of_paint
+    slope = (weight * xy - x_sum * y_sum) / (weight * xx - x_sum * x_sum)
+    offset = (y_sum - slope * x_sum) / weight
+    for n in range(objects):
+        for c in range(3 if seen_share[n] >= 0 else 0):
+            light = max(slope, 0.0) * tops[n, 0, c] + offset
+            light += seen_share[n] * (tops[n, 2, c] - light)
+            colours[PARTS * n + TOP_PART, c] = white * min(max(light, 0.0), 1.0) ** (1 / _GAMMA)
+
+
 @compiled
 def paint(pixel: Any, part: Any, nearest: Any, table: Any, seen: Any, reach: float, rounding: float, view: Any) -> None:
     """Paint the unseen pixels of objects in a view; without a colour of their part, not at all.
@@ -362,6 +492,7 @@ def warm_up() -> None:
     mark_cells(cells[0, 3], seen, chosen, seen, 1, chosen.copy())
     fields, reach = np.ones((2, 2, 2, 2), np.float32), np.ones((5, 2), np.float32)
     continue_lines(cells[0], cells[1], cells[1], chosen, fields, reach)
+    colour_objects(colours, pixel, 1.0, np.empty((PARTS, 3), np.float32))
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
         sum_cells(view, chosen, 1, cells[0])
         put_cells(cells[0], 1, chosen, 0.5, view)
