@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.environment import called, compiled, inlined
+from arbiview_aug.environment import borrowing, called, compiled, inlined
 from arbiview_aug.scene.boxes import PARTS, RIM_PART, TOP_PART
 
 _ZERO, _ONE, _HALF, _QUARTER = np.float32(0), np.float32(1), np.float32(0.5), np.float32(0.25)
@@ -333,26 +333,45 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
                     view[c, y, x] = rows[c, i] + t * (rows[c, i + 1] - rows[c, i])
 
 
-@called
-def _quantile(samples: Any, share: float, colour: Any) -> bool:
-    """Write a quantile of each channel of samples (n, 3), not interpolated; False for too few of them."""
-    k = int(share * samples.shape[0])
-    for c in range(3 if samples.shape[0] else 0):
-        colour[c] = np.partition(samples[:, c].copy(), k)[k]
-    return samples.shape[0] >= _LEAST_SAMPLES
+@borrowing
+def _select(values: Any, n: int, share: float) -> Any:
+    """A quantile of the first n values, not interpolated; they are reordered (Hoare's selection)."""
+    low, high, k = 0, n - 1, int(share * n)
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        low, high = (low, j) if k <= j else (i, high) if k >= i else (k, k)
+    return values[k]
 
 
-@called
-def _brightest(samples: Any, colour: Any) -> bool:
-    """Write the median colour of the brightest samples (n, 3): windows are darker than the paint around them."""
-    level, k = np.empty(samples.shape[0], np.float32), int(_PAINT_SHARE * samples.shape[0])
-    for n in range(samples.shape[0]):
-        level[n] = max(samples[n, 0], samples[n, 1], samples[n, 2])  # saturated paint has little luminance
-    _quantile(samples[level >= np.partition(level, k)[k]], _MEDIAN, colour)
-    return True
+@borrowing
+def _quantile(samples: Any, first: int, end: int, share: float, bright: float, values: Any, colour: Any) -> bool:
+    """Write a quantile of each channel of some samples (n, 3), or of the brightest ones; False for too few of them.
+
+    ``bright`` is the quantile of their largest channels from which on they count; ``values`` (n,) is scratch.
+    """
+    for k in range(first, end):
+        values[k - first] = max(samples[k, 0], samples[k, 1], samples[k, 2])  # saturated paint has little luminance
+    least = _select(values, end - first, bright) if bright > 0 else _ZERO
+    for c in range(3 if end > first else 0):
+        n = 0
+        for k in range(first, end):
+            if bright <= 0 or max(samples[k, 0], samples[k, 1], samples[k, 2]) >= least:
+                values[n] = samples[k, c]
+                n += 1
+        colour[c] = _select(values, n, share)
+    return end - first >= _LEAST_SAMPLES
 
 
-@called
+@borrowing
 def _is_of_rim(windows: Any, body: Any, rim: Any) -> bool:
     """Whether a top has its rim's paint, which is neither the body, nor the windows, nor a mixture of both."""
     along = across = apart = 0.0
@@ -365,7 +384,7 @@ def _is_of_rim(windows: Any, body: Any, rim: Any) -> bool:
     return apart > across / 4
 
 
-@called
+@borrowing
 def _same_hue(paint: Any, top: Any) -> bool:
     """Whether a top (3,), shares of white, has the hue of its paint, perhaps paler by reflected sky."""
     white = np.float64(1 / 50)
@@ -399,52 +418,54 @@ def colour_objects(sample: Any, part: Any, white: float, colours: Any) -> None:
     ends = np.zeros(colours.shape[0] + 1, np.int64)
     for k in range(part.shape[0]):
         ends[part[k] + 1] += 1
-    ends[:] = np.cumsum(ends)
-    place, ordered = ends.copy(), np.empty_like(sample)
+    for k in range(colours.shape[0]):
+        ends[k + 1] += ends[k]
+    place, ordered, values = ends.copy(), np.empty_like(sample), np.empty(part.shape[0], np.float32)
     for k in range(part.shape[0]):
-        ordered[place[part[k]]] = sample[k]
+        for c in range(3):
+            ordered[place[part[k]], c] = sample[k, c]
         place[part[k]] += 1
     objects = colours.shape[0] // PARTS
-    tops, seen_share = np.empty((objects, 3, 3)), np.empty(objects)  # paint, body, seen top; in linear light
-    weight, x_sum, y_sum, xx, xy = 2.0, 1.0, 1.0, 1.0, 1.0  # sums over a black and a white top
-    colours[:] = -1
+    tops, sure = np.empty((objects, 3, 3)), np.empty(objects)  # paint, body and seen top of each, linear
+    weight, x_sum, y_sum, xx, xy = 2.0, 1.0, 1.0, 1.0, 1.0  # of a black and a white top
     windows, body, rim, top = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for n in range(objects):
-        first = PARTS * n
-        cabin, above = ordered[ends[first] : ends[first + 1]], ordered[ends[first + TOP_PART] : ends[first + RIM_PART]]
-        has_windows = _quantile(cabin, _MEDIAN, windows)
-        has_body = _quantile(ordered[ends[first + 1] : ends[first + TOP_PART]], _MEDIAN, body)
-        has_rim = _quantile(ordered[ends[first + RIM_PART] : ends[first + PARTS]], _RIM_SHARE, rim)
-        _quantile(above, _TOP_SHARE, top)
-        is_rim = has_rim and (not has_body or (has_windows and _is_of_rim(windows, body, rim)))
-        if not has_body and has_windows:
-            has_body = _brightest(cabin, body)
-        if has_body:
-            colours[first] = windows if has_windows else body
-            colours[first + 1 : first + TOP_PART] = body
-        seen_share[n] = above.shape[0] / (above.shape[0] + _SURE_SAMPLES)
-        if not (is_rim or has_body or above.shape[0]):
-            seen_share[n] = -1
+        first, seen = PARTS * n, ends[PARTS * n + RIM_PART] - ends[PARTS * n + TOP_PART]
+        has_windows = _quantile(ordered, ends[first], ends[first + 1], _MEDIAN, 0, values, windows)
+        has_body = _quantile(ordered, ends[first + 1], ends[first + TOP_PART], _MEDIAN, 0, values, body)
+        _quantile(ordered, ends[first + TOP_PART], ends[first + RIM_PART], _TOP_SHARE, 0, values, top)
+        has_rim = _quantile(ordered, ends[first + RIM_PART], ends[first + PARTS], _RIM_SHARE, 0, values, rim)
+        has_rim = has_rim and (not has_body or (has_windows and _is_of_rim(windows, body, rim)))
+        if has_windows and not has_body:
+            has_body = _quantile(ordered, ends[first], ends[first + 1], _MEDIAN, _PAINT_SHARE, values, body)
+        sure[n] = seen / (seen + _SURE_SAMPLES) if seen or has_rim or has_body else -1
+        for c in range(3):
+            for k in range(TOP_PART):
+                colours[first + k, c] = (windows[c] if has_windows and not k else body[c]) if has_body else -1
+            paint = rim[c] if has_rim else body[c] if has_body else top[c]
+            tops[n, 0, c] = paint / white
+            tops[n, 1, c] = (body[c] if has_body else paint) / white
+            tops[n, 2, c] = (top[c] if seen else paint) / white
+            colours[first + TOP_PART, c] = colours[first + RIM_PART, c] = -1
+        if sure[n] < 0:
             continue
-        paint = rim if is_rim else body if has_body else top
-        tops[n, 0], tops[n, 1], tops[n, 2] = paint, body if has_body else paint, top if above.shape[0] else paint
-        tops[n] /= white
         of_body, of_paint = _same_hue(tops[n, 1], tops[n, 2]), _same_hue(tops[n, 0], tops[n, 2])
-        tops[n] **= _GAMMA
-        for c in range(3 if of_body else 0):
-            x, y = tops[n, 1, c], tops[n, 2, c]
-            weight += seen_share[n]
-            x_sum += seen_share[n] * x
-            y_sum += seen_share[n] * y
-            xx += seen_share[n] * x * x
-            xy += seen_share[n] * x * y
-        seen_share[n] *= of_paint
+        for c in range(3):
+            for k in range(3):
+                tops[n, k, c] = tops[n, k, c] ** _GAMMA
+            x, y, share = tops[n, 1, c], tops[n, 2, c], sure[n] if of_body else 0.0
+            weight += share
+            x_sum += share * x
+            y_sum += share * y
+            xx += share * x * x
+            xy += share * x * y
+        sure[n] *= of_paint
     slope = (weight * xy - x_sum * y_sum) / (weight * xx - x_sum * x_sum)
     offset = (y_sum - slope * x_sum) / weight
     for n in range(objects):
-        for c in range(3 if seen_share[n] >= 0 else 0):
+        for c in range(3 if sure[n] >= 0 else 0):
             light = max(slope, 0.0) * tops[n, 0, c] + offset
-            light += seen_share[n] * (tops[n, 2, c] - light)
+            light += sure[n] * (tops[n, 2, c] - light)
             colours[PARTS * n + TOP_PART, c] = white * min(max(light, 0.0), 1.0) ** (1 / _GAMMA)
 
 
