@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.environment import borrowing, called, compiled, inlined
+from arbiview_aug.environment import borrowing, compiled, inlined
 from arbiview_aug.scene.boxes import PARTS, RIM_PART, TOP_PART
 
 _ZERO, _ONE, _HALF, _QUARTER = np.float32(0), np.float32(1), np.float32(0.5), np.float32(0.25)
@@ -66,7 +66,7 @@ def sum_cells(view: Any, known: Any, cell: int, sums: Any) -> None:
                 out[i] *= per_pixel
 
 
-@called
+@borrowing
 def _halve(fine: Any, tall: int, weight: float, coarse: Any) -> None:
     """Add up cells (4, ny, nx) of a ``weight`` by ``tall`` (1 or 2) rows and 2 columns, at most to full cells."""
     ny, nx = fine.shape[1:]
@@ -87,7 +87,7 @@ def _halve(fine: Any, tall: int, weight: float, coarse: Any) -> None:
                     coarse[c, j, i] /= known
 
 
-@called
+@borrowing
 def _complete(coarse: Any, tall: int, fine: Any) -> None:
     """Complete what cells (4, ny, nx) do not know by coarser ones, complete themselves; see ``_halve``."""
     ny, nx = fine.shape[1:]
@@ -109,7 +109,7 @@ def _complete(coarse: Any, tall: int, fine: Any) -> None:
                 fine[c, j, i] += missing * (above + s * (below - above))
 
 
-@called
+@borrowing
 def _smooth(known: Any, sweeps: int, cells: Any) -> None:
     """Draw complete cells (4, ny, nx) towards the mean of their neighbours, as far as they are not ``known``.
 
@@ -220,15 +220,28 @@ def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: An
             outermost ones are the view's corners.
         reach: (5, F) float32 distance in cells at which a line weighs as much as the complete value, by kind.
     """
-    (ny, nx), families = kinds.shape, fields.shape[0]
+    (ny, nx), families, most = kinds.shape, fields.shape[0], 0
     number, first = np.zeros((ny, nx), np.int32), np.zeros((families, ny + 1), np.int64)
-    most = 0
     for j in range(ny):
         for i in range(nx):
             number[j, i] = most
             most += kinds[j, i] > 0
-    column, code, slope = np.empty(most, np.int32), np.empty(most, np.uint8), np.empty(most, np.float32)
+    lines = np.empty(most, np.int32), np.empty(most, np.uint8), np.empty(most, np.float32)
     met = np.zeros((2 * families, most, 4), np.float32)
+    _follow_lines(sums, around, kinds, fields, reach, number, first, *lines, met)
+    _mix_lines(sums, complete, kinds, reach, number, met, np.empty(3, np.float32))
+
+
+@borrowing
+def _follow_lines(
+    sums: Any, around: Any, kinds: Any, fields: Any, reach: Any, number: Any, first: Any, column: Any, code: Any,
+    slope: Any, met: Any,
+) -> None:  # fmt: skip
+    """Find what the lines of each cell meet first on both sides: ``met`` (2 F, n, 4), a colour and its distance.
+
+    ``number`` (ny, nx) are the cells' places in ``met``; ``first``, ``column``, ``code`` and ``slope`` are scratch.
+    """
+    (ny, nx), families = kinds.shape, fields.shape[0]
     wide, high = np.float32(fields.shape[3] - 1) / np.float32(nx), np.float32(fields.shape[2] - 1) / np.float32(ny)
     for f in range(families):
         across, down, runs = fields[f, 0], fields[f, 1], first[f]
@@ -279,7 +292,12 @@ def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: An
                         for c in range(4):
                             line[c] *= _ONE / total
                         line[3] += np.sqrt(_ONE + t * t)
-    mixed = np.empty(3, np.float32)
+
+
+@borrowing
+def _mix_lines(sums: Any, complete: Any, kinds: Any, reach: Any, number: Any, met: Any, mixed: Any) -> None:
+    """Mix what lines meet with the complete cells, where ``sums`` knows too little; ``mixed`` (3,) is scratch."""
+    ny, nx = kinds.shape
     for j in range(ny):
         for i in range(nx):
             known = sums[3, j, i]
@@ -293,7 +311,7 @@ def continue_lines(sums: Any, around: Any, complete: Any, kinds: Any, fields: An
             total = _ONE
             for c in range(3):
                 mixed[c] = _node(complete[c], yy, xx)
-            for k in range(2 * families if kinds[j, i] else 0):
+            for k in range(met.shape[0] if kinds[j, i] else 0):
                 line = met[k, number[j, i]]
                 if line[3] > _ZERO:
                     weight = reach[kinds[j, i], k // 2] / line[3]
