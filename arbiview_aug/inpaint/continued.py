@@ -67,7 +67,8 @@ class Continue(Inpainter):
         for frame in rendered:
             plans = frame.layers, frame.paint, frame.road, frame.rig
             images = fill_holes(frame.images, list(frame.coverage), *plans, only_mean=self.only_mean)
-            filled.append(replace(frame, images=images, generated=stacked([~seen for seen in frame.coverage])))
+            holes = [torch.from_numpy(~seen.numpy()) if seen.device.type == "cpu" else ~seen for seen in frame.coverage]
+            filled.append(replace(frame, images=images, generated=stacked(holes)))
         return filled
 
 
@@ -171,9 +172,11 @@ def _fill(
     from arbiview_aug.inpaint.kernels import complete_cells, continue_lines, mark_cells, put_cells, sum_cells
 
     cell = _cell_px(seen.shape)
-    known = seen & (layers < OBJECT)
     sums = np.empty((4, *(-(-n // cell) for n in seen.shape)), np.float32)
-    sum_cells(view, (known if known.any() else seen).view(np.uint8), cell, sums)
+    for below in (OBJECT, OBJECT + 1):  # objects are all that is seen of some views
+        sum_cells(view, seen, layers, below, cell, sums)
+        if sums[3].any():
+            break
     complete, around = (np.empty((4, *(-(-n // k) for n in sums.shape[1:])), np.float32) for k in (2, 4))
     complete_cells(sums, mean, _WIDE, _SWEEPS, complete, around)
     road = _road_below_horizon(camera, seen.shape) if road is None else road
@@ -181,7 +184,7 @@ def _fill(
     mark_cells(sums[3], seen, layers, road, cell, kinds)
     reach = REACH * np.float32(min(seen.shape) / cell)
     continue_lines(sums, around, complete, kinds, _line_directions(camera), reach)
-    put_cells(sums, cell, (~seen).view(np.uint8), 0.5 if view.dtype == np.uint8 else 0.0, view)
+    put_cells(sums, cell, seen, 0.5 if view.dtype == np.uint8 else 0.0, view)
 
 
 def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
@@ -190,9 +193,8 @@ def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
         return np.array([(0, 0), (0, 1)], np.float32)[..., None, None].repeat(2, 2).repeat(2, 3)
     if not camera.is_rectilinear:
         return _bent_directions(camera)
-    at = _places(camera.size, 2)
-    ends = (camera.K @ camera.cam2ego[:3:2, :3].T).T  # vanishing points, homogeneous
-    return np.array([[end[axis] - end[2] * at[..., axis] for axis in (0, 1)] for end in ends], np.float32)
+    ends = (camera.K @ camera.cam2ego[:3:2, :3].T).T[..., None, None]  # vanishing points, homogeneous
+    return np.asarray(ends[:, :2] - ends[:, 2:] * np.moveaxis(_places(camera.size, 2), -1, 0), np.float32)
 
 
 @lru_cache(32)  # of a rig, frame by frame: it takes a millisecond
@@ -203,6 +205,7 @@ def _bent_directions(camera: Camera) -> npt.NDArray[np.float32]:
     return np.nan_to_num(np.moveaxis(np.stack(moved), -1, 1) / _MOVE, posinf=0, neginf=0).astype(np.float32, "C")
 
 
+@lru_cache(32)
 def _places(size: tuple[int, int], n: int) -> npt.NDArray[np.float64]:
     """(n, n, 2) pixels from edge to edge of a view (h, w)."""
     h, w = size

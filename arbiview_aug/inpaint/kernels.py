@@ -29,32 +29,33 @@ _GAMMA = 2.2
 
 
 @compiled
-def sum_cells(view: Any, known: Any, cell: int, sums: Any) -> None:
+def sum_cells(view: Any, seen: Any, layers: Any, below: int, cell: int, sums: Any) -> None:
     """Mean over each cell of its known pixels' colours, the others counting as 0, and the known share.
 
     Args:
         view: (3, h, w), of any type.
-        known: (h, w) uint8, 1 where a pixel is known, else 0.
+        seen: (h, w) bool.
+        layers: (h, w) uint8; seen pixels of layers ``below`` this one are known.
+        below: First layer that is not known.
         cell: Side of a cell, pixels.
         sums: (4, ny, nx) float32, written.
     """
-    h, w = known.shape
-    ny, nx = sums.shape[1:]
-    row, per_pixel = np.empty(w, np.float32), _ONE / np.float32(cell * cell)
-    for c in range(4):
-        for j in range(ny):
+    (h, w), (ny, nx) = seen.shape, sums.shape[1:]
+    rows, known, per_pixel = np.empty((4, w), np.float32), np.empty(w, np.float32), _ONE / np.float32(cell * cell)
+    for j in range(ny):
+        rows[:] = _ZERO
+        for y in range(j * cell, min(j * cell + cell, h)):
+            mark, layer, row = seen[y], layers[y], rows[3]
             for x in range(w):
-                row[x] = _ZERO
-            for y in range(j * cell, min(j * cell + cell, h)):
-                mark = known[y]
-                if c < 3:
-                    plane = view[c, y]
-                    for x in range(w):
-                        row[x] += np.float32(plane[x]) * np.float32(mark[x])
-                else:
-                    for x in range(w):
-                        row[x] += np.float32(mark[x])
-            out, whole = sums[c, j], w // cell
+                known[x] = np.float32(mark[x] & (layer[x] < below))
+            for x in range(w):
+                row[x] += known[x]
+            for c in range(3):
+                row, plane = rows[c], view[c, y]
+                for x in range(w):
+                    row[x] += np.float32(plane[x]) * known[x]
+        for c in range(4):
+            out, row, whole = sums[c, j], rows[c], w // cell
             for i in range(nx):
                 out[i] = _ZERO
             for k in range(cell):
@@ -323,18 +324,18 @@ def _mix_lines(sums: Any, complete: Any, kinds: Any, reach: Any, number: Any, me
 
 
 @compiled
-def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) -> None:
-    """Interpolate cells (4, ny, nx) into the chosen pixels (h, w) uint8 of a view (3, h, w); add ``rounding``."""
-    (h, w), (ny, nx) = chosen.shape, cells.shape[1:]
+def put_cells(cells: Any, cell: int, seen: Any, rounding: float, view: Any) -> None:
+    """Interpolate cells (4, ny, nx) into the pixels of a view (3, h, w) that are not seen (h, w); add ``rounding``."""
+    (h, w), (ny, nx) = seen.shape, cells.shape[1:]
     rows, left, share = np.empty((3, nx + 1), np.float32), np.empty(w, np.int32), np.empty(w, np.float32)
     for x in range(w):
         at = min(max((np.float32(x) + _HALF) / np.float32(cell) - _HALF, _ZERO), np.float32(nx - 1))
         left[x], share[x] = np.int32(at), at - np.float32(np.int32(at))
     for y in range(h):
-        any_chosen = np.uint8(0)
+        all_seen = True
         for x in range(w):
-            any_chosen |= chosen[y, x]
-        if not any_chosen:
+            all_seen &= seen[y, x]
+        if all_seen:
             continue
         at = min(max((np.float32(y) + _HALF) / np.float32(cell) - _HALF, _ZERO), np.float32(ny - 1))
         j0 = int(at)
@@ -345,7 +346,7 @@ def put_cells(cells: Any, cell: int, chosen: Any, rounding: float, view: Any) ->
                 row[i] = above[i] + s * (below[i] - above[i]) + np.float32(rounding)
             row[nx] = row[nx - 1]
         for x in range(w):
-            if chosen[y, x]:
+            if not seen[y, x]:
                 i, t = left[x], share[x]
                 for c in range(3):
                     view[c, y, x] = rows[c, i] + t * (rows[c, i + 1] - rows[c, i])
@@ -526,13 +527,13 @@ def paint(pixel: Any, part: Any, nearest: Any, table: Any, seen: Any, reach: flo
 def warm_up() -> None:
     """Compile these kernels, or load them from numba's cache."""
     cells, pixel, colours = np.ones((3, 4, 2, 2), np.float32), np.zeros(1, np.int32), np.ones((1, 3), np.float32)
-    chosen, seen = np.zeros((2, 2), np.uint8), np.zeros((2, 2), bool)
+    layers, seen = np.zeros((2, 2), np.uint8), np.zeros((2, 2), bool)
     complete_cells(cells[0], colours[0], 1, 1, cells[1, :, :1, :1].copy(), cells[2, :, :1, :1].copy())
-    mark_cells(cells[0, 3], seen, chosen, seen, 1, chosen.copy())
+    mark_cells(cells[0, 3], seen, layers, seen, 1, layers.copy())
     fields, reach = np.ones((2, 2, 2, 2), np.float32), np.ones((5, 2), np.float32)
-    continue_lines(cells[0], cells[1], cells[1], chosen, fields, reach)
+    continue_lines(cells[0], cells[1], cells[1], layers, fields, reach)
     colour_objects(colours, pixel, 1.0, np.empty((PARTS, 3), np.float32))
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
-        sum_cells(view, chosen, 1, cells[0])
-        put_cells(cells[0], 1, chosen, 0.5, view)
+        sum_cells(view, seen, layers, 2, 1, cells[0])
+        put_cells(cells[0], 1, seen, 0.5, view)
         paint(pixel, pixel, np.zeros((4, 1), np.int32), colours, seen, 1.0, 0.5, view.reshape(3, 4))
