@@ -22,7 +22,6 @@ from arbiview_aug.inpaint.inpainter import Inpainter, Tensors
 from arbiview_aug.inpaint.telea import GREY
 from arbiview_aug.render.plan import OBJECT, Paint
 from arbiview_aug.render.rendered import RenderedFrame
-from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import Frame
 from arbiview_aug.scene.boxes import PARTS
 
@@ -67,8 +66,9 @@ class Continue(Inpainter):
         for frame in rendered:
             plans = frame.layers, frame.paint, frame.road, frame.rig
             images = fill_holes(frame.images, list(frame.coverage), *plans, only_mean=self.only_mean)
-            holes = [torch.from_numpy(~seen.numpy()) if seen.device.type == "cpu" else ~seen for seen in frame.coverage]
-            filled.append(replace(frame, images=images, generated=stacked(holes)))
+            seen = frame.coverage
+            holes = ~seen if isinstance(seen, torch.Tensor) else [~of_view for of_view in seen]
+            filled.append(replace(frame, images=images, generated=holes))
         return filled
 
 

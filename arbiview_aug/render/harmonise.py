@@ -36,7 +36,7 @@ from arbiview_aug.cameras.rays import (
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError, shown
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.plan import SEAM_ROWS, RenderPlan
+from arbiview_aug.render.plan import SEAM_ROWS, RenderPlan, SharedPixels
 from arbiview_aug.scene.surface import Street
 
 _STEP_PX = 4  # every fourth pixel of each fourth row is read: medians need no more
@@ -114,51 +114,43 @@ class PhotometricReport:
 class Overlaps(NamedTuple):
     """All overlaps of a rig: results must not depend on the order of its cameras, which are in content order here."""
 
-    order: tuple[int, ...]  # index of each camera in the rig
+    order: list[int]  # index of each camera in the rig
     pairs: npt.NDArray[np.int64]  # (2, P) adjacent cameras that share enough pixels
-    at: npt.NDArray[np.int64]  # (K, 2) rows and columns that are read
-    runs: npt.NDArray[np.int64]  # (N, 3) first reading, end and number of each camera
-    fitted: npt.NDArray[np.int64]  # (2, P, L) each pair's two readings of the pixels to fit; padded by K
-    held_out: npt.NDArray[np.int64]  # the same of those held out
+    shared: SharedPixels  # each pair's pixels to fit, then each pair's held out
 
 
 def find_overlaps(rig: Rig) -> Overlaps:
     """Find the pixels that adjacent cameras share over the street surface, without own-car masks."""
-    order = tuple(content_order(rig.cameras))
+    order = content_order(rig.cameras)
     rig = rig.with_cameras([rig[k] for k in order])
     lattice, held_out = _lattice()
-    surface = Street(ground_z_m=rig.ground_z_m)
-    pairs, shared = [], []
+    surface, pairs, kinds = Street(ground_z_m=rig.ground_z_m), [], ([], [])
     for pair in adjacent_pairs(rig):
         view = half_way_view(rig[pair[0]], rig[pair[1]], HALF_VIEW_SIZE)
         rays, valid = ego_rays(view, lattice)
-        q = surface.inverse_distance(view.center_m, rays)
-        both, reads = np.flatnonzero(valid), list[npt.NDArray[np.int64]]()
-        for camera in (rig[k] for k in pair):
+        q, both = surface.inverse_distance(view.center_m, rays), np.flatnonzero(valid)
+        at = np.empty((2, 2, len(q)), np.int64)
+        for camera, (rows, columns) in zip((rig[k] for k in pair), at, strict=True):
             uv, seen = project_rays(camera, rays[both], q[both], view.center_m - camera.center_m)
-            at = np.where(seen, uv.T[::-1], 0).round().astype(np.int64).T
-            last = np.array(camera.size) - 1
-            seen &= ((at > 0) & (at < last)).all(1)
+            column, row = np.where(seen, uv.T, 0).round().astype(np.int64)
+            h, w = camera.size
+            seen &= (row > 0) & (row < h - 1) & (column > 0) & (column < w - 1)
+            both, row, column = both[seen], row[seen], column[seen]
             if camera.mask is not None:
-                seen &= camera.mask[tuple(at.clip(0, last).T)]
-            both, reads = both[seen], [one[seen] for one in (*reads, at)]
-        kinds = ~held_out[both], held_out[both]
-        if _STEP_PX**2 * min(kind.sum() for kind in kinds) >= MIN_PIXELS:
+                clear = camera.mask[row, column]
+                both, row, column = both[clear], row[clear], column[clear]
+            rows[both], columns[both] = row, column
+        chosen = [both[held_out[both] == is_held] for is_held in (False, True)]
+        if _STEP_PX**2 * min(map(len, chosen)) >= MIN_PIXELS:
             pairs.append(pair)
-            shared.append([[at[kind] for kind in kinds] for at in reads])
-    longest = max((len(at) for of_pair in shared for at in of_pair[0]), default=0)
-    count = sum(len(at) for of_pair in shared for of_camera in of_pair for at in of_camera)
-    numbers, pixels, runs = np.full((2, 2, len(pairs), longest), count), np.empty((count, 2), np.int64), []
-    end = 0
-    for k in range(len(rig)):
-        runs.append((end, end, k))
-        for p, side, kind in np.ndindex(len(pairs), 2, 2):
-            if pairs[p][side] == k:
-                first, end = end, end + len(shared[p][side][kind])
-                numbers[kind, side, p, : end - first] = np.arange(first, end)
-                pixels[first:end] = shared[p][side][kind]
-        runs[k] = (runs[k][0], end, k)
-    return Overlaps(order, np.array(pairs, np.int64).reshape(-1, 2).T, pixels, np.array(runs), *numbers)
+            for kind, places in zip(kinds, chosen, strict=True):
+                kind.append(at[:, :, places])
+    groups = [*kinds[0], *kinds[1]]
+    ends = np.cumsum([0, *(group.shape[2] for group in groups)])
+    paired = np.array(pairs, np.int64).reshape(-1, 2).T
+    source = np.array(order)[np.hstack([paired, paired])].repeat(np.diff(ends), 1)
+    at = np.concatenate([np.empty((2, 2, 0), np.int64), *groups], 2).transpose(0, 2, 1).copy()
+    return Overlaps(order, paired, SharedPixels(source, at, ends))
 
 
 @cache
@@ -180,8 +172,9 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
     none = (1.0,) * len(rig)
     if not overlaps.pairs.size:
         return PhotometricReport(none, False, "no two cameras overlap enough")
-    pixels = _read([images[k] for k in overlaps.order], overlaps.at, overlaps.runs)
-    ratios = pair_ratios(pixels, overlaps.fitted, DARK, BRIGHT)
+    shared, count = overlaps.shared, overlaps.pairs.shape[1]
+    pixels, fitted, held_out = _read(images, shared), shared.ends[: count + 1], shared.ends[count:]
+    ratios = _log_ratios(pixels, fitted)
     enough = _STEP_PX**2 * ratios[:, 0] >= MIN_PIXELS
     if not enough.any():
         return PhotometricReport(none, False, "too few pixels in the overlaps are neither dark nor saturated")
@@ -193,40 +186,41 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
     if np.abs(log_gains).max() < _MIN_LOG_GAIN:
         return PhotometricReport(none, False, "the cameras agree already")
     gains = np.exp(log_gains)
-    before = _held_out_db(pixels, overlaps)
-    tone(pixels.reshape(-1), overlaps.runs, tone_curves(gains).astype(np.float32), *SHARES)
-    after = _held_out_db(pixels, overlaps)
+    before = _overlap_db(pixels, held_out)
+    runs = np.empty((2, 2 * count, 3), np.int64)
+    for k in range(2):
+        runs[..., k] = shared.ends[k : 2 * count + k] + np.array([[0], [pixels.shape[1]]])
+    runs[..., 2] = np.tile(overlaps.pairs, 2)
+    tone(pixels.reshape(-1), runs.reshape(-1, 3), tone_curves(gains).astype(np.float32), *SHARES)
+    after = _overlap_db(pixels, held_out)
     reason = f"overlap {before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < MIN_RISE_DB:
         return PhotometricReport(none, False, f"gains would not help, {reason}")
     return PhotometricReport(tuple(gains[np.argsort(overlaps.order)].tolist()), True, reason)
 
 
-def _read(images: Sequence[torch.Tensor], at: npt.NDArray[np.int64], runs: npt.NDArray[np.int64]) -> _Pixels:
-    """Readings (K, 3) of images (3, H, W), float32 in [0, 1]; arguments as in ``Overlaps``."""
+def _read(images: Sequence[torch.Tensor], shared: SharedPixels) -> _Pixels:
+    """Readings (2, n, 3) of images (3, H, W), float32 in [0, 1]."""
     from arbiview_aug.render.photometry_kernels import read_pixels
 
     dtype, scale = (torch.uint8, 1 / 255) if images[0].dtype == torch.uint8 else (torch.float32, 1.0)
-    pixels = np.empty((len(at), 3), np.float32)
-    for image, (first, end, _) in zip(images, runs.tolist(), strict=True):
-        places, image = at[first:end], image.detach()
+    pixels = np.empty((*shared.source.shape, 3), np.float32)
+    for k, image in enumerate(image.detach() for image in images):
         if image.device.type == "cpu":
-            read_pixels(image.to(dtype).numpy(), places, np.float32(scale), pixels[first:end])
+            read_pixels(image.to(dtype).numpy(), k, shared.source, shared.at, np.float32(scale), pixels)
         else:
-            rows, columns = torch.from_numpy(places).to(image.device).unbind(1)
-            pixels[first:end] = (image[:, rows, columns].T.float() * scale).nan_to_num(0, 0, 0).cpu()
+            read = shared.source == k
+            rows, columns = torch.from_numpy(shared.at[read]).to(image.device).unbind(1)
+            pixels[read] = (image[:, rows, columns].T.float() * scale).nan_to_num(0, 0, 0).cpu()
     return pixels
 
 
-def pair_ratios(pixels: _Pixels, reads: npt.NDArray[np.int64], dark: float, bright: float) -> npt.NDArray[np.float64]:
-    """Number (P, 3) of each pair's pixels that count, and the median and spread of their log-ratios.
-
-    Arguments are as in ``photometry_kernels.log_ratios``.
-    """
+def _log_ratios(pixels: _Pixels, ends: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """Number (G, 3) of each group's pixels that count, and the median and spread of their log-ratios."""
     from arbiview_aug.render.photometry_kernels import log_ratios
 
-    measured = np.zeros((reads.shape[1], 3))
-    log_ratios(pixels, reads, dark, bright, measured)
+    measured = np.empty((len(ends) - 1, 3))
+    log_ratios(pixels, ends, DARK, BRIGHT, measured)
     return measured
 
 
@@ -249,12 +243,12 @@ def _solve(
     return log_gains
 
 
-def _held_out_db(pixels: _Pixels, overlaps: Overlaps) -> float:
-    """PSNR in dB between the two readings of held-out pixels, mean over pairs."""
+def _overlap_db(pixels: _Pixels, ends: npt.NDArray[np.int64]) -> float:
+    """PSNR in dB between both readings of each group's pixels, mean over groups."""
     from arbiview_aug.render.photometry_kernels import pair_errors
 
-    errors = np.empty(overlaps.held_out.shape[1])
-    pair_errors(pixels, overlaps.held_out, errors)
+    errors = np.empty(len(ends) - 1)
+    pair_errors(pixels, ends, errors)
     return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-10))))
 
 
@@ -280,8 +274,7 @@ def match_seams(
         (M, N, ``SEAM_ROWS``); those of a view's main source are as given.
     """
     samples = plan.seam_samples
-    pixels = _read(images, samples.at, samples.runs)
-    number, ratio, spread = pair_ratios(pixels, samples.reads, DARK, BRIGHT).T
+    number, ratio, spread = _log_ratios(_read(images, samples.shared), samples.shared.ends).T
     # Neighbouring pixels err together: four count once.
     noise = 4 * spread**2 / np.maximum(number, 1) / _PAIR_LOG_ERROR**2
     weight = (number >= _MIN_SEAM_PIXELS) / (1 + noise)

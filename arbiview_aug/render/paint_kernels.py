@@ -155,9 +155,9 @@ def list_parts(face: Any, columns: Any, part: Any, winner: Any, step: int, table
     for y in range(h):
         starts[y], first, last = hidden, columns[y, 0], columns[y, 1]
         row, who, is_sampled = face[y], winner[y], y % step == 0 and min(y, h - 1 - y) >= margin
-        for x in range(1, w):  # the first pixels of faces, too, to learn the objects' rows
-            looked[x] = np.uint8((row[x] >= 0) & ((who[x] < 0) | (row[x] != row[x - 1])))
-        looked[0] = np.uint8(row[0] >= 0)
+        looked[0], after, here, unseen = 1, looked[1:], row[1:], who[1:]
+        for x in range(w - 1):  # the first pixels of faces, too, to learn the objects' rows
+            after[x] = np.uint8((here[x] >= 0) & ((unseen[x] < 0) | (here[x] != row[x])))
         for x in range(w if is_sampled else 0):
             looked[x] |= lattice[x]
         for x in range(first, last):

@@ -12,56 +12,133 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 
 
 @compiled
-def read_pixels(image: Any, at: Any, scale: Any, pixels: Any) -> None:
-    """Read an image (3, h, w) at (n, 2) rows and columns, times a scale, into (n, 3) float32; no number is 0."""
-    for k in range(len(at)):
-        for c in range(3):
-            value = np.float32(image[c, at[k, 0], at[k, 1]]) * scale
-            pixels[k, c] = value if np.isfinite(value) else _ZERO
+def read_pixels(image: Any, camera: int, source: Any, at: Any, scale: Any, pixels: Any) -> None:
+    """Read one camera's pixels, times a scale; what is no number is 0.
+
+    Args:
+        image: (3, h, w), the camera's.
+        camera: Its number.
+        source: (2, n) camera of each pixel.
+        at: (2, n, 2) row and column of each.
+        scale: Float32.
+        pixels: (2, n, 3) float32, written where ``source`` is this camera.
+    """
+    for side in range(2):
+        for k in range(source.shape[1]):
+            for c in range(3 if source[side, k] == camera else 0):
+                value = np.float32(image[c, at[side, k, 0], at[side, k, 1]]) * scale
+                pixels[side, k, c] = value if np.isfinite(value) else _ZERO
 
 
 @compiled
-def log_ratios(pixels: Any, reads: Any, dark: float, bright: float, measured: Any) -> None:
-    """Log-ratios between the two readings of each pair's pixels, where they count.
+def log_ratios(pixels: Any, ends: Any, dark: float, bright: float, measured: Any) -> None:
+    """Log-ratios between both readings of each group's pixels, where they count.
 
     Args:
-        pixels: (K, 3) float32 readings.
-        reads: (2, P, L) two readings of each pixel; K after a pair's last one.
+        pixels: (2, n, 3) float32 readings.
+        ends: (G + 1,) first pixel of each group, and the last one's end.
         dark: Pixels count above this mean value,
         bright: and below this value in every channel.
-        measured: (P, 3) float64, written where pixels count: their number, and the median and spread of their
-            log-ratios.
+        measured: (G, 3) float64, written: the number of pixels that count, and the median and spread of their
+            log-ratios; 0 without any.
     """
-    ratios = np.empty(reads.shape[2])
-    for p in range(reads.shape[1]):
+    ratios = np.empty(pixels.shape[1])
+    for g in range(len(ends) - 1):
         n = 0
-        for j in range(reads.shape[2]):
-            if reads[0, p, j] == len(pixels):
-                break
-            one, two = pixels[reads[0, p, j]], pixels[reads[1, p, j]]
+        for k in range(ends[g], ends[g + 1]):
+            one, two = pixels[0, k], pixels[1, k]
             light, other = one[0] + one[1] + one[2], two[0] + two[1] + two[2]
             most = max(one[0], one[1], one[2], two[0], two[1], two[2])
             if min(light, other) > 3 * dark and most < bright:
                 ratios[n] = np.log(np.float64(light) / np.float64(other))
                 n += 1
+        measured[g] = 0
         if n:
             middle = np.median(ratios[:n])
-            measured[p, 0], measured[p, 1] = n, middle
-            measured[p, 2] = 1.4826 * np.median(np.abs(ratios[:n] - middle))
+            measured[g, 0], measured[g, 1] = n, middle
+            measured[g, 2] = 1.4826 * np.median(np.abs(ratios[:n] - middle))
 
 
 @compiled
-def pair_errors(pixels: Any, reads: Any, errors: Any) -> None:
-    """Mean squared difference (P,) between the two readings of each pair's pixels; arguments as in ``log_ratios``."""
-    for p in range(reads.shape[1]):
-        total, n = 0.0, 0
-        for j in range(reads.shape[2]):
-            if reads[0, p, j] == len(pixels):
-                break
+def pair_errors(pixels: Any, ends: Any, errors: Any) -> None:
+    """Mean squared difference (G,) between both readings of each group's pixels; arguments as in ``log_ratios``."""
+    for g in range(len(ends) - 1):
+        total = 0.0
+        for k in range(ends[g], ends[g + 1]):
             for c in range(3):
-                total += np.float64(pixels[reads[0, p, j], c] - pixels[reads[1, p, j], c]) ** 2
-            n += 3
-        errors[p] = total / n
+                total += np.float64(pixels[0, k, c] - pixels[1, k, c]) ** 2
+        errors[g] = total / (3 * (ends[g + 1] - ends[g]))
+
+
+@compiled
+def sample_band(
+    weight: Any, y0: int, x0: int, step: int, xy: Any, band_xy: Any, slots: Any, rank: Any, parts: Any, groups: Any,
+    source: Any, at: Any, count: int,
+) -> int:  # fmt: skip
+    """Sample the pixels of a blended band that two sources show; return the new number of samples.
+
+    Args:
+        weight: (h, w) share of the band's source, which counts where it is not 0.
+        y0: Row of the band in the view,
+        x0: and its column.
+        step: Distance of samples, pixels.
+        xy: (H, W, 2) positions of the view's pixels in the atlas.
+        band_xy: (h, w, 2) positions of the band's pixels in its source.
+        slots: (S, 6) x, y, width, height, source and halvings of the sources in the atlas.
+        rank: (N,) place of each source among those of the view, those that win more pixels first.
+        parts: (H,) part of the view's height of each row.
+        groups: (n, 4) rank and number of the worse source, number of the better one, and part of the height; written.
+        source: (2, n) the better and the worse source, written like ``at`` from ``count`` on.
+        at: (2, n, 2) row and column in each.
+        count: Samples written so far.
+    """
+    for y in range(0, weight.shape[0], step):
+        for x in range(0, weight.shape[1], step):
+            if weight[y, x] == _ZERO:
+                continue
+            for side in range(2):
+                place = band_xy[y, x] if side else xy[y + y0, x + x0]
+                source[side, count] = -1
+                for s in range(slots.shape[0]):
+                    column, row = place[0] - slots[s, 0], place[1] - slots[s, 1]
+                    if 0 <= column < slots[s, 2] and 0 <= row < slots[s, 3]:
+                        source[side, count], level = slots[s, 4], slots[s, 5]
+                        at[side, count, 0] = (row << level) + (1 << level) // 2
+                        at[side, count, 1] = (column << level) + (1 << level) // 2
+            one, two = source[0, count], source[1, count]
+            if one < 0 or two < 0:
+                continue
+            if rank[two] < rank[one]:
+                source[0, count], source[1, count] = two, one
+                for k in range(2):
+                    at[0, count, k], at[1, count, k] = at[1, count, k], at[0, count, k]
+            other = source[1, count]
+            groups[count, 0], groups[count, 1] = rank[other], other
+            groups[count, 2], groups[count, 3] = source[0, count], parts[y + y0]
+            count += 1
+    return count
+
+
+@compiled
+def list_runs(winner: Any, runs: Any) -> int:
+    """List the runs of pixels of one source in a row of (h, w) int8 winners; return their number.
+
+    ``runs`` (h w, 3) are written: first pixel in the flattened view, end, and source · h + row.
+    """
+    (h, w), count = winner.shape, 0
+    for y in range(h):
+        row, start = winner[y], 0
+        for x0 in range(1, w + 1, 64):
+            here, before, changes = row[x0 : x0 + 64], row[x0 - 1 : min(x0 + 63, w - 1)], False
+            for x in range(len(before)):
+                changes |= here[x] != before[x]
+            for x in range(x0 if changes else max(w, x0), min(x0 + 64, w + 1)):
+                if x == w or row[x] != row[start]:
+                    if row[start] >= 0:
+                        runs[count, 0], runs[count, 1], runs[count, 2] = y * w + start, y * w + x, row[start] * h + y
+                        count += 1
+                    start = x
+    return count
 
 
 @compiled
@@ -109,11 +186,15 @@ def blend(first: Any, second: Any, weight: Any, rounding: Any) -> None:
 
 def warm_up() -> None:
     """Compile these kernels, or load them from numba's cache."""
-    reads, pixels, curve = np.zeros((2, 1, 1), np.int64), np.ones((1, 3), np.float32), np.ones((1, 2), np.float32)
-    log_ratios(pixels, reads, 0.0, 2.0, np.empty((1, 3)))
-    pair_errors(pixels, reads, np.empty(1))
+    source, at, ends = np.zeros((2, 1), np.int64), np.zeros((2, 1, 2), np.int64), np.array([0, 1])
+    pixels, curve, slots = np.ones((2, 1, 3), np.float32), np.ones((1, 2), np.float32), np.array([[0, 0, 1, 1, 0, 0]])
+    xy, weight = np.zeros((1, 1, 2), np.int16), np.ones((1, 1), np.float32)
+    log_ratios(pixels, ends, 0.0, 2.0, np.empty((1, 3)))
+    pair_errors(pixels, ends, np.empty(1))
+    sample_band(weight, 0, 0, 1, xy, xy, slots, ends, ends, np.zeros((1, 4), np.int64), source, at, 0)
+    list_runs(np.zeros((1, 1), np.int8), at[0].repeat(3, 1)[:, :3].copy())
     for planes in (np.zeros((3, 1, 1), np.uint8), np.zeros((3, 1, 1), np.float32)):
         for image in (planes, planes.transpose(0, 2, 1)):  # channels first, and last
-            read_pixels(image, reads[:, :, 0].T.copy(), _ONE, pixels)
+            read_pixels(image, 0, source, at, _ONE, pixels)
         tone(planes.reshape(-1), np.zeros((1, 3), np.int64), curve, _ONE, _ZERO)
-        blend(planes.reshape(1, 3), planes.reshape(1, 3), pixels[:, :1], _ZERO)
+        blend(planes.reshape(1, 3), planes.reshape(1, 3), weight, _ZERO)

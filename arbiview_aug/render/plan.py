@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -178,16 +178,6 @@ class AtlasLayout:
             )
         return layout
 
-    def source_pixels(self, xy: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-        """(n, 3) source, row and column in its image of atlas pixels (n, 2); -1 outside the images."""
-        pixels = np.full((len(xy), 3), -1)
-        for slot in self.slots:
-            local = xy[:, ::-1] - np.array([slot.y, slot.x])
-            inside = ((local >= 0) & (local < slot.size)).all(1)
-            pixels[inside, 0] = slot.source
-            pixels[inside, 1:] = (local[inside] << slot.level) + (1 << slot.level) // 2
-        return pixels
-
     def slot(self, source: int, level: int) -> Slot:
         """The place of one source at one level."""
         return next(s for s in self.slots if (s.source, s.level) == (source, level))
@@ -289,11 +279,10 @@ class ViewPlan:
     @cached_property
     def runs(self) -> npt.NDArray[np.int64]:
         """(n, 3) runs of pixels of one source in a row of h: first one in the flattened view, end, source · h + row."""
-        winner = self.source_camera
-        start = np.flatnonzero(np.diff(winner, prepend=np.int8(-2)) != 0)  # of int8 it takes ten times as long
-        source, row = winner.ravel()[start].astype(np.int64), start // winner.shape[1]
-        runs = np.stack([start, np.append(start[1:], winner.size), source * len(winner) + row], 1)
-        return runs[runs[:, 2] >= 0]
+        from arbiview_aug.render.photometry_kernels import list_runs
+
+        runs = np.empty((self.source_camera.size, 3), np.int64)
+        return runs[: list_runs(self.source_camera, runs)].copy()
 
     @cached_property
     def band_runs(self) -> list[npt.NDArray[np.int64]]:
@@ -319,16 +308,21 @@ SEAM_ROWS = 16
 _SEAM_SAMPLES = 90  # along a view's width
 
 
-@dataclass(frozen=True)
-class SeamSamples:
-    """A sample of pixels that two sources of a view show, in G groups: those of two sources in a part of the height.
+class SharedPixels(NamedTuple):
+    """Pixels that two source cameras show, in G groups."""
 
-    The better source wins more of the view. A seam is all groups of another source of the view.
+    source: npt.NDArray[np.int64]  # (2, n) both cameras
+    at: npt.NDArray[np.int64]  # (2, n, 2) row and column in each
+    ends: npt.NDArray[np.int64]  # (G + 1,) first pixel of each group, and the last one's end
+
+
+class SeamSamples(NamedTuple):
+    """A sample of the pixels that two sources of a view show, in groups by sources and part of the view's height.
+
+    The better source, which comes first, wins more of the view. A seam is all groups of another source of the view.
     """
 
-    at: npt.NDArray[np.int64]  # (K, 2) rows and columns in source images
-    runs: npt.NDArray[np.int64]  # (N, 3) first of these, end and source
-    reads: npt.NDArray[np.int64]  # (2, G, L) which of these the better and the other source show; padded by K
+    shared: SharedPixels
     better: npt.NDArray[np.int64]  # (G,) the better source
     part: npt.NDArray[np.int64]  # (G,) part of the height
     seams: list[list[int]]  # view, other source, first group and end; sources that win more come first
@@ -358,47 +352,30 @@ class RenderPlan:
     @cached_property
     def seam_samples(self) -> SeamSamples:
         """The blended bands as two sources show them."""
-        sources, rows = len(self.source), [np.empty((0, 6), np.int64)]
-        rank = np.full((len(self.targets), sources), sources)
+        from arbiview_aug.render.photometry_kernels import sample_band
+
+        slots = np.array([[s.x, s.y, *s.size[::-1], s.source, s.level] for s in self.layout.slots], np.int64)
+        most, count = sum(band.weight.size for view in self.targets for band in view.bands), 0
+        keys, source, at = (np.empty(shape, np.int64) for shape in ((most, 5), (2, most), (2, most, 2)))
         for number, view in enumerate(self.targets):
-            rank[number, [pair.source for pair in view.pairs]] = range(len(view.pairs))
-            h, w = view.source_camera.shape
-            step = max(1, w // _SEAM_SAMPLES)
+            step = max(1, view.source_camera.shape[1] // _SEAM_SAMPLES)
+            rank, h = np.full(len(self.source), len(self.source)), len(view.source_camera)
+            rank[[pair.source for pair in view.pairs]] = range(len(view.pairs))
+            parts, first = np.arange(h) * SEAM_ROWS // h, count
             for band in view.bands:
-                y, x = (step * places for places in np.nonzero(band.weight[::step, ::step]))
-                part = (y + band.y) * SEAM_ROWS // h
-                places = view.at.xy[y + band.y, x + band.x], band.at.xy[y, x]
-                rows.append(np.column_stack([np.full(len(y), number), part, *places]))
-        table = np.concatenate(rows)
-        both = self.layout.source_pixels(table[:, 2:].reshape(-1, 2)).reshape(-1, 2, 3)
-        seen = (both[..., 0] >= 0).all(1)
-        (view, part), both = table[seen, :2].T, both[seen]
-        ranks = rank[view[:, None], both[..., 0]]
-        both = np.take_along_axis(both, ranks.argsort(1)[..., None], 1)
-        return _grouped(np.column_stack([view, ranks.max(1), both[:, ::-1, 0], part]), both, sources)
+                place = band.y, band.x, step, view.at.xy, band.at.xy
+                count = sample_band(band.weight, *place, slots, rank, parts, keys[:, 1:], source, at, count)
+            keys[first:count, 0] = number
+        order = np.lexsort(keys[:count, ::-1].T)
+        keys = keys[order]
+        starts = np.flatnonzero(np.diff(keys, axis=0, prepend=-1).any(1))
+        groups = keys[starts]
+        first = np.flatnonzero(np.diff(groups[:, :3], axis=0, prepend=-1).any(1))
+        seams = np.column_stack([groups[first][:, [0, 2]], first, np.append(first, len(groups))[1:]]).tolist()
+        shared = SharedPixels(source[:, order], at[:, order], np.append(starts, count))
+        return SeamSamples(shared, groups[:, 3], groups[:, 4], seams)
 
     @property
     def coverage(self) -> list[BoolArray]:
         """(h, w) for each target camera."""
         return [t.coverage for t in self.targets]
-
-
-def _grouped(keys: npt.NDArray[np.int64], pixels: npt.NDArray[np.int64], sources: int) -> SeamSamples:
-    """Group n samples by (n, 5) view, rank and number of the other source, better source, and part of the height.
-
-    ``pixels`` (n, 2, 3) are source, row and column in the better and the other source.
-    """
-    by_group = np.lexsort(keys[:, ::-1].T)
-    keys = keys[by_group]
-    starts = np.flatnonzero(np.diff(keys, axis=0, prepend=-1).any(1))
-    groups, size = keys[starts], np.diff(starts, append=len(keys))
-    group, place = np.repeat(np.arange(len(groups)), size), np.arange(len(keys)) - np.repeat(starts, size)
-    flat = pixels[by_group].reshape(-1, 3)
-    order = flat[:, 0].argsort(kind="stable")
-    ends = np.searchsorted(flat[order, 0], np.arange(sources + 1))
-    reads = np.full((2, len(groups), size.max(initial=0)), len(flat))
-    reads[:, group, place] = order.argsort().reshape(-1, 2).T
-    first = np.flatnonzero(np.diff(groups[:, :3], axis=0, prepend=-1).any(1))
-    seams = np.column_stack([groups[first][:, [0, 2]], first, np.append(first, len(groups))[1:]]).tolist()
-    runs = np.stack([ends[:-1], ends[1:], np.arange(sources)], 1)
-    return SeamSamples(flat[order, 1:], runs, reads, groups[:, 3], groups[:, 4], seams)
