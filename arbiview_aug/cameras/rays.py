@@ -75,11 +75,11 @@ HALF_VIEW_SIZE, HALF_TILE_PX = (225, 400), 16
 
 def adjacent_pairs(rig: Rig) -> list[tuple[int, int]]:
     """Pairs of cameras that are neighbours in azimuth and whose horizontal fields of view overlap."""
-    order = sorted(range(len(rig)), key=lambda k: (rig[k].azimuth_deg, k))
+    azimuth, fov = [camera.azimuth_deg for camera in rig], [camera.fov_deg[0] for camera in rig]
+    order = sorted(range(len(rig)), key=lambda k: (azimuth[k], k))
     pairs = []
     for here, there in zip(order, order[1:] + order[:1], strict=True):
-        gap = (rig[there].azimuth_deg - rig[here].azimuth_deg) % 360
-        if here != there and gap < (rig[here].fov_deg[0] + rig[there].fov_deg[0]) / 2:
+        if here != there and (azimuth[there] - azimuth[here]) % 360 < (fov[here] + fov[there]) / 2:
             pairs.append((min(here, there), max(here, there)))
     return sorted(set(pairs))
 

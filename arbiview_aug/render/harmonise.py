@@ -28,10 +28,9 @@ from arbiview_aug.cameras.rays import (
     HALF_TILE_PX,
     HALF_VIEW_SIZE,
     adjacent_pairs,
-    ego_rays,
     half_way_view,
     odd_tiles,
-    project_rays,
+    source_pixels,
 )
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.errors import SampleError, shown
@@ -124,17 +123,20 @@ def find_overlaps(rig: Rig) -> Overlaps:
     order = content_order(rig.cameras)
     rig = rig.with_cameras([rig[k] for k in order])
     lattice, held_out = _lattice()
-    surface, pairs, kinds = Street(ground_z_m=rig.ground_z_m), [], ([], [])
+    surface, pairs = Street(ground_z_m=rig.ground_z_m), []
+    kinds: tuple[list[npt.NDArray[np.int64]], ...] = [], []
     for pair in adjacent_pairs(rig):
         view = half_way_view(rig[pair[0]], rig[pair[1]], HALF_VIEW_SIZE)
-        rays, valid = ego_rays(view, lattice)
-        q, both = surface.inverse_distance(view.center_m, rays), np.flatnonzero(valid)
-        at = np.empty((2, 2, len(q)), np.int64)
+        rays = np.linalg.inv(view.K) @ lattice
+        rays /= np.sqrt((rays * rays).sum(0))
+        local = rays.astype(np.float32)[:, None]
+        q = surface.inverse_distance(view.center_m, (view.cam2ego[:3, :3] @ rays).T).astype(np.float32)
+        both, at = np.arange(len(q)), np.empty((2, 2, len(q)), np.int64)
         for camera, (rows, columns) in zip((rig[k] for k in pair), at, strict=True):
-            uv, seen = project_rays(camera, rays[both], q[both], view.center_m - camera.center_m)
-            column, row = np.where(seen, uv.T, 0).round().astype(np.int64)
+            u, v = source_pixels(view, local[..., both], q[None, both], camera)
+            column, row = u[0].round().astype(np.int64), v[0].round().astype(np.int64)
             h, w = camera.size
-            seen &= (row > 0) & (row < h - 1) & (column > 0) & (column < w - 1)
+            seen = (row > 0) & (row < h - 1) & (column > 0) & (column < w - 1)
             both, row, column = both[seen], row[seen], column[seen]
             if camera.mask is not None:
                 clear = camera.mask[row, column]
@@ -155,10 +157,11 @@ def find_overlaps(rig: Rig) -> Overlaps:
 
 @cache
 def _lattice() -> tuple[FloatArray, BoolArray]:
-    """The pixels (n, 2) of a half-way view that are read, and whether each is held out."""
+    """The homogeneous pixels (3, n) of a half-way view that are read, and whether each is held out."""
     y, x = np.mgrid[: HALF_VIEW_SIZE[0] : _STEP_PX, : HALF_VIEW_SIZE[1] : _STEP_PX]
     even = ~odd_tiles(HALF_VIEW_SIZE, HALF_TILE_PX)[y, x]
-    return np.stack([x, y], -1)[even].astype(np.float64), odd_tiles(HALF_VIEW_SIZE, HALF_TILE_PX // 2)[y, x][even]
+    pixels = np.stack([x, y, np.ones_like(x)])[:, even].astype(np.float64)
+    return pixels, odd_tiles(HALF_VIEW_SIZE, HALF_TILE_PX // 2)[y, x][even]
 
 
 def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overlaps | None = None) -> PhotometricReport:

@@ -355,7 +355,7 @@ class RenderPlan:
         from arbiview_aug.render.photometry_kernels import sample_band
 
         slots = np.array([[s.x, s.y, *s.size[::-1], s.source, s.level] for s in self.layout.slots], np.int64)
-        most, count = sum(band.weight.size for view in self.targets for band in view.bands), 0
+        count, most = 0, sum(band.weight.size for view in self.targets for band in view.bands)
         keys, source, at = (np.empty(shape, np.int64) for shape in ((most, 5), (2, most), (2, most, 2)))
         for number, view in enumerate(self.targets):
             step = max(1, view.source_camera.shape[1] // _SEAM_SAMPLES)
@@ -370,8 +370,8 @@ class RenderPlan:
         keys = keys[order]
         starts = np.flatnonzero(np.diff(keys, axis=0, prepend=-1).any(1))
         groups = keys[starts]
-        first = np.flatnonzero(np.diff(groups[:, :3], axis=0, prepend=-1).any(1))
-        seams = np.column_stack([groups[first][:, [0, 2]], first, np.append(first, len(groups))[1:]]).tolist()
+        changes = np.flatnonzero(np.diff(groups[:, :3], axis=0, prepend=-1).any(1))
+        seams = np.column_stack([groups[changes][:, [0, 2]], changes, np.append(changes, len(groups))[1:]]).tolist()
         shared = SharedPixels(source[:, order], at[:, order], np.append(starts, count))
         return SeamSamples(shared, groups[:, 3], groups[:, 4], seams)
 
