@@ -22,10 +22,9 @@ from arbiview_aug.render.harmonise import (
     PhotometricReport,
     estimate_gains,
     find_overlaps,
-    pair_ratios,
     tone_curves,
 )
-from arbiview_aug.render.photometry_kernels import pair_errors, tone
+from arbiview_aug.render.photometry_kernels import log_ratios, pair_errors, tone
 from arbiview_aug.render.plan import FixedMap, ViewPlan
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.torch_backend import render_torch
@@ -133,12 +132,10 @@ def test_harmful_gains_are_declined(street, monkeypatch: pytest.MonkeyPatch) -> 
     assert after > before  # what it would have been
     assert torch.equal(declined, retargeted(rig, spoiled, match_exposure=False))
     # At the fitted pixels the first camera reads a brighter image: a lie that the others uncover.
-    told = np.zeros(len(overlaps.at) + 1, np.uint8)
-    told[overlaps.fitted[0]], told[overlaps.fitted[1]] = 120, 60
-    lies = [image.clone() for image in images]
-    for first, end, k in overlaps.runs:
-        rows, columns = overlaps.at[first:end][told[first:end] > 0].T
-        lies[overlaps.order[k]][:, rows, columns] = torch.from_numpy(told[first:end][told[first:end] > 0])
+    lies, (sources, at, ends) = [image.clone() for image in images], overlaps.shared
+    for value, source, places in zip((120, 60), sources, at, strict=True):
+        for k, (y, x) in zip(source[: ends[overlaps.pairs.shape[1]]], places, strict=False):
+            lies[k][:, y, x] = value
     report = estimate_gains(rig, lies, overlaps=overlaps)
     before, after = told_db(report.reason)
     assert not report.accepted and after < before
@@ -186,16 +183,14 @@ def toned(x: np.ndarray, curve: np.ndarray) -> np.ndarray:
 
 
 def test_pairs_are_compared_by_their_usable_pixels() -> None:
-    rng = np.random.default_rng(0)
-    pixels = rng.uniform(0, 1, (200, 3)).astype(np.float32)
-    reads = np.full((2, 3, 80), 200)
-    for p, count in enumerate((80, 33, 2)):
-        reads[:, p, :count] = rng.integers(0, 200, (2, count))
-    pixels[reads[:, 2, :2]] = 0.001  # dark
-    ratios, errors = pair_ratios(pixels, reads, 0.2, 0.9), np.empty(3)
-    pair_errors(pixels, reads, errors)
-    for (number, middle, spread), error, (one, two) in zip(ratios, errors, reads.swapaxes(0, 1), strict=True):
-        one, two = (pixels[side[side < 200]].astype(np.float64) for side in (one, two))
+    rng, ends = np.random.default_rng(0), np.array([0, 80, 113, 115])
+    pixels = rng.uniform(0, 1, (2, 115, 3)).astype(np.float32)
+    pixels[:, 113:] = 0.001  # dark
+    ratios, errors = np.empty((3, 3)), np.empty(3)
+    log_ratios(pixels, ends, 0.2, 0.9, ratios)
+    pair_errors(pixels, ends, errors)
+    for (number, middle, spread), error, first, end in zip(ratios, errors, ends, ends[1:], strict=False):
+        one, two = pixels[:, first:end].astype(np.float64)
         assert error == pytest.approx(np.mean((one - two) ** 2), rel=1e-5)
         use = np.all([(side.mean(1) > 0.2) & (side.max(1) < 0.9) for side in (one, two)], 0)
         assert number == use.sum()

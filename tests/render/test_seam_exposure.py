@@ -8,7 +8,8 @@ import torch
 
 from arbiview_aug import Rig, RigRetarget, load_rig
 from arbiview_aug.cameras.rays import ego_rays
-from arbiview_aug.render.harmonise import Curves, Harmoniser, match_seams, pair_ratios, tone_curves
+from arbiview_aug.render.harmonise import Curves, Harmoniser, match_seams, tone_curves
+from arbiview_aug.render.photometry_kernels import log_ratios
 from arbiview_aug.render.plan import SEAM_ROWS, RenderPlan
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.torch_backend import render_torch
@@ -47,20 +48,21 @@ def step(plan: RenderPlan, images: list[torch.Tensor], curves: Curves | None) ->
 
 def test_samples_read_the_same_direction_in_both_sources(planned: tuple[Rig, RenderPlan]) -> None:
     rig, plan = planned
-    samples = plan.seam_samples
+    samples, images = plan.seam_samples, pictures(rig)
+    (source, at, ends), measured = samples.shared, np.empty((len(samples.better), 3))
     assert len(samples.better) > 50 and plan.seam_samples is samples
-    count, runs, images = len(samples.at), samples.runs.tolist(), pictures(rig)
-    source = np.repeat(np.arange(len(rig)), np.diff(samples.runs[:, :2]).ravel())
-    light = [image.numpy().mean(0)[tuple(samples.at[a:b].T)] for image, (a, b, _) in zip(images, runs, strict=True)]
-    pixels = np.repeat(np.concatenate(light)[:, None] / 255, 3, 1).astype(np.float32)
-    numbers, ratio, spread = pair_ratios(pixels, samples.reads, 0.0, 1.0).T
-    assert (numbers == (samples.reads[0] < count).sum(1)).all() and numbers.sum() == count / 2
-    assert np.abs(ratio).max() < 0.05 and np.median(spread) < 0.05
+    light = [
+        [images[k][:, y, x].numpy() / 255 for k, (y, x) in zip(*side, strict=True)]
+        for side in zip(source, at, strict=True)
+    ]
+    log_ratios(np.array(light, np.float32), ends, 0.0, 1.0, measured)
+    numbers, ratio, spread = measured.T
+    assert (numbers == np.diff(ends)).all() and np.abs(ratio).max() < 0.05 and np.median(spread) < 0.05
     for view, other, first, end in samples.seams:
         share = {pair.source: pair.share for pair in plan.targets[view].pairs}
         assert all(share[k] >= share.get(other, 0) for k in samples.better[first:end])
         for g in range(first, end):
-            better, worse = (source[side[g][side[g] < count]] for side in samples.reads)
+            better, worse = source[:, ends[g] : ends[g + 1]]
             assert (better == samples.better[g]).all() and (worse == other).all()
 
 
