@@ -12,9 +12,10 @@ or raised and pitched down, all without scanners. *Motion estimate*: nuScenes' s
 maps* from motion and from a network cost the same; these say at every pixel the depth of the nearest LiDAR point.
 *Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it the plan; every other call plans anew.
 Images are decoded at half size where they are then still larger than the views. They lie channels-last in one block, as
-this package's readers give them; contiguous ones are planes, torch's usual layout. Holes stay black unless they are
-*filled*. *Points by rays*: ``retarget_points`` alone. With ``--device`` the floor is a copy there of as many bytes as
-rendering must move; the clock of a GPU is its events.
+this package's readers give them; contiguous ones are planes, torch's usual layout. Holes stay black and exposures as
+recorded, unless the settings are the *default* ones. *Moment*: a frame of PandaSet with LiDAR and its labelled boxes,
+where ``ARBIVIEW_DATA`` holds that, else this frame with 95. *Points by rays*: ``retarget_points`` alone. With
+``--device`` the floor is a copy there of as many bytes as rendering must move; the clock of a GPU is its events.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import Pinhole, intrinsics_for_fov
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.choices import GeometryName, Holes, Reduce
+from arbiview_aug.choices import GeometryName, Reduce
 from arbiview_aug.cli.arguments import add_data, count, device_named, output_file, size
 from arbiview_aug.cli.bench.data import Recorded, lidar_maps, recorded
 from arbiview_aug.cli.bench.timing import (
@@ -50,13 +51,12 @@ from arbiview_aug.cli.bench.timing import (
     timed_rounds,
 )
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
-from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import DataError, WarnOnce
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.image_ops import resized
-from arbiview_aug.render.harmonise import Harmonise
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.torch_backend import maps_on, render_torch
 from arbiview_aug.render.view_planner import build_plan
@@ -75,6 +75,8 @@ SCANNED = 120_000
 BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
     SIZE: {
         **{"street, held": 1.2, "street": 3.5, "LiDAR": 8.0, "LiDAR, 75 boxes": 11.0},
+        **{"street, held, default": 1.15, "75 boxes, default": 6.5, "LiDAR, 75 boxes, default": 10.5},
+        "moment, default": 15.0,
         **{f"{n} boxes": 5.0 for n in BOXES},
         **{f"street, held, {fit} from full size, contiguous": 2.0 for fit in ("squashed", "cropped")},
         **{f"{known}, two neighbours": 20.0 for known in ("street", "75 boxes")},
@@ -84,6 +86,8 @@ BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
 """Largest ratios of calls by the size of the views, from nuScenes' images."""
 
 _FLOOR = "bare cv2.remap"
+_PLAIN: dict[str, Any] = {"holes": "black", "match_exposure": False}
+_DEFAULT: dict[str, Any] = {"holes": "continue", "match_exposure": True}
 _ENOUGH_MS = 1500.0
 _TRAVEL_M, _MOST_NEIGHBOURS = 1.2, 8  # between neighbouring frames, and their number
 _DTYPES = {"uint8": torch.uint8, "bf16": torch.bfloat16, "fp32": torch.float32}
@@ -177,9 +181,17 @@ def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tup
             calls |= _both_layouts("street, held, cropped from full size", full, cropped)
         yield name, calls
     if is_small:
+        moment, floor = _moment() or {**sample, "boxes_3d": boxes_around(95)}, remap_floor(sample["images"][:5], size)
+        yield "moment", {_FLOOR: floor, "moment, default": _anew(moment, waymo.undistorted(), "lidar", **_DEFAULT)}
         yield "own", {_FLOOR: remap_floor(sample["images"], size)} | _own(sample, size) | _scans(sample)
     if size == FULL_SIZE:
         yield "own", {_FLOOR: remap_floor(sample["images"], size)} | _motion()
+
+
+def _moment() -> Sample | None:
+    """A frame of PandaSet below ``ARBIVIEW_DATA``, read at half size, if there."""
+    folder = Path(os.environ.get("ARBIVIEW_DATA", "")) / "pandaset"
+    return FrameFolder(folder, reduce=2)[3] if folder.is_dir() else None
 
 
 def _cameras_of(name: str) -> Rig:
@@ -204,11 +216,13 @@ def table(report: Mapping[str, Any]) -> str:
 def _calls(sample: Sample, target: Rig) -> Calls:
     return {
         **_both_layouts("street, held", sample, target),
-        "street, held, filled": _held(sample, target, holes="continue"),
+        "street, held, default": _held(sample, target, **_DEFAULT),
         "street": _anew(sample, target, "street"),
         **{f"{n} boxes": _anew({**sample, "boxes_3d": boxes_around(n)}, target, "boxes") for n in BOXES},
         "LiDAR": _anew(sample, target, "lidar"),
         "LiDAR, 75 boxes": _anew({**sample, "boxes_3d": boxes_around(75)}, target, "lidar"),
+        "75 boxes, default": _anew({**sample, "boxes_3d": boxes_around(75)}, target, "boxes", **_DEFAULT),
+        "LiDAR, 75 boxes, default": _anew({**sample, "boxes_3d": boxes_around(75)}, target, "lidar", **_DEFAULT),
         "depth maps": _anew(sample, target, "learned"),
         "fused, 75 boxes": _anew({**sample, "boxes_3d": boxes_around(75)}, target, "fused"),
     }
@@ -254,8 +268,7 @@ def _own(sample: Sample, views: tuple[int, int]) -> Calls:
     with_boxes = frame | boxes | {"neighbours": [other | boxes for other in others[:2]]}
     return {
         "street, held, turned": _held(sample, turned),
-        "street, held, turned, filled": _held(sample, turned, holes="continue"),
-        "street, held, turned, harmonised": _held(sample, turned, harmonise=True),
+        "street, held, turned, default": _held(sample, turned, **_DEFAULT),
         "street, no neighbours": _anew(frame, low, "street"),
         "street, one neighbour": _anew(frame | {"neighbours": others[:1]}, low, "street"),
         "street, two neighbours": _anew(frame | {"neighbours": others[:2]}, low, "street"),
@@ -303,13 +316,13 @@ def _both_layouts(name: str, sample: Sample, target: Rig) -> Calls:
     return {name: _held(sample, target), f"{name}, contiguous": _held(contiguous, target)}
 
 
-def _held(sample: Sample, target: Rig, holes: Holes = "black", harmonise: Harmonise = False) -> Callable[[], Any]:
-    return partial(RigRetarget(target, geometry="street", holes=holes, match_exposure=harmonise), sample)
+def _held(sample: Sample, target: Rig, **settings: Any) -> Callable[[], Any]:
+    return partial(RigRetarget(target, geometry="street", **_PLAIN | settings), sample)
 
 
-def _anew(sample: Sample, target: Rig, surface: GeometryName) -> Callable[[], Any]:
+def _anew(sample: Sample, target: Rig, surface: GeometryName, **settings: Any) -> Callable[[], Any]:
     """Call with the rig, over the street, always a little elsewhere; plans over a frame's geometry never come back."""
-    retarget = RigRetarget(target, geometry=surface, match_exposure=False, holes="black", cache=PlanCache(max_bytes=0))
+    retarget = RigRetarget(target, geometry=surface, cache=PlanCache(max_bytes=0), **_PLAIN | settings)
     rigs = cycle([sample["rig"].shifted(x_m=k * _STEP_M) for k in range(_STEPS if surface == "street" else 1)])
     return lambda: retarget({**sample, "rig": next(rigs)})
 

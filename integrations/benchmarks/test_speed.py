@@ -40,7 +40,7 @@ TOLERANCE, ROUNDS = 0.02, 121
 IMPORT_S = 0.4
 OVERLAP_MS, REUSED_RATIO = 200.0, 1.5  # depth from overlap, at 1600x900
 ALLOWED = {
-    SIZE: [1.2, 3.5, 8, 11, *[5] * len(BOXES), 2, 2, 20, 20],
+    SIZE: [1.2, 3.5, 8, 11, 1.15, 6.5, 10.5, 15, *[5] * len(BOXES), 2, 2, 20, 20],
     FULL_SIZE: [2.5, 3.5, 4, *[3] * len(BOXES)],
 }
 """Every bound: none must move, or vanish, without this list changing too."""
@@ -55,6 +55,10 @@ MISSED: Mapping[tuple[int, int], Mapping[str, tuple[float, float]]] = {
         "150 boxes": (9.0, 13.2),
         "LiDAR": (9.8, 16.5),
         "LiDAR, 75 boxes": (13.4, 22.6),
+        "street, held, default": (1.5, 3.9),
+        "75 boxes, default": (10.5, 15.0),
+        "LiDAR, 75 boxes, default": (16.5, 28.0),
+        "moment, default": (30.0, 30.0),
     },
     FULL_SIZE: {
         "street": (3.8, 4.3),
@@ -156,7 +160,9 @@ def _bound(size: tuple[int, int], name: str, fisheye: bool) -> float:
         for size, bounds in BOUNDS.items()
         for name in bounds
         for fisheye in (False, True)
-        if not (fisheye and name.endswith(("contiguous", "two neighbours")))  # measured with one target alone
+        if not (
+            fisheye and name.endswith(("contiguous", "two neighbours", "moment, default"))
+        )  # measured with one target alone
     ],
 )
 def test_bounds(
