@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader, default_collate
+from torch.utils.data import default_collate
 
 from arbiview_aug import Camera, Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.errors import GeneratorError
@@ -140,15 +140,17 @@ def test_occluded_pixels_are_those_that_an_image_contains(size: tuple[int, int],
     assert np.count_nonzero((view.layers == OCCLUDED) != expected) < 0.002 * expected.size
 
 
-def test_what_objects_hide_is_occluded_and_what_nobody_looks_at_is_not(street: dict[str, Any]) -> None:
-    for surface in ("boxes", "lidar"):
-        out = RigRetarget(raised(street), geometry=surface)  # type: ignore[arg-type]
-        plan = out.plan_frame(read_frames(street, None)[0], raised(street)).plan
-        for view in plan.targets:
-            assert view.layers is None or not ((view.layers == OCCLUDED) & view.coverage).any()
-        occluded = [view.layers == OCCLUDED for view in plan.targets if view.layers is not None]
-        assert sum(int(part.sum()) for part in occluded) > 300
-        assert not any(part[0].mean() > 0.5 for part in occluded)  # over the top edge nobody looks
+@pytest.mark.parametrize("surface", ["boxes", "lidar"])
+def test_plans_know_what_is_occluded_and_where_the_road_lies(street: dict[str, Any], surface: Any) -> None:
+    target = raised(street)
+    plan = RigRetarget(target, geometry=surface).plan_frame(read_frames(street, None)[0], target).plan
+    occluded = [view.layers == OCCLUDED for view in plan.targets if view.layers is not None]
+    assert sum(map(np.count_nonzero, occluded)) > 300
+    assert not any(part[0].mean() > 0.5 for part in occluded)  # over the top edge nobody looks
+    for viewpoint, view in zip(target, plan.targets, strict=True):
+        assert view.layers is None or not ((view.layers == OCCLUDED) & view.coverage).any()
+        assert view.road is not None and view.road.shape == tuple(-(-n // 8) + 1 for n in viewpoint.size)
+        assert not view.road[0].any() and view.road[-1].mean() > 0.5  # above and below the horizon
 
 
 def test_holes_where_no_other_source_looks_show_road_and_objects() -> None:
@@ -176,36 +178,14 @@ def test_holes_of_one_camera_that_turns_need_no_geometry(surface: str) -> None:
     assert out["generated"].any() and torch.equal(out["generated"], ~out["coverage"])
 
 
-def test_plans_without_holes_hold_no_map_of_them() -> None:
-    source = ring()
-    assert all(view.layers is view.paint is None for view in build_plan(source, source).targets)
-
-
 # --- the transform ----------------------------------------------------------------------------------------------------
 def test_a_whole_target_asks_for_no_filling(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(holes_module, "object_colours", None)
     source = ring()
+    assert all(view.layers is view.paint is None for view in build_plan(source, source).targets)
     images = torch.randint(0, 255, (6, 3, 72, 96), dtype=torch.uint8)
     out = RigRetarget(source)({"images": images, "rig": source})
     assert out["coverage"].all() and not out["generated"].any() and torch.equal(out["images"], images)
-
-
-@pytest.mark.parametrize("execution", ["opencv", "torch"])
-def test_frames_of_a_batch_are_filled_as_alone(street: dict[str, Any], execution: str) -> None:
-    retarget = RigRetarget(raised(street), geometry="street", backend=execution)  # type: ignore[arg-type]
-    frames = [street | {"images": images} for images in (street["images"], street["images"].flip(-1))]
-    keys = ("images", "K", "cam2ego")
-    rig = street["rig"]
-    alone = [retarget({key: frame[key] for key in keys if key in frame} | {"rig": rig}) for frame in frames]
-    batch = {
-        "images": torch.stack([frame["images"] for frame in frames]),
-        "K": torch.from_numpy(rig.K).expand(2, -1, -1, -1),
-        "cam2ego": torch.from_numpy(rig.cam2ego).expand(2, -1, -1, -1),
-    }
-    out = retarget(batch)
-    for k in range(2):
-        for key in ("images", "coverage", "generated"):
-            assert torch.equal(out[key][k], alone[k][key])
 
 
 @pytest.mark.parametrize("how", SETTINGS)
@@ -244,40 +224,12 @@ def test_views_of_several_sizes() -> None:
         assert filled.any() and image[:, filled].any()
 
 
-class _Frames(torch.utils.data.Dataset[Any]):
-    def __init__(self, sample: dict[str, Any], retarget: RigRetarget) -> None:
-        self.sample, self.retarget = sample, retarget
-
-    def __len__(self) -> int:
-        return 2
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        out = self.retarget(self.sample)
-        return {key: out[key] for key in ("images", "coverage", "generated")}
-
-
-def test_in_workers_and_after_pickling(street: dict[str, Any]) -> None:
-    retarget = RigRetarget(raised(street), geometry="street")
-    expected = retarget(street)
-    again = pickle.loads(pickle.dumps(retarget))
-    assert "holes=Continue" in repr(again)
-    assert torch.equal(again(street)["images"], expected["images"])
-    for batch in DataLoader(_Frames(street, retarget), num_workers=1):
-        assert torch.equal(batch["images"][0], expected["images"])
-        assert torch.equal(batch["generated"][0], expected["generated"])
-
-
-def test_made_up_pixels_are_never_sources(street: dict[str, Any]) -> None:
+def test_made_up_pixels_are_never_sources_and_marks_follow_cropping(street: dict[str, Any]) -> None:
     first = RigRetarget(raised(street), geometry="street")(street)
     other = dict(first) | {"images": torch.where(first["generated"][:, None], 255, first["images"])}
     back = RigRetarget(street["rig"], geometry="street", holes="black")
-    out, changed = back(first), back(other)
-    assert torch.equal(out["images"], changed["images"]) and "generated" not in out
-
-
-def test_marks_follow_resizing_and_cropping(street: dict[str, Any]) -> None:
-    out = RigRetarget(raised(street), geometry="street")(street)
-    small = CropRig(0, 8, (24, 72))(ResizeRig((32, 88))(out))
+    assert torch.equal(back(first)["images"], back(other)["images"]) and "generated" not in back(first)
+    small = CropRig(0, 8, (24, 72))(ResizeRig((32, 88))(first))
     assert small["generated"].shape == small["coverage"].shape == (6, 24, 72) and small["generated"].any()
     assert not (small["generated"] & small["coverage"]).any()
 
@@ -288,6 +240,9 @@ def test_the_mean_colour_is_that_of_what_is_seen_in_all_views() -> None:
     seen = [torch.zeros((8, 8), dtype=torch.bool), torch.ones((8, 8), dtype=torch.bool)]
     seen[0][:4] = True
     np.testing.assert_allclose(mean_colour([view.numpy() for view in views], [part.numpy() for part in seen]), 60)
+    few, corner = np.zeros((3, 512, 512), np.uint8), np.zeros((512, 512), bool)  # between the samples
+    few[:, 1:5, 1:5], corner[1:5, 1:5] = 200, True
+    assert (mean_colour([few], [corner]) == 200).all()
     (first, second) = fill_holes([view.clone() for view in views], seen, [None] * 2, [None] * 2, only_mean=True)
     assert (first[:, 4:] == 60).all() and not first[:, :4].any() and torch.equal(second, views[1])
 
@@ -375,17 +330,6 @@ def test_lines_lead_to_the_vanishing_points_of_the_heading_and_the_vertical() ->
     assert (up[1] < 0).all()
 
 
-def test_plans_know_where_the_road_lies_behind_holes(street: dict[str, Any]) -> None:
-    target = raised(street)
-    for surface in ("boxes", "lidar"):
-        plan = RigRetarget(target, geometry=surface).plan_frame(read_frames(street, None)[0], target).plan  # type: ignore[arg-type]
-        for view, of_view in zip(target, plan.targets, strict=True):
-            assert of_view.road is not None
-            assert not of_view.road[0].any()  # above the horizon
-            assert of_view.road[-1].mean() > 0.5
-            assert of_view.road.shape == tuple(-(-n // 8) + 1 for n in view.size)
-
-
 def test_batches_without_a_plan_are_filled(street: dict[str, Any]) -> None:
     keys = SampleKeys(extra=("sources", "confidence"))
     batch = default_collate([RigRetarget(raised(street), holes="black", keys=keys)(street)])
@@ -446,12 +390,6 @@ def test_what_an_inpainter_makes_is_finite_and_in_range(street: dict[str, Any]) 
         RigRetarget(raised(street), holes=Painter(float("nan")))(sample)
 
 
-def test_few_seen_pixels_have_a_mean_colour() -> None:
-    view, seen = np.zeros((3, 512, 512), np.uint8), np.zeros((512, 512), bool)
-    view[:, 1:5, 1:5], seen[1:5, 1:5] = 200, True
-    assert (mean_colour([view], [seen]) == 200).all()
-
-
 def test_unlabelled_things_before_a_hole_are_found_by_their_distance() -> None:
     q = np.full((64, 64), 0.05, np.float32)
     q[:, 26:30] = 0.2  # a post, and the background that it hides to its right
@@ -463,183 +401,154 @@ def test_unlabelled_things_before_a_hole_are_found_by_their_distance() -> None:
 
 
 FACE_PARTS = np.array([1, 2, 3, 4, 0, 5, 8, 9, 10, 11, 7, 12], np.int32)  # two boxes, whose last faces are tops
+Seen = tuple[torch.Tensor, torch.Tensor, Paint]
 
 
-def paint_of(face: np.ndarray, winner: np.ndarray, parts: np.ndarray = FACE_PARTS) -> Paint:
-    paint = find_paint(np.ones(face.shape, np.float32), face, parts, winner, 8, np.zeros(face.shape, np.uint8))
-    assert paint is not None
-    return paint
+def objects(*painted: tuple[Any, int, Any], hidden: Any = (), parts: np.ndarray = FACE_PARTS) -> Seen:
+    """A view (3, 64, 64) of 200 with faces painted into places, what is seen of it, and its paint."""
+    face, view = np.full((64, 64), -1, np.int32), torch.full((3, 64, 64), 200, dtype=torch.uint8)
+    for place, number, colour in painted:
+        face[place] = number
+        view[(slice(None), *place)] = torch.tensor(np.broadcast_to(colour, 3).copy())[:, None, None]
+    seen = np.ones(face.shape, bool)
+    for place in hidden:
+        seen[place] = False
+    winner, layers = np.where(seen, 0, -1).astype(np.int8), np.zeros(face.shape, np.uint8)
+    paint = find_paint(np.ones(face.shape, np.float32), face, parts, winner, 8, layers)
+    assert paint is not None and ((layers == OBJECT) == (face >= 0)).all()
+    return view * torch.from_numpy(seen), torch.from_numpy(seen), paint
 
 
-def painted(top_seen: bool, scale: float = 1.0) -> tuple[torch.Tensor, Paint, torch.Tensor]:
-    """A view of two boxes: the first shows its top (80 on 40), the second, with windows (30 in 100), some or none."""
-    face = np.full((64, 64), -1, np.int32)
-    face[10:20, 4:28], face[20:50, 4:28] = 5, 0
-    face[10:20, 36:60], face[20:50, 36:60] = 11, 6
-    view = torch.full((3, 64, 64), 200.0)
-    for number, colour in ((5, 80), (0, 40), (11, 150), (6, 100)):
-        view[:, torch.from_numpy(face == number)] = colour
-    view[:, 22:32, 36:60], view[:, 10:20, 53] = 30, 10  # the top's border mixes colours
-    seen = torch.ones((64, 64), dtype=torch.bool)
-    seen[10:20, 36 if not top_seen else 54 : 60] = False
-    view = (view * seen * scale).to(torch.uint8 if scale == 1 else torch.float32)
-    paint = paint_of(face, np.where(seen.numpy(), 0, -1).astype(np.int8))
-    return view, paint, seen
+def filled(view: torch.Tensor, seen: torch.Tensor, paint: Paint, layer: int = OBJECT) -> torch.Tensor:
+    """The view, all of whose pixels are objects, or whose unseen ones are of another layer."""
+    (out,) = fill_holes(
+        [view.clone()], [seen], [np.where(seen | (layer == OBJECT), OBJECT, layer).astype(np.uint8)], [paint]
+    )
+    return out
 
 
-def test_tops_take_their_bodies_paint_in_the_light_of_seen_tops() -> None:
-    view, paint, seen = painted(top_seen=True)
-    colours = object_colours([view.numpy()], [paint])
-    np.testing.assert_array_equal(colours[:5, 0], 40)
-    np.testing.assert_array_equal(colours[PARTS : PARTS + 5, 0], 100)
-    assert 78 < colours[TOP_PART, 0] < 84 and 142 < colours[PARTS + TOP_PART, 0] < 152
-    for scale in (1.0, 1 / 255):
-        view, paint, seen = painted(top_seen=False, scale=scale)  # the other's top is twice as bright as its body
-        colours = object_colours([view.numpy()], [paint])
-        top = float(colours[PARTS + TOP_PART, 0])
-        assert 1.05 * 100 < top / scale < 150 and (colours == colours[:, :1]).all()
-        alone = replace(paint, nearest=np.full_like(paint.nearest, -1))
-        (out,) = fill_holes([view.clone()], [seen], [np.full(seen.shape, OBJECT, np.uint8)], [alone])
-        torch.testing.assert_close(
-            out[:, ~seen].float(), torch.full((3, int((~seen).sum())), top), atol=0.51 * (scale == 1), rtol=1e-5
-        )
-        assert torch.equal(out[:, seen], view[:, seen])
+BOX, TOP = np.s_[20:50, 4:28], np.s_[10:20, 4:28]
+OTHER, OTHERS_TOP, WINDOWS = np.s_[20:50, 36:60], np.s_[10:20, 36:60], np.s_[22:32, 36:60]
+TWO = [
+    (TOP, 5, 80),
+    (BOX, 0, 40),
+    (OTHERS_TOP, 11, 150),
+    (OTHER, 6, 100),
+    (WINDOWS, 6, 30),
+    (np.s_[10:20, 53:54], 11, 10),
+]
+"""The first box shows its top (80 on 40); the second has windows (30 in 100), and a column of its top mixes colours."""
 
-
-def test_tops_are_as_bright_as_their_bodies_where_no_top_is_seen() -> None:
-    view, paint, _ = painted(top_seen=False)
-    others = paint.sample_part != TOP_PART
-    paint = replace(paint, sample=paint.sample[others], sample_part=paint.sample_part[others])
-    assert object_colours([view.numpy()], [paint])[PARTS + TOP_PART, 0] == pytest.approx(100, abs=1e-3)
-
-
-def test_tops_go_on_from_the_seen_pixels_of_their_body() -> None:
-    view, paint, seen = painted(top_seen=False)
-    (out,) = fill_holes([view.clone()], [seen], [np.full(seen.shape, OBJECT, np.uint8)], [paint])
-    column, top = out[0, 10:20, 50].float(), float(object_colours([view.numpy()], [paint])[PARTS + TOP_PART, 0])
-    assert (column.diff() <= 0).all() and column[-1] < 103 and abs(column[0] - (top + 1.6 * 100) / 2.6) < 1
+ROOF = [(np.s_[20:35, 36:60], 10, 30), (np.s_[35:50, 36:60], 6, (160, 60, 60))]  # a cabin, and a red body
+CABIN, SIDE, RED = np.s_[10:30, 4:60], np.s_[30:50, 4:60], (180, 50, 10)
+TOP_OF_OTHER = PARTS + TOP_PART
 
 
 @pytest.mark.parametrize(
-    ("rim", "expected"),
-    [(30, (160, 60, 60)), (95, (160, 60, 60)), ((40, 160, 40), (40, 160, 40)), (230, (230, 230, 230))],
-    ids=["glass up to the roof", "glass and body", "another paint", "a white roof"],
-)
-def test_roofs_take_their_bodies_paint_unless_the_rim_has_another(rim: Any, expected: tuple[int, ...]) -> None:
-    face = np.full((64, 64), -1, np.int32)
-    face[10:20, 36:60], face[20:35, 36:60], face[35:50, 36:60] = 11, 10, 6  # roof, cabin, body
+    ("painted", "hidden", "expected"),
+    [
+        (TWO, [np.s_[10:20, 54:60]], {**dict.fromkeys(range(5), 40), **dict.fromkeys(range(PARTS, PARTS + 5), 100)}),
+        (TWO, [TOP, OTHERS_TOP], {TOP_OF_OTHER: 100}),
+        ([(OTHERS_TOP, 11, 9), (OTHER, 10, 100), (WINDOWS, 10, 30)], [OTHERS_TOP], {TOP_OF_OTHER: 100}),
+        *[
+            ([(OTHERS_TOP, 11, 9), *ROOF, (np.s_[20:23, 36:60], 10, rim)], [OTHERS_TOP], {TOP_OF_OTHER: roof})
+            for rim, roof in [(30, ROOF[1][2]), (95, ROOF[1][2]), ((40, 160, 40),) * 2, (230, 230)]
+        ],
+        ([(CABIN, 4, 30), (SIDE, 0, 150)], [np.s_[:, 56:]], {0: 30, **dict.fromkeys(range(1, 5), 150)}),
+        ([(CABIN, 4, (40, 60, 90)), (np.s_[12:20, 4:60], 4, RED), (SIDE, 0, 9)], [SIDE], {1: RED}),
+        ([(np.s_[20:50, 10:54], 0, 60)], [np.s_[21:50, 10:54]], {1: 60}),
+    ],
+    ids=[
+        "sides take the median of their body", "tops are as bright as their bodies where no top is seen",
+        "all that is seen is a cabin", "glass up to the roof", "glass and body", "another paint", "a white roof",
+        "cabins and bodies have separate colours", "a body takes the paint around the windows, no mixture",
+        "one row remains",
+    ],
+)  # fmt: skip
+def test_colours_of_objects(painted: Any, hidden: Any, expected: dict[int, Any]) -> None:
     parts = np.where(np.arange(12) == 10, PARTS, FACE_PARTS).astype(np.int32)
-    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
-    view[:, 35:50, 36:60] = torch.tensor([160, 60, 60])[:, None, None]
-    view[:, 20:35, 36:60] = 30
-    view[:, 20:23, 36:60] = torch.tensor(np.broadcast_to(rim, 3).copy())[:, None, None]
-    paint = paint_of(face, np.where(face == 11, -1, 0).astype(np.int8), parts)
+    view, _, paint = objects(*painted, hidden=hidden, parts=parts)
+    colours = object_colours([view.numpy()], [paint])
+    for part, colour in expected.items():
+        np.testing.assert_allclose(colours[part], np.broadcast_to(colour, 3), atol=1e-2)
+
+
+def test_tops_take_their_bodies_paint_in_the_light_of_seen_tops() -> None:
+    view, _, paint = objects(*TWO, hidden=[np.s_[10:20, 54:60]])
+    colours = object_colours([view.numpy()], [paint])
+    assert 78 < colours[TOP_PART, 0] < 84 and 142 < colours[TOP_OF_OTHER, 0] < 152
+    view[2, 10:20, 36:54] = 90  # what sources show there is yellow, the body grey
+    assert np.ptp(object_colours([view.numpy()], [paint])[TOP_OF_OTHER]) < 1e-3
+    view, seen, paint = objects(*TWO, hidden=[OTHERS_TOP])  # the other's top is twice as bright as its body
+    alone = replace(paint, nearest=np.full_like(paint.nearest, -1))
+    for image in (view, view / 255):
+        white = 255 / float(image.max()) * 200 / 255
+        (top, *others) = object_colours([image.numpy()], [paint])[TOP_OF_OTHER] * white
+        assert 105 < top < 150 and others == [top, top]
+        out = filled(image, seen, alone)
+        assert (out[:, ~seen] * white - top).abs().max() < 0.51 and torch.equal(out[:, seen], image[:, seen])
+
+
+def test_rims_of_roofs_are_sampled_below_their_edge() -> None:
+    _, _, paint = objects((OTHERS_TOP, 11, 9), *ROOF, hidden=[OTHERS_TOP], parts=np.r_[FACE_PARTS[:10], PARTS, 12])
     edge = paint.sample[paint.sample_part == PARTS + RIM_PART] // 64
     assert sorted(set(edge.tolist())) == [20, 21, 22] and len(edge) == 3 * 24
-    np.testing.assert_allclose(object_colours([view.numpy()], [paint])[PARTS + TOP_PART], expected, atol=1e-2)
 
 
-def test_windows_and_what_stands_behind_do_not_colour_tops() -> None:
-    view, paint, _ = painted(top_seen=False)
-    others = paint.sample_part != TOP_PART
-    lamp = replace(paint, sample=paint.sample[others], sample_part=np.full(others.sum(), PARTS, np.int32))
-    assert object_colours([view.numpy()], [lamp])[PARTS + TOP_PART, 0] == pytest.approx(100, abs=1e-3)  # all on cabins
-    view, paint, _ = painted(top_seen=True)
-    view[2, 10:20, 36:54] = 90  # what sources show there is yellow, the body grey
-    top = object_colours([view.numpy()], [paint])[PARTS + TOP_PART]
-    assert np.ptp(top) < 1e-3
+def test_tops_go_on_from_the_seen_pixels_of_their_body() -> None:
+    view, seen, paint = objects(*TWO, hidden=[OTHERS_TOP])
+    column, top = (
+        filled(view, seen, paint)[0, 10:20, 50].float(),
+        object_colours([view.numpy()], [paint])[TOP_OF_OTHER, 0],
+    )
+    assert (column.diff() <= 0).all() and column[-1] < 103 and abs(float(column[0]) - (top + 1.6 * 100) / 2.6) < 1
 
 
 def test_a_top_without_any_seen_part_is_left_to_the_background() -> None:
-    view, paint, seen = painted(top_seen=False)
+    view, seen, paint = objects(*TWO, hidden=[OTHERS_TOP])
     alone = replace(paint, sample=paint.sample[:0], sample_part=paint.sample_part[:0])
-    assert (object_colours([view.numpy()], [alone]) == -1).all()
-    (out,) = fill_holes([view.clone()], [seen], [np.where(seen, 0, 1).astype(np.uint8)], [alone])
-    assert (out[:, ~seen] > 0).all()
+    assert (object_colours([view.numpy()], [alone]) == -1).all() and (
+        filled(view, seen, alone, OCCLUDED)[:, ~seen] > 0
+    ).all()
 
 
 def test_cracks_in_objects_take_the_colour_beside_them() -> None:
-    face = np.zeros((64, 64), np.int32)
-    view = gradient(64, 64)[0].clone()
-    expected = view[:, :, 20].clone()
-    seen = torch.ones((64, 64), dtype=torch.bool)
-    seen[:, 20] = False
-    view[:, ~seen] = 0
-    paint = paint_of(face, np.where(seen.numpy(), 0, -1).astype(np.int8))
-    (out,) = fill_holes([view], [seen], [np.full((64, 64), OBJECT, np.uint8)], [paint])
-    assert (out[:, :, 20].int() - expected.int()).abs().max() <= 3  # a 33rd of it is the object's own colour
+    rows = [(np.s_[y : y + 1, :], 0, 40 + 2 * y) for y in range(64)]
+    out = filled(*objects(*rows, hidden=[np.s_[:, 20]]))
+    assert (out[:, :, 20].int() - out[:, :, 10].int()).abs().max() <= 3  # a 33rd of it is the object's own colour
 
 
 def test_sides_take_the_seen_pixels_in_their_row_and_column() -> None:
-    face = np.full((64, 64), -1, np.int32)
-    face[20:50, 10:54] = 0
-    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
-    view[:, 20:35, 10:54], view[:, 35:50, 10:54] = 40, 120  # windows, and the body below
-    seen = torch.ones((64, 64), dtype=torch.bool)
-    seen[20:50, 22:54] = False  # up to the object's right end
-    view *= seen
-    paint = paint_of(face, np.where(seen.numpy(), 0, -1).astype(np.int8))
-    layers = np.where(face >= 0, OBJECT, 0).astype(np.uint8)
-    (out,) = fill_holes([view.clone()], [seen], [layers], [paint])
-    assert abs(int(out[0, 27, 35]) - 40) <= abs(int(out[0, 27, 50]) - 40) < 80
+    windows, body = (np.s_[20:35, 10:54], 0, 40), (np.s_[35:50, 10:54], 0, 120)
+    view, seen, paint = objects(windows, body, hidden=[np.s_[20:50, 22:54]])  # up to the object's right end
+    out = filled(view, seen, paint)[0].int()
+    assert abs(int(out[27, 35]) - 40) <= abs(int(out[27, 50]) - 40) < 80
     # One seen pixel, 14 to the left of (42, 35); the part's median is its windows' or its body's.
-    median = int(object_colours([view.numpy()], [paint])[0, 0])
-    reach, far = 64 / 4, 35 - 21
-    assert abs(int(out[0, 42, 35]) - (median + 120 * reach / far) / (1 + reach / far)) <= 1
+    median, reach = int(object_colours([view.numpy()], [paint])[0, 0]), 64 / 4 / (35 - 21)
+    assert abs(int(out[42, 35]) - (median + 120 * reach) / (1 + reach)) <= 1
 
 
 def test_unseen_sides_take_no_colour_of_what_stands_before_them() -> None:
-    face = np.full((64, 64), -1, np.int32)
-    face[20:50, 10:54], face[10:50, 26:30] = 0, 6  # a dark object before the side of a bright one, hidden right of it
-    face[10:20, 30:54] = 4  # a cabin over it, seen
-    seen = np.ones(face.shape, bool)
-    seen[20:50, 30:54] = False
-    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
-    view[:, 20:50, 10:26], view[:, 10:50, 26:30], view[:, 10:20, 30:54] = 180, 10, 90
-    paint = paint_of(face, np.where(seen, 0, -1).astype(np.int8))
+    """A dark object before the side of a bright one, which is hidden to the right of it, below a seen cabin."""
+    side, dark, cabin = (np.s_[20:50, 10:54], 0, 180), (np.s_[10:50, 26:30], 6, 10), (np.s_[10:20, 30:54], 4, 90)
+    view, seen, paint = objects(side, dark, cabin, hidden=[np.s_[20:50, 30:54]])
     assert len(paint.pixel) == 30 * 24 and (paint.nearest == -1).all()
-    layers = np.where(face >= 0, OBJECT, 0).astype(np.uint8)
-    (out,) = fill_holes([view * torch.from_numpy(seen)], [torch.from_numpy(seen)], [layers], [paint])
-    assert (out[:, ~seen] == 180).all()
+    assert (filled(view, seen, paint)[:, ~seen] == 180).all()
 
 
-def test_unseen_cabins_and_bodies_have_colours_of_their_own() -> None:
-    face = np.full((64, 64), -1, np.int32)
-    face[10:30, 4:60], face[30:50, 4:60] = 4, 0  # the cabin, and a side of the body
-    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
-    view[:, 10:30, 4:60], view[:, 30:50, 4:60] = 30, 150
-    right = np.tile(np.where(np.arange(64) < 56, 0, -1), (64, 1)).astype(np.int8)  # its end is hidden
-    paint = paint_of(face, right)
-    np.testing.assert_array_equal(object_colours([view.numpy()], [paint])[:5, 0], [30, 150, 150, 150, 150])
-    red = torch.tensor([180, 50, 10], dtype=torch.uint8)[:, None, None]
-    view[:, 10:30, 4:60], view[:, 12:20, 4:60] = torch.tensor([40, 60, 90])[:, None, None], red  # windows in red paint
-    paint = paint_of(face, np.where((face == 4) | (face < 0), 0, -1).astype(np.int8))
-    np.testing.assert_array_equal(object_colours([view.numpy()], [paint])[1], red[:, 0, 0])  # no mixture of the two
-
-
-def test_vehicles_of_which_only_an_edge_is_seen_are_painted() -> None:
-    face = np.full((64, 64), -1, np.int32)
-    face[20:50, 10:54] = 0
-    seen = np.ones(face.shape, bool)
-    seen[21:50, 10:54] = False  # one row remains
-    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
-    view[:, 20, 10:54] = 60
-    paint = paint_of(face, np.where(seen, 0, -1).astype(np.int8))
-    assert len(paint.sample) == 44 and object_colours([view.numpy()], [paint])[1, 0] == 60
-    small = paint_of(face, np.where(seen, 0, -1).astype(np.int8), np.zeros(1, np.int32))
-    assert len(small.sample) == 0  # of a barrier or a head, an edge may be anything
+def test_all_that_is_seen_of_a_vehicle_is_sampled_where_little_is() -> None:
+    edge = (np.s_[20:50, 10:54], 0, 60)
+    for parts, count in ((FACE_PARTS, 44), (np.zeros(1, np.int32), 0)):  # of a barrier, an edge may be anything
+        assert len(objects(edge, hidden=[np.s_[21:50, 10:54]], parts=parts)[2].sample) == count
 
 
 def test_objects_that_nobody_sees_are_background() -> None:
-    face = np.full((64, 64), -1, np.int32)
-    face[20:50, 10:30], face[20:50, 30:44] = 0, 6  # the second one stands behind the first
-    view = torch.full((3, 64, 64), 120, dtype=torch.uint8)
-    view[:, 20:50, 10:30] = 10
-    seen = torch.from_numpy(face != 6)
-    paint = paint_of(face, np.where(seen.numpy(), 0, -1).astype(np.int8))
-    layers = np.where(face >= 0, OBJECT, 0).astype(np.uint8)
-    (out,) = fill_holes([view * seen], [seen], [layers], [paint])
-    assert (out[:, 22:48, 31:42].float() - 120).abs().max() <= 1
+    behind = np.s_[20:50, 30:44]
+    view, seen, paint = objects((np.s_[20:50, 10:30], 0, 10), (behind, 6, 9), hidden=[behind])
+    layers = np.zeros(seen.shape, np.uint8)
+    layers[20:50, 10:44] = OBJECT
+    (out,) = fill_holes([view], [seen], [layers], [paint])
+    assert (out[:, 22:48, 31:42].float() - 200).abs().max() <= 1
 
 
 @pytest.mark.slow

@@ -142,22 +142,15 @@ def test_harmful_gains_are_declined(street, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize(
-    ("fill", "reason"),
-    [(0, "dark nor saturated"), (255, "dark nor saturated"), (128, "agree already"), (2, "dark nor saturated")],
+    ("fill", "reason"), [(0, "nor saturated"), (255, "nor saturated"), (128, "agree already"), (2, "nor saturated")]
 )
-def test_blank_images(street, fill: int, reason: str) -> None:
+def test_blank_images_and_stripes(street, fill: int, reason: str) -> None:
     rig, images = street
-    report = estimate_gains(rig, [torch.full_like(image, fill) for image in images])
-    assert not report.accepted and reason in report.reason
-
-
-def test_stripes(street) -> None:
-    rig, images = street
-    stripes = [torch.zeros_like(image) for image in images]
-    for image in stripes:
+    blank = [torch.full_like(image, fill) for image in images]
+    assert reason in estimate_gains(rig, blank).reason
+    for image in blank:
         image[..., ::8] = 200
-    report = estimate_gains(rig, stripes)
-    assert all(0.9 < gain < 1.1 for gain in report.gains) and report.reason
+    assert all(0.9 < gain < 1.1 for gain in estimate_gains(rig, blank).gains)
 
 
 def test_order_of_cameras_and_repetition_change_nothing(street) -> None:
@@ -238,8 +231,9 @@ def test_executions_and_layouts_agree(street, scale: float) -> None:
     images = [image.contiguous() for image in images]
     kept = [image.clone() for image in images]
     gains = (0.7, 1.0, 1.3, 0.9, 1.6, 1.1)
-    curves = tone_curves(np.divide.outer(gains, gains).T)  # every view has its own
     plan = build_plan(rig, rig.turned(yaw_deg=20).resized(scale))
+    rows = np.linspace(0.9, 1.1, plan.target[0].height_px)  # every view and row has its own
+    curves = tone_curves(np.divide.outer(gains, gains).T[..., None] * rows)
     views = render_opencv(plan, images, None, curves)
     other = [image.flip(-1) for image in images]
     batch = [torch.stack(pair) for pair in zip(images, other, strict=True)]

@@ -12,7 +12,6 @@ from arbiview_aug.render.harmonise import Curves, Harmoniser, match_seams, tone_
 from arbiview_aug.render.photometry_kernels import log_ratios
 from arbiview_aug.render.plan import SEAM_ROWS, RenderPlan
 from arbiview_aug.render.rendered import render_opencv
-from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.render.view_planner import build_plan
 
 SIZE, NO_GAINS = (180, 320), np.zeros((6, 6))
@@ -105,27 +104,6 @@ def test_the_order_of_cameras_makes_no_difference(planned: tuple[Rig, RenderPlan
     matched = match_seams(plan, images, NO_GAINS)
     other = match_seams(shuffled, [images[k] for k in order], NO_GAINS)
     np.testing.assert_allclose(other, matched[:, order], atol=1e-12)
-
-
-def test_executions_agree(planned: tuple[Rig, RenderPlan]) -> None:
-    rig, plan = planned
-    images = pictures(rig, 0.25, 0.8)
-    floats = [image.float() / 255 for image in images]
-    curves, of_floats = (Harmoniser().curves(rig, one, plan) for one in (images, floats))
-    assert curves is not None and of_floats is not None
-    np.testing.assert_allclose(of_floats, curves, atol=1e-3)
-    views = render_opencv(plan, images, None, curves)
-    batch = [torch.stack([image, image.flip(-1)]) for image in images]
-    by_torch = render_torch(plan, batch, [curves, None])
-    error = torch.stack([(v.int() - t[0].int()).abs() for v, t in zip(views, by_torch, strict=True)]).float()
-    assert error.mean() <= 0.05 and error.quantile(0.999) <= 1
-    plain = render_torch(plan, [one[1:] for one in batch])
-    assert all(torch.equal(t[1], p[0]) for t, p in zip(by_torch, plain, strict=True)), "frames have their own curves"
-    leaves = [image[None].requires_grad_() for image in floats]
-    again = torch.stack(render_torch(plan, leaves, [of_floats]))[:, 0]
-    assert (torch.stack(render_opencv(plan, floats, None, of_floats)) - again).abs().mean() <= 2e-4
-    again.sum().backward()
-    assert all(leaf.grad is not None and leaf.grad.isfinite().all() for leaf in leaves)
 
 
 def test_the_transform(planned: tuple[Rig, RenderPlan]) -> None:
