@@ -42,12 +42,13 @@ def sum_cells(view: Any, seen: Any, layers: Any, below: int, cell: int, sums: An
     """
     (h, w), (ny, nx) = seen.shape, sums.shape[1:]
     rows, known, per_pixel = np.empty((4, w), np.float32), np.empty(w, np.float32), _ONE / np.float32(cell * cell)
+    first_unknown = np.uint8(below)
     for j in range(ny):
         rows[:] = _ZERO
         for y in range(j * cell, min(j * cell + cell, h)):
             mark, layer, row = seen[y], layers[y], rows[3]
             for x in range(w):
-                known[x] = np.float32(mark[x] & (layer[x] < below))
+                known[x] = _ONE if mark[x] & (layer[x] < first_unknown) else _ZERO
             for x in range(w):
                 row[x] += known[x]
             for c in range(3):

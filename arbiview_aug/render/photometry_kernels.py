@@ -60,17 +60,6 @@ def log_ratios(pixels: Any, ends: Any, dark: float, bright: float, measured: Any
 
 
 @compiled
-def pair_errors(pixels: Any, ends: Any, errors: Any) -> None:
-    """Mean squared difference (G,) between both readings of each group's pixels; arguments as in ``log_ratios``."""
-    for g in range(len(ends) - 1):
-        total = 0.0
-        for k in range(ends[g], ends[g + 1]):
-            for c in range(3):
-                total += np.float64(pixels[0, k, c] - pixels[1, k, c]) ** 2
-        errors[g] = total / (3 * (ends[g + 1] - ends[g]))
-
-
-@compiled
 def sample_band(
     weight: Any, y0: int, x0: int, step: int, xy: Any, band_xy: Any, slots: Any, rank: Any, parts: Any, groups: Any,
     source: Any, at: Any, count: int,
@@ -116,28 +105,6 @@ def sample_band(
             groups[count, 0], groups[count, 1] = rank[other], other
             groups[count, 2], groups[count, 3] = source[0, count], parts[y + y0]
             count += 1
-    return count
-
-
-@compiled
-def list_runs(winner: Any, runs: Any) -> int:
-    """List the runs of pixels of one source in a row of (h, w) int8 winners; return their number.
-
-    ``runs`` (h w, 3) are written: first pixel in the flattened view, end, and source · h + row.
-    """
-    (h, w), count = winner.shape, 0
-    for y in range(h):
-        row, start = winner[y], 0
-        for x0 in range(1, w + 1, 64):
-            here, before, changes = row[x0 : x0 + 64], row[x0 - 1 : min(x0 + 63, w - 1)], False
-            for x in range(len(before)):
-                changes |= here[x] != before[x]
-            for x in range(x0 if changes else max(w, x0), min(x0 + 64, w + 1)):
-                if x == w or row[x] != row[start]:
-                    if row[start] >= 0:
-                        runs[count, 0], runs[count, 1], runs[count, 2] = y * w + start, y * w + x, row[start] * h + y
-                        count += 1
-                    start = x
     return count
 
 
@@ -190,9 +157,7 @@ def warm_up() -> None:
     pixels, curve, slots = np.ones((2, 1, 3), np.float32), np.ones((1, 2), np.float32), np.array([[0, 0, 1, 1, 0, 0]])
     xy, weight = np.zeros((1, 1, 2), np.int16), np.ones((1, 1), np.float32)
     log_ratios(pixels, ends, 0.0, 2.0, np.empty((1, 3)))
-    pair_errors(pixels, ends, np.empty(1))
     sample_band(weight, 0, 0, 1, xy, xy, slots, ends, ends, np.zeros((1, 4), np.int64), source, at, 0)
-    list_runs(np.zeros((1, 1), np.int8), at[0].repeat(3, 1)[:, :3].copy())
     for planes in (np.zeros((3, 1, 1), np.uint8), np.zeros((3, 1, 1), np.float32)):
         for image in (planes, planes.transpose(0, 2, 1)):  # channels first, and last
             read_pixels(image, 0, source, at, _ONE, pixels)

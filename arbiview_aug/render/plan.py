@@ -279,10 +279,11 @@ class ViewPlan:
     @cached_property
     def runs(self) -> npt.NDArray[np.int64]:
         """(n, 3) runs of pixels of one source in a row of h: first one in the flattened view, end, source · h + row."""
-        from arbiview_aug.render.photometry_kernels import list_runs
-
-        runs = np.empty((self.source_camera.size, 3), np.int64)
-        return runs[: list_runs(self.source_camera, runs)].copy()
+        winner = self.source_camera
+        start = np.flatnonzero(np.diff(winner, prepend=np.int8(-2)) != 0)  # of int8 it takes ten times as long
+        source, row = winner.ravel()[start].astype(np.int64), start // winner.shape[1]
+        runs = np.stack([start, np.append(start[1:], winner.size), source * len(winner) + row], 1)
+        return runs[runs[:, 2] >= 0]
 
     @cached_property
     def band_runs(self) -> list[npt.NDArray[np.int64]]:
