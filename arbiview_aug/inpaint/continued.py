@@ -1,8 +1,8 @@
 """Default filling of holes: the background continued along lines of the scene and by a pyramid of cells.
 
-A hole pixel knows whether its ray would meet the road next. The road goes on along the ego's heading, in its plane;
-what stands upright goes on along the heading, too, at equal height, and up and down. Each pixel mixes what its lines
-meet first with a blurred completion of all that is beside it. Unseen parts of objects are painted.
+A hole pixel knows whether its ray would meet the road next. The road continues along the ego's heading, in its plane;
+upright things continue along the heading, too, at equal height, and up and down. Each pixel mixes what its lines meet
+first with a blurred completion of its surroundings. Unseen parts of objects are painted.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any, ClassVar
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -34,23 +35,23 @@ view's shorter side: nothing; upright things and road outside the sources' image
 SIDE_REACH = 1 / 4
 """The same of seen pixels of a body or cabin in the row and column of its unseen ones, against its colour."""
 
-_LENS_NODES = 17  # directions of lines are interpolated between so many nodes along each side; a pinhole's are linear
+_LENS_NODES = 17  # directions of lines are interpolated between N nodes along each side; a pinhole's are linear
 _MOVE = 1e-4  # by which rays are moved along a line, as a share of their length
 _STEP_PX = 4  # distance of the nodes at which views without a plan know the road
 
-_WIDE = 2  # halvings of the columns alone: what is hidden looks like what is beside it, not above or below
+_WIDE = 2  # halvings of the columns alone: what is hidden looks like what is left and right of it
 _SWEEPS = 2
-"""Sweeps of smoothing at each size of the cells. Synthetic streets: 0 to 0.08 dB of whole views; 4 sweeps: +0.03."""
+"""Sweeps of smoothing at each size of the cells; more gain little (docs/decisions.md)."""
 
 Colour = npt.NDArray[np.float32]
 """(3,), or (n, 3) samples, in the images' unit."""
 
 
 class Continue(Inpainter):
-    """Continues the road along the heading, and what stands upright along the heading and vertically.
+    """Continues the road along the heading, and upright things along the heading and vertically.
 
     Unseen parts of labelled objects: tops take the paint of their object's body and what a source sees of its tops
-    (``object_colours``); sides go on from their seen pixels. Covered pixels do not change.
+    (``kernels.colour_objects``); sides continue their seen pixels. Covered pixels do not change.
     """
 
     outcome: ClassVar[str] = "filled in from its surroundings"
@@ -67,7 +68,7 @@ class Continue(Inpainter):
             plans = frame.layers, frame.paint, frame.road, frame.rig
             images = fill_holes(frame.images, list(frame.coverage), *plans, only_mean=self.only_mean)
             seen = frame.coverage
-            holes = ~seen if isinstance(seen, torch.Tensor) else [~of_view for of_view in seen]
+            holes = ~seen if isinstance(seen, torch.Tensor) else [~covered for covered in seen]
             filled.append(replace(frame, images=images, generated=holes))
         return filled
 
@@ -131,16 +132,12 @@ def fill_holes(
 
 
 def mean_colour(views: Sequence[npt.NDArray[Any]], coverage: Sequence[npt.NDArray[Any]]) -> Colour:
-    """Mean colour of the covered pixels of M views (3, h, w); grey without any. Large views are sampled."""
-    for is_sampled in (True, False):  # few covered pixels may lie between the samples
-        total, count = np.zeros(3), 0
-        for view, seen in zip(views, coverage, strict=True):
-            step = _cell_px(seen.shape) if is_sampled else 1
-            sampled = seen[::step, ::step]
-            total += (view[:, ::step, ::step].astype(np.float64) * sampled).sum((1, 2))
-            count += int(sampled.sum())
-        if count:
-            break
+    """Mean colour of the covered pixels of M views (3, h, w); grey without any."""
+    total, count = np.zeros(3), 0
+    for view, seen in zip(views, coverage, strict=True):
+        pixels = int(np.count_nonzero(seen))
+        total += pixels * np.array([cv2.mean(plane, seen.view(np.uint8))[0] for plane in view])
+        count += pixels
     top = 255 if views[0].dtype == np.uint8 else 1
     return np.clip(total / count if count else np.full(3, top * GREY), 0, top).astype(np.float32)
 
