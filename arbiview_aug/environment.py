@@ -115,15 +115,16 @@ def called(function: Any) -> Any:
     return compiled(function, no_cpython_wrapper=True)
 
 
-def borrowing(function: Any) -> Any:
+def borrowing(function: Any, *, no_cpython_wrapper: bool = True) -> Any:
     """Compile a function as ``called`` does, without counting references to arrays, which takes a fifth of the time.
 
-    It must not allocate or return an array, nor call a function that does: its caller hands it the scratch that it needs.
+    It must not allocate or return an array, nor call a function that does: its caller hands it scratch.
+    Python can call it with ``no_cpython_wrapper=False``.
     """
     from numba.core.cpu import CPUTargetOptions
 
     option = {"_nrt": False} if hasattr(CPUTargetOptions, "_nrt") else {}  # private; numba's own str kernels use it
-    return compiled(function, no_cpython_wrapper=True, **option)
+    return compiled(function, no_cpython_wrapper=no_cpython_wrapper, **option)
 
 
 def inlined(function: Any) -> Any:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug.cameras.lens import MIN_DEPTH
-from arbiview_aug.environment import called, compiled, inlined
+from arbiview_aug.environment import borrowing, compiled, inlined
 
 Row = Any  # float32 (n,): kernels are typed by numba
 
@@ -54,7 +54,7 @@ def pinhole_rays_row(P: Row, v: float, first: int, rx: Row, ry: Row, rz: Row) ->
         ry[i] = y * rz[i]
 
 
-@called
+@borrowing
 def rays_row(planes: Row, P: Row, y: int, x0: int, rx: Row, ry: Row, rz: Row) -> None:
     """Unit rays (n,) of the pixels of row ``y`` from column ``x0`` on, camera frame."""
     if planes.shape[1] == 0:
@@ -114,7 +114,7 @@ def cell_cones(planes: Row, P: Row, size: Row, step: int, cones: Row) -> None:
             cones[0, j, i], cones[1, j, i], cones[2, j, i], cones[3, j, i] = x, y, z, spread
 
 
-@called
+@borrowing
 def turn_row(rx: Row, ry: Row, rz: Row, q: Row, A: Row, o: Row, x: Row, y: Row, z: Row) -> None:
     """Points A r + q o of rays r (n,) in another camera's frame, times their inverse distance q (n,)."""
     a, b, c, d = A[0, 0], A[0, 1], A[0, 2], o[0]
@@ -128,7 +128,7 @@ def turn_row(rx: Row, ry: Row, rz: Row, q: Row, A: Row, o: Row, x: Row, y: Row, 
         z[i] = a * rx[i] + b * ry[i] + c * rz[i] + d * q[i]
 
 
-@called
+@borrowing
 def project_row(x: Row, y: Row, z: Row, kind: int, P: Row, a: Row, b: Row, u: Row, v: Row) -> None:
     """Pixels u, v (n,) of camera-frame points; ``FAR_AWAY_PX`` where there is none. ``a`` and ``b`` are scratch."""
     n = u.shape[0]
@@ -176,7 +176,7 @@ def project_row(x: Row, y: Row, z: Row, kind: int, P: Row, a: Row, b: Row, u: Ro
         v[i] = fy * yd + cy if a[i] > _ZERO else FAR_AWAY_PX
 
 
-@called
+@borrowing
 def angle_row(r: Row, z: Row, out: Row) -> None:
     """atan2(r, z) (n,) in [0, pi] for r >= 0, by the octant that r and |z| lie in."""
     for i in range(r.shape[0]):

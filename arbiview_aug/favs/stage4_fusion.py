@@ -7,7 +7,7 @@ Generation":
 - w⁽ⁱ⁾ = w_distance⁽ⁱ⁾ · w_gradient⁽ⁱ⁾ · w_quality⁽ⁱ⁾ · w_primary⁽ⁱ⁾: ``fusion_weight``.
 - I_target = Σ w⁽ⁱ⁾ I_warped⁽ⁱ⁾ / Σ w⁽ⁱ⁾: ``fuse``.
 
-w_distance is that of render plans (``arbiview_aug.render.weights``).
+w_distance is that of render plans, too (``arbiview_aug.render.kernels.measure_nodes``).
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.render.weights import distance_weight
 
 Float32Image = npt.NDArray[np.float32]
 
@@ -77,6 +76,14 @@ def source_pixels(
 
 
 # --- weights ----------------------------------------------------------------------------------------------------------
+def distance_weight(distance_px: FloatArray, d_max_px: float) -> FloatArray:
+    """w_distance(x, y) = d(x, y) / d_max, with γ = 1: 0 at the border of a source's coverage, 1 at its middle.
+
+    d (...,) is the distance to the border, negative outside; d_max > 0.
+    """
+    return np.clip(distance_px / d_max_px, 0.0, 1.0)
+
+
 def gradient_weight(gradient_magnitude: FloatArray, sigma: float) -> FloatArray:
     """w_gradient(x, y) = 1 / (1 + ‖∇I(x, y)‖ / σ), with ‖∇I‖ (...,) and σ > 0 in grey levels per pixel."""
     return 1.0 / (1.0 + gradient_magnitude / sigma)

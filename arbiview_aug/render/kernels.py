@@ -1,20 +1,28 @@
-"""Compiled inner loops of planning: which cells a source may see, its pixels, and who wins them.
+"""Compiled inner loops of planning: where each source sees a view's pixels, and which source wins them.
 
-A target is worked on row by row; every loop over a row writes one array, so that it becomes vector instructions.
-None writes the array whose elements it keeps under a condition: ``x[i] = a if c else x[i]`` becomes a masked store,
-which takes AMD's processors ten cycles. It writes a scratch row, and the next loop copies that.
+A view takes two steps. ``measure_nodes`` projects nodes 8 px apart into all sources and weighs these there.
+``plan_pixels`` evaluates all pixels: by rows where one source has weight, else in small blocks, of which the best two
+sources are kept. Sources without weight fill what those do not see.
+
+Every loop over pixels writes one array, so that it becomes vector instructions. None writes the array whose elements it
+keeps under a condition: ``x[i] = a if c else x[i]`` becomes a masked store, which takes AMD's processors ten cycles.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
 
-from arbiview_aug.cameras.kernels import edge_distance_row, project_row, rays_row, turn_row
+from arbiview_aug.cameras.kernels import FAR_AWAY_PX, edge_distance_row, project_row, rays_row, turn_row
+from arbiview_aug.cameras.rays import CELL_PX
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
-from arbiview_aug.environment import called, compiled, inlined
+from arbiview_aug.environment import borrowing, compiled, inlined
 from arbiview_aug.render.plan import OUTSIDE
 from arbiview_aug.scene.boxes import PIECES
 from arbiview_aug.scene.kernels import upsampled_row
@@ -27,197 +35,239 @@ LEAST_INCIDENCE = np.float32(0.05)
 SAME_OBJECT_M = np.float32(0.15)
 """A piece of an object must be nearer by this share to hide another: they touch, and are drawn half a pixel wider."""
 
+LEAST_BORDER_PX = np.float32(0.499)
+"""Distance to the border from which a source sees a point: the outermost pixel centres, and a rounding."""
+
 WHOLE = 0.97
 """Share of an object's nodes, among those of the source that sees most, from which a source sees it whole."""
 
-_BORDER_PX = np.float32(1.0)  # maps bulge between the corners of a cell
+LEAST_SHARE = np.float32(1 / 256)
+"""Share of a pixel below which a second source cannot change a grey level."""
+
+BLOCK_PX, FLOAT_ROWS, INT_ROWS = 56, 15, 11
+"""Most columns of a block that several sources share: its scratch stays in the first-level cache. Scratch arrays."""
+
+_MOST_HALVINGS, _MOST_BITS = 14, 62
+_COARSEST = np.float32(0.05)  # source pixels per target pixel below which weights fall no further
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
-_WORK_ROWS = 10  # of scratch memory in ``_evaluate_row``
-MAP_LIMIT_PX = np.float32(MAX_SIZE_PX)
 _MAX_SIDE_PX = 32767
+_MAP_LIMIT_PX = np.float32(MAX_SIZE_PX)
 _AHEAD_COLUMNS, _MOST_AHEAD = 176, 32  # of a strip at a time; at most so many pixels are read for each of its own
 
 
+class Images(NamedTuple):
+    """An array for each of K sources, of different sizes, by its address: the caller keeps them alive, C-contiguous."""
+
+    address: Any  # (K,) int64
+    size: Any  # (K, 2) int64 rows and columns, 0 for none
+
+
+class View(NamedTuple):
+    """A target view (h, w) with nodes (ny, nx)."""
+
+    planes: Any  # (3, h, w) float32 unit rays of the pixels; (3, 0, 0) for a pinhole
+    P: Any  # (14,) float32 ``Camera.parameters``
+    R: Any  # (3, 3) float64 rotation to the ego frame
+    center_m: Any  # (3,) float64 in the ego frame
+    cone: Any  # (4,) float64 middle of a cone around the rays, camera frame, and its half angle
+    y: Any  # (ny,) int64 rows of the nodes
+    x: Any  # (nx,) int64 columns of the nodes
+    rays: Any  # (3, ny, nx) float32 unit rays of the nodes
+    step: int  # side of a cell, pixels
+
+
+class Sources(NamedTuple):
+    """The K source cameras that may see a view, as they are read: some are halved."""
+
+    A: Any  # (K, 3, 3) float32 rotation from the target's frame
+    o: Any  # (K, 3) float32 the target's centre in the source's frame; 0 where the scene counts as infinitely far
+    kind: Any  # (K,) int64 lens; -1 for one that kernels do not know
+    P: Any  # (K, 14) float32 ``Camera.parameters``
+    size: Any  # (K, 2) int64 height and width, not halved
+    bounds: Any  # (K, 6) float32 least columns and rows of the image, largest ones; last pixel of a halved one, or -1
+    offset_m: Any  # (K, 3) float32 the target's centre minus the source's, target's frame
+    bonus: Any  # (K,) float32 factor of the weight
+    slot: Any  # (K, 3) int32 number of the source; column and row of its image in the atlas
+    positions: Images  # (2 h, w) float32 columns, then rows, for lenses that kernels do not know
+    to_mask: Images  # float32 distance of each cell of ``CELL_PX`` to the own car, pixels
+    clean: Images  # uint8, 0 where the image shows the own car
+
+
+class Surfaces(NamedTuple):
+    """The scene as a view sees it."""
+
+    q: Any  # (h, w) float32 inverse distances along the pixels' rays, 1/m
+    face: Any  # (h, w) int32 faces of objects, -1 elsewhere; (0, 0) without any
+    behind: Any  # (ny, nx) float32 inverse distances of the background on the nodes
+    uncertainty: Any  # (ny, nx) float32 expected error of the inverse distance on the nodes, 1/m
+
+
+class Occluders(NamedTuple):
+    """What hides points from K sources; ``surface.OcclusionMap`` for each."""
+
+    beyond: Images  # float32 inverse distances beyond which points are hidden, 1/m
+    solid: Images  # int32 number of the solid that hides them, -1 for none
+    scale: Any  # (K,) float32 size of these images over that of the image that is read
+    before_m: Any  # (K, F) float32 metres that the source lies before the plane of each face; (K, 0) without objects
+    is_guess: bool  # the background was not measured: all that stands before it hides it
+
+
+class Nodes(NamedTuple):
+    """What weights depend on, for K sources on the nodes of a view; written by ``measure_nodes``."""
+
+    score: Any  # (K, ny, nx) float32 weight, 0 where the source sees nothing
+    border: Any  # (K, ny, nx) float32 distance to the border of what the source sees, target pixels; 0 if not ``near``
+    parallax: Any  # (K, ny, nx) float32 expected displacement, target pixels
+    resolution: Any  # (K, ny, nx) float32 source pixels per target pixel along the worse axis
+    near: Any  # (K, ny, nx) bool, whether the source's image may contain pixels of the cells around
+    uv: Any  # (K, 2, ny, nx) float32 columns and rows in the source; given where the lens is unknown
+    halvings: Any  # (K,) int64 of the source's image before it is read; -1 where no pixel can lie in it
+
+
+class Pixels(NamedTuple):
+    """The plan of a view's pixels; written by ``plan_pixels``."""
+
+    winner: Any  # (h, w) int8 number of the winning source, -1 for none
+    xy: Any  # (h, w) int32, two int16: whole pixels in the atlas
+    frac: Any  # (h, w) uint16 32nds of a pixel
+    second: Any  # (h, w) int8 number of the source that is blended in, -1 for none; given as -1; (0, 0) without seams
+    second_xy: Any  # (h, w) int32 its ``xy``, where ``shared``, as all that follow
+    second_frac: Any  # (h, w) uint16
+    share: Any  # (h, w) float32 its share
+    shared: Any  # (ny - 1, nx - 1) bool cells in which several sources have weight
+    in_image: Any  # (h, w) uint8, not 0 where some source's image contains the pixel; (0, 0) where nothing hides
+    won: Any  # (128,) int64 pixels that each source wins; given as 0
+
+
+class Block(NamedTuple):
+    """Pixels (n,) of a view as points A ray + q o of a source, and where that sees them."""
+
+    x: Any  # float32 unit rays
+    y: Any
+    z: Any
+    q: Any  # float32 inverse distances
+    face: Any  # int32
+    u: Any  # float32 columns and rows in the source; given where the lens is unknown
+    v: Any
+    seen: Any  # int32, written: whether the source sees them
+    held: Any  # int32, updated: whether the image of some source contains them
+
+
+def _array_at(typing: Any, address: Any, shape: Any, dtype: Any) -> Any:
+    """The C-contiguous array of a shape and type that lies at an address; compiled code alone can call it."""
+    kind = types.Array(dtype.dtype, len(shape), "C")
+
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        item = context.get_data_type(kind.dtype)
+        size = stride = context.get_constant(types.intp, context.get_abi_sizeof(item))
+        sides, strides = cgutils.unpack_tuple(builder, arguments[1]), list[Any]()
+        for side in reversed(sides):
+            strides.insert(0, stride)
+            stride = builder.mul(stride, side)
+        array = context.make_array(kind)(context, builder)
+        data = builder.inttoptr(arguments[0], item.as_pointer())
+        populate_array(array, data=data, shape=sides, strides=strides, itemsize=size, meminfo=None)
+        return array._getvalue()
+
+    return kind(types.int64, shape, dtype), codegen
+
+
+array_at: Any = intrinsic(_array_at)
+
+
+# --- nodes ------------------------------------------------------------------------------------------------------------
 @compiled
-def depth_range(q: Any, step: int, nearest: Any, farthest: Any) -> None:
-    """Largest and smallest inverse distance (ny, nx) of each cell of an image (h, w)."""
-    h, w = q.shape
-    ny, nx = nearest.shape
-    work = np.empty((4, w), np.float32)
-    high, low, next_high, next_low = work[0], work[1], work[2], work[3]
-    for j in range(ny):
-        high[:] = _ZERO
-        low[:] = np.float32(1e9)
-        for y in range(j * step, min(j * step + step, h)):
-            row = q[y]
-            for x in range(w):
-                next_high[x] = max(high[x], row[x])
-            for x in range(w):
-                next_low[x] = min(low[x], row[x])
-            high, next_high, low, next_low = next_high, high, next_low, low
-        for i in range(nx):
-            most, least = high[i * step], low[i * step]
-            for x in range(i * step, min(i * step + step, w)):
-                most, least = max(most, high[x]), min(least, low[x])
-            nearest[j, i], farthest[j, i] = most, least
-
-
-@compiled
-def cells_in_view(
-    rays: Any, nearest: Any, farthest: Any, A: Any, o: Any, kind: int, P: Any, size: Any, cone_rad: float, open: Any,
-    columns: Any,
-) -> None:  # fmt: skip
-    """Find the cells of a target that a source may see.
-
-    A cell is left out where its eight corners, the nodes' rays at its least and largest distance, all lie beyond one
-    side of the source's image, read off homogeneous coordinates for a pinhole; for a lens, also outside its cone.
-
-    Args:
-        rays: (3, ny + 1, nx + 1) nodes.
-        nearest: (ny, nx) largest inverse distance.
-        farthest: (ny, nx) least.
-        A: (3, 3) target to source.
-        o: (3,) the target's centre in the source's frame.
-        kind: The source's lens; it may see all open cells through one that kernels do not know.
-        P: Its parameters.
-        size: (2,) float32 its height and width.
-        cone_rad: Angle off its axis beyond which it sees nothing.
-        open: (ny, nx) bool, cells that it may change.
-        columns: (ny, 2) int64, written: first and last (exclusive) such cell of each row.
-    """
-    ny, nx = open.shape
-    right, bottom = size[1] - _ONE + _BORDER_PX, size[0] - _ONE + _BORDER_PX
-    work, common = np.empty((12, nx), np.float32), np.empty(nx, np.int32)
-    x, y, z, u, v, a, b = work[0], work[1], work[2], work[3], work[4], work[5], work[6]
-    first_x, first_y, first_z, forward, together = work[7], work[8], work[9], work[10], work[11]
-    for j in range(ny):
-        common[:] = 31 if kind >= 0 else 0
-        forward[:] = -_ONE
-        together[:] = _ONE
-        for c in range(8 if kind >= 0 else 0):
-            jj, ii = j + (c >> 1 & 1), c & 1
-            q = nearest[j] if c < 4 else farthest[j]
-            corner = slice(ii, ii + nx)
-            turn_row(rays[0, jj, corner], rays[1, jj, corner], rays[2, jj, corner], q, A, o, x, y, z)
-            if kind == 0:
-                for i in range(nx):
-                    u[i], v[i] = P[0] * x[i] + P[1] * y[i] + P[2] * z[i], P[3] * y[i] + P[4] * z[i]
-            else:
-                project_row(x, y, z, kind, P, a, b, u, v)
-            for i in range(nx):
-                one = z[i] if kind == 0 else _ONE  # of a lens, positions are no homogeneous coordinates
-                code = np.int32(1) if u[i] < -_BORDER_PX * one else np.int32(0)
-                code |= np.int32(2) if u[i] > right * one else np.int32(0)
-                code |= np.int32(4) if v[i] < -_BORDER_PX * one else np.int32(0)
-                code |= np.int32(8) if v[i] > bottom * one else np.int32(0)
-                code |= np.int32(16) if one < _ZERO else np.int32(0)
-                common[i] &= code if kind == 0 or abs(u[i]) < np.float32(9e4) else np.int32(0)
-            if kind == 0:
-                continue
-            for i in range(nx):
-                a[i] = max(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i]), _TINY)
-            for i in range(nx):
-                forward[i] = max(forward[i], z[i] / a[i])
-            for i in range(nx if c == 0 else 0):
-                first_x[i], first_y[i], first_z[i] = x[i] / a[i], y[i] / a[i], z[i] / a[i]
-            for i in range(nx):
-                together[i] = min(together[i], (first_x[i] * x[i] + first_y[i] * y[i] + first_z[i] * z[i]) / a[i])
-        columns[j, 0] = columns[j, 1] = 0
-        for i in range(nx):
-            use = open[j, i] and common[i] == 0
-            if use and kind > 0:
-                use = np.arccos(min(forward[i], _ONE)) <= cone_rad + np.arccos(max(together[i], -_ONE))
-            if use:
-                columns[j, 0] = columns[j, 0] if columns[j, 1] else i
-                columns[j, 1] = i + 1
-
-
-@compiled
-def measure_nodes(
-    rays: Any, q: Any, A: Any, o: Any, kind: int, P: Any, y: Any, x: Any, size: Any, to_mask: Any, cell_px: int,
-    offset_m: Any, uncertainty: Any, focal_px: float, u: Any, v: Any, measured: Any, rounded: Any,
-) -> None:  # fmt: skip
-    """Compute what weights depend on, at the nodes of a target.
-
-    Args:
-        rays: (3, ny, nx) of the nodes.
-        q: (ny, nx) inverse distances along them.
-        A: (3, 3) target to source.
-        o: (3,) the target's centre in the source's frame.
-        kind: The source's lens.
-        P: Its parameters.
-        y: (ny,) the nodes' rows in the target.
-        x: (nx,) their columns.
-        size: (h, w) of the source.
-        to_mask: (H, W) distance of each cell of the source to its mask, pixels; (0, 0) without one.
-        cell_px: Side of those cells.
-        offset_m: (3,) float64 the target's centre minus the source's, target's frame.
-        uncertainty: (ny, nx) expected error of the inverse distance, 1/m.
-        focal_px: The target's focal length.
-        u: (ny, nx) float32 columns in the source: given for lenses that kernels do not know, else written.
-        v: (ny, nx) its rows.
-        measured: (3, ny, nx) float64, written: source pixels per target pixel along the worse axis, which is the
-            smaller singular value of the Jacobian; ``rays.edge_distance``; displacement that unknown depth may cause,
-            target pixels: offset across the ray times uncertainty.
-        rounded: (2, ny, nx) float32, written: that displacement; the edge's distance in target pixels.
-    """
-    ny, nx = u.shape
-    resolution, edge_px, parallax_px = measured[0], measured[1], measured[2]
-    if kind >= 0:
-        work = np.empty((5, nx), np.float32)
-        for j in range(ny):
-            turn_row(rays[0, j], rays[1, j], rays[2, j], q[j], A, o, work[0], work[1], work[2])
-            project_row(work[0], work[1], work[2], kind, P, work[3], work[4], u[j], v[j])
+def measure_nodes(view: View, sources: Sources, surfaces: Surfaces, antialias: bool, nodes: Nodes) -> None:
+    """Project the nodes of a view into all sources, and weigh these by distance to the border and quality."""
+    K, ny, nx = nodes.score.shape
+    work, edge, focal_px, step2 = np.empty((5, nx), np.float32), np.empty(nx), view.P[0], np.float32(view.step**2)
     # The last nodes may coincide: their difference says nothing.
-    last_y = max(ny - 2 - (ny > 2 and y[ny - 1] == y[ny - 2]), 0)
-    last_x = max(nx - 2 - (nx > 2 and x[nx - 1] == x[nx - 2]), 0)
-    is_line = y[ny - 1] == y[0] or x[nx - 1] == x[0]
-    length2 = offset_m[0] ** 2 + offset_m[1] ** 2 + offset_m[2] ** 2
-    for j in range(ny):
-        jj = min(j, last_y)
-        per_y = 1.0 / max(y[jj + 1] - y[jj], 1)
-        for i in range(nx):
-            ii = min(i, last_x)
-            per_x = 1.0 / max(x[ii + 1] - x[ii], 1)
-            a, c = (u[j, ii + 1] - u[j, ii]) * per_x, (v[j, ii + 1] - v[j, ii]) * per_x
-            b, d = (u[jj + 1, i] - u[jj, i]) * per_y, (v[jj + 1, i] - v[jj, i]) * per_y
-            half_sum, determinant = (a * a + b * b + c * c + d * d) / 2, a * d - b * c
-            root = np.sqrt(max(half_sum * half_sum - determinant * determinant, 0.0))
-            resolution[j, i] = 1.0 if is_line else np.sqrt(max(half_sum - root, 0.0))
-        edge_distance_row(u[j], v[j], size, to_mask, cell_px, edge_px[j])
-        for i in range(nx):
-            along = rays[0, j, i] * offset_m[0] + rays[1, j, i] * offset_m[1] + rays[2, j, i] * offset_m[2]
-            parallax_px[j, i] = focal_px * (np.sqrt(max(length2 - along * along, 0.0)) * uncertainty[j, i])
-        for i in range(nx):
-            rounded[0, j, i] = parallax_px[j, i]
-        for i in range(nx):
-            rounded[1, j, i] = edge_px[j, i] / max(resolution[j, i], 1e-3)
+    last_y = max(ny - 2 - (ny > 2 and view.y[ny - 1] == view.y[ny - 2]), 0)
+    last_x = max(nx - 2 - (nx > 2 and view.x[nx - 1] == view.x[nx - 2]), 0)
+    is_line = view.y[ny - 1] == view.y[0] or view.x[nx - 1] == view.x[0]
+    rays, q, near_q = view.rays, surfaces.behind, np.empty(nx, np.float32)
+    for k in range(K):
+        u, v, offset_m, size = nodes.uv[k, 0], nodes.uv[k, 1], sources.offset_m[k], sources.size[k]
+        for j in range(ny if sources.kind[k] >= 0 else 0):
+            turn_row(rays[0, j], rays[1, j], rays[2, j], q[j], sources.A[k], sources.o[k], work[0], work[1], work[2])
+            project_row(work[0], work[1], work[2], sources.kind[k], sources.P[k], work[3], work[4], u[j], v[j])
+        shape = sources.to_mask.size[k, 0], sources.to_mask.size[k, 1]
+        to_mask, least = array_at(sources.to_mask.address[k], shape, np.float32), np.float32(min(size[0], size[1]))
+        right, bottom = np.float32(size[1] - 1), np.float32(size[0] - 1)
+        ox, oy, oz = offset_m[0], offset_m[1], offset_m[2]
+        length2, is_near = ox * ox + oy * oy + oz * oz, False
+        inside: Any = 0
+        for j in range(ny):
+            jj = min(j, last_y)
+            per_y = _ONE / np.float32(max(view.y[jj + 1] - view.y[jj], 1))
+            edge_distance_row(u[j], v[j], (size[0], size[1]), to_mask, CELL_PX, edge)
+            for i in range(nx):
+                ii = min(i, last_x)
+                per_x = _ONE / np.float32(max(view.x[ii + 1] - view.x[ii], 1))
+                # The resolution along the worse axis is the smaller singular value of the Jacobian ((a, b), (c, d)).
+                a, c = (u[j, ii + 1] - u[j, ii]) * per_x, (v[j, ii + 1] - v[j, ii]) * per_x
+                b, d = (u[jj + 1, i] - u[jj, i]) * per_y, (v[jj + 1, i] - v[jj, i]) * per_y
+                half_sum, determinant, border = (
+                    (a * a + b * b + c * c + d * d) * _HALF,
+                    a * d - b * c,
+                    np.float32(edge[i]),
+                )
+                # Pixels of the cells around a node lie in the source at most so far from it.
+                room2 = min((_ONE + half_sum + half_sum) * step2, least * least)
+                outside = max(max(-u[j, i], u[j, i] - right), max(-v[j, i], v[j, i] - bottom))
+                nodes.near[k, j, i] = outside < _ZERO or outside * outside < room2
+                is_near = is_near or nodes.near[k, j, i]
+                if not nodes.near[k, j, i]:
+                    nodes.score[k, j, i], nodes.border[k, j, i] = _ZERO, _ZERO
+                    nodes.parallax[k, j, i], nodes.resolution[k, j, i] = _ZERO, _ZERO
+                    continue
+                root = np.sqrt(max(half_sum * half_sum - determinant * determinant, _ZERO))
+                fine = _ONE if is_line else abs(determinant) / max(np.sqrt(half_sum + root), _TINY)
+                along = rays[0, j, i] * ox + rays[1, j, i] * oy + rays[2, j, i] * oz
+                off = focal_px * np.float32(np.sqrt(max(length2 - along * along, _ZERO))) * surfaces.uncertainty[j, i]
+                is_seen, distance_weight = border >= LEAST_BORDER_PX, min((border + border) / least, _ONE)
+                weight = distance_weight * min(max(fine, _COARSEST), _ONE) / (_ONE + off) * sources.bonus[k]
+                nodes.score[k, j, i] = weight if is_seen else _ZERO
+                nodes.border[k, j, i] = border / max(fine, np.float32(1e-3))
+                nodes.parallax[k, j, i], nodes.resolution[k, j, i] = off, fine
+                inside += is_seen
+        if not is_near and surfaces.face.shape[0] and sources.kind[k] >= 0:  # it may see objects before the background
+            for j in range(ny):
+                for i in range(nx):
+                    near_q[i] = surfaces.q[view.y[j], view.x[i]]
+                turn_row(
+                    rays[0, j], rays[1, j], rays[2, j], near_q, sources.A[k], sources.o[k], work[0], work[1], work[2]
+                )
+                project_row(work[0], work[1], work[2], sources.kind[k], sources.P[k], work[3], work[4], u[j], v[j])
+                for i in range(nx):
+                    is_near = is_near or (u[j, i] >= 0 and u[j, i] <= right and v[j, i] >= 0 and v[j, i] <= bottom)
+        nodes.halvings[k] = 0 if is_near else -1
+        for level in range(1, 1 + _MOST_HALVINGS if antialias and inside else 1):
+            # Four fifths of the nodes are minified by 2^level; 2 %: a target of half size must read the halved source.
+            count, limit = 0, np.float32(2.0**level / 1.02)
+            for j in range(ny):
+                for i in range(nx):
+                    count += (nodes.resolution[k, j, i] >= limit) & (nodes.score[k, j, i] > _ZERO)
+            if 5 * count < 4 * inside or min(size[0], size[1]) >> level < 2:
+                break
+            nodes.halvings[k] = level
 
 
 @compiled
-def win_nodes(
-    scores: Any, parallax: Any, boxes: Any, center: Any, R: Any, rays: Any, axis: Any, node_rad: float, winner: Any
-) -> None:  # fmt: skip
+def win_nodes(view: View, nodes: Nodes, boxes: Any, winner: Any) -> None:
     """Let the source of the largest weight win each node, but one source all that it sees of a labelled object.
 
     A seam repeats or cuts what it crosses. An object that one would cross is read from the source of the least parallax
     among those that see it whole. Nearer objects decide last. Objects that a source shows exactly, from the target's
     own centre, stay as they are.
 
-    Args:
-        scores: (K, ny, nx) weight of each source, 0 where it sees nothing.
-        parallax: (K, ny, nx) its expected displacement.
-        boxes: (B, 7) float64 centre, length, width, height, yaw, ego frame; the nearest last.
-        center: (3,) the target's.
-        R: (3, 3) float64 target to ego.
-        rays: (3, ny, nx) of the nodes.
-        axis: (4,) middle of a cone around the target's rays, camera frame, and its half angle.
-        node_rad: Angle between nodes: objects are wider by it.
-        winner: (ny, nx) int8, written; -1 for none.
+    ``boxes`` (B, 7) float64 are centre, length, width, height and yaw in the ego frame, the nearest last; ``winner``
+    (ny, nx) int8 is written, -1 for none.
     """
-    K, ny, nx = scores.shape
-    n = ny * nx
-    score, error, ray, chosen = scores.reshape(K, n), parallax.reshape(K, n), rays.reshape(3, n), winner.reshape(n)
+    K, ny, nx = nodes.score.shape
+    n, center, R, axis, node_rad = ny * nx, view.center_m, view.R, view.cone, view.step / np.float64(view.P[0])
+    score, error = nodes.score.reshape(K, n), nodes.parallax.reshape(K, n)
+    ray, chosen = view.rays.reshape(3, n), winner.reshape(n)
     x, y, z = ray[0], ray[1], ray[2]
     first, near, inside = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
     along, vectors, count, total = np.empty(n, np.float32), np.empty((7, 3)), np.empty(K), np.empty(K)
@@ -321,276 +371,440 @@ def soften(winner: Any, border_px: Any, radius: int, width_px: float, weights: A
                 soft[j, i] *= min(max(border_px[k, j, i] / width, _ZERO), _ONE)
 
 
+# --- pixels -----------------------------------------------------------------------------------------------------------
+@inlined
+def _block(floats: Any, ints: Any, q: Any, n: int) -> Block:
+    """A block of n pixels with scratch memory, of which ``_look`` uses rows 6 to 10 of ``floats`` and 3 of ``ints``."""
+    x, y, z, u, v = floats[0, :n], floats[1, :n], floats[2, :n], floats[4, :n], floats[5, :n]
+    return Block(x, y, z, q, ints[0, :n], u, v, ints[1, :n], ints[2, :n])
+
+
 @inlined
 def _fixed(value: Any) -> Any:
     """32nds of a pixel."""
-    return np.int32(np.rint(min(max(value, -MAP_LIMIT_PX), MAP_LIMIT_PX) * np.float32(32)))
+    return np.int32(np.rint(min(max(value, -_MAP_LIMIT_PX), _MAP_LIMIT_PX) * np.float32(32)))
 
 
-@called
-def _occlude_row(
-    q: Any, face: Any, px: Any, py: Any, pz: Any, u: Any, v: Any, column: Any, row: Any, hides: Any, place: Any,
-    scale: float, before_m: Any, shadow: Any, solid: Any, guess: bool, seen: Any,
-) -> None:  # fmt: skip
-    """Clear ``seen`` (n,) where something hides a point from a source, or its face is turned away from it.
+@inlined
+def _project_pinhole(block: Block, A: Any, o: Any, P: Any, per_depth: Any) -> None:
+    """Write columns and rows of a block in a pinhole source, ``FAR_AWAY_PX`` behind it; ``per_depth`` is scratch."""
+    x, y, z, q, u, v = block.x, block.y, block.z, block.q, block.u, block.v
+    a, b, c, d = A[2, 0], A[2, 1], A[2, 2], o[2]
+    for i in range(u.shape[0]):
+        depth = a * x[i] + b * y[i] + c * z[i] + d * q[i]
+        per_depth[i] = _ONE / depth if depth > np.float32(1e-6) else _ZERO
+    fx, skew, fy = P[0], P[1], P[3]
+    a, b, c = fx * A[0, 0] + skew * A[1, 0], fx * A[0, 1] + skew * A[1, 1], fx * A[0, 2] + skew * A[1, 2]
+    d = fx * o[0] + skew * o[1]
+    for i in range(u.shape[0]):
+        column = (a * x[i] + b * y[i] + c * z[i] + d * q[i]) * per_depth[i] + P[2]
+        u[i] = column if per_depth[i] > _ZERO else FAR_AWAY_PX
+    a, b, c, d = fy * A[1, 0], fy * A[1, 1], fy * A[1, 2], fy * o[1]
+    for i in range(u.shape[0]):
+        v[i] = (a * x[i] + b * y[i] + c * z[i] + d * q[i]) * per_depth[i] + P[4]
 
-    The points ``px``, ``py`` and ``pz`` lie in the source's frame, times ``q``; all three are overwritten. ``face``
-    numbers faces of solids, -1 for the background; (0,) without any. ``u`` and ``v`` are positions in the source as it
-    is read, of which the occlusion map has ``scale`` times the size; ``column`` to ``place``, int32, are scratch. The
-    source lies ``before_m`` (F,) metres before each face's plane. The map hides what has a smaller inverse distance
-    than ``shadow`` (h, w), 0 for nothing; ``solid`` says by which solid. A background that is a ``guess`` was not
-    measured: whatever stands in its way hides it.
-    """
-    n = q.shape[0]
-    h, w = shadow.shape
-    shift = (scale - _ONE) * _HALF
+
+@inlined
+def _hide(
+    sources: Sources, k: int, occluders: Occluders, block: Block, has_faces: bool, floats: Any, place: Any
+) -> None:
+    """Clear ``block.seen`` where something hides a point from source k, or its face is turned away from it."""
+    n, u, v, q, face, seen = block.u.shape[0], block.u, block.v, block.q, block.face, block.seen
+    h, w = occluders.beyond.size[k, 0], occluders.beyond.size[k, 1]
+    beyond = array_at(occluders.beyond.address[k], (h * w,), np.float32)
+    solid = array_at(occluders.solid.address[k], (h * w,), np.int32)
+    x, y, z, hides, limit = floats[6, :n], floats[7, :n], floats[8, :n], floats[9, :n], floats[10, :n]
+    scale, columns = occluders.scale[k], np.int32(w)
+    shift, right, down = (scale - _ONE) * _HALF, np.float32(w - 1), np.float32(h - 1)
+    is_smooth, before_m = not occluders.is_guess and min(h, w) > 1, occluders.before_m[k]
+    if not is_smooth or before_m.shape[0]:
+        for i in range(n):
+            column = np.int32(min(max(u[i] * scale + shift, _ZERO), right) + _HALF)
+            place[i] = np.int32(min(max(v[i] * scale + shift, _ZERO), down) + _HALF) * columns + column
     # The distance from the source, inverted: what must not be exceeded by what hides.
-    for i in range(n):
-        pz[i] = q[i] / max(np.sqrt(px[i] * px[i] + py[i] * py[i] + pz[i] * pz[i]), _TINY)
-    for i in range(n):
-        column[i] = min(max(u[i] * scale + shift, _ZERO), np.float32(w - 1))
-    for i in range(n):
-        row[i] = min(max(v[i] * scale + shift, _ZERO), np.float32(h - 1))
-    smooth = not guess and min(h, w) > 1
-    beyond, number_at = shadow.reshape(h * w), solid.reshape(h * w)
-    if not smooth or before_m.shape[0]:
+    if has_faces or not occluders.is_guess:
+        turn_row(block.x, block.y, block.z, q, sources.A[k], sources.o[k], x, y, z)
         for i in range(n):
-            place[i] = np.int32(np.rint(row[i])) * np.int32(w) + np.int32(np.rint(column[i]))
-    if smooth:  # what was measured hides smoothly, silhouettes of solids do not
-        top, left, right, down = np.float32(h - 2), np.float32(w - 2), np.uint64(1), np.uint64(w)
+            limit[i] = q[i] / max(np.sqrt(x[i] * x[i] + y[i] * y[i] + z[i] * z[i]), _TINY)
+    if is_smooth:  # what was measured hides smoothly, silhouettes of solids do not
+        top, left, one, row = np.float32(h - 2), np.float32(w - 2), np.uint64(1), np.uint64(w)
         for i in range(n):
-            px[i] = np.float32(np.int32(min(row[i], top)))
+            x[i] = min(max(u[i] * scale + shift, _ZERO), right)
         for i in range(n):
-            py[i] = np.float32(np.int32(min(column[i], left)))
+            y[i] = min(max(v[i] * scale + shift, _ZERO), down)
         for i in range(n):
-            k = np.uint64(np.int32(px[i]) * np.int32(w) + np.int32(py[i]))
-            s, t = row[i] - px[i], column[i] - py[i]
-            above = beyond[k] * (_ONE - t) + beyond[k + right] * t
-            below = beyond[k + down] * (_ONE - t) + beyond[k + down + right] * t
+            j, m = np.int32(min(x[i], left)), np.int32(min(y[i], top))
+            at, s, t = np.uint64(m * columns + j), y[i] - np.float32(m), x[i] - np.float32(j)
+            above = beyond[at] * (_ONE - t) + beyond[at + one] * t
+            below = beyond[at + row] * (_ONE - t) + beyond[at + row + one] * t
             hides[i] = above * (_ONE - s) + below * s
         for i in range(n if before_m.shape[0] else 0):  # whose it is decides few pixels, and costs a cache miss to read
             nearest = beyond[np.uint32(place[i])]
-            if face.shape[0] and face[i] >= 0:
+            if has_faces and face[i] >= 0:
                 hides[i] = nearest
-            elif (nearest <= pz[i]) != (hides[i] <= pz[i]) and number_at[np.uint32(place[i])] >= 0:
+            elif (nearest <= limit[i]) != (hides[i] <= limit[i]) and solid[np.uint32(place[i])] >= 0:
                 hides[i] = nearest
     else:
         for i in range(n):
             hides[i] = beyond[np.uint32(place[i])]
-    if guess and face.shape[0]:
-        for i in range(n):
-            py[i] = pz[i] if face[i] >= 0 else _ZERO
-        pz, py = py, pz
-    elif guess:
-        for i in range(n):
-            pz[i] = _ZERO
-    for i in range(face.shape[0]):
+    if occluders.is_guess:
+        for i in range(0 if has_faces else n):
+            limit[i] = _ZERO
+        for i in range(n if has_faces else 0):
+            z[i] = limit[i] if face[i] >= 0 else _ZERO
+        for i in range(n if has_faces else 0):
+            limit[i] = z[i]
+    for i in range(n if has_faces else 0):
         number = face[i]
         if number < 0:
             continue
         me = np.uint32(number)
-        if before_m[me] <= _ZERO or before_m[me] * pz[i] < LEAST_INCIDENCE:
-            pz[i] = -_ONE
-        elif hides[i] > pz[i]:
-            there = number_at[np.uint32(place[i])]
+        if before_m[me] <= _ZERO or before_m[me] * limit[i] < LEAST_INCIDENCE:
+            limit[i] = -_ONE
+        elif hides[i] > limit[i]:
+            there = solid[np.uint32(place[i])]
             if there == number // 6:  # pieces are convex
-                pz[i] = _MOST
+                limit[i] = _MOST
             elif there // PIECES == number // (6 * PIECES):
-                pz[i] = pz[i] / max(_ONE - SAME_OBJECT_M * pz[i], _TINY)
+                limit[i] = limit[i] / max(_ONE - SAME_OBJECT_M * limit[i], _TINY)
     for i in range(n):
-        seen[i] = seen[i] & (hides[i] <= pz[i])
+        seen[i] = seen[i] & (hides[i] <= limit[i])
 
 
-@inlined
-def _evaluate_row(
-    planes: Any, target: Any, q: Any, face: Any, source: Any, y: int, x0: int, n: int, work: Any,
-    inside: Any, seen: Any, place: Any,
+@borrowing
+def _look(
+    sources: Sources, k: int, occluders: Occluders, block: Block, has_faces: bool, has_held: bool, floats: Any,
+    ints: Any, xy: Any, tag: Any,
 ) -> None:  # fmt: skip
-    """Positions u, v (rows 0 and 1 of ``work``) in a source of n pixels of a target's row from ``x0`` on.
+    """Find where source k sees the pixels of a block.
 
-    ``inside`` (n,) becomes whether its image holds them, ``seen`` (n,) whether it sees them; ``place`` is scratch.
+    ``xy`` (n,) int32 becomes the packed position in the atlas, ``tag`` (n,) int32 its fraction with the number of the
+    source above it; -1 where the source does not see the pixel.
     """
-    A, o, kind, P, bounds, clean, before_m, shadow, solid, guess, positions = source
-    u, v, rx, ry, rz = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
-    px, py, pz, a, b = work[5, :n], work[6, :n], work[7, :n], work[8, :n], work[9, :n]
-    rays_row(planes, target, y, x0, rx, ry, rz)
-    turn_row(rx, ry, rz, q[y, x0 : x0 + n], A, o, px, py, pz)
-    if kind < 0:
-        for i in range(n):
-            u[i], v[i] = positions[0, y, x0 + i], positions[1, y, x0 + i]
-    else:
-        project_row(px, py, pz, kind, P, a, b, u, v)
-    low_u, low_v, high_u, high_v = bounds[0], bounds[1], bounds[2], bounds[3]
+    n, u, v, seen = xy.shape[0], block.u, block.v, block.seen
+    x, y, z, place = floats[6, :n], floats[7, :n], floats[8, :n], ints[3, :n]
+    A, o, P, kind, bounds = sources.A[k], sources.o[k], sources.P[k], sources.kind[k], sources.bounds[k]
+    if kind == 0:
+        _project_pinhole(block, A, o, P, x)
+    elif kind > 0:
+        turn_row(block.x, block.y, block.z, block.q, A, o, x, y, z)
+        project_row(x, y, z, kind, P, floats[9, :n], floats[10, :n], u, v)
+    low_u, low_v, high_u, high_v, right, bottom = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4], bounds[5]
     for i in range(n):
-        inside[i] = (u[i] >= low_u) & (u[i] <= high_u) & (v[i] >= low_v) & (v[i] <= high_v)
-    for i in range(n):
-        seen[i] = inside[i]
-    if shadow.shape[0]:
-        faces = face[y, x0 : x0 + n] if face.shape[0] else face[:, 0]
-        _occlude_row(
-            q[y, x0 : x0 + n], faces, px, py, pz, u, v, rx, ry, rz, place, bounds[6], before_m,
-            shadow, solid, guess, seen,
-        )  # fmt: skip
-    # The outer half pixel of a full image lies outside the halved one: its border pixel is read.
-    right, bottom = bounds[4], bounds[5]
-    if right >= _ZERO:
+        seen[i] = (u[i] >= low_u) & (u[i] <= high_u) & (v[i] >= low_v) & (v[i] <= high_v)
+    for i in range(n if has_held else 0):
+        block.held[i] |= seen[i]
+    if occluders.beyond.size[k, 0]:
+        _hide(sources, k, occluders, block, has_faces, floats, place)
+    if right >= _ZERO:  # the outer half pixel of a full image lies outside the halved one: its border pixel is read
         for i in range(n):
             u[i] = min(max(u[i], _ZERO), right)
         for i in range(n):
             v[i] = min(max(v[i], _ZERO), bottom)
-    h, w = clean.shape
+    for i in range(n):
+        place[i] = _fixed(u[i])
+    for i in range(n):
+        tag[i] = _fixed(v[i])
+    h, w = sources.clean.size[k, 0], sources.clean.size[k, 1]
     if h:
+        clean = array_at(sources.clean.address[k], (h, w), np.uint8)
         for i in range(n):
             if seen[i]:  # no tap of the interpolation may lie on the own car
-                fu, fv = _fixed(u[i]), _fixed(v[i])
-                c0, r0 = min(max(fu >> 5, 0), w - 1), min(max(fv >> 5, 0), h - 1)
-                c1 = min(c0 + 1, w - 1) if fu & 31 else c0
-                r1 = min(r0 + 1, h - 1) if fv & 31 else r0
-                seen[i] = clean[r0, c0] and clean[r0, c1] and clean[r1, c0] and clean[r1, c1]
+                c0, r0 = min(max(place[i] >> 5, 0), w - 1), min(max(tag[i] >> 5, 0), h - 1)
+                c1 = min(c0 + 1, w - 1) if place[i] & 31 else c0
+                r1 = min(r0 + 1, h - 1) if tag[i] & 31 else r0
+                seen[i] = (clean[r0, c0] & clean[r0, c1] & clean[r1, c0] & clean[r1, c1]) > 0
+    number, left, top = sources.slot[k, 0] << 16, sources.slot[k, 1], sources.slot[k, 2]
+    for i in range(n):
+        xy[i] = ((tag[i] >> 5) + top) << 16 | (((place[i] >> 5) + left) & 0xFFFF)
+    for i in range(n):
+        tag[i] = number | (tag[i] & 31) << 5 | (place[i] & 31) if seen[i] else np.int32(-1)
 
 
-@compiled
-def put_source(
-    planes: Any, target: Any, q: Any, face: Any, source: Any, slot: Any, weight: Any, step: int, columns: Any,
-    shared: Any, best: Any, winner: Any, xy: Any, frac: Any, in_image: Any,
-    next_best: Any, second: Any, next_xy: Any, next_frac: Any,
-) -> None:  # fmt: skip
-    """Let a source win the pixels that it sees with more weight than the best so far; see also ``clear_unseen``.
+@partial(borrowing, no_cpython_wrapper=False)
+def see_nodes(
+    view: View, sources: Sources, surfaces: Surfaces, occluders: Occluders, nodes: Nodes, floats: Any, ints: Any
+) -> None:
+    """Clear the scores of nodes that a source does not see; ``floats`` and ``ints`` are as in ``plan_pixels``."""
+    K, ny, nx = nodes.score.shape
+    block, has_faces = _block(floats, ints, floats[3, :nx], nx), surfaces.face.shape[0] > 0
+    xy, tag = ints[6, :nx], ints[7, :nx]
+    for j in range(ny):
+        for i in range(nx):
+            block.x[i], block.y[i], block.z[i] = view.rays[0, j, i], view.rays[1, j, i], view.rays[2, j, i]
+            block.q[i] = surfaces.q[view.y[j], view.x[i]]
+            block.face[i] = surfaces.face[view.y[j], view.x[i]] if has_faces else np.int32(-1)
+        for k in range(K):
+            if sources.kind[k] < 0:
+                h, w = sources.positions.size[k, 0], sources.positions.size[k, 1]
+                positions = array_at(sources.positions.address[k], (h, w), np.float32)
+                for i in range(nx):
+                    block.u[i] = positions[view.y[j], view.x[i]]
+                    block.v[i] = positions[h // 2 + view.y[j], view.x[i]]
+            _look(sources, k, occluders, block, has_faces, False, floats, ints, xy, tag)
+            score = nodes.score[k, j]
+            for i in range(nx):
+                score[i] = score[i] if tag[i] >= 0 else _ZERO
 
-    Args:
-        planes: (3, h, w) the target's rays; (3, 0, 0) for a pinhole.
-        target: Its ``Camera.parameters``.
-        q: (h, w) inverse distances along its rays.
-        face: (h, w) int32 faces of solids, -1 elsewhere; (0, 0) without any.
-        source: As ``view_planner.ViewPlanner._kernel`` makes it.
-        slot: The source's index; column and row of its first pixel in the atlas.
-        weight: (ny + 1, nx + 1) its weight on the nodes.
-        step: Side of a cell, pixels.
-        columns: (ny, 2) first and last (exclusive) cell of each row of cells that it may see.
-        shared: (ny, nx) bool, cells in which the second-best source is kept.
-        best: (h, w) float32 largest weight so far, below 0 where there is none; updated, as are all that follow.
-            If it is (0, 0), ``weight`` (h, w) becomes 0 where the source does not see a pixel, and nothing is written.
-        winner: (h, w) int8.
-        xy: (h, w) int32, two int16: whole pixels in the source.
-        frac: (h, w) uint16, 32nds of a pixel.
-        in_image: (h, w) uint8, 255 where some source's image contains the pixel; (0, 0) where that is not asked.
-        next_best: (h, w) float32 weight of the second-best source in these cells, 0 for none.
-        second: (h, w) int8 whose that is, -1 for none.
-        next_xy: (h, w) int32 where it is read.
-        next_frac: (h, w) uint16.
+
+@inlined
+def _weigh_row(weights: Any, step: int, y: int, x0: int, out: Any) -> None:
+    """Bilinear weights (n,) between nodes (ny, nx) at pixels of row ``y`` from column ``x0`` on, a node's."""
+    j, left, n, per = y // step, x0 // step, out.shape[0], _ONE / np.float32(step)
+    t = np.float32(y - j * step) * per
+    for i in range(left, (x0 + n + step - 1) // step):
+        first = weights[j, i] + (weights[j + 1, i] - weights[j, i]) * t
+        slope = (weights[j, i + 1] + (weights[j + 1, i + 1] - weights[j, i + 1]) * t - first) * per
+        cell = out[i * step - x0 : min(i * step + step - x0, n)]
+        for m in range(cell.shape[0]):
+            cell[m] = first + slope * np.float32(m)
+
+
+@inlined
+def _is_in(sources: int, k: int) -> bool:
+    """Whether a set holds source k; -1 is the set of all, however many."""
+    return sources < 0 or (sources >> k) & 1 != 0
+
+
+@borrowing
+def _plan_block(
+    view: View, sources: Sources, surfaces: Surfaces, occluders: Occluders, weights: Any, pixels: Pixels,
+    floats: Any, ints: Any, y0: int, y1: int, x0: int, x1: int, some: int, fills: bool,
+) -> Any:  # fmt: skip
+    """Let ``some`` sources win the pixels of rows y0 to y1 and columns x0 to x1; return how many none of them sees.
+
+    With ``fills`` the first one that sees a pixel wins it, if none has won it before.
     """
-    h, w = q.shape
-    work, share = np.empty((_WORK_ROWS, w), np.float32), np.empty(w, np.float32)
-    inside, seen = np.empty(w, np.int32), np.empty(w, np.int32)
-    fu, fv = np.empty(w, np.int32), np.empty(w, np.int32)
-    row = np.empty(weight.shape[1], np.float32)
-    me, left, top, kept = np.int32(slot[0]), np.int32(slot[1]), np.int32(slot[2]), np.empty(w, np.int32)
-    for y in range(h):
-        j = y // step
-        x0, x1 = columns[j, 0] * step, min(columns[j, 1] * step, w)
-        n = x1 - x0
-        if n <= 0:
+    n, total = x1 - x0, (x1 - x0) * (y1 - y0)
+    block = _block(floats, ints, floats[3, :total] if y1 - y0 > 1 else surfaces.q[y0, x0:x1], total)
+    in_image = pixels.in_image.shape[0] > 0
+    has_faces: Any = False
+    weight_1, weight_2, weight, mixed = floats[11, :total], floats[12, :total], floats[13, :total], floats[14, :total]
+    xy_1, tag_1, xy, tag = ints[4, :total], ints[5, :total], ints[6, :total], ints[7, :total]
+    xy_2, tag_2, work = ints[8, :total], ints[9, :total], ints[10, :total]
+    for y in range(y0, y1):
+        row = slice((y - y0) * n, (y - y0) * n + n)
+        rays_row(view.planes, view.P, y, x0, block.x[row], block.y[row], block.z[row])
+        q, to_q = surfaces.q[y, x0:x1], block.q[row]
+        for x in range(n if y1 - y0 > 1 else 0):
+            to_q[x] = q[x]
+        if surfaces.face.shape[0]:
+            face, to_face, most = surfaces.face[y, x0:x1], block.face[row], np.int32(-1)
+            for x in range(n):
+                to_face[x] = face[x]
+            for x in range(n):
+                most = max(most, to_face[x])
+            has_faces = has_faces or most >= 0
+    for x in range(total if in_image else 0):
+        block.held[x] = 0
+    several, is_first = not fills and some & (some - 1) != 0, True
+    for k in range(sources.A.shape[0]):
+        if not _is_in(some, k):
             continue
-        _evaluate_row(planes, target, q, face, source, y, x0, n, work, inside[:n], seen[:n], fu[:n])
-        if not best.shape[0]:
-            of_pixels = weight[y]
-            for i in range(n):
-                of_pixels[i] = of_pixels[i] if seen[i] else _ZERO
-            continue
-        u, v = work[0, :n], work[1, :n]
-        upsampled_row(weight, step, y, x0, row, work[2, :n])
-        for i in range(n):
-            share[i] = work[2, i] if seen[i] else -_ONE - _ONE
-        for i in range(n):
-            fu[i] = _fixed(u[i])
-        for i in range(n):
-            fv[i] = _fixed(v[i])
-        for i in range(columns[j, 0], columns[j, 1]):
-            if not shared[j, i]:
-                continue
-            for x in range(i * step, min(i * step + step, w)):
-                k = x - x0
-                if share[k] > best[y, x]:
-                    if best[y, x] > _ZERO:
-                        next_best[y, x], second[y, x] = best[y, x], winner[y, x]
-                        next_xy[y, x], next_frac[y, x] = xy[y, x], frac[y, x]
-                elif share[k] > next_best[y, x]:
-                    next_best[y, x], second[y, x] = share[k], np.int8(me)
-                    next_xy[y, x] = (((fv[k] >> 5) + top) << 16) | (((fu[k] >> 5) + left) & 0xFFFF)
-                    next_frac[y, x] = ((fv[k] & 31) << 5) | (fu[k] & 31)
-        held, where, part, mine, image = (
-            best[y, x0:x1],
-            xy[y, x0:x1],
-            frac[y, x0:x1],
-            winner[y, x0:x1],
-            in_image[y, x0:x1] if in_image.shape[0] else in_image[:, 0],
-        )
-        for i in range(n):
-            place = (((fv[i] >> 5) + top) << 16) | (((fu[i] >> 5) + left) & 0xFFFF)
-            kept[i] = place if share[i] > held[i] else where[i]
-        for i in range(n):
-            where[i] = kept[i]
-        for i in range(n):
-            fraction, before = ((fv[i] & 31) << 5) | (fu[i] & 31), np.int32(part[i])
-            kept[i] = fraction if share[i] > held[i] else before
-        for i in range(n):
-            part[i] = np.uint16(kept[i])
-        for i in range(n):
-            before = np.int32(mine[i])
-            kept[i] = me if share[i] > held[i] else before
-        for i in range(n):
-            mine[i] = np.int8(kept[i])
-        for i in range(image.shape[0]):
-            image[i] |= np.uint8(255) * inside[i]
-        for i in range(n):
-            share[i] = max(share[i], held[i])
-        for i in range(n):
-            held[i] = share[i]
+        if sources.kind[k] < 0:
+            rows, columns = sources.positions.size[k, 0], sources.positions.size[k, 1]
+            positions = array_at(sources.positions.address[k], (rows, columns), np.float32)
+            for y in range(y0, y1):
+                for x in range(n):
+                    block.u[(y - y0) * n + x] = positions[y, x0 + x]
+                    block.v[(y - y0) * n + x] = positions[rows // 2 + y, x0 + x]
+        to_xy, to_tag = (xy_1, tag_1) if is_first else (xy, tag)
+        _look(sources, k, occluders, block, has_faces, in_image, floats, ints, to_xy, to_tag)
+        if several:
+            for y in range(y0, y1):
+                _weigh_row(weights[k], view.step, y, x0, mixed[(y - y0) * n : (y - y0) * n + n])
+        if is_first:
+            is_first = False
+            for x in range(total if several else 0):
+                weight_1[x] = mixed[x] if tag_1[x] >= 0 else -_ONE
+            for x in range(total if several else 0):
+                weight_2[x] = _ZERO
+            for x in range(total if several else 0):
+                xy_2[x] = _OUTSIDE
+            for x in range(total if several else 0):
+                tag_2[x] = np.int32(-1)
+        elif not several:
+            for x in range(total):
+                work[x] = xy[x] if tag_1[x] < 0 else xy_1[x]
+            for x in range(total):
+                xy_1[x] = work[x]
+            for x in range(total):
+                work[x] = tag[x] if tag_1[x] < 0 else tag_1[x]
+            for x in range(total):
+                tag_1[x] = work[x]
+        else:
+            for x in range(total):
+                weight[x] = mixed[x] if tag[x] >= 0 else -_ONE - _ONE
+            # The second is the best so far if this one beats that, and this one if it beats the second alone.
+            for best, next_best, new in ((xy_1, xy_2, xy), (tag_1, tag_2, tag)):
+                for x in range(total):
+                    old = best[x] if weight_1[x] > _ZERO else next_best[x]
+                    kept = new[x] if weight[x] > weight_2[x] else next_best[x]
+                    work[x] = old if weight[x] > weight_1[x] else kept
+                for x in range(total):
+                    next_best[x] = work[x]
+                for x in range(total):
+                    work[x] = new[x] if weight[x] > weight_1[x] else best[x]
+                for x in range(total):
+                    best[x] = work[x]
+            for x in range(total):
+                higher = max(weight_1[x], weight_2[x])
+                mixed[x] = higher if weight[x] > weight_1[x] else max(weight[x], weight_2[x])
+            for x in range(total):
+                weight_2[x] = mixed[x]
+            for x in range(total):
+                mixed[x] = max(weight_1[x], weight[x])
+            for x in range(total):
+                weight_1[x] = mixed[x]
+    if fills:
+        for y in range(y0, y1):
+            for x in range(x0, x1):
+                at = (y - y0) * n + x - x0
+                if in_image:
+                    pixels.in_image[y, x] |= np.uint8(block.held[at])
+                if pixels.winner[y, x] < 0 and tag_1[at] >= 0:
+                    pixels.xy[y, x], pixels.frac[y, x] = xy_1[at], tag_1[at] & 1023
+                    pixels.winner[y, x] = tag_1[at] >> 16
+                    pixels.won[tag_1[at] >> 16] += 1
+        return 0
+    unseen = np.int32(0)
+    for x in range(total):
+        unseen -= tag_1[x] >> 31
+    for k in range(sources.A.shape[0]):
+        if _is_in(some, k):
+            count, number = np.int32(total - unseen), sources.slot[k, 0]
+            for x in range(total if several else 0):
+                count -= np.int32((tag_1[x] >> 16 != number) & (tag_1[x] >= 0))
+            pixels.won[number] += count
+    for y in range(y0, y1):
+        part = slice((y - y0) * n, (y - y0) * n + n)  # an index of two terms would not become vectors
+        from_xy, from_tag, from_held = xy_1[part], tag_1[part], block.held[part]
+        winner, to_xy, frac = pixels.winner[y, x0:x1], pixels.xy[y, x0:x1], pixels.frac[y, x0:x1]
+        for x in range(n):
+            to_xy[x] = from_xy[x] if from_tag[x] >= 0 else _OUTSIDE
+        for x in range(n):
+            frac[x] = np.uint16(from_tag[x] & 1023 if from_tag[x] >= 0 else np.int32(0))
+        for x in range(n):
+            winner[x] = np.int8(from_tag[x] >> 16)
+        if in_image:
+            image = pixels.in_image[y, x0:x1]
+            for x in range(n):
+                image[x] = np.uint8(from_held[x])
+    if several and pixels.second.shape[0]:
+        for x in range(total):
+            value = weight_2[x] / max(weight_1[x] + weight_2[x], _TINY)
+            weight[x] = value if (tag_2[x] >= 0) & (value >= LEAST_SHARE) else _ZERO
+        for y in range(y0, y1):
+            part = slice((y - y0) * n, (y - y0) * n + n)
+            from_xy, from_tag, from_share = xy_2[part], tag_2[part], weight[part]
+            second, share = pixels.second[y, x0:x1], pixels.share[y, x0:x1]
+            to_xy, frac = pixels.second_xy[y, x0:x1], pixels.second_frac[y, x0:x1]
+            for x in range(n):
+                share[x] = from_share[x]
+            for x in range(n):
+                second[x] = np.int8(from_tag[x] >> 16 if from_share[x] > _ZERO else np.int32(-1))
+            for x in range(n):
+                to_xy[x] = from_xy[x]
+            for x in range(n):
+                frac[x] = np.uint16(from_tag[x] & 1023)
+    return unseen
 
 
-_NOTHING = tuple(np.zeros((0, 0), dtype) for dtype in ("?", "f4", "i1", "i4", "u2", "u1", "f4", "i1", "i4", "u2"))
-_ONE_CELL = np.array([[0, 1]])
+@partial(borrowing, no_cpython_wrapper=False)
+def plan_pixels(
+    view: View, sources: Sources, surfaces: Surfaces, occluders: Occluders, weights: Any, near: Any, wanted: Any,
+    pixels: Pixels, floats: Any, ints: Any, sets: Any,
+) -> None:  # fmt: skip
+    """Let the source of the largest weight among those that see it win each pixel, and keep the second best.
 
-
-def clear_unseen(planes: Any, target: Any, q: Any, face: Any, source: Any, weight: npt.NDArray[np.float32]) -> None:
-    """Clear the weights (h, w) of pixels that a source does not see, by ``put_source``; arguments as there."""
-    put_source(planes, target, q, face, source, (0, 0, 0), weight, max(q.shape), _ONE_CELL, *_NOTHING)
+    Args:
+        view: The view.
+        sources: Its sources, in content order: the first one wins a tie.
+        surfaces: The scene as the view sees it.
+        occluders: What hides it from the sources.
+        weights: (K, ny, nx) float32 of the sources on the nodes.
+        near: ``Nodes.near``.
+        wanted: (ny - 1, nx - 1) bool cells that are planned; (0, 0) for all.
+        pixels: The plan.
+        floats: (``FLOAT_ROWS``, n) float32 scratch for the pixels of a row, and of a block of ``BLOCK_PX`` columns.
+        ints: (``INT_ROWS``, n) int32 scratch.
+        sets: (2, nx - 1) int64 scratch: the sources that have weight in each cell, as bits, and the others near it.
+    """
+    (h, w), (K, ny, nx), step = pixels.winner.shape, weights.shape, view.step
+    strong, others, every = sets[0], sets[1], np.int64(-1) if K > _MOST_BITS else (np.int64(1) << K) - 1
+    for j in range(ny - 1):
+        y0, y1 = j * step, min(j * step + step, h)
+        sets[:] = 0
+        for k in range(K):
+            bit = np.int64(-1) if K > _MOST_BITS else np.int64(1) << k
+            upper, lower, near_upper, near_lower = weights[k, j], weights[k, j + 1], near[k, j], near[k, j + 1]
+            for i in range(nx - 1):
+                if max(max(upper[i], upper[i + 1]), max(lower[i], lower[i + 1])) > _ZERO:
+                    strong[i] |= bit
+                if near_upper[i] | near_upper[i + 1] | near_lower[i] | near_lower[i + 1]:
+                    others[i] |= bit
+        unseen = np.int64(0)
+        for i in range(nx - 1):
+            if wanted.shape[0] and not wanted[j, i]:
+                strong[i], others[i] = 0, 0
+            others[i] &= ~strong[i]
+            pixels.shared[j, i] = strong[i] & (strong[i] - 1) != 0
+            if strong[i] == 0:
+                unseen += 1
+                for y in range(y0, y1):
+                    for x in range(i * step, min(i * step + step, w)):
+                        pixels.winner[y, x], pixels.xy[y, x], pixels.frac[y, x] = -1, _OUTSIDE, 0
+                        if pixels.in_image.shape[0]:
+                            pixels.in_image[y, x] = 0
+        for fills in range(2):  # first the sources that have weight, then others where those see nothing
+            todo, i = others if fills else strong, 0
+            for c in range(nx - 1 if fills and unseen else 0):
+                has_hole, has_object = False, False
+                for y in range(y0, y1):
+                    for x in range(c * step, min(c * step + step, w)):
+                        if pixels.winner[y, x] < 0:
+                            has_hole = True
+                            has_object = has_object or (surfaces.face.shape[0] > 0 and surfaces.face[y, x] >= 0)
+                if has_object and (wanted.shape[0] == 0 or wanted[j, c]):  # it lies before what nodes know
+                    others[c] = every & ~strong[c]
+                others[c] = others[c] if has_hole else 0
+            while i < nx - 1 and (fills == 0 or unseen > 0):
+                some, end, in_blocks = todo[i], i + 1, fills == 1 or pixels.shared[j, i]
+                most = i + max(BLOCK_PX // step, 1) if in_blocks else nx - 1
+                while end < min(most, nx - 1) and todo[end] == some:
+                    end += 1
+                if some:
+                    x0, x1 = i * step, min(end * step, w)
+                    for y in range(y0, y1, y1 - y0 if in_blocks else 1):
+                        unseen += _plan_block(
+                            view, sources, surfaces, occluders, weights, pixels, floats, ints, y,
+                            y1 if in_blocks else y + 1, x0, x1, some, fills == 1,
+                        )  # fmt: skip
+                i = end
 
 
 @compiled
-def find_bands(
-    shared: Any, step: int, strip: int, best: Any, share: Any, second: Any, least: float, sources: Any, bands: Any
-) -> int:
-    """Turn weights of second-best sources into shares, and find the rectangles that each adds to; return their number.
+def find_bands(pixels: Pixels, step: int, strip: int, sources: Any, bands: Any) -> int:
+    """Find the rectangles that each second source adds to, and return their number.
 
     Args:
-        shared: (ny, nx) bool cells as in ``put_source``.
+        pixels: The plan of a view.
         step: Side of a cell, pixels.
         strip: Height of a strip, pixels: slanted seams make narrow rectangles.
-        best: (h, w) weight of the winner.
-        share: (h, w) that of the second-best source; becomes its share, 0 below ``least``.
-        second: (h, w) int8 whose that is.
-        least: Smallest share that counts.
         sources: (S,) sources in content order.
         bands: (n, 5) int64, written: source, first and last (exclusive) row, first and last (exclusive) column.
     """
-    (h, w), nx, low = second.shape, shared.shape[1], np.float32(least)
+    (h, w), nx = pixels.second.shape, pixels.shared.shape[1]
     rows = np.empty((128, (h + strip - 1) // strip, nx, 2), np.int32)  # first and last of each column of cells
     for k in sources:
         rows[k, ..., 0] = h
         rows[k, ..., 1] = 0
     for y in range(h):
         for i in range(nx):
-            if not shared[y // step, i]:
-                continue
-            x0, x1 = i * step, min(i * step + step, w)
-            part, whole, who, last = share[y, x0:x1], best[y, x0:x1], second[y, x0:x1], np.int8(-1)
-            for x in range(x1 - x0):
-                value = part[x] / max(whole[x] + part[x], _TINY)
-                part[x] = value if (who[x] >= 0) & (value >= low) else _ZERO
-            for x in range(x1 - x0):
-                if part[x] > _ZERO and who[x] != last:
-                    last = who[x]
+            second, last = pixels.second[y, i * step : min(i * step + step, w)], np.int8(-1)
+            for x in range(second.shape[0] if pixels.shared[y // step, i] else 0):
+                if second[x] >= 0 and second[x] != last:
+                    last = second[x]
                     ends = rows[last, y // strip, i]
                     ends[0], ends[1] = min(ends[0], y), max(ends[1], y + 1)
     count = 0
@@ -611,29 +825,24 @@ def find_bands(
 
 
 @compiled
-def cut_bands(
-    bands: Any, share: Any, second: Any, xy: Any, frac: Any, band_xy: Any, band_frac: Any, weight: Any
-) -> None:  # fmt: skip
+def cut_bands(pixels: Pixels, bands: Any, band_xy: Any, band_frac: Any, weight: Any) -> None:
     """Copy the positions and shares in rectangles (n, 5), one after the other; others than its source's read nothing.
 
-    ``band_xy``, ``band_frac`` and ``weight`` (all their pixels,) are written; the others are as in ``find_bands``.
+    ``band_xy``, ``band_frac`` and ``weight`` (all their pixels,) are written.
     """
     at = 0
     for k in range(bands.shape[0]):
         source, x0, x1 = np.int8(bands[k, 0]), bands[k, 3], bands[k, 4]
         for y in range(bands[k, 1], bands[k, 2]):
-            out, out_xy, out_frac = (
-                weight[at : at + x1 - x0],
-                band_xy[at : at + x1 - x0],
-                band_frac[at : at + x1 - x0],
-            )
-            part, who, where, fraction = share[y, x0:x1], second[y, x0:x1], xy[y, x0:x1], frac[y, x0:x1]
+            part, second = slice(at, at + x1 - x0), pixels.second[y, x0:x1]
+            share, xy, frac = pixels.share[y, x0:x1], pixels.second_xy[y, x0:x1], pixels.second_frac[y, x0:x1]
+            out, out_xy, out_frac = weight[part], band_xy[part], band_frac[part]
             for x in range(out.shape[0]):
-                out[x] = part[x] if who[x] == source else _ZERO
+                out[x] = share[x] if second[x] == source else _ZERO
             for x in range(out.shape[0]):
-                out_xy[x] = where[x] if out[x] > _ZERO else _OUTSIDE
+                out_xy[x] = xy[x] if out[x] > _ZERO else _OUTSIDE
             for x in range(out.shape[0]):
-                out_frac[x] = fraction[x] if out[x] > _ZERO else np.uint16(0)
+                out_frac[x] = frac[x] if out[x] > _ZERO else np.uint16(0)
             at += x1 - x0
 
 

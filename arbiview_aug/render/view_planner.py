@@ -1,16 +1,15 @@
 """How a rig is rendered: which sources see each target view, over which surface, and who wins each pixel.
 
-Compiled code evaluates every pixel (``arbiview_aug.render.kernels``), fast enough for calibrations or geometry that
-change with every frame.
+The scene becomes images first: inverse distances of each view, and what hides it from each source. Compiled code
+(``arbiview_aug.render.kernels``) then evaluates nodes and pixels, fast enough for calibrations or geometry that change
+with every frame.
 """
 
 from __future__ import annotations
 
 import hashlib
-import math
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -20,14 +19,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray, LensName
-from arbiview_aug.cameras.rays import (
-    CELL_PX,
-    MAX_INVERSE_DISTANCE,
-    RayCache,
-    look_apart,
-    relative_pose,
-    source_pixels,
-)
+from arbiview_aug.cameras.rays import RayCache, source_pixels
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import compilation_announced
 from arbiview_aug.image_ops import at_level, level_size, some_of_cells
@@ -36,412 +28,376 @@ from arbiview_aug.render.plan import (
     GRID_STEP_PX,
     ROAD_M,
     AtlasLayout,
+    BlendRegion,
     FixedMap,
     RenderConfig,
     RenderPlan,
     SourceUse,
     ViewPlan,
 )
-from arbiview_aug.render.requirements import SAME_CENTER_M
-from arbiview_aug.render.weights import SecondBest, seam_weights, source_weight
+from arbiview_aug.render.requirements import SAME_CENTER_M, covers_target_exactly
 from arbiview_aug.scene.boxes import BOX_ERROR
 from arbiview_aug.scene.point_cloud import occlusion_level
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.scene.surface import FAR_PARALLAX_PX, OcclusionMap, is_within_wall, worst_parallax_px
 
 SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
-_NO_PARTS = np.zeros(0, np.int32)
-_SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
+PRIMARY_BONUS = 1e6
+"""w_primary of a source at the target's own centre (paper, FAVS Stage 4). It is exact and wins where it sees, down to
+the border of an image of 32767 px, where other weights make 1.5e-6 at least; those of other sources make 1 at most.
+"""
+
 MAGNIFIED = 0.8
 """A view is read by cubics where it has at most this many source pixels per pixel, and is mostly read at its own
 centre: docs/benchmarks.md (Ablation)."""
 
-
-@dataclass(frozen=True)
-class _Geometry:
-    """A surface as a target sees it.
-
-    Attributes:
-        surface: The surface.
-        q: (h, w) float32 inverse distances along the pixels' rays, 1/m.
-        face: (h, w) int32 faces of solids in front of the background, -1 elsewhere; (0, 0) without any.
-        on_nodes: (ny + 1, nx + 1) ``q`` on the nodes.
-        face_on_nodes: (ny + 1, nx + 1) ``face`` there.
-        behind: (ny + 1, nx + 1) float32 inverse distances of the background on the nodes.
-        nearest: (ny, nx) float32 largest inverse distance in each cell.
-        farthest: (ny, nx) float32 least inverse distance in each cell.
-        uncertainty: (ny + 1, nx + 1) expected error of the inverse distance on the nodes, 1/m.
-        apart: Whether each source looks elsewhere.
-        is_guess: Whether its background was not measured.
-    """
-
-    surface: Any
-    q: npt.NDArray[np.float32]
-    face: npt.NDArray[np.int32]
-    on_nodes: npt.NDArray[np.float32]
-    face_on_nodes: npt.NDArray[np.int32]
-    behind: npt.NDArray[np.float32]
-    nearest: npt.NDArray[np.float32]
-    farthest: npt.NDArray[np.float32]
-    uncertainty: FloatArray
-    apart: list[bool]
-    is_guess: bool
+_SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
+_APART_RAD = 0.01  # cones of rays are apart by at least this
+_STRIP_PX = 128  # height of strips in which bands along seams are rectangles
+_NO_IMAGE, _NO_FACES, _NO_PARTS = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32), np.zeros(0, np.int32)
 
 
-@dataclass
-class _Region:
-    """Contribution of one source to one target; all arrays on the nodes (ny + 1, nx + 1)."""
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """A pair of rigs in one ego frame, the scene and settings; M target and N source cameras."""
 
-    source: int
-    level: int
-    surface: str
-    reason: str
-    baseline_m: float
-    geometry: _Geometry
-    columns: npt.NDArray[np.int64]  # (ny, 2) first and last (exclusive) cell in view of each row of cells
-    kernel: tuple[Any, ...]
-    hides: bool  # whether occluders or a mask may hide what lies in the source's image
-    score: npt.NDArray[np.float32]  # stage-4 weight, 0 where not visible
-    parallax: npt.NDArray[np.float32]  # expected displacement, target pixels
-    border_px: npt.NDArray[np.float32]  # distance to the border of what the source sees, target pixels
-    fineness: float  # median of the pixels, as they are read, per target pixel
-    certainty: npt.NDArray[np.float32] | None  # in 255ths, if asked for
+    source: Rig
+    target: Rig
+    geometry: str
+    scene: Scene
+    config: RenderConfig
+    maps: RayCache
+    _seconds: dict[tuple[int, int], list[Any]] = field(default_factory=dict)
+
+    @cached_property
+    def order(self) -> list[int]:
+        """Sources in content order, so that ties never depend on the order of the list."""
+        return content_order(self.source.cameras)
+
+    @cached_property
+    def baselines_m(self) -> FloatArray:
+        """Distances (M, N) of the centres."""
+        offsets_m = self.target.cam2ego[:, None, :3, 3] - self.source.cam2ego[None, :, :3, 3]
+        return np.asarray(np.linalg.norm(offsets_m, axis=-1))
+
+    @cached_property
+    def angles(self) -> tuple[FloatArray, FloatArray]:
+        """Angles (M, N) between the axes of cones around the cameras' rays, and sums of their half angles, radians."""
+        cones = np.array([self.maps.rays(camera).cone for camera in self.target])
+        axes = (self.target.cam2ego[:, :3, :3] @ cones[:, :3, None])[..., 0] @ self.source.cam2ego[:, :3, 2].T
+        half_rad = np.array([camera.half_angle_rad for camera in self.source])
+        return np.arccos(np.clip(axes, -1, 1)), cones[:, 3:] + half_rad
+
+    @cached_property
+    def poses(self) -> tuple[npt.NDArray[np.float32], ...]:
+        """Rotations (M, N, 3, 3) from targets to sources, and targets minus sources in the frames of both (M, N, 3)."""
+        of_target, of_source = self.target.cam2ego[:, None, :3, :3], self.source.cam2ego[None, :, :3, :3]
+        offsets_m = self.target.cam2ego[:, None, :3, 3:] - self.source.cam2ego[None, :, :3, 3:]
+        to_source = of_source.transpose(0, 1, 3, 2)
+        in_source, in_target = to_source @ offsets_m, of_target.transpose(0, 1, 3, 2) @ offsets_m
+        return tuple(part.astype(np.float32) for part in (to_source @ of_target, in_source[..., 0], in_target[..., 0]))
+
+    def seconds(self, size: tuple[int, int]) -> list[Any]:
+        """Scratch images (h, w) of second sources: ``kernels.Pixels.second``, its places and shares."""
+        if size not in self._seconds:
+            kinds = np.int8, np.int32, np.uint16, np.float32
+            self._seconds[size] = [self.maps.memory.empty(size, kind) for kind in kinds]
+        self._seconds[size][0].fill(-1)
+        return self._seconds[size]
+
+    @cached_property
+    def lenses(self) -> tuple[npt.NDArray[Any], ...]:
+        """Lens codes (N,), ``Camera.parameters`` (N, 14), sizes (N, 2) and bounds (N, 6) of the sources."""
+        from arbiview_aug.cameras.kernels import LENS_CODES
+
+        codes = np.array([LENS_CODES.get(camera.lens, -1) for camera in self.source])
+        bounds = np.array([source_bounds(size, 0) for size in self.source.sizes], np.float32)
+        return codes, np.stack([camera.parameters for camera in self.source]), np.array(self.source.sizes), bounds
 
 
 class ViewPlanner:
-    """Builds one target's plan in two steps: what each source sees, then who wins and where ``seams`` are blended.
+    """Plans one view in two steps: what each source sees, then who wins each pixel and where seams are blended.
 
-    Positions, visibility and winners are evaluated at every pixel (``kernels``). Weights are smooth: they are known on
-    nodes ``GRID_STEP_PX`` apart, which lie on pixel centres, and interpolated between.
+    Positions, visibility and winners are evaluated at every pixel. Weights are smooth: they are known on nodes
+    ``GRID_STEP_PX`` apart, which lie on pixel centres, and interpolated between.
     """
 
-    def __init__(
-        self,
-        source: Rig,
-        order: list[int],
-        camera: Camera,
-        surface: str,
-        scene: Scene,
-        config: RenderConfig,
-        maps: RayCache,
-        wanted: BoolArray | None = None,
-    ) -> None:
-        self.sources, self.camera, self.surface, self.config = source.cameras, camera, surface, config
-        self.scene, self.ground_z_m, self.maps = scene, source.ground_z_m, maps
-        self.baselines_m = [math.dist(camera.center_m, one.center_m) for one in self.sources]
-        self.parallax_px = worst_parallax_px(np.array(self.baselines_m), float(camera.K[0, 0]))
-        self.rays = maps.rays(camera)
+    def __init__(self, pair: _Pair, index: int, wanted: BoolArray | None = None) -> None:
+        from arbiview_aug.render.kernels import View
+
+        self.pair, self.index, self.camera = pair, index, pair.target[index]
+        self.config, self.scene, self.maps = pair.config, pair.scene, pair.maps
+        self.name = pair.scene.best if pair.geometry == "auto" else pair.geometry
         # From outside, the far wall is a narrow strip with edges, which cells could step over.
-        coarse = min(camera.size) >= SMALL_SIDE_PX
-        coarse &= is_within_wall(camera.center_m) or not GEOMETRIES[surface].has_wall
-        self.step = GRID_STEP_PX if coarse else 1
-        corners, self.nodes = nodes_of(camera.size, self.step)
-        y, x = self.nodes
-        self.at_nodes = y[:, None], x[None]
-        self.corner_rays, self.node_rays = maps.of_lens(
-            camera, self.step, lambda: np.stack([continued(self.rays.at(*corners)), self.rays.at(y, x)])
-        )
-        self._geometries: dict[str, _Geometry] = {}
-        # Cells that sources elsewhere may change: none without a ray.
-        self._open = _whole_cells(self.corner_rays.any(axis=0))
-        self._wanted = None if wanted is None else some_of_cells(wanted, self.step)
-        exact = {k: self._region(k) for k in order if self.baselines_m[k] < SAME_CENTER_M}
-        for one in filter(None, exact.values()):
-            self._open = self._open & self._around_unseen(one)
-        if any(exact.values()):  # however far the scene is
-            near, far = (np.full(self._open.shape, q, np.float32) for q in (MAX_INVERSE_DISTANCE, 0))
-            seen, cells = np.zeros_like(self._open), np.arange(self._open.shape[1])
-            for k in set(order) - set(exact):
-                first, last = self._in_view(self.sources[k], self._projection(self.sources[k]), near, far).T
-                seen |= (first[:, None] <= cells) & (cells < last[:, None])
-            self._open = seen
-        regions = exact | {k: self._region(k) for k in order if k not in exact}
-        # In content order, so that ties never depend on the order of the source list.
-        self.regions = [region for k in order if (region := regions[k]) is not None]
+        coarse = min(self.camera.size) >= SMALL_SIDE_PX
+        coarse &= is_within_wall(self.camera.center_m) or not GEOMETRIES[pair.geometry].has_wall
+        step = GRID_STEP_PX if coarse else 1
+        y, x = nodes_of(self.camera.size, step)
+        self.rays = self.maps.rays(self.camera)
+        rays = self.maps.of_lens(self.camera, step, lambda: self.rays.at(y, x))
+        pose = self.camera.cam2ego[:3, :3].copy(), self.camera.center_m.copy()
+        self.view = View(self.rays.planes, self.rays.parameters, *pose, self.rays.cone, y, x, rays, step)
+        self.wanted = np.zeros((0, 0), bool) if wanted is None else some_of_cells(wanted, step)
+        self._surfaces: dict[str, Any] = {}
+        self._alive = list[Any]()  # arrays that kernels read by their addresses
+        self._measure()
 
-    # --- what a source sees -------------------------------------------------------------------------------------------
-    def _choose_surface(self, index: int) -> tuple[str, str]:
-        baseline_m, worst = self.baselines_m[index], self.parallax_px[index]
-        if baseline_m < SAME_CENTER_M:
-            return "infinity", "centres coincide: exact"
-        if self.surface != "auto":
-            return self.surface, "asked for"
-        if worst < FAR_PARALLAX_PX:
-            return "infinity", f"worst-case parallax {worst:.2f} px"
-        return self.scene.best, f"centres {baseline_m:.2f} m apart"
-
-    def _around_unseen(self, region: _Region) -> BoolArray:
-        """Cells (ny, nx) that an exact source does not certainly win, and those around them that seams may reach."""
-        from arbiview_aug.render.kernels import clear_unseen, depth_range
-
-        whole = _whole_cells(region.score > 1)  # no weight of a source elsewhere exceeds 1
-        # Borders, masks and image circles may lie between nodes.
-        visible = self.maps.memory.full(self.camera.size, 1, np.float32)
-        clear_unseen(*self._target(region), region.kernel, visible)
-        most, least = np.empty((2, *whole.shape), np.float32)
-        depth_range(visible, self.step, most, least)
-        whole &= least > 0
-        unseen = (~whole).astype(np.uint8)
-        side = 2 * (2 * self._seam_radius + 1) + 1  # two passes of a box, and a node
-        return cv2.dilate(unseen, np.ones((side, side), np.uint8)) > 0
-
-    @property
-    def _seam_radius(self) -> int:
-        """Half the width of a seam, in nodes."""
-        return max(1, round(self.config.seam_width * self.camera.width_px / self.step / 2))
-
+    # --- the scene as images ------------------------------------------------------------------------------------------
     @cached_property
     def _directions(self) -> FloatArray:
-        """Rays of the nodes in the ego frame, float64."""
-        rays = self.node_rays.astype(np.float64)
-        return np.moveaxis((self.camera.cam2ego[:3, :3] @ rays.reshape(3, -1)).reshape(rays.shape), 0, -1)
+        """Rays (ny, nx, 3) of the nodes in the ego frame."""
+        rays = self.view.rays.astype(np.float64)
+        return np.moveaxis((self.view.R @ rays.reshape(3, -1)).reshape(rays.shape), 0, -1)
 
-    def _geometry(self, name: str) -> _Geometry:
-        """A surface where sources elsewhere may matter, infinity beyond; all of it where holes show it."""
-        if name in self._geometries:
-            return self._geometries[name]
-        from arbiview_aug.render.kernels import depth_range
+    def _seen(self, name: str) -> Any:
+        """A surface as the view sees it: ``kernels.Surfaces``."""
+        from arbiview_aug.render.kernels import Surfaces
 
-        surface: Any = self.scene.surface(name, self.ground_z_m)
-        background = surface.background
-        center, memory = self.camera.center_m, self.maps.memory
-        size = np.repeat(self.camera.size, 2)
-        rows, columns = (np.flatnonzero((self._open | self.config.layers).any(axis)) for axis in (1, 0))
-        cells = np.array([rows[0], rows[-1] + 1, columns[0], columns[-1] + 1])
-        y0, y1, x0, x1 = np.minimum(cells * self.step + np.array([0, 1, 0, 1]), size).tolist()  # with the last nodes
-        window = y0, x0, (y1 - y0, x1 - x0)
-        is_whole = window[2] == self.camera.size
-        camera, rays = self.camera if is_whole else self.camera.crop(*window), self.rays.crop(*window)
-
-        def widened(image: Any, outside: float) -> Any:
-            if is_whole:
-                return image
-            wide = memory.full(self.camera.size, outside, image.dtype)
-            wide[y0:y1, x0:x1] = image
-            return wide
-
-        q = np.ascontiguousarray(widened(background.image(camera, rays, memory), 0))  # kernels know no other order
-        behind = q[self.at_nodes]
-        face = np.zeros((0, 0), np.int32)
+        if name in self._surfaces:
+            return self._surfaces[name]
+        surface: Any = self.scene.surface(name, self.pair.source.ground_z_m)
+        camera, rays, memory, face = self.camera, self.rays, self.maps.memory, _NO_FACES
+        if name == "infinity":
+            q = memory.full(camera.size, 0, np.float32)
+        else:
+            q = np.ascontiguousarray(surface.background.image(camera, rays, memory))
+        behind = on_nodes = q[self.view.y][:, self.view.x]
         if surface.is_layered:
-            solid, face = (widened(*one) for one in zip(surface.drawn(camera, rays, memory), (0, -1), strict=True))
+            solid, face = surface.drawn(camera, rays, memory)
             shown = face >= 0
             np.copyto(q, solid, where=shown)
-            face = face if shown.any() else np.zeros((0, 0), np.int32)
-        at_nodes = q[self.at_nodes], face[self.at_nodes] if face.size else face
-        uncertainty = surface.uncertainty(center, self._directions, at_nodes[0])
+            face = np.ascontiguousarray(face) if shown.any() else _NO_FACES
+            on_nodes = q[self.view.y][:, self.view.x]
+        uncertainty = surface.uncertainty(camera.center_m, self._directions, on_nodes)
         if face.size:
-            uncertainty = np.where(at_nodes[1] >= 0, BOX_ERROR * at_nodes[0], uncertainty)
-        nearest, farthest = np.empty((2, *self._open.shape), np.float32)
-        depth_range(q, self.step, nearest, farthest)
-        apart = look_apart(self.camera, self.sources, float(nearest.max()))
-        if is_whole and (surface.is_layered or surface.is_dense):
-            self.scene.images[name, self.camera.content_key] = q
-        measured = q, face, *at_nodes, behind, nearest, farthest, uncertainty
-        self._geometries[name] = _Geometry(surface, *measured, apart, background.is_guess)
-        return self._geometries[name]
-
-    def _projection(self, source: Camera) -> tuple[Any, ...]:
-        """Relative pose (2 arrays), lens and parameters of a source, as kernels read them."""
-        from arbiview_aug.cameras.kernels import LENS_CODES
-
-        return *relative_pose(self.camera, source), LENS_CODES.get(source.lens, -1), source.parameters
-
-    def _in_view(
-        self, source: Camera, projection: tuple[Any, ...], nearest: Any, farthest: Any
-    ) -> npt.NDArray[np.int64]:
-        """First and last (exclusive) open cell (ny, 2) of each row that a source may see, by ``_Geometry``'s depths."""
-        from arbiview_aug.render.kernels import cells_in_view
-
-        size, columns = np.array(source.size, np.float32), np.empty((len(self._open), 2), np.int64)
-        cells = self._open if self._wanted is None else self._open & self._wanted
-        cells_in_view(self.corner_rays, nearest, farthest, *projection, size, source.cone_rad, cells, columns)
-        return columns
-
-    def _region(self, index: int) -> _Region | None:
-        from arbiview_aug.cameras.kernels import FAR_AWAY_PX
-        from arbiview_aug.render.kernels import clear_unseen, measure_nodes
-
-        if not self._open.any():
-            return None
-        source = self.sources[index]
-        baseline_m, focal_px = self.baselines_m[index], float(self.camera.K[0, 0])
-        name, reason = self._choose_surface(index)
-        geometry = self._geometry(name)
-        if geometry.apart[index]:
-            return None
-        A, o, kind, P = projection = self._projection(source)
-        columns = self._in_view(source, projection, geometry.nearest, geometry.farthest)
-        if not columns.any():
-            return None
-        uv, rounded = np.empty((2, 2, *geometry.behind.shape), np.float32)
-        u, v = uv
-        if kind < 0:
-            u, v = source_pixels(self.camera, self.node_rays, geometry.behind, source)
-        measured = np.empty((3, *u.shape))
-        resolution, edge_px, parallax = measured
-        offset_m = (self.camera.center_m - source.center_m) @ self.camera.cam2ego[:3, :3]
-        measure_nodes(
-            self.node_rays, geometry.behind, A, o, kind, P, *self.nodes, source.size, self.maps.to_mask(source),
-            CELL_PX, offset_m, geometry.uncertainty, focal_px, u, v, measured, rounded,
-        )  # fmt: skip
-        most = np.sort(resolution[edge_px > 0][::4])  # pixels that it cannot project lie far outside
-        level = halvings(most[len(most) // 5], source.size) if self.config.antialias and len(most) else 0
-        kernel, hides = self._kernel(source, level, geometry, A, o, P)
-        positions = np.ascontiguousarray(kernel[-1][(slice(None), *self.at_nodes)]) if kind < 0 else kernel[-1]
-        is_primary = baseline_m < SAME_CENTER_M
-        score = source_weight(edge_px, min(source.size) / 2, parallax, resolution, is_primary).astype(np.float32)
-        on_nodes = self.node_rays, self.rays.parameters, geometry.on_nodes, geometry.face_on_nodes
-        clear_unseen(*on_nodes, (*kernel[:-1], positions), score)
-        certain = 255 * certainty(parallax / focal_px, resolution) if self.config.certainty else None
-        return _Region(
-            source=index,
-            level=level,
-            surface=name,
-            reason=reason,
-            baseline_m=baseline_m,
-            geometry=geometry,
-            columns=columns,
-            kernel=kernel,
-            hides=hides,
-            score=score,
-            parallax=rounded[0],
-            border_px=rounded[1],
-            fineness=float(most[len(most) // 2]) / 2**level if len(most) else 1.0,
-            certainty=None if certain is None else _filled(certain, np.abs(u) < 0.9 * FAR_AWAY_PX),
-        )
-
-    def _kernel(
-        self, source: Camera, level: int, geometry: _Geometry, A: Any, o: Any, P: Any
-    ) -> tuple[tuple[Any, ...], bool]:
-        """The source as ``kernels.put_source`` reads it, halved ``level`` times, and whether it has what hides."""
-        from arbiview_aug.cameras.kernels import LENS_CODES
-
-        kind, surface = LENS_CODES.get(source.lens, -1), geometry.surface
-        positions = np.zeros((2, 0, 0), np.float32)
-        if kind < 0:
-            u, v = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), geometry.q, source)
-            positions = at_level(np.stack([u, v]), level).astype(np.float32)
-        occluders = OcclusionMap(np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32))
-        shadow_scale = 1.0
+            uncertainty = np.where(face[self.view.y][:, self.view.x] >= 0, BOX_ERROR * on_nodes, uncertainty)
         if surface.is_layered or surface.is_dense:
-            # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
-            coarser = level if surface.is_layered else max(level, occlusion_level(source))
-            half = halved_camera(source, coarser) if coarser else source
-            occluders = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)
-            shadow_scale = 0.5 ** (coarser - level)
-        clean = self.maps.clean_pixels(source, level)
-        kernel = (
-            A,
-            o,
-            kind,
-            source.parameters_at(0.5**level) if level else P,
-            np.array([*source_bounds(source.size, level), shadow_scale], np.float32),
-            clean,
-            occluders.before_m,
-            occluders.beyond,
-            np.ascontiguousarray(occluders.solid),
-            geometry.is_guess,
-            positions,
-        )
-        return kernel, bool(clean.size or occluders.beyond.size)
+            self.scene.images[name, camera.content_key] = q
+        self._surfaces[name] = Surfaces(q, face, behind, uncertainty.astype(np.float32))
+        return self._surfaces[name]
+
+    def _occluders(self) -> Any:
+        """What hides the scene from the sources: ``kernels.Occluders``."""
+        from arbiview_aug.render.kernels import Occluders
+
+        surface: Any = self.scene.surface(self.seen_name, self.pair.source.ground_z_m)
+        found, scales = [], []
+        for k, level in self.used:
+            hiding, coarser, source = OcclusionMap(_NO_IMAGE, _NO_FACES), level, self.pair.source[k]
+            if (surface.is_layered or surface.is_dense) and not self.is_far[k]:
+                # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
+                coarser = level if surface.is_layered else max(level, occlusion_level(source))
+                half = halved_camera(source, coarser) if coarser else source
+                hiding = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)
+            found.append(hiding)
+            scales.append(0.5 ** (coarser - level))
+        before_m = np.zeros((len(found), max((len(one.before_m) for one in found), default=0)), np.float32)
+        for row, one in zip(before_m, found, strict=True):
+            row[: len(one.before_m)] = one.before_m
+        images = self._images([one.beyond for one in found]), self._images([one.solid for one in found])
+        return Occluders(*images, np.array(scales, np.float32), before_m, bool(surface.background.is_guess))
+
+    def _images(self, arrays: Sequence[npt.NDArray[Any]]) -> Any:
+        """Arrays as ``kernels.Images``."""
+        from arbiview_aug.render.kernels import Images
+
+        address, size = np.zeros(len(arrays), np.int64), np.zeros((len(arrays), 2), np.int64)
+        for k, array in enumerate(arrays):
+            if array.size:
+                array = np.ascontiguousarray(array)
+                self._alive.append(array)
+                address[k], size[k] = array.__array_interface__["data"][0], array.shape
+        return Images(address, size)
+
+    # --- what sources see ---------------------------------------------------------------------------------------------
+    def _measure(self) -> None:
+        """Choose the sources that may see the view, and weigh them on its nodes."""
+        from arbiview_aug.render.kernels import Nodes, measure_nodes
+
+        pair, baselines_m = self.pair, self.pair.baselines_m[self.index]
+        is_exact = baselines_m < SAME_CENTER_M
+        parallax_px = worst_parallax_px(baselines_m, float(self.camera.K[0, 0]))
+        self.is_far = is_exact | (pair.geometry == "auto") & (parallax_px < FAR_PARALLAX_PX)
+        exact = np.flatnonzero(is_exact).tolist()
+        is_served = any(covers_target_exactly(pair.source[k], self.camera, self.config) for k in exact)
+        asked = is_exact if is_served else np.ones(len(is_exact), bool)
+        self.seen_name = "infinity" if self.is_far[asked].all() else self.name
+        self.is_far |= self.seen_name == "infinity"
+        surfaces = self._seen(self.seen_name)
+        asked = asked & ~self._look_apart(float(surfaces.q.max()))
+        sources = [k for k in pair.order if asked[k]]
+        read = self._read(sources)
+        shape = len(sources), *surfaces.behind.shape
+        uv = np.empty((len(sources), 2, *surfaces.behind.shape), np.float32)
+        for i in np.flatnonzero(read.kind < 0):
+            behind = surfaces.behind * np.float32(not self.is_far[sources[i]])
+            uv[i] = source_pixels(self.camera, self.view.rays, behind, pair.source[sources[i]])
+        score, border, parallax, resolution = np.empty((4, *shape), np.float32)
+        places = np.empty(shape, bool), uv, np.empty(len(sources), np.int64)
+        nodes = Nodes(score, border, parallax, resolution, *places)
+        measure_nodes(self.view, read, surfaces, self.config.antialias, nodes)
+        seen = np.flatnonzero(nodes.halvings >= 0)
+        self.nodes = nodes if len(seen) == len(sources) else Nodes(*(part[seen] for part in nodes))
+        self.sources, self.levels = [sources[i] for i in seen], self.nodes.halvings.tolist()
+
+    @property
+    def used(self) -> list[tuple[int, int]]:
+        """Numbers of the sources that may see the view, in content order, and halvings of their images."""
+        return list(zip(self.sources, self.levels, strict=True))
+
+    def _look_apart(self, nearest: float) -> BoolArray:
+        """Whether cones of the sources (N,) are disjoint from the view's, for inverse distances up to ``nearest``.
+
+        By the law of sines, the directions to a point at 1 / q from two centres differ by at most asin(baseline * q).
+        """
+        angles, spreads = (part[self.index] for part in self.pair.angles)
+        sine = self.pair.baselines_m[self.index] * nearest * ~self.is_far
+        return (sine < 1) & (angles > spreads + np.arcsin(np.minimum(sine, 1)) + _APART_RAD)
+
+    def _read(self, sources: list[int], layout: AtlasLayout | None = None) -> Any:
+        """Sources at full size, or halved and with their places in an atlas, as ``kernels.Sources``."""
+        from arbiview_aug.render.kernels import Sources
+
+        pair, k = self.pair, np.array(sources, np.int64)
+        A, o, offset_m = (part[self.index, k] for part in pair.poses)
+        kind, parameters, size, bounds = (part[k] for part in pair.lenses)
+        o *= ~self.is_far[k][:, None]
+        bonus = np.where(pair.baselines_m[self.index, k] < SAME_CENTER_M, PRIMARY_BONUS, 1).astype(np.float32)
+        slots, positions = np.zeros((len(k), 3), np.int32), [_NO_IMAGE] * len(k)
+        clean: list[npt.NDArray[Any]] = [_NO_IMAGE] * len(k)
+        for i, level in enumerate(self.levels if layout else []):
+            assert layout is not None
+            camera, slot = pair.source[sources[i]], layout.slot(sources[i], level)
+            slots[i], clean[i] = (slot.source, slot.x, slot.y), self.maps.clean_pixels(camera, level)
+            if level:
+                parameters[i], bounds[i] = camera.parameters_at(0.5**level), source_bounds(camera.size, level)
+            if kind[i] < 0:
+                q = self._seen("infinity" if self.is_far[sources[i]] else self.seen_name).q
+                uv = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), q, camera)
+                positions[i] = at_level(np.concatenate(uv), level).astype(np.float32)
+        to_mask = [self.maps.to_mask(pair.source[i]) for i in sources]
+        images = (self._images(arrays) for arrays in (positions, to_mask, clean))
+        return Sources(A, o, kind, parameters, size, bounds, offset_m, bonus, slots, *images)
 
     # --- who wins -----------------------------------------------------------------------------------------------------
     def finish(self, layout: AtlasLayout) -> ViewPlan:
         """Winners, maps into the atlas, and blended bands."""
-        from arbiview_aug.render.kernels import put_source, upsample_where
+        from arbiview_aug.render.kernels import BLOCK_PX, FLOAT_ROWS, INT_ROWS, Pixels, plan_pixels, see_nodes
         from arbiview_aug.render.paint_kernels import find_paint
 
-        size, memory = self.camera.size, self.maps.memory
-        fixed = FixedMap.outside(size, memory)
-        packed = fixed.packed
-        winner = memory.full(size, -1, np.int8)
-        hides = any(region.hides for region in self.regions)
-        in_image = memory.full(size if hides else (0, 0), 0, np.uint8)
-        best = memory.full(size, -1, np.float32)  # a source that sees a pixel beats none, even with a weight of 0
-        weights = self._weights()
-        seconds = SecondBest(weights if self.config.seam_width else weights[:0], self.step, size, memory)
-        for region, weight in zip(self.regions, weights, strict=True):
-            slot = layout.slot(region.source, region.level)
-            put_source(
-                *self._target(region), region.kernel, (region.source, slot.x, slot.y), weight, self.step,
-                region.columns, seconds.shared, best, winner, packed, fixed.frac, in_image, *seconds.images,
-            )  # fmt: skip
-        won_px = Counter({r.source: int(np.count_nonzero(winner == r.source)) for r in self.regions})
-        bands = tuple(seconds.blend_regions([region.source for region in self.regions], best))
-        certain = None
-        if self.config.certainty:
-            certain = memory.full(size, 0, np.uint8)
-            for region in self.regions:
-                upsample_where(region.certainty, self.step, winner, region.source, certain)
+        size, memory, view, surfaces = self.camera.size, self.maps.memory, self.view, self._seen(self.seen_name)
+        sources, occluders = self._read(self.sources, layout), self._occluders()
+        most = max(size[1], view.step * BLOCK_PX, len(view.x))
+        scratch = np.empty((FLOAT_ROWS, most), np.float32), np.empty((INT_ROWS, most), np.int32)
+        hides = bool(sources.clean.size.any() or occluders.beyond.size.any())
+        if hides:
+            see_nodes(view, sources, surfaces, occluders, self.nodes, *scratch)
+        at = FixedMap(memory.empty((*size, 2), np.int16), memory.empty(size, np.uint16))
+        blended = size if self.config.seam_width and len(self.sources) > 1 else (0, 0)
+        winner, shared = memory.empty(size, np.int8), np.empty((len(view.y) - 1, len(view.x) - 1), bool)
+        in_image, won_px = memory.empty(size if hides else (0, 0), np.uint8), np.zeros(128, np.int64)
+        second, second_xy, second_frac, share = self.pair.seconds(blended)
+        seconds = second, second_xy, second_frac, share, shared
+        pixels = Pixels(winner, at.packed, at.frac, *seconds, in_image, won_px)
+        sets = np.empty((2, shared.shape[1]), np.int64)
+        weights = self._weights(), self.nodes.near
+        plan_pixels(view, sources, surfaces, occluders, *weights, self.wanted, pixels, *scratch, sets)
+        bands = self._bands(pixels) if shared.any() and blended[0] else ()
+        certain = self._certainty(winner) if self.config.certainty else None
         interpolation = self._interpolation(won_px)
         if interpolation == "nearest":
-            fixed, bands = fixed.rounded(), tuple(replace(band, at=band.at.rounded()) for band in bands)
-        edge = self._edge(fixed, winner, layout) if interpolation == "cubic" else None
-        reports = tuple(self._reports(winner, won_px))
-        if not self.config.layers or sum(won_px.values()) == winner.size:
-            return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge)
+            at, bands = at.rounded(), tuple(replace(band, at=band.at.rounded()) for band in bands)
+        edge = self._edge(at, winner, layout) if interpolation == "cubic" else None
+        plan = ViewPlan(at, winner, bands, tuple(self._reports(winner, won_px)), interpolation, certain, edge)
+        if not self.config.layers or won_px.sum() == winner.size:
+            return plan
         layers = ((winner < 0) & (in_image > 0)).view(np.uint8) if hides else np.zeros(size, np.uint8)
         # The asked geometry only if a source needed it: else the scene may not have it.
-        name = self.surface if self.surface in self._geometries else self.scene.best
+        name = self.name if self.name in self._surfaces else self.scene.best
         paint = road = None
         if name != "infinity":
-            geometry = self._geometry(name)
-            road = self._road(geometry.behind)
-            if geometry.face.size or layers.any():
-                parts = geometry.surface.face_parts if geometry.face.size else _NO_PARTS
-                paint = find_paint(geometry.q, geometry.face, parts, winner, self.step, layers)
-        marked = layers if layers.any() else None
-        return ViewPlan(fixed, winner, bands, reports, interpolation, certain, edge, marked, paint, road)
+            surfaces = self._seen(name)
+            road = self._road(surfaces.behind)
+            if surfaces.face.size or layers.any():
+                surface: Any = self.scene.surface(name, self.pair.source.ground_z_m)
+                parts = surface.face_parts if surfaces.face.size else _NO_PARTS
+                paint = find_paint(surfaces.q, surfaces.face, parts, winner, view.step, layers)
+        return replace(plan, layers=layers if layers.any() else None, paint=paint, road=road)
+
+    def _weights(self) -> npt.NDArray[np.float32]:
+        """Weights (K, ny, nx) of the sources: their scores, for one source or hard seams.
+
+        A seam blends each source over its weight around the area that it wins, which fades at its own border.
+        """
+        from arbiview_aug.render.kernels import soften, win_nodes
+
+        width_px, view, nodes = self.config.seam_width * self.camera.width_px, self.view, self.nodes
+        if width_px == 0 or len(self.sources) < 2:
+            return nodes.score
+        labelled = self.scene.boxes if "boxes" in GEOMETRIES[self.pair.geometry].reads else None
+        boxes = np.zeros((0, 7)) if labelled is None else labelled[:, :7]
+        near_last = np.argsort(-np.linalg.norm(boxes[:, :3] - view.center_m, axis=-1), kind="stable")
+        winner, weights = np.empty(nodes.score.shape[1:], np.int8), np.empty_like(nodes.score)
+        win_nodes(view, nodes, boxes[near_last], winner)
+        soften(winner, nodes.border, max(1, round(width_px / view.step / 2)), width_px, weights)
+        return weights
+
+    def _bands(self, pixels: Any) -> tuple[BlendRegion, ...]:
+        """Rectangles around the pixels that a second source adds to, in content order: they overlap."""
+        from arbiview_aug.render.kernels import cut_bands, find_bands
+
+        strips, columns = -(-len(pixels.winner) // _STRIP_PX), pixels.shared.shape[1]
+        bands = np.empty((len(self.sources) * strips * columns, 5), np.int64)
+        bands = bands[: find_bands(pixels, self.view.step, _STRIP_PX, np.array(self.sources), bands)]
+        size = np.stack([bands[:, 2] - bands[:, 1], bands[:, 4] - bands[:, 3]], -1)
+        ends = [0, *np.cumsum(size.prod(axis=1)).tolist()]
+        xy, frac, weight = (np.empty(ends[-1], kind) for kind in (np.int32, np.uint16, np.float32))
+        cut_bands(pixels, bands, xy, frac, weight)
+        regions = []
+        for (source, y0, _, x0, _), (h, w), a, b in zip(bands.tolist(), size.tolist(), ends, ends[1:], strict=False):
+            at = FixedMap(xy[a:b].view(np.int16).reshape(h, w, 2), frac[a:b].reshape(h, w))
+            regions.append(BlendRegion(y0, x0, source, at, weight[a:b].reshape(h, w)))
+        return tuple(regions)
+
+    def _certainty(self, winner: npt.NDArray[np.int8]) -> npt.NDArray[np.uint8]:
+        """``confidence.certainty`` (h, w) of the winning sources in 255ths."""
+        from arbiview_aug.render.kernels import upsample_where
+
+        certain, nodes = self.maps.memory.full(winner.shape, 0, np.uint8), self.nodes
+        share = 255 * certainty(nodes.parallax / float(self.camera.K[0, 0]), nodes.resolution)
+        for i, k in enumerate(self.sources):
+            upsample_where(_filled(share[i], nodes.near[i]), self.view.step, winner, k, certain)
+        return certain
 
     def _road(self, behind: npt.NDArray[np.float32]) -> BoolArray:
         """The nodes (ny + 1, nx + 1) behind which the road lies, by inverse distances of the background."""
         down = self._directions[..., 2] / np.maximum(behind, np.float32(1e-9))
-        height_m = self.camera.center_m[2] - self.ground_z_m + down
+        height_m = self.camera.center_m[2] - self.pair.source.ground_z_m + down
         return np.asarray((height_m < ROAD_M) & (behind > 0))
 
-    def _weights(self) -> npt.NDArray[np.float32]:
-        """Weights (K, ny + 1, nx + 1) of the sources: their scores, for one source or hard seams."""
-        from arbiview_aug.render.kernels import win_nodes
-
-        width_px = self.config.seam_width * self.camera.width_px
-        scores = np.array([region.score for region in self.regions], np.float32).reshape(-1, *self.node_rays.shape[1:])
-        if width_px == 0 or len(scores) < 2:
-            return scores
-        parallax, border_px = (
-            np.array([getattr(region, name) for region in self.regions]) for name in ("parallax", "border_px")
-        )
-        labelled = self.scene.boxes if "boxes" in GEOMETRIES[self.surface].reads else None
-        boxes = np.zeros((0, 7)) if labelled is None else labelled[:, :7]
-        near_last = np.argsort(-np.linalg.norm(boxes[:, :3] - self.camera.center_m, axis=-1), kind="stable")
-        pose = np.ascontiguousarray(self.camera.center_m), np.ascontiguousarray(self.camera.cam2ego[:3, :3])
-        node_rad, winner = self.step / float(self.camera.K[0, 0]), np.empty(scores.shape[1:], np.int8)
-        win_nodes(scores, parallax, boxes[near_last], *pose, self.node_rays, self.rays.cone, node_rad, winner)
-        return seam_weights(winner, border_px, self._seam_radius, width_px)
-
-    def _target(self, region: _Region) -> tuple[Any, Any, Any, Any]:
-        return self.rays.planes, self.rays.parameters, region.geometry.q, region.geometry.face
-
-    def _interpolation(self, won_px: Counter[int]) -> str:
+    def _interpolation(self, won_px: npt.NDArray[np.int64]) -> str:
         """Cubic where it is asked for and the view magnifies, by ``MAGNIFIED``, what lies at its own centre."""
         if self.config.interpolation != "cubic":
             return self.config.interpolation
-        exact = [region for region in self.regions if region.baseline_m < SAME_CENTER_M]
-        won = sum(won_px[region.source] for region in exact)
-        total = sum(region.fineness * won_px[region.source] for region in exact)
-        most = 2 * won > sum(won_px.values())
+        won, total = 0, 0.0
+        for i, k in enumerate(self.sources):
+            if self.pair.baselines_m[self.index, k] < SAME_CENTER_M and won_px[k]:
+                resolution = np.sort(self.nodes.resolution[i][self.nodes.border[i] > 0])
+                fineness = resolution[len(resolution) // 2] / 2 ** self.levels[i] if len(resolution) else 1.0
+                won, total = won + won_px[k], total + fineness * won_px[k]
+        most = 2 * won > won_px.sum()
         return "cubic" if most and total <= MAGNIFIED * won else "linear"
 
     def _edge(self, fixed: FixedMap, winner: npt.NDArray[np.int8], layout: AtlasLayout) -> npt.NDArray[np.int64]:
         """The pixels whose cubics, 4 x 4 pixels from one before ``fixed.xy``, leave the source or touch its mask."""
         edge = np.zeros(winner.shape, np.uint8)
-        for region in self.regions:
-            slot = layout.slot(region.source, region.level)
-            (h, w), source = slot.size, self.sources[region.source]
-            own_pixels: Any = cv2.inRange(winner, region.source, region.source)  # type: ignore[call-overload]
+        for k, level in self.used:
+            slot = layout.slot(k, level)
+            h, w = slot.size
+            own_pixels: Any = cv2.inRange(winner, k, k)  # type: ignore[call-overload]
             low, high = (slot.x + 1, slot.y + 1), (slot.x + w - 3, slot.y + h - 3)
             inside: Any = cv2.inRange(fixed.xy, low, high)  # type: ignore[call-overload]
-            clean = self.maps.clean_pixels(source, region.level)
+            clean = self.maps.clean_pixels(self.pair.source[k], level)
             if clean.size:
                 clean = np.asarray(cv2.erode(clean, np.ones((4, 4), np.uint8), anchor=(1, 1)), np.uint8)
                 at = fixed.xy - np.array([slot.x, slot.y], np.int16)
@@ -449,47 +405,47 @@ class ViewPlanner:
             cv2.bitwise_or(edge, cv2.bitwise_and(own_pixels, cv2.bitwise_not(inside)), dst=edge)
         return np.flatnonzero(edge)
 
-    def _reports(self, winner: npt.NDArray[np.int8], won_px: Counter[int]) -> Iterator[SourceUse]:
+    def _reports(self, winner: npt.NDArray[np.int8], won_px: npt.NDArray[np.int64]) -> Iterator[SourceUse]:
         """Summaries of the sources that win any pixel, largest share first."""
-        on_nodes = winner[self.at_nodes]
-        for region in sorted(self.regions, key=lambda r: -won_px[r.source]):
-            if won_px[region.source] == 0:
+        some, baselines_m = 2 if self.view.step > 1 else 1, self.pair.baselines_m[self.index]  # of the nodes
+        on_nodes = winner[self.view.y[::some]][:, self.view.x[::some]]
+        for i in sorted(range(len(self.sources)), key=lambda i: -won_px[self.sources[i]]):
+            k = self.sources[i]
+            if won_px[k] == 0:
                 continue
-            won = np.sort(region.parallax[on_nodes == region.source])
+            won = np.sort(self.nodes.parallax[i, ::some, ::some][on_nodes == k])
             middle_px = float(won[(won.size - 1) // 2] + won[won.size // 2]) / 2 if won.size else 0.0
             yield SourceUse(
-                source=region.source,
-                surface=region.surface,
-                reason=region.reason,
-                baseline_m=region.baseline_m,
+                source=k,
+                surface="infinity" if self.is_far[k] else self.name,
+                reason=self._reason(baselines_m[k]),
+                baseline_m=float(baselines_m[k]),
                 parallax_px=middle_px,
-                share=won_px[region.source] / winner.size,
-                level=region.level,
+                share=int(won_px[k]) / winner.size,
+                level=self.levels[i],
             )
+
+    def _reason(self, baseline_m: float) -> str:
+        """Why a source so far away is read over its surface."""
+        worst_px = worst_parallax_px(baseline_m, float(self.camera.K[0, 0]))
+        if baseline_m < SAME_CENTER_M:
+            return "centres coincide: exact"
+        if self.pair.geometry != "auto":
+            return "asked for"
+        if worst_px < FAR_PARALLAX_PX:
+            return f"worst-case parallax {worst_px:.2f} px"
+        return f"centres {baseline_m:.2f} m apart"
 
 
 @lru_cache(32)
-def nodes_of(size: tuple[int, int], step: int) -> tuple[list[npt.NDArray[np.int64]], list[npt.NDArray[np.int64]]]:
-    """Rows and columns of the corners of cells in an image (h, w), the last ones its last; and of nodes.
+def nodes_of(size: tuple[int, int], step: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Rows (ny,) and columns (nx,) of the nodes in an image (h, w): the corners of its cells.
 
     The outermost nodes lie half a cell inside: a magnified source does not see the outermost pixels.
     """
-    corners, inset = [np.minimum(np.arange(0, n + step, step), n - 1) for n in size], step // 2
-    return corners, [corner.clip(inset, n - 1 - inset) for corner, n in zip(corners, size, strict=True)]
-
-
-def _whole_cells(on_nodes: BoolArray) -> BoolArray:
-    """Cells (ny, nx) of which all four nodes (ny + 1, nx + 1) are True."""
-    return on_nodes[1:, 1:] & on_nodes[1:, :-1] & on_nodes[:-1, 1:] & on_nodes[:-1, :-1]
-
-
-def halvings(resolution: float, size: tuple[int, int]) -> int:
-    """How many times an image of (h, w) that is minified by ``resolution`` is halved: at least 2 pixels remain."""
-    # 2 % of tolerance: a target of exactly half size must read the halved source.
-    level = int(max(0, math.floor(math.log2(max(1.02 * resolution, 1e-6)))))
-    while level and min(level_size(size, level)) < 2:
-        level -= 1
-    return level
+    inset = step // 2
+    y, x = (np.arange(0, n + step, step).clip(inset, n - 1 - inset) for n in size)
+    return y, x
 
 
 @lru_cache(32)
@@ -508,22 +464,6 @@ def halved_camera(camera: Camera, level: int) -> Camera:
     """The camera of an image that was halved ``level`` times, at least once."""
     h, w = level_size(camera.size, level)
     return camera.crop(0, 0, (h << level, w << level)).resize((h, w))
-
-
-def continued(rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """Rays (3, ny, nx) of nodes, those up to two nodes outside a lens's image circle as if it went on.
-
-    Lenses turn fast at their rim: rays go on four times as fast, and the cells there hold all of their pixels' rays.
-    """
-    (ny, nx), known = rays.shape[1:], rays.any(axis=0)
-    for _ in range(0 if known.all() else 2):
-        wide, further = np.pad(rays, ((0, 0), (2, 2), (2, 2))), np.zeros_like(rays)
-        for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-            one, two = (wide[:, 2 + k * dy : 2 + k * dy + ny, 2 + k * dx : 2 + k * dx + nx] for k in (1, 2))
-            further += one.any(axis=0) * np.where(two.any(axis=0), 5 * one - 4 * two, one)
-        length = np.linalg.norm(further, axis=0)
-        rays = np.where(rays.any(axis=0), rays, further / np.maximum(length, np.float32(1e-30)))
-    return rays
 
 
 def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:
@@ -569,9 +509,17 @@ def build_plan(
         The plan. Targets that no source sees have zero coverage.
     """
     with compilation_announced():
-        config, scene, maps = config or RenderConfig(), scene or Scene(), maps or RayCache()
-        target = target.in_frame_of(source)
-        return _built(source, target, geometry, config, scene, maps, wanted or [None] * len(target))
+        settings = geometry, scene or Scene(), config or RenderConfig(), maps or RayCache()
+        pair = _Pair(source, target.in_frame_of(source), *settings)
+        # Cameras at one centre share panoramas: the order of targets must not tell which of them makes one.
+        order = content_order(pair.target.cameras)
+        planners = {k: ViewPlanner(pair, k, None if wanted is None else wanted[k]) for k in order}
+        layout = AtlasLayout.for_sources(source.sizes, [used for planner in planners.values() for used in planner.used])
+        views = {k: planner.finish(layout) for k, planner in planners.items()}
+        # The same places for what is read: images that win no pixel are not copied.
+        read = {used for k, view in views.items() for used in planners[k].used if used[0] in view.sources}
+        layout = AtlasLayout(tuple(slot for slot in layout.slots if (slot.source, slot.level) in read))
+        return RenderPlan(source, pair.target, layout, tuple(views[k] for k in range(len(views))), pair.config)
 
 
 def warm_up() -> None:
@@ -596,31 +544,3 @@ def warm_up() -> None:
     for surface in ("ground", "boxes"):
         plan = build_plan(source, target, geometry=surface, config=config, scene=scene)
     read_ahead(np.zeros((1, 3), np.uint8), 3, plan.targets[0].at.packed, plan.targets[0].source_camera)
-
-
-def _built(
-    source: Rig,
-    target: Rig,
-    surface: str,
-    config: RenderConfig,
-    scene: Scene,
-    maps: RayCache,
-    wanted: Sequence[BoolArray | None],
-) -> RenderPlan:
-    order = content_order(source.cameras)
-    # Targets at one centre share panoramas: their order must not tell which of them makes one.
-    by_target = {
-        k: ViewPlanner(source, order, target[k], surface, scene, config, maps, wanted[k])
-        for k in content_order(target.cameras)
-    }
-    planners = [by_target[k] for k in range(len(target))]
-    used = [(region.source, region.level) for planner in planners for region in planner.regions]
-    layout = AtlasLayout.for_sources(source.sizes, used)
-    targets = tuple(planner.finish(layout) for planner in planners)
-    read = set[tuple[int, int]]()
-    for planner, view in zip(planners, targets, strict=True):
-        sources = view.sources
-        read |= {(region.source, region.level) for region in planner.regions if region.source in sources}
-    # The same places for what is read: images that win no pixel are not copied.
-    layout = AtlasLayout(tuple(slot for slot in layout.slots if (slot.source, slot.level) in read))
-    return RenderPlan(source, target, layout, targets, config)

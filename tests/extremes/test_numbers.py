@@ -28,7 +28,7 @@ from arbiview_aug.render.harmonise import LEVELS, SHARES, estimate_gains, tone_c
 from arbiview_aug.render.photometry_kernels import tone
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.torch_backend import render_torch
-from arbiview_aug.render.view_planner import build_plan
+from arbiview_aug.render.view_planner import ViewPlanner, build_plan
 from tests.extremes import reference
 from tests.extremes.conftest import Worst
 from tests.extremes.test_geometry import SOURCES, TARGETS, camera, no_numpy_warnings, ring
@@ -180,7 +180,7 @@ def test_coverage_does_not_depend_on_weights(weight: float, execution: str, monk
     rig, target = ring(8), Rig([camera("t", azimuth_deg=20.0, position_m=(0.1, 0.2, 1.7))])
     config = RenderConfig(seam_width=0.1)
     _, covered, _ = shaded(rig, target, config, execution)
-    monkeypatch.setattr("arbiview_aug.render.weights.distance_weight", lambda d, *_: np.full(d.shape, weight))
+    monkeypatch.setattr(ViewPlanner, "_weights", lambda self: np.full_like(self.nodes.score, weight))
     with no_numpy_warnings():
         image, still, plan = shaded(rig, target, config, execution)
     assert np.array_equal(still, covered) and np.isfinite(image).all()

@@ -5,12 +5,7 @@ from dataclasses import fields, replace
 import numpy as np
 
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.favs.stage4_fusion import (
-    fuse,
-    fusion_weight,
-    gradient_weight,
-)
-from arbiview_aug.render.weights import distance_weight, quality_weight, source_weight
+from arbiview_aug.favs.stage4_fusion import distance_weight, fuse, fusion_weight, gradient_weight
 
 OFF = PaperConfig(**{f.name: False for f in fields(PaperConfig) if f.name.startswith("use_")})
 
@@ -18,10 +13,6 @@ OFF = PaperConfig(**{f.name: False for f in fields(PaperConfig) if f.name.starts
 def test_weights_by_hand() -> None:
     assert np.allclose(distance_weight(np.array([-3.0, 0.0, 25.0, 100.0, 200.0]), 100.0), [0, 0, 0.25, 1, 1])
     assert np.allclose(gradient_weight(np.array([0.0, 10.0, 30.0]), 10.0), [1, 0.5, 0.25])
-    assert np.allclose(quality_weight(np.array([0.0, 3.0, 0.0]), np.array([2.0, 1.0, 0.5])), [1, 0.25, 0.5])
-    border, coarsest = np.array(0.5), np.array(0.01)  # the outermost pixel centres of the largest image
-    assert source_weight(border, 32767 / 2, np.array(0.0), coarsest, True) > 1
-    assert source_weight(np.array(9.0), 4.0, np.array(0.0), np.array(2.0), False) == 1
 
 
 def test_the_product_of_weights_by_hand() -> None:
