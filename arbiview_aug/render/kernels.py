@@ -597,7 +597,7 @@ def _plan_block(
             has_faces = has_faces or most >= 0
     for x in range(total if in_image else 0):
         block.held[x] = 0
-    several, is_first = not fills and some & (some - 1) != 0, True
+    several, is_first = some & (some - 1) != 0, True
     for k in range(sources.A.shape[0]):
         if not _is_in(some, k):
             continue
@@ -623,15 +623,6 @@ def _plan_block(
                 xy_2[x] = _OUTSIDE
             for x in range(total if several else 0):
                 tag_2[x] = np.int32(-1)
-        elif not several:
-            for x in range(total):
-                work[x] = xy[x] if tag_1[x] < 0 else xy_1[x]
-            for x in range(total):
-                xy_1[x] = work[x]
-            for x in range(total):
-                work[x] = tag[x] if tag_1[x] < 0 else tag_1[x]
-            for x in range(total):
-                tag_1[x] = work[x]
         else:
             for x in range(total):
                 weight[x] = mixed[x] if tag[x] >= 0 else -_ONE - _ONE

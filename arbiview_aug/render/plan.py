@@ -27,7 +27,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.choices import is_number
 from arbiview_aug.errors import CalibrationError, shown
-from arbiview_aug.image_ops import FRESH, Memory, level_size
+from arbiview_aug.image_ops import level_size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,11 +94,6 @@ class FixedMap:
 
     xy: npt.NDArray[np.int16]
     frac: npt.NDArray[np.uint16]
-
-    @classmethod
-    def outside(cls, size: tuple[int, int], memory: Memory = FRESH) -> FixedMap:
-        """A map (h, w) that reads nothing."""
-        return cls(memory.full((*size, 2), OUTSIDE, np.int16), memory.full(size, 0, np.uint16))
 
     def rounded(self) -> FixedMap:
         """The same map at the nearest whole pixels."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray, LensName
-from arbiview_aug.cameras.rays import RayCache, source_pixels
+from arbiview_aug.cameras.rays import RayCache, look_apart, source_pixels
 from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.environment import compilation_announced
 from arbiview_aug.image_ops import at_level, level_size, some_of_cells
@@ -52,7 +52,6 @@ MAGNIFIED = 0.8
 centre: docs/benchmarks.md (Ablation)."""
 
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
-_APART_RAD = 0.01  # cones of rays are apart by at least this
 _STRIP_PX = 128  # height of strips in which bands along seams are rectangles
 _NO_IMAGE, _NO_FACES, _NO_PARTS = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32), np.zeros(0, np.int32)
 
@@ -67,26 +66,12 @@ class _Pair:
     scene: Scene
     config: RenderConfig
     maps: RayCache
-    _seconds: dict[tuple[int, int], list[Any]] = field(default_factory=dict)
-
-    @cached_property
-    def order(self) -> list[int]:
-        """Sources in content order, so that ties never depend on the order of the list."""
-        return content_order(self.source.cameras)
 
     @cached_property
     def baselines_m(self) -> FloatArray:
         """Distances (M, N) of the centres."""
         offsets_m = self.target.cam2ego[:, None, :3, 3] - self.source.cam2ego[None, :, :3, 3]
         return np.asarray(np.linalg.norm(offsets_m, axis=-1))
-
-    @cached_property
-    def angles(self) -> tuple[FloatArray, FloatArray]:
-        """Angles (M, N) between the axes of cones around the cameras' rays, and sums of their half angles, radians."""
-        cones = np.array([self.maps.rays(camera).cone for camera in self.target])
-        axes = (self.target.cam2ego[:, :3, :3] @ cones[:, :3, None])[..., 0] @ self.source.cam2ego[:, :3, 2].T
-        half_rad = np.array([camera.half_angle_rad for camera in self.source])
-        return np.arccos(np.clip(axes, -1, 1)), cones[:, 3:] + half_rad
 
     @cached_property
     def poses(self) -> tuple[npt.NDArray[np.float32], ...]:
@@ -96,14 +81,6 @@ class _Pair:
         to_source = of_source.transpose(0, 1, 3, 2)
         in_source, in_target = to_source @ offsets_m, of_target.transpose(0, 1, 3, 2) @ offsets_m
         return tuple(part.astype(np.float32) for part in (to_source @ of_target, in_source[..., 0], in_target[..., 0]))
-
-    def seconds(self, size: tuple[int, int]) -> list[Any]:
-        """Scratch images (h, w) of second sources: ``kernels.Pixels.second``, its places and shares."""
-        if size not in self._seconds:
-            kinds = np.int8, np.int32, np.uint16, np.float32
-            self._seconds[size] = [self.maps.memory.empty(size, kind) for kind in kinds]
-        self._seconds[size][0].fill(-1)
-        return self._seconds[size]
 
     @cached_property
     def lenses(self) -> tuple[npt.NDArray[Any], ...]:
@@ -224,8 +201,9 @@ class ViewPlanner:
         self.seen_name = "infinity" if self.is_far[asked].all() else self.name
         self.is_far |= self.seen_name == "infinity"
         surfaces = self._seen(self.seen_name)
-        asked = asked & ~self._look_apart(float(surfaces.q.max()))
-        sources = [k for k in pair.order if asked[k]]
+        apart = look_apart(self.camera, pair.source.cameras, float(surfaces.q.max()))
+        # In content order, so that ties never depend on the order of the source list.
+        sources = [k for k in content_order(pair.source.cameras) if asked[k] and not apart[k]]
         read = self._read(sources)
         shape = len(sources), *surfaces.behind.shape
         uv = np.empty((len(sources), 2, *surfaces.behind.shape), np.float32)
@@ -244,15 +222,6 @@ class ViewPlanner:
     def used(self) -> list[tuple[int, int]]:
         """Numbers of the sources that may see the view, in content order, and halvings of their images."""
         return list(zip(self.sources, self.levels, strict=True))
-
-    def _look_apart(self, nearest: float) -> BoolArray:
-        """Whether cones of the sources (N,) are disjoint from the view's, for inverse distances up to ``nearest``.
-
-        By the law of sines, the directions to a point at 1 / q from two centres differ by at most asin(baseline * q).
-        """
-        angles, spreads = (part[self.index] for part in self.pair.angles)
-        sine = self.pair.baselines_m[self.index] * nearest * ~self.is_far
-        return (sine < 1) & (angles > spreads + np.arcsin(np.minimum(sine, 1)) + _APART_RAD)
 
     def _read(self, sources: list[int], layout: AtlasLayout | None = None) -> Any:
         """Sources at full size, or halved and with their places in an atlas, as ``kernels.Sources``."""
@@ -296,8 +265,8 @@ class ViewPlanner:
         blended = size if self.config.seam_width and len(self.sources) > 1 else (0, 0)
         winner, shared = memory.empty(size, np.int8), np.empty((len(view.y) - 1, len(view.x) - 1), bool)
         in_image, won_px = memory.empty(size if hides else (0, 0), np.uint8), np.zeros(128, np.int64)
-        second, second_xy, second_frac, share = self.pair.seconds(blended)
-        seconds = second, second_xy, second_frac, share, shared
+        second, xy = memory.full(blended, -1, np.int8), memory.empty(blended, np.int32)
+        seconds = second, xy, memory.empty(blended, np.uint16), memory.empty(blended, np.float32), shared
         pixels = Pixels(winner, at.packed, at.frac, *seconds, in_image, won_px)
         sets = np.empty((2, shared.shape[1]), np.int64)
         weights = self._weights(), self.nodes.near

@@ -216,7 +216,9 @@ def test_runs_hold_every_pixel_with_its_own_source() -> None:
     winner[60:, 50:] = -1
     for one in (winner, np.full((40, 8), -1, np.int8), np.zeros((40, 8), np.int8)):
         seen = np.full(one.size, -1, np.int8)
-        for start, end, source in ViewPlan(FixedMap.outside(one.shape), one, (), ()).runs:
+        for start, end, source in ViewPlan(
+            FixedMap(np.zeros((*one.shape, 2), np.int16), np.zeros(one.shape, np.uint16)), one, (), ()
+        ).runs:
             assert (seen[start:end] == -1).all(), "no pixel gets two curves"
             seen[start:end] = source // len(one)
             assert start // one.shape[1] == (end - 1) // one.shape[1] == source % len(one), "every row has its own"
