@@ -26,7 +26,7 @@ from arbiview_aug.evaluate.methods import Method, retargeting, views_of
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.scan_pictures import scan_sheet
 from arbiview_aug.evaluate.report.tables import evaluation_tables, text_table
-from arbiview_aug.sample.inputs import read_frames, read_scene
+from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.scans import retarget_points
 from arbiview_aug.transforms.warm_up import compiling
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
     data = open_frames(arguments, [arguments.geometry], lidar=arguments.geometry == "lidar")
     with compiling("objects", "plans", *(() if arguments.data is None else ("points",))):
         sample = data[0]
-        read_scene(read_frames(sample, None)[0], arguments.geometry)  # refuses what the sample lacks before any work
+        read_frames(sample, None, arguments.geometry)  # refuses what the sample lacks before any work
     methods = _compared(arguments.quality, arguments.geometry, arguments.holes)
     notes: list[str] = []
     done = measured(arguments, data, methods, notes, agreement=False)

@@ -27,10 +27,10 @@ from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, D
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.environment import compilation_announced
 from arbiview_aug.errors import OutputError, WarnOnce, described
+from arbiview_aug.sample.frame import Neighbour
 from arbiview_aug.sample.inputs import read_frames, read_scene
-from arbiview_aug.sample.neighbours import Neighbour, neighbour_images, read_neighbours
+from arbiview_aug.sample.neighbours import neighbour_images
 from arbiview_aug.scene.depth_map import points_of
-from arbiview_aug.scene.scene import Scene
 from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, learned_depth
 from arbiview_aug.temporal.motion_depth import motion_depth, warm_up
 from arbiview_aug.temporal.transformers_depth import TransformersDepth
@@ -77,10 +77,9 @@ class _Frames(Dataset[Any]):
 
 def _from_motion(depths: DepthFolder, token: str, sample: dict[str, Any]) -> Done:
     """Compute and write a frame's depth from motion, unless it is there."""
-    (frame,) = read_frames(sample, None)
     warn = WarnOnce()
-    neighbours = read_neighbours(frame, warn)
-    used = [neighbour.name for neighbour in neighbours]
+    (frame,) = read_frames(sample, None, further=("neighbours",), warn=warn)
+    used = [neighbour.name for neighbour in frame.neighbours or ()]
     known = depths.find(token, sample["rig"], used)
     if known is not None:
         return Done(token, known.density, "", existed=True)
@@ -92,7 +91,7 @@ def _from_motion(depths: DepthFolder, token: str, sample: dict[str, Any]) -> Don
             used.remove(neighbour.name)  # the frame is done again once the neighbour can be read
         return images
 
-    depth = motion_depth(frame.rig, frame.images, neighbours, boxes, load)
+    depth = motion_depth(frame.rig, frame.images, frame.neighbours or (), boxes, load)
     depths.write(token, sample["rig"], depth, used)
     return Done(token, depth.density, str(depth))
 
@@ -109,8 +108,8 @@ def _for_network(
 
     ``model`` is what a file says of the network; ``motion`` is the folder of depth from motion.
     """
-    (frame,) = read_frames(sample, None)
-    scene = read_scene(frame, "auto") or Scene()
+    (frame,) = read_frames(sample, None, "auto")
+    scene = read_scene(frame, "auto")
     measured = [] if scene.points is None else [scene.points[:, :3]]
     if isinstance(maps := scene.further.get("depth_m"), tuple):
         measured.append(points_of(maps)[0])

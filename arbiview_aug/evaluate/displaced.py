@@ -18,8 +18,9 @@ from arbiview_aug.evaluate.frames import Photographs, ScoredFrame
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.methods import Method
 from arbiview_aug.evaluate.targets import without_masks
-from arbiview_aug.sample.inputs import LEARNED_KEY, Frame, read_frames
-from arbiview_aug.sample.neighbours import STILL_M, Neighbour, read_neighbours
+from arbiview_aug.sample.frame import Frame, Neighbour
+from arbiview_aug.sample.inputs import LEARNED_KEY, read_frames
+from arbiview_aug.sample.neighbours import STILL_M
 from arbiview_aug.temporal.motion_depth import without_objects
 
 MOST_APART_S = 2.0
@@ -50,7 +51,7 @@ def displaced_frames(
             moved = later.labelled if later.moved is None else later.moved
             rig = later.rig.with_cameras([without_objects(camera, moved) for camera in later.rig])
             photographs = _photographs(rig, later.images(frame.images))
-            sample = {**frame.sample, **({"neighbours": others} if others else {})}
+            sample = {**sample, **({"neighbours": others} if others else {})}
         name = str(sample.get("token", index))
         yield name, ScoredFrame(sample, truth=photographs.of_rig, target=photographs.rig)
         found = True
@@ -67,8 +68,9 @@ def later_neighbour(
     was wrong goes to ``problems``.
     """
     entries = [*([] if next_frame is None else [next_frame]), *(sample.get("neighbours") or [])]
-    (frame,) = read_frames({**sample, "neighbours": entries}, None)
-    neighbours = read_neighbours(frame, lambda _, message: problems.append(message))
+    with_others = {**sample, "neighbours": entries}
+    (frame,) = read_frames(with_others, None, further=("neighbours",), warn=lambda _, message: problems.append(message))
+    neighbours = frame.neighbours or ()
     later = next((one for one in neighbours if one.is_later and (next_frame is None or one.number == 0)), None)
     if later is None:
         return None

@@ -18,9 +18,8 @@ from arbiview_aug.inpaint.inpainter import Black, Inpainter
 from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.sample.inputs import DEPTH_KEYS, MOTION_KEY, read_frames, read_scene
-from arbiview_aug.sample.neighbours import read_neighbours
-from arbiview_aug.scene.scene import GEOMETRIES, Scene
-from arbiview_aug.temporal.motion_depth import estimate_motion, estimates_motion
+from arbiview_aug.scene.scene import GEOMETRIES
+from arbiview_aug.temporal.motion_depth import brings_motion, estimate_motion
 from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys, inpainter_of, render_config
@@ -115,7 +114,7 @@ def retargeting(
 
 def _overlap_depth(sample: Sample, surface: GeometryName) -> OverlapDepth:
     """Depth from a sample's overlaps, as ``estimate_overlap`` measures it."""
-    scene = read_scene(read_frames(sample, None)[0], surface) or Scene()
+    scene = read_scene(read_frames(sample, None, surface)[0], surface)
     row = GEOMETRIES[scene.best if surface == "auto" else surface]
     boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
     return overlap_depth(sample["rig"], list(sample["images"]), boxes)
@@ -123,11 +122,11 @@ def _overlap_depth(sample: Sample, surface: GeometryName) -> OverlapDepth:
 
 def _with_motion(sample: Sample, surface: GeometryName) -> Sample:
     """The sample with its depth from motion, where that must be estimated."""
-    frame, warn = read_frames(sample, None)[0], WarnOnce()
-    if not estimates_motion(frame, surface):
+    warn = WarnOnce()
+    frame = read_frames(sample, None, surface, further=("neighbours",), warn=warn)[0]
+    if brings_motion(frame, surface):
         return sample
-    scene = read_scene(frame, surface) or Scene()
-    motion = estimate_motion(frame, scene, read_neighbours(frame, warn), warn)
+    motion = estimate_motion(frame, read_scene(frame, surface).boxes, warn)
     return {**sample, MOTION_KEY: list(map(torch.from_numpy, motion.depth_m))}
 
 

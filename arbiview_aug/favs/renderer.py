@@ -30,7 +30,7 @@ from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion,
 from arbiview_aug.render.rendered import RenderedFrame, from_winners
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.sample.detections import Detection, read_detections
-from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.sample.frame import Frame
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,7 @@ def render_paper(
 
 def render_frame(frame: Frame, source: Rig, target: Rig, config: PaperConfig) -> PaperRendering:
     """Render a frame, with its detections where the settings use them."""
-    has_detections = any(frame.sample.get(key) is not None for key in ("detections", "boxes_3d"))
-    detections = read_detections(frame) if config.use_detections and has_detections else {}
+    detections = read_detections(frame) if config.use_detections else {}
     return render_paper(source, target, frame.images, config, detections)
 
 

@@ -28,7 +28,7 @@ from arbiview_aug.inpaint.inpainter import (
 from arbiview_aug.inpaint.networks import NetworkInpainter, PipelineInpainter, TorchScriptInpainter
 from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.rendered import RenderedFrame
-from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.sample.frame import Frame
 
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
 VIEWS_AT_ONCE = 24  # views that the denoiser sees in one call; a whole frame in any case

@@ -23,7 +23,7 @@ from arbiview_aug.inpaint.inpainter import Inpainter, Tensors
 from arbiview_aug.inpaint.telea import GREY
 from arbiview_aug.render.plan import OBJECT, Paint
 from arbiview_aug.render.rendered import RenderedFrame
-from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.sample.frame import Frame
 from arbiview_aug.scene.boxes import PARTS
 
 CELLS = 64  # cells along a view's shorter side; the pyramid starts with half as many

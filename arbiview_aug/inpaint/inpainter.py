@@ -14,7 +14,8 @@ from arbiview_aug.choices import is_number, is_whole
 from arbiview_aug.errors import GeneratorError, SampleError, shown
 from arbiview_aug.render.rendered import MAP_KEYS, LabelFill, RenderedFrame
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
-from arbiview_aug.sample.inputs import Frame, read_frames
+from arbiview_aug.sample.frame import Frame
+from arbiview_aug.sample.inputs import read_frames
 
 Tensors = Sequence[torch.Tensor]
 
@@ -106,7 +107,7 @@ class Inpainter(ABC):
                 f"complete: expected {', '.join(missing)} in the batch: retarget with "
                 "keys=SampleKeys(extra=('sources', 'confidence'))"
             )
-        sources = read_frames(batch[SOURCES_KEY], None)
+        sources = read_frames({**batch[SOURCES_KEY], "token": batch.get("token")}, None, names=("token",))
         views = read_frames({key: value for key, value in batch.items() if key != "coverage"}, None)
         lead = leading_shape(batch["images"])
         if len(sources) != len(views):
@@ -123,8 +124,6 @@ class Inpainter(ABC):
             else:
                 images = [image.clone() for image in view.images]  # some fill in place
             rendered.append(RenderedFrame(images, view.rig, **{key: frames[b] for key, frames in maps.items()}))
-        if batch.get("token") is not None:
-            sources = [replace(frame, sample={**frame.sample, "token": batch["token"]}) for frame in sources]
         done = [_without_own_car(frame) for frame in self.fill(rendered, sources)]
         out = {key: value for key, value in batch.items() if key != SOURCES_KEY}
         for key in (*maps, "generated"):
@@ -220,7 +219,7 @@ def _without_own_car(frame: RenderedFrame) -> RenderedFrame:
 # --- randomness -------------------------------------------------------------------------------------------------------
 def frame_names(frames: Sequence[Frame]) -> list[str]:
     """Names of frames for seeds: their ``token``, else a digest of their images (33 ms for six of 1600 x 900)."""
-    return [f.name("token") if f.sample.get("token") is not None else digest_of(f.images) for f in frames]
+    return [f.further["token"] if "token" in f.further else digest_of(f.images) for f in frames]
 
 
 def digest_of(tensors: Iterable[torch.Tensor]) -> str:

@@ -26,7 +26,8 @@ from arbiview_aug.inpaint.merging import Candidate, merged
 from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
 from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
 from arbiview_aug.render.view_planner import build_plan
-from arbiview_aug.sample.neighbours import BOX_MARGIN_M, ChangeRisk, Neighbour, Warn, change_risks, neighbour_images
+from arbiview_aug.sample.frame import Neighbour
+from arbiview_aug.sample.neighbours import BOX_MARGIN_M, ChangeRisk, Warn, change_risks, neighbour_images
 from arbiview_aug.scene.boxes import BoxSurface, whole
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Street, Surface

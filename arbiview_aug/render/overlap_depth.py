@@ -35,14 +35,12 @@ from arbiview_aug.cameras.rays import (
     project_rays,
 )
 from arbiview_aug.cameras.rig import Rig, content_order
-from arbiview_aug.choices import GeometryName
 from arbiview_aug.errors import SampleError
 from arbiview_aug.image_ops import at_level, level_size, write_halved
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import MIN_PIXELS
-from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.sample.frame import Frame
 from arbiview_aug.scene.boxes import draw_boxes
-from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.scene.surface import Correction, StaticSurface, Street
 
 ROUND_TRIP_PX = 0.75
@@ -412,21 +410,18 @@ def overlap_cache(share: bool | str, config: Any) -> OverlapCache | None:
 
 
 def estimate_overlap(
-    frame: Frame, scene: Scene, surface: GeometryName, share: bool | str, shared: OverlapCache | None
-) -> OverlapDepth | None:
-    """Estimate depth from the overlaps of a frame's images, or take it from a cache; None if the surface has no use.
+    frame: Frame, boxes: FloatArray | None, share: bool | str, shared: OverlapCache | None
+) -> OverlapDepth:
+    """Estimate depth from the overlaps of a frame's images without objects (B, 7), or take it from a cache.
 
     Raises:
         SampleError: The sample lacks the key ``share`` by which the cache shares depth.
     """
-    row = GEOMETRIES[scene.best if surface == "auto" else surface]
-    if not row.overlap_depth:
-        return None
-    boxes = scene.boxes if "boxes" in row.reads else None
     if shared is None:
         return overlap_depth(frame.rig, frame.images, boxes)
-    key = share if isinstance(share, str) else None
-    if key is not None and key not in frame.sample:
-        raise SampleError(f"PlanCache.share_overlap: expected {key!r} in the sample, to tell which frames share depth")
-    name = None if key is None else frame.name(key)
+    name = frame.further.get(share) if isinstance(share, str) else None
+    if isinstance(share, str) and name is None:
+        raise SampleError(
+            f"PlanCache.share_overlap: expected {share!r} in the sample, which tells frames that share depth"
+        )
     return shared.get((frame.rig.named_key, name), lambda: overlap_depth(frame.rig, frame.images, boxes))

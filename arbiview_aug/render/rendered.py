@@ -24,7 +24,7 @@ from arbiview_aug.render.harmonise import LEVELS, SHARES, Curves
 from arbiview_aug.render.plan import AtlasLayout, FixedMap, Paint, RenderPlan
 from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.sample.batching import barred, covered, framed, stacked
-from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.sample.frame import Frame
 
 _REMAP_COLUMNS = 32000  # cv2.remap needs sizes below 32767
 _STRIP_ROWS = 32  # are read together: they stay in the CPU's cache

@@ -12,7 +12,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.boxes_2d import rig_of
-from arbiview_aug.sample.inputs import as_array
+from arbiview_aug.sample.calibration import as_array
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.scene.point_cloud import checked_points
 from arbiview_aug.scene.surface import Points

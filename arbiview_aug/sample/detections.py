@@ -10,7 +10,8 @@ import numpy as np
 
 from arbiview_aug.errors import SampleError, SampleTypeError
 from arbiview_aug.sample.boxes_2d import outline
-from arbiview_aug.sample.inputs import Frame, numbers
+from arbiview_aug.sample.calibration import as_array, numbers
+from arbiview_aug.sample.frame import Frame
 from arbiview_aug.scene.boxes import checked_boxes
 
 
@@ -33,15 +34,14 @@ def read_detections(frame: Frame) -> OfCameras:
     in a batch, such a list for each frame. ``box_names``: a name for each of the ``boxes_3d``, ``upright`` by default;
     in a batch, a list for each frame.
     """
-    sample = frame.sample
-    if sample.get("detections") is not None:
-        return _of_cameras(frame.entry("detections"), frame)
-    if (array := frame.array("boxes_3d")) is None:
+    if "detections" in frame.further:
+        return _of_cameras(frame.further["detections"], frame)
+    if frame.boxes is None:
         return {}
-    boxes = checked_boxes(array)
+    boxes = checked_boxes(as_array("boxes_3d", frame.boxes))
     names = [UNNAMED_TYPE] * len(boxes)
-    if sample.get("box_names") is not None:
-        names = _names("box_names", frame.entry("box_names"), len(boxes))
+    if "box_names" in frame.further:
+        names = _names("box_names", frame.further["box_names"], len(boxes))
     of_cameras = {}
     for k, camera in enumerate(frame.rig):
         outlines = [(outline(camera, box), name) for box, name in zip(boxes, names, strict=True)]

@@ -10,6 +10,7 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_mounted, pose_mistake
+from arbiview_aug.sample.calibration import as_array
 from arbiview_aug.sample.camera_mistakes import (
     neighbour_errors,
     neighbour_findings,
@@ -17,7 +18,8 @@ from arbiview_aug.sample.camera_mistakes import (
     pose_findings,
 )
 from arbiview_aug.sample.findings import CheckReport, Finding
-from arbiview_aug.sample.inputs import Frame, as_array, focal_mistake, misnamed_keys, read_frames
+from arbiview_aug.sample.frame import Frame
+from arbiview_aug.sample.inputs import focal_mistake, misnamed_keys, read_frames
 from arbiview_aug.sample.label_mistakes import ELSEWHERE_M, label_findings
 from arbiview_aug.sample.masks import CLEANING, dark_rims, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
@@ -46,7 +48,7 @@ def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
     Raises:
         ArbiviewError: ``RigRetarget`` would refuse the sample too.
     """
-    frames = read_frames(sample, source)
+    frames = read_frames(sample, source, further=("points", "boxes_3d", "ego2world"))
     findings = [
         Finding(wrong, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
         for wrong, meant in misnamed_keys(sample, source is not None or sample.get("rig") is not None).items()
@@ -58,9 +60,8 @@ def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
         of_rig = check_rig(frame.rig, masks=is_recorded and sample.get("ego_mask") is None)
         findings += of_rig
         findings += _image_findings(frame)
-        given = {key: frame.array(key) for key in ("boxes_3d", "points")}
-        boxes = None if given["boxes_3d"] is None else checked_boxes(given["boxes_3d"])
-        points = None if given["points"] is None else checked_points(given["points"])
+        boxes = None if frame.boxes is None else checked_boxes(as_array("boxes_3d", frame.boxes))
+        points = None if frame.points is None else checked_points(as_array("points", frame.points))
         # Images tell nothing through poses that are all wrong.
         is_clear = is_recorded and all(finding.where != "cam2ego" for finding in of_rig)
         findings += label_findings(frame.rig, frame.images if is_clear else (), boxes, points, _pose(frame))
@@ -93,8 +94,9 @@ def check_own_car(frames: Sequence[Frame]) -> list[Finding]:
 
 def _pose(frame: Frame) -> FloatArray | None:
     """The frame's ``ego2world`` (4, 4); None without one, or for other shapes, which only neighbours need refuse."""
-    pose = frame.array("ego2world")
-    return None if pose is None or np.shape(pose) != (4, 4) else np.asarray(pose, np.float64)
+    pose = frame.further.get("ego2world")
+    pose = None if pose is None else as_array("ego2world", pose)
+    return None if pose is None or pose.shape != (4, 4) else np.asarray(pose, np.float64)
 
 
 def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:

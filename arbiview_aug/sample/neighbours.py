@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntEnum
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,9 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import is_rigid
 from arbiview_aug.errors import ArbiviewError, SampleError, SampleTypeError, shown
-from arbiview_aug.sample.batching import check_container, checked_images
-from arbiview_aug.sample.inputs import Frame, as_array, frame_from, numbers
-from arbiview_aug.scene.boxes import carried, checked_boxes, moved_boxes, moved_by, points_in
-from arbiview_aug.scene.point_cloud import checked_points, finite_rows, own_car, seen_through
+from arbiview_aug.sample.calibration import as_array, numbers, read_rig
+from arbiview_aug.sample.frame import Frame, Neighbour
+from arbiview_aug.scene.boxes import checked_boxes, moved_by, points_in
 from arbiview_aug.scene.surface import Points
 
 MAX_NEIGHBOURS = 120  # frame numbers are int8
@@ -44,130 +42,53 @@ Warn = Callable[[str, str], None]
 """Warns of a topic with a message, once per topic."""
 
 
-@dataclass(frozen=True, eq=False)
-class Neighbour:
-    """Another frame of the drive, seen from the current one."""
+def read_neighbours(
+    frame: Frame, entries: Any, sample: Mapping[str, Any], index: tuple[int, ...], warn: Warn
+) -> tuple[Neighbour, ...]:
+    """Read the neighbours of a frame at an ``index`` of a sample, nearest first, of two at one distance the one behind.
 
-    number: int  # its index in the sample's list
-    name: str  # its token, else its number
-    rig: Rig  # its cameras in the current frame's ego frame, over the current frame's road
-    travel_m: float  # distance between the two vehicles
-    ahead_m: float  # its position along the current heading
-    seconds: float | None  # time from the current frame to it; None if either has no time
-    boxes: FloatArray | None  # (B, 7) labelled objects at its time, in the current ego frame; None if unknown
-    boxes_now: FloatArray | None  # (B, 7) labelled objects in the current frame; None if unknown
-    ego2ego: FloatArray  # (4, 4) its ego frame to the current one
-    given: Mapping[str, Any]  # the entry itself; its images are read lazily
+    ``entries`` is a list of mappings, each another frame of the same rig: ``images``; ``ego2ego`` (4, 4), its ego frame
+    to the current one, or ``ego2world`` as in the sample; optionally ``points`` and ``boxes_3d`` in its own ego frame,
+    ``time_s``, ``token``, and its calibration where it differs. K and cam2ego alone keep the current lenses and masks.
+    Without own boxes, the sample's are moved by their velocities (columns 7 and 8, m/s in the ego frame) if both frames
+    have a time and all velocities are finite.
 
-    @property
-    def is_later(self) -> bool:
-        """Whether it was recorded after the current frame; without times, whether it is ahead."""
-        return (self.seconds or self.ahead_m) > 0
-
-    @property
-    def labelled(self) -> FloatArray:
-        """(B, 7) the labelled objects of both frames, in the current ego frame."""
-        return np.concatenate([np.zeros((0, 7)), *(b for b in (self.boxes, self.boxes_now) if b is not None)])
-
-    @cached_property
-    def moved(self) -> FloatArray | None:
-        """(B, 7) the labels of both frames that moved between them; None if either has none."""
-        if self.boxes is None or self.boxes_now is None:
-            return None
-        return moved_boxes(self.boxes_now, self.boxes)
-
-    def points(self) -> FloatArray | None:
-        """(P, C) its points in the current ego frame, those of labelled objects where these are now; None without.
-
-        Columns beyond x, y, z stay.
-        """
-        value = self.given.get("points")
-        if value is None:
-            return None
-        array = as_array("points", value)
-        own_points = checked_points(array)
-        kept = ~own_car(own_points)
-        points = np.array(array[finite_rows(array)][kept] if array.ndim == 2 else own_points, np.float64)
-        points[:, :3] = own_points[kept] @ self.ego2ego[:3, :3].T + self.ego2ego[:3, 3]
-        return points if self.boxes is None or self.boxes_now is None else carried(points, self.boxes, self.boxes_now)
-
-    def images(self, like: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
-        """Its images, checked, with the dtype and device of the current ones."""
-        check_container(self.given.get("images"))
-        images = checked_images(list(self.given["images"]))
-        sizes, expected = [tuple(image.shape[1:]) for image in images], self.rig.sizes
-        if sizes != expected:
-            raise SampleError(f"images: expected the sizes {expected}, got {sizes}")
-        if images[0].dtype != like[0].dtype:
-            raise SampleTypeError(f"images: expected {like[0].dtype} as in the current frame, got {images[0].dtype}")
-        return tuple(image.to(like[0].device) for image in images)
-
-
-def read_neighbours(frame: Frame, warn: Warn) -> list[Neighbour]:
-    """Read the neighbours of a frame, nearest first, of two at one distance the one behind.
-
-    ``neighbours`` is a list of mappings, each another frame of the same rig (in a batch, a list of such lists):
-    ``images``; ``ego2ego`` (4, 4), its ego frame to the current one, or ``ego2world`` as in the sample; optionally
-    ``points`` and ``boxes_3d`` in its own ego frame, ``time_s``, ``token``, and its calibration where it differs. K and
-    cam2ego alone keep the current lenses and masks. Without own boxes, the sample's are moved by their velocities
-    (columns 7 and 8, m/s in the ego frame) if both frames have a time and all velocities are finite.
-
-    Frames at the same place are left out silently, unusable ones with a warning. They are read once for each frame.
+    Frames at the same place are left out silently, unusable ones with a warning.
     """
-    if frame.neighbours is None:
-        object.__setattr__(frame, "neighbours", _read(frame, warn))
-    return frame.neighbours or []
-
-
-def _read(frame: Frame, warn: Warn) -> list[Neighbour]:
-    entries = frame.entry("neighbours")
-    if entries is None:
-        return []
     if not isinstance(entries, list | tuple):
-        expected = f"a list of frames{' for each frame of the batch' if frame.lead else ''}"
+        expected = f"a list of frames{' for each frame of the batch' if index else ''}"
         raise SampleTypeError(f"neighbours: expected {expected}, got {type(entries).__name__}")
     if len(entries) > MAX_NEIGHBOURS:
         raise SampleError(f"neighbours: expected at most {MAX_NEIGHBOURS} for a frame, got {len(entries)}")
-    boxes, neighbours = frame.array("boxes_3d"), []
+    boxes, neighbours = None if frame.boxes is None else as_array("boxes_3d", frame.boxes), []
     for number, entry in enumerate(entries):
         token = entry.get("token") if isinstance(entry, Mapping) else None
         name = str(number) if token is None else shown(token)
         try:
-            neighbour = _neighbour(frame, boxes, entry, number, name)
+            neighbour = _neighbour(frame, boxes, entry, sample, index, number, name)
         except (ArbiviewError, OSError) as error:
             _warn_lost(warn, name, error)
             continue
         if neighbour is not None:
             neighbours.append(neighbour)
-    return sorted(neighbours, key=lambda neighbour: (neighbour.travel_m, neighbour.ahead_m))
+    return tuple(sorted(neighbours, key=lambda neighbour: (neighbour.travel_m, neighbour.ahead_m)))
 
 
 def points_of_neighbours(frame: Frame, warn: Warn) -> list[FloatArray]:
     """Points (P, C) of a frame's neighbours in its ego frame, metres: an array for each that has some.
 
-    Points that the frame's own contradict are left out, and points that cannot be read, with a warning. They are read
-    once for each frame; without points of its own there are none.
+    Points that the frame's own contradict are left out, and points that cannot be read, with a warning.
     """
-    if frame.sweeps is None:
-        object.__setattr__(frame, "sweeps", _sweeps(frame, warn))
-    return frame.sweeps or []
-
-
-def _sweeps(frame: Frame, warn: Warn) -> list[FloatArray]:
-    array = frame.array("points")
-    if array is None or not (neighbours := read_neighbours(frame, warn)):
-        return []
-    points, parts = checked_points(array), list[FloatArray]()
-    origin = np.mean([camera.center_m for camera in frame.rig], axis=0)
-    for neighbour in neighbours[:MAX_SWEEPS]:
+    sweeps = list[FloatArray]()
+    for neighbour in (frame.neighbours or ())[:MAX_SWEEPS]:
         try:
-            others = neighbour.points()
+            sweep = neighbour.sweep
         except (ArbiviewError, OSError) as error:
             warn(f"points of {neighbour.name}", f"points of neighbour {neighbour.name} are left out: {error}")
             continue
-        if others is not None:
-            parts.append(others[~seen_through(points, others[:, :3], origin)])
-    return parts
+        if sweep is not None:
+            sweeps.append(sweep)
+    return sweeps
 
 
 def neighbour_images(neighbour: Neighbour, like: Sequence[torch.Tensor], warn: Warn) -> tuple[torch.Tensor, ...] | None:
@@ -184,12 +105,20 @@ def _warn_lost(warn: Warn, name: str, error: Exception) -> None:
     warn(f"neighbour {name}", f"neighbour {name} is left out: {error}; the frame is rendered without it")
 
 
-def _neighbour(frame: Frame, current: Points | None, entry: Any, number: int, name: str) -> Neighbour | None:
+def _neighbour(
+    frame: Frame,
+    current: Points | None,
+    entry: Any,
+    sample: Mapping[str, Any],
+    index: tuple[int, ...],
+    number: int,
+    name: str,
+) -> Neighbour | None:
     if not isinstance(entry, Mapping):
         raise SampleTypeError(f"expected a mapping with images and a pose, got {type(entry).__name__}")
-    ego2ego = _ego2ego(frame.sample, frame.index, entry)
+    ego2ego = _ego2ego(sample, index, entry)
     travel_m, turned_deg = float(np.linalg.norm(ego2ego[:3, 3])), _angle_deg(ego2ego[:3, :3])
-    seconds = _seconds(frame.sample, frame.index, entry)
+    seconds = _seconds(sample, index, entry)
     _check_motion(ego2ego, travel_m, seconds)
     if travel_m < STILL_M and turned_deg < STILL_DEG:
         return None
@@ -198,17 +127,17 @@ def _neighbour(frame: Frame, current: Points | None, entry: Any, number: int, na
     cameras = [camera.moved(ego2ego) for camera in own_rig]
     rig = Rig(cameras, ground_z_m=frame.rig.ground_z_m, name=f"{frame.rig.name} {name}".strip())
     now, then = _boxes(current, entry, ego2ego, seconds)
-    return Neighbour(number, name, rig, travel_m, float(ego2ego[0, 3]), seconds, then, now, ego2ego, entry)
+    return Neighbour(number, name, rig, travel_m, float(ego2ego[0, 3]), seconds, then, now, ego2ego, entry, frame)
 
 
 def _own_rig(frame: Frame, entry: Mapping[str, Any]) -> Rig:
     """Its cameras in its own ego frame; the current images stand for its own, which are read lazily."""
     if entry.get("rig") is not None or (entry.get("K") is None and entry.get("cam2ego") is None):
-        return frame_from(frame.images, entry, frame.rig).rig
+        return read_rig(frame.images, entry, frame.rig)
     if entry.get("K") is None:
         entry = {**entry, "K": frame.rig.K}
     cameras = []
-    for camera, now in zip(frame_from(frame.images, entry, None).rig, frame.rig, strict=True):
+    for camera, now in zip(read_rig(frame.images, entry, None), frame.rig, strict=True):
         of_lens = camera if entry.get("lens") is not None else now
         mask = now.mask if camera.mask is None else camera.mask
         cameras.append(replace(camera, name=now.name, lens=of_lens.lens, distortion=of_lens.distortion, mask=mask))

@@ -22,15 +22,15 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import pixels_of
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import GeometryName
 from arbiview_aug.environment import compilation_announced
 from arbiview_aug.errors import SampleError, WarnOnce
-from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY, Frame
-from arbiview_aug.sample.neighbours import BOX_MARGIN_M, Neighbour, neighbour_images
+from arbiview_aug.sample.frame import Frame, Neighbour
+from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY
+from arbiview_aug.sample.neighbours import BOX_MARGIN_M, neighbour_images
 from arbiview_aug.scene.boxes import SAME_SIZE_M, STAYED_M, draw_boxes
 from arbiview_aug.scene.depth_map import DepthMap, Maps, anchored_maps, motion_camera
 from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.scene.scene import GEOMETRIES, Geometry, Scene
+from arbiview_aug.scene.scene import GEOMETRIES, Geometry
 from arbiview_aug.temporal.moving import stand_on_road
 from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, read_at, reduced_grey
 
@@ -270,28 +270,27 @@ def _depth_m(image: SweptImage, estimate: _Estimate, unsure: FloatArray) -> Laye
 
 
 # --- as a stage of the transform --------------------------------------------------------------------------------------
-def estimates_motion(frame: Frame, surface: GeometryName) -> bool:
-    """Whether depth from motion must be estimated for a surface that needs it; False if the sample brings some.
+def brings_motion(frame: Frame, geometry: str) -> bool:
+    """Whether a frame brings the depth that a geometry needs; False if it must be estimated.
 
     Raises:
-        SampleError: The sample has no neighbours to estimate it from.
+        SampleError: The frame has no neighbours to estimate it from.
     """
-    keys = [key for key in (MOTION_KEY, LEARNED_KEY) if key == MOTION_KEY or key in GEOMETRIES[surface].reads]
-    if any(frame.sample.get(key) is not None for key in keys):
-        return False
-    if frame.sample.get("neighbours") is None:
-        raise SampleError(
-            f"geometry={surface!r}: expected 'neighbours' in the sample, or {' or '.join(map(repr, keys))} from the "
-            "depth command, got none"
-        )
-    return True
+    keys = [key for key in (MOTION_KEY, LEARNED_KEY) if key == MOTION_KEY or key in GEOMETRIES[geometry].reads]
+    if not frame.depth.keys().isdisjoint(keys):
+        return True
+    if frame.neighbours is None:
+        made = " or ".join(map(repr, keys))
+        expected = f"'neighbours' in the sample, or {made} from the depth command"
+        raise SampleError(f"geometry={geometry!r}: expected {expected}, got none")
+    return False
 
 
-def estimate_motion(frame: Frame, scene: Scene, neighbours: Sequence[Neighbour], warn: WarnOnce) -> MotionDepth:
-    """Estimate depth from the motion between a frame and its neighbours; warn once if it is declined."""
-
+def estimate_motion(frame: Frame, boxes: FloatArray | None, warn: WarnOnce) -> MotionDepth:
+    """Estimate depth from the motion between a frame with objects (B, 7) and its neighbours; warn if it is declined."""
+    assert frame.neighbours is not None
     load = partial(neighbour_images, like=frame.images, warn=warn)
-    motion = motion_depth(frame.rig, frame.images, neighbours, scene.boxes, load)
+    motion = motion_depth(frame.rig, frame.images, frame.neighbours, boxes, load)
     if not motion.density:
         warn("motion", str(motion))
     return motion
@@ -300,9 +299,7 @@ def estimate_motion(frame: Frame, scene: Scene, neighbours: Sequence[Neighbour],
 def warn_of_declined(frame: Frame, from_motion: bool, warn: WarnOnce) -> None:
     """Warn once that the depth that a sample brings, from motion or learned, is known nowhere."""
     key, words_key = (MOTION_KEY, MOTION_WORDS_KEY) if from_motion else (LEARNED_KEY, LEARNED_WORDS_KEY)
-    has_words = frame.sample.get(words_key) is not None
-    words = frame.name(words_key) if has_words else f"{key}: 0 everywhere; what else the sample offers stands"
-    warn("motion", words)
+    warn("motion", frame.further.get(words_key, f"{key}: 0 everywhere; what else the sample offers stands"))
 
 
 # --- errors of poses --------------------------------------------------------------------------------------------------

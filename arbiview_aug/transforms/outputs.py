@@ -17,8 +17,18 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError, shown
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY
 from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
-from arbiview_aug.sample.batching import gathered, is_readable, lens_names, like, rewrapped, split, stacked
-from arbiview_aug.sample.inputs import CALIBRATION_KEYS, CAMERA_KEYS, PIXEL_BOUND_KEYS, Frame
+from arbiview_aug.sample.batching import (
+    gathered,
+    is_readable,
+    leading_shape,
+    lens_names,
+    like,
+    rewrapped,
+    split,
+    stacked,
+)
+from arbiview_aug.sample.frame import Frame
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, CAMERA_KEYS, PIXEL_BOUND_KEYS
 from arbiview_aug.transforms.settings import SampleKeys
 
 
@@ -35,6 +45,7 @@ class SampleWriter:
 
     def write(
         self,
+        sample: Mapping[str, Any],
         frames: Sequence[Frame],
         rendered: Sequence[RenderedFrame],
         labels: Sequence[str],
@@ -42,12 +53,12 @@ class SampleWriter:
         params: Mapping[str, float],
         points: Sequence[transforms.RetargetedPoints] = (),
     ) -> dict[str, Any]:
-        """Write the output sample of a sample's frames; the input is not changed.
+        """Write the output sample of a ``sample`` and its frames; the input is not changed.
 
         ``labels`` are the sample's keys that hold label maps; ``target`` is in its own ego frame; ``points`` are those
         of its scanners.
         """
-        sample, lead = frames[0].sample, frames[0].lead
+        lead = leading_shape(sample["images"])
         out = self._passed_on(sample, labels) | (transforms.entries_of(points, lead) if points else {})
         out["images"] = rewrapped(gathered([stacked(frame.images) for frame in rendered], lead), sample["images"])
         rigs, device = [frame.rig for frame in rendered], rendered[0].images[0].device
@@ -122,7 +133,7 @@ def target_labels(
     SampleError for maps that do not fit the images, or a fill value that their type cannot hold.
     """
     views = []
-    for of_frame, maps in zip(rendered, label_maps(key, value, frames), strict=True):
+    for of_frame, maps in zip(rendered, label_maps(key, value, frames, lead), strict=True):
         assert of_frame.labels is not None
         if (dtype := maps[0].dtype) in (torch.uint16, torch.uint32, torch.uint64):  # torch cannot index them by masks
             raise SampleTypeError(f"{key}: expected uint8 or signed label maps, got {dtype}; use .to(torch.int32)")
@@ -131,12 +142,11 @@ def target_labels(
     return rewrapped(gathered(views, lead), value)
 
 
-def label_maps(key: str, value: Any, frames: Sequence[Frame]) -> list[Any]:
+def label_maps(key: str, value: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Any]:
     """The maps of each frame, from (*lead, N, ..., H, W) or a list of (*lead, ..., Hi, Wi).
 
     SampleError for maps that do not fit the images.
     """
-    lead = frames[0].lead
     if not all(map(is_readable, value if isinstance(value, list | tuple) else [value])):
         got = type(value).__name__
         raise SampleTypeError(f"{key}: expected label maps as tensors, got {got}; use torch.as_tensor")

@@ -21,8 +21,8 @@ from arbiview_aug.render.overlap_depth import OverlapDepth
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.requirements import needs_geometry, stand_in_view, static_harm
 from arbiview_aug.render.view_planner import build_plan, plan_key
-from arbiview_aug.sample.inputs import Frame, focal_mistake
-from arbiview_aug.sample.neighbours import Neighbour
+from arbiview_aug.sample.frame import Frame, Neighbour
+from arbiview_aug.sample.inputs import focal_mistake
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 
 Coverages = Sequence[BoolArray]

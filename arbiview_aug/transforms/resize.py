@@ -18,7 +18,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.image_ops import nearest_resized, resized
-from arbiview_aug.sample.batching import like, rewrapped
+from arbiview_aug.sample.batching import leading_shape, like, rewrapped
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, PIXEL_BOUND_KEYS, check_other_keys, read_frames
 from arbiview_aug.transforms.outputs import label_maps
 from arbiview_aug.transforms.settings import SampleKeys, checked_instance, checked_pixels
@@ -49,7 +49,7 @@ class _PixelTransform(torch.nn.Module, ABC):
             SampleError: As ``RigRetarget`` raises; ``CropRig``: a window that leaves an image.
         """
         frames = read_frames(sample, None)
-        images, lead = sample["images"], frames[0].lead
+        images, lead = sample["images"], leading_shape(sample["images"])
         sizes = [tuple(image.shape[-2:]) for image in frames[0].images]
         labels = check_other_keys(sample, sizes, self.keys.labels, self.keys.keep)
         out = dict(sample)
@@ -62,7 +62,7 @@ class _PixelTransform(torch.nn.Module, ABC):
             maps = out[key]
             if maps is None and key in _MAPS:
                 continue
-            out[key] = rewrapped(_each(label_maps(key, maps, frames), self._map, lead), maps)
+            out[key] = rewrapped(_each(label_maps(key, maps, frames, lead), self._map, lead), maps)
         if isinstance(sample.get("rig"), Rig):
             out["rig"] = sample["rig"].with_cameras([self._camera(camera) for camera in sample["rig"]])
         if sample.get("K") is not None:

@@ -30,11 +30,11 @@ from arbiview_aug.render.overlap_depth import estimate_overlap, overlap_cache
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, RenderedFrame, Renderer, resize_only
 from arbiview_aug.render.requirements import harm_remedies
+from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import (
     LEARNED_KEY,
     LEARNED_WORDS_KEY,
     MOTION_WORDS_KEY,
-    Frame,
     check_other_keys,
     read_frames,
     read_scene,
@@ -42,7 +42,7 @@ from arbiview_aug.sample.inputs import (
     warn_of_cameras,
     warn_of_misnamed,
 )
-from arbiview_aug.sample.neighbours import points_of_neighbours, read_neighbours
+from arbiview_aug.sample.neighbours import points_of_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
 from arbiview_aug.transforms.outputs import SampleWriter
 from arbiview_aug.transforms.plan_cache import FramePlan, PlanCache, Plans, check_reach
@@ -253,9 +253,9 @@ class RigRetarget(torch.nn.Module):
 
     def _retargeted(self, sample: Mapping[str, Any], params: Mapping[str, float] | None) -> dict[str, Any]:
         self._limit_threads()
-        frames = read_frames(sample, self.source)
+        frames = self._read(sample)
         labels = self._check_keys(sample, frames)
-        target, skip, draws = self._make_params(frames, params)
+        target, skip, draws = self._make_params(sample, frames, params)
         if skip and self.size is not None:
             rendered = [resize_only(frame, self.size, self.fit, self.keys.extra) for frame in frames]
         else:
@@ -263,7 +263,25 @@ class RigRetarget(torch.nn.Module):
             if self.size is not None and self.fit == "pad":
                 rendered = [of_frame.between_bars(self.size) for of_frame in rendered]
         points = self._scanned(frames, target, skip)
-        return self._writer.write(frames, rendered, labels, target, draws, points)
+        return self._writer.write(sample, frames, rendered, labels, target, draws, points)
+
+    def _read(self, sample: Any) -> list[Frame]:
+        """The frames of a sample, with what the settings read."""
+        further, names = set[str](), set[str]()
+        if self._base.lidars and self.keys.points == "target":
+            further |= {"points", "boxes_3d"}
+        if self.neighbours is not None or self._row.needs == "motion":
+            further.add("neighbours")
+        if self._is_paper and self.config.use_detections:
+            further |= {"detections", "box_names", "boxes_3d"}
+        if self._row.needs in ("motion", LEARNED_KEY) or "motion" in self._row.reads:
+            names |= {MOTION_WORDS_KEY, LEARNED_WORDS_KEY}
+        if self.inpainter.is_random:
+            names.add("token")
+        if isinstance(self.cache.share_overlap, str):
+            names.add(self.cache.share_overlap)
+        geometry = "infinity" if self._is_paper else self.geometry
+        return read_frames(sample, self.source, geometry, further=further, names=names, warn=self._warn)
 
     def _scanned(self, frames: Sequence[Frame], target: Rig, skip: bool = False) -> list[transforms.RetargetedPoints]:
         """Points of the frames by the target's scanners, if it has any and they are wanted."""
@@ -290,32 +308,29 @@ class RigRetarget(torch.nn.Module):
     def plan_frame(self, frame: Frame, target: Rig) -> FramePlan:
         """Read a frame's scene, estimate the depth that its geometry asks for, and plan how it is rendered."""
         pair = self._plans.pair(frame.rig, target)
-        has_neighbours, fills = frame.sample.get("neighbours") is not None, self.neighbours is not None
-        from_motion = (
-            self._row.needs == "motion" and pair.needs_geometry and temporal.estimates_motion(frame, self.geometry)
-        )
-        neighbours = read_neighbours(frame, self._warn) if has_neighbours and (fills or from_motion) else []
-        reads_scene = pair.needs_geometry or self.geometry != "auto" or bool(neighbours)  # objects limit what they fill
-        scene = (reads_scene and read_scene(frame, self.geometry)) or pair.road
+        fills, row = self.neighbours is not None and bool(frame.neighbours), self._row
+        # Objects limit what neighbours fill.
+        reads_scene = pair.needs_geometry or self.geometry != "auto" or bool(frame.neighbours)
+        scene = read_scene(frame, self.geometry) if reads_scene else pair.road
+        surface = scene.best if self.geometry == "auto" else self.geometry
         overlap = motion = None
-        if pair.needs_geometry and self.config.overlap_depth:
-            overlap = estimate_overlap(frame, scene, self.geometry, self.cache.share_overlap, self.overlaps)
-        if from_motion:
-            motion = temporal.estimate_motion(frame, scene, neighbours, self._warn)
-        elif pair.needs_geometry and self._row.needs in ("motion", LEARNED_KEY):
-            if scene.geometry(self._row.needs) == ():
+        if pair.needs_geometry:
+            if self.config.overlap_depth and GEOMETRIES[surface].overlap_depth:
+                boxes = scene.boxes if "boxes" in row.reads else None
+                overlap = estimate_overlap(frame, boxes, self.cache.share_overlap, self.overlaps)
+                scene = replace(scene, corrections=overlap.corrections)
+            if row.needs == "motion" and not temporal.brings_motion(frame, self.geometry):
+                motion = temporal.estimate_motion(frame, scene.boxes, self._warn)
+            elif row.needs in ("motion", LEARNED_KEY) and scene.geometry(row.needs) == ():
                 temporal.warn_of_declined(frame, scene.motion is not None, self._warn)
-        if overlap is not None:
-            scene = replace(scene, corrections=overlap.corrections)
-        if fills and neighbours and scene.points is not None and pair.needs_geometry:
-            parts = points_of_neighbours(frame, self._warn)
-            scene = replace(scene, sweeps=np.concatenate([part[:, :3] for part in parts]) if parts else None)
-        if self._row.needs == "motion" and scene.motion is None:
+            if fills and scene.points is not None:
+                parts = points_of_neighbours(frame, self._warn)
+                scene = replace(scene, sweeps=np.concatenate([part[:, :3] for part in parts]) if parts else None)
+        if row.needs == "motion" and scene.motion is None:
             before = [part for part in [scene.geometry("points")] if part is not None]
             scene = replace(scene, motion=motion.maps(frame.rig, before) if motion else ())
-        surface = scene.best if self.geometry == "auto" else self.geometry
         plan = self._plans.plan(pair, scene)
-        return FramePlan(frame, pair, scene, surface, plan, neighbours if fills else (), overlap, motion)
+        return FramePlan(frame, pair, scene, surface, plan, (frame.neighbours or ()) if fills else (), overlap, motion)
 
     def plan_fills(self, planned: FramePlan) -> Fills | None:
         """Plan what a frame's neighbours fill."""
@@ -355,13 +370,13 @@ class RigRetarget(torch.nn.Module):
         return rendering
 
     def _make_params(
-        self, frames: Sequence[Frame], params: Mapping[str, float] | None
+        self, sample: Mapping[str, Any], frames: Sequence[Frame], params: Mapping[str, float] | None
     ) -> tuple[Rig, bool, dict[str, float]]:
         """Draw the target rig and whether to skip; return both, and the parameters that replay them."""
         if params is not None:
             rest = checked_params(params)
         elif isinstance(self.target, RandomRig):
-            rest = self.draw(self.target.rng_for(frames[0].sample))
+            rest = self.draw(self.target.rng_for(sample))
         else:
             rest = self.draw()
         draws = {"skipped": rest.pop("skipped", 0.0)} if self.p < 1 else {}
@@ -433,14 +448,14 @@ class RigRetarget(torch.nn.Module):
         With ``quality="paper"``: what each stage made of each source. A random target is explained for one draw. Like a
         call, it fills the caches, issues warnings once, and advances the RNG.
         """
-        frame = read_frames(sample, self.source)[0]
-        target, _, _ = self._make_params([frame], None)
+        frame = self._read(sample)[0]
+        target, _, _ = self._make_params(sample, [frame], None)
         if self._is_paper:
             return transforms.PaperExplanation(self._published(frame, target), self.inpainter.outcome)
         planned = self.plan_frame(frame, target)
         gains = self.harmoniser.report(frame.rig, frame.images) if self.harmoniser.is_on else None
         keys = ("motion", MOTION_WORDS_KEY), (LEARNED_KEY, LEARNED_WORDS_KEY)
-        words = [frame.name(key) for read, key in keys if read in self._row.reads and sample.get(key) is not None]
+        words = [frame.further[key] for read, key in keys if read in self._row.reads and key in frame.further]
         points = [transforms.words_of(part, frame, target) for part in self._scanned([frame], target)]
         depth, fills = "\n".join(words) or None, self.plan_fills(planned)
         return transforms.Explanation(planned, self.inpainter.outcome, gains, depth, fills, *points)

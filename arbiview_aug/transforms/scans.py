@@ -14,7 +14,8 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError
 from arbiview_aug.sample.batching import is_readable
-from arbiview_aug.sample.inputs import Frame, as_array
+from arbiview_aug.sample.calibration import as_array
+from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.neighbours import Warn, points_of_neighbours
 from arbiview_aug.scene.boxes import checked_boxes, points_by_box
 from arbiview_aug.scene.point_cloud import checked_points, finite_rows
@@ -129,13 +130,13 @@ def retarget_frames(
 
     With ``neighbours``, other frames of the drive fill what one does not see; ``warn`` tells why one cannot.
     """
-    if frames[0].sample.get("points") is None:
+    if frames[0].points is None:
         return []
     return [
         retarget_points(
-            frame.entry("points"),
+            frame.points,
             target,
-            boxes_3d=frame.array("boxes_3d"),
+            boxes_3d=None if frame.boxes is None else as_array("boxes_3d", frame.boxes),
             ground_z_m=frame.rig.ground_z_m,
             skip=skip,
             sweeps=_sweeps(frame, warn) if neighbours and not skip else (),
@@ -146,10 +147,8 @@ def retarget_frames(
 
 def _sweeps(frame: Frame, warn: Warn) -> list[FloatArray]:
     """Points (Q, C) of a frame's neighbours with the columns of its own."""
-    points, parts = frame.array("points"), points_of_neighbours(frame, warn)
+    points, parts = as_array("points", frame.points), points_of_neighbours(frame, warn)
     columns = [part.shape[1] for part in parts]
-    if points is None:
-        return []
     if any(count != points.shape[-1] for count in columns):
         warn("columns of points", f"points of neighbours: expected {points.shape[-1]} columns, got {columns}")
     return [part for part in parts if part.shape[1] == points.shape[-1]]
@@ -167,7 +166,7 @@ def words_of(part: RetargetedPoints, frame: Frame, target: Rig) -> str:
     """One line for ``explain``."""
     rays = sum(math.prod(lidar.shape) for lidar in target.lidars)
     return (
-        f"points: {len(frame.entry('points'))} measured, {len(part.points)} by the target's "
+        f"points: {len(frame.points)} measured, {len(part.points)} by the target's "
         f"{', '.join(lidar.name for lidar in target.lidars)} ({rays} rays); "
         f"{part.unsupported:.0%} of the rays, the sky's among them, meet nothing that was measured"
     )

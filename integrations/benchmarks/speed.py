@@ -61,8 +61,6 @@ from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.torch_backend import maps_on, render_torch
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, read_frames
-from arbiview_aug.sample.neighbours import read_neighbours
-from arbiview_aug.scene.scene import Scene
 from arbiview_aug.temporal.motion_depth import estimate_motion
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.scans import retarget_points
@@ -252,8 +250,7 @@ def _motion() -> Calls:
     @cache
     def read() -> tuple[Any, ...]:  # drawing takes 8 s
         drive = SyntheticDrive(load_rig("nuscenes"), num_frames=3, neighbours=Neighbours(count=1, step_m=_TRAVEL_M))
-        frame, warn = read_frames(drive[1], None)[0], WarnOnce()
-        return frame, Scene(), read_neighbours(frame, warn), warn
+        return read_frames(drive[1], None, further=("neighbours",))[0], None, WarnOnce()
 
     return {"motion estimate": lambda: estimate_motion(*read())}
 

@@ -14,7 +14,8 @@ import torch
 
 from arbiview_aug import CalibrationError, Camera, RandomRig, Rig, SampleError, load_rig
 from arbiview_aug.errors import SampleTypeError
-from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.sample.inputs import read_frames
+from tests.helpers import sample_of
 from tests.mutations import nested
 
 NEUTRAL = {
@@ -180,7 +181,7 @@ def test_what_has_another_text_in_each_process_names_nothing(name: Any) -> None:
     with pytest.raises(SampleTypeError, match="scene_token: expected"):
         by_sequence().draw_for({"scene_token": name})
     with pytest.raises(SampleTypeError, match="token: expected"):
-        Frame((), load_rig("waymo"), {"token": name}).name("token")
+        read_frames(sample_of(load_rig("waymo").resized((8, 12))) | {"token": name}, None, names=("token",))
 
 
 @pytest.mark.parametrize("epoch", [math.nan, 1.5, 2**70, -(2**70), "1", None, True])

@@ -12,7 +12,7 @@ from arbiview_aug import PaperConfig, Rig, RigRetarget, SampleError
 from arbiview_aug.datasets import FrameFolder, NuScenesDataset
 from arbiview_aug.favs.renderer import PaperRendering
 from arbiview_aug.sample.detections import UNNAMED_TYPE, read_detections
-from arbiview_aug.sample.inputs import Frame, read_frames
+from arbiview_aug.sample.inputs import read_frames
 from tests.helpers import camera
 
 # 90 degrees over 801 px: focal length 400 px, principal point (400, 200), looking along the ego's x axis.
@@ -22,8 +22,10 @@ IMAGES = torch.zeros(2, 3, 401, 801, dtype=torch.uint8)
 
 
 def detected(sample: dict, lead: tuple[int, ...] = ()) -> list:
-    frames: list[Frame] = read_frames({"images": IMAGES.expand(*lead, -1, -1, -1, -1), "rig": RIG}, None)
-    return [read_detections(replace(frame, sample=sample)) for frame in frames]
+    sample = {"images": IMAGES.expand(*lead, -1, -1, -1, -1), "rig": RIG, **sample}
+    return [
+        read_detections(frame) for frame in read_frames(sample, None, further=("detections", "box_names", "boxes_3d"))
+    ]
 
 
 def box(x: float, y: float = 0.0, z: float = 1.0, yaw: float = 0.0, size=(2.0, 2.0, 2.0)) -> list[float]:

@@ -154,11 +154,11 @@ def test_entries_that_say_nothing_of_their_shape() -> None:
     nested = torch.nested.nested_tensor([torch.ones(2), torch.ones(3)])
     for odd in (nested, SimpleNamespace(shape=None)):
         assert check_other_keys(sample(mine=odd), [(H, W)], (), ()) == []
-    (frame,) = read_frames(sample(images=torch.zeros(1, 2, 3, H, W), rig=rig(), scene=torch.arange(1)), None)
-    assert frame.name("scene") == "0"
-    frame = read_frames(sample(images=torch.zeros(2, 2, 3, H, W), rig=rig(), scene=torch.arange(3)), None)[0]
+    batch = sample(images=torch.zeros(1, 2, 3, H, W), rig=rig(), scene=torch.arange(1))
+    assert read_frames(batch, None, names=("scene",))[0].further == {"scene": "0"}
+    batch = sample(images=torch.zeros(2, 2, 3, H, W), rig=rig(), scene=torch.arange(3))
     with pytest.raises(SampleError, match="scene: expected a name for each of 2 frames, got Tensor"):
-        frame.name("scene")
+        read_frames(batch, None, names=("scene",))
 
 
 @pytest.mark.parametrize("size", [(256, 704), (320, 800), (96, 264)])

@@ -11,8 +11,9 @@ import torch
 from arbiview_aug import Rig, RigRetarget, SampleError, SampleKeys, SampleTypeError
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
+from arbiview_aug.sample.frame import Neighbour
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.neighbours import Neighbour, _pose, read_neighbours
+from arbiview_aug.sample.neighbours import _pose
 from arbiview_aug.scene.point_cloud import seen_through
 
 RIG = demo_source_rig((64, 176))
@@ -30,10 +31,10 @@ def sample(recorded: dict[str, Any]) -> dict[str, Any]:
     return recorded | {"neighbours": [dict(neighbour) for neighbour in recorded["neighbours"]]}
 
 
-def read(sample: dict[str, Any]) -> tuple[list[Neighbour], list[str]]:
+def read(sample: dict[str, Any], source: Rig | None = None) -> tuple[tuple[Neighbour, ...], list[str]]:
     said: list[str] = []
-    neighbours = read_neighbours(read_frames(sample, None)[0], lambda _, message: said.append(message))
-    return neighbours, said
+    (frame,) = read_frames(sample, source, further=("neighbours",), warn=lambda _, message: said.append(message))
+    return frame.neighbours or (), said
 
 
 def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0) -> np.ndarray:
@@ -88,7 +89,7 @@ def test_velocities_stand_in_for_missing_boxes(sample: dict[str, Any]) -> None:
 
 def test_the_same_place_says_nothing(sample: dict[str, Any]) -> None:
     sample["neighbours"] = [sample["neighbours"][0] | {"ego2ego": pose(0.01), "time_s": -1.0}]
-    assert read(sample) == ([], [])
+    assert read(sample) == ((), [])
 
 
 @pytest.mark.parametrize(
@@ -183,8 +184,7 @@ def test_lenses_and_masks_of_the_rig_that_all_samples_share(sample: dict[str, An
     for neighbour in bare["neighbours"]:
         neighbour.pop("rig", None)
         neighbour |= {"K": rig.K, "cam2ego": rig.cam2ego}
-    said: list[str] = []
-    neighbours = read_neighbours(read_frames(bare, rig)[0], lambda _, message: said.append(message))
+    neighbours, said = read(bare, rig)
     assert not said and len(neighbours) == 2
     for camera in neighbours[0].rig:
         assert camera.lens == "radtan" and np.array_equal(camera.mask, mask)

@@ -12,8 +12,8 @@ from arbiview_aug import RigRetarget
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleError
+from arbiview_aug.sample.frame import Frame, Neighbour
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.neighbours import Neighbour, read_neighbours
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.temporal.motion_depth import MotionDepth, motion_depth
@@ -38,10 +38,14 @@ def sample(drive: SyntheticDrive) -> dict[str, Any]:
     return frame
 
 
+def read(sample: dict[str, Any]) -> Frame:
+    (frame,) = read_frames(sample, None, further=("neighbours",), warn=lambda topic, message: pytest.fail(message))
+    return frame
+
+
 def depth_of(sample: dict[str, Any], **changes: Any) -> MotionDepth:
-    (frame,) = read_frames(sample, None)
-    near = read_neighbours(frame, lambda topic, message: pytest.fail(message))
-    settings: dict[str, Any] = {"neighbours": near, "boxes": None, "load": lambda n: n.images(frame.images)}
+    frame = read(sample)
+    settings: dict[str, Any] = {"neighbours": frame.neighbours, "boxes": None, "load": lambda n: n.images(frame.images)}
     return motion_depth(frame.rig, frame.images, **(settings | changes))
 
 
@@ -118,10 +122,8 @@ PARKED = np.array([[8.0, 6.0, 1.0, 4.0, 2.0, 2.0, 0.0]])  # a label at the kerb,
 
 def with_labels(sample: dict[str, Any], moved_m: float | None) -> MotionDepth:
     """Depth with the label, which moved along the street in the neighbours; None for neighbours without labels."""
-    (frame,) = read_frames(sample, None)
-    near = read_neighbours(frame, lambda topic, message: pytest.fail(message))
     then = None if moved_m is None else PARKED + np.array([moved_m, 0, 0, 0, 0, 0, 0])
-    return depth_of(sample, boxes=PARKED, neighbours=[replace(one, boxes=then) for one in near])
+    return depth_of(sample, boxes=PARKED, neighbours=[replace(one, boxes=then) for one in read(sample).neighbours])
 
 
 def test_labels_of_what_moved_are_left_out(sample: dict[str, Any], exact: MotionDepth) -> None:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.evaluate.images import Image, as_arrays
 from arbiview_aug.evaluate.report.pictures import Picture, draw_labels
+from arbiview_aug.sample.batching import leading_shape
+from arbiview_aug.sample.calibration import as_array
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.boxes import checked_boxes
 
@@ -36,10 +38,10 @@ def show(sample: Mapping[str, Any]) -> Figure:
         SampleError: As ``RigRetarget`` raises it.
     """
     drawn: list[tuple[str, Picture]] = []
-    for frame in read_frames(sample, None):
-        boxes = frame.array("boxes_3d")
-        boxes = None if boxes is None else checked_boxes(boxes)
-        of_frame = f"frame {frame.number}, " if frame.lead else ""
+    frames = read_frames(sample, None, further=("boxes_3d",))
+    for number, frame in enumerate(frames):
+        boxes = None if frame.boxes is None else checked_boxes(as_array("boxes_3d", frame.boxes))
+        of_frame = f"frame {number}, " if leading_shape(sample["images"]) else ""
         for camera, image in zip(frame.rig, as_arrays(frame.images), strict=True):
             drawn.append((of_frame + camera.name, draw_labels(*_dimmed(camera, image), None, boxes)))
     columns = min(_COLUMNS, len(drawn))

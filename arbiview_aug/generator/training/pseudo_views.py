@@ -34,7 +34,7 @@ from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.render.rendered import Renderer
 from arbiview_aug.render.view_planner import build_plan
-from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.sample.frame import Frame
 
 _YAW_DEG = (13.75, 35.0)  # the paper's rotations
 _PITCH_DEG = (5.0, 12.0)

@@ -26,7 +26,7 @@ from arbiview_aug.integrations.mmdet3d.matrices import (
     read_views,
     stacked,
 )
-from arbiview_aug.sample.inputs import as_array
+from arbiview_aug.sample.calibration import as_array
 from arbiview_aug.scene.surface import Points
 from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
