@@ -34,11 +34,11 @@ if TYPE_CHECKING:
     from arbiview_aug.sample.mistakes import check as check
     from arbiview_aug.sample.training import lift_mask as lift_mask
     from arbiview_aug.sample.training import visible_boxes as visible_boxes
-    from arbiview_aug.transforms.plan_cache import PlanCache as PlanCache
     from arbiview_aug.transforms.resize import CropRig as CropRig
     from arbiview_aug.transforms.resize import ResizeRig as ResizeRig
     from arbiview_aug.transforms.rig_retarget import RigRetarget as RigRetarget
     from arbiview_aug.transforms.scans import retarget_points as retarget_points
+    from arbiview_aug.transforms.settings import PlanCache as PlanCache
     from arbiview_aug.transforms.settings import SampleKeys as SampleKeys
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

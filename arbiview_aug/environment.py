@@ -10,8 +10,8 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from functools import cache
+from contextlib import contextmanager, nullcontext, suppress
+from functools import cache, wraps
 from hashlib import sha256
 from importlib import import_module, metadata
 from io import BytesIO
@@ -145,6 +145,25 @@ def compilation_announced() -> Iterator[None]:
     finally:
         with compilation.lock:
             compilation.announcers -= 1
+
+
+def eager_on_cpu(method: Any) -> Any:
+    """Run a method outside ``torch.compile``, with new tensors on the CPU; say where kernels are compiled."""
+
+    def run_on_cpu(*args: Any, **options: Any) -> Any:
+        torch = sys.modules["torch"]
+        # Under another default device, numbers of plans would be made there, or nowhere (meta).
+        is_cpu = torch.empty(0).device.type == "cpu"  # get_default_device of torch 2.6 misses contexts
+        with nullcontext() if is_cpu else torch.device("cpu"), compilation_announced():
+            return method(*args, **options)
+
+    @wraps(method)
+    def run(*args: Any, **options: Any) -> Any:
+        if "torch._dynamo" in sys.modules:  # importing it takes a second
+            return sys.modules["torch"].compiler.disable(run_on_cpu)(*args, **options)
+        return run_on_cpu(*args, **options)
+
+    return run
 
 
 def is_kept(kernel: Any) -> bool:

@@ -20,9 +20,8 @@ from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.sample.inputs import DEPTH_KEYS, MOTION_KEY, read_frames, read_scene
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.temporal.motion_depth import brings_motion, estimate_motion
-from arbiview_aug.transforms.plan_cache import PlanCache
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from arbiview_aug.transforms.settings import SampleKeys, inpainter_of, render_config
+from arbiview_aug.transforms.settings import PlanCache, SampleKeys, inpainter_of, render_config
 
 Sample = Mapping[str, Any]
 
@@ -93,8 +92,8 @@ def retargeting(
             holes="black",
             keys=SampleKeys(points="source"),
         )
-        if depth is not None and retarget.overlaps is not None:
-            retarget.overlaps.get((alone["rig"].named_key, None), lambda: depth)
+        if depth is not None and retarget.renderer.overlaps is not None:
+            retarget.renderer.overlaps.get((alone["rig"].named_key, None), lambda: depth)
         (view,) = views_of(retarget(alone))
         return view
 

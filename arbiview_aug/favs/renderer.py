@@ -27,6 +27,7 @@ from arbiview_aug.favs.stage1_geometry import check_pinhole, h_geom_of_visible
 from arbiview_aug.favs.stage2_features import NO_MATCHES, FeatureReport, Region, optimise_transformation, unmatched
 from arbiview_aug.favs.stage3_objects import AlignmentReport, align_objects, declined, find_objects
 from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion, source_pixels, warp_perspective
+from arbiview_aug.render.harmonise import Harmoniser
 from arbiview_aug.render.rendered import RenderedFrame, from_winners
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.sample.detections import Detection, read_detections
@@ -105,19 +106,27 @@ def render_paper(
     return PaperRendering(source, target, tuple(views))
 
 
-def render_frame(frame: Frame, source: Rig, target: Rig, config: PaperConfig) -> PaperRendering:
-    """Render a frame, with its detections where the settings use them."""
+def render_frame(frame: Frame, target: Rig, config: PaperConfig) -> PaperRendering:
+    """Render a frame, with its detections where the settings use them; the target is in its ego frame."""
     detections = read_detections(frame) if config.use_detections else {}
-    return render_paper(source, target, frame.images, config, detections)
+    return render_paper(frame.rig, target, frame.images, config, detections)
 
 
-def check_settings(target: Rig, geometry: str, backend: str) -> None:
+def check_settings(
+    target: Rig, geometry: str, backend: str, outputs: Collection[str], min_confidence: float, harmoniser: Harmoniser
+) -> None:
     """Refuse settings of ``RigRetarget`` that the published stages do not have."""
+    if "confidence" in outputs:
+        raise ValueError("SampleKeys.extra: quality='paper' has no 'confidence': it moves pixels by what it matches")
+    if min_confidence:
+        raise ValueError("holes: quality='paper' has no confidence: expected min_confidence=0")
     check_pinhole(target)
     if geometry not in ("auto", "infinity"):
         raise ValueError(f"geometry: quality='paper' has none: expected auto or infinity, got {geometry!r}")
     if backend == "torch":
         raise ValueError("backend: quality='paper' runs in OpenCV: expected auto or opencv, got 'torch'")
+    if harmoniser.is_on:
+        raise ValueError(f"match_exposure: quality='paper' is as published: expected True or False, got {harmoniser!r}")
 
 
 def primary_camera(sources: Sequence[Camera], target: Camera, candidates: Sequence[int]) -> int:

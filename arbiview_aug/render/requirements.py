@@ -7,13 +7,18 @@ geometry can change the view.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import look_apart
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.validation import pose_mistake
+from arbiview_aug.errors import GeometryWarning, UnreachableError, WarnOnce
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.scene.surface import FAR_PARALLAX_PX, NEAREST_SCENE_M, worst_parallax_px
@@ -43,6 +48,32 @@ it. Nothing is labelled beyond the third."""
 _COARSE_MASK_PX = 16  # margin that must be unmasked: weights know masks by blocks of 8 px
 _ROUNDING_PX = 1e-6  # of float64 at the outermost pixel centres; plans allow for 1e-3
 _MAP_ERROR_PX = 1 / 32  # rounding of fixed-point maps, with as much again
+
+
+_FINER = 3.0  # readers decode at 1/4, while targets have their full size; 1/2 is a fair trade
+_UNREACHABLE = 0.5  # warn of target cameras of which less than this share is covered
+_SUSPICIOUS = 0.3  # a rig of which less is covered may have wrong poses
+
+
+@dataclass(frozen=True, eq=False)
+class RigPair:
+    """A source rig and a target rig, and what follows from their calibrations alone."""
+
+    key: tuple[bytes, bytes]  # of both, with names
+    source: Rig
+    target: Rig  # in the source's ego frame
+    geometry: str  # a name in ``GEOMETRIES``
+    config: RenderConfig
+
+    @cached_property
+    def needs_geometry(self) -> bool:
+        """Whether the source position of any target pixel depends on the distance of the scene."""
+        return needs_geometry(self.source, self.target, self.geometry, self.config)
+
+    @cached_property
+    def harm(self) -> str | None:
+        """Why a detector suffers if the target is rendered over a static surface; None if it does not."""
+        return static_harm(self.source, self.target, "street", self.config)
 
 
 def baselines_m(source: Rig, target: Rig) -> FloatArray:
@@ -109,6 +140,14 @@ def stand_in_view(source: Rig, boxes: FloatArray) -> bool:
     return False
 
 
+def boxes_harm(pair: RigPair, boxes: FloatArray | None) -> str | None:
+    """The harm of a pair that is rendered over boxes (B, 7) which fit nothing; None if there are none, or they fit."""
+    if boxes is None or not len(boxes) or stand_in_view(pair.source, boxes):
+        return None
+    lost = f"boxes_3d: most of {len(boxes)} are off the road or in no camera's view (python -m arbiview_aug check)"
+    return f"{lost}; {pair.harm}"
+
+
 def harm_remedies(source: Rig, target: Rig) -> str:
     """Remedies of ``static_harm``: data, or mixing with untouched samples."""
     mixing = "p=0.5" if len(source) == len(target) else "arbiview_aug.MixedDataset, since camera counts differ"
@@ -150,3 +189,43 @@ def covers_target_exactly(source: Camera, target: Camera, config: RenderConfig) 
         slice(max(0, math.floor(low) - around), math.ceil(high) + around + 1) for low, high in ((v0, v1), (u0, u1))
     )
     return bool(source.mask[rows, columns].all())
+
+
+def check_reach(source: Rig, target: Rig, coverages: Sequence[BoolArray], unseen: str, warn: WarnOnce) -> None:
+    """Warn once of target cameras that the sources hardly cover; ``unseen`` says what becomes of uncovered pixels.
+
+    Raises:
+        UnreachableError: The sources cover none of the target's pixels.
+    """
+    finer = float(np.median(target.K[:, 0, 0]) / source.K[:, 0, 0].max())
+    if finer > _FINER:
+        views = f"views are {finer:.0f} times as fine as the finest source image, and blurred"
+        fix = "read the images larger (reduce), or set a smaller size= or a wider field of view"
+        warn("fine", f"{views}; {fix}", GeometryWarning)
+    is_empty = not any(map(np.any, coverages))
+    if "unreachable" in warn.topics and not is_empty:  # the means below take milliseconds
+        return
+    lost = f"the target rig {target.name!r} cannot be reached from this data"
+    if is_empty:
+        cause = _likely_cause(source, target)
+        raise UnreachableError(f"{lost}: expected some pixels to be covered, got none. {cause}")
+    shares = [np.count_nonzero(covered) / covered.size for covered in coverages]
+    poor = [f"{c.name} {share:.0%}" for c, share in zip(target, shares, strict=True) if share < _UNREACHABLE]
+    if poor:
+        cause = f"{_likely_cause(source, target)}. " if np.mean(shares) < _SUSPICIOUS else ""
+        covered = f"covered are {', '.join(poor)}. {cause}{unseen}"
+        warn("unreachable", f"{lost}: {covered} Or choose another target", GeometryWarning)
+
+
+def _likely_cause(source: Rig, target: Rig) -> str:
+    """Why a target sees nothing of the sources, and the fix."""
+    hint = "No source camera looks where the target's do, or masks hide it; python -m arbiview_aug check tests the data"
+    return pose_mistakes(source, target) or hint
+
+
+def pose_mistakes(source: Rig, target: Rig) -> str:
+    """The rig whose poses are probably wrong, and the fix; empty without one."""
+    for whose, rig in (("source", source), ("target", target)):
+        if mistake := pose_mistake(rig.cam2ego, rig.ground_z_m):
+            return f"The {whose}'s cam2ego seems to be {mistake[0]}: {mistake[1]}"
+    return ""

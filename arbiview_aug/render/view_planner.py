@@ -7,9 +7,8 @@ with every frame.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -445,13 +444,6 @@ def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:
 
 
 # --- all views of a rig -----------------------------------------------------------------------------------------------
-def plan_key(source: Rig, target: Rig, surface: str, config: RenderConfig, scene: Scene | None = None) -> bytes:
-    """Content key of a plan: calibrations with names, which ``explain`` shows, scene, surface and settings."""
-    settings = tuple(getattr(config, f.name) for f in fields(config))
-    geometry = (scene or Scene()).key
-    return hashlib.sha256(repr((source.named_key, target.named_key, surface, settings, geometry)).encode()).digest()
-
-
 def build_plan(
     source: Rig,
     target: Rig,

@@ -31,7 +31,8 @@ MOTION_KEY, LEARNED_KEY = "motion_depth_m", "learned_depth_m"
 """(N, h, w) z-depth computed offline, at the size of ``motion_camera``."""
 
 MOTION_WORDS_KEY, LEARNED_WORDS_KEY = "motion_depth_words", "learned_depth_words"
-"""How they were made, or why they were declined, for ``explain`` and warnings."""
+DEPTH_WORDS = {"motion": MOTION_WORDS_KEY, LEARNED_KEY: LEARNED_WORDS_KEY}
+"""How they were made, or why they were declined, for ``explain`` and warnings; by names of ``GeometryRow.reads``."""
 
 CALIBRATION_KEYS = (
     *("images", "rig", "K", "cam2ego", "distortion", "lens", "ground_z_m", "coverage", "ego_mask", "neighbours"),

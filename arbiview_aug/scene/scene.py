@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,8 +18,6 @@ from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxe
 from arbiview_aug.scene.surface import CorrectedSurface, Correction, Far, Ground, Points, StaticSurface, Street, Surface
 
 Geometry = Points | Maps
-
-_ROWS = 1 << 18  # hashed at once, to avoid a copy of all points
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,42 +53,19 @@ class Scene:
             return self.further.get(other)
         return getattr(self, name) if name in ("boxes", "points", "motion") else self.further.get(name)
 
-    @cached_property
+    @property
     def is_empty(self) -> bool:
         """Whether there is no geometry."""
         arrays = self.boxes, self.points, self.motion
         return all(array is None for array in arrays) and not self.further and not self.corrections
 
     @property
-    def words(self) -> str:
-        """How much of which geometry there is; empty without any."""
-        arrays: dict[str, Any] = {"boxes": self.boxes, "points": self.points}
-        arrays["pixels of depth from motion"] = self.motion
-        arrays["points of neighbouring frames"] = self.sweeps
-        arrays |= {f"pixels of {key}": maps for key, maps in self.further.items() if isinstance(maps, tuple)}
-        known = {name: array for name, array in arrays.items() if array is not None and len(array)}
-        return ", ".join(f"{_count(array)} {name}" for name, array in known.items())
-
-    @cached_property
     def best(self) -> GeometryName:
         """The surface that ``auto`` uses: made of the most accurate geometry."""
         motion = self.motion is not None and len(self.motion) > 0
         if any(array is not None and len(array) for array in (self.points, self.further.get("depth_m"))):
             return "fused" if motion else "lidar"
         return "motion" if motion else "street" if self.boxes is None else "boxes"
-
-    @property
-    def key(self) -> bytes:
-        """Content hash."""
-        digest = hashlib.sha256(repr(sorted(self.further)).encode())
-        parts = self.boxes, self.points, self.motion, self.sweeps, *(self.further[key] for key in sorted(self.further))
-        for array in chain.from_iterable([m.depth_m for m in p] if isinstance(p, tuple) else [p] for p in parts):
-            digest.update(b"none" if array is None else repr((array.shape, array.dtype.str)).encode())
-            for rows in () if array is None else np.array_split(array, 1 + len(array) // _ROWS):
-                digest.update(rows.tobytes())
-        for correction in self.corrections:
-            digest.update(correction.key)
-        return digest.digest()
 
     def surface(self, name: str, ground_z_m: float) -> Surface:
         """A surface by name, over a road at ``ground_z_m``; cached."""
@@ -141,11 +114,6 @@ def _street(scene: Scene, ground_z_m: float) -> StaticSurface:
 def _boxes(scene: Scene, ground_z_m: float) -> Surface:
     assert scene.boxes is not None
     return BoxSurface(_street(scene, ground_z_m), scene.boxes, solids(scene.boxes))
-
-
-def _count(part: Geometry) -> int:
-    """Number of points or boxes, or of the pixels that depth maps know."""
-    return sum(int(np.count_nonzero(one.depth_m)) for one in part) if isinstance(part, tuple) else len(part)
 
 
 def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: Geometry | None) -> Surface:

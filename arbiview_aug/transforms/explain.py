@@ -16,7 +16,9 @@ from arbiview_aug.inpaint.neighbours import Fills
 from arbiview_aug.render.harmonise import PhotometricReport
 from arbiview_aug.render.plan import RenderPlan, SourceUse
 from arbiview_aug.render.requirements import harm_remedies
-from arbiview_aug.transforms.plan_cache import FramePlan
+from arbiview_aug.sample.inputs import DEPTH_WORDS
+from arbiview_aug.scene.scene import Scene
+from arbiview_aug.transforms.renderers import FramePlan
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,6 @@ class Explanation:
     planned: FramePlan
     outcome: str  # of pixels that no camera saw
     harmonisation: PhotometricReport | None = None  # the sources' gains and why, if they are harmonised
-    depth: str | None = None  # how depth on disk was found, if the surface may be made of it
     fills: Fills | None = None  # how other frames of the drive fill holes, if there are any
     points: str | None = None  # what the target's scanners measure, if it has any
 
@@ -68,12 +69,12 @@ class Explanation:
             lines += [self.planned.harm, f"better: {harm_remedies(self.plan.source, self.plan.target)}"]
         if self.planned.overlap is not None:
             lines += str(self.planned.overlap).splitlines()
-        if geometry := self.planned.scene.words:
-            lines.append(f"geometry: {geometry}; the street elsewhere")
+        if known := list(_known(self.planned.scene)):
+            lines.append(f"geometry: {', '.join(known)}; the street elsewhere")
         if self.planned.motion is not None:
             lines.append(str(self.planned.motion))
-        if self.depth is not None:
-            lines += self.depth.splitlines()
+        for key in DEPTH_WORDS.values():
+            lines += self.planned.frame.further.get(key, "").splitlines()
         if self.fills is not None:
             lines += self.fills.lines(self.plan)
         if self.points is not None:
@@ -120,6 +121,17 @@ class PaperExplanation:
         return "\n".join([head, *_lines(self.as_dict(), self.outcome, _stages)])
 
     __repr__ = __str__
+
+
+def _known(scene: Scene) -> Iterator[str]:
+    """How much of which geometry a scene has: numbers of points and boxes, or of the pixels that depth maps know."""
+    parts: dict[str, Any] = {"boxes": scene.boxes, "points": scene.points}
+    parts |= {"pixels of depth from motion": scene.motion, "points of neighbouring frames": scene.sweeps}
+    parts |= {f"pixels of {key}": maps for key, maps in scene.further.items() if isinstance(maps, tuple)}
+    for name, part in parts.items():
+        if part is not None and len(part):
+            pixels = sum(np.count_nonzero(one.depth_m) for one in part) if isinstance(part, tuple) else len(part)
+            yield f"{pixels} {name}"
 
 
 def _head(source: Rig, target: Rig) -> str:

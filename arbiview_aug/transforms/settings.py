@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -12,13 +13,13 @@ from arbiview_aug import favs
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cameras.validation import MAX_SIZE_PX
+from arbiview_aug.cameras.validation import MAX_SIZE_PX, is_mounted
 from arbiview_aug.choices import choice, is_number
 from arbiview_aug.environment import imported
 from arbiview_aug.errors import SampleError, shown
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY, Black, Inpainter
 from arbiview_aug.render.plan import PRESETS, RenderConfig
-from arbiview_aug.sample.inputs import CALIBRATION_KEYS
+from arbiview_aug.sample.inputs import CALIBRATION_KEYS, focal_mistake
 
 T = TypeVar("T")
 
@@ -69,6 +70,30 @@ class SampleKeys:
             raise ValueError(f"SampleKeys.ignore_index: expected a number, got {self.ignore_index!r}")
         choice("SampleKeys.frame", self.frame, ("source", "target"))
         choice("SampleKeys.points", self.points, ("source", "target"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanCache:
+    """Plans that a transform keeps between calls. Pickles and copies are empty: each DataLoader worker fills its own.
+
+    Attributes:
+        max_bytes: Memory for plans of calibrations that come back; the least recently used go first.
+        share_overlap: Frames that share the depth from overlap of ``quality="accurate"``, which depends on the images:
+            False, none; a key of the sample, such as a scene token, those with the same value and calibration; True,
+            all of a calibration, which is right for a vehicle at rest alone.
+
+    Raises:
+        ValueError: Impossible values.
+    """
+
+    max_bytes: int = 512 * 2**20
+    share_overlap: bool | str = False
+
+    def __post_init__(self) -> None:
+        if not is_number(self.max_bytes) or not self.max_bytes >= 0:
+            raise ValueError(f"PlanCache.max_bytes: expected a number of bytes from 0, got {self.max_bytes!r}")
+        if not isinstance(self.share_overlap, bool | str):
+            raise ValueError(f"PlanCache.share_overlap: expected a bool or a sample key, got {self.share_overlap!r}")
 
 
 def render_config(quality: Any) -> Any:
@@ -189,3 +214,15 @@ def _lost(camera: Camera, size: tuple[int, int], fit: Fit) -> str:
     if kept[side] >= (_LEAST_KEPT, _LEAST_ROWS)[side] * fov[side]:
         return ""
     return f"{camera.name!r} keeps {kept[side]:.0f} of its {fov[side]:.0f} degrees {('across', 'up and down')[side]}"
+
+
+def target_mistakes(target: Rig) -> Iterator[tuple[str, str]]:
+    """Topics and warnings of target cameras that no vehicle has."""
+    for camera, mounted in zip(target, is_mounted(target.cam2ego, target.ground_z_m), strict=True):
+        where = f"target camera {camera.name!r}"
+        if not mounted:
+            x, y, z = camera.center_m - (0, 0, target.ground_z_m)
+            place = f"({x:.1f}, {y:.1f}) m, {z:.1f} m above the road"
+            yield "mounting", f"{where}: expected a place on a vehicle, got {place}; are moves and poses in metres?"
+        if mistake := focal_mistake(camera):
+            yield "target focal", f"{where}: K: expected a focal length in pixels, got {'; '.join(mistake)}"

@@ -20,7 +20,6 @@ from arbiview_aug.inpaint.telea import Telea
 from arbiview_aug.render.paint_kernels import find_paint
 from arbiview_aug.render.plan import BACKGROUND, OBJECT, OCCLUDED, Paint
 from arbiview_aug.render.view_planner import build_plan
-from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.boxes import PARTS, RIM_PART, TOP_PART
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.transforms.resize import CropRig, ResizeRig
@@ -143,7 +142,7 @@ def test_occluded_pixels_are_those_that_an_image_contains(size: tuple[int, int],
 @pytest.mark.parametrize("surface", ["boxes", "lidar"])
 def test_plans_know_what_is_occluded_and_where_the_road_lies(street: dict[str, Any], surface: Any) -> None:
     target = raised(street)
-    plan = RigRetarget(target, geometry=surface).plan_frame(read_frames(street, None)[0], target).plan
+    plan = RigRetarget(target, geometry=surface).explain(street).plan
     occluded = [view.layers == OCCLUDED for view in plan.targets if view.layers is not None]
     assert sum(map(np.count_nonzero, occluded)) > 300
     assert not any(part[0].mean() > 0.5 for part in occluded)  # over the top edge nobody looks

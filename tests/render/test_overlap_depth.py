@@ -272,7 +272,7 @@ def test_a_cache_computes_each_scene_once(nearer: tuple[torch.Tensor, OverlapDep
     retarget = RigRetarget(
         TARGET, source=RIG, geometry="street", quality="accurate", cache=PlanCache(share_overlap="token")
     )
-    cache = retarget.overlaps
+    cache = retarget.renderer.overlaps
     assert cache is not None
     first = retarget({"images": images, "token": "a"})["images"]
     again = retarget({"images": images, "token": "a"})["images"]
@@ -316,8 +316,10 @@ def test_a_cache_needs_something_to_hold() -> None:
 
 def test_the_plan_knows_its_corrections(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
     _, depth = nearer
-    assert Scene().key != Scene(corrections=depth.corrections).key
-    assert Scene(corrections=depth.corrections).best == "street"
+    retarget = RigRetarget(TARGET, quality="accurate", geometry="street", cache=PlanCache(share_overlap=True))
+    plan = retarget.plan(RIG, TARGET, Scene(corrections=depth.corrections))
+    assert retarget.plan(RIG, TARGET, Scene(corrections=depth.corrections)) is plan
+    assert retarget.plan(RIG, TARGET) is not plan
 
 
 def test_the_preset() -> None:

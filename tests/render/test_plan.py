@@ -12,8 +12,8 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import ego_rays, project_rays
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.plan import RenderConfig, RenderPlan
-from arbiview_aug.render.view_planner import build_plan, plan_key
+from arbiview_aug.render.plan import RenderPlan
+from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.scene import Scene
 from tests.helpers import in_atlas, in_source, sampled
@@ -204,24 +204,18 @@ def test_plans_pickle_and_the_cache_is_bounded() -> None:
     again = pickle.loads(pickle.dumps(plan))
     assert np.array_equal(again.targets[0].at.xy, plan.targets[0].at.xy)
     cache: LRUCache[bytes, RenderPlan] = LRUCache(int(plan.nbytes * 2.5), attrgetter("nbytes"))
-    keys = []
     for yaw in (1, 2, 3, 1):
         target = source.turned(yaw_deg=yaw)
-        keys.append(plan_key(source, target, "auto", RenderConfig()))
-        cache.get(keys[-1], lambda target=target: build_plan(source, target))
-    assert keys[0] == keys[3] and len(cache) == 2 and cache.size <= cache.limit and cache.misses == 4
+        cache.get(target.named_key, lambda target=target: build_plan(source, target))
+    assert len(cache) == 2 and cache.size <= cache.limit and cache.misses == 4
     assert len(pickle.loads(pickle.dumps(cache))) == 0
 
 
-def test_plan_key_knows_content_and_names() -> None:
-    rig, config = load_rig("nuscenes"), RenderConfig()
+def test_plans_come_back_by_content_and_names() -> None:
+    rig = load_rig("nuscenes").resized(0.05)
+    retarget = RigRetarget(rig, geometry="street")
+    plan = retarget.plan(rig, rig)
+    assert retarget.plan(replace(rig), replace(rig)) is plan
     renamed = rig.with_cameras([replace(c, name=c.name + "x") for c in rig])
-    assert plan_key(rig, rig, "auto", config) == plan_key(replace(rig), replace(rig), "auto", config)
-    for other in (
-        plan_key(rig, renamed, "auto", config),
-        plan_key(replace(rig, name="other"), rig, "auto", config),
-        plan_key(rig, rig.shifted(x_m=1e-9), "auto", config),
-        plan_key(rig, rig, "infinity", config),
-        plan_key(rig, rig, "auto", RenderConfig(seam_width=0.01)),
-    ):
-        assert other != plan_key(rig, rig, "auto", config)
+    for target in (renamed, replace(rig, name="other"), rig.shifted(x_m=1e-9)):
+        assert retarget.plan(rig, target) is not plan

@@ -1,0 +1,297 @@
+"""Renderers of ``RigRetarget``, of one protocol: over a scene by a plan, by the paper's stages, and resized only.
+
+``plan`` says how a frame is rendered, ``render`` makes the views of frames by their plans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+
+from arbiview_aug import favs, temporal, transforms
+from arbiview_aug.cameras.framing import Fit
+from arbiview_aug.cameras.rays import RayCache
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import GeometryName
+from arbiview_aug.errors import GeometryWarning, WarnOnce
+from arbiview_aug.inpaint.inpainter import Inpainter
+from arbiview_aug.inpaint.neighbours import Fills, Reach, fill_from_neighbours, plan_fills
+from arbiview_aug.lru_cache import LRUCache
+from arbiview_aug.render.harmonise import Harmoniser
+from arbiview_aug.render.overlap_depth import OverlapDepth, estimate_overlap, overlap_cache
+from arbiview_aug.render.plan import RenderConfig, RenderPlan
+from arbiview_aug.render.rendered import Backend, RenderedFrame, Renderer, resize_only
+from arbiview_aug.render.requirements import RigPair, boxes_harm, check_reach, harm_remedies, pose_mistakes
+from arbiview_aug.render.view_planner import build_plan
+from arbiview_aug.sample.frame import Frame
+from arbiview_aug.sample.inputs import LEARNED_KEY, read_scene
+from arbiview_aug.sample.neighbours import points_of_neighbours
+from arbiview_aug.scene.scene import GEOMETRIES, Scene
+from arbiview_aug.transforms.settings import PlanCache, unseen_note
+
+
+class FrameRenderer(Protocol):
+    """Renders frames of one sample for a target in its own ego frame."""
+
+    def plan(self, frame: Frame, target: Rig) -> Any:
+        """Plan how a frame is rendered."""
+
+    def render(self, plans: Sequence[Any]) -> list[RenderedFrame]:
+        """Render frames by their plans; holes stay."""
+
+
+# --- over a scene -----------------------------------------------------------------------------------------------------
+class SceneChoice(NamedTuple):
+    """A frame's scene, and how its depth was estimated."""
+
+    scene: Scene
+    geometry: GeometryName  # what ``auto`` chose, else as asked
+    overlap: OverlapDepth | None = None  # depth from overlap, if it was estimated
+    motion: temporal.MotionDepth | None = None  # depth from motion, likewise
+
+
+def choose_scene(
+    frame: Frame,
+    geometry: GeometryName,
+    is_needed: bool,
+    warn: WarnOnce,
+    overlap_of: Callable[[Frame, Any], OverlapDepth] | None = None,
+    reads_sweeps: bool = False,
+) -> SceneChoice:
+    """Read a frame's scene, decide what ``auto`` is, and estimate the depth that the geometry asks for.
+
+    Args:
+        frame: The frame, read for this geometry.
+        geometry: A name in ``GEOMETRIES``.
+        is_needed: Whether any pixel depends on distances: only then is depth estimated.
+        warn: Called for depth that is declined, and for neighbours that cannot be read.
+        overlap_of: Estimates depth from overlap of a frame with boxes; None where it is not asked for.
+        reads_sweeps: Whether points of neighbours are added.
+    """
+    row, overlap, motion = GEOMETRIES[geometry], None, None
+    is_read = is_needed or geometry != "auto" or bool(frame.neighbours)  # objects limit what neighbours fill
+    scene = read_scene(frame, geometry) if is_read else Scene()
+    chosen = scene.best if geometry == "auto" else geometry
+    if is_needed:
+        if overlap_of is not None and GEOMETRIES[chosen].overlap_depth:
+            overlap = overlap_of(frame, scene.boxes)
+            scene = replace(scene, corrections=overlap.corrections)
+        if row.needs == "motion" and not temporal.brings_motion(frame, geometry):
+            motion = temporal.estimate_motion(frame, scene.boxes, warn)
+        elif row.needs in ("motion", LEARNED_KEY) and scene.geometry(row.needs) == ():
+            temporal.warn_of_declined(frame, scene.motion is not None, warn)
+        if reads_sweeps and scene.points is not None and (sweeps := points_of_neighbours(frame, warn)):
+            scene = replace(scene, sweeps=np.concatenate([sweep[:, :3] for sweep in sweeps]))
+    if row.needs == "motion" and scene.motion is None:
+        before = [part for part in [scene.geometry("points")] if part is not None]
+        scene = replace(scene, motion=motion.maps(frame.rig, before) if motion else ())
+    return SceneChoice(scene, chosen, overlap, motion)
+
+
+@dataclass(frozen=True, eq=False)
+class FramePlan:
+    """How one frame is rendered, and from what it was planned."""
+
+    frame: Frame
+    pair: RigPair  # its rig and the target
+    scene: Scene  # with estimated depth
+    geometry: GeometryName  # what the target is rendered over, where centres differ
+    overlap: OverlapDepth | None
+    motion: temporal.MotionDepth | None
+    plan: RenderPlan
+
+    @property
+    def harm(self) -> str | None:
+        """Why a detector suffers from cameras that move over a static surface; None if it does not."""
+        if GEOMETRIES[self.geometry].is_static or self.pair.harm is None:
+            return self.pair.harm
+        return boxes_harm(self.pair, self.scene.boxes) if self.geometry == "boxes" else None
+
+
+class PlannedRenderer:
+    """Renders frames over their scenes, by plans; holes are filled from neighbouring frames alone.
+
+    Args:
+        config: Settings of plans.
+        geometry: A name in ``GEOMETRIES``.
+        reach: Area that neighbouring frames may fill; None for none.
+        harmoniser: Tone curves of the sources.
+        backend: Executes plans.
+        cache: Limits of ``plans`` and of ``overlaps``, the depth from overlap that frames share.
+        outputs: Requested maps, as in ``Renderer.render``.
+        inpainter: Fills the holes that stay.
+        warns_of_harm: Whether to warn once that ``auto`` falls back to the street although cameras move.
+        warn: Warns once per topic.
+    """
+
+    def __init__(
+        self,
+        config: RenderConfig,
+        geometry: GeometryName,
+        reach: Reach | None,
+        harmoniser: Harmoniser,
+        backend: Backend,
+        cache: PlanCache,
+        outputs: Collection[str],
+        inpainter: Inpainter,
+        warns_of_harm: bool,
+        warn: WarnOnce,
+    ) -> None:
+        certainty = config.certainty or "confidence" in outputs or inpainter.needs_confidence
+        self.config = replace(config, certainty=certainty, layers=inpainter.needs_layers)
+        self.outputs = (*outputs, "confidence") if certainty else tuple(outputs)
+        self.geometry, self.reach, self.harmoniser, self.backend = geometry, reach, harmoniser, Renderer(backend)
+        self.share_overlap, self.overlaps = cache.share_overlap, overlap_cache(cache.share_overlap, config)
+        self.plans: LRUCache[Any, RenderPlan] = LRUCache(cache.max_bytes, attrgetter("nbytes"))
+        self.unseen, self.warns_of_harm, self.warn = unseen_note(inpainter), warns_of_harm, warn
+        self._maps = RayCache()
+        self._pairs: LRUCache[Any, RigPair] = LRUCache(_MAX_RIG_PAIRS)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Sample keys that are read in addition to those of the geometry."""
+        return ("neighbours",) if self.reach is not None or GEOMETRIES[self.geometry].needs == "motion" else ()
+
+    def pair(self, source: Rig, target: Rig) -> RigPair:
+        """The pair of a source and a target rig; cached."""
+        key = source.named_key, target.named_key
+        return self._pairs.get(
+            key, lambda: RigPair(key, source, target.in_frame_of(source), self.geometry, self.config)
+        )
+
+    def plan(self, frame: Frame, target: Rig) -> FramePlan:
+        """Choose a frame's scene, and plan how it is rendered over it."""
+        pair = self.pair(frame.rig, target)
+        overlap_of = self._overlap_of if self.config.overlap_depth else None
+        reads_sweeps = self.reach is not None and bool(frame.neighbours)
+        chosen = choose_scene(frame, self.geometry, pair.needs_geometry, self.warn, overlap_of, reads_sweeps)
+        return FramePlan(frame, pair, *chosen, self.plan_views(pair, chosen.scene))
+
+    def _overlap_of(self, frame: Frame, boxes: Any) -> OverlapDepth:
+        return estimate_overlap(frame, boxes, self.share_overlap, self.overlaps)
+
+    def plan_views(self, pair: RigPair, scene: Scene) -> RenderPlan:
+        """The plan of a pair in a scene; cached without a frame's own geometry, which never comes back.
+
+        A scene that no pixel depends on is ignored.
+        """
+        if scene.is_empty or not pair.needs_geometry:
+            return self.plans.get((pair.key, ()), lambda: self._build(pair, Scene()))
+        if self.overlaps is not None and scene.best == "street":
+            key = pair.key, tuple(correction.key for correction in scene.corrections)
+            return self.plans.get(key, lambda: self._build(pair, scene))
+        return self._build(pair, scene)
+
+    def _build(self, pair: RigPair, scene: Scene) -> RenderPlan:
+        source, target = pair.source, pair.target
+        plan = build_plan(source, target, geometry=self.geometry, config=self.config, scene=scene, maps=self._maps)
+        coverage = plan.coverage
+        # Objects may hide all of a frame's target, if its cameras are where they should be.
+        if not scene.is_empty and not any(map(np.any, coverage)) and not pose_mistakes(source, target):
+            coverage = build_plan(source, target, geometry="street", config=self.config, maps=self._maps).coverage
+        check_reach(source, target, coverage, self.unseen, self.warn)
+        return plan
+
+    def render(self, plans: Sequence[FramePlan]) -> list[RenderedFrame]:
+        """Render frames by their plans, and fill holes from their neighbours."""
+        for planned in plans if self.warns_of_harm else ():
+            if "static" not in self.warn.topics and planned.harm is not None:
+                better = harm_remedies(planned.frame.rig, planned.pair.target)
+                message = f"{planned.harm}. Better: {better}; geometry='street' accepts it"
+                self.warn("static", message, GeometryWarning)
+        frames = [planned.frame for planned in plans]
+        curves = [self.harmoniser.curves(p.frame.rig, p.frame.images, p.plan) for p in plans]
+        views = self.backend.render([planned.plan for planned in plans], frames, curves, self.outputs)
+        for k, planned in enumerate(plans):
+            if (fills := self._plan_fills(planned)) is not None:
+                views[k] = fill_from_neighbours(views[k], fills, frames[k].images, self.backend, self.warn)
+        return views
+
+    def _plan_fills(self, planned: FramePlan) -> Fills | None:
+        """Plan what a frame's neighbours fill."""
+        neighbours = planned.frame.neighbours
+        if self.reach is None or not neighbours:
+            return None
+        settings = planned.geometry, self.config, self.reach, self._maps
+        return plan_fills(planned.plan, neighbours, planned.scene, *settings)
+
+    def explain(self, frame: Frame, target: Rig, outcome: str, points: str | None = None) -> transforms.Explanation:
+        """Explain how a frame is rendered; ``outcome`` is what becomes of holes, ``points`` what scanners measure."""
+        planned = self.plan(frame, target)
+        gains = self.harmoniser.report(frame.rig, frame.images) if self.harmoniser.is_on else None
+        return transforms.Explanation(planned, outcome, gains, self._plan_fills(planned), points)
+
+
+_MAX_RIG_PAIRS = 64  # one or two kilobytes each, in addition to the target's cameras
+
+
+# --- by the paper, and resized ----------------------------------------------------------------------------------------
+class PaperPlan(NamedTuple):
+    """A frame, and the target in its ego frame."""
+
+    frame: Frame
+    target: Rig
+
+
+class PaperRenderer:
+    """Renders frames by the paper's stages 1 to 4, which depend on every image: no plan comes back."""
+
+    geometry: ClassVar[GeometryName] = "infinity"
+    overlaps: ClassVar[None] = None
+
+    def __init__(
+        self, config: favs.PaperConfig, outputs: Collection[str], inpainter: Inpainter, warn: WarnOnce
+    ) -> None:
+        self.config, self.outputs = config, outputs
+        self.unseen, self.warn = unseen_note(inpainter), warn
+        self.plans: LRUCache[Any, RenderPlan] = LRUCache(0)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Sample keys that are read."""
+        return ("detections", "box_names", "boxes_3d") if self.config.use_detections else ()
+
+    def pair(self, source: Rig, target: Rig) -> RigPair:
+        """Raises ValueError."""
+        raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
+
+    def plan_views(self, pair: RigPair, scene: Scene) -> RenderPlan:
+        """Unreachable: there are no pairs."""
+        raise NotImplementedError
+
+    def plan(self, frame: Frame, target: Rig) -> PaperPlan:
+        """Bring the target into the frame's ego frame."""
+        return PaperPlan(frame, target.in_frame_of(frame.rig))
+
+    def _render(self, planned: PaperPlan) -> favs.PaperRendering:
+        rendering = favs.render_frame(*planned, self.config)
+        check_reach(planned.frame.rig, planned.target, rendering.coverage, self.unseen, self.warn)
+        return rendering
+
+    def render(self, plans: Sequence[PaperPlan]) -> list[RenderedFrame]:
+        """Render frames by the published stages."""
+        return [favs.as_rendered(self._render(planned), self.outputs) for planned in plans]
+
+    def explain(self, frame: Frame, target: Rig, outcome: str, *_: str) -> transforms.PaperExplanation:
+        """Explain what the stages made of a frame; ``outcome`` is what becomes of holes."""
+        return transforms.PaperExplanation(self._render(self.plan(frame, target)), outcome)
+
+
+class Resizer:
+    """Resizes the images of frames that are not retargeted."""
+
+    def __init__(self, size: tuple[int, int] | None, fit: Fit, outputs: Collection[str]) -> None:
+        self.size, self.fit, self.outputs = size, fit, outputs
+
+    def plan(self, frame: Frame, target: Rig) -> Frame:
+        """The frame itself."""
+        return frame
+
+    def render(self, plans: Sequence[Frame]) -> list[RenderedFrame]:
+        """Resize frames."""
+        assert self.size is not None
+        return [resize_only(frame, self.size, self.fit, self.outputs) for frame in plans]
