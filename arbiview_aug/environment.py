@@ -152,6 +152,8 @@ def eager_on_cpu(method: Any) -> Any:
 
     def run_on_cpu(*args: Any, **options: Any) -> Any:
         torch = sys.modules["torch"]
+        if torch.utils.data.get_worker_info() is not None:
+            _one_thread_of_opencv(os.getpid())
         # Under another default device, numbers of plans would be made there, or nowhere (meta).
         is_cpu = torch.empty(0).device.type == "cpu"  # get_default_device of torch 2.6 misses contexts
         with nullcontext() if is_cpu else torch.device("cpu"), compilation_announced():
@@ -164,6 +166,12 @@ def eager_on_cpu(method: Any) -> Any:
         return run_on_cpu(*args, **options)
 
     return run
+
+
+@cache
+def _one_thread_of_opencv(process: int) -> None:
+    """Leave OpenCV one thread in a DataLoader's worker: more would fight for the cores."""
+    sys.modules["cv2"].setNumThreads(0)
 
 
 def is_kept(kernel: Any) -> bool:

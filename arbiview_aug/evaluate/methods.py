@@ -111,21 +111,21 @@ def retargeting(
     return Method(label, render, reads_points, alone)
 
 
-def _overlap_depth(sample: Sample, surface: GeometryName) -> OverlapDepth:
+def _overlap_depth(sample: Sample, geometry: GeometryName) -> OverlapDepth:
     """Depth from a sample's overlaps, as ``estimate_overlap`` measures it."""
-    scene = read_scene(read_frames(sample, None, surface)[0], surface)
-    row = GEOMETRIES[scene.best if surface == "auto" else surface]
+    scene = read_scene(read_frames(sample, None, geometry)[0], geometry)
+    row = GEOMETRIES[scene.best if geometry == "auto" else geometry]
     boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
     return overlap_depth(sample["rig"], list(sample["images"]), boxes)
 
 
-def _with_motion(sample: Sample, surface: GeometryName) -> Sample:
+def _with_motion(sample: Sample, geometry: GeometryName) -> Sample:
     """The sample with its depth from motion, where that must be estimated."""
     warn = WarnOnce()
-    frame = read_frames(sample, None, surface, further=("neighbours",), warn=warn)[0]
-    if brings_motion(frame, surface):
+    frame = read_frames(sample, None, geometry, further=("neighbours",), warn=warn)[0]
+    if brings_motion(frame, geometry):
         return sample
-    motion = estimate_motion(frame, read_scene(frame, surface).boxes, warn)
+    motion = estimate_motion(frame, read_scene(frame, geometry).boxes, warn)
     return {**sample, MOTION_KEY: list(map(torch.from_numpy, motion.depth_m))}
 
 

@@ -289,7 +289,7 @@ class Renderer:
                 continue
             seams: list[torch.Tensor] | None = [] if with_seams else None
             views = render_opencv(plan, frame.images, self._scratch, curves[b], seams)
-            rendered[b] = _rendered(plan, views, seams or (), curves[b], outputs)
+            rendered[b] = _make_views(plan, views, seams or (), curves[b], outputs)
         for members in batches.values():
             plan = plans[members[0]]
             seams = [] if with_seams else None
@@ -297,7 +297,7 @@ class Renderer:
             views = render_torch(plan, sources, [curves[b] for b in members], seams)
             for k, b in enumerate(members):
                 of_frame = [view[k] for view in views], [seam[k] for seam in seams or ()]
-                rendered[b] = _rendered(plan, *of_frame, curves[b], outputs)
+                rendered[b] = _make_views(plan, *of_frame, curves[b], outputs)
         return [rendered[b] for b in range(len(frames))]
 
     def views(
@@ -319,7 +319,7 @@ class Renderer:
         return self.backend == "torch" or (self.backend == "auto" and needed)
 
 
-def _rendered(
+def _make_views(
     plan: RenderPlan,
     images: list[torch.Tensor],
     seams: Sequence[torch.Tensor],

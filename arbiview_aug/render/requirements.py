@@ -82,10 +82,10 @@ def baselines_m(source: Rig, target: Rig) -> FloatArray:
     return np.asarray(np.linalg.norm(target.cam2ego[:, None, :3, 3] - source.cam2ego[None, :, :3, 3], axis=-1))
 
 
-def needs_geometry(source: Rig, target: Rig, surface: str, config: RenderConfig) -> bool:
+def needs_geometry(source: Rig, target: Rig, geometry: str, config: RenderConfig) -> bool:
     """Whether the source position of any target pixel depends on the distance of the scene.
 
-    The target is in its own ego frame. Surface ``auto`` ignores pairs of cameras whose worst-case parallax is below
+    The target is in its own ego frame. Geometry ``auto`` ignores pairs of cameras whose worst-case parallax is below
     ``FAR_PARALLAX_PX``, and those without common points beyond ``NEAREST_SCENE_M``.
     """
     target = target.in_frame_of(source)
@@ -96,20 +96,20 @@ def needs_geometry(source: Rig, target: Rig, surface: str, config: RenderConfig)
             continue
         focal_px = float(camera.K[0, 0])
         for apart, b in zip(look_apart(camera, source.cameras, 1 / NEAREST_SCENE_M), row.tolist(), strict=True):
-            if surface == "auto" and (worst_parallax_px(b, focal_px) < FAR_PARALLAX_PX or apart):
+            if geometry == "auto" and (worst_parallax_px(b, focal_px) < FAR_PARALLAX_PX or apart):
                 continue
             if b >= SAME_CENTER_M:
                 return True
     return False
 
 
-def static_harm(source: Rig, target: Rig, surface: str, config: RenderConfig) -> str | None:
+def static_harm(source: Rig, target: Rig, geometry: str, config: RenderConfig) -> str | None:
     """Explain how a detector suffers from cameras that move over a static surface; None if it does not.
 
-    Objects are projected onto the road or the house behind them. The target is in its own ego frame; the surface is the
-    one that is rendered over, not ``auto``.
+    Objects are projected onto the road or the house behind them. The target is in its own ego frame; the geometry is
+    the one that is rendered over, not ``auto``.
     """
-    if not GEOMETRIES[surface].is_static:
+    if not GEOMETRIES[geometry].is_static:
         return None
     moved_m = float(baselines_m(source, target).min(axis=1).max())
     if moved_m <= MOVED_M or not needs_geometry(source, target, "auto", config):

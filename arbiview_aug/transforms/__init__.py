@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from arbiview_aug.transforms.explain import Explanation as Explanation
     from arbiview_aug.transforms.explain import PaperExplanation as PaperExplanation
     from arbiview_aug.transforms.scans import RetargetedPoints as RetargetedPoints
+    from arbiview_aug.transforms.scans import describe_points as describe_points
     from arbiview_aug.transforms.scans import entries_of as entries_of
     from arbiview_aug.transforms.scans import retarget_frames as retarget_frames
-    from arbiview_aug.transforms.scans import words_of as words_of
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from arbiview_aug.errors import GeometryWarning, WarnOnce
 from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.inpaint.neighbours import Fills, Reach, fill_from_neighbours, plan_fills
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.harmonise import Harmoniser
+from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, estimate_overlap, overlap_cache
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, RenderedFrame, Renderer, resize_only
@@ -32,6 +32,35 @@ from arbiview_aug.sample.inputs import LEARNED_KEY, read_scene
 from arbiview_aug.sample.neighbours import points_of_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.transforms.settings import PlanCache, unseen_note
+
+
+@dataclass(frozen=True, kw_only=True)
+class RendererSettings:
+    """Settings that renderers share.
+
+    Attributes:
+        target: The target, or the base of drawn ones, in its own ego frame.
+        geometry: A name in ``GEOMETRIES``.
+        reach: Area that neighbouring frames may fill; None for none.
+        match_exposure: How sources are brought to one exposure.
+        backend: Executes plans.
+        cache: Limits of plans, and of depth from overlap that frames share.
+        outputs: Requested maps, as in ``Renderer.render``.
+        inpainter: Fills the holes that stay.
+        p: Share of samples that are retargeted.
+        warn: Warns once per topic.
+    """
+
+    target: Rig
+    geometry: GeometryName
+    reach: Reach | None
+    match_exposure: Harmonise
+    backend: Backend
+    cache: PlanCache
+    outputs: Collection[str]
+    inpainter: Inpainter
+    p: float
+    warn: WarnOnce
 
 
 class FrameRenderer(Protocol):
@@ -45,13 +74,8 @@ class FrameRenderer(Protocol):
 
 
 # --- over a scene -----------------------------------------------------------------------------------------------------
-class SceneChoice(NamedTuple):
-    """A frame's scene, and how its depth was estimated."""
-
-    scene: Scene
-    geometry: GeometryName  # what ``auto`` chose, else as asked
-    overlap: OverlapDepth | None = None  # depth from overlap, if it was estimated
-    motion: temporal.MotionDepth | None = None  # depth from motion, likewise
+Choice = tuple[Scene, GeometryName, OverlapDepth | None, temporal.MotionDepth | None]
+"""A frame's scene; the geometry that ``auto`` chose, else as asked; depth from overlap and motion, if estimated."""
 
 
 def choose_scene(
@@ -61,7 +85,7 @@ def choose_scene(
     warn: WarnOnce,
     overlap_of: Callable[[Frame, Any], OverlapDepth] | None = None,
     reads_sweeps: bool = False,
-) -> SceneChoice:
+) -> Choice:
     """Read a frame's scene, decide what ``auto`` is, and estimate the depth that the geometry asks for.
 
     Args:
@@ -89,7 +113,7 @@ def choose_scene(
     if row.needs == "motion" and scene.motion is None:
         before = [part for part in [scene.geometry("points")] if part is not None]
         scene = replace(scene, motion=motion.maps(frame.rig, before) if motion else ())
-    return SceneChoice(scene, chosen, overlap, motion)
+    return scene, chosen, overlap, motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,46 +139,27 @@ class FramePlan:
 class PlannedRenderer:
     """Renders frames over their scenes, by plans; holes are filled from neighbouring frames alone.
 
-    Args:
-        config: Settings of plans.
-        geometry: A name in ``GEOMETRIES``.
-        reach: Area that neighbouring frames may fill; None for none.
-        harmoniser: Tone curves of the sources.
-        backend: Executes plans.
-        cache: Limits of ``plans`` and of ``overlaps``, the depth from overlap that frames share.
-        outputs: Requested maps, as in ``Renderer.render``.
-        inpainter: Fills the holes that stay.
-        warns_of_harm: Whether to warn once that ``auto`` falls back to the street although cameras move.
-        warn: Warns once per topic.
+    Attributes:
+        plans: Plans of calibrations that come back.
+        overlaps: Depth from overlap that frames share; None if they share none.
     """
 
-    def __init__(
-        self,
-        config: RenderConfig,
-        geometry: GeometryName,
-        reach: Reach | None,
-        harmoniser: Harmoniser,
-        backend: Backend,
-        cache: PlanCache,
-        outputs: Collection[str],
-        inpainter: Inpainter,
-        warns_of_harm: bool,
-        warn: WarnOnce,
-    ) -> None:
-        certainty = config.certainty or "confidence" in outputs or inpainter.needs_confidence
+    def __init__(self, config: RenderConfig, settings: RendererSettings) -> None:
+        inpainter, cache = settings.inpainter, settings.cache
+        certainty = config.certainty or "confidence" in settings.outputs or inpainter.needs_confidence
         self.config = replace(config, certainty=certainty, layers=inpainter.needs_layers)
-        self.outputs = (*outputs, "confidence") if certainty else tuple(outputs)
-        self.geometry, self.reach, self.harmoniser, self.backend = geometry, reach, harmoniser, Renderer(backend)
-        self.share_overlap, self.overlaps = cache.share_overlap, overlap_cache(cache.share_overlap, config)
+        self.settings, self.geometry, self.warn = settings, settings.geometry, settings.warn
+        self.outputs = (*settings.outputs, "confidence") if certainty else tuple(settings.outputs)
+        self.harmoniser, self.backend = Harmoniser(settings.match_exposure), Renderer(settings.backend)
+        self.overlaps = overlap_cache(cache.share_overlap, config)
         self.plans: LRUCache[Any, RenderPlan] = LRUCache(cache.max_bytes, attrgetter("nbytes"))
-        self.unseen, self.warns_of_harm, self.warn = unseen_note(inpainter), warns_of_harm, warn
-        self._maps = RayCache()
+        self._maps, self._unseen = RayCache(), unseen_note(inpainter)
         self._pairs: LRUCache[Any, RigPair] = LRUCache(_MAX_RIG_PAIRS)
 
     @property
     def reads(self) -> tuple[str, ...]:
         """Sample keys that are read in addition to those of the geometry."""
-        return ("neighbours",) if self.reach is not None or GEOMETRIES[self.geometry].needs == "motion" else ()
+        return ("neighbours",) if self.settings.reach is not None or GEOMETRIES[self.geometry].needs == "motion" else ()
 
     def pair(self, source: Rig, target: Rig) -> RigPair:
         """The pair of a source and a target rig; cached."""
@@ -167,12 +172,12 @@ class PlannedRenderer:
         """Choose a frame's scene, and plan how it is rendered over it."""
         pair = self.pair(frame.rig, target)
         overlap_of = self._overlap_of if self.config.overlap_depth else None
-        reads_sweeps = self.reach is not None and bool(frame.neighbours)
-        chosen = choose_scene(frame, self.geometry, pair.needs_geometry, self.warn, overlap_of, reads_sweeps)
-        return FramePlan(frame, pair, *chosen, self.plan_views(pair, chosen.scene))
+        reads_sweeps = self.settings.reach is not None and bool(frame.neighbours)
+        choice = choose_scene(frame, self.geometry, pair.needs_geometry, self.warn, overlap_of, reads_sweeps)
+        return FramePlan(frame, pair, *choice, self.plan_views(pair, choice[0]))
 
     def _overlap_of(self, frame: Frame, boxes: Any) -> OverlapDepth:
-        return estimate_overlap(frame, boxes, self.share_overlap, self.overlaps)
+        return estimate_overlap(frame, boxes, self.settings.cache.share_overlap, self.overlaps)
 
     def plan_views(self, pair: RigPair, scene: Scene) -> RenderPlan:
         """The plan of a pair in a scene; cached without a frame's own geometry, which never comes back.
@@ -193,13 +198,14 @@ class PlannedRenderer:
         # Objects may hide all of a frame's target, if its cameras are where they should be.
         if not scene.is_empty and not any(map(np.any, coverage)) and not pose_mistakes(source, target):
             coverage = build_plan(source, target, geometry="street", config=self.config, maps=self._maps).coverage
-        check_reach(source, target, coverage, self.unseen, self.warn)
+        check_reach(source, target, coverage, self._unseen, self.warn)
         return plan
 
     def render(self, plans: Sequence[FramePlan]) -> list[RenderedFrame]:
         """Render frames by their plans, and fill holes from their neighbours."""
-        for planned in plans if self.warns_of_harm else ():
-            if "static" not in self.warn.topics and planned.harm is not None:
+        is_accepted = self.geometry not in ("auto", "boxes") or self.settings.p <= _MIXED_P
+        for planned in () if is_accepted or "static" in self.warn.topics else plans:
+            if planned.harm is not None:
                 better = harm_remedies(planned.frame.rig, planned.pair.target)
                 message = f"{planned.harm}. Better: {better}; geometry='street' accepts it"
                 self.warn("static", message, GeometryWarning)
@@ -207,34 +213,35 @@ class PlannedRenderer:
         curves = [self.harmoniser.curves(p.frame.rig, p.frame.images, p.plan) for p in plans]
         views = self.backend.render([planned.plan for planned in plans], frames, curves, self.outputs)
         for k, planned in enumerate(plans):
-            if (fills := self._plan_fills(planned)) is not None:
+            if (fills := self._plan_neighbours(planned)) is not None:
                 views[k] = fill_from_neighbours(views[k], fills, frames[k].images, self.backend, self.warn)
         return views
 
-    def _plan_fills(self, planned: FramePlan) -> Fills | None:
+    def _plan_neighbours(self, planned: FramePlan) -> Fills | None:
         """Plan what a frame's neighbours fill."""
         neighbours = planned.frame.neighbours
-        if self.reach is None or not neighbours:
+        if self.settings.reach is None or not neighbours:
             return None
-        settings = planned.geometry, self.config, self.reach, self._maps
+        settings = planned.geometry, self.config, self.settings.reach, self._maps
         return plan_fills(planned.plan, neighbours, planned.scene, *settings)
 
     def explain(self, frame: Frame, target: Rig, outcome: str, points: str | None = None) -> transforms.Explanation:
         """Explain how a frame is rendered; ``outcome`` is what becomes of holes, ``points`` what scanners measure."""
         planned = self.plan(frame, target)
         gains = self.harmoniser.report(frame.rig, frame.images) if self.harmoniser.is_on else None
-        return transforms.Explanation(planned, outcome, gains, self._plan_fills(planned), points)
+        return transforms.Explanation(planned, outcome, gains, self._plan_neighbours(planned), points)
 
+
+_MIXED_P = 0.5
+"""At most this share of retargeted samples, views over a static street do not harm a detector
+(``integrations/cross_rig``)."""
 
 _MAX_RIG_PAIRS = 64  # one or two kilobytes each, in addition to the target's cameras
 
 
 # --- by the paper, and resized ----------------------------------------------------------------------------------------
-class PaperPlan(NamedTuple):
-    """A frame, and the target in its ego frame."""
-
-    frame: Frame
-    target: Rig
+PaperPlan = tuple[Frame, Rig]
+"""A frame, and the target in its ego frame."""
 
 
 class PaperRenderer:
@@ -243,12 +250,15 @@ class PaperRenderer:
     geometry: ClassVar[GeometryName] = "infinity"
     overlaps: ClassVar[None] = None
 
-    def __init__(
-        self, config: favs.PaperConfig, outputs: Collection[str], inpainter: Inpainter, warn: WarnOnce
-    ) -> None:
-        self.config, self.outputs = config, outputs
-        self.unseen, self.warn = unseen_note(inpainter), warn
+    def __init__(self, config: favs.PaperConfig, settings: RendererSettings) -> None:
+        self.config, self.settings = config, settings
+        self.harmoniser = Harmoniser(settings.match_exposure is not True and settings.match_exposure)
         self.plans: LRUCache[Any, RenderPlan] = LRUCache(0)
+        overlap_cache(settings.cache.share_overlap, config)  # refused
+        least = settings.inpainter.min_confidence
+        favs.check_settings(
+            settings.target, settings.geometry, settings.backend, settings.outputs, least, self.harmoniser
+        )
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -265,27 +275,30 @@ class PaperRenderer:
 
     def plan(self, frame: Frame, target: Rig) -> PaperPlan:
         """Bring the target into the frame's ego frame."""
-        return PaperPlan(frame, target.in_frame_of(frame.rig))
+        return frame, target.in_frame_of(frame.rig)
 
     def _render(self, planned: PaperPlan) -> favs.PaperRendering:
-        rendering = favs.render_frame(*planned, self.config)
-        check_reach(planned.frame.rig, planned.target, rendering.coverage, self.unseen, self.warn)
+        (frame, target), unseen = planned, unseen_note(self.settings.inpainter)
+        rendering = favs.render_frame(frame, target, self.config)
+        check_reach(frame.rig, target, rendering.coverage, unseen, self.settings.warn)
         return rendering
 
     def render(self, plans: Sequence[PaperPlan]) -> list[RenderedFrame]:
         """Render frames by the published stages."""
-        return [favs.as_rendered(self._render(planned), self.outputs) for planned in plans]
+        return [favs.as_rendered(self._render(planned), self.settings.outputs) for planned in plans]
 
     def explain(self, frame: Frame, target: Rig, outcome: str, *_: str) -> transforms.PaperExplanation:
         """Explain what the stages made of a frame; ``outcome`` is what becomes of holes."""
         return transforms.PaperExplanation(self._render(self.plan(frame, target)), outcome)
 
 
+@dataclass(frozen=True)
 class Resizer:
     """Resizes the images of frames that are not retargeted."""
 
-    def __init__(self, size: tuple[int, int] | None, fit: Fit, outputs: Collection[str]) -> None:
-        self.size, self.fit, self.outputs = size, fit, outputs
+    size: tuple[int, int] | None
+    fit: Fit
+    outputs: Collection[str]
 
     def plan(self, frame: Frame, target: Rig) -> Frame:
         """The frame itself."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
 
-import cv2
 import torch
 
 from arbiview_aug import favs, transforms
@@ -22,10 +20,9 @@ from arbiview_aug.errors import GeometryWarning, SampleError, WarnOnce
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
 from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
-from arbiview_aug.render.overlap_depth import overlap_cache
+from arbiview_aug.render.harmonise import Harmonise, PhotometricReport
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
-from arbiview_aug.render.rendered import Backend, RenderedFrame
+from arbiview_aug.render.rendered import Backend
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import (
     DEPTH_WORDS,
@@ -37,7 +34,7 @@ from arbiview_aug.sample.inputs import (
 )
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.transforms.outputs import SampleWriter
-from arbiview_aug.transforms.renderers import FrameRenderer, PaperRenderer, PlannedRenderer, Resizer
+from arbiview_aug.transforms.renderers import FrameRenderer, PaperRenderer, PlannedRenderer, RendererSettings, Resizer
 from arbiview_aug.transforms.settings import (
     PlanCache,
     SampleKeys,
@@ -48,12 +45,8 @@ from arbiview_aug.transforms.settings import (
     inpainter_of,
     render_config,
     size_mistake,
-    target_mistakes,
+    warn_of_target,
 )
-
-_MIXED_P = 0.5
-"""At most this share of retargeted samples, views over a static street do not harm a detector
-(``integrations/cross_rig``)."""
 
 
 class RigRetarget(torch.nn.Module):
@@ -137,29 +130,30 @@ class RigRetarget(torch.nn.Module):
         self.inpainter = inpainter_of(holes)  # moves with this module
         self._warn = WarnOnce()
         config = render_config(quality)
-        is_published = not isinstance(config, RenderConfig)
-        self.harmoniser = Harmoniser(False if is_published and match_exposure is True else match_exposure)
-        self.renderer = self._make_renderer(config, choice("backend", backend, get_args(Backend)))
-        self._resizer = Resizer(self.size or (1, 1), self.fit, self.keys.extra)
+        is_reused = isinstance(self.target, Rig) or self.target.per != "sample"  # drawn rigs never come back
+        settings = RendererSettings(
+            target=self._base,
+            geometry=self.geometry,
+            reach=self.neighbours,
+            match_exposure=match_exposure,
+            backend=choice("backend", backend, get_args(Backend)),
+            cache=self.cache if is_reused else replace(self.cache, max_bytes=0),
+            outputs=self.keys.extra,
+            inpainter=self.inpainter,
+            p=self.p,
+            warn=self._warn,
+        )
+        is_planned = isinstance(config, RenderConfig)
+        self.renderer = PlannedRenderer(config, settings) if is_planned else PaperRenderer(config, settings)
+        self._resizer = Resizer(self.size, self.fit, self.keys.extra)
         if self.size is not None and (mistake := size_mistake(self._base, self.size, self.fit)):
             self._warn("size", mistake, GeometryWarning)
-        self._fixed_target = self._sized(self.target) if isinstance(self.target, Rig) else None
-        if self._fixed_target is not None:
-            self._warn_of_target(self._fixed_target)
+        self._scans_points = bool(self._base.lidars) and self.keys.points == "target"
+        self._bars = self.size if self.fit == "pad" else None
+        if isinstance(self.target, Rig):
+            self._fixed_target = self._sized(self.target)
+            warn_of_target(self._fixed_target, self._warn)
         self._checked: set[frozenset[Any]] = set()  # keys and types of samples that were checked for misnamed keys
-        self._limited_process: int | None = None
-
-    def _make_renderer(self, config: Any, backend: Backend) -> PlannedRenderer | PaperRenderer:
-        is_reused = isinstance(self.target, Rig) or self.target.per != "sample"  # drawn rigs never come back
-        cache = self.cache if is_reused else replace(self.cache, max_bytes=0)
-        if isinstance(config, RenderConfig):
-            warns_of_harm = self.geometry in ("auto", "boxes") and self.p > _MIXED_P
-            settings = self.geometry, self.neighbours, self.harmoniser, backend, cache, self.keys.extra, self.inpainter
-            return PlannedRenderer(config, *settings, warns_of_harm, self._warn)
-        overlap_cache(cache.share_overlap, config)  # refused
-        least = self.inpainter.min_confidence
-        favs.check_settings(self._base, self.geometry, backend, self.keys.extra, least, self.harmoniser)
-        return PaperRenderer(config, self.keys.extra, self.inpainter, self._warn)
 
     @property
     def _base(self) -> Rig:
@@ -180,12 +174,12 @@ class RigRetarget(torch.nn.Module):
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
+        holes, exposure = type(self.inpainter).__name__, self.renderer.harmoniser
         settings = (
-            f"geometry={self.geometry}, holes={type(self.inpainter).__name__}, match_exposure={self.harmoniser}, "
-            f"size={self.size}, fit={self.fit}, p={self.p:g}"
+            f"geometry={self.geometry}, holes={holes}, match_exposure={exposure}, size={self.size}, fit={self.fit}"
         )
         cache = "" if self.cache.share_overlap is False else f"{self.cache!r}, "
-        return f"target={target}, {settings}, {cache}{self.renderer.config}"
+        return f"target={target}, {settings}, p={self.p:g}, {cache}{self.renderer.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
     @eager_on_cpu
@@ -204,7 +198,6 @@ class RigRetarget(torch.nn.Module):
             SampleTypeError: Values of a type that is not supported.
             CalibrationError: Impossible K, cam2ego or lens.
         """
-        self._limit_threads()
         frames = self._read_frames(sample)
         labels = self._check_keys(sample, frames)
         target, is_skipped, draws = self._make_params(sample, frames, params)
@@ -212,7 +205,8 @@ class RigRetarget(torch.nn.Module):
         plans = [renderer.plan(frame, target) for frame in frames]
         views = renderer.render(plans)
         if not is_skipped:
-            views = self._frame_views(self.inpainter.fill(views, frames))
+            views = self.inpainter.fill(views, frames)
+            views = views if self._bars is None else [view.between_bars(self._bars) for view in views]
         points = self._scan_points(frames, target, is_skipped)
         return self._writer.write(sample, frames, views, labels, target, draws, points)
 
@@ -236,27 +230,14 @@ class RigRetarget(torch.nn.Module):
         names |= {share} if isinstance(share := self.cache.share_overlap, str) else set()
         return read_frames(sample, self.source, renderer.geometry, further=further, names=names, warn=self._warn)
 
-    @property
-    def _scans_points(self) -> bool:
-        return bool(self._base.lidars) and self.keys.points == "target"
-
     def _scan_points(
         self, frames: Sequence[Frame], target: Rig, is_skipped: bool = False
     ) -> list[transforms.RetargetedPoints]:
         """Points of the frames by the target's scanners, if it has any and they are wanted."""
         if not self._scans_points:
             return []
-        return transforms.retarget_frames(
-            frames, target, is_skipped, self._warn, neighbours=self.neighbours is not None
-        )
-
-    def _frame_views(self, views: list[RenderedFrame]) -> list[RenderedFrame]:
-        """Put views between bars where ``fit`` asks for them."""
-        return views if self.size is None or self.fit != "pad" else [view.between_bars(self.size) for view in views]
-
-    def _warn_of_target(self, target: Rig) -> None:
-        for topic, message in target_mistakes(target):
-            self._warn(topic, message, GeometryWarning)
+        uses_neighbours = self.neighbours is not None
+        return transforms.retarget_frames(frames, target, is_skipped, self._warn, neighbours=uses_neighbours)
 
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
         """Check the sample's further keys, and return those that hold label maps."""
@@ -277,35 +258,29 @@ class RigRetarget(torch.nn.Module):
         self, sample: Mapping[str, Any], frames: Sequence[Frame], params: Mapping[str, float] | None
     ) -> tuple[Rig, bool, dict[str, float]]:
         """Draw the target rig and whether to skip; return both, and the parameters that replay them."""
-        if params is not None:
-            rest = checked_params(params)
-        elif isinstance(self.target, RandomRig):
-            rest = self.draw(self.target.rng_for(sample))
-        else:
-            rest = self.draw()
-        draws = {"skipped": rest.pop("skipped", 0.0)} if self.p < 1 else {}
+        if params is None:
+            params = self.draw(self.target.rng_for(sample) if isinstance(self.target, RandomRig) else None)
+        draws = checked_params(params)
+        skipped = {"skipped": draws.pop("skipped", 0.0)} if self.p < 1 else {}
         if isinstance(self.target, RandomRig):
-            target = self._sized(self.target.rig(rest))
-            self._warn_of_target(target)
-            draws.update(rest)
+            target = self._sized(self.target.rig(draws))
+            warn_of_target(target, self._warn)
+        elif draws:
+            raise SampleError(f"params: expected none for a fixed target rig, got {', '.join(draws)}")
         else:
-            assert self._fixed_target is not None
             target = self._fixed_target
-            if rest:
-                raise SampleError(f"params: expected none for a fixed target rig, got {', '.join(rest)}")
         for frame in frames if self.p < 1 else ():
             if len(frame.rig) != len(target):
-                raise SampleError(
-                    f"p < 1: expected the target to have the source's {len(frame.rig)} cameras, got {len(target)}; "
-                    "batches could not be collated; mix on the level of the data set (arbiview_aug.MixedDataset)"
-                )
-        return target, bool(draws.get("skipped")), draws
+                fix = "batches could not be collated; mix on the level of the data set (arbiview_aug.MixedDataset)"
+                expected = f"expected the target to have the source's {len(frame.rig)} cameras, got {len(target)}"
+                raise SampleError(f"p < 1: {expected}; {fix}")
+        return target, bool(skipped.get("skipped")), skipped | draws
 
     def _sized(self, target: Rig) -> Rig:
         """The target's cameras at ``size``, without bars."""
-        if self.size is None or self.fit != "pad":
+        if self._bars is None:
             return target if self.size is None else target.resized(self.size, self.fit)
-        return target.with_cameras([c.resize(framing(c.name, c.size, self.size, "pad").scaled) for c in target])
+        return target.with_cameras([c.resize(framing(c.name, c.size, self._bars, "pad").scaled) for c in target])
 
     # --- plans ------------------------------------------------------------------------------------------------------
     @property
@@ -331,15 +306,13 @@ class RigRetarget(torch.nn.Module):
             ValueError: No source rig, a random target, ``quality="paper"``, or a surface that every frame has anew.
         """
         source = self.source if source is None else load_rig(source)
-        if source is None or self._fixed_target is None:
+        if source is None or isinstance(self.target, RandomRig):
             got = f"{'no source' if source is None else 'a source'} and a target {type(self.target).__name__}"
             raise ValueError(f"prepare: expected a source rig and a fixed target rig, got {got}")
         pair = self.renderer.pair(source, self._fixed_target)
         if GEOMETRIES[self.geometry].needs is not None and pair.needs_geometry:
-            raise ValueError(
-                f"prepare: expected a geometry whose plans come back, got {self.geometry!r}: boxes, points or depth "
-                "need a new plan for every frame"
-            )
+            got = f"{self.geometry!r}: boxes, points or depth need a new plan for every frame"
+            raise ValueError(f"prepare: expected a geometry whose plans come back, got {got}")
         return self.renderer.plan_views(pair, Scene())
 
     # --- reports ----------------------------------------------------------------------------------------------------
@@ -351,17 +324,10 @@ class RigRetarget(torch.nn.Module):
         """
         frame = self._read_frames(sample)[0]
         target, _, _ = self._make_params(sample, [frame], None)
-        points = [transforms.words_of(part, frame, target) for part in self._scan_points([frame], target)]
+        points = [transforms.describe_points(part, frame, target) for part in self._scan_points([frame], target)]
         return self.renderer.explain(frame, target, self.inpainter.outcome, *points)
 
     def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
         """The gains that a sample's source images would get, and why; for a batch, its first frame's."""
         frame = read_frames(sample, self.source)[0]
-        return self.harmoniser.report(frame.rig, frame.images)
-
-    # --- processes --------------------------------------------------------------------------------------------------
-    def _limit_threads(self) -> None:
-        """Leave OpenCV one thread in DataLoader workers, which would fight for the cores otherwise."""
-        if self._limited_process != os.getpid() and torch.utils.data.get_worker_info() is not None:
-            cv2.setNumThreads(0)
-            self._limited_process = os.getpid()
+        return self.renderer.harmoniser.report(frame.rig, frame.images)

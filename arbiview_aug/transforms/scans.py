@@ -162,7 +162,7 @@ def entries_of(parts: Sequence[RetargetedPoints], lead: tuple[int, ...]) -> dict
     return {key: values if lead else values[0] for key, values in keys.items()}
 
 
-def words_of(part: RetargetedPoints, frame: Frame, target: Rig) -> str:
+def describe_points(part: RetargetedPoints, frame: Frame, target: Rig) -> str:
     """One line for ``explain``."""
     rays = sum(math.prod(lidar.shape) for lidar in target.lidars)
     return (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -16,7 +15,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.validation import MAX_SIZE_PX, is_mounted
 from arbiview_aug.choices import choice, is_number
 from arbiview_aug.environment import imported
-from arbiview_aug.errors import SampleError, shown
+from arbiview_aug.errors import GeometryWarning, SampleError, WarnOnce, shown
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY, Black, Inpainter
 from arbiview_aug.render.plan import PRESETS, RenderConfig
 from arbiview_aug.sample.inputs import CALIBRATION_KEYS, focal_mistake
@@ -216,13 +215,14 @@ def _lost(camera: Camera, size: tuple[int, int], fit: Fit) -> str:
     return f"{camera.name!r} keeps {kept[side]:.0f} of its {fov[side]:.0f} degrees {('across', 'up and down')[side]}"
 
 
-def target_mistakes(target: Rig) -> Iterator[tuple[str, str]]:
-    """Topics and warnings of target cameras that no vehicle has."""
+def warn_of_target(target: Rig, warn: WarnOnce) -> None:
+    """Warn once of target cameras that no vehicle has."""
     for camera, mounted in zip(target, is_mounted(target.cam2ego, target.ground_z_m), strict=True):
         where = f"target camera {camera.name!r}"
         if not mounted:
             x, y, z = camera.center_m - (0, 0, target.ground_z_m)
-            place = f"({x:.1f}, {y:.1f}) m, {z:.1f} m above the road"
-            yield "mounting", f"{where}: expected a place on a vehicle, got {place}; are moves and poses in metres?"
+            got = f"({x:.1f}, {y:.1f}) m, {z:.1f} m above the road; are moves and poses in metres?"
+            warn("mounting", f"{where}: expected a place on a vehicle, got {got}", GeometryWarning)
         if mistake := focal_mistake(camera):
-            yield "target focal", f"{where}: K: expected a focal length in pixels, got {'; '.join(mistake)}"
+            got = "; ".join(mistake)
+            warn("target focal", f"{where}: K: expected a focal length in pixels, got {got}", GeometryWarning)

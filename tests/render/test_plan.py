@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from arbiview_aug import RigRetarget
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import ego_rays, project_rays
 from arbiview_aug.cameras.rig import Rig, load_rig
