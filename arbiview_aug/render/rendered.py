@@ -363,23 +363,39 @@ def confidence_of(rendered: RenderedFrame) -> Maps:
 
 
 # --- resized only -----------------------------------------------------------------------------------------------------
-def resize_only(frame: Frame, size: tuple[int, int], fit: Fit, outputs: Collection[str] = ()) -> RenderedFrame:
-    """Resize a frame to ``size`` (h, w) without retargeting it; all but bars is covered."""
-    device = frame.images[0].device
-    framings = [framing(camera.name, camera.size, size, fit) for camera in frame.rig]
-    coverage = torch.stack([framed(torch.ones(f.scaled, dtype=torch.bool, device=device), f) for f in framings])
-    current = coverage.to(torch.int8) - 1
-    numbers = torch.arange(len(coverage), dtype=torch.int8, device=device)[:, None, None]
-    return RenderedFrame(
-        [framed(resized(image, f.scaled), f) for image, f in zip(frame.images, framings, strict=True)],
-        frame.rig.resized(size, fit),
-        coverage,
-        source_camera=torch.where(coverage, numbers, current) if "source_camera" in outputs else None,
-        source_frame=current if "source_frame" in outputs else None,
-        confidence=coverage.float() if "confidence" in outputs else None,
-        generated=torch.zeros_like(coverage),
-        labels=lambda maps, fill: [
-            framed(nearest_resized(label, f.scaled), f, fill(label.dtype) if f.has_bars else 0)
-            for label, f in zip(maps, framings, strict=True)
-        ],
-    )
+@dataclass(frozen=True)
+class Resizer:
+    """Resizes the images of frames without retargeting them to ``size`` (h, w); all but bars is covered."""
+
+    size: tuple[int, int] | None
+    fit: Fit
+    outputs: Collection[str] = ()
+
+    def plan(self, frame: Frame, target: Rig) -> Frame:
+        """The frame itself."""
+        return frame
+
+    def render(self, plans: Sequence[Frame]) -> list[RenderedFrame]:
+        """Resize frames."""
+        return list(map(self._resize, plans))
+
+    def _resize(self, frame: Frame) -> RenderedFrame:
+        size, outputs, device = self.size, self.outputs, frame.images[0].device
+        assert size is not None
+        framings = [framing(camera.name, camera.size, size, self.fit) for camera in frame.rig]
+        coverage = torch.stack([framed(torch.ones(f.scaled, dtype=torch.bool, device=device), f) for f in framings])
+        current = coverage.to(torch.int8) - 1
+        numbers = torch.arange(len(coverage), dtype=torch.int8, device=device)[:, None, None]
+        return RenderedFrame(
+            [framed(resized(image, f.scaled), f) for image, f in zip(frame.images, framings, strict=True)],
+            frame.rig.resized(size, self.fit),
+            coverage,
+            source_camera=torch.where(coverage, numbers, current) if "source_camera" in outputs else None,
+            source_frame=current if "source_frame" in outputs else None,
+            confidence=coverage.float() if "confidence" in outputs else None,
+            generated=torch.zeros_like(coverage),
+            labels=lambda maps, fill: [
+                framed(nearest_resized(label, f.scaled), f, fill(label.dtype) if f.has_bars else 0)
+                for label, f in zip(maps, framings, strict=True)
+            ],
+        )

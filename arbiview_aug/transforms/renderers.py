@@ -1,6 +1,6 @@
-"""Renderers of ``RigRetarget``, of one protocol: over a scene by a plan, by the paper's stages, and resized only.
+"""Renderers of ``RigRetarget``, of one protocol: over a scene by a plan, and by the paper's stages.
 
-``plan`` says how a frame is rendered, ``render`` makes the views of frames by their plans.
+``plan`` says how a frame is rendered, ``render`` makes the views of frames by their plans. ``render.rendered.Resizer`` is the third.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from arbiview_aug import favs, temporal, transforms
-from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.rays import RayCache
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName
@@ -24,7 +23,7 @@ from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, estimate_overlap, overlap_cache
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
-from arbiview_aug.render.rendered import Backend, RenderedFrame, Renderer, resize_only
+from arbiview_aug.render.rendered import Backend, RenderedFrame, Renderer
 from arbiview_aug.render.requirements import RigPair, boxes_harm, check_reach, harm_remedies, pose_mistakes
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.frame import Frame
@@ -239,7 +238,7 @@ _MIXED_P = 0.5
 _MAX_RIG_PAIRS = 64  # one or two kilobytes each, in addition to the target's cameras
 
 
-# --- by the paper, and resized ----------------------------------------------------------------------------------------
+# --- by the paper -----------------------------------------------------------------------------------------------------
 PaperPlan = tuple[Frame, Rig]
 """A frame, and the target in its ego frame."""
 
@@ -290,21 +289,3 @@ class PaperRenderer:
     def explain(self, frame: Frame, target: Rig, outcome: str, *_: str) -> transforms.PaperExplanation:
         """Explain what the stages made of a frame; ``outcome`` is what becomes of holes."""
         return transforms.PaperExplanation(self._render(self.plan(frame, target)), outcome)
-
-
-@dataclass(frozen=True)
-class Resizer:
-    """Resizes the images of frames that are not retargeted."""
-
-    size: tuple[int, int] | None
-    fit: Fit
-    outputs: Collection[str]
-
-    def plan(self, frame: Frame, target: Rig) -> Frame:
-        """The frame itself."""
-        return frame
-
-    def render(self, plans: Sequence[Frame]) -> list[RenderedFrame]:
-        """Resize frames."""
-        assert self.size is not None
-        return [resize_only(frame, self.size, self.fit, self.outputs) for frame in plans]

@@ -22,7 +22,7 @@ from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmonise, PhotometricReport
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
-from arbiview_aug.render.rendered import Backend
+from arbiview_aug.render.rendered import Backend, Resizer
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import (
     DEPTH_WORDS,
@@ -34,7 +34,7 @@ from arbiview_aug.sample.inputs import (
 )
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.transforms.outputs import SampleWriter
-from arbiview_aug.transforms.renderers import FrameRenderer, PaperRenderer, PlannedRenderer, RendererSettings, Resizer
+from arbiview_aug.transforms.renderers import FrameRenderer, PaperRenderer, PlannedRenderer, RendererSettings
 from arbiview_aug.transforms.settings import (
     PlanCache,
     SampleKeys,

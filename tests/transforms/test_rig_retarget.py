@@ -6,6 +6,7 @@ import copy
 import pickle
 import warnings
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -87,22 +88,6 @@ def test_mixed_target_sizes_give_lists_unless_a_size_is_asked_for() -> None:
     out = RigRetarget(target, size=(24, 40))(sample_of(base))
     assert out["images"].shape == (4, 3, 24, 40)
     np.testing.assert_array_equal(out["K"], target.resized((24, 40), "crop").K)
-
-
-def test_mixed_source_sizes_come_as_a_list() -> None:
-    base = ring()
-    source = base.with_cameras([base[0].resize((18, 32)), *base.cameras[1:]])
-    out = RigRetarget(base)(sample_of(source))
-    assert out["images"].shape == (4, 3, *SIZE)
-
-
-def test_source_camera_says_who_won() -> None:
-    source = ring()
-    out = RigRetarget(source, keys=SampleKeys(extra=["source_camera"]))(sample_of(source))
-    assert out["source_camera"].dtype == torch.int8
-    assert torch.equal(out["source_camera"] >= 0, out["coverage"])
-    inner = out["source_camera"][:, 4:-4, 4:-4]
-    assert torch.equal(inner, torch.arange(4, dtype=torch.int8)[:, None, None].expand_as(inner))
 
 
 def test_calibration_follows_the_inputs_dtype() -> None:
@@ -265,99 +250,83 @@ def test_other_names_of_stale_keys_are_dropped(key: str) -> None:
     assert RigRetarget(ring().turned(yaw_deg=3), source=ring(), keys=keep)(sample)[key] is sample[key]
 
 
-OF_A_CAMERA = (
-    "depth",
-    "depth_m",
-    "gt_depth",
-    "depth_map",
-    "Depth_GT",
-    "depthmap",
-    "disparity",
-    "optical_flow",
-    "normals",
-)
+MAPS = torch.zeros((4, *SIZE), dtype=torch.uint8)
+OF_A_CAMERA = "depth depth_m gt_depth depth_map Depth_GT depthmap disparity optical_flow normals".split()
+FIX = {
+    True: r"a label map needs a key of its own.* SampleKeys\(keep=\('parts',\)\)",
+    False: r"name it in SampleKeys\(labels=\('parts',\)\).* SampleKeys\(keep=\('parts',\)\)",
+}
+IMAGES = torch.zeros((4, 3, *SIZE), dtype=torch.uint8)
+ELSEWHERE = "shape .* images of .*'neighbours'.*Several frames.* drop the key"
+STALE: list[tuple[str, Any, str]] = [  # key, value, and what is said of it
+    *(("parts", np.zeros(shape), FIX[False]) for shape in (SIZE, (4, *SIZE), (4, 2, *SIZE), (4, *SIZE, 2))),
+    *(("parts", [{"parts": torch.zeros(shape)}], FIX[True]) for shape in (SIZE, (4, *SIZE), (4, *SIZE, 2))),
+    (
+        "flow",
+        np.zeros((4, *SIZE)),
+        r"depth, .* other cameras: drop the key, or name it in SampleKeys\(keep=\('flow',\)",
+    ),
+    ("sweeps", [{"images": IMAGES}], f"{ELSEWHERE}$"),
+    ("cams", {"front": {"img": IMAGES[0]}}, f"{ELSEWHERE}$"),
+    ("sweep_arrays", [{"images": IMAGES.numpy()}], f"{ELSEWHERE}$"),
+    ("previous", IMAGES, rf"{ELSEWHERE}.*SampleKeys\(labels="),
+    ("previous_list", list(IMAGES), rf"{ELSEWHERE}.*SampleKeys\(labels="),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "message"), STALE)
+def test_what_is_bound_to_the_sources_pixels_is_refused(key: str, value: Any, message: str) -> None:
+    sample = sample_of(ring(), **{key: value})
+    with pytest.raises(SampleError, match=f"{key}: shape .*{message.removeprefix('shape .*')}"):
+        RigRetarget(ring())(sample)
+    assert RigRetarget(ring(), keys=SampleKeys(keep=[key]))(sample)[key] is value
+
+
+def test_maps_of_three_cameras_are_no_images() -> None:
+    three = ring().with_cameras(list(ring())[:3])
+    labels = torch.zeros((3, *SIZE), dtype=torch.uint8)
+    with pytest.raises(SampleError, match=r"seg: shape .* a map .*; name it in SampleKeys\(labels=\('seg',\)\)"):
+        RigRetarget(three)({"images": IMAGES[:3], "rig": three, "seg": labels})
 
 
 @pytest.mark.parametrize("key", OF_A_CAMERA)
 def test_values_that_depend_on_the_camera_are_no_label_maps(key: str) -> None:
-    refused = (
-        rf"labels: expected keys of label maps, got {key}: depth, .* other cameras; drop .* depth_maps\(points, views"
-    )
+    refused = rf"labels: expected keys of label maps, got {key}: depth, .* cameras; drop .* depth_maps\(points, views"
     with pytest.raises(SampleError, match=refused):
         RigRetarget(ring(), keys=SampleKeys(labels=("seg", key)))
 
 
 @pytest.mark.parametrize("key", ["depth_mask", "flow_valid", "depth_bins", "overflow", "normal_vehicles"])
 def test_label_maps_beside_depth_are_rendered(key: str) -> None:
-    sample = sample_of(ring(), **{key: torch.ones((4, *SIZE), dtype=torch.uint8)})
-    assert key in RigRetarget(ring(), keys=SampleKeys(labels=(key,)))(sample)
+    assert key in RigRetarget(ring(), keys=SampleKeys(labels=(key,)))(sample_of(ring(), **{key: MAPS}))
 
 
-def test_masks_whose_values_depend_on_the_camera_are_refused() -> None:
-    tv_tensors = pytest.importorskip("torchvision.tv_tensors")
-    sample = sample_of(ring(), gt_flow=tv_tensors.Mask(torch.zeros(4, *SIZE)))
-    with pytest.raises(SampleError, match="labels: expected keys of label maps, got gt_flow"):
-        RigRetarget(ring())(sample)
-    assert RigRetarget(ring(), keys=SampleKeys(keep=("gt_flow",)))(sample)["gt_flow"] is sample["gt_flow"]
-
-
-@pytest.mark.parametrize("shape", [SIZE, (4, *SIZE), (4, 2, *SIZE), (4, *SIZE, 2)])
-@pytest.mark.parametrize("nested", [False, True])
-def test_a_map_over_the_sources_pixels_is_refused(shape: tuple[int, ...], nested: bool) -> None:
-    value: Any = [{"parts": torch.zeros(shape)}] if nested else np.zeros(shape)
-    sample = sample_of(ring(), parts=value)
-    fix = "a label map needs a key of its own" if nested else r"name it in SampleKeys\(labels=\('parts',\)\)"
-    with pytest.raises(SampleError, match=rf"parts: shape .* be stale; {fix}.* SampleKeys\(keep=\('parts',\)\)"):
-        RigRetarget(ring())(sample)
-    assert RigRetarget(ring(), keys=SampleKeys(keep=["parts"]))(sample)["parts"] is value
-    flow = (
-        r"flow: shape .* be stale; depth, .* other cameras: drop the key, or name it in SampleKeys\(keep=\('flow',\)\)"
-    )
-    with pytest.raises(SampleError, match=flow):
-        RigRetarget(ring())(sample_of(ring(), flow=value))
-
-
-@pytest.mark.parametrize("key", ["sweeps", "cams", "sweep_arrays", "previous", "previous_list"])
-def test_images_of_other_frames_belong_elsewhere(key: str) -> None:
-    sample = sample_of(ring())
-    images = sample["images"]
-    sample[key] = {
-        "sweeps": [{"images": images}],
-        "cams": {"front": {"img": images[0]}},
-        "sweep_arrays": [{"images": images.numpy()}],
-        "previous": images,
-        "previous_list": list(images),
-    }[key]
-    with pytest.raises(
-        SampleError, match=f"{key}: shape .* images of .*'neighbours'.*Several frames.* drop the key"
-    ) as e:
-        RigRetarget(ring())(sample)
-    assert ("SampleKeys(labels=" in str(e.value)) == key.startswith("previous")
-    three = ring().with_cameras(list(ring())[:3])  # (3, H, W) are the maps of three cameras
-    labels = torch.zeros((3, *SIZE), dtype=images.dtype)
-    with pytest.raises(SampleError, match=r"seg: shape .* a map .*; name it in SampleKeys\(labels=\('seg',\)\)"):
-        RigRetarget(three)({"images": images[:3], "rig": three, "seg": labels})
-
-
-def test_bounding_boxes_are_refused() -> None:
+def test_stale_tensors_of_torchvision_are_refused() -> None:
     tv_tensors = pytest.importorskip("torchvision.tv_tensors")
     boxes = tv_tensors.BoundingBoxes(torch.rand(2, 4), format="XYXY", canvas_size=SIZE)
-    for value in (boxes, {"boxes": boxes}):
-        sample = sample_of(ring(), target=value)
-        with pytest.raises(SampleError, match=r"target: a tv_tensors.Bound.* SampleKeys\(keep=\('target',\)\)"):
-            RigRetarget(ring())(sample)
-        assert RigRetarget(ring(), keys=SampleKeys(keep=["target"]))(sample)["target"] is value
+    stale = r"target: a tv_tensors.Bound.* SampleKeys\(keep=\('target',\)\)"
+    flow = "labels: expected keys of label maps, got gt_flow"
+    for key, value, message in (
+        ("target", boxes, stale),
+        ("target", {"boxes": boxes}, stale),
+        ("gt_flow", tv_tensors.Mask(MAPS), flow),
+    ):
+        with pytest.raises(SampleError, match=message):
+            RigRetarget(ring())(sample_of(ring(), **{key: value}))
+        assert RigRetarget(ring(), keys=SampleKeys(keep=[key]))(sample_of(ring(), **{key: value}))[key] is value
 
 
 # --- label maps -------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float32])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float32, torch.bool])
 def test_label_maps_are_the_winning_sources(dtype: torch.dtype) -> None:
     source, target = ring(), ring().turned(yaw_deg=30)
     values = torch.arange(4)[:, None, None].expand(4, *SIZE).to(dtype).contiguous()
     retarget = RigRetarget(target, keys=SampleKeys(labels=["classes"], ignore_index=77, extra=["source_camera"]))
     out = retarget(sample_of(source, classes=values))
     assert out["classes"].dtype == dtype and out["classes"].shape == (4, *SIZE)
-    expected = torch.where(out["coverage"], out["source_camera"].to(dtype), torch.tensor(77, dtype=dtype))
+    expected = torch.where(
+        out["coverage"], out["source_camera"].to(dtype), torch.tensor(77 * (dtype != torch.bool), dtype=dtype)
+    )
     assert torch.equal(out["classes"], expected)
 
 
@@ -370,41 +339,33 @@ def test_labels_of_pixels_that_were_filled_anew_are_ignored() -> None:
     assert (out["seg"][out["generated"]] == 255).all()
 
 
-def test_bool_labels_are_false_where_uncovered() -> None:
-    source = ring().with_cameras([ring()[0]])
-    sample = sample_of(source, moving=torch.ones((1, *SIZE), dtype=torch.bool))
-    out = RigRetarget(source.turned(yaw_deg=30), keys=SampleKeys(labels=["moving"]))(sample)
-    assert out["moving"].dtype == torch.bool and torch.equal(out["moving"], out["coverage"])
+NAN = float("nan")
+UNFIT: list[tuple[Any, float, str]] = [  # label maps, the value of uncovered pixels, and what is said of them
+    (MAPS[:3], 255, "classes: expected 4 label maps, one an image, got 3"),
+    (MAPS.mT, 255, r"classes: camera 'camera 0': expected a map of \(h, w\) = \(36, 64\), got"),
+    (MAPS.to(torch.int8), 255, r"classes: SampleKeys.ignore_index: expected a value of torch.int8, got 255; give"),
+    (MAPS.int(), NAN, r"classes: SampleKeys.ignore_index: expected .* torch.int32, got nan"),
+    (MAPS.half(), 1e5, r"classes: SampleKeys.ignore_index: expected .* torch.float16, got 100000"),
+    (MAPS.half(), NAN, ""),
+    (MAPS.to(torch.int8), -1, ""),
+    (torch.tensor(3), 255, r"classes: expected label maps of shape \(..., N, H, W\), got \(\)"),
+    (
+        [MAPS[:k].bool() for k in range(1, 5)],
+        255,
+        r"'camera 1': expected .*torch.bool', 1, 'H', .*, got .*2, .*; m",
+    ),
+    (MAPS.numpy(), 255, "classes: expected label maps as tensors, got ndarray"),
+    (MAPS.to(torch.uint16), 255, r"classes: expected uint8 or .*torch.uint16; use .to\(torch.int32\)"),
+]
 
 
-def test_label_maps_that_do_not_fit() -> None:
-    def labels(value: Any, **settings: Any) -> Any:
-        return RigRetarget(ring(), keys=SampleKeys(labels=["classes"], **settings))(sample_of(ring(), classes=value))
-
-    with pytest.raises(SampleError, match="classes: expected 4 label maps, one an image, got 3"):
-        labels(torch.zeros((3, *SIZE)))
-    with pytest.raises(SampleError, match=r"classes: camera 'camera 0': expected a map of \(h, w\) = \(36, 64\), got"):
-        labels(torch.zeros((4, 64, 36)))
-    with pytest.raises(
-        SampleError, match=r"classes: SampleKeys.ignore_index: expected a value of torch.int8, got 255; give"
-    ):
-        labels(torch.zeros((4, *SIZE), dtype=torch.int8))
-    with pytest.raises(SampleError, match=r"classes: SampleKeys.ignore_index: expected .* torch.int32, got nan"):
-        labels(torch.zeros((4, *SIZE), dtype=torch.int32), ignore_index=float("nan"))
-    with pytest.raises(SampleError, match=r"classes: expected label maps of shape \(..., N, H, W\), got \(\)"):
-        labels(torch.tensor(3))
-    with pytest.raises(SampleError, match=r"'camera 1': expected .*torch.bool', 1, 'H', .*, got .*2, .*; merge masks"):
-        labels([torch.zeros((k, *SIZE), dtype=torch.bool) for k in range(1, 5)])
-    with pytest.raises(SampleError, match=r"classes: SampleKeys.ignore_index: expected .* torch.float16, got 100000"):
-        labels(torch.zeros((4, *SIZE), dtype=torch.float16), ignore_index=1e5)
-    labels(torch.zeros((4, *SIZE), dtype=torch.float16), ignore_index=float("nan"))
-    labels(torch.zeros((4, *SIZE), dtype=torch.int8), ignore_index=-1)
-    with pytest.raises(SampleTypeError, match="classes: expected label maps as tensors, got ndarray"):
-        labels(np.zeros((4, *SIZE)))
-    with pytest.raises(SampleTypeError, match=r"classes: expected uint8 or .*torch.uint16; use .to\(torch.int32\)"):
-        labels(torch.zeros((4, *SIZE), dtype=torch.uint16))
+@pytest.mark.parametrize(("value", "fill", "message"), UNFIT)
+def test_label_maps_that_do_not_fit(value: Any, fill: float, message: str) -> None:
+    retarget = RigRetarget(ring(), keys=SampleKeys(labels=["classes"], ignore_index=fill))
+    with pytest.raises((SampleError, SampleTypeError), match=message) if message else nullcontext():
+        retarget(sample_of(ring(), classes=value))
     with pytest.raises(SampleError, match=r"SampleKeys.labels: expected classes in the sample, got images, K, cam2ego"):
-        RigRetarget(ring(), keys=SampleKeys(labels=["classes"]))(sample_of(ring()))
+        retarget(sample_of(ring()))
 
 
 # --- torchvision ------------------------------------------------------------------------------------------------------
@@ -526,19 +487,6 @@ def test_skipped_samples_collate_with_retargeted_ones(masked: str, lensed: str) 
         assert not outs[0.0]["ego_mask"].any()
     if masked == "source":
         np.testing.assert_array_equal(skipped["ego_mask"][0], ~source.resized((18, 32))[0].mask)
-
-
-def test_samples_of_different_vehicles_collate() -> None:
-    retarget = RigRetarget(ring().turned(yaw_deg=20), p=0.5, size=SIZE)
-    torch.manual_seed(0)
-    vehicles = [ring(), with_mask(ring()), with_lens(ring())]
-    outs = [retarget({"images": smooth_images(rig), "rig": rig}) for rig in vehicles * 4]
-    assert len({tuple(out) for out in outs}) == 1
-    default_collate(outs)
-    # Retargeted again, some with holes in their coverage.
-    again = RigRetarget(ring().turned(yaw_deg=3), p=0.5, size=SIZE)
-    default_collate([again(out) for out in outs])
-    again(default_collate(outs))
 
 
 def test_a_skipped_sample_is_the_resized_source_in_memory_of_its_own() -> None:
@@ -664,18 +612,20 @@ def test_points_in_lists_and_arrays_move_too(container: str) -> None:
         np.testing.assert_array_equal(out, moved)
 
 
-def test_labels_that_cannot_move() -> None:
-    retarget = RigRetarget(ring(ground_z_m=-0.5), keys=SampleKeys(frame="target"))
-    with pytest.raises(SampleTypeError, match="boxes_3d: expected a tensor of numbers, got str"):
-        retarget(sample_of(ring(), boxes_3d="none"))
-    retarget = RigRetarget(ring(ground_z_m=-0.5), keys=SampleKeys(frame="target"), geometry="street")
-    with pytest.raises(SampleTypeError, match=r"boxes_3d: SampleKeys.frame='target': expected a float tensor, got str"):
-        retarget(sample_of(ring(), boxes_3d="none"))
-    with pytest.raises(SampleTypeError, match=r"points: .*expected a float tensor, got torch.int64"):
-        retarget(sample_of(ring(), points=torch.zeros(3, 3, dtype=torch.int64)))
-    with pytest.raises(SampleTypeError, match=r"ego2world: .*expected a float tensor, got list"):
-        retarget(sample_of(ring(), ego2world=np.eye(4).tolist()))
-    with pytest.raises(SampleError, match=r"points: expected shape \(2, count, >=3\), got \(7, 3\)"):
+@pytest.mark.parametrize(
+    ("geometry", "entry", "message"),
+    [
+        ("auto", {"boxes_3d": "none"}, "boxes_3d: expected a tensor of numbers, got str"),
+        ("street", {"boxes_3d": "none"}, "boxes_3d: SampleKeys.frame='target': expected a float tensor, got str"),
+        ("street", {"points": torch.zeros(3, 3).long()}, "points: .*expected a float tensor, got torch.int64"),
+        ("street", {"ego2world": np.eye(4).tolist()}, "ego2world: .*expected a float tensor, got list"),
+    ],
+)
+def test_labels_that_cannot_move(geometry: Any, entry: dict[str, Any], message: str) -> None:
+    retarget = RigRetarget(ring(ground_z_m=-0.5), keys=SampleKeys(frame="target"), geometry=geometry)
+    with pytest.raises(SampleTypeError, match=message):
+        retarget(sample_of(ring(), **entry))
+    with pytest.raises(SampleError, match=r"points: expected .*\(2.*, got .*\(7, 3\)"):
         retarget({**default_collate([sample_of(ring())] * 2), "points": torch.zeros(7, 3)})
 
 
@@ -906,12 +856,6 @@ def test_explain_changes_nothing_but_the_random_state() -> None:
     expected = retarget(sample)
     retarget.explain(sample)
     assert same(retarget(sample), expected) and retarget.plans.misses == 1
-
-
-def test_a_shipped_rig_by_name() -> None:
-    nuscenes = load_rig("nuscenes").resized(0.05)
-    out = RigRetarget("waymo", size=(20, 30))({"images": smooth_images(nuscenes), "rig": nuscenes})
-    assert out["images"].shape == (5, 3, 20, 30)
 
 
 # --- what surrounds a call --------------------------------------------------------------------------------------------
