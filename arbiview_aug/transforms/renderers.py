@@ -1,6 +1,7 @@
 """Renderers of ``RigRetarget``, of one protocol: over a scene by a plan, and by the paper's stages.
 
-``plan`` says how a frame is rendered, ``render`` makes the views of frames by their plans. ``render.rendered.Resizer`` is the third.
+``plan`` says how a frame is rendered, ``render`` makes the views of frames by their plans. The third renderer is
+``render.rendered.Resizer``.
 """
 
 from __future__ import annotations

@@ -324,9 +324,8 @@ def test_label_maps_are_the_winning_sources(dtype: torch.dtype) -> None:
     retarget = RigRetarget(target, keys=SampleKeys(labels=["classes"], ignore_index=77, extra=["source_camera"]))
     out = retarget(sample_of(source, classes=values))
     assert out["classes"].dtype == dtype and out["classes"].shape == (4, *SIZE)
-    expected = torch.where(
-        out["coverage"], out["source_camera"].to(dtype), torch.tensor(77 * (dtype != torch.bool), dtype=dtype)
-    )
+    fill = torch.tensor(0 if dtype == torch.bool else 77, dtype=dtype)
+    expected = torch.where(out["coverage"], out["source_camera"].to(dtype), fill)
     assert torch.equal(out["classes"], expected)
 
 
