@@ -258,9 +258,10 @@ class RigRetarget(torch.nn.Module):
         self, sample: Mapping[str, Any], frames: Sequence[Frame], params: Mapping[str, float] | None
     ) -> tuple[Rig, bool, dict[str, float]]:
         """Draw the target rig and whether to skip; return both, and the parameters that replay them."""
-        if params is None:
-            params = self.draw(self.target.rng_for(sample) if isinstance(self.target, RandomRig) else None)
-        draws = checked_params(params)
+        if params is not None:
+            draws = checked_params(params)
+        else:
+            draws = self.draw(self.target.rng_for(sample) if isinstance(self.target, RandomRig) else None)
         skipped = {"skipped": draws.pop("skipped", 0.0)} if self.p < 1 else {}
         if isinstance(self.target, RandomRig):
             target = self._sized(self.target.rig(draws))
