@@ -151,7 +151,6 @@ class OverlapDepth:
 
     corrections: tuple[Correction, ...]  # one for each accepted pair
     reports: tuple[OverlapReport, ...]  # one for each pair of neighbours, in the order of their names
-    matched: int  # number of pairs that were matched
 
     @property
     def nbytes(self) -> int:
@@ -190,19 +189,18 @@ def overlap_depth(rig: Rig, images: Sequence[torch.Tensor], boxes: FloatArray | 
     strips = [(a, b, _strip(rig, a, b, surface, boxes)) for a, b in adjacent_pairs(rig)]
     used = {k for a, b, strip in strips if strip is not None for k in (a, b)}
     small = {k: _small(rig[k], images[k]) for k in used}
-    corrections, reports, matched = [], [], 0
+    corrections, reports = [], []
     for a, b, strip in strips:
         names = rig[a].name, rig[b].name
         if strip is None:
             reports.append(OverlapReport(*names, False, "they share too little"))
             continue
-        matched += 1
         correction, report = _refine(strip, (rig[a], rig[b]), (small[a], small[b]), surface)
         reports.append(report)
         if correction is not None:
             corrections.append(correction)
     reports.sort(key=attrgetter("first", "second"))
-    return OverlapDepth(tuple(corrections), tuple(reports), matched)
+    return OverlapDepth(tuple(corrections), tuple(reports))
 
 
 class _Small(NamedTuple):

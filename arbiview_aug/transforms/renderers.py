@@ -161,7 +161,7 @@ class PlannedRenderer:
         """Sample keys that are read in addition to those of the geometry."""
         return ("neighbours",) if self.settings.reach is not None or GEOMETRIES[self.geometry].needs == "motion" else ()
 
-    def pair(self, source: Rig, target: Rig) -> RigPair:
+    def _pair(self, source: Rig, target: Rig) -> RigPair:
         """The pair of a source and a target rig; cached."""
         key = source.named_key, target.named_key
         return self._pairs.get(
@@ -170,16 +170,20 @@ class PlannedRenderer:
 
     def plan(self, frame: Frame, target: Rig) -> FramePlan:
         """Choose a frame's scene, and plan how it is rendered over it."""
-        pair = self.pair(frame.rig, target)
+        pair = self._pair(frame.rig, target)
         overlap_of = self._overlap_of if self.config.overlap_depth else None
         reads_sweeps = self.settings.reach is not None and bool(frame.neighbours)
         choice = choose_scene(frame, self.geometry, pair.needs_geometry, self.warn, overlap_of, reads_sweeps)
-        return FramePlan(frame, pair, *choice, self.plan_views(pair, choice[0]))
+        return FramePlan(frame, pair, *choice, self._plan_views(pair, choice[0]))
 
     def _overlap_of(self, frame: Frame, boxes: Any) -> OverlapDepth:
         return estimate_overlap(frame, boxes, self.settings.cache.share_overlap, self.overlaps)
 
-    def plan_views(self, pair: RigPair, scene: Scene) -> RenderPlan:
+    def plan_views(self, source: Rig, target: Rig, scene: Scene) -> RenderPlan:
+        """The plan of a source and a target rig in a scene, as ``plan`` makes it."""
+        return self._plan_views(self._pair(source, target), scene)
+
+    def _plan_views(self, pair: RigPair, scene: Scene) -> RenderPlan:
         """The plan of a pair in a scene; cached without a frame's own geometry, which never comes back.
 
         A scene that no pixel depends on is ignored.
@@ -251,7 +255,8 @@ class PaperRenderer:
     overlaps: ClassVar[None] = None
 
     def __init__(self, config: favs.PaperConfig, settings: RendererSettings) -> None:
-        self.config, self.settings = config, settings
+        self.config: Any = config
+        self.settings = settings
         self.harmoniser = Harmoniser(settings.match_exposure is not True and settings.match_exposure)
         self.plans: LRUCache[Any, RenderPlan] = LRUCache(0)
         overlap_cache(settings.cache.share_overlap, config)  # refused
@@ -265,13 +270,9 @@ class PaperRenderer:
         """Sample keys that are read."""
         return ("detections", "box_names", "boxes_3d") if self.config.use_detections else ()
 
-    def pair(self, source: Rig, target: Rig) -> RigPair:
+    def plan_views(self, source: Rig, target: Rig, scene: Scene) -> RenderPlan:
         """Raises ValueError."""
         raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
-
-    def plan_views(self, pair: RigPair, scene: Scene) -> RenderPlan:
-        """Unreachable: there are no pairs."""
-        raise NotImplementedError
 
     def plan(self, frame: Frame, target: Rig) -> PaperPlan:
         """Bring the target into the frame's ego frame."""

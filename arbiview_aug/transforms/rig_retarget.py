@@ -23,6 +23,7 @@ from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmonise, PhotometricReport
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, Resizer
+from arbiview_aug.render.requirements import needs_geometry
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import (
     DEPTH_WORDS,
@@ -295,7 +296,7 @@ class RigRetarget(torch.nn.Module):
         Raises:
             ValueError: With ``quality="paper"``.
         """
-        return self.renderer.plan_views(self.renderer.pair(load_rig(source), load_rig(target)), scene or Scene())
+        return self.renderer.plan_views(load_rig(source), load_rig(target), scene or Scene())
 
     def prepare(self, source: Rig | str | Path | None = None) -> RenderPlan:
         """Build the plan for a source rig before DataLoader workers fork: they share its memory.
@@ -310,11 +311,11 @@ class RigRetarget(torch.nn.Module):
         if source is None or isinstance(self.target, RandomRig):
             got = f"{'no source' if source is None else 'a source'} and a target {type(self.target).__name__}"
             raise ValueError(f"prepare: expected a source rig and a fixed target rig, got {got}")
-        pair = self.renderer.pair(source, self._fixed_target)
-        if GEOMETRIES[self.geometry].needs is not None and pair.needs_geometry:
+        target, row = self._fixed_target, GEOMETRIES[self.geometry]
+        if row.needs is not None and needs_geometry(source, target, self.geometry, self.renderer.config):
             got = f"{self.geometry!r}: boxes, points or depth need a new plan for every frame"
             raise ValueError(f"prepare: expected a geometry whose plans come back, got {got}")
-        return self.renderer.plan_views(pair, Scene())
+        return self.renderer.plan_views(source, target, Scene())
 
     # --- reports ----------------------------------------------------------------------------------------------------
     def explain(self, sample: Mapping[str, Any]) -> transforms.Explanation | transforms.PaperExplanation:
