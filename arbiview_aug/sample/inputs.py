@@ -98,10 +98,10 @@ def read_frames(
             raise SampleError(f"{key}: expected the calibration of source=, got another; {fix}")
     row = GEOMETRIES[geometry]
     _check_needs(sample, geometry, row.needs)
-    keys = {_SAMPLE_KEYS.get(name, name) for name in row.reads} | {*further}
-    if "neighbours" in keys:
-        keys.add("boxes_3d")  # they tell what moved
-    entries = {key: _entries(key, sample[key], lead) for key in keys if sample.get(key) is not None}
+    wanted = [*(_SAMPLE_KEYS.get(name, name) for name in row.reads), *sorted(further)]
+    if "neighbours" in wanted and sample.get("neighbours") is not None:
+        wanted.append("boxes_3d")  # they tell what moved
+    entries = {key: _entries(key, sample[key], lead) for key in wanted if sample.get(key) is not None}
     entries |= {key: _names(key, sample[key], lead) for key in names if sample.get(key) is not None}
     return [
         _with_entries(frame, {key: of_frames[k] for key, of_frames in entries.items()}, sample, index, warn)

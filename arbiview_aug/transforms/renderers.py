@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any, ClassVar, Protocol
@@ -74,48 +74,6 @@ class FrameRenderer(Protocol):
 
 
 # --- over a scene -----------------------------------------------------------------------------------------------------
-Choice = tuple[Scene, GeometryName, OverlapDepth | None, temporal.MotionDepth | None]
-"""A frame's scene; the geometry that ``auto`` chose, else as asked; depth from overlap and motion, if estimated."""
-
-
-def choose_scene(
-    frame: Frame,
-    geometry: GeometryName,
-    is_needed: bool,
-    warn: WarnOnce,
-    overlap_of: Callable[[Frame, Any], OverlapDepth] | None = None,
-    reads_sweeps: bool = False,
-) -> Choice:
-    """Read a frame's scene, decide what ``auto`` is, and estimate the depth that the geometry asks for.
-
-    Args:
-        frame: The frame, read for this geometry.
-        geometry: A name in ``GEOMETRIES``.
-        is_needed: Whether any pixel depends on distances: only then is depth estimated.
-        warn: Called for depth that is declined, and for neighbours that cannot be read.
-        overlap_of: Estimates depth from overlap of a frame with boxes; None where it is not asked for.
-        reads_sweeps: Whether points of neighbours are added.
-    """
-    row, overlap, motion = GEOMETRIES[geometry], None, None
-    is_read = is_needed or geometry != "auto" or bool(frame.neighbours)  # objects limit what neighbours fill
-    scene = read_scene(frame, geometry) if is_read else Scene()
-    chosen = scene.best if geometry == "auto" else geometry
-    if is_needed:
-        if overlap_of is not None and GEOMETRIES[chosen].overlap_depth:
-            overlap = overlap_of(frame, scene.boxes)
-            scene = replace(scene, corrections=overlap.corrections)
-        if row.needs == "motion" and not temporal.brings_motion(frame, geometry):
-            motion = temporal.estimate_motion(frame, scene.boxes, warn)
-        elif row.needs in ("motion", LEARNED_KEY) and scene.geometry(row.needs) == ():
-            temporal.warn_of_declined(frame, scene.motion is not None, warn)
-        if reads_sweeps and scene.points is not None and (sweeps := points_of_neighbours(frame, warn)):
-            scene = replace(scene, sweeps=np.concatenate([sweep[:, :3] for sweep in sweeps]))
-    if row.needs == "motion" and scene.motion is None:
-        before = [part for part in [scene.geometry("points")] if part is not None]
-        scene = replace(scene, motion=motion.maps(frame.rig, before) if motion else ())
-    return scene, chosen, overlap, motion
-
-
 @dataclass(frozen=True, eq=False)
 class FramePlan:
     """How one frame is rendered, and from what it was planned."""
@@ -171,13 +129,36 @@ class PlannedRenderer:
     def plan(self, frame: Frame, target: Rig) -> FramePlan:
         """Choose a frame's scene, and plan how it is rendered over it."""
         pair = self._pair(frame.rig, target)
-        overlap_of = self._overlap_of if self.config.overlap_depth else None
-        reads_sweeps = self.settings.reach is not None and bool(frame.neighbours)
-        choice = choose_scene(frame, self.geometry, pair.needs_geometry, self.warn, overlap_of, reads_sweeps)
-        return FramePlan(frame, pair, *choice, self._plan_views(pair, choice[0]))
+        scene, geometry, overlap, motion = self.choose_scene(frame, pair)
+        return FramePlan(frame, pair, scene, geometry, overlap, motion, self._plan_views(pair, scene))
 
-    def _overlap_of(self, frame: Frame, boxes: Any) -> OverlapDepth:
-        return estimate_overlap(frame, boxes, self.settings.cache.share_overlap, self.overlaps)
+    def choose_scene(
+        self, frame: Frame, pair: RigPair
+    ) -> tuple[Scene, GeometryName, OverlapDepth | None, temporal.MotionDepth | None]:
+        """Read a frame's scene, decide what ``auto`` is, and estimate the depth that the geometry asks for.
+
+        Returns the scene, the geometry's name, and depth from overlap and from motion as far as they were estimated,
+        which they are only where a pixel depends on distances.
+        """
+        row, overlap, motion = GEOMETRIES[self.geometry], None, None
+        is_read = pair.needs_geometry or self.geometry != "auto" or bool(frame.neighbours)  # objects limit their fills
+        scene = read_scene(frame, self.geometry) if is_read else Scene()
+        geometry = scene.best if self.geometry == "auto" else self.geometry
+        if pair.needs_geometry:
+            if self.config.overlap_depth and GEOMETRIES[geometry].overlap_depth:
+                overlap = estimate_overlap(frame, scene.boxes, self.settings.cache.share_overlap, self.overlaps)
+                scene = replace(scene, corrections=overlap.corrections)
+            if row.needs == "motion" and not temporal.brings_motion(frame, self.geometry):
+                motion = temporal.estimate_motion(frame, scene.boxes, self.warn)
+            elif row.needs in ("motion", LEARNED_KEY) and scene.geometry(row.needs) == ():
+                temporal.warn_of_declined(frame, scene.motion is not None, self.warn)
+            sweeps = points_of_neighbours(frame, self.warn) if self.settings.reach and scene.points is not None else []
+            if sweeps:
+                scene = replace(scene, sweeps=np.concatenate([sweep[:, :3] for sweep in sweeps]))
+        if row.needs == "motion" and scene.motion is None:
+            before = [part for part in [scene.geometry("points")] if part is not None]
+            scene = replace(scene, motion=motion.maps(frame.rig, before) if motion else ())
+        return scene, geometry, overlap, motion
 
     def plan_views(self, source: Rig, target: Rig, scene: Scene) -> RenderPlan:
         """The plan of a source and a target rig in a scene, as ``plan`` makes it."""

@@ -158,12 +158,6 @@ def test_batches_are_their_frames(recorded: list[dict[str, Any]]) -> None:
         assert all(torch.equal(one[key], two) for one, two in zip(singles, batch[key], strict=True))
 
 
-def test_in_a_data_loader(recorded: list[dict[str, Any]]) -> None:
-    data = RetargetedDataset(recorded[:2], RigRetarget(target(), size=(32, 88)))
-    (batch,) = torch.utils.data.DataLoader(data, batch_size=2, num_workers=1, collate_fn=collate)
-    assert [len(points) for points in batch["points"]] == [len(rings) for rings in batch["point_rings"]]
-
-
 def test_skipped_samples_have_the_same_keys(sample: dict[str, Any]) -> None:
     retarget = RigRetarget(target(), p=0.5, size=SIZE)
     skipped, scanned = (retarget(sample, params={"skipped": skip}) for skip in (1.0, 0.0))
@@ -257,12 +251,6 @@ def test_sweeps_of_users() -> None:
     assert isinstance(retarget_points(own.numpy(), target(), sweeps=[other]).points, np.ndarray)
     for sweep in (torch.from_numpy(other), other.tolist()):
         assert torch.equal(retarget_points(own, target(), sweeps=[sweep]).points, both)
-    with pytest.raises(SampleError, match=r"sweeps\[0\]: expected the columns of points .*, got \(5, 3\)"):
-        retarget_points(own, target(), sweeps=[np.zeros((5, 3))])
-    with pytest.raises(SampleTypeError, match=r"sweeps: expected a list of points \(Q, C\), got int"):
-        retarget_points(own, target(), sweeps=3)  # type: ignore[arg-type]
-    with pytest.raises(SampleError, match=r"ground_z_m: expected one height, got shape \(2,\)"):
-        retarget_points(own, target(), ground_z_m=[0.0, 1.0])  # type: ignore[arg-type]
 
 
 # --- bad input --------------------------------------------------------------------------------------------------------
@@ -297,25 +285,32 @@ def test_extremes(sample: dict[str, Any], lidar: dict[str, Any], more: dict[str,
     assert out["num_points"].sum() <= len(points)
 
 
-def test_impossible_scanners() -> None:
-    for change, message in (
+REFUSED: list[tuple[Any, dict[str, Any], str]] = [  # points, other arguments, and what is said of them
+    (torch.ones((5, 4), dtype=torch.int32), {}, "points: expected a float tensor or array to scan, got torch"),
+    ([[1.0, 2.0, 3.0]], {}, "got list"),
+    (torch.ones((5, 2)), {}, "points: expected shape"),
+    (WALL, {"ground_z_m": "x"}, "ground_z_m: expected a tensor of numbers, got str"),
+    (WALL, {"ground_z_m": [0.0, 1.0]}, r"ground_z_m: expected one height, got shape \(2,\)"),
+    (WALL, {"sweeps": [np.zeros((5, 3))]}, r"sweeps\[0\]: expected the columns of points .*, got \(5, 3\)"),
+    (WALL, {"sweeps": 3}, r"sweeps: expected a list of points \(Q, C\), got int"),
+    (WALL, {"target": "lyft_l5"}, "rig 'lyft_l5': expected lidars, which measure the points, got none"),
+    (WALL, {"target": target(lidars=[TOP.shifted(z_m=-3)])}, "lidar 'top': expected a place over the road"),
+]
+
+
+@pytest.mark.parametrize(("points", "arguments", "message"), REFUSED)
+def test_what_is_refused(points: Any, arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises((SampleError, SampleTypeError, CalibrationError), match=message):
+        retarget_points(points, **({"target": target()} | arguments))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
         ({"elevations_deg": (0.0,) * 10_000}, "lidar 'top': elevations_deg: expected 1 to 1024"),
         ({"range_m": (0.0, 0.0)}, "lidar 'top': range_m: expected two distances"),
-    ):
-        with pytest.raises(CalibrationError, match=message):
-            replace(TOP, **change)
-
-
-def test_what_is_refused() -> None:
-    with pytest.raises(SampleTypeError, match="points: expected a float tensor or array to scan, got torch"):
-        retarget_points(torch.ones((5, 4), dtype=torch.int32), target())
-    with pytest.raises(SampleTypeError, match="got list"):
-        retarget_points([[1.0, 2.0, 3.0]], target())
-    with pytest.raises(SampleTypeError, match="ground_z_m: expected a tensor of numbers, got str"):
-        retarget_points(torch.ones((5, 4)), target(), ground_z_m="x")  # type: ignore[arg-type]
-    with pytest.raises(SampleError, match="points: expected shape"):
-        retarget_points(torch.ones((5, 2)), target())
-    with pytest.raises(CalibrationError, match="rig 'lyft_l5': expected lidars, which measure the points, got none"):
-        retarget_points(torch.ones((5, 4)), "lyft_l5")
-    with pytest.raises(CalibrationError, match="lidar 'top': expected a place over the road"):
-        retarget_points(torch.ones((5, 4)), target(lidars=[TOP.shifted(z_m=-3)]))
+    ],
+)
+def test_impossible_scanners(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        replace(TOP, **change)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import GeometryWarning, Rig, RigRetarget, load_rig
+from arbiview_aug import GeometryWarning, RandomRig, Rig, RigRetarget, load_rig
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from tests.helpers import street_sample
 
@@ -68,6 +68,20 @@ def test_a_target_that_is_hardly_meant(mistake: str) -> None:
         except Exception as error:  # no pixel is covered
             assert "cannot be reached" in str(error)
     assert any(re.search(message, str(one.message)) for one in said), [str(one.message) for one in said]
+
+
+@pytest.mark.parametrize("mistake", ["a move in millimetres", "below the road", "K in millimetres"])
+def test_a_target_is_judged_when_the_transform_is_made(mistake: str) -> None:
+    change, message = TARGETS[mistake]
+    with pytest.warns(GeometryWarning, match=message):
+        RigRetarget(change(demo_source_rig((32, 88))))
+
+
+def test_a_drawn_target_is_judged_when_it_is_drawn() -> None:
+    rig = demo_source_rig((32, 88))
+    retarget = RigRetarget(RandomRig(rig, height_m=(600.0, 700.0)), geometry="infinity")
+    with pytest.warns(GeometryWarning, match="expected a place on a vehicle"):
+        retarget({"images": torch.zeros(6, 3, 32, 88, dtype=torch.uint8), "rig": rig})
 
 
 # --- boxes that fit nothing -------------------------------------------------------------------------------------------
