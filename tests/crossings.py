@@ -24,14 +24,14 @@ from arbiview_aug.scene.depth_map import motion_camera
 
 PACKAGE = str(Path(arbiview_aug.__file__).parent)
 BOUNDS = {
-    "street, plan cached": (15, 47),
-    "LiDAR + boxes": (27, 600),
-    "LiDAR + boxes, points scanned": (32, 650),
-    "learned depth": (28, 600),
-    "generated": (29, 1500),
-    "neighbours, all": (35, 2500),
-    "motion": (43, 2600),
-    "paper": (20, 180),
+    "street, plan cached": (17, 53),
+    "LiDAR + boxes": (30, 600),
+    "LiDAR + boxes, points scanned": (35, 650),
+    "learned depth": (29, 600),
+    "generated": (31, 1500),
+    "neighbours, all": (39, 2500),
+    "motion": (47, 2600),
+    "paper": (23, 200),
 }
 """Most files and crossings that a call may have."""
 

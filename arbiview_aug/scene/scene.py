@@ -59,7 +59,7 @@ class Scene:
         arrays = self.boxes, self.points, self.motion
         return all(array is None for array in arrays) and not self.further and not self.corrections
 
-    @property
+    @cached_property
     def best(self) -> GeometryName:
         """The surface that ``auto`` uses: made of the most accurate geometry."""
         motion = self.motion is not None and len(self.motion) > 0

@@ -130,6 +130,20 @@ class RigRetarget(torch.nn.Module):
         refuse_camera_values(self.keys.labels)
         self.inpainter = inpainter_of(holes)  # moves with this module
         self._warn = WarnOnce()
+        self.renderer = self._make_renderer(quality, match_exposure, backend)
+        self._resizer = Resizer(self.size, self.fit, self.keys.extra)
+        if self.size is not None and (mistake := size_mistake(self._base, self.size, self.fit)):
+            self._warn("size", mistake, GeometryWarning)
+        self._scans_points = bool(self._base.lidars) and self.keys.points == "target"
+        self._bars = self.size if self.fit == "pad" else None
+        if isinstance(self.target, Rig):
+            self._fixed_target = self._sized(self.target)
+            warn_of_target(self._fixed_target, self._warn)
+        self._checked: set[frozenset[Any]] = set()  # keys and types of samples that were checked for misnamed keys
+
+    def _make_renderer(
+        self, quality: Any, match_exposure: Harmonise, backend: Backend
+    ) -> PlannedRenderer | PaperRenderer:
         config = render_config(quality)
         is_reused = isinstance(self.target, Rig) or self.target.per != "sample"  # drawn rigs never come back
         settings = RendererSettings(
@@ -145,16 +159,7 @@ class RigRetarget(torch.nn.Module):
             warn=self._warn,
         )
         is_planned = isinstance(config, RenderConfig)
-        self.renderer = PlannedRenderer(config, settings) if is_planned else PaperRenderer(config, settings)
-        self._resizer = Resizer(self.size, self.fit, self.keys.extra)
-        if self.size is not None and (mistake := size_mistake(self._base, self.size, self.fit)):
-            self._warn("size", mistake, GeometryWarning)
-        self._scans_points = bool(self._base.lidars) and self.keys.points == "target"
-        self._bars = self.size if self.fit == "pad" else None
-        if isinstance(self.target, Rig):
-            self._fixed_target = self._sized(self.target)
-            warn_of_target(self._fixed_target, self._warn)
-        self._checked: set[frozenset[Any]] = set()  # keys and types of samples that were checked for misnamed keys
+        return PlannedRenderer(config, settings) if is_planned else PaperRenderer(config, settings)
 
     @property
     def _base(self) -> Rig:
