@@ -141,16 +141,14 @@ class RigRetarget(torch.nn.Module):
             warn_of_target(self._fixed_target, self._warn)
         self._checked: set[frozenset[Any]] = set()  # keys and types of samples that were checked for misnamed keys
 
-    def _make_renderer(
-        self, quality: Any, match_exposure: Harmonise, backend: Backend
-    ) -> PlannedRenderer | PaperRenderer:
+    def _make_renderer(self, quality: Any, exposure: Harmonise, backend: Backend) -> PlannedRenderer | PaperRenderer:
         config = render_config(quality)
         is_reused = isinstance(self.target, Rig) or self.target.per != "sample"  # drawn rigs never come back
         settings = RendererSettings(
             target=self._base,
             geometry=self.geometry,
             reach=self.neighbours,
-            match_exposure=match_exposure,
+            match_exposure=exposure,
             backend=choice("backend", backend, get_args(Backend)),
             cache=self.cache if is_reused else replace(self.cache, max_bytes=0),
             outputs=self.keys.extra,
@@ -158,8 +156,7 @@ class RigRetarget(torch.nn.Module):
             p=self.p,
             warn=self._warn,
         )
-        is_planned = isinstance(config, RenderConfig)
-        return PlannedRenderer(config, settings) if is_planned else PaperRenderer(config, settings)
+        return (PlannedRenderer if isinstance(config, RenderConfig) else PaperRenderer)(config, settings)
 
     @property
     def _base(self) -> Rig:
@@ -236,14 +233,11 @@ class RigRetarget(torch.nn.Module):
         names |= {share} if isinstance(share := self.cache.share_overlap, str) else set()
         return read_frames(sample, self.source, renderer.geometry, further=further, names=names, warn=self._warn)
 
-    def _scan_points(
-        self, frames: Sequence[Frame], target: Rig, is_skipped: bool = False
-    ) -> list[transforms.RetargetedPoints]:
+    def _scan_points(self, frames: Sequence[Frame], target: Rig, is_skipped: bool = False) -> list[Any]:
         """Points of the frames by the target's scanners, if it has any and they are wanted."""
         if not self._scans_points:
             return []
-        uses_neighbours = self.neighbours is not None
-        return transforms.retarget_frames(frames, target, is_skipped, self._warn, neighbours=uses_neighbours)
+        return transforms.retarget_frames(frames, target, is_skipped, self._warn, neighbours=bool(self.neighbours))
 
     def _check_keys(self, sample: Mapping[str, Any], frames: Sequence[Frame]) -> list[str]:
         """Check the sample's further keys, and return those that hold label maps."""
@@ -296,11 +290,7 @@ class RigRetarget(torch.nn.Module):
         return self.renderer.plans
 
     def plan(self, source: Rig | str | Path, target: Rig | str | Path, scene: Scene | None = None) -> RenderPlan:
-        """The cached render plan of a pair of rigs in a scene.
-
-        Raises:
-            ValueError: With ``quality="paper"``.
-        """
+        """The cached render plan of a pair of rigs in a scene; ValueError with ``quality="paper"``."""
         return self.renderer.plan_views(load_rig(source), load_rig(target), scene or Scene())
 
     def prepare(self, source: Rig | str | Path | None = None) -> RenderPlan:
