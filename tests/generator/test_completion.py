@@ -18,7 +18,7 @@ from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, Generator
 from arbiview_aug.generator.config import AutoencoderConfig
 from arbiview_aug.render.rendered import RenderedFrame
-from arbiview_aug.sample.inputs import Frame
+from arbiview_aug.sample.frame import Frame
 from tests.generator.small import ring, small_config, stirred
 from tests.helpers import assert_same_to_a_level
 
