@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from arbiview_aug.cameras.rig import load_rig as load_rig
     from arbiview_aug.cameras.rig import save_rig as save_rig
     from arbiview_aug.cameras.shipped import shipped_rigs as shipped_rigs
+    from arbiview_aug.cameras.validation import Finding as Finding
     from arbiview_aug.datasets.wrappers import MixedDataset as MixedDataset
     from arbiview_aug.datasets.wrappers import RetargetedDataset as RetargetedDataset
     from arbiview_aug.datasets.wrappers import RetargetedIterable as RetargetedIterable
@@ -29,8 +30,7 @@ if TYPE_CHECKING:
     from arbiview_aug.sample.boxes_2d import project_boxes_3d as project_boxes_3d
     from arbiview_aug.sample.collate import collate as collate
     from arbiview_aug.sample.depth_maps import depth_maps as depth_maps
-    from arbiview_aug.sample.findings import CheckReport as CheckReport
-    from arbiview_aug.sample.findings import Finding as Finding
+    from arbiview_aug.sample.mistakes import CheckReport as CheckReport
     from arbiview_aug.sample.mistakes import check as check
     from arbiview_aug.sample.training import lift_mask as lift_mask
     from arbiview_aug.sample.training import visible_boxes as visible_boxes

@@ -309,7 +309,7 @@ def read_rig(path: Path) -> tuple[Rig, str]:
     rig = Rig.from_dict(data, folder=path.parent, where=where)
     if found := doubts(rig.cameras, rig.ground_z_m):
         more = f"; and {len(found) - 4} more" if len(found) > 4 else ""
-        warn(f"{where}: {'; '.join(found[:4])}{more}. If this is meant so, ignore the warning (docs/rigs.md)")
+        warn(f"{where}: {'; '.join(map(str, found[:4]))}{more}. If this is meant so, ignore the warning (docs/rigs.md)")
     return rig, data.get("notes", "")
 
 

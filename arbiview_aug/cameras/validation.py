@@ -1,6 +1,6 @@
-"""Checks of a camera's calibration.
+"""Checks of a camera's calibration, and likely mistakes of a rig's.
 
-All functions take the camera's name first, return read-only values and raise ``CalibrationError`` with the fix.
+``checked_...`` take the camera's name first, return read-only values and raise ``CalibrationError`` with the fix.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -32,12 +33,41 @@ MOST_M = 1e9  # of positions, as far
 _FARTHEST_M, _MOST_HEIGHT_M = 20.0, 8.0  # of a vehicle's cameras, from the ego origin and over the road
 
 _COMPARE = "compare docs/rigs.md"  # the fix of an unknown mistake
-_STEEP_DEG = 60.0  # cameras of vehicles roll less and look up less
+_AS_MOUNTED = "turn the image, or mend its pose; ignore this if it is mounted like that"
+_STEEP_DEG, _DOWN_DEG = 60.0, -75.0  # cameras of vehicles roll less and look up less; few look down more
+_SAME_COSINE = 0.94  # of 20 degrees: such a mistake hardly turns this camera
+
+_LEAST_NAMED, _ALIKE = 3, 0.8
+"""Cameras with sides in their names, and the length of the mean of their turns' unit vectors, to tell of the set."""
+
+_OFF_CENTER, _OFF_CENTER_ALONE, _ALIKE_OFF = 0.04, 0.08, 0.06
+"""Principal points off centre by such a share of the width, in all cameras or in one alone, and by about the same of
+the height, are another resolution's. Real ones are off by up to 0.02 of the width, in both directions."""
 
 BODY_AXES = "a body's axes (ROS: x forward, z up)"  # words of messages
 
 MAX_SIZE_PX = 32766
 """Largest image side: OpenCV's remap needs sizes below 32767."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One probable mistake.
+
+    Attributes:
+        where: The camera or key.
+        expected: The right value.
+        found: The given value.
+        fix: The step that mends it.
+    """
+
+    where: str
+    expected: str
+    found: str
+    fix: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: expected {self.expected}, found {self.found}; {self.fix}"
 
 
 def checked_calibration(
@@ -235,46 +265,107 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
     return f"cameras that lie on their side or look up, {heights} m over the road", _COMPARE
 
 
-def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[str]:
-    """What is likely wrong with the cameras of a rig: poses, directions unlike their names, K of another size.
+def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[Finding]:
+    """Likely mistakes in the cameras of a rig: poses, directions unlike their names, K of another size.
 
     Some may be meant so: cameras that are mounted on their side, or crosswise.
     """
-    cam2ego, sides = np.stack([camera.cam2ego for camera in cameras]), [_side(camera.name) for camera in cameras]
-    mistake, fix = pose_mistake(cam2ego, ground_z_m) or ("", "")
-    y_axes = (cam2ego[:, :3, :3] @ CAMERA_AXES_IN_EGO if mistake == BODY_AXES else cam2ego)[:, 1, 2]
-    swapped = [left * y < -0.35 for y, (_, left) in zip(y_axes, sides, strict=True) if left]  # by 20 degrees or more
+    cam2ego = np.stack([camera.cam2ego for camera in cameras])
+    mistake = pose_mistake(cam2ego, ground_z_m)
+    upright = "cameras upright over the road: cam2ego with axes right, down, forward, in metres"
+    general = [] if mistake is None else [Finding("cam2ego", upright, *mistake)]
+    is_known, is_body = mistake is not None and mistake[1] != _COMPARE, mistake is not None and mistake[0] == BODY_AXES
+    if not is_known or is_body:
+        of_set = _set_mistake(cam2ego, [_side(camera.name) for camera in cameras], is_body)
+        if of_set is not None:
+            return [Finding("cam2ego", "cameras that look where their names say", *of_set)]
+    if is_known:
+        return general
+    y_m, y_axes = cam2ego[:, 1, 3], cam2ego[:, 1, 2]
+    aside = (np.abs(y_m) > 0.1) & (np.abs(y_axes) > 0.5)
+    found = []
+    if aside.sum() > 1 and (y_m * y_axes)[aside].max() < 0:
+        fix = "positions are left-handed (y to the right): negate cam2ego[1, 3]"
+        found.append(
+            Finding("cam2ego", "cameras that look to the left on the left", "y of all positions mirrored", fix)
+        )
+    has_front = any(_side(camera.name) == (1, 0) for camera in cameras)
+    for camera in cameras:
+        where, doubt = f"camera {shown(camera.name)}: cam2ego", pose_doubt(camera, has_front)
+        likely = doubt and next(likely_poses(camera, ground_z_m, has_front), None)
+        if doubt is not None and (likely or camera.elevation_deg >= _DOWN_DEG):  # some look down in earnest
+            as_with, fix = ("", _AS_MOUNTED) if not likely else (f", as with {likely[1]}", likely[2])
+            found.append(Finding(where, doubt[0], doubt[1] + as_with, fix))
+        elif not is_mounted(camera.cam2ego[None], ground_z_m)[0]:
+            at = "({:.1f}, {:.1f}), {:.1f} m over the road".format(
+                *camera.center_m[:2], camera.center_m[2] - ground_z_m
+            )
+            fix = "compare it with the other cameras': metres, and cam2ego instead of its inverse?"
+            found.append(Finding(where, "a place on a vehicle", at, fix))
+    return (found or general) + _size_doubts(cameras)
+
+
+def pose_doubt(camera: Any, has_front: bool) -> tuple[str, str] | None:
+    """What is expected and found of a camera that lies, looks up, or looks elsewhere than its name says; or None."""
+    pose, up_deg, side = camera.cam2ego, camera.elevation_deg, _side(camera.name)
+    if up_deg > _STEEP_DEG or (up_deg < _DOWN_DEG and side[1]):
+        return "a level camera", f"it looks {'up' if up_deg > 0 else 'down'} by {abs(up_deg):.0f} degrees"
+    if up_deg > -_STEEP_DEG and abs(_roll_deg(pose)) > _STEEP_DEG:
+        return "an upright image", f"rolled by {_roll_deg(pose):.0f} degrees"
+    if _belies(pose, side, has_front):
+        return "a camera that looks where its name says", f"it looks to {camera.azimuth_deg:+.0f} degrees"
+    return None
+
+
+def likely_poses(camera: Any, ground_z_m: float, has_front: bool) -> Iterator[tuple[FloatArray, str, str]]:
+    """Poses (4, 4) that a camera's may stand for, what it is instead, and the fix, the likeliest first.
+
+    The camera is upright, nearly level and on the vehicle in each, and looks where its name says.
+    """
+    side = _side(camera.name)
+    staying_first = sorted(
+        _candidates(camera.cam2ego[None]), key=lambda c: bool((c[0][0, :3, 3] != camera.center_m).any())
+    )
+    for (pose,), mistake, fix in staying_first:
+        is_other = np.trace(pose[:3, :3].T @ camera.cam2ego[:3, :3]) < 1 + 2 * _SAME_COSINE
+        is_level = abs(pose[2, 0]) < 0.2 and pose[2, 1] < -0.5 and abs(pose[2, 2]) < 0.6
+        if is_other and is_level and is_mounted(pose[None], ground_z_m)[0] and not _belies(pose, side, has_front):
+            yield pose, mistake, fix
+
+
+def _set_mistake(cam2ego: FloatArray, sides: Sequence[tuple[int, int]], is_body: bool) -> tuple[str, str] | None:
+    """The set mirrored or turned as a whole, by the sides in the cameras' names, and the fix."""
+    axes = (cam2ego[:, :3, :3] @ CAMERA_AXES_IN_EGO if is_body else cam2ego)[:, :2, 2]
+    swapped = [left * axis[1] < -0.35 for axis, (_, left) in zip(axes, sides, strict=True) if left]  # 20 degrees
     if len(swapped) > 1 and all(swapped):
         unreal = "diag(1, -1, 1, 1) @ cam2ego @ [[0, 0, 1, 0], [1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]"
-        fix = unreal if mistake == BODY_AXES else "negate y of the positions, and yaw"
-        return [f"all cameras: left and right are swapped, as in left-handed axes (CARLA, Unreal: y is right): {fix}"]
-    if mistake and fix != _COMPARE:
-        return [f"all cameras: {mistake}: {fix}"]
-    lateral = [pose[1, 3] * pose[1, 2] for pose in cam2ego if abs(pose[1, 3]) > 0.2 and abs(pose[1, 2]) > 0.5]
+        fix = unreal if is_body else "negate cam2ego[1] and cam2ego[:, 0]"
+        return "left and right are swapped, as in left-handed axes (CARLA, Unreal: y is right)", fix
+    named = [complex(*axis) / complex(*side) * abs(complex(*side)) for axis, side in zip(axes, sides, strict=True)
+             if any(side) and math.hypot(*axis) > 0.5]  # fmt: skip
+    turn = np.mean(named) if len(named) >= _LEAST_NAMED and not is_body else 0j
+    turn_deg = math.degrees(np.angle(turn))
+    if abs(turn) > _ALIKE and abs(turn_deg) > 60:
+        fix = f"x of the ego frame is forward: turn poses, points and boxes by {-turn_deg:.0f} degrees about z"
+        return f"all cameras turned by {turn_deg:.0f} degrees", fix
+    return None
+
+
+def _size_doubts(cameras: Sequence[Any]) -> list[Finding]:
+    """Cameras whose K is of an image of another size: principal points off centre by the same share both ways."""
+    sizes = np.array([camera.size[::-1] for camera in cameras])
+    middles = np.stack([camera.K[:2, 2] for camera in cameras]) + 0.5
+    off = middles / sizes - 0.5
+    together = (np.abs(off[:, 0]) > _OFF_CENTER).all() and len(set(np.sign(off[:, 0]))) == 1
     found = []
-    if len(lateral) > 1 and max(lateral) < 0:
-        found.append("all cameras: those on the left look to the right: is y of the positions mirrored?")
-    has_front = (1, 0) in sides
-    for camera, side in zip(cameras, sides, strict=True):
-        pose, up_deg, said = camera.cam2ego, camera.elevation_deg, []
-        likely = (f", as with {a}: {b}" for right, a, b in _candidates(pose[None]) if _fits(right[0], side, has_front))
-        fix = next(likely, "")
-        if up_deg > _STEEP_DEG or (up_deg < -75 and side[1] and fix):
-            said.append(f"looks {'up' if up_deg > 0 else 'down'} by {abs(up_deg):.0f} degrees")
-        elif up_deg > -_STEEP_DEG and abs(_roll_deg(pose)) > _STEEP_DEG:
-            said.append(f"is rolled by {_roll_deg(pose):.0f} degrees")
-        elif _belies(pose, side, has_front):
-            said.append(f"looks to {camera.azimuth_deg:+.0f} degrees, unlike its name")
-        said = [f"{words}{fix}" for words in said]
-        if not said and not is_mounted(pose[None], ground_z_m)[0]:
-            said.append("is at ({:.1f}, {:.1f}), {:.1f} m over the road".format(*pose[:2, 3], pose[2, 3] - ground_z_m))
-        size, middle = np.array(camera.size[::-1]), camera.K[:2, 2] + 0.5
-        (x, y), other = middle / size, middle / size[::-1]
-        is_scaled = abs(x / y - 1) < 0.1 and not 0.37 < x < 0.67
-        is_swapped = max(abs(x - 0.5), abs(y - 0.5)) > 0.1 and np.abs(other - 0.5).max() < 0.05
-        if is_scaled or is_swapped or not (0 < x < 1 and 0 < y < 1):
-            said.append("has K of an image of {:.0f}x{:.0f}, not of {}x{}".format(*2 * middle, *size))
-        found += [f"camera {shown(camera.name)} {words}" for words in said]
+    for camera, (x, y), (w, h), middle in zip(cameras, off, sizes, middles, strict=True):
+        is_scaled = abs(x) > (_OFF_CENTER if together else _OFF_CENTER_ALONE) and abs(x - y) < _ALIKE_OFF
+        is_turned = max(abs(x), abs(y)) > 0.1 and np.abs(middle / (h, w) - 0.5).max() < 0.05
+        if is_scaled or is_turned or max(abs(x), abs(y)) > 0.5:
+            expected = f"a principal point near the middle of {w}x{h} pixels"
+            is_of = "the middle of about {:.0f}x{:.0f} pixels".format(*2 * middle)
+            fix = "is K of another resolution? Camera.resize scales it"
+            found.append(Finding(f"camera {shown(camera.name)}: K", expected, is_of, fix))
     return found
 
 
@@ -298,27 +389,26 @@ def _roll_deg(pose: FloatArray) -> float:
     return math.degrees(math.atan2(pose[2, 0], -pose[2, 1]))
 
 
-def _fits(pose: FloatArray, side: tuple[int, int], has_front: bool) -> bool:
-    """Whether a camera is upright, nearly level, and looks where its name says."""
-    return abs(_roll_deg(pose)) < 45 and abs(pose[2, 2]) < 0.7 and not _belies(pose, side, has_front)
-
-
 def _candidates(cam2ego: FloatArray) -> Iterator[tuple[FloatArray, str, str]]:
     """Poses (N, 4, 4) that wrong ones may stand for, what these are instead, and the fix."""
-    body, metres, upside_down = np.eye(4), cam2ego.copy(), np.diag([1.0, -1, -1, 1])
+    body, metres, turned = np.eye(4), cam2ego.copy(), cam2ego.copy()
     body[:3, :3] = CAMERA_AXES_IN_EGO
     metres[:, :3, 3] /= 1000
+    turned[:, :3, :3] = cam2ego[:, :3, :3].transpose(0, 2, 1)
     axes = f"by {CAMERA_AXES_IN_EGO.astype(int).tolist()} from the"
     yield metres, "positions in millimetres", "divide cam2ego[:3, 3] by 1000"
     yield cam2ego @ body, BODY_AXES, f"multiply cam2ego[:3, :3] {axes} right"
     yield body @ cam2ego, "an ego frame with a camera's axes (z forward)", f"multiply cam2ego[:3] {axes} left"
-    yield cam2ego @ upside_down, "OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]"
+    yield cam2ego @ np.diag([1.0, -1, -1, 1]), "OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]"
     yield np.asarray(np.linalg.inv(cam2ego), np.float64), "ego2cam, the inverse", "pass np.linalg.inv(cam2ego)"
+    yield turned, "ego2cam's rotation, the inverse", "transpose cam2ego[:3, :3]"
     for given, read, order in (("x y z w", "w x y z", [3, 0, 1, 2]), ("w x y z", "x y z w", [1, 2, 3, 0])):
         right = cam2ego.copy()
         quaternions = np.stack([quaternion_from_rotation(pose[:3, :3])[order] for pose in cam2ego])
         right[:, :3, :3] = rotation_from_quaternion(quaternions)
-        yield right, f"a quaternion in the order {given}, read as {read}", f"pass it as {read}"
+        yield right, f"a quaternion {given} read as {read}", f"pass it as {read}"
+    mirrored = np.diag([1.0, -1, 1, 1]) @ cam2ego @ np.diag([-1.0, 1, 1, 1])
+    yield mirrored, "y to the right (a left-handed frame)", "negate cam2ego[1] and cam2ego[:, 0]"
 
 
 def _stands(cam2ego: FloatArray) -> BoolArray:

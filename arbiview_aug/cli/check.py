@@ -17,10 +17,9 @@ from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.report.pictures import draw_labels, save_picture
 from arbiview_aug.sample.camera_mistakes import neighbour_errors
-from arbiview_aug.sample.findings import CheckReport
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.sample.mistakes import check, check_own_car, check_rig
+from arbiview_aug.sample.mistakes import CheckReport, check, check_own_car, check_rig
 
 _MOST_HELD = 8  # frames in memory at once, in which the own car is looked for
 

@@ -1,8 +1,7 @@
-"""Mistakes of single cameras: their axes and names, points on their images, neighbours that disagree, the own car."""
+"""Mistakes of single cameras that images show: points on them, neighbours that disagree, the own car."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, islice, pairwise
@@ -16,112 +15,10 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cameras.rotations import (
-    CAMERA_AXES_IN_EGO,
-    quaternion_from_rotation,
-    rotation_from_quaternion,
-)
-from arbiview_aug.cameras.validation import BODY_AXES
-from arbiview_aug.sample.findings import Finding
+from arbiview_aug.cameras.validation import Finding, likely_poses, pose_doubt
 from arbiview_aug.scene.surface import Points
 
 Gray = npt.NDArray[np.float32]
-
-MIRROR = np.diag([1.0, -1.0, 1.0])
-"""From a left-handed frame, y to the right, to the ego frame."""
-
-# --- poses and names --------------------------------------------------------------------------------------------------
-_SIDES = {"front": (1, 0), "back": (-1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}
-_AGAINST = -0.5  # cosine: a side's camera may look 30 degrees past the front or the back, as stereo pairs do not
-
-_LEVEL = 0.2, 0.6  # sines of a mounted camera's roll and elevation
-
-_SAME_COSINE = 0.94  # of 20 degrees: such a mistake hardly turns this camera, and points cannot tell it
-
-_LEAST_NAMED, _ALIKE = 3, 0.8
-"""Cameras with sides in their names, and the length of the mean of their unit vectors, for them to tell of the set."""
-
-
-def _opposes(name: str, cam2ego: FloatArray) -> list[str]:
-    """Sides in a camera's name that its optical axis points away from."""
-    sides = re.findall("|".join(_SIDES), name.lower())
-    return [side for side in sides if np.dot(_SIDES[side], cam2ego[:2, 2]) < _AGAINST]
-
-
-def likely_readings(camera: Camera) -> Iterator[tuple[str, str, FloatArray]]:
-    """What a pose may be instead, the fix, and the pose that is then meant, the likeliest first.
-
-    The camera is upright and level in it, and looks to the side in its name.
-    """
-    R, body = camera.cam2ego[:3, :3], CAMERA_AXES_IN_EGO
-    w, x, y, z = quaternion_from_rotation(R)
-    axes = f"by {body.astype(int).tolist()} from the"
-    mirrored = MIRROR @ R * (-1, 1, 1)
-    for found, fix, meant in (
-        (BODY_AXES, f"multiply cam2ego[:3, :3] {axes} right", R @ body),
-        ("OpenGL's axes (y up, z backward)", "negate cam2ego[:3, 1:3]", R * (1, -1, -1)),
-        ("a quaternion x y z w read as w x y z", "reorder it", rotation_from_quaternion((z, w, x, y))),
-        ("a quaternion w x y z read as x y z w", "reorder it", rotation_from_quaternion((x, y, z, w))),
-        ("ego2cam's rotation, the inverse", "transpose cam2ego[:3, :3]", R.T),
-        ("an ego frame with a camera's axes (z forward)", f"multiply cam2ego[:3] {axes} left", body @ R),
-        ("y to the right (a left-handed frame)", "negate cam2ego[1] and cam2ego[:, 0]", mirrored),
-    ):
-        is_other = np.trace(meant.T @ R) < 1 + 2 * _SAME_COSINE
-        is_level = abs(meant[2, 0]) < _LEVEL[0] and abs(meant[2, 2]) < _LEVEL[1]
-        if is_other and is_level and _is_upright(meant) and not _opposes(camera.name, meant):
-            yield found, fix, np.vstack([np.hstack([meant, camera.cam2ego[:3, 3:]]), camera.cam2ego[3:]])
-
-
-def _set_finding(rig: Rig) -> Finding | None:
-    """The set mirrored or turned as a whole, by the sides in the cameras' names."""
-    names, axes = [], []
-    for camera in rig:
-        sides = [complex(*_SIDES[side]) for side in re.findall("|".join(_SIDES), camera.name.lower())]
-        if abs(sum(sides)) > 0.5 and np.hypot(*camera.cam2ego[:2, 2]) > 0.5:
-            names.append(sum(sides) / abs(sum(sides)))
-            axes.append(complex(*camera.cam2ego[:2, 2]))
-    if len(names) < _LEAST_NAMED:
-        return None
-    turned = complex(np.mean(np.multiply(axes, np.conj(names))))
-    mirrored = float(np.mean(np.multiply(axes, names)).real)
-    turn = float(np.degrees(np.angle(turned)))
-    if abs(turned) > _ALIKE and abs(turn) > 60:
-        fix = f"turn poses, points and boxes by {-turn:.0f} degrees about z"
-        return Finding("cam2ego", "x of the ego frame forward", f"all cameras turned by {turn:.0f} degrees", fix)
-    if mirrored > max(_ALIKE, abs(turned)):
-        fix = "the frame is left-handed (y to the right): negate cam2ego[1] and cam2ego[:, 0]; or were sides swapped?"
-        return Finding("cam2ego", "left cameras that look to the left, y > 0", "all sides mirrored", fix)
-    return None
-
-
-def pose_findings(rig: Rig) -> Iterator[Finding]:
-    """Cameras that lie, or look away from the side in their name; the whole set where it is mirrored or turned."""
-    if (set_finding := _set_finding(rig)) is not None:
-        yield set_finding
-        return
-    lean, y_m = rig.cam2ego[:, 1, 2], rig.cam2ego[:, 1, 3]
-    aside = (np.abs(lean) > 0.5) & (np.abs(y_m) > 0.1)
-    if aside.sum() > 1 and (np.sign(lean[aside]) != np.sign(y_m[aside])).all():
-        fix = "positions are left-handed (y to the right): negate cam2ego[1, 3]"
-        yield Finding("cam2ego", "cameras that look to the left on the left", "y of all positions mirrored", fix)
-    for camera in rig:
-        pose, sides = camera.cam2ego, _opposes(camera.name, camera.cam2ego)
-        expected, found = f"a camera that looks to the {''.join(sides[:1])}", f"{camera.azimuth_deg:+.0f} degrees"
-        if not _is_upright(pose):
-            roll = np.degrees(np.arctan2(pose[2, 0], -pose[2, 1]))
-            expected = "an upright image"
-            found = f"rolled by {roll:.0f} degrees, looking {camera.elevation_deg:.0f} degrees up"
-        elif not sides:
-            continue
-        unknown = "", "turn the image, or mend its pose; ignore this if it is mounted like that"
-        how, fix = next(((f": {how}", fix) for how, fix, _ in likely_readings(camera)), unknown)
-        yield Finding(f"camera {camera.name!r}: cam2ego", expected, found + how, fix)
-
-
-def _is_upright(cam2ego: FloatArray) -> bool:
-    """Whether an image's lower edge is down and it does not show the sky, or it shows the road from above."""
-    return bool((cam2ego[2, 1] < -0.5 and cam2ego[2, 2] < 0.5) or cam2ego[2, 2] < -0.8)
-
 
 # --- points on images -------------------------------------------------------------------------------------------------
 EDGE_WIDTH_PX, _NEARER, _LEAST_EDGES = 160, 0.2, 50
@@ -186,23 +83,22 @@ def total(fits: Sequence[EdgeFit]) -> EdgeFit:
     return EdgeFit(sum(fit.gain * fit.edges for fit in fits) / max(edges, 1), edges)
 
 
-def fit_findings(views: Sequence[tuple[Camera, Gray]], points: Points) -> Iterator[Finding]:
+def fit_findings(rig: Rig, views: Sequence[tuple[Camera, Gray]], points: Points) -> Iterator[Finding]:
     """Cameras that points do not fit although they fit others, where another pose or image is clearly better.
 
-    Those whose pose alone is impossible are left to ``pose_findings``.
+    Those whose pose alone is impossible are left to ``validation.doubts``.
     """
     fits = [edge_fit(camera, ranks, points) for camera, ranks in views]
     for k, (camera, ranks) in enumerate(views):
         others = total(fits[:k] + fits[k + 1 :])
-        is_doubted = not _is_upright(camera.cam2ego) or _opposes(camera.name, camera.cam2ego)
-        if is_doubted or fits[k].gain > CLEAR_FIT or others.gain < CLEAR_FIT:
+        if pose_doubt(camera, True) is not None or fits[k].gain > CLEAR_FIT or others.gain < CLEAR_FIT:
             continue
         where, expected = f"camera {camera.name!r}", "points on the edges of its image"
         order = "are the images in another order?"
         tries = [(where, f"they fit that of {other.name!r}", order, camera, image) for other, image in views]
         tries = [way for way in tries if way[-1] is not ranks and way[-1].shape == ranks.shape]
-        for found, fix, meant in likely_readings(camera):
-            tries.append((f"{where}: cam2ego", found, fix, replace(camera, cam2ego=meant), ranks))
+        for pose, found, fix in likely_poses(camera, rig.ground_z_m, True):
+            tries.append((f"{where}: cam2ego", found, fix, replace(camera, cam2ego=pose), ranks))
         better = (way for way in tries if edge_fit(*way[3:], points).beats(fits[k]))
         yield from (Finding(at, expected, found, fix) for at, found, fix, *_ in islice(better, 1))
 

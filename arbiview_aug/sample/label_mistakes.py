@@ -12,17 +12,16 @@ import torch
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.rotations import rotation_z
+from arbiview_aug.cameras.validation import Finding
 from arbiview_aug.sample.camera_mistakes import (
     CLEAR_FIT,
     EDGE_WIDTH_PX,
-    MIRROR,
     edge_fit,
     edge_ranks,
     fit_findings,
     gray,
     total,
 )
-from arbiview_aug.sample.findings import Finding
 from arbiview_aug.scene.boxes import points_in
 from arbiview_aug.scene.point_cloud import own_car
 from arbiview_aug.scene.surface import Points
@@ -110,7 +109,7 @@ def label_findings(
 
 
 _FLIPS: tuple[tuple[str, FloatArray, str, str], ...] = (
-    ("mirrored (y to the right)", MIRROR, "negate y", "negate y and yaw"),
+    ("mirrored (y to the right)", np.diag([1.0, -1, 1]), "negate y", "negate y and yaw"),
     ("with x backward", np.diag([-1.0, 1, 1]), "negate x", "negate x, and pass pi - yaw"),
     ("with x and y swapped", np.eye(3)[[1, 0, 2]], "swap x and y", "swap x and y, and pass pi / 2 - yaw"),
     ("with y to the right and z down", np.diag([1.0, -1, -1]), "negate y and z", "negate y, z and yaw"),
@@ -171,7 +170,7 @@ def _points_finding(
         if other.beats(fit) and other.gain > best.gain:
             best, chosen, moved = other, reading, there
     if chosen is None:
-        return list(fit_findings(views, xyz)), points, fit.gain > CLEAR_FIT
+        return list(fit_findings(rig, views, xyz)), points, fit.gain > CLEAR_FIT
     seen = f"points {chosen.found}, by the edges of the images"
     return [Finding("points", "points in the ego frame", seen, chosen.fix)], moved, True
 

@@ -386,17 +386,17 @@ def test_sound_rigs_raise_no_doubt() -> None:
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("front", BODY, r"'front' looks up by 90 degrees, as with a body's axes"),
-        ("left", BODY, "'left' looks up by 90 degrees, as with a body's axes"),
-        ("left", np.diag([-1.0, -1.0, 1.0]), "'left' is rolled by -?180 degrees"),
+        ("front", BODY, "'front'.*looks up by 90 degrees, as with a body's axes"),
+        ("left", BODY, "'left'.*looks up by 90 degrees, as with a body's axes"),
+        ("left", np.diag([-1.0, -1.0, 1.0]), "'left'.*rolled by -?180 degrees"),
         ("left", np.diag([1.0, -1.0, -1.0]), "OpenGL's axes"),
-        ("back", np.diag([-1.0, 1.0, -1.0]), "'back' looks to .*0 degrees, unlike its name"),
+        ("back", np.diag([-1.0, 1.0, -1.0]), "'back'.*where its name says, found it looks to .*0 degrees"),
     ],
 )
 def test_one_camera_of_several(name: str, change: np.ndarray, message: str) -> None:
     rig = [turned(c, c.cam2ego[:3, :3] @ change) if c.name == name else c for c in AROUND]
     (said,) = doubts(rig, 0.0)
-    assert re.search(message, said), said
+    assert re.search(message, str(said)), said
 
 
 @pytest.mark.parametrize("order", [[1, 2, 3, 0], [3, 0, 1, 2]])
@@ -404,7 +404,7 @@ def test_quaternions_in_another_order(order: list[int]) -> None:
     left = at("left", 80.0, elevation_deg=-7.0)
     wrong = rotation_from_quaternion(quaternion_from_rotation(left.cam2ego[:3, :3])[order])
     (said,) = doubts([AROUND[0], turned(left, wrong), *AROUND[2:]], 0.0)
-    assert "a quaternion in the order" in said
+    assert "a quaternion" in said.found
 
 
 def test_mirrored_rigs_are_called_left_handed(tmp_path: Path) -> None:
@@ -420,13 +420,13 @@ def test_mirrored_rigs_are_called_left_handed(tmp_path: Path) -> None:
         with pytest.raises(CalibrationError, match=f"right-handed axes, got mirrored, left-handed.*{fix}"):
             turned(AROUND[0], axes)
     crossed = [at("left", 90.0, position_m=(0, -1, 1.5)), at("right", -90.0, position_m=(0, 1, 1.5))]
-    assert "is y of the positions mirrored" in doubts(crossed, 0.0)[0]
+    assert "y of all positions mirrored" in doubts(crossed, 0.0)[0].found
 
 
 @pytest.mark.parametrize("size", [(36, 48), (96, 72), (144, 192)])
 def test_intrinsics_of_another_size(size: tuple[int, int]) -> None:
     (said,) = doubts([camera(size=size, K=camera().K)], 0.0)
-    assert f"has K of an image of 96x72, not of {size[1]}x{size[0]}" in said
+    assert f"middle of {size[1]}x{size[0]} pixels, found the middle of about 96x72" in str(said)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not doubts([camera().crop(10, 0, (62, 96)), camera("b", 1.0)], 0.0)

@@ -273,11 +273,11 @@ MISTAKES: dict[str, tuple[Callable[[Sample], Sample], str]] = {
     ),
     "left-handed poses": (
         poses(lambda pose: MIRROR @ pose @ np.diag([-1.0, 1, 1, 1])),
-        "cam2ego: .*all sides mirrored; the frame is left-handed",
+        r"cam2ego: .*left and right are swapped.*; negate cam2ego\[1\] and",
     ),
     "y of the ego frame forward": (
         poses(lambda pose: np.vstack([rotation_z(90) @ pose[:3], pose[3:]])),
-        "cam2ego: .*x of the ego frame forward.*turned by 1[12]. degrees",
+        "cam2ego: .*turned by 1[12]. degrees; x of the ego frame is forward",
     ),
     "a mask that hides all": (
         cameras(lambda c: replace(c, mask=np.zeros(c.size, bool))),
