@@ -10,9 +10,7 @@ from collections.abc import Callable, Sequence
 import cv2
 import numpy as np
 
-from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.displaced import own_index
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors, to_bytes
 from arbiview_aug.evaluate.methods import Method, Sample
@@ -20,7 +18,6 @@ from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.view_planner import build_plan
 
 Renderer = Callable[[Rig, Sequence[Image], Rig], list[RenderedView]]  # source rig, its images, target rig to views
-SPLIT_DEPTH_M = 50.0  # depth above the horizon row in ``row_split``, from UniDrive
 
 
 def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
@@ -78,45 +75,7 @@ def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[Re
     return views
 
 
-def row_split(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
-    """Project the road plane below the horizon row and a plane 50 m ahead above it, as UniDrive does.
-
-    Nearest-neighbour sampling; the last source in the rig's order wins. SampleError for lenses other than pinhole.
-    """
-    if any(not camera.is_rectilinear for camera in (*source, *target)):
-        raise SampleError("row_split: expected pinhole cameras; use Rig.undistorted()")
-    views: list[RenderedView] = []
-    for camera in target:
-        points = _split_points(camera.K, camera.cam2ego, camera.size, source.ground_z_m).reshape(-1, 3)
-        view, seen = np.zeros((len(points), 3), np.float32), np.zeros(len(points), bool)
-        for at, image in zip(source, images, strict=True):
-            ahead = np.flatnonzero((points - at.center_m) @ at.cam2ego[:3, 2] > 0)  # cheap test that halves the points
-            uv, _, valid = at.project(points[ahead])
-            pixel = np.floor(uv + 0.5)
-            inside = valid & (pixel >= 0).all(-1) & (pixel < (at.width_px, at.height_px)).all(-1)
-            index, (column, row) = ahead[inside], pixel[inside].astype(np.int64).T
-            if at.mask is not None:
-                free = at.mask[row, column]
-                index, column, row = index[free], column[free], row[free]
-            view[index] = np.asarray(image)[row, column]
-            seen[index] = True
-        views.append(RenderedView(view.reshape(*camera.size, 3), seen.reshape(camera.size)))
-    return views
-
-
-def _split_points(K: FloatArray, cam2ego: FloatArray, size: tuple[int, int], ground_z_m: float) -> FloatArray:
-    """Scene points (h, w, 3) of ``row_split`` in the ego frame."""
-    v, u = np.indices(size, dtype=np.float64)
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(size)], -1)
-    down = rays @ cam2ego[2, :3]  # the ego's z along a ray of unit depth
-    with np.errstate(divide="ignore"):
-        road_m = (ground_z_m - cam2ego[2, 3]) / down
-    below = (v > K[1, 2]) & (road_m > 0)
-    depth = np.where(below, np.minimum(road_m, 1e4), SPLIT_DEPTH_M)
-    return (rays * depth[..., None]) @ cam2ego[:3, :3].T + cam2ego[:3, 3]
-
-
-BASELINES: dict[str, Renderer] = {"own camera": own_camera, "crop and slide": crop_and_slide, "row split": row_split}
+BASELINES: dict[str, Renderer] = {"own camera": own_camera, "crop and slide": crop_and_slide}
 
 
 def method_of(name: str, renderer: Renderer) -> Method:

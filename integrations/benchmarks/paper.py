@@ -7,14 +7,13 @@ four other vehicles, and the cameras 1 m higher (a truck). Every method gets ima
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib.util import find_spec
 from itertools import product, starmap
 from pathlib import Path
 from typing import Any
@@ -31,16 +30,13 @@ from arbiview_aug.cli.arguments import (
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.errors import CalibrationError, DataError, SampleError
+from arbiview_aug.errors import CalibrationError, SampleError
 from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scores
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.evaluate.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets
 from arbiview_aug.favs.config import PaperConfig
-from arbiview_aug.generator import Diffusion, load_inpainter
-from arbiview_aug.generator.config import TrainedOn
-from arbiview_aug.inpaint.inpainter import Inpainter
 from integrations.benchmarks.baselines import BASELINES, method_of
 from integrations.benchmarks.study import run_study, study_parser
 
@@ -83,7 +79,6 @@ class Study:
 
     means: dict[str, dict[str, dict[str, dict[str, float]]]] = field(default_factory=dict)
     declined: dict[str, str] = field(default_factory=dict)
-    generator: str | None = None  # whose row it is; None for the shipped weights
 
     def as_dict(self) -> dict[str, Any]:
         """Plain data for JSON, with the paper's numbers."""
@@ -96,7 +91,6 @@ def measure_paper(
     frames: int | None = None,
     size: tuple[int, int] | None = None,
     methods: Sequence[Method] | None = None,
-    trained_on: TrainedOn | None = None,
     tick: Callable[[str, int], None] = lambda _, __: None,
 ) -> Study:
     """Measure all rows on a folder of real frames; by default on ``REAL_FRAMES`` below ARBIVIEW_DATA and on streets.
@@ -105,11 +99,10 @@ def measure_paper(
         frames: Frames per data set; by default 1 of real ones and ``SYNTHETIC_FRAMES``.
         size: (h, w) of the synthetic images.
         methods: By default ``study_methods``.
-        trained_on: Data of the generator's training, of which only held-out frames are measured.
         tick: Called before each step with its name and the number of steps so far.
     """
     study, rows, steps = Study(), methods or study_methods(), 0
-    for name, data_set in _data_sets(data, frames, size, trained_on):
+    for name, data_set in _data_sets(data, frames, size):
         collected: dict[str, dict[str, list[dict[str, float]]]] = {m.name: {kind: [] for kind in SETS} for m in rows}
         for frame in data_set:
             for kind in SETS:
@@ -129,34 +122,21 @@ def measure_paper(
 
 
 def _data_sets(
-    data: str | Path | None, frames: int | None, size: tuple[int, int] | None, trained_on: TrainedOn | None
+    data: str | Path | None, frames: int | None, size: tuple[int, int] | None
 ) -> Iterator[tuple[str, Iterator[ScoredFrame]]]:
     root = os.environ.get("ARBIVIEW_DATA")
     folders = [Path(data)] if data is not None else [Path(root) / name for name in REAL_FRAMES] if root else []
     for folder in folders:
         if data is not None or folder.is_dir():
             samples = open_data(folder, reduce=REDUCE)
-            indices = unseen_frames(trained_on, folder, min(frames or 1, len(samples)))
-            yield data_name(folder), (make_frame(_bare(samples[k])) for k in indices)
+            yield data_name(folder), (make_frame(_bare(samples[k])) for k in range(min(frames or 1, len(samples))))
     if data is None:
-        streets = unseen_frames(trained_on, None, frames or SYNTHETIC_FRAMES)
-        seed = SYNTHETIC_SEED if trained_on is None or trained_on.unseen(None) is None else trained_on.seed
-        drive = SyntheticDrive(demo_source_rig(size or SYNTHETIC_SIZE), num_frames=max(streets) + 1, seed=seed)
+        rig, count = demo_source_rig(size or SYNTHETIC_SIZE), frames or SYNTHETIC_FRAMES
+        drive = SyntheticDrive(rig, num_frames=count, seed=SYNTHETIC_SEED)
         yield (
             SYNTHETIC,
-            (make_frame(_bare(drive[k]), truth=partial(drive.render, k), exposures=("raw",)) for k in streets),
+            (make_frame(_bare(drive[k]), truth=partial(drive.render, k), exposures=("raw",)) for k in range(count)),
         )
-
-
-def unseen_frames(trained_on: TrainedOn | None, data: str | Path | None, count: int) -> Sequence[int]:
-    """The first frames of a folder, or of streets (None): held-out ones of the data that a generator was trained on.
-
-    DataError if that data has none.
-    """
-    held_out = None if trained_on is None else trained_on.unseen(data)
-    if held_out is not None and not held_out:
-        raise DataError(f"{data or SYNTHETIC}: the generator was trained on all of its scenes; expected other data")
-    return range(count) if held_out is None else held_out[:count]
 
 
 def _bare(sample: Mapping[str, Any]) -> dict[str, Any]:
@@ -167,10 +147,6 @@ def _bare(sample: Mapping[str, Any]) -> dict[str, Any]:
 _FOUR = (("PSNR", "{psnr_db:.2f}"), ("SSIM", "{ssim:.4f}"), ("MAE", "{mae:.2f}"), ("RMSE", "{rmse:.2f}"))
 _HEADINGS = {"paper": "six", "yaw": "turned", "vehicles": "vehicles", "truck": "truck"}
 _TURNS = ", ".join(f"{yaw:g}" for yaw in YAWS_DEG)
-_OWN_GENERATOR = (
-    f"*{GENERATED}*: `fast`, its holes by {{}}. Frames of the data that it was trained on are held-out ones; the "
-    "paper's were trained on nuScenes from Stable Diffusion's."
-)
 _GENERATOR = (
     f"*{GENERATED}*: `fast`, its holes by the weights in the package, which were trained on synthetic streets alone, "
     "those of the synthetic columns among them, "
@@ -190,9 +166,8 @@ _OTHERS = (
 
 def paper_report(study: Study) -> str:
     """Markdown tables: the paper's measure, PSNR on all targets, losses, and differences in protocol."""
-    parts = [] if not study.means else [_SIX, _six(study), _OTHERS, _others(study), *_losses(study)]
-    of_generator = _GENERATOR if study.generator is None else _OWN_GENERATOR.format(study.generator)
-    caption = [of_generator] if GENERATED in _methods(study) else []
+    parts = [] if not study.means else [_SIX, _six(study), _OTHERS, _others(study)]
+    caption = [_GENERATOR] if GENERATED in _methods(study) else []
     return "\n\n".join([*parts, *caption, *(f"{where}: {why}" for where, why in study.declined.items()), PROTOCOL])
 
 
@@ -226,22 +201,6 @@ def _others(study: Study) -> str:
     return markdown_table(head, rows)
 
 
-def _losses(study: Study) -> list[str]:
-    """Sentence on the baselines that are above ours, with unseen pixels black."""
-    losses = []
-    for of, methods in study.means.items():
-        metric = "true_psnr_db" if _has_truth(methods) else "even_psnr_db"
-        for kind, heading in _HEADINGS.items():
-            db = {name: kinds[kind][metric] for name, kinds in methods.items() if metric in kinds.get(kind, {})}
-            baselines = {name: db[name] for name in (*BASELINES, "paper") if name in db}
-            best = max(baselines.values(), default=-math.inf)
-            below = [f"{name} {db[name]:.2f}" for name in OURS if name in db and db[name] < best]
-            above = [f"{name} {value:.2f}" for name, value in baselines.items() if value == best]
-            if below:
-                losses.append(f"{of}, {heading}: {', '.join(above)} above {', '.join(below)}")
-    return [f"Baselines above ours, unseen pixels black: {'; '.join(losses)}."] if losses else []
-
-
 def _methods(study: Study) -> list[str]:
     return list(dict.fromkeys(name for methods in study.means.values() for name in methods))
 
@@ -272,26 +231,16 @@ def paper_stages() -> dict[str, PaperConfig]:
     }
 
 
-def study_methods(generator: Inpainter | None = None) -> list[Method]:
-    """Rows of the paper's tables and ours, from images and poses alone.
-
-    The generator's row is of the shipped weights if none is given, and only with diffusers.
-    """
+def study_methods() -> list[Method]:
+    """Rows of the paper's tables and ours, from images and poses alone; the generator's only with diffusers."""
     published = [retargeting(config, "auto", name) for name, config in paper_stages().items()]
     return [
         *starmap(method_of, BASELINES.items()),
         *published,
         *(retargeting(quality, "street", quality) for quality in OURS),
         retargeting("fast", "street", INPAINTED, holes="telea"),
-        *generating(GENERATED, generator),
+        *([retargeting("fast", "street", GENERATED, holes="diffusion")] if find_spec("diffusers") else []),
     ]
-
-
-def generating(name: str, generator: Inpainter | None) -> list[Method]:
-    """``fast`` with holes by a generator, or by the shipped weights; nothing where these are not installed."""
-    if generator is None and importlib.util.find_spec("diffusers") is None:
-        return []
-    return [retargeting("fast", "street", name, holes=generator or "diffusion")]
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -308,7 +257,6 @@ def parser() -> argparse.ArgumentParser:
         "--data FOLDER",
     )
     add_data(parser, "nuscenes-one and ddad-one below ARBIVIEW_DATA, and synthetic streets")
-    parser.add_argument("--generator", metavar="PATH", help="of the row *generator*; frames are held-out ones")
     parser.add_argument("--frames", type=count, metavar="N", help="frames of tables (default: 1; 3 synthetic ones)")
     parser.add_argument("--size", type=size, metavar="HxW", help="of synthetic images (default: 256x704)")
     add_output(parser)
@@ -317,18 +265,8 @@ def parser() -> argparse.ArgumentParser:
 
 def _run(arguments: argparse.Namespace) -> None:
     folder = writable_folder(Path(arguments.output), arguments.output)
-    generator = None if arguments.generator is None else load_inpainter(arguments.generator)
-    trained_on = generator.generator.trained_on if isinstance(generator, Diffusion) else None
     with named_steps([]) as tick:  # warnings of targets half outside the view are expected
-        study = measure_paper(
-            arguments.data,
-            frames=arguments.frames,
-            size=arguments.size,
-            methods=study_methods(generator),
-            trained_on=trained_on,
-            tick=tick,
-        )
-    study.generator = arguments.generator
+        study = measure_paper(arguments.data, frames=arguments.frames, size=arguments.size, tick=tick)
     (folder / "paper.json").write_text(json.dumps(study.as_dict(), indent=1) + "\n")
     print(f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}")
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
-from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.errors import SampleError
-from integrations.benchmarks.baselines import BASELINES, SPLIT_DEPTH_M, crop_and_slide, own_camera, row_split
+from integrations.benchmarks.baselines import BASELINES, crop_and_slide, own_camera
 from tests import helpers
 from tests.helpers import ring
 
@@ -65,31 +62,3 @@ def test_crop_and_slide_is_a_window_over_strips() -> None:
     np.testing.assert_array_equal(row[63:], np.broadcast_to(COLOURS[0], (118, 3)))
     (back,) = crop_and_slide(rig, images, rig.with_cameras([camera("any", 180.0)]))
     assert tuple(back.image[45, 90]) == COLOURS[2], "the panorama is closed"
-
-
-def test_row_split_is_the_road_below_the_horizon_and_a_plane_above() -> None:
-    """f = 90.5 px, the horizon at row 45."""
-    row, column = (np.broadcast_to(axis[..., None], (91, 181, 3)).astype(np.uint8) for axis in np.indices((91, 181)))
-    (view,) = row_split(Rig([camera()]), [row], Rig([camera(position_m=(0.0, 0.0, 3.0))]))
-    # A road point at row 45 + v is at 90.5 · 3 / v m, and there at half of v; 50 m ahead, 1.5 m are 2.7 px.
-    assert view.image[45 + 40, 90, 0] == 45 + 20 and view.image[45 + 20, 90, 0] == 45 + 10
-    assert view.image[20, 90, 0] == round(20 - camera().K[1, 1] * 1.5 / SPLIT_DEPTH_M)
-    (view,) = row_split(Rig([camera()]), [column], Rig([camera(position_m=(0.0, 2.0, 1.5))]))
-    shift = round(float(camera().K[0, 0]) * 2.0 / SPLIT_DEPTH_M)
-    assert shift == 4
-    assert view.image[10, 90, 0] == 90 - shift, "from 2 m to the left, what is 50 m ahead was further left"
-
-
-def test_row_split_the_last_camera_wins_and_masks_hold() -> None:
-    mask = np.ones((91, 181), bool)
-    mask[:, :60] = False
-    masked = replace(camera(name="second"), mask=mask)
-    (view,) = row_split(Rig([camera(), masked]), [plain(COLOURS[0]), plain(COLOURS[1])], Rig([camera()]))
-    assert tuple(view.image[45, 30]) == COLOURS[0] and tuple(view.image[45, 100]) == COLOURS[1]
-    assert view.coverage.all()
-
-
-def test_row_split_refuses_lenses() -> None:
-    lens = replace(camera(), lens="fisheye", distortion=(0.0, 0.0, 0.0, 0.0))
-    with pytest.raises(SampleError, match="row_split: expected pinhole cameras"):
-        row_split(Rig([lens]), [noise()], Rig([camera()]))

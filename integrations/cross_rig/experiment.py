@@ -274,7 +274,7 @@ def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
         title = source.variant.title if source.variant else "true"
         if made := make_frames(source, setup.settings.count(source.split), workers):
             took_s = time.monotonic() - start
-            log(f"{source.split} frames, {source.change or 'A'}, {title}: {made} chunks, {took_s:.0f} s")
+            log(f"{source.split} frames, {source.change or 'A'}, {title}: {made} made, {took_s:.0f} s")
     missing = setup.missing()
     yield len(missing)
     for done, line in enumerate(in_processes(setup.do, missing, workers), 1):

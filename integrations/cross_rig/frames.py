@@ -1,17 +1,16 @@
 """The vehicles, the streets, and the frames of the experiment on disk: A's, B's, each variant's training set.
 
-Frames are chunks of arrays in a folder named after what made them. A chunk is written under another name and renamed
-when it is whole, so that a process may die at any time; the next one makes what is missing.
+Each frame is a file in a folder named after what makes it. A file is whole or not there, so that a process may die at
+any time; the next one makes what is missing.
 """
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
-import shutil
-import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
@@ -25,6 +24,7 @@ import torch
 
 import arbiview_aug
 from arbiview_aug import Camera, Rig
+from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_target_rig
 from integrations.cross_rig.cuboids import CuboidDrive
 from integrations.cross_rig.labels import Grid, box_cells, vehicle_boxes, visible_objects
@@ -95,13 +95,6 @@ CHANGES: dict[str, Change] = {
 """By name. ``waymo``: Waymo's azimuths and height at A's field of view, so that it stays a change of the layout."""
 
 
-CHUNK_FRAMES = 20
-"""About 10 s of rendering: a killed process loses no more."""
-
-_MOST_MAPS = 256
-"""Chunks whose images are mapped: each holds a file open, of which a process commonly may have 1024."""
-
-
 def content_hash(spec: Any) -> str:
     """16 hex digits of plain data."""
     return hashlib.sha256(json.dumps(spec, sort_keys=True).encode()).hexdigest()[:16]
@@ -127,41 +120,26 @@ class FrameStore:
         self.folder = root / self.key
 
     def missing(self, num_frames: int) -> list[int]:
-        """Chunks that ``num_frames`` need and that are not there."""
-        return [k for k in range(-(-num_frames // CHUNK_FRAMES)) if not self._chunk(k).is_dir()]
+        """Frames that are not there, of the first ``num_frames``."""
+        return [k for k in range(num_frames) if not self._path(k).is_file()]
 
-    def write(self, chunk: int, frames: Iterable[Arrays]) -> None:
-        """Make a chunk of its ``CHUNK_FRAMES`` frames: all of it or nothing."""
-        rows = list(frames)
-        self.folder.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(prefix=f".part-{chunk}-", dir=self.folder))
-        for name in rows[0]:
-            np.save(part / f"{name}.npy", np.stack([row[name] for row in rows]))
-        try:
-            part.rename(self._chunk(chunk))
-        except OSError:
-            if not self._chunk(chunk).is_dir():
-                raise
-            shutil.rmtree(part)  # a worker that outlived its killed parent was first, with the same frames
+    def write(self, index: int, frame: Arrays) -> None:
+        """Write a frame; of several processes that make it, the last one's stays, which is the same."""
+        content = io.BytesIO()
+        np.savez(content, **frame)  # type: ignore[arg-type]
+        write_whole({self._path(index): content.getvalue()})
 
-    def images(self, index: int) -> np.ndarray:
-        """Images of one frame, mapped from disk."""
-        chunk, row = divmod(index, CHUNK_FRAMES)
-        return np.asarray(_mapped(self._chunk(chunk) / "images.npy")[row])
+    def read(self, name: str, index: int) -> np.ndarray:
+        """An array of one frame."""
+        with np.load(self._path(index)) as arrays:
+            return np.asarray(arrays[name])
 
     def stacked(self, name: str, num_frames: int) -> np.ndarray:
-        """The first ``num_frames`` of one array, in memory: for small ones."""
-        chunks = [np.load(self._chunk(k) / f"{name}.npy") for k in range(-(-num_frames // CHUNK_FRAMES))]
-        return np.asarray(np.concatenate(chunks)[:num_frames])
+        """An array of the first ``num_frames``, in memory: for small ones."""
+        return np.stack([self.read(name, k) for k in range(num_frames)])
 
-    def _chunk(self, chunk: int) -> Path:
-        return self.folder / f"{chunk:05}"
-
-
-@lru_cache(_MOST_MAPS)
-def _mapped(path: Path) -> np.ndarray:
-    array: np.ndarray = np.load(path, mmap_mode="r")
-    return array
+    def _path(self, index: int) -> Path:
+        return self.folder / f"{index:05}.npz"
 
 
 T = TypeVar("T")
@@ -247,7 +225,7 @@ class Source:
 
         def make(index: int) -> Arrays:
             boxes = drive.scene(index).boxes_ego(original.rig.ground_z_m).astype(np.float32)
-            frame: dict[str, Any] = {"images": torch.from_numpy(store.images(index).copy())}
+            frame: dict[str, Any] = {"images": torch.from_numpy(store.read("images", index))}
             frame |= {"boxes_3d": torch.from_numpy(boxes)}
             if "points" in variant.reads:
                 frame["points"] = drive.points(index)
@@ -257,17 +235,15 @@ class Source:
 
 
 def make_frames(source: Source, num_frames: int, workers: int) -> int:
-    """Make the missing chunks; returns how many were."""
-    missing = source.store().missing(num_frames)
-    return sum(1 for _ in in_processes(partial(_make_chunk, source), missing, workers))
+    """Make the missing frames; returns how many were."""
+    return sum(1 for _ in in_processes(partial(_make_frame, source), source.store().missing(num_frames), workers))
 
 
-def _make_chunk(source: Source, chunk: int) -> None:
-    frames = range(chunk * CHUNK_FRAMES, (chunk + 1) * CHUNK_FRAMES)
-    source.store().write(chunk, map(_maker(source), frames))
+def _make_frame(source: Source, index: int) -> None:
+    source.store().write(index, _maker(source)(index))
 
 
-@lru_cache(maxsize=2)  # a worker goes from chunk to chunk of one source
+@lru_cache(maxsize=2)  # a worker goes from frame to frame of one source
 def _maker(source: Source) -> Callable[[int], Arrays]:
     return source.maker()
 

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from arbiview_aug import Rig, RigRetarget
-from arbiview_aug.atomic_io import checksum
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.drive import Recording
 from arbiview_aug.datasets.synthetic import BoxClass
@@ -58,13 +57,6 @@ def first_rig(data: str) -> Rig:
     """The rig of the first sample, whose images are read for it."""
     rig: Rig = recording(data)[0]["rig"]
     return rig
-
-
-@lru_cache(maxsize=4)
-def calibration_hash(data: str) -> str:
-    """SHA-256 of the table of calibrations."""
-    opened: Any = recording(data)
-    return checksum(opened.root / opened.version / "calibrated_sensor.json")
 
 
 def drives_of(data: str) -> list[str]:
@@ -137,11 +129,11 @@ class RecordedSource(Source):
         return small_rig(first_rig(self.data[self.change is not None]), self.size)
 
     def spec(self) -> dict[str, Any]:
-        """Data set, samples and calibration."""
+        """Data set, samples, and the first frame's calibration."""
         data = self.recorded_by
         samples = [recording(data).tokens[k] for k in self.frames]
-        where = {"data": str(Path(data).resolve()), "calibration": calibration_hash(data), "samples": samples}
-        return where | {"size": self.size, "rig": self.rig.content_key.hex()}
+        rigs = {"rig": self.rig.content_key.hex(), "recorded": first_rig(data).content_key.hex()}
+        return {"data": str(Path(data).resolve()), "samples": samples, "size": self.size, **rigs}
 
     def drives(self, count: int) -> list[int]:
         """Numbers of the drives of the first frames."""
@@ -149,9 +141,9 @@ class RecordedSource(Source):
         return [sorted(set(chosen)).index(name) for name in chosen]
 
     def maker(self) -> Callable[[int], Arrays]:
-        """Function that makes a frame of this set; indices past its end begin again, to fill the last chunk."""
+        """Function that makes a frame of this set."""
         make = super().maker()
-        return lambda index: make(self.frames[index % len(self.frames)])
+        return lambda index: make(self.frames[index])
 
     def _true_frames(self) -> Callable[[int], Arrays]:
         return self._recorded

@@ -74,7 +74,7 @@ class FrameSet:
 
     def frame(self, index: int) -> Arrays:
         """One frame's arrays: a ``Batch`` without its first dimension."""
-        images = self.store.images(index)
+        images = self.store.read("images", index)
         calibration = {"K": self.K[index], "cam2ego": self.cam2ego[index]}
         covered = {"images": images, "coverage": np.ones((len(images), *images.shape[-2:]), bool)}
         labels = {"state": self.state[index], "counts": self.counts, "boxes": self.boxes[index]}

@@ -48,13 +48,11 @@ class MeanColour(lightning.LightningModule):
 
     def training_step(self, batch: dict[str, Any], index: int) -> torch.Tensor:
         """On retargeted frames."""
-        assert batch["coverage"].device == batch["images"].device
         return (batch["images"].float() / 255 - self.colour).square().mean()
 
     def validation_step(self, batch: dict[str, Any], index: int) -> None:
         """On frames as they are."""
-        error = (batch["images"].float() / 255 - self.colour).square().mean()
-        self.log("val_loss", error, batch_size=len(batch["images"]))
+        self.log("val_loss", self.training_step(batch, index), batch_size=len(batch["images"]))
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Adam."""

@@ -63,14 +63,6 @@ def test_points_read_the_pixel_that_they_project_to(family, stride):
     assert outside.any() and not read[outside].any()
 
 
-def test_moving_a_camera_moves_the_features(voxels):
-    frames = [batch([source_rig(SIZE).shifted(metres, 0, 0)]) for metres in (0.0, 1.0, 2.0)]
-    seen = [voxels.family.voxel_features(voxels.features(one), one) for one in frames]
-    # Voxels are 2 m wide here: one column of them is seen from a place half a voxel further back.
-    assert not torch.allclose(seen[0], seen[1])
-    torch.testing.assert_close(seen[2][:, :, 1:], seen[0][:, :, :-1], atol=1e-3, rtol=1e-3)
-
-
 def test_features_are_lifted_to_where_their_rays_lead():
     """All of the probability at one depth: the cell that the camera model gives."""
     family, front = Depths(GRID, 4, 8), source_rig(SIZE)["front"]

@@ -34,16 +34,6 @@ def test_a_point_is_in_the_pillar_over_its_cell(model):
     assert pillars[0].any(0).nonzero().tolist() == [[70, 20]] and pillars[1].any(0).nonzero().tolist() == [[50, 50]]
 
 
-def test_the_order_of_points_and_frames_does_not_matter(model):
-    rng = np.random.default_rng(0)
-    clouds = [rng.uniform((-24, -24, 0, 0), (24, 24, 3, 255), (n, 4)) for n in (90, 70)]
-    with torch.no_grad():
-        both = model(PointSet.joined([frame(*cloud) for cloud in clouds]))
-        alone = [model(PointSet.joined([frame(*cloud[::-1])])) for cloud in clouds]
-    for whole, *each in zip(both, *alone, strict=True):
-        torch.testing.assert_close(whole, torch.cat(each), atol=1e-4, rtol=1e-4)
-
-
 def test_sets_that_are_the_same_have_one_name():
     assert scans_of("fewer", "oracle") == scans_of("more", "raw") == scans_of("up70", "dropped")
     assert scans_of("fewer", "dropped") == (*CHANGES["fewer"], "dropped")

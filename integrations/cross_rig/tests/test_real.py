@@ -11,7 +11,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.errors import DataError
 from integrations.cross_rig import __main__ as command
-from integrations.cross_rig import frames, real
+from integrations.cross_rig import real
 from integrations.cross_rig.experiment import REAL, Run, Settings, fitted, jobs, recorded
 from integrations.cross_rig.frames import OF_TESTS
 from integrations.cross_rig.labels import FREE, HIDDEN, VEHICLE
@@ -20,11 +20,6 @@ from tests.datasets.nuscenes_root import START_US, Street, streets, tables_of, w
 
 SIZE = (24, 64)
 SMALL = Settings(size=SIZE, train_frames=1000, schedule=Schedule(steps=2, batch=2, precision="fp32"))
-
-
-@pytest.fixture(autouse=True)
-def _short_chunks(monkeypatch):
-    monkeypatch.setattr(frames, "CHUNK_FRAMES", 2)
 
 
 def _root(path: Path, rig: Rig, drives: range) -> Path:
@@ -75,7 +70,6 @@ def test_frames_have_labels_where_the_lidar_saw_a_vehicle(roots, tmp_path):
             cell = ((box[:2] + 25) / 0.5).astype(int)
             assert arrays["state"][tuple(cell)] == (VEHICLE if inside else HIDDEN)
     assert (arrays["state"] == FREE).mean() > 0.8
-    np.testing.assert_array_equal(make(4)["state"], arrays["state"], "indices past the end begin again")
     # Views have the other vehicle's cameras, over the same road.
     views = next(run.images(job) for job in jobs(run.settings) if job.variant.name == "auto_fill").maker()(0)
     true = run.source("test", REAL).maker()(0)
@@ -91,25 +85,12 @@ def test_drives_are_split_and_drawn_together(roots, tmp_path, monkeypatch):
     # A data set against itself: what tests is no less apart from what trains the oracle.
     itself = run_of(roots[1], roots[1], tmp_path)
     tested = {k for split in OF_TESTS for k in itself.source(split, REAL).frames}
-    trained = set(itself.source("train", REAL).frames)
-    assert tested and trained and not tested & trained and set(itself.source("train").frames) == trained
-    assert {names[k] for k in real.frames_of(roots[1], None)[:4]} == set(names), "the first are of all drives"
+    assert tested and not tested & set(itself.source("train", REAL).frames)
     drives = run.source("test", REAL).drives(run.settings.test_frames)
     assert len(drives) == run.settings.test_frames and len(set(drives)) == len(splits[2])
     monkeypatch.setattr(real, "drives_of", lambda data: names if data == roots[1] else [names[k] for k in tested])
     with pytest.raises(DataError, match="drives that are not of B's validation or test"):
         real.frames_of_a("a", roots[1])
-
-
-def test_frames_and_results_follow_the_calibration(roots, tmp_path, monkeypatch):
-    def paths() -> set[Path]:
-        run = run_of(*roots, tmp_path)
-        return {run.source("train").store().folder, *map(run.result_path, jobs(run.settings))}
-
-    before = paths()
-    assert before == paths()
-    monkeypatch.setattr(real, "calibration_hash", lambda data: "another")
-    assert not before & paths()
 
 
 @pytest.mark.slow

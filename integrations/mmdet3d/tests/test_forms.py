@@ -25,7 +25,7 @@ from arbiview_aug import (
 )
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD
-from arbiview_aug.integrations.mmdet3d.matrices import MATRICES, decomposed, upper_triangular
+from arbiview_aug.integrations.mmdet3d.matrices import MATRICES
 from arbiview_aug.integrations.mmdet3d.results import geometry
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
 from integrations.mmdet3d.fake_results import EGO2GLOBAL, FORMS, LIDAR2EGO, Boxes, Recording, recording, source_rig
@@ -296,21 +296,6 @@ def test_messages(given: Recording) -> None:
 def test_malformed_settings_are_named(settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=rf"^{next(iter(settings))}: expected"):
         step(**settings)
-
-
-def test_upper_triangular_times_rotation() -> None:
-    rng = np.random.default_rng(0)
-    M = rng.normal(size=(50, 3, 3))
-    M[np.linalg.det(M) < 0] *= -1
-    K, R = upper_triangular(M)
-    assert np.allclose(K @ R, M) and np.allclose(np.tril(K, -1), 0) and (np.diagonal(K, axis1=1, axis2=2) > 0).all()
-    assert np.allclose(R @ R.transpose(0, 2, 1), np.eye(3)) and np.allclose(np.linalg.det(R), 1)
-    P = np.tile(np.eye(4), (2, 1, 1))
-    P[:, :3] = [[700, 0, 600, 45], [0, 700, 180, -0.3], [0, 0, 1, 0.005]]  # KITTI's P2: a place in its last column
-    K, lidar2cam = decomposed(P)
-    full = np.tile(np.eye(4), (2, 1, 1))
-    full[:, :3, :3] = K
-    assert np.allclose(full @ lidar2cam, P) and np.allclose(K[:, 0, 0], 700)
 
 
 def test_readme_names_every_key_and_form() -> None:

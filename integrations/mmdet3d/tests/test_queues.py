@@ -186,17 +186,6 @@ def test_frames_of_a_drive_share_a_draw(drive: list[Recording]) -> None:
             step(FORMS["DETR3D"](drive[0]))
 
 
-@pytest.mark.parametrize("target", [TARGET, RandomRig(TARGET, yaw_deg=10, per="sequence")], ids=["fixed", "random"])
-def test_epochs_draw_anew(target: Any) -> None:
-    """Without workers or with persistent ones, whose seed stays."""
-    step = RigRetargetMultiView(target, lidar2ego=LIDAR2EGO, p=0.5, size=SIZE, sequence_key="scene_token")
-    draws = []
-    for epoch in (0, 1, 0):
-        step.set_epoch(epoch)
-        draws.append([step.draw({"scene_token": name})["skipped"] for name in range(30)])
-    assert draws[0] == draws[2] != draws[1] and {*draws[0]} == {0.0, 1.0}
-
-
 @pytest.mark.parametrize(
     ("entries", "message"),
     [
