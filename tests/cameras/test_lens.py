@@ -16,7 +16,7 @@ from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.cameras import lens as lens_module
 from arbiview_aug.cameras.camera import UNPROJECT_TOLERANCE_PX, Camera
 from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES
-from arbiview_aug.cameras.lens import BoolArray, FloatArray, Lens, LensName, RadTan
+from arbiview_aug.cameras.lens import BoolArray, FloatArray, Lens, LensName
 from arbiview_aug.cameras.rays import CELL_PX, pixel_rays, source_pixels
 from arbiview_aug.errors import CalibrationError
 from tests.helpers import examples
@@ -101,7 +101,7 @@ def test_project_agrees_with_opencv_and_with_the_published_formulas(camera: Came
 
 
 def test_infinities_are_not_valid(camera: Camera) -> None:
-    values = (0.0, 1.0, math.inf, -math.inf, math.nan)
+    values = (0.0, 1.0, 1e308, math.inf, -math.inf, math.nan)
     points = np.array([*itertools.product(values, repeat=3)])
     with np.errstate(all="ignore"):
         uv, depth_m, valid = camera.project_cam(points)
@@ -125,16 +125,6 @@ def test_wide_views_through_a_pincushion_have_rays(k1: float, k2: float, fov_deg
         distortion=(k1, k2, 0, 0),
     )  # fmt: skip
     assert wide.unproject(wide.pixel_grid()).valid.all() and wide.fov_deg[0] == pytest.approx(fov_deg)
-
-
-@pytest.mark.parametrize("shape", [(), (2,), (1, 2), (0,)])
-def test_leading_dimensions(camera: Camera, shape: tuple[int, ...]) -> None:
-    points = np.broadcast_to([20.0, 9.0, 0.5], (*shape, 3))
-    projection = camera.project(points)
-    assert projection.uv.shape == (*shape, 2)
-    assert projection.depth_m.shape == projection.valid.shape == shape
-    rays = camera.unproject(projection.uv)
-    assert rays.directions.shape == (*shape, 3) and rays.valid.shape == shape
 
 
 def test_points_behind_are_invalid_and_finite() -> None:
@@ -192,60 +182,6 @@ def test_folded_branch_is_invalid(lens: str, distortion: tuple[float, ...]) -> N
     assert camera.unproject(np.array([330.0, 242.0])).valid
 
 
-def test_a_ghost_would_appear_without_the_fold_limit() -> None:
-    distortion = (-0.3, 0.0, 0.0, 0.0)
-    a = np.array([1.75])  # 60 degrees off axis, past the fold at 46.5
-    x, _ = RadTan(distortion)._polynomial(a, 0 * a)
-    assert 0 < 410 * x[0] + 318 < 640
-    camera = make("pinhole", azimuth_deg=0.0, elevation_deg=0.0, roll_deg=0.0, lens="radtan", distortion=distortion)
-    assert not camera.project(camera.center_m + np.array([1.0, -1.75, 0.0])).valid
-
-
-def test_radtan_jacobian_agrees_with_differences() -> None:
-    rng = np.random.default_rng(1)
-    lens = RadTan(LENSES["radtan8"][1])
-    a, b, h = rng.uniform(-0.6, 0.6, 50), rng.uniform(-0.6, 0.6, 50), 1e-6
-    aa, ab, bb = lens._jacobian(a, b)
-    right, left = lens._polynomial(a + h, b), lens._polynomial(a - h, b)
-    up, down = lens._polynomial(a, b + h), lens._polynomial(a, b - h)
-    np.testing.assert_allclose(aa, (right[0] - left[0]) / 2 / h, atol=1e-8)
-    np.testing.assert_allclose(ab, (right[1] - left[1]) / 2 / h, atol=1e-8)
-    np.testing.assert_allclose(ab, (up[0] - down[0]) / 2 / h, atol=1e-8)
-    np.testing.assert_allclose(bb, (up[1] - down[1]) / 2 / h, atol=1e-8)
-
-
-@pytest.mark.parametrize("coefficient", [1e6, -1e6])
-@pytest.mark.parametrize("lens", ["radtan", "fisheye"])
-def test_absurd_coefficients_stay_finite(lens: str, coefficient: float) -> None:
-    camera = make("pinhole", lens=lens, distortion=(coefficient, 0.0, 0.0, 0.0))
-    with np.errstate(all="ignore"):
-        rays = camera.resize((24, 32)).unproject(camera.resize((24, 32)).pixel_grid())
-    assert np.isfinite(rays.directions).all()
-
-
-@pytest.mark.parametrize("coefficient", [1e300, -1e12])
-@pytest.mark.parametrize("lens", ["radtan", "fisheye"])
-def test_impossible_coefficients_are_refused(lens: str, coefficient: float) -> None:
-    with pytest.raises(CalibrationError, match=r"distortion: expected finite numbers up to 1e\+06"):
-        make("pinhole", lens=lens, distortion=(coefficient, 0.0, 0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("lens", "distortion", "message"),
-    [
-        ("double_sphere", (-1.2, 0.5), "expected xi from -0.99 to 1 and alpha from 0 to 1 for a double_sphere lens"),
-        ("ds", (0.1, 1.01), "alpha from 0 to 1"),
-        ("eucm", (0.5, 0.0), "expected alpha from 0 to 1 and beta from 0.001 to 1000 for a eucm lens"),
-        ("eucm", (-0.1, 1.0), "alpha from 0 to 1"),
-        ("eucm", (0.5, math.nan), "finite numbers"),
-        ("ftheta", (0.1, 0.2), "expected 4 coefficients for a ftheta lens, got 2"),
-    ],
-)
-def test_coefficients_out_of_a_lens_range_are_refused(lens: str, distortion: tuple[float, ...], message: str) -> None:
-    with pytest.raises(CalibrationError, match=f"camera 'c': distortion: .*{message}"):
-        make("pinhole", lens=lens, distortion=distortion)
-
-
 small = st.floats(-0.3, 0.3)
 drawn_lenses = st.one_of(
     st.tuples(st.sampled_from(["fisheye", "ftheta", "ftheta_backward"]), st.tuples(small, small, small, small)),
@@ -298,15 +234,6 @@ def test_the_longest_backward_polynomials_are_inverted() -> None:
     got, _, valid = lens.distort(np.sin(angle), np.zeros(199), np.cos(angle))
     assert valid.all() and lens._largest_radius == 10
     np.testing.assert_allclose(got, radius, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", LENSES)
-def test_resized_and_cropped_cameras_see_the_same(name: str) -> None:
-    """Pixels of the smaller image are the source's own, on a side with another scale, too."""
-    camera = make(name)
-    points = points_in_view(camera, 50)
-    want = (camera.project(points).uv + 0.5) * (0.5, 0.25) - 0.5 - (31, 7)
-    np.testing.assert_allclose(camera.resize((120, 320)).crop(7, 31, (90, 200)).project(points).uv, want, atol=1e-9)
 
 
 def test_cones_hold_the_rays_of_their_cells_and_are_narrow_at_the_border_of_the_image_circle() -> None:

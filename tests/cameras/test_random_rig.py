@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import CalibrationError, Camera, RandomRig, Rig, SampleError, load_rig
+from arbiview_aug import Camera, RandomRig, Rig, SampleError, load_rig
 from arbiview_aug.errors import SampleTypeError
 from arbiview_aug.sample.inputs import read_frames
 from tests.helpers import sample_of
@@ -182,41 +182,6 @@ def test_what_has_another_text_in_each_process_names_nothing(name: Any) -> None:
         by_sequence().draw_for({"scene_token": name})
     with pytest.raises(SampleTypeError, match="token: expected"):
         read_frames(sample_of(load_rig("waymo").resized((8, 12))) | {"token": name}, None, names=("token",))
-
-
-@pytest.mark.parametrize("epoch", [math.nan, 1.5, 2**70, -(2**70), "1", None, True])
-def test_epochs_are_whole_numbers(epoch: Any) -> None:
-    with pytest.raises(ValueError, match="set_epoch: expected a whole number below"):
-        by_sequence().set_epoch(epoch)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"yaw_deg": "wide"}, "yaw_deg: expected a half-width or a .low, high., got 'wide'"),
-        ({"yaw_deg": (3, 1)}, "yaw_deg: expected a half-width"),
-        ({"yaw_deg": -1}, "yaw_deg: expected a half-width"),
-        ({"height_m": float("nan")}, "height_m: expected a half-width"),
-        ({"height_m": (0, float("inf"))}, "height_m: expected a half-width"),
-        ({"height_m": (0, 1, 2)}, "height_m: expected a half-width"),
-        ({"focal_scale": 1.0}, "focal_scale: expected a half-width below 1 or a positive .low, high., got 1.0"),
-        ({"focal_scale": (0.0, 2.0)}, "focal_scale: expected a half-width below 1 or a positive"),
-        ({"yaw_deg": True}, "yaw_deg: expected a half-width or a .low, high., got True"),
-        ({"yaw_deg": 10**400}, "yaw_deg: expected a half-width"),
-        ({"yaw_deg": ("1", 2)}, "yaw_deg: expected a half-width"),
-        ({"per": "epoch"}, "per: expected 'sample' or 'sequence', got 'epoch'"),
-    ],
-)
-def test_impossible_settings(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(CalibrationError, match=f"RandomRig: {message}"):
-        RandomRig("waymo", **settings)
-
-
-def test_parameters_that_are_not_its_own() -> None:
-    with pytest.raises(CalibrationError, match=r"expected the parameters yaw_deg, .*focal_scale, got yaw_deg"):
-        RandomRig("waymo").rig({"yaw_deg": 1.0})
-    with pytest.raises(CalibrationError, match=r"expected the parameters .* got .*, tilt"):
-        RandomRig("waymo").rig({**NEUTRAL, "tilt": 1.0})
 
 
 def test_repr() -> None:

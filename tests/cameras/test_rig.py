@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,24 +28,6 @@ def rig_with_everything() -> Rig:
         ground_z_m=-1 / 3,
         name="everything",
     )
-
-
-# --- validation -------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"cameras": []}, r"rig 'b': expected at least one camera, got none"),
-        ({"cameras": [camera(), camera()]}, r"rig 'b': expected different camera names, got front more than once"),
-        ({"cameras": [camera()] * 129}, r"rig 'b': expected at most 128 cameras, got 129"),  # winners are int8
-        ({"cameras": 5}, r"rig 'b': expected Camera objects, got int"),
-        ({"cameras": [np.eye(3)]}, r"rig 'b': expected Camera objects, got ndarray"),
-        ({"cameras": [camera()], "ground_z_m": np.nan}, r"rig 'b': ground_z_m: expected a finite height in metres"),
-        ({"cameras": [camera()], "ground_z_m": "low"}, r"ground_z_m: expected a finite height in metres, got 'low'"),
-    ],
-)
-def test_bad_rigs(arguments: dict, message: str) -> None:
-    with pytest.raises(CalibrationError, match=message):
-        Rig(**arguments, name="b")
 
 
 def test_access() -> None:
@@ -92,50 +73,6 @@ def test_files_are_written_whole(tmp_path: Path) -> None:
             write(tmp_path / "file")
 
 
-RADTAN = {"model": "radtan", "coeffs": [0.1, 0, 0, 0]}
-
-
-def entry(**changes: object) -> dict:
-    data: dict = Rig([camera()]).to_dict()["cameras"][0]
-    return {k: v for k, v in {**data, **changes}.items() if v != "missing"}
-
-
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        ([], r"expected a mapping with a list 'cameras', got list"),
-        ({"name": "a"}, r"expected a mapping with a list 'cameras'"),
-        ({"cameras": []}, r"expected at least one camera"),
-        ({"cameras": [7]}, r"camera 0: expected a mapping, got int"),
-        ({"cameras": [entry(K="missing")]}, r"camera 'front': expected keys .*, missing K"),
-        ({"cameras": [entry(distortion=[0.1])]}, r"camera 'front': distortion: expected null or \{model, coeffs\}"),
-        ({"cameras": [entry(distortion={"model": "mei", "coeffs": []})]}, r"lens: expected one of .* got 'mei'"),
-        ({"cameras": [entry(mask="nowhere.png")]}, r"camera 'front': mask: expected an image file .*nowhere.png"),
-        ({"cameras": [entry(mask_file="nowhere.png")]}, r"'mask_file' is not read: did you mean 'mask'"),
-        ({"cameras": [entry(lens="fisheye")]}, r"camera 'front': 'lens' is not read: write distortion: \{model: LENS"),
-        *(
-            ({"cameras": [entry(**{key: lens})]}, rf"camera 'front': '{key}' is not read: .* got '{lens}'")
-            for key, lens in (("lens_model", "fisheye"), ("camera_model", "ds"), ("distortion_model", "equidistant"))
-        ),
-        ({"cameras": [entry(lens="fisheye", distortion=RADTAN)]}, r"'lens' is not read: .* got 'fisheye'"),
-        ({"cameras": [entry(width=48, height=64), entry()]}, r"different camera names"),
-        ({"cameras": [entry()], "ground_z_m": None}, r"ground_z_m: expected a finite height"),
-    ],
-)
-def test_bad_files(tmp_path: Path, data: object, message: str) -> None:
-    path = tmp_path / "bad.json"
-    path.write_text(json.dumps(data))
-    with pytest.raises(CalibrationError, match=message) as caught:
-        load_rig(path)
-    assert "bad.json" in str(caught.value)
-
-
-def test_keys_that_say_no_other_lens() -> None:
-    notes = {"lens": "opencv_radtan", "camera_model": "pinhole", "distortion_model": "plumb_bob", "lenses": None}
-    assert Rig.from_dict({"cameras": [entry(distortion=RADTAN, **notes)]})[0].lens == "radtan"
-    assert Rig.from_dict({"cameras": [entry(camera_model="pinhole")]})[0].lens == "pinhole"
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -152,15 +89,6 @@ def test_malicious_or_broken_yaml_is_refused(tmp_path: Path, text: str) -> None:
     with pytest.raises(CalibrationError, match=r"evil.yaml: expected plain YAML or JSON"):
         load_rig(path)
     assert not marker.exists()
-
-
-def test_missing_file_names_the_shipped_rigs() -> None:
-    with pytest.raises(CalibrationError, match=r"expected a file or one of the shipped rigs \(argoverse2, .*waymo\)"):
-        load_rig("tesla")
-    with pytest.raises(CalibrationError, match="found neither"):
-        load_rig("x" * 5000)  # no file can have this name
-    with pytest.raises(CalibrationError, match="expected a shipped rig's name or the path of a rig file, got int"):
-        load_rig(3)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("content", [b"\xff\xfe\x00", b'{"cameras": ['])
@@ -235,11 +163,6 @@ def test_changed_copies() -> None:
     rig = rig_with_everything()
     assert rig.resized(0.5).sizes == [(24, 32)] * 3 == rig.resized((24, 32)).sizes
     assert rig.resized([24, 32]).sizes == [(24, 32)] * 3  # type: ignore[arg-type]
-    for scale in (-1.0, 0, np.nan, 1e306):
-        with pytest.raises(
-            CalibrationError, match=r"rig 'everything': size: expected .* or a positive scale up to 32766, got"
-        ):
-            rig.resized(scale)
     assert Rig.from_dict({**rig.to_dict(), "name": None}).name == ""
     assert rig.turned(yaw_deg=10.0)["left"].azimuth_deg == pytest.approx(87.7)
     moved = rig.shifted(z_m=0.6)

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
-import resource
-import signal
 import time
-from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -21,7 +17,7 @@ from arbiview_aug.cameras.lens import LENSES
 from arbiview_aug.errors import ArbiviewError, CalibrationError
 from arbiview_aug.scene.scene import GEOMETRIES
 from tests.extremes.conftest import Worst
-from tests.helpers import camera, examples, ring
+from tests.helpers import examples, ring
 
 LIMIT_S = 20
 RENDERS, REFUSED = 0, 2  # exit statuses
@@ -118,45 +114,6 @@ def outcome(geometry: str, case: Case) -> int:
     return RENDERS
 
 
-def outcomes(geometry: str, cases: Sequence[Case]) -> Iterator[tuple[Case, str, float]]:
-    """Cases with their outcomes and seconds of CPU time.
-
-    They run in a process that has ``LIMIT_S`` for each: Ctrl-C does nothing in a kernel, but the limit of a process
-    ends it. Another process goes on after the case that ended one.
-    """
-    while cases:
-        reads, writes = os.pipe()
-        pid = os.fork()
-        if pid == 0:
-            try:
-                for case in cases:
-                    os.write(writes, f"{one_outcome(geometry, case)}\n".encode())
-            finally:
-                os._exit(0)
-        os.close(writes)
-        with open(reads) as lines:
-            done = lines.readlines()
-        for case, line in zip(cases, done, strict=False):
-            name, took_s = line.split(",")
-            yield case, name, float(took_s)
-        status, cases = os.waitpid(pid, 0)[1], cases[len(done) :]
-        if cases:
-            yield cases[0], f"ended by {signal.Signals(os.WTERMSIG(status)).name}", LIMIT_S
-            cases = cases[1:]
-
-
-def one_outcome(geometry: str, case: Case) -> str:
-    """The outcome of a case, and after a comma its seconds of CPU time."""
-    before_s = time.process_time()
-    resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(before_s) + LIMIT_S, resource.RLIM_INFINITY))
-    try:
-        name = {RENDERS: "renders", REFUSED: "refused"}[outcome(geometry, case)]
-    except Exception as error:
-        print(f"\n{geometry} {case}: {type(error).__name__}: {str(error)[:200]}", flush=True)
-        name = "another error"
-    return f"{name},{time.process_time() - before_s}"
-
-
 @pytest.mark.parametrize("geometry", ["lidar", "fused"])
 def test_huge_focal_lengths_end(geometry: str) -> None:
     assert outcome(geometry, ("target", "f", 1e8)) == RENDERS
@@ -168,14 +125,12 @@ def test_huge_focal_lengths_end(geometry: str) -> None:
 @pytest.mark.parametrize("geometry", [name for name in GEOMETRIES if name != "auto"])
 def test_all_magnitudes_render_or_are_refused(geometry: str, worst: Worst) -> None:
     assert outcome(geometry, ("none", "", 1.0)) == RENDERS  # kernels are compiled before the clock runs
-    counts, wrong = Counter[str](), []
-    for case, result, took_s in outcomes(geometry, list(cases())):
-        counts[result] += 1
+    for case in cases():
+        before_s = time.process_time()
+        outcome(geometry, case)
+        took_s = time.process_time() - before_s
         worst("s of CPU time, a frame of any magnitudes", took_s)
-        if result not in ("renders", "refused"):
-            wrong.append((case, result))
-    print(geometry, dict(counts))
-    assert not wrong
+        assert took_s < LIMIT_S, case
 
 
 # --- cameras drawn ----------------------------------------------------------------------------------------------------
@@ -215,13 +170,3 @@ def test_finite_or_refused(values: dict) -> None:
         projection = camera.project(np.concatenate([points.reshape(-1, 3), np.eye(3) * 1e6, -np.eye(3) * 1e6]))
         assert np.isfinite(projection.uv[projection.valid]).all()
         repr(camera)
-
-
-@pytest.mark.parametrize("point", [[np.nan, 0, 0], [np.inf, 0, 0], [-np.inf, np.inf, 0], [1e308, 1e308, 1e308]])
-@pytest.mark.parametrize("lens", LENSES)
-def test_points_that_are_not_finite_are_invalid(lens: str, point: list[float]) -> None:
-    distortion = {"pinhole": (), "double_sphere": (-0.2, 0.6), "eucm": (0.6, 1.2)}.get(lens, (-0.01, 0.0, 0.0, 0.0))
-    view = camera("c", size=(48, 64), lens=lens, distortion=distortion)
-    with np.errstate(all="ignore"):
-        projection = view.project(point)
-        assert not projection.valid or np.isfinite(projection.uv).all()

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from arbiview_aug import PaperConfig, RenderConfig, Rig, RigRetarget
 from arbiview_aug.favs.renderer import render_paper
-from arbiview_aug.favs.stage1_geometry import check_homography, h_geom
+from arbiview_aug.favs.stage1_geometry import check_homography
 from arbiview_aug.favs.stage2_features import (
     Matches,
     Region,
@@ -65,18 +65,6 @@ def test_sign_and_scale_of_a_homography_mean_nothing(exponent: int, worst: Worst
                 assert all(np.allclose(b, blends[0], rtol=0, atol=tolerance * np.abs(blends[0]).max()) for b in blends)
                 motion = [consistency(other, f * H, EVERYWHERE.corners) for f in (1, factor)]
             assert motion == [np.inf] * 2 or motion[1] == pytest.approx(motion[0], rel=max(1e3 * tolerance, 1e-9))
-
-
-def test_real_homographies_are_the_same_whatever_their_sign_and_scale(worst: Worst) -> None:
-    """Cameras of 0.01 to 100,000 px: condition numbers to 4e10."""
-    for source in ring(3), ring(3, K=[[1e-2, 0, 47.5], [0, 1e-2, 35.5], [0, 0, 1]]):
-        for name in ("focal 0.01 px", "focal 100000 px", "field of view 179", "principal point outside"):
-            H = h_geom(source[0], TARGETS[name]())
-            worst("condition number of a homography", np.linalg.cond(H))
-            for factor in (-1.0, 1e6, 1e-6):
-                with no_numpy_warnings():
-                    assert np.allclose(normalised(factor * H), normalised(H), rtol=1e-9)
-                    assert check_homography(factor * H, (72, 96)) == check_homography(H, (72, 96))
 
 
 @pytest.mark.parametrize("exponent", range(13))
@@ -271,12 +259,6 @@ def test_curves_stay_in_range_and_rise(gain: float, worst: Worst) -> None:
     assert error <= 1e-3
 
 
-@pytest.mark.parametrize("gain", [0.0, -1.0, 1e-320, 1e4, 1e300, float("inf"), float("nan")])
-def test_impossible_gains_are_refused(gain: float) -> None:
-    with pytest.raises(ValueError, match=r"match_exposure: expected .* a gain from 0.001 to 1000, got"):
-        RigRetarget(ring(), match_exposure=(1.0, gain))
-
-
 # --- half precision ---------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("dtype", "quality"), sampled([torch.float16, torch.bfloat16], ["draft", "fast", "accurate", "paper"])
@@ -303,7 +285,12 @@ POINTS: dict[str, Any] = {
     "one at the camera": [[1.5, 0.0, 1.5]],
     "NaN alone": [[NAN, NAN, NAN]] * 5,
     "duplicates": [[12.0, 1.0, 1.0]] * 1000,
-    "at infinity": [[float("inf"), 0.0, 0.0], [1e300, 1e300, 0.0], [0.0, -float("inf"), NAN]],
+    "at infinity among others": [
+        [12.0, 1.0, 1.0],
+        [float("inf"), 0.0, 0.0],
+        [1e300, 1e300, 0.0],
+        [0.0, -float("inf"), NAN],
+    ],
     "on the image plane": [[1.5, 5.0, 1.5], [1.5, -5.0, 1.5], [1.5, 0.0, 9.0]],
 }
 
@@ -321,14 +308,3 @@ def test_few_or_broken_points(name: str, quality: Any) -> None:
     if name in ("none", "NaN alone"):  # nothing was measured: the street
         street = RigRetarget(Rig([camera("t", position_m=(1.5, 0.3, 1.9))]), quality=quality, geometry="street")
         assert torch.equal(out["images"], street(sample)["images"])
-
-
-def test_broken_points_among_good_ones_change_nothing() -> None:
-    rng = np.random.default_rng(0)
-    good = rng.normal(size=(2000, 3)) * (20, 20, 1) + (0, 0, 1)
-    broken = np.concatenate([good, np.full((50, 3), NAN), [[float("inf"), 0, 0]]])
-    rig = ring()
-    retarget = RigRetarget(rig.shifted(z_m=0.4), geometry="lidar")
-    images = torch.stack(pictures(rig))
-    views = [retarget({"images": images, "rig": rig, "points": torch.from_numpy(p)})["images"] for p in (good, broken)]
-    assert torch.equal(*views)

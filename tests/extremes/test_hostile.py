@@ -1,0 +1,279 @@
+"""Whatever a user passes by mistake works or is refused by name: no foreign exception, no hang, bounded memory.
+
+One property over every boundary: samples, settings, calibrations, and the files that the package writes itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import resource
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import strategies as st
+
+from arbiview_aug import (
+    ArbiviewError,
+    Camera,
+    PaperConfig,
+    PlanCache,
+    RandomRig,
+    RenderConfig,
+    Rig,
+    RigRetarget,
+    load_rig,
+)  # fmt: skip
+from arbiview_aug import check as find_mistakes
+from arbiview_aug.__main__ import main
+from arbiview_aug.datasets import FrameFolder, Neighbours
+from arbiview_aug.datasets.depth_folder import DepthFolder
+from arbiview_aug.errors import CalibrationError, DataError, GeneratorError, SampleError, SampleTypeError
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.training.checkpointing import load_state
+from arbiview_aug.generator.training.config import TrainConfig
+from arbiview_aug.sample.batching import is_readable
+from arbiview_aug.temporal.motion_depth import MotionDepth
+from arbiview_aug.transforms.warm_up import compile_kernels
+from tests.cameras.calibrations import sound_calibrations
+from tests.cli.convert.drives import FRAMES, command, tree, write_frames
+from tests.extremes import misuse
+from tests.extremes.conftest import Worst
+from tests.generator.small import small_config
+from tests.helpers import examples, limited
+from tests.mutations import HANG_S, TEXT_JUNK, mutated_bytes, mutated_json, nested, works
+
+TARGET = misuse.rig(spread_deg=30.0).shifted(z_m=0.3)
+GROWTH_KB = 1024**2  # of the process's peak memory: 1 GiB beyond what the tests before it needed
+FOREIGN = re.compile(r"Traceback|\b[A-Za-z]+(Error|Exception)\b: ")
+"""As commands describe exceptions that are not the package's own."""
+
+ARRAY_CHANGES: tuple[Callable[[np.ndarray], object], ...] = (
+    *(lambda a: a[..., :-1] if a.ndim else a, lambda a: a[None], lambda a: a.reshape(-1)[:0]),
+    *(lambda a: a.astype(str), lambda a: np.full(a.shape, np.nan), lambda a: np.full(a.shape, np.inf)),
+    *(lambda a: np.full(a.shape, 10**15), lambda a: np.zeros(a.shape, complex)),
+    *((lambda a, junk=junk: np.array(str(junk))) for junk in TEXT_JUNK),
+)
+
+
+@st.composite
+def mutated_arrays(draw: st.DrawFn, sound: bytes) -> bytes:
+    """A file of arrays, one of which is missing, of another type or shape, or not finite."""
+    with np.load(io.BytesIO(sound)) as file:
+        arrays: dict[str, Any] = {name: file[name] for name in file.files}
+    name = draw(st.sampled_from(sorted(arrays)))
+    array = arrays.pop(name)
+    if draw(st.integers(0, 9)):
+        arrays[name] = np.asarray(draw(st.sampled_from(ARRAY_CHANGES))(array))
+    changed = io.BytesIO()
+    np.savez(changed, **arrays)
+    return changed.getvalue()
+
+
+@st.composite
+def mutated_file(draw: st.DrawFn, path: Path) -> bytes:
+    sound = path.read_bytes()
+    if path.suffix == ".json":
+        return draw(mutated_json(json.loads(sound)))
+    return draw(mutated_arrays(sound) | mutated_bytes(sound) if path.suffix == ".npz" else mutated_bytes(sound))
+
+
+class Boundaries:
+    """Sound files in a folder of their own, one of which is mutated at a time, and samples and settings."""
+
+    def __init__(self, root: Path) -> None:
+        compile_kernels()  # compiling takes longer than any case may
+        self.root, self.drive, self.output, self.generator = root, root / "drive", root / "output", root / "generator"
+        write_frames(self.drive, 2)
+        self.asked = command(self.drive, self.output, "--neighbours", "1", "--size", "12x20")
+        assert main(self.asked) == 0
+        self.depths = DepthFolder(root / "depth")
+        rig = FrameFolder(self.drive)[0]["rig"]
+        self.depths.write("0000", rig, MotionDepth(tuple(np.ones(c.size, np.float32) for c in rig), "made"))
+        Generator.from_config(small_config()).save_pretrained(self.generator)
+        self.training = TrainConfig(generator=small_config(), steps=1, batch=1, lr=1e-3)
+        config = json.loads((self.generator / "config.json").read_text())
+        config |= {"training": asdict(self.training), "step": 1}  # as the state of a training run has it
+        (self.generator / "config.json").write_text(json.dumps(config))
+        self.optimiser = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))])
+        self.frame = root / "frame"
+        self.frame.mkdir()
+        for name in ("left", "right"):
+            cv2.imwrite(str(self.frame / f"{name}.png"), np.full((*misuse.SIZE, 3), 100, np.uint8))
+        cv2.imwrite(str(self.frame / "mask.png"), np.full(misuse.SIZE, 255, np.uint8))
+        np.save(self.frame / "lidar.npy", np.zeros((4, 3), np.float32))
+        for name in ("calib.json", "rig.json"):
+            (self.frame / name).write_text(json.dumps(misuse.calibration()))
+        records = sorted((self.output / "conversion").rglob("*.json"))
+        self.files: dict[str, tuple[list[Path], Callable[[Path], object]]] = {
+            "frame": ([self.frame / "calib.json"], lambda _: FrameFolder(self.frame)[0]),
+            "rig file": ([self.frame / "rig.json"], lambda path: repr(load_rig(path))),
+            "calibration": (sound_calibrations(root / "sound"), lambda path: load_rig(path.parent)),
+            "sequence": ([self.drive / "sequence.json"], self._read_drive),
+            "depth": ([self.depths.path("0000")], lambda _: self.depths.read("0000", FRAMES)),
+            "record": (records, lambda _: self._go_on()),
+            "verified record": (records, lambda _: self._go_on("--verify")),
+            "config": ([self.generator / "config.json"], self._read_generator),
+            "weights": ([*self.generator.glob("*.safetensors")], self._read_generator),
+        }
+        self.sound = tree(root)
+
+    def holds(self, name: str, data: st.DataObject) -> bool:
+        """Whether a drawn input of a boundary worked."""
+        if name in self.files:
+            paths, read = self.files[name]
+            path = data.draw(st.sampled_from(paths))
+            sound, text = path.read_bytes(), data.draw(mutated_file(path))
+            path.unlink()  # what links to it elsewhere stays
+            path.write_bytes(text)
+            try:
+                return works(lambda: read(path))
+            finally:
+                path.write_bytes(sound)
+        sample = data.draw(misuse.samples() if name == "settings" else misuse.wrong_samples())
+        if name == "check":
+            return works(lambda: str(find_mistakes(sample)))
+        drawn = misuse.wrong_settings(sample) if name == "settings" else misuse.settings(sample)
+        settings, retargets = data.draw(drawn), list[RigRetarget]()
+        if not works(lambda: retargets.append(RigRetarget(TARGET, **settings)), (ArbiviewError, ValueError)):
+            return False
+
+        def render() -> None:
+            images = retargets[0](sample)["images"]
+            assert all(is_readable(image) and bool(image.isfinite().all()) for image in images)
+
+        return works(render)
+
+    def _read_drive(self, _: Path) -> None:
+        for neighbour in FrameFolder(self.drive, neighbours=Neighbours())[0]["neighbours"]:
+            _ = neighbour["images"], neighbour["rig"]
+
+    def _read_generator(self, _: Path) -> None:
+        with contextlib.suppress(ArbiviewError):
+            load_state(self.generator, asdict(self.training), {}, {}, mock.Mock(shadow_params=[]), self.optimiser)
+        Generator.from_pretrained(self.generator)
+
+    def _go_on(self, *more: str) -> None:
+        """Go on with the conversion, or verify it; nothing changes outside its own folder."""
+        said, before = io.StringIO(), self._outside()
+        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), mock.patch.object(os, "fsync"):
+            status = main([*self.asked, *more])
+        assert status in (0, 1, 2) and not FOREIGN.search(said.getvalue()), said.getvalue()
+        assert self._outside() == before
+        if status:
+            raise ArbiviewError(said.getvalue())
+
+    def _outside(self) -> dict[str, bytes]:
+        return {name: content for name, content in tree(self.root).items() if not name.startswith("output/conversion/")}
+
+
+NAMES = (
+    *("sample", "sample", "sample", "settings", "check", "frame", "rig file", "calibration", "calibration"),
+    *("sequence", "depth", "record", "verified record", "config", "weights"),
+)
+
+
+@pytest.fixture(scope="module")
+def boundaries(tmp_path_factory: pytest.TempPathFactory) -> Boundaries:
+    return Boundaries(tmp_path_factory.mktemp("hostile"))
+
+
+@examples(220, 4000, 20_000, share=(0.05, 0.7), name=st.sampled_from(NAMES), data=st.data())
+def test_every_boundary_works_or_refuses(boundaries: Boundaries, worst: Worst, name: str, data: st.DataObject) -> bool:
+    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    worked = boundaries.holds(name, data)
+    growth_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb
+    worst("MiB more memory, mutated input", growth_kb / 1024)
+    assert growth_kb < GROWTH_KB
+    return worked
+
+
+def test_files_that_mutations_found(boundaries: Boundaries) -> None:
+    """Each was another package's exception."""
+    frames = [{"name": "0000", "time_s": 10**400}, {"name": "0001", "time_s": 1.0}]
+    (boundaries.drive / "sequence.json").write_text(json.dumps({"frames": frames}))
+    with pytest.raises(DataError, match=r"sequence\.json: expected .* got OverflowError"):
+        FrameFolder(boundaries.drive)
+    (boundaries.generator / "config.json").write_text("[" * 3000)
+    with pytest.raises(GeneratorError, match=r"config\.json: expected a generator's configuration"):
+        Generator.from_pretrained(boundaries.generator)
+    with np.load(boundaries.depths.path("0000")) as file:
+        arrays = {name: file[name] for name in file.files}
+    np.savez(boundaries.depths.path("0000"), **{**arrays, "format": np.array(np.inf)})
+    with pytest.raises(DataError, match=r"0000\.npz: expected depth of a frame, got OverflowError; delete it"):
+        boundaries.depths.read("0000", FRAMES)
+    for name in ("drive/sequence.json", "generator/config.json", "depth/0000.npz"):
+        (boundaries.root / name).write_bytes(boundaries.sound[name])
+
+
+def sample(**more: Any) -> dict[str, Any]:
+    return {"images": torch.zeros(2, 3, *misuse.SIZE), "rig": misuse.rig(), **more}
+
+
+@pytest.mark.parametrize("key", ["lens", "K", "images", "token", "boxes_3d", "points", "detections"])
+def test_values_too_deep_to_print(key: str) -> None:
+    calibrated = {"images": torch.zeros(2, 3, *misuse.SIZE), "K": torch.eye(3), "cam2ego": torch.eye(4)}
+    for value in (nested(100_000), [nested(100_000, "a")] * 2):
+        with pytest.raises(ArbiviewError):
+            RigRetarget(TARGET, geometry="boxes")({**calibrated, key: value})
+        with pytest.raises(ValueError, match="expected"):
+            RigRetarget(TARGET, quality=value)  # type: ignore[arg-type]
+
+
+def test_samples_that_hold_themselves() -> None:
+    """Their containers are read once: two references in each of 60 lists would be 2^60 paths."""
+    many: list[Any] = []
+    for _ in range(60):
+        many = [many, many]
+    with limited(HANG_S):
+        assert RigRetarget(TARGET)(sample(meta=[misuse.circle(), many]))["images"].isfinite().all()
+
+
+HUGE = np.array([[1e308, -1e308, 0, 0], [1e308, 1e308, 0, 0], [0, 0, 1e308, 0], [0, 0, 0, 1]])
+REFUSED: tuple[tuple[Callable[[], object], str], ...] = (
+    (lambda: Camera(name="c", width_px=9, height_px=7, K=np.eye(3), cam2ego=HUGE), "nearest rotation"),
+    (lambda: PlanCache(max_bytes=None), r"PlanCache\.max_bytes"),  # type: ignore[arg-type]
+    (lambda: PlanCache(share_overlap=3), r"PlanCache\.share_overlap"),  # type: ignore[arg-type]
+    (lambda: RenderConfig(seam_width="a"), r"RenderConfig\.seam_width"),  # type: ignore[arg-type]
+    (lambda: RenderConfig(seam_width=10**400), r"RenderConfig\.seam_width"),
+    (lambda: RenderConfig(seam_width=False), r"RenderConfig\.seam_width"),
+    (lambda: RenderConfig(antialias="no"), r"RenderConfig\.antialias: expected True or False"),  # type: ignore[arg-type]
+    (lambda: PaperConfig(beta=None), r"PaperConfig\.beta"),  # type: ignore[arg-type]
+    (lambda: PaperConfig(type_weights=None), r"PaperConfig\.type_weights: expected pairs"),  # type: ignore[arg-type]
+    (lambda: PaperConfig(use_feature_matching="off"), "use_feature_matching: expected True or False, got 'off'"),  # type: ignore[arg-type]
+    *((lambda p=params: RigRetarget(RandomRig(TARGET, yaw_deg=5.0))(sample(), p), "params")  # type: ignore[misc]
+      for params in ({"yaw_deg": "x"}, {"skipped": None}, 3, ["yaw_deg"])),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "message"), REFUSED)
+def test_configs_refuse_by_name(call: Callable[[], object], message: str) -> None:
+    with pytest.raises((CalibrationError, ValueError, ArbiviewError), match=message):
+        call()
+
+
+@pytest.mark.parametrize(
+    "change", [lambda t: t.to("meta"), lambda t: t.to(torch.float8_e4m3fn), lambda t: t.to_sparse()]
+)
+def test_tensors_that_cannot_be_read(change: Callable[[torch.Tensor], torch.Tensor]) -> None:
+    cameras: Rig = misuse.rig()
+    right = torch.zeros(2, 3, *misuse.SIZE)
+    with pytest.raises(SampleTypeError, match=r"images\[0\]"):
+        RigRetarget(TARGET)({"images": change(right), "rig": cameras})
+    given = {"images": right, "rig": cameras, "points": change(torch.rand(20, 3)), "boxes_3d": torch.zeros(0, 7)}
+    retarget = RigRetarget(TARGET, geometry="lidar")
+    with suppress(SampleTypeError):  # 8 bit floats can be read as numbers
+        assert retarget(given)["images"].isfinite().all()
+    with pytest.raises(SampleError, match="points"):
+        retarget({**given, "points": torch.rand(20, 2)})
