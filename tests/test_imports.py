@@ -20,12 +20,6 @@ ROOMS = (
 generator's folder: it reads data sets and scores, which the generator does not know of.
 """
 
-MOST_FOLDERS, MOST_FILES = 13, 10
-"""At the top of the package."""
-
-MOST_AT_TOP = 52
-"""Files of the package that importing ``RigRetarget`` reads."""
-
 HEAVY = (
     "arbiview_aug.cameras.formats.calibration",
     "numba",
@@ -104,11 +98,6 @@ def test_no_module_imports_itself_through_others() -> None:
         visit(name, ())
 
 
-def test_the_top_of_the_package_is_small() -> None:
-    folders = [path for path in PACKAGE.iterdir() if path.is_dir() and any(path.glob("*.py"))]
-    assert len(folders) <= MOST_FOLDERS and len(list(PACKAGE.glob("*.py"))) <= MOST_FILES
-
-
 def test_importing_loads_nothing_heavy() -> None:
     code = (
         "import sys, torch; had = set(sys.modules)\n"
@@ -118,14 +107,3 @@ def test_importing_loads_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=500, check=True)
     assert done.stdout.strip() == "[]"
-
-
-def test_the_transform_imports_few_files() -> None:
-    code = (
-        "import sys, arbiview_aug.transforms.rig_retarget\n"
-        "print(*(getattr(m, '__file__', None) for n, m in sys.modules.items() if n.startswith('arbiview_aug')))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=500, check=True)
-    files = [path for path in done.stdout.split() if Path(path).stat().st_size]
-    assert len(files) <= MOST_AT_TOP, files
-    assert not [path for path in files if "favs" in Path(path).parts and Path(path).name != "__init__.py"]

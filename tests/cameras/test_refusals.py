@@ -200,6 +200,7 @@ REFUSED: tuple[tuple[Callable[[], object], str], ...] = (
     (lambda: file(top={"Lidars": []}), "'Lidars' is not read: did you mean 'lidars'"),
     (lambda: file(top={"scanners": []}), "'scanners' is not read: did you mean 'lidars'"),
     *((lambda v=v: file(top={"lidars": v}), "lidars: expected a list of at most 32") for v in ({}, "", {"top": {}})),
+    (lambda: file(top={"ground_z_m": None, "ground_z": -0.2}), "'ground_z' is not read: did you mean 'ground_z"),
     (lambda: file(top={"extra": 1}), "'extra' is not read: expected keys are cameras, dataset"),
     (lambda: lidar_file("top"), "lidar 0: expected a mapping, got str"),
     (lambda: lidar_file({"name": "top"}), "lidar 'top': expected keys .*, missing lidar2ego, elevations_deg"),

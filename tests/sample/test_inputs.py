@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from arbiview_aug import ArbiviewError, Rig, RigRetarget, SampleError, SampleTypeError, load_rig, shipped_rigs
 from arbiview_aug.sample.inputs import check_other_keys, read_frames
@@ -53,7 +54,13 @@ def test_the_good_sample_is_good() -> None:
     assert len(frame.images) == 2 and frame.rig.sizes == [(H, W)] * 2
 
 
+ARRAY = np.zeros((H, W, 3), np.uint8)
+FROM_NUMPY = r"expected torch tensors, got ndarray; use torch.from_numpy\(array\).permute\(2, 0, 1\) for an \(H, W, 3\)"
 IMAGES: dict[str, tuple[Any, str]] = {
+    "an array": (np.stack([ARRAY] * 2), rf"images: {FROM_NUMPY} RGB array"),
+    "arrays": ([ARRAY] * 2, rf"images\[0\]: {FROM_NUMPY}"),
+    "a file": ("front.jpg", r"images: expected torch tensors, got str; use a \(N, 3, H, W\) tensor"),
+    "PIL": ([Image.new("RGB", (W, H))] * 2, r"images\[0\]: expected torch tensors, got Image; use .*pil_to_tensor"),
     "no images": (None, "sample: expected a key 'images', got K, cam2ego"),
     "no cameras": (torch.zeros(0, 3, H, W), "images: expected at least one image, got none"),
     "an empty list": ([], "images: expected at least one image, got none"),
@@ -82,23 +89,9 @@ def test_bad_images(case: str) -> None:
         read_frames(sample(images=images), None)
 
 
-def test_images_that_are_no_tensors() -> None:
-    fix = r"use torch.from_numpy\(array\).permute\(2, 0, 1\) for an \(H, W, 3\) RGB array"
-    array = np.zeros((H, W, 3), np.uint8)
-    with pytest.raises(SampleTypeError, match=rf"images: expected torch tensors, got ndarray; {fix}"):
-        read_frames(sample(images=np.stack([array] * 2)), None)
-    with pytest.raises(SampleTypeError, match=rf"images\[0\]: expected torch tensors, got ndarray; {fix}"):
-        read_frames(sample(images=[array] * 2), None)
-    with pytest.raises(SampleTypeError, match=r"images: expected torch tensors, got str; use a \(N, 3, H, W\) tensor"):
-        read_frames(sample(images="front.jpg"), None)
+def test_samples_that_are_none() -> None:
     with pytest.raises(SampleTypeError, match="sample: expected a dict, got list"):
         read_frames([sample()], None)
-
-
-def test_pil_images() -> None:
-    image = pytest.importorskip("PIL.Image").new("RGB", (W, H))
-    with pytest.raises(SampleTypeError, match=r"images\[0\]: expected torch tensors, got Image; use .*pil_to_tensor"):
-        read_frames(sample(images=[image, image]), None)
 
 
 HALF = torch.from_numpy(rig().K) * torch.tensor([[0.5], [0.5], [1.0]])
@@ -127,6 +120,8 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "three coefficients": (with_distortion([[0.1] * 3] * 2, ["radtan"] * 2), "expected 4 or 5 or 8 coeff.* got 3"),
     "five for a fisheye": (with_distortion([[0.1] * 5] * 2, ["fisheye"] * 2), "expected 4 coefficients .* got 5"),
     "no lens": (with_distortion([[0.1] * 4] * 2), "distortion: expected 'lens' beside it, one of pinhole, radtan"),
+    "a mask of bytes": (sample(ego_mask=torch.zeros(2, H, W, dtype=torch.uint8)), "ego_mask: .*bool"),
+    "images under another key": (sample(images=None, imgs=torch.zeros(2, 3, H, W)), "did you mean 'images'"),
     "road": (sample(ground_z_m=float("nan")), "ground_z_m: expected a finite height"),
     "rig file": (sample(rig="nuscenes"), r"rig: expected an arbiview_aug.Rig, got str; use load_rig\(path\)"),
     "rig of three": (sample(rig=rig(3)), "images: expected 3 images for cameras c0, c1, c2, got 2"),
