@@ -31,7 +31,7 @@ from arbiview_aug.cameras.validation import (
     checked_pixels,
     checked_size,
 )
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.errors import CalibrationError, shown
 
 UNPROJECT_TOLERANCE_PX = 1e-6
 """Largest reprojection error of a valid ray."""
@@ -99,6 +99,10 @@ class Camera:
         for array in (self.K, self.cam2ego, *([] if self.mask is None else [self.mask])):
             array.setflags(write=False)
 
+    @property
+    def _where(self) -> str:
+        return f"camera {shown(self.name)}"
+
     # --- construction ---------------------------------------------------------------------------------------------
     @classmethod
     def looking(
@@ -139,9 +143,9 @@ class Camera:
         """
         if (K is None) == (horizontal_fov_deg is None):
             raise CalibrationError(f"camera {name!r}: expected either K or horizontal_fov_deg, got both or none")
-        angles = azimuth_deg, elevation_deg, roll_deg
-        azimuth, elevation, roll = checked_numbers(name, "azimuth, elevation, roll", angles, 3, _ANGLES)
-        position = checked_numbers(name, "position_m", position_m, 3, _METRES)
+        where, angles = f"camera {shown(name)}", (azimuth_deg, elevation_deg, roll_deg)
+        azimuth, elevation, roll = checked_numbers(where, "azimuth, elevation, roll", angles, 3, _ANGLES)
+        position = checked_numbers(where, "position_m", position_m, 3, _METRES)
         cam2ego = np.eye(4)
         cam2ego[:3, :3] = rotation_z(azimuth) @ CAMERA_AXES_IN_EGO @ rotation_x(elevation) @ rotation_z(roll)
         cam2ego[:3, 3] = position
@@ -326,7 +330,7 @@ class Camera:
             if frame.has_bars and self.mask is None:
                 scaled = replace(scaled, mask=np.ones(frame.scaled, bool))
             return scaled.crop(frame.top, frame.left, frame.size)
-        h, w = checked_size(self.name, size)
+        h, w = checked_size(self._where, size)
         mask = self.mask
         if mask is not None:
             mask = cv2.resize(mask.astype(np.uint8), (w, h), interpolation=cv2.INTER_NEAREST_EXACT).astype(bool)
@@ -337,9 +341,9 @@ class Camera:
 
         The window may exceed the image; a mask is False there.
         """
-        h, w = checked_size(self.name, size)
+        h, w = checked_size(self._where, size)
         K = self.K.copy()
-        top, left = (checked_pixels(self.name, f, n, -MAX_SIZE_PX) for f, n in (("top", top), ("left", left)))
+        top, left = (checked_pixels(self._where, f, n, -MAX_SIZE_PX) for f, n in (("top", top), ("left", left)))
         K[:2, 2] -= left, top
         mask = None
         if self.mask is not None:
@@ -351,7 +355,7 @@ class Camera:
 
     def moved(self, ego2ego: Any) -> Camera:
         """The same camera in another ego frame: ``cam2ego`` becomes ``ego2ego @ cam2ego``."""
-        move = checked_array(self.name, "ego2ego", ego2ego, (4, 4))
+        move = checked_array(self._where, "ego2ego", ego2ego, (4, 4))
         with np.errstate(over="ignore", invalid="ignore"):  # ``Camera`` refuses such a pose
             cam2ego = move @ self.cam2ego
         return replace(self, cam2ego=cam2ego)
@@ -361,7 +365,7 @@ class Camera:
 
         The mask stays on the own car: it is re-sampled, and pixels that the old image did not show are not masked.
         """
-        yaw, pitch, roll = checked_numbers(self.name, "yaw, pitch, roll", (yaw_deg, pitch_deg, roll_deg), 3, _ANGLES)
+        yaw, pitch, roll = checked_numbers(self._where, "yaw, pitch, roll", (yaw_deg, pitch_deg, roll_deg), 3, _ANGLES)
         cam2ego = self.cam2ego.copy()
         cam2ego[:3, :3] = rotation_z(yaw) @ cam2ego[:3, :3] @ rotation_x(pitch) @ rotation_z(roll)
         return with_mask_of(self, replace(self, cam2ego=cam2ego, mask=None), outside=True)
@@ -369,7 +373,7 @@ class Camera:
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Camera:
         """Moved along the ego's axes."""
         cam2ego = self.cam2ego.copy()
-        cam2ego[:3, 3] += checked_numbers(self.name, "shift", (x_m, y_m, z_m), 3, _METRES)
+        cam2ego[:3, 3] += checked_numbers(self._where, "shift", (x_m, y_m, z_m), 3, _METRES)
         return replace(self, cam2ego=cam2ego)
 
     def undistorted(self) -> Camera:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal, NamedTuple, get_args
 
 from arbiview_aug.cameras.validation import MAX_SIZE_PX, checked_size
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.errors import CalibrationError, shown
 
 Fit = Literal["crop", "pad", "stretch"]
 """``stretch`` scales each side by itself; the others keep the aspect ratio. ``crop`` scales to cover the size and cuts
@@ -36,7 +36,7 @@ def framing(name: str, size: tuple[int, int], to: tuple[int, int], fit: Fit) -> 
     """
     if fit not in get_args(Fit):
         raise CalibrationError(f"camera {name!r}: fit: expected one of {', '.join(get_args(Fit))}, got {fit!r}")
-    h, w = to = checked_size(name, to)
+    h, w = to = checked_size(f"camera {shown(name)}", to)
     if fit == "stretch":
         return Framing(to, 0, 0, to)
     # In integers: rounding errors of floats would change the window by a pixel where the aspects are equal.

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -14,7 +13,7 @@ import numpy.typing as npt
 
 from arbiview_aug.cameras.key_names import hint, unknown_key
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.validation import checked_numbers, checked_pose
+from arbiview_aug.cameras.validation import checked_numbers, checked_pose, refusal
 from arbiview_aug.errors import CalibrationError, calibration_of, shown
 
 MOST_BEAMS, MOST_RAYS = 1024, 1 << 21
@@ -49,26 +48,22 @@ class Lidar:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise CalibrationError(f"lidar name: expected a non-empty string, got {shown(self.name)}")
-        with _of_lidar():
-            self.__dict__.update(self._checked())
-
-    def _checked(self) -> dict[str, Any]:
-        name, elevations = self.name, self.elevations_deg
+        where, elevations = self._where, self.elevations_deg
         try:
             count = len(elevations)
         except TypeError:  # a generator, which may have no end, or a number
             count = 0
         beams = f"1 to {MOST_BEAMS} elevations from -90 to 90 degrees"
         is_short = 0 < count <= MOST_BEAMS
-        table = checked_numbers(name, "elevations_deg", elevations, count, beams) if is_short else ()
+        table = checked_numbers(where, "elevations_deg", elevations, count, beams) if is_short else ()
         if not table or max(map(abs, table)) > 90:
-            raise CalibrationError(f"camera {shown(name)}: elevations_deg: expected {beams}, got {shown(elevations)}")
+            raise refusal(where, "elevations_deg", beams, shown(elevations))
         span = "two azimuths in degrees, the first below the second by at most 360"
-        first, end = checked_numbers(name, "azimuth_deg", self.azimuth_deg, 2, span)
+        first, end = checked_numbers(where, "azimuth_deg", self.azimuth_deg, 2, span)
         ranges = "two distances in metres, 0 <= the least < the largest"
-        least, most = checked_numbers(name, "range_m", self.range_m, 2, ranges)
-        (step,) = checked_numbers(name, "azimuth_step_deg", [self.azimuth_step_deg], 1, "a number of degrees")
-        pose = checked_pose(name, self.lidar2ego, "lidar2ego")
+        least, most = checked_numbers(where, "range_m", self.range_m, 2, ranges)
+        (step,) = checked_numbers(where, "azimuth_step_deg", [self.azimuth_step_deg], 1, "a number of degrees")
+        pose = checked_pose(where, self.lidar2ego, "lidar2ego")
         fewest = (end - first) * count / MOST_RAYS
         for field, is_valid, expected, got in (
             ("azimuth_deg", 0 < end - first <= 360, span, (first, end)),
@@ -76,11 +71,15 @@ class Lidar:
             ("azimuth_step_deg", fewest <= step <= 360 and step > 0, f"more than {fewest:.2g} and at most 360", step),
         ):
             if not is_valid:
-                raise CalibrationError(f"camera {shown(name)}: {field}: expected {expected}, got {got}")
-        return {
-            **{"name": str(name), "lidar2ego": pose, "elevations_deg": table},  # numpy's text is no plain YAML
+                raise refusal(where, field, expected, got)
+        self.__dict__.update(
+            **{"name": str(self.name), "lidar2ego": pose, "elevations_deg": table},  # numpy's text is no plain YAML
             **{"azimuth_step_deg": step, "range_m": (least, most), "azimuth_deg": (first, end)},
-        }
+        )
+
+    @property
+    def _where(self) -> str:
+        return f"lidar {shown(self.name)}"
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -134,14 +133,12 @@ class Lidar:
 
     def moved(self, ego2ego: Any) -> Lidar:
         """The same scanner in another ego frame: ``lidar2ego`` becomes ``ego2ego @ lidar2ego``."""
-        with _of_lidar():
-            return replace(self, lidar2ego=checked_pose(self.name, ego2ego, "ego2ego") @ self.lidar2ego)
+        return replace(self, lidar2ego=checked_pose(self._where, ego2ego, "ego2ego") @ self.lidar2ego)
 
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Lidar:
         """Moved along the ego's axes."""
         T = np.eye(4)
-        with _of_lidar():
-            T[:3, 3] = checked_numbers(self.name, "shift", (x_m, y_m, z_m), 3, "three finite numbers of metres")
+        T[:3, 3] = checked_numbers(self._where, "shift", (x_m, y_m, z_m), 3, "three finite numbers of metres")
         return self.moved(T)
 
     def to_dict(self) -> dict[str, Any]:
@@ -161,15 +158,6 @@ class Lidar:
             raise CalibrationError(f"{where}: {unknown}")
         with calibration_of(where):
             return cls(**{key: entry[key] for key in (*_KEYS, "azimuth_deg") if key in entry})
-
-
-@contextmanager
-def _of_lidar() -> Iterator[None]:
-    """Name the scanner in errors of checks, which are those of cameras."""
-    try:
-        yield
-    except CalibrationError as error:
-        raise CalibrationError(f"lidar{str(error).removeprefix('camera').removeprefix('lidar')}") from None
 
 
 def hdl64e(lidar2ego: Any, name: str = "hdl64e") -> Lidar:

@@ -1,6 +1,7 @@
 """Checks of a camera's calibration, and likely mistakes of a rig's.
 
-``checked_...`` take the camera's name first, return read-only values and raise ``CalibrationError`` with the fix.
+``checked_...`` first take whose value it is ("camera 'front'"). They return read-only values and raise
+``CalibrationError`` with the fix.
 """
 
 from __future__ import annotations
@@ -76,17 +77,18 @@ def checked_calibration(
     """The checked fields of a camera."""
     if not isinstance(name, str) or not name or re.search("[\0\ud800-\udfff]", name):
         raise CalibrationError(f"camera name: expected a non-empty string of Unicode, got {shown(name)}")
-    w, h = checked_pixels(name, "width_px", width_px), checked_pixels(name, "height_px", height_px)
-    K, cam2ego, lens = checked_intrinsics(name, K), checked_pose(name, cam2ego), checked_lens(name, lens)
+    where = f"camera {shown(name)}"
+    w, h = checked_pixels(where, "width_px", width_px), checked_pixels(where, "height_px", height_px)
+    K, cam2ego, lens = checked_intrinsics(where, K), checked_pose(where, cam2ego), checked_lens(where, lens)
     return {
         **{"name": str(name), "width_px": w, "height_px": h},  # numpy's text is no plain YAML
         **{"K": K, "cam2ego": cam2ego, "lens": lens},
-        "distortion": checked_distortion(name, lens, distortion),
-        "mask": None if mask is None else checked_mask(name, mask, (h, w)),
+        "distortion": checked_distortion(where, lens, distortion),
+        "mask": None if mask is None else checked_mask(where, mask, (h, w)),
     }
 
 
-def checked_pixels(name: str, field: str, value: Any, least: int = 1) -> int:
+def checked_pixels(where: str, field: str, value: Any, least: int = 1) -> int:
     """An integer number of pixels from ``least`` to ``MAX_SIZE_PX``."""
     try:
         pixels = int(value)
@@ -94,19 +96,19 @@ def checked_pixels(name: str, field: str, value: Any, least: int = 1) -> int:
     except (TypeError, ValueError, OverflowError):
         valid = False
     if not valid:
-        raise _error(name, field, f"a whole number of pixels from {least} to {MAX_SIZE_PX}", shown(value))
+        raise refusal(where, field, f"a whole number of pixels from {least} to {MAX_SIZE_PX}", shown(value))
     return pixels
 
 
-def checked_size(name: str, value: Any) -> tuple[int, int]:
+def checked_size(where: str, value: Any) -> tuple[int, int]:
     try:
         h, w = value
     except (TypeError, ValueError):
-        raise _error(name, "size", "(h, w) in pixels", shown(value)) from None
-    return checked_pixels(name, "height_px", h), checked_pixels(name, "width_px", w)
+        raise refusal(where, "size", "(h, w) in pixels", shown(value)) from None
+    return checked_pixels(where, "height_px", h), checked_pixels(where, "width_px", w)
 
 
-def checked_numbers(name: str, field: str, values: Any, count: int, expected: str) -> tuple[float, ...]:
+def checked_numbers(where: str, field: str, values: Any, count: int, expected: str) -> tuple[float, ...]:
     """``count`` finite numbers; ``expected`` describes them in the error."""
     try:
         numbers = tuple(float(v) for v in values)
@@ -115,11 +117,11 @@ def checked_numbers(name: str, field: str, values: Any, count: int, expected: st
     except (TypeError, ValueError, OverflowError):
         valid = False
     if not valid:
-        raise _error(name, field, expected, shown(values))
+        raise refusal(where, field, expected, shown(values))
     return numbers
 
 
-def checked_array(name: str, field: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
+def checked_array(where: str, field: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
     """A finite float64 copy of the given shape."""
     try:
         if np.iscomplexobj(value):
@@ -128,11 +130,12 @@ def checked_array(name: str, field: str, value: Any, shape: tuple[int, ...]) -> 
             raise TypeError("true or false")
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: tensors that need gradients
-        raise _error(name, field, f"numbers of shape {shape}", f"{type(value).__name__} ({str(error)[:200]})") from None
+        got = f"{type(value).__name__} ({str(error)[:200]})"
+        raise refusal(where, field, f"numbers of shape {shape}", got) from None
     if array.shape != shape:
-        raise _error(name, field, f"shape {shape}", f"shape {array.shape}")
+        raise refusal(where, field, f"shape {shape}", f"shape {array.shape}")
     if not np.isfinite(array).all():
-        raise _error(name, field, "finite numbers", f"NaN or infinity in {array.tolist()}")
+        raise refusal(where, field, "finite numbers", f"NaN or infinity in {array.tolist()}")
     array += 0.0  # -0.0 becomes 0.0: equal calibrations have equal bytes (content_key)
     array.setflags(write=False)
     return array
@@ -144,17 +147,17 @@ def _holds_booleans(value: Sequence[Any]) -> bool:
     return any(isinstance(one, bool) for row in (value, *rows) for one in row)
 
 
-def checked_intrinsics(name: str, value: Any) -> FloatArray:
+def checked_intrinsics(where: str, value: Any) -> FloatArray:
     """(3, 3) K: upper triangular, normalised, with positive focal lengths."""
-    K = checked_array(name, "K", value, (3, 3))
+    K = checked_array(where, "K", value, (3, 3))
     if K[0, 0] < _SHORTEST_PX or K[1, 1] < _SHORTEST_PX:
         expected = f"positive focal lengths, {_SHORTEST_PX:g} px at least"
-        raise _error(name, "K", expected, f"fx {K[0, 0]:g}, fy {K[1, 1]:g}")
+        raise refusal(where, "K", expected, f"fx {K[0, 0]:g}, fy {K[1, 1]:g}")
     if np.abs(K).max() > _MOST_PX:
-        raise _error(name, "K", f"entries of at most {_MOST_PX:g} px", f"{K.tolist()}")
+        raise refusal(where, "K", f"entries of at most {_MOST_PX:g} px", f"{K.tolist()}")
     if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or abs(K[2, 2] - 1) > 1e-9:
         fix = "pass K.T" if np.any(K[2, :2]) and not np.any(K[:2, 2]) else "divide K by K[2, 2]"
-        raise _error(name, "K", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]", f"{K.tolist()}", fix)
+        raise refusal(where, "K", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]", f"{K.tolist()}", fix)
     return K
 
 
@@ -168,30 +171,30 @@ def is_rigid(pose: FloatArray) -> bool:
     return bool(np.abs(R @ R.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(R) > 0)
 
 
-def checked_pose(name: str, value: Any, field: str = "cam2ego") -> FloatArray:
+def checked_pose(where: str, value: Any, field: str = "cam2ego") -> FloatArray:
     """(4, 4) pose; a rotation within ``ROTATION_TOLERANCE`` is made exact."""
-    pose = checked_array(name, field, value, (4, 4))
+    pose = checked_array(where, field, value, (4, 4))
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-9:
         fix = f"pass {field}.T" if np.any(pose[3, :3]) and not np.any(pose[:3, 3]) else ""
-        raise _error(name, field, "last row (0, 0, 0, 1)", f"{pose[3].tolist()}", fix)
+        raise refusal(where, field, "last row (0, 0, 0, 1)", f"{pose[3].tolist()}", fix)
     R = pose[:3, :3]
     largest = float(np.abs(R).max())
     if largest > 2:  # the products below could overflow
         fix = f"the nearest rotation is {nearest_rotation(R / largest).round(9).tolist()}"
-        raise _error(name, field, "a rotation, with entries from -1 to 1", f"{R.tolist()}", fix)
+        raise refusal(where, field, "a rotation, with entries from -1 to 1", f"{R.tolist()}", fix)
     deviation = float(np.abs(R @ R.T - np.eye(3)).max())
     determinant = float(np.linalg.det(R))
     if deviation <= 0.1 and determinant < 0:
         fix = f"np.diag([1, -1, 1, 1]) @ {field}, if y is to the right (CARLA, Unreal)"
         if R[2, 1] > 0.5:  # the image's y axis is up, where the ego's z is
             fix = f"negate {field}[:3, 1], if the camera's y axis is up (Unity)"
-        raise _error(name, field, "right-handed axes", "mirrored, left-handed ones (determinant -1)", fix)
+        raise refusal(where, field, "right-handed axes", "mirrored, left-handed ones (determinant -1)", fix)
     if deviation > ROTATION_TOLERANCE or determinant < 0:
         expected = f"a rotation (|R Rᵀ - I| <= {ROTATION_TOLERANCE:g}, determinant +1)"
         fix = f"the nearest rotation is {nearest_rotation(R).round(9).tolist()}"
-        raise _error(name, field, expected, f"deviation {deviation:.3g}, determinant {determinant:.6g}", fix)
+        raise refusal(where, field, expected, f"deviation {deviation:.3g}, determinant {determinant:.6g}", fix)
     if np.abs(pose[:3, 3]).max() > MOST_M:
-        raise _error(name, field, f"a position within {MOST_M:g} m of the ego frame", f"{pose[:3, 3].tolist()}")
+        raise refusal(where, field, f"a position within {MOST_M:g} m of the ego frame", f"{pose[:3, 3].tolist()}")
     # Residual scale and skew of rounded digits would bend straight lines by a fraction of a pixel.
     if deviation > 1e-12:
         pose = pose.copy()
@@ -200,47 +203,47 @@ def checked_pose(name: str, value: Any, field: str = "cam2ego") -> FloatArray:
     return pose
 
 
-def checked_lens(name: str, value: Any) -> LensName:
+def checked_lens(where: str, value: Any) -> LensName:
     """The name of a lens in ``LENSES``, also for its aliases."""
     lens = canonical_name(value) if isinstance(value, str) else ""
     if lens not in LENSES:
-        raise _error(name, "lens", f"one of {', '.join(LENSES)}", shown(value))
+        raise refusal(where, "lens", f"one of {', '.join(LENSES)}", shown(value))
     return cast(LensName, lens)
 
 
-def checked_distortion(name: str, lens: str, value: Any) -> tuple[float, ...]:
+def checked_distortion(where: str, lens: str, value: Any) -> tuple[float, ...]:
     """As many coefficients as the lens takes, up to ``_MAX_COEFFICIENT``."""
     try:
         coefficients = tuple(float(k) + 0.0 for k in value)
         if isinstance(value, str) or (isinstance(value, list | tuple) and _holds_booleans(value)):
             raise TypeError
     except (TypeError, ValueError, OverflowError):
-        raise _error(name, "distortion", "a sequence of numbers", shown(value)) from None
+        raise refusal(where, "distortion", "a sequence of numbers", shown(value)) from None
     counts = LENSES[lens].coefficient_counts
     if len(coefficients) not in counts:
         expected = " or ".join(map(str, counts)) + f" coefficients for a {lens} lens"
         others = " or ".join(f"lens={other!r}" for other in LENSES if LENSES[other].coefficient_counts != (0,))
         fix = f"name the lens: {others}" if counts == (0,) else "docs/formats.md, Lenses, has them"
-        raise _error(name, "distortion", expected, str(len(coefficients)), fix)
+        raise refusal(where, "distortion", expected, str(len(coefficients)), fix)
     if not all(abs(k) <= _MAX_COEFFICIENT for k in coefficients):  # also catches NaN
-        raise _error(name, "distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", shown(coefficients))
+        raise refusal(where, "distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", shown(coefficients))
     ranges = LENSES[lens].coefficient_ranges
     if any(not low <= k <= high for k, (_, low, high) in zip(coefficients, ranges, strict=False)):
         expected = " and ".join(f"{label} from {low:g} to {high:g}" for label, low, high in ranges)
-        raise _error(name, "distortion", f"{expected} for a {lens} lens", shown(coefficients))
+        raise refusal(where, "distortion", f"{expected} for a {lens} lens", shown(coefficients))
     return coefficients
 
 
-def checked_mask(name: str, value: Any, size: tuple[int, int]) -> BoolArray:
+def checked_mask(where: str, value: Any, size: tuple[int, int]) -> BoolArray:
     """A copy (h, w) bool of the image's size."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, RuntimeError) as error:  # rows of several lengths; tensors on other devices
-        raise _error(name, "mask", "a bool array", one_line(error, 200)) from None
+        raise refusal(where, "mask", "a bool array", one_line(error, 200)) from None
     if array.dtype != np.bool_:
-        raise _error(name, "mask", "bool, True = scene", f"dtype {array.dtype}", "pass mask > 0")
+        raise refusal(where, "mask", "bool, True = scene", f"dtype {array.dtype}", "pass mask > 0")
     if array.shape != size:
-        raise _error(name, "mask", f"shape {size}, the size (h, w) of the image", f"shape {array.shape}")
+        raise refusal(where, "mask", f"shape {size}, the size (h, w) of the image", f"shape {array.shape}")
     array = array.copy()
     array.setflags(write=False)
     return array
@@ -343,7 +346,7 @@ def _set_mistake(cam2ego: FloatArray, sides: Sequence[tuple[int, int]], is_body:
         return "left and right are swapped, as in left-handed axes (CARLA, Unreal: y is right)", fix
     named = [complex(*axis) / complex(*side) * abs(complex(*side)) for axis, side in zip(axes, sides, strict=True)
              if any(side) and math.hypot(*axis) > 0.5]  # fmt: skip
-    turn = np.mean(named) if len(named) >= _LEAST_NAMED and not is_body else 0j
+    turn = complex(np.mean(named)) if len(named) >= _LEAST_NAMED and not is_body else 0j
     turn_deg = math.degrees(np.angle(turn))
     if abs(turn) > _ALIKE and abs(turn_deg) > 60:
         fix = f"x of the ego frame is forward: turn poses, points and boxes by {-turn_deg:.0f} degrees about z"
@@ -423,6 +426,7 @@ def is_mounted(cam2ego: FloatArray, ground_z_m: float) -> BoolArray:
     return np.asarray(near & (height > 0) & (height < _MOST_HEIGHT_M))
 
 
-def _error(name: str, field: str, expected: str, got: str, fix: str = "") -> CalibrationError:
-    tail = f"; {fix}" if fix else ""
-    return CalibrationError(f"camera {shown(name)}: {field}: expected {expected}, got {got}{tail}")
+def refusal(where: str, field: str, expected: str, got: Any, fix: str = "") -> CalibrationError:
+    """The error of a value: whose it is, its name, what was expected, what was given."""
+    words = "".join(f"{one}: " for one in (where, field) if one)
+    return CalibrationError(f"{words}expected {expected}, got {got}{f'; {fix}' if fix else ''}")

@@ -14,9 +14,9 @@ import torch
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.random_rig import RandomRig
-from arbiview_aug.cameras.validation import checked_pose
+from arbiview_aug.cameras.validation import checked_pose, refusal
 from arbiview_aug.choices import is_number
-from arbiview_aug.errors import CalibrationError, SampleError
+from arbiview_aug.errors import SampleError
 from arbiview_aug.integrations.mmdet3d.matrices import entry, like_array, padded
 from arbiview_aug.integrations.mmdet3d.results import check_as_recorded, geometry, moved_points
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
@@ -245,10 +245,7 @@ def _each(matrices: Any, change: Callable[[FloatArray], FloatArray]) -> Any:
 
 
 def _upright_pose(name: str, value: Any) -> FloatArray:
-    try:
-        pose = checked_pose("LiDAR", value, name)
-    except CalibrationError as error:  # the checks are those of cameras
-        raise CalibrationError(str(error).removeprefix("camera 'LiDAR': ")) from None
+    pose = checked_pose("", value, name)
     if pose[2, 2] < _LEAST_UP:
-        raise CalibrationError(f"{name}: expected a frame whose z points up, got {pose[2, 2]:.2f} of it upwards")
+        raise refusal("", name, "a frame whose z points up", f"{pose[2, 2]:.2f} of it upwards")
     return pose

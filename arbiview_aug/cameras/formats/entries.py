@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from arbiview_aug.cameras import validation
 from arbiview_aug.cameras.lens import LENSES, FloatArray
 from arbiview_aug.errors import CalibrationError
 
@@ -18,8 +19,7 @@ WAY_OUT = (
 
 def refusal(name: str, expected: str, got: str, fix: str = "", *, key: str = "") -> CalibrationError:
     """The error of a camera whose file says something else than ``expected``."""
-    where, end = f"{key}: " if key else "", f"; {fix}" if fix else ""
-    return CalibrationError(f"camera {name!r}: {where}expected {expected}, got {got}{end}")
+    return validation.refusal(f"camera {name!r}", key, expected, got, fix)
 
 
 def fitted(name: str, lens: str, coefficients: Any) -> tuple[str, list[float]]:

@@ -56,16 +56,16 @@ def _relative(chain: Mapping[str, Mapping[str, Any]]) -> dict[str, FloatArray]:
     first, *others = chain
     for key, power in (("T_cam_imu", -1), ("T_imu_cam", 1)):
         if others and all(one.get(key) and not one.get("T_cn_cnm1") for one in chain.values()):
-            poses = {name: checked_pose(name, one[key], key) for name, one in chain.items()}
+            poses = {name: checked_pose(f"camera {name!r}", one[key], key) for name, one in chain.items()}
             return {name: np.asarray(np.linalg.matrix_power(pose, power), np.float64) for name, pose in poses.items()}
     pose: FloatArray = np.eye(4)
     relative = {first: pose}
     if chain[first].get("T_cn_cnm1") is not None:
         raise CalibrationError(f"camera {first!r}: expected no T_cn_cnm1, as it is the first; sort the file")
     for name in others:
-        if chain[name].get("T_cn_cnm1") is None:
+        if (before := chain[name].get("T_cn_cnm1")) is None:
             raise refusal(name, "T_cn_cnm1, or T_cam_imu of all cameras", "neither")
-        pose = pose @ np.asarray(np.linalg.inv(checked_pose(name, chain[name]["T_cn_cnm1"], "T_cn_cnm1")), np.float64)
+        pose = pose @ np.asarray(np.linalg.inv(checked_pose(f"camera {name!r}", before, "T_cn_cnm1")), np.float64)
         relative[name] = pose
     return relative
 

@@ -13,7 +13,7 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import read_plain
 from arbiview_aug.cameras.rotations import poses_from
-from arbiview_aug.cameras.validation import checked_numbers, checked_pose
+from arbiview_aug.cameras.validation import checked_numbers, checked_pose, refusal
 from arbiview_aug.errors import CalibrationError, shown
 
 MOUNTING = "mounting.yaml"
@@ -110,14 +110,15 @@ class Mounting:
 
 def pose_of(name: str, value: Any) -> FloatArray:
     """(4, 4) pose of a matrix, or of a translation and a quaternion as tf writes them."""
+    where = f"camera {name!r}"
     if isinstance(value, Mapping):
         try:
             numbers = [value["translation"][axis] for axis in "xyz"] + [value["rotation"][axis] for axis in "wxyz"]
         except (LookupError, TypeError):
             expected = "a 4x4 matrix, or {translation: {x, y, z}, rotation: {x, y, z, w}}"
-            raise CalibrationError(f"camera {name!r}: pose: expected {expected}, got {shown(value)}") from None
-        checked_numbers(name, "pose", numbers, 7, "seven finite numbers")
+            raise refusal(where, "pose", expected, shown(value)) from None
+        checked_numbers(where, "pose", numbers, 7, "seven finite numbers")
         if not any(numbers[3:]):
-            raise CalibrationError(f"camera {name!r}: pose: expected a quaternion, got zeros")
+            raise refusal(where, "pose", "a quaternion", "zeros")
         value = poses_from(numbers)
-    return checked_pose(name, value, "pose")
+    return checked_pose(where, value, "pose")
