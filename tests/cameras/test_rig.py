@@ -73,31 +73,6 @@ def test_files_are_written_whole(tmp_path: Path) -> None:
             write(tmp_path / "file")
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "!!python/object/apply:os.system ['touch {marker}']",
-        "cameras: !!python/object/apply:os.system ['touch {marker}']",
-        "cameras: [!!python/name:os.system '']",
-        "cameras: [{{unclosed",
-        "a: \x00",
-    ],
-)
-def test_malicious_or_broken_yaml_is_refused(tmp_path: Path, text: str) -> None:
-    marker, path = tmp_path / "executed", tmp_path / "evil.yaml"
-    path.write_text(text.format(marker=marker))
-    with pytest.raises(CalibrationError, match=r"evil.yaml: expected plain YAML or JSON"):
-        load_rig(path)
-    assert not marker.exists()
-
-
-@pytest.mark.parametrize("content", [b"\xff\xfe\x00", b'{"cameras": ['])
-def test_broken_json_and_bytes(tmp_path: Path, content: bytes) -> None:
-    (tmp_path / "rig.json").write_bytes(content)
-    with pytest.raises(CalibrationError, match="expected plain YAML or JSON"):
-        load_rig(tmp_path / "rig.json")
-
-
 # --- shipped rigs -----------------------------------------------------------------------------------------------------
 # Per rig: cameras, mean height of their centres above the road, azimuth and horizontal field of view of one of them.
 # (fisheye_surround's heights are the source's own: about 1.8 m.)
