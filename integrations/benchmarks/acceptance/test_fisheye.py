@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import LensName
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import FrameFolder
@@ -18,6 +17,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from tests.helpers import camera
 
 PLACES = ((0.0, (2.0, 0.0, 1.0)), (90.0, (1.0, 0.9, 1.0)), (180.0, (-1.0, 0.0, 1.0)), (-90.0, (1.0, -0.9, 1.0)))
 """Azimuth and position of a surround-view rig."""
@@ -25,26 +25,12 @@ COEFFICIENTS = (-0.06, -0.002, -0.0004, 0.0)
 
 
 def surround(size: tuple[int, int], fov_deg: float, lens: LensName, distortion: tuple[float, ...], pitch: float) -> Rig:
-    return Rig(
-        [
-            Camera.looking(
-                name=f"camera {k}",
-                azimuth_deg=azimuth,
-                elevation_deg=pitch,
-                position_m=position,
-                width_px=size[1],
-                height_px=size[0],
-                horizontal_fov_deg=fov_deg,
-                lens=lens,
-                distortion=distortion,
-            )
-            for k, (azimuth, position) in enumerate(PLACES)
-        ]
-    )
+    own = {"size": size, "horizontal_fov_deg": fov_deg, "lens": lens, "distortion": distortion, "elevation_deg": pitch}
+    return Rig([camera(f"camera {k}", a, position_m=at, **own) for k, (a, at) in enumerate(PLACES)])
 
 
 def lens_ignored(rig: Rig) -> Rig:
-    return rig.with_cameras([replace(camera, lens="pinhole", distortion=()) for camera in rig])
+    return rig.with_cameras([replace(c, lens="pinhole", distortion=()) for c in rig])
 
 
 @pytest.mark.slow
@@ -89,21 +75,9 @@ def test_a_real_fisheye_frame_becomes_straight(fisheye_root: Path) -> None:
     """
     sample = FrameFolder(fisheye_root)[0]
     source: Rig = sample["rig"]
-    target = Rig(
-        [
-            Camera.looking(
-                name=camera.name,
-                azimuth_deg=camera.azimuth_deg,
-                elevation_deg=-15,
-                position_m=tuple(camera.center_m),
-                width_px=640,
-                height_px=400,
-                horizontal_fov_deg=90,
-            )
-            for camera in source
-        ],
-        ground_z_m=source.ground_z_m,
-    )
+    view = {"size": (400, 640), "elevation_deg": -15, "horizontal_fov_deg": 90}
+    views = [camera(c.name, c.azimuth_deg, position_m=tuple(c.center_m), **view) for c in source]
+    target = Rig(views, ground_z_m=source.ground_z_m)
     out = RigRetarget(target, holes="black")(sample)
     assert (out["coverage"].float().mean((1, 2)) >= 0.95).all()
     floats = RigRetarget(target, holes="black")({**sample, "images": sample["images"].float() / 255})["images"]
