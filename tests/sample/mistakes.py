@@ -20,6 +20,7 @@ from arbiview_aug.cameras.rotations import (
 )
 
 Sample = dict[str, Any]
+Mistake = Callable[[Sample], Sample]
 BODY = np.eye(4)
 BODY[:3, :3] = CAMERA_AXES_IN_EGO
 
@@ -36,51 +37,49 @@ def turned(sample: Sample, yaw_deg: float) -> Sample:
     return {**sample, "rig": rig, "points": points, "boxes_3d": boxes}
 
 
-def columns(order: list[int]) -> Callable[[Sample], Sample]:
+def boxes(change: Callable[[torch.Tensor], torch.Tensor]) -> Mistake:
+    return lambda sample: {**sample, "boxes_3d": change(sample["boxes_3d"])}
+
+
+def columns(order: list[int]) -> Mistake:
     """Boxes with their first seven columns in another order."""
-    return lambda sample: {**sample, "boxes_3d": sample["boxes_3d"][:, order]}
+    return boxes(lambda rows: rows[:, order])
 
 
-def yaws(change: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Sample], Sample]:
-    def mistaken(sample: Sample) -> Sample:
-        boxes = sample["boxes_3d"].clone()
-        boxes[:, 6] = change(boxes[:, 6])
-        return {**sample, "boxes_3d": boxes}
-
-    return mistaken
+def yaws(change: Callable[[torch.Tensor], torch.Tensor]) -> Mistake:
+    return boxes(lambda rows: torch.cat([rows[:, :6], change(rows[:, 6:7]), rows[:, 7:]], dim=1))
 
 
-def at_the_bottom(sample: Sample) -> Sample:
-    boxes = sample["boxes_3d"].clone()
-    boxes[:, 2] -= boxes[:, 5] / 2
-    return {**sample, "boxes_3d": boxes}
+def raised(heights: float) -> Mistake:
+    return boxes(lambda rows: torch.cat([rows[:, :2], rows[:, 2:3] + heights * rows[:, 5:6], rows[:, 3:]], dim=1))
 
 
-def without(*keys: str) -> Callable[[Sample], Sample]:
+def sizes(factor: float) -> Mistake:
+    return boxes(lambda rows: rows[:, :7] * torch.tensor([1.0] * 3 + [factor] * 3 + [1.0]))
+
+
+at_the_bottom, at_the_top = raised(-0.5), raised(0.5)
+
+
+def without(*keys: str) -> Mistake:
     return lambda sample: {key: value for key, value in sample.items() if key not in keys}
 
 
-def lidar_frame(yaw_deg: float, forward_m: float = 0.94, up_m: float = 1.84) -> Callable[[Sample], Sample]:
+def lidar_frame(yaw_deg: float, forward_m: float = 0.94, up_m: float = 1.84) -> Mistake:
     """Points in the frame of a LiDAR on the roof; its x axis looks to ``-yaw_deg``."""
-
-    def mistaken(sample: Sample) -> Sample:
-        points = sample["points"].clone()
-        points[:, :3] -= torch.tensor([forward_m, 0, up_m])
-        points[:, :3] = points[:, :3] @ torch.from_numpy(rotation_z(yaw_deg).T).to(points.dtype)
-        return {**sample, "points": points}
-
-    return mistaken
+    R = rotation_z(yaw_deg)
+    return moved("points", R, tuple(R @ (-forward_m, 0, -up_m)))
 
 
-def ground(shift_m: float) -> Callable[[Sample], Sample]:
+def ground(shift_m: float) -> Mistake:
     return lambda sample: {**sample, "rig": Rig(list(sample["rig"]), ground_z_m=sample["rig"].ground_z_m + shift_m)}
 
 
-def cameras(change: Callable[[Camera], Camera]) -> Callable[[Sample], Sample]:
+def cameras(change: Callable[[Camera], Camera]) -> Mistake:
     return lambda sample: {**sample, "rig": sample["rig"].with_cameras(list(map(change, sample["rig"])))}
 
 
-def poses(change: Callable[[FloatArray], FloatArray]) -> Callable[[Sample], Sample]:
+def poses(change: Callable[[FloatArray], FloatArray]) -> Mistake:
     return cameras(lambda camera: replace(camera, cam2ego=change(camera.cam2ego)))
 
 
@@ -92,16 +91,11 @@ WORLD = np.array([[0.6, -0.8, 0, 411.0], [0.8, 0.6, 0, 1181], [0, 0, 1, 0.4], [0
 """A pose of the ego in the world."""
 
 
-def in_world(key: str) -> Callable[[Sample], Sample]:
-    def mistaken(sample: Sample) -> Sample:
-        rows = sample[key].clone()
-        rows[:, :3] = torch.from_numpy(rows[:, :3].numpy() @ WORLD[:3, :3].T + WORLD[:3, 3])
-        return {**sample, key: rows}
-
-    return mistaken
+def in_world(key: str) -> Mistake:
+    return moved(key, WORLD[:3, :3], tuple(WORLD[:3, 3]))
 
 
-def scaled_K(factor: float) -> Callable[[Sample], Sample]:
+def scaled_K(factor: float) -> Mistake:
     """K of images of ``factor`` times the size."""
     return cameras(lambda camera: replace(camera, K=np.diag([factor, factor, 1]) @ camera.K))
 
@@ -123,11 +117,11 @@ def inverted_mask(sample: Sample) -> Sample:
     return cameras(own_car)(sample)
 
 
-def renamed(key: str, name: str) -> Callable[[Sample], Sample]:
+def renamed(key: str, name: str) -> Mistake:
     return lambda sample: {name if k == key else k: value for k, value in sample.items()}
 
 
-def moved(key: str, A: FloatArray | list[list[float]], t: tuple[float, ...] = (0, 0, 0)) -> Callable[[Sample], Sample]:
+def moved(key: str, A: FloatArray | list[list[float]], t: tuple[float, ...] = (0, 0, 0)) -> Mistake:
     """Points or boxes moved by A (3, 3) and t; boxes' headings with them."""
 
     def mistaken(sample: Sample) -> Sample:
@@ -143,7 +137,7 @@ def moved(key: str, A: FloatArray | list[list[float]], t: tuple[float, ...] = (0
     return mistaken
 
 
-def in_camera(key: str) -> Callable[[Sample], Sample]:
+def in_camera(key: str) -> Mistake:
     """Points, or boxes as KITTI has them: the bottom's centre, and yaw about the y axis down."""
 
     def mistaken(sample: Sample) -> Sample:
@@ -158,7 +152,7 @@ def in_camera(key: str) -> Callable[[Sample], Sample]:
     return mistaken
 
 
-def in_local_world(key: str) -> Callable[[Sample], Sample]:
+def in_local_world(key: str) -> Mistake:
     """In a world that begins nearby, as simulators and odometry have it."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation_z(37), (25, -14, 0.3)
@@ -166,18 +160,7 @@ def in_local_world(key: str) -> Callable[[Sample], Sample]:
     return lambda sample: {**change(sample), "ego2world": torch.from_numpy(pose)}
 
 
-def sizes(factor: float) -> Callable[[Sample], Sample]:
-    scale = torch.tensor([1.0] * 3 + [factor] * 3)
-    return lambda sample: {**sample, "boxes_3d": sample["boxes_3d"][:, :7] * torch.cat([scale, torch.ones(1)])}
-
-
-def at_the_top(sample: Sample) -> Sample:
-    boxes = sample["boxes_3d"].clone()
-    boxes[:, 2] += boxes[:, 5] / 2
-    return {**sample, "boxes_3d": boxes}
-
-
-def second_camera(change: Callable[[FloatArray], FloatArray]) -> Callable[[Sample], Sample]:
+def second_camera(change: Callable[[FloatArray], FloatArray]) -> Mistake:
     def mistaken(sample: Sample) -> Sample:
         first, second, *others = sample["rig"]
         second = replace(second, cam2ego=change(second.cam2ego))
@@ -191,7 +174,7 @@ def turn(change: Callable[[FloatArray], FloatArray]) -> Callable[[FloatArray], F
     return lambda pose: np.vstack([np.hstack([change(pose[:3, :3]), pose[:3, 3:]]), pose[3:]])
 
 
-def quaternion_misread(order: list[int]) -> Callable[[Sample], Sample]:
+def quaternion_misread(order: list[int]) -> Mistake:
     return second_camera(turn(lambda R: rotation_from_quaternion(quaternion_from_rotation(R)[order])))
 
 
@@ -203,7 +186,7 @@ def swapped_images(sample: Sample) -> Sample:
 MIRROR = np.diag([1.0, -1, 1, 1])
 FLIP_Y, FLIP_X, DOWN, SWAP = np.diag([1.0, -1, 1]), np.diag([-1.0, 1, 1]), np.diag([1.0, -1, -1]), np.eye(3)[[1, 0, 2]]
 quarter = math.pi / 2
-MISTAKES: dict[str, tuple[Callable[[Sample], Sample], str]] = {
+MISTAKES: dict[str, tuple[Mistake, str]] = {
     "yaw in degrees": (yaws(torch.rad2deg), "boxes_3d: .*in radians.* torch.deg2rad"),
     "width before length": (columns([0, 1, 2, 4, 3, 5, 6]), "boxes_3d: .*wider than long.*Swap columns 3 and 4"),
     "height first": (columns([0, 1, 2, 5, 4, 3, 6]), "boxes_3d: .*highest along the sixth.*Reorder"),
