@@ -30,9 +30,6 @@ OnError = Literal["report", "skip", "fatal"]
 """Treatments of samples that cannot be converted: ``report`` converts the others and leaves the output unfinished,
 ``skip`` leaves the sample out and reports it, ``fatal`` stops."""
 
-TARGET_SETS = ("paper", "yaw", "vehicles", "truck")
-"""Sets of targets that ``evaluate`` renders."""
-
 TRAINING_PRESETS = ("paper", "inpaint", "small", "compact", "tiny")
 """Presets of all settings of a training."""
 

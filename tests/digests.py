@@ -166,7 +166,7 @@ def commands(data: Path | None) -> Iterator[tuple[str, Any]]:
                 for holes in ("continue", "black"):
                     output = Path(scratch, f"{kind}-{holes}")
                     arguments = ["convert", "--data", f"{kind}:{data / folder}", "--target", "argoverse2"]
-                    arguments += ["--size", "64x96", "--downscale", "4", "--workers", "1", "--report", "0"]
+                    arguments += ["--size", "64x96", "--downscale", "4", "--workers", "1"]
                     yield (
                         f"convert {kind} {holes}",
                         _quiet([*arguments, "--output", str(output), "--holes", holes]) or files_of(output),

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 
 from arbiview_aug.errors import ArbiviewError, GeneratorError
-from arbiview_aug.evaluate.judges import load_detector
 from arbiview_aug.files import read_bytes, read_text
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.generator import load_part
@@ -40,13 +39,11 @@ def with_pipe(folder: Path, name: str = "config.json") -> Path:
         lambda folder: PipelineInpainter.from_pretrained(with_pipe(folder)),
         lambda folder: read_checkpoint(missing_weights(folder)),
         lambda folder: load_torchscript(with_pipe(folder) / "config.json", "network", GeneratorError),
-        lambda folder: load_detector("ssdlite320_mobilenet_v3_large", str(with_pipe(folder) / "config.json")),
-        lambda folder: load_detector(str(with_pipe(folder))),
         lambda folder: TransformersDepth(str(with_pipe(folder))),
         lambda folder: load_part("AutoencoderKL", with_pipe(folder), "vae", {}),
         lambda folder: load_perceptual(with_pipe(folder) / "config.json"),
     ],
-    ids=["generator", "pipeline", "weights", "TorchScript", "torchvision", "detector", "depth", "diffusers", "VGG"],
+    ids=["generator", "pipeline", "weights", "TorchScript", "depth", "diffusers", "VGG"],
 )
 def test_pipes_among_weights_are_refused(load: Callable[[Path], object], tmp_path: Path) -> None:
     """They would be waited for."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import re
 import sys
@@ -12,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 from tqdm import tqdm
 
@@ -22,9 +21,6 @@ from arbiview_aug.choices import GeometryName, Holes, Quality, Reduce
 from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
 from arbiview_aug.errors import DataError, shown
 
-if TYPE_CHECKING:
-    import torch
-
 REAL_TARGET = "waymo"  # default target rig of real frames
 
 
@@ -33,12 +29,11 @@ class _HelpFormatter(argparse.HelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> str:
         text, default = action.help or "", action.default
-        has_none = default is None or isinstance(default, bool) or default in ("", [], argparse.SUPPRESS)
-        if has_none or "default" in text or not action.option_strings:
+        if not action.option_strings or "default" in text or default in (None, True, False, "", [], argparse.SUPPRESS):
             return text
-        several = default if isinstance(default, list) else [default]
-        shown = ["x".join(map(str, one)) if isinstance(one, tuple) else str(one) for one in several]
-        return f"{text} (default: {' '.join(shown)})"
+        values = default if isinstance(default, list) else [default]
+        texts = ["x".join(map(str, value)) if isinstance(value, tuple) else str(value) for value in values]
+        return f"{text} (default: {' '.join(texts)})"
 
 
 def command_parser(
@@ -89,78 +84,10 @@ def kinds_text() -> str:
     return "; ".join(f"{kind}: {reader.description}" for kind, reader in READERS.items())
 
 
-def add_data(parser: argparse.ArgumentParser, without: str | None = None, **options: Any) -> None:
-    """Add ``--data``; ``without`` describes the data used without it, None makes it required."""
-    default = "" if without is None else f" (default: {without})"
-    text = f"real frames, by their path alone or with their kind. {kinds_text()}{default}"
-    parser.add_argument("--data", type=data, metavar="[KIND:]PATH", required=without is None, help=text, **options)
-
-
-def add_target(group: argparse._ActionsContainer, *, required: bool = False) -> None:
-    default = "" if required else f" (default: a higher five-camera rig; of real frames, {REAL_TARGET})"
-    text = f"rig to render: a shipped one ({', '.join(shipped_rigs())}), a rig file or a calibration{default}"
-    group.add_argument("--target", type=path, metavar="RIG", required=required, help=text)
-
-
-def add_rendering(parser: argparse.ArgumentParser, holes: str = "continue", *, several: bool = False) -> None:
-    """Add ``--quality``, ``--geometry`` and ``--holes``; with ``several``, each takes one value or more."""
-    for name, choices, default, text in (
-        ("--quality", get_args(Quality), "fast", "renderer preset; paper: the published stages, without lenses"),
-        ("--geometry", get_args(GeometryName), "auto", "scene geometry; auto: the best that the data offers"),
-        ("--holes", get_args(Holes), holes, f"what fills holes (default: {holes}; docs/holes.md)"),
-    ):
-        options: dict[str, Any] = {"nargs": "+", "default": [default]} if several else {"default": default}
-        parser.add_argument(name, choices=choices, help=text, **options)
-
-
-def add_frames(
-    parser: argparse.ArgumentParser, default: int | None, text: str = "number of frames", *, slices: bool = False
-) -> None:
-    """Add ``--frames``, ``--seed`` and ``--size``; with ``slices``, ``--frames`` takes A:B:STEP, too."""
-    kind, metavar = (frames, "N|A:B:STEP") if slices else (count, "N")
-    parser.add_argument("--frames", type=kind, default=default, metavar=metavar, help=text)
-    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the synthetic streets")
-    parser.add_argument(
-        "--size",
-        type=size,
-        metavar="HxW",
-        help="render at this height and width, the target cut to this aspect; synthetic sources too (default: the "
-        "rig's own; synthetic: 256x704)",
-    )
-
-
-def add_downscale(parser: argparse.ArgumentParser, default: Reduce = 1) -> None:
-    text = "decode images at 1/N of their size"
-    parser.add_argument("--downscale", dest="reduce", type=int, choices=get_args(Reduce), default=default, help=text)
-
-
-def add_reading(parser: argparse.ArgumentParser) -> None:
-    """Add ``--downscale`` and ``--clean-masks``."""
-    add_downscale(parser)
-    text = "take specks out of frame folders' masks, and mask the dark rims of fisheye images without a mask"
-    parser.add_argument("--clean-masks", action="store_true", help=text)
-    add_lidar(parser)
-
-
-def add_lidar(parser: argparse.ArgumentParser) -> None:
-    """Add ``--lidar-channel`` and ``--lidar-columns``."""
-    text = "nuScenes: the LiDAR to read (default: LIDAR_TOP, or the only one)"
-    parser.add_argument("--lidar-channel", type=path, metavar="NAME", help=text)
-    text = (
-        "nuScenes: columns of LiDAR files without a header, such as x y z intensity, float32 or with a type as in "
-        "ring:uint16 (default: x y z intensity ring)"
-    )
-    parser.add_argument("--lidar-columns", nargs="+", metavar="NAME", help=text)
-
-
 def reading(arguments: argparse.Namespace) -> dict[str, Any]:
     """Options of ``open_data`` that the command has."""
     names = ("reduce", "clean_masks", "lidar_channel", "lidar_columns")
     return {name: getattr(arguments, name) for name in names if hasattr(arguments, name)}
-
-
-def add_output(parser: argparse.ArgumentParser, text: str = "folder to write to") -> None:
-    parser.add_argument("--output", type=path, default="output", metavar="DIR", help=text)
 
 
 def count(text: str) -> int:
@@ -168,24 +95,10 @@ def count(text: str) -> int:
     return _integer(text, 1, "above 0")
 
 
-def frames(text: str) -> int | str:
-    """Number of frames, or ``A:B:STEP`` as in Python."""
-    if ":" not in text:
-        return count(text)
-    if not re.fullmatch(r"\d*:\d*(:[1-9]\d*)?", text):
-        raise argparse.ArgumentTypeError(f"expected a number of frames or A:B:STEP such as 0:100:10, got {text!r}")
-    return text
-
-
-def chosen_frames(asked: int | str, count_of: int) -> list[int]:
-    """Indices of the frames that ``--frames`` asks for: a number spread over all ``count_of``, or a slice of them."""
-    if isinstance(asked, int):
-        number = min(asked, count_of)
-        return [k * count_of // number for k in range(number)]
-    indices = list(range(count_of)[slice(*(int(part) if part else None for part in asked.split(":")))])
-    if not indices:
-        raise DataError(f"--frames {asked}: expected some of the {count_of} frames, got none")
-    return indices
+def chosen_frames(asked: int, count_of: int) -> list[int]:
+    """Indices of the frames that ``--frames`` asks for, spread over all ``count_of``."""
+    number = min(asked, count_of)
+    return [k * count_of // number for k in range(number)]
 
 
 def seed(text: str) -> int:
@@ -193,34 +106,11 @@ def seed(text: str) -> int:
     return _integer(text, 0, "from 0")
 
 
-def positive(text: str) -> float:
-    """Finite number above 0."""
-    value = float(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a finite number above 0, got {text!r}")
-    return value
-
-
 def _integer(text: str, least: int, expected: str) -> int:
     value = int(text)
     if not least <= value <= 1 << 60:
         raise argparse.ArgumentTypeError(f"expected a whole number {expected}, at most 2**60, got {text!r}")
     return value
-
-
-def device_named(name: str | None) -> torch.device:
-    """Torch device of this name, by default a GPU if there is one; DataError for one that is not there."""
-    import torch
-
-    if name is None:
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise DataError(f"--device: expected cpu, cuda, cuda:1, ..., got {name!r}") from None
-    if device.type != "cpu" and not (device.type == "cuda" and (device.index or 0) < torch.cuda.device_count()):
-        raise DataError(f"--device: expected cpu or a CUDA device that is there, got {name!r}")
-    return device
 
 
 def size(text: str) -> tuple[int, int]:
@@ -237,6 +127,55 @@ def pair(text: str) -> tuple[str, str]:
     if not (old and new):
         raise argparse.ArgumentTypeError(f"expected OLD=NEW, got {text!r}")
     return old, new
+
+
+def options() -> dict[str, dict[str, Any]]:
+    """Options that several commands have, as argparse takes them."""
+    default_target = f"(default: a higher five-camera rig; of real frames, {REAL_TARGET})"
+    known: dict[str, dict[str, Any]] = {"--downscale": {"dest": "reduce", "type": int, "choices": get_args(Reduce)}}
+    for flag, kind, metavar, default, text in (
+        ("--data", data, "[KIND:]PATH", None, f"real frames, by their path alone or with their kind. {kinds_text()}"),
+        ("--target", path, "RIG", None, f"rig to render: {', '.join(shipped_rigs())}, or a file {default_target}"),
+        ("--output", path, "DIR", "output", "folder to write to"),
+        ("--quality", get_args(Quality), None, "fast", "renderer preset; paper: the published stages, without lenses"),
+        ("--geometry", get_args(GeometryName), None, "auto", "scene geometry; auto: the best that the data offers"),
+        ("--holes", get_args(Holes), None, "continue", "what fills holes (docs/holes.md)"),
+        ("--generator", path, "PATH", None, "of --holes diffusion: folder, TorchScript file or OWNER/NAME on the Hub"),
+        ("--steps", count, "N", None, "steps of the generator (default: its own)"),
+        ("--frames", count, "N", 1, "number of frames"),
+        ("--seed", seed, "N", 0, "seed of the synthetic streets"),
+        ("--size", size, "HxW", None, "cut the target to this height and width (default: its own; synthetic: 256x704)"),
+        ("--downscale", int, None, 1, "decode images at 1/N of their size"),
+        ("--lidar-channel", path, "NAME", None, "nuScenes: the LiDAR to read (default: LIDAR_TOP, or the only one)"),
+        ("--lidar-columns", str, "NAME", None, "nuScenes: columns of LiDAR files without a header (docs/formats.md)"),
+    ):
+        typed = {"choices": kind} if isinstance(kind, tuple) else {"type": kind, "metavar": metavar}
+        known[flag] = {**typed, "default": default, "help": text, **known.get(flag, {})}
+    known["--lidar-columns"]["nargs"] = "+"
+    text = "take specks out of frame folders' masks, and mask the dark rims of fisheye images without a mask"
+    return known | {"--clean-masks": {"action": "store_true", "help": text}}
+
+
+def add_options(parser: argparse.ArgumentParser, *flags: str, without: str = "", **changes: Any) -> None:
+    """Add shared options; ``changes`` replace what ``options`` says of them.
+
+    Args:
+        parser: The command's parser.
+        flags: Names in ``options``.
+        without: What is used without the option, for its text.
+        changes: As argparse takes them.
+    """
+    for flag in flags:
+        option = {**options()[flag], **changes}
+        option["help"] += f" (default: {without})" if without else ""
+        if option.get("required"):
+            option["help"] = option["help"].partition(" (default")[0]
+        parser.add_argument(flag, **option)
+
+
+LIDAR = "--lidar-channel", "--lidar-columns"
+READING = "--downscale", "--clean-masks", *LIDAR
+RENDERING = "--quality", "--geometry", "--holes"
 
 
 def frames_text(count_of: int) -> str:

@@ -21,7 +21,7 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.atomic_io import inside, remove_parts
 from arbiview_aug.choices import Reference
-from arbiview_aug.cli.arguments import device_named, gathered_warnings, reading, writable_folder
+from arbiview_aug.cli.arguments import gathered_warnings, reading, writable_folder
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDER, LEARNED_FOLDER, WANTED, DepthFolder
 from arbiview_aug.datasets.registry import open_data, split_kind
@@ -126,7 +126,7 @@ def _for_network(
 
 def run(arguments: argparse.Namespace) -> int:
     """Compute and write the depth of every frame that has none yet; return 1 if one failed or none has depth."""
-    device = device_named(arguments.device)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     _, root = split_kind(arguments.data)
     warned: list[str] = []
     with gathered_warnings(warned):

@@ -9,12 +9,11 @@ import re
 import shutil
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 from timeit import timeit
-from typing import Any
 
 import cv2
 import numpy as np
@@ -110,22 +109,13 @@ def _frame(size: tuple[int, int]) -> Line:
     """Time one frame of a synthetic street, and check that something was seen."""
     with compiling("objects", "plans", "points"):
         sample = SyntheticDrive(demo_source_rig(size), num_frames=1)[0]
-    target = demo_target_rig(size)
-    calls = {
-        "street": partial(RigRetarget(target, geometry="street"), sample),
-        "auto": partial(RigRetarget(target), sample),
-    }
-    with gathered_warnings([]):
-        out = [call() for call in calls.values()][-1]
-        times = _times(calls)
-        with one_thread():
-            times += f"; on one thread {_times(calls)}"
+    target, found = demo_target_rig(size), list[str]()
+    with gathered_warnings([]), one_thread():
+        for geometry in ("street", "auto"):
+            call = partial(RigRetarget(target, geometry=geometry), sample)  # type: ignore[arg-type]
+            out = call()
+            ms = statistics.median(1e3 * timeit(call, timer=working_s, number=1) for _ in range(_CALLS))
+            found.append(f"{geometry} {ms:.0f} ms")
     images = np.stack([image.numpy() for image in out["images"]])
-    text = f"a frame, {len(sample['rig'])} cameras to {len(images)} of {size[0]}x{size[1]}: {times}"
-    return bool(images.std() > 1 and out["coverage"].any()), text
-
-
-def _times(calls: Mapping[str, Callable[[], Any]]) -> str:
-    """Median times of calls."""
-    ms = {name: [1e3 * timeit(call, timer=working_s, number=1) for _ in range(_CALLS)] for name, call in calls.items()}
-    return ", ".join(f"{name} {statistics.median(times):.0f} ms" for name, times in ms.items())
+    cameras = f"{len(sample['rig'])} cameras to {len(images)} of {size[0]}x{size[1]}"
+    return bool(images.std() > 1 and out["coverage"].any()), f"a frame, {cameras}, on one thread: {', '.join(found)}"

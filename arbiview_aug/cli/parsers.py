@@ -5,21 +5,17 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Iterable
-from pathlib import Path
 from typing import get_args
 
 from arbiview_aug.atomic_io import Link
 from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import TARGET_SETS, TRAINING_PRESETS, OnError, Quality, Reduce, Reference
+from arbiview_aug.choices import TRAINING_PRESETS, OnError, Quality, Reduce, Reference
 from arbiview_aug.cli.arguments import (
-    add_data,
-    add_frames,
-    add_lidar,
-    add_output,
-    add_reading,
-    add_rendering,
-    add_target,
+    LIDAR,
+    READING,
+    RENDERING,
+    add_options,
     command_parser,
     count,
     data,
@@ -27,7 +23,6 @@ from arbiview_aug.cli.arguments import (
     kinds_text,
     pair,
     path,
-    positive,
     seed,
     size,
 )
@@ -36,17 +31,8 @@ from arbiview_aug.datasets.registry import READERS
 SIZE, FULL_SIZE = (256, 704), (900, 1600)
 """Sizes (h, w) of the views that benchmarks render."""
 
-EXECUTIONS = ("opencv", "torch", "cuda")
-"""Backends of ``bench``: ``opencv`` or ``torch`` on the CPU, or ``cuda``: torch on a GPU."""
-
 SCORED = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3d", "lidar": "points"}
 """Geometry that ``bench`` scores, and the sample key that offers it."""
-
-_GENERATOR = "folder of a generator or of diffusers, TorchScript file, or OWNER/NAME on the Hugging Face Hub"
-
-
-def _file(text: str) -> Path:
-    return Path(path(text))
 
 
 def check() -> argparse.ArgumentParser:
@@ -58,9 +44,9 @@ def check() -> argparse.ArgumentParser:
     )
     text = f"real frames, by their path alone or with their kind; a rig file or a calibration. {kinds_text()}"
     parser.add_argument("data", type=path, metavar="[KIND:]PATH", help=text)
-    parser.add_argument("--frames", type=count, default=3, metavar="N", help="number of frames, spread over the data")
-    add_reading(parser)
-    add_output(parser, "folder for the pictures")
+    add_options(parser, "--frames", default=3, help="number of frames, spread over the data")
+    add_options(parser, *READING)
+    add_options(parser, "--output", help="folder for the pictures")
     return parser
 
 
@@ -71,29 +57,26 @@ def convert() -> argparse.ArgumentParser:
         "tables, or frame folders. Files that are there are left as they are: run it again to go on.",
         "--data nuscenes:ROOT --target argoverse2 --output converted --size 256x704",
     )
-    add_data(parser)
+    add_options(parser, "--data", "--target", required=True)
     add = parser.add_argument
     add("--version", type=path, metavar="NAME", help="nuScenes' folder of tables (default: v1.0-mini, -trainval)")
-    add_target(parser, required=True)
     names = "new names of the target's cameras, such as ring_front_center=CAM_FRONT, by which detectors find them"
     add("--names", nargs="+", type=pair, default=[], metavar="OLD=NEW", help=names)
-    add("--output", type=path, required=True, metavar="DIR", help="folder to write to")
-    add_rendering(parser)
-    add("--generator", type=_file, metavar="PATH", help=f"of --holes diffusion: {_GENERATOR} (default: the own)")
-    add("--steps", type=count, metavar="N", help="steps of the generator (default: its own)")
+    add_options(parser, "--output", required=True, default=None)
+    add_options(parser, *RENDERING, "--generator", "--steps")
     add("--size", type=size, metavar="HxW", help="height and width of every view (default: the target's own)")
     fit = "with --size: cut at the top and the sides (default), add black bars there, or stretch"
     add("--fit", choices=get_args(Fit), default="crop", help=fit)
     points = "as the target's scanners would have measured them, if it has any (default), or as they are"
     add("--points", choices=("target", "source"), default="target", help=points)
-    add_reading(parser)
+    add_options(parser, *READING)
     neighbours = "let N frames of the drive before and after each fill holes (default: none)"
     add("--neighbours", type=seed, default=0, metavar="N", help=neighbours)
     depth = (
         "what the depth command wrote, for --geometry auto, motion, fused or learned (default: its folder in the data; "
         "auto: none)"
     )
-    add("--depth", dest="motion_depth", type=_file, metavar="DIR", help=depth)
+    add("--depth", dest="motion_depth", type=path, metavar="DIR", help=depth)
     add("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
     add("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0")
     add("--num-shards", type=count, default=1, metavar="N", help="number of shards")
@@ -107,9 +90,6 @@ def convert() -> argparse.ArgumentParser:
         "symbolic links, which readers of this package refuse"
     )
     add("--link", choices=get_args(Link), default="hard", help=link)
-    verify = "write nothing: compare sources and outputs with the checksums that were recorded"
-    add("--verify", action="store_true", help=verify)
-    add("--report", type=seed, default=2, metavar="N", help="number of frames in report.html")
     return parser
 
 
@@ -120,14 +100,11 @@ def demo() -> argparse.ArgumentParser:
         "and one contact sheet.",
         "--data FOLDER --target waymo",
     )
-    add_data(parser, "a synthetic street")
-    add_target(parser)
-    add_output(parser, "folder for demo.png, or a picture file ending in .png or .jpg")
-    add_rendering(parser)
-    add_frames(parser, 1)
-    add_lidar(parser)
+    add_options(parser, "--data", without="a synthetic street")
+    add_options(parser, "--output", help="folder for demo.png, or a picture file ending in .png or .jpg")
+    add_options(parser, "--target", *RENDERING, "--frames", "--seed", "--size", *LIDAR)
     parser.add_argument("--width", type=count, default=1800, metavar="PX", help="width of the contact sheet")
-    parser.set_defaults(target_set=None, reduce=1, clean_masks=False)
+    parser.set_defaults(reduce=1, clean_masks=False)
     return parser
 
 
@@ -139,18 +116,17 @@ def depth() -> argparse.ArgumentParser:
         "go on.",
         "--data nuscenes:ROOT --workers 4",
     )
-    add_data(parser)
+    add_options(parser, "--data", required=True)
     add = parser.add_argument
     output = "where to write (default: motion_depth or learned_depth beside the data)"
     add("--output", type=path, metavar="FOLDER", help=output)
     add("--workers", type=count, default=1, metavar="N", help="processes")
     add("--model", type=path, metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub")
-    add("--device", metavar="NAME", help="cpu, cuda, cuda:1, ... (default: the GPU, if there is one)")
     add("--batch", type=count, default=8, metavar="N", help="images that the model sees at once")
     references = list(get_args(Reference))
     reference = "what scale and shift of the model are fitted to, the first that a camera has"
     add("--reference", nargs="+", choices=references, default=references, help=reference)
-    add_lidar(parser)
+    add_options(parser, *LIDAR)
     return parser
 
 
@@ -160,51 +136,43 @@ def doctor() -> argparse.ArgumentParser:
         "Check this installation: versions, OpenCV's wheels, threads, compiled kernels, disk, extras; time one frame.",
         "--size 256x704",
     )
-    parser.add_argument("--size", type=size, default=SIZE, metavar="HxW", help="of the views (default: 256x704)")
+    add_options(parser, "--size", default=SIZE, help="of the views")
     return parser
 
 
 def evaluate() -> argparse.ArgumentParser:
     parser = command_parser(
         "evaluate",
-        "Measure the quality of rendered views: sparse LiDAR metrics, overlap and consistency on real frames, truth on "
+        "Measure the quality of rendered views: LiDAR points or photographs as truth on real frames, true views on "
         "synthetic streets. Writes tables, evaluate.json, pictures, and a self-contained report.html.",
         "--data FOLDER --target waymo --geometry auto street",
     )
-    add_data(parser, "synthetic streets")
-    target = parser.add_mutually_exclusive_group()
-    add_target(target)
-    sets = "instead of --target: paper (its six configurations), yaw (5 turns), vehicles, or truck (1 m higher)"
-    target.add_argument("--target-set", choices=TARGET_SETS, help=sets)
-    add_rendering(parser, "black", several=True)
+    add_options(parser, "--data", without="synthetic streets")
+    add_options(parser, "--target")
+    for option, default in zip(RENDERING, ("fast", "auto", "black"), strict=True):
+        add_options(parser, option, nargs="+", default=[default])
+    text = "number of frames, spread over the data (default: 1; --displaced, --lidar: all)"
+    add_options(parser, "--frames", default=None, help=text)
+    add_options(parser, "--generator", "--steps", "--seed", "--size", *READING, "--output")
     add = parser.add_argument
-    add("--generator", type=path, metavar="PATH", help=f"of --holes diffusion: {_GENERATOR}")
-    add("--steps", nargs="+", type=count, default=[None], metavar="N", help="steps of the generator (default: its own)")
-    text = "number of frames, spread over the data, or a slice of them (default: 1; --displaced: all)"
-    add_frames(parser, None, text, slices=True)
-    add_reading(parser)
-    add_output(parser)
     displaced = (
-        "photographs as truth: of the frames' `truth` camera (docs/formats.md), else of the next frame of the drive; "
-        "with NEXT of this frame folder's first frame. Surfaces: a copy, and all that the data offers"
+        "photographs as truth: of the frames' `truth` camera (docs/formats.md), else of the next frame of the drive. "
+        "Geometries: a copy, and all that the data offers"
     )
-    add("--displaced", nargs="?", type=path, const=True, metavar="NEXT", help=displaced)
+    add("--displaced", action="store_true", help=displaced)
     lidar = (
-        "instead of images, score points as the target's scanners would have measured them, against true scans: of "
-        "synthetic streets; with --displaced, the next frame's, by the target's scanners or those in calib.json"
+        "instead of images, score points as the target's scanners, or those in calib.json, would have measured them "
+        "from where the next frame was taken, against that frame's scan"
     )
     add("--lidar", action="store_true", help=lidar)
     detector = (
         "AP and recall of a detector in the views, against true images or labels: FILE.py:function (RGB (H, W, 3) "
-        "uint8 to boxes (n, 4) xyxy, scores, labels), or a torchvision detector's name (docs/benchmarks.md)"
+        "uint8 to boxes (n, 4) xyxy, scores, labels; docs/benchmarks.md)"
     )
     add("--detector", type=path, metavar="MODEL", help=detector)
-    add("--detector-weights", type=path, metavar="FILE", help="weights of a torchvision detector")
-    classes = "labels that count (default: names of vehicles and people; all numbers)"
-    add("--detector-classes", nargs="+", default=[], metavar="LABEL", help=classes)
     segmenter = (
         "IoU of a segmenter's masks in the views with those in true images: FILE.py:function (RGB (H, W, 3) uint8 to "
-        "masks (n, H, W)), or TorchScript of TwinLiteNet's kind"
+        "masks (n, H, W))"
     )
     add("--segmenter", type=path, metavar="MODEL", help=segmenter)
     return parser
@@ -235,7 +203,7 @@ def train() -> argparse.ArgumentParser:
     kinds = " or ".join(f"{kind}:PATH" for kind in READERS)
     text = f"synthetic, or real frames with their kind: {kinds} (default: synthetic)"
     add("--data", type=path, metavar="DATA", help=text)
-    add_output(parser, "folder of the run")
+    add_options(parser, "--output", help="folder of the run")
     add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
     weights = "config paper or inpaint: Stable Diffusion 1.5, or its inpainting model: a folder or hub id"
     add("--weights", type=path, metavar="DIR", help=weights)
@@ -251,16 +219,11 @@ def view() -> argparse.ArgumentParser:
         "source images beside the target's views, their coverage and confidence. Needs the extra viewer.",
         "/data/frames --target waymo --frames 10",
     )
-    add = parser.add_argument
     text = f"real frames, by their path alone or with their kind. {kinds_text()} (default: a synthetic street)"
-    add("data", nargs="?", type=data, metavar="[KIND:]PATH", help=text)
-    add_target(parser)
-    add_rendering(parser)
-    add_frames(parser, 5)
-    add_reading(parser)
-    add("--output", type=path, default="output/view.rrd", metavar="FILE", help="recording to write")
-    add("--open", action="store_true", help="open it in the viewer")
-    parser.set_defaults(target_set=None)
+    parser.add_argument("data", nargs="?", type=data, metavar="[KIND:]PATH", help=text)
+    add_options(parser, "--frames", default=5)
+    add_options(parser, "--target", *RENDERING, "--seed", "--size", *READING)
+    add_options(parser, "--output", default="output/view.rrd", metavar="FILE", help="recording to write")
     return parser
 
 
@@ -268,24 +231,18 @@ def view() -> argparse.ArgumentParser:
 def bench() -> argparse.ArgumentParser:
     parser = command_parser(
         "bench",
-        "Speed against accuracy: every quality, surface, decoded size and execution, for one target rig.",
-        "--data FOLDER --budget-ms 20",
+        "Speed against accuracy: every quality, geometry and decoded size, for one target rig.",
+        "--data FOLDER --target waymo",
     )
-    add_data(parser, "synthetic streets")
+    add_options(parser, "--data", without="synthetic streets")
+    add_options(parser, "--target", "--output")
+    add_options(parser, "--size", default=SIZE, help="of every view")
+    add_options(parser, "--frames", help="frames for accuracy")
     add = parser.add_argument
-    add("--size", type=size, default=SIZE, metavar="HxW", help="of every view")
-    add("--repeats", type=count, default=9, metavar="N", help="rounds of timing")
-    add_output(parser)
-    add_target(parser)
-    add("--frames", type=count, default=1, metavar="N", help="frames for accuracy")
     add("--quality", nargs="+", choices=get_args(Quality), default=[*get_args(Quality)], help="presets")
     add("--geometry", nargs="+", choices=[*SCORED], help="(default: what the samples offer)")
-    reduces = [*get_args(Reduce)]
-    add("--downscale", dest="reduce", nargs="+", type=int, choices=reduces, default=reduces, help="decode at 1/N")
-    add("--execution", nargs="+", choices=EXECUTIONS, help="backends (default: those of this machine)")
-    limit = parser.add_mutually_exclusive_group()
-    limit.add_argument("--budget-ms", type=positive, metavar="MS", help="recommend the most accurate within it")
-    limit.add_argument("--min-psnr", type=positive, metavar="DB", help="recommend the fastest that reaches it")
+    text = "decode real images at 1/N of their size"
+    add_options(parser, "--downscale", nargs="+", default=[*get_args(Reduce)], help=text)
     return parser
 
 
@@ -306,7 +263,7 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
         if {*surfaces} - {"auto", "infinity"}:
             parser.error(f"argument --geometry: quality paper knows infinity alone, got {', '.join(surfaces)}")
     if name == "depth" and not arguments.model:
-        refuse(("device", "batch", "reference"), "expected it with --model alone: depth from motion needs no network")
+        refuse(("batch", "reference"), "expected it with --model alone: depth from motion needs no network")
     if name == "check" and is_rig(arguments.data):
         if arguments.data in shipped_rigs() or os.path.exists(arguments.data):
             refuse(("frames", "reduce", "clean_masks"), "expected frames with it, got a rig")
@@ -316,19 +273,11 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
         refuse(("generator", "steps"), "expected it with --holes diffusion")
     if name == "evaluate":
         if arguments.displaced:
-            fixed = "target_set", "seed", "size", *(() if arguments.lidar else ("target",))
-            refuse(fixed, "--displaced has its own; expected none")
+            refuse(("seed", "size", "target", "lidar"), "expected it without --displaced, which has its own")
         if arguments.lidar:
-            if arguments.data is not None and not arguments.displaced:
-                parser.error("argument --lidar: expected --displaced with --data: a drive's truth is its next scan")
-            of_drives = () if arguments.displaced else ("reduce", "clean_masks")
-            of_images = "detector", "segmenter", "target_set", "size", "quality", "geometry", "holes", *of_drives
+            of_images = "detector", "segmenter", "size", "quality", "geometry", "holes"
             refuse(of_images, "it is of images; expected no --lidar")
-        if not arguments.detector:
-            refuse(("detector_weights", "detector_classes"), "expected --detector with it, found none")
         if arguments.segmenter and arguments.data is not None and not arguments.displaced:
             parser.error("argument --segmenter: expected --displaced with --data: it compares with true images")
-        if isinstance(arguments.frames, str) and arguments.data is None:
-            parser.error("argument --frames: expected --data FOLDER with A:B:STEP, found none")
-        if arguments.displaced and arguments.data is None:
-            parser.error("argument --displaced: expected --data FOLDER with it, found none")
+        if arguments.data is None:
+            refuse(("displaced", "lidar"), "expected --data FOLDER with it, found none")

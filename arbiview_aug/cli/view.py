@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import re
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -18,7 +16,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import frames_text, named_steps, output_file
-from arbiview_aug.cli.evaluate import open_frames, target_rigs
+from arbiview_aug.cli.evaluate import open_frames, target_rig
 from arbiview_aug.cli.parsers import SIZE
 from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.datasets.image_io import encoded_image
@@ -27,8 +25,7 @@ from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import views_of
-from arbiview_aug.evaluate.report.pictures import BOX, HOLE, RIG_COLOURS, box_lines, left_to_right
-from arbiview_aug.evaluate.report.scan_pictures import height_colours
+from arbiview_aug.evaluate.report.pictures import BOX, HOLE, RIG_COLOURS, box_lines, coloured, left_to_right
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys
@@ -36,6 +33,7 @@ from arbiview_aug.transforms.settings import SampleKeys
 _STEP_M = 1.2  # between frames of the synthetic street
 _FRUSTUM_M = 0.8  # from a camera to its image in 3D
 _PIXEL_CENTER = 0.5  # Rerun counts pixels from the image's corner
+_LOW_M, _HIGH_M = -0.5, 3.5  # heights of points over the road, blue to red
 _THIN = -1.0  # a radius in points of the screen
 _SEEN, _FILLED, _BLACK, _MASKED = range(4)
 _LEGEND = (
@@ -44,11 +42,10 @@ _LEGEND = (
     (_BLACK, "black: no camera saw it", (*HOLE, 255)),
     (_MASKED, "masked", (90, 90, 90, 255)),
 )
-_MAPS = ("boxes", "coverage", "confidence")  # over a camera's image, in two dimensions alone
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Write the recording; with ``--open`` show it, and return the viewer's exit status."""
+def run(arguments: argparse.Namespace) -> None:
+    """Write the recording."""
     path = output_file(arguments.output, [".rrd"])
     if re.search("[\ud800-\udfff]", arguments.output):
         raise DataError(f"--output {arguments.output!a}: expected a name in UTF-8, which Rerun's writer needs")
@@ -58,14 +55,10 @@ def run(arguments: argparse.Namespace) -> int:
     with named_steps(notes, arguments.frames) as tick, whole_file(path) as file:
         frames = _frames(arguments)
         first = next(frames)
-        (target,) = target_rigs(arguments, chosen, first["rig"]).values()
-        retarget = RigRetarget(
-            target,
-            quality=arguments.quality,
-            geometry=arguments.geometry,
-            holes=arguments.holes,
-            keys=SampleKeys(extra=() if arguments.quality == "paper" else ("confidence",)),
-        )
+        target = target_rig(arguments, chosen, first["rig"])
+        keys = SampleKeys(extra=() if arguments.quality == "paper" else ("confidence",))
+        given = {name: getattr(arguments, name) for name in ("quality", "geometry", "holes")}
+        retarget = RigRetarget(target, keys=keys, **given)
         recording = SampleRecording(Path(file.name), first["rig"], target)
         for number, sample in enumerate(chain([first], frames)):
             tick(str(sample.get("token", number)), 1)
@@ -74,11 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     for note in notes:
         print(f"note: {note}\n")
     print(f"recording: {path} ({frames_text(number + 1)}, {path.stat().st_size / 1e6:.1f} MB)")
-    if arguments.open:
-        viewer = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(path)]
-        return subprocess.run(viewer, check=False).returncode
     print(f"open it: python -m rerun {path}")
-    return 0
 
 
 def _frames(arguments: argparse.Namespace) -> Iterator[Mapping[str, Any]]:
@@ -108,8 +97,7 @@ class SampleRecording:
         self._stream = self._rr.RecordingStream("arbiview_aug")
         self._stream.save(path)
         self._log, self._frames, self._target = self._stream.log, 0, target
-        self._world2first: Any = None
-        self._first_s: Any = None
+        self._first: dict[str, Any] = {}  # time and pose of the first frame
         self._log("/", self._rr.ViewCoordinates.FLU, static=True)
         self._log("/", self._rr.AnnotationContext(list(_LEGEND)), static=True)
         self._lay_out({"source": source, "target": target})
@@ -119,48 +107,45 @@ class SampleRecording:
         self._stream.disconnect()
 
     def _lay_out(self, rigs: Mapping[str, Rig]) -> None:
-        """Put the 3D scene beside the source's images, the target's views, and their confidence."""
+        """Put the 3D scene next to the source's images and the target's views."""
         views = optional_package("rerun.blueprint", "viewer")
         cameras = [(self._path(side, camera), camera) for side, rig in rigs.items() for camera in rig]
-        flat = [f"{path}/{name}" for path, _ in cameras for name in _MAPS]
+        flat = [f"{path}/{name}" for path, _ in cameras for name in ("boxes", "coverage", "confidence")]
         flat += [f"{path}/image" for path, camera in cameras if not camera.is_rectilinear]
-        scene = views.Spatial3DView(
-            origin="/ego",
-            contents=["/ego/**", *(f"- {path}" for path in flat)],
-            name="vehicle",
-            eye_controls=views.EyeControls3D(position=(-11.0, 0.0, 9.0), look_target=(6.0, 0.0, 0.0)),
-        )
+        contents = ["/ego/**", *(f"- {path}" for path in flat)]
+        scene = views.Spatial3DView(origin="/ego", contents=contents, name="vehicle")
 
-        def grid(side: str, maps: Sequence[str], name: str) -> Any:
-            rig = rigs[side]
-            images = []
-            for camera in (rig[k] for k in left_to_right(rig)):
-                contents = [f"$origin/{one}" for one in maps]
-                bounds = views.VisualBounds2D(x_range=(0, camera.width_px), y_range=(0, camera.height_px))
-                place = {"origin": self._path(side, camera), "name": camera.name}
-                images.append(views.Spatial2DView(contents=contents, visual_bounds=bounds, **place))
-            return views.Grid(*images, grid_columns=min(3, len(rig)), name=name)
+        def grid(side: str, shown: str, name: str) -> Any:
+            ordered = [rigs[side][k] for k in left_to_right(rigs[side])]
+            contents = [f"$origin/{layer}" for layer in (*shown.split(), "boxes")]
+            places = [{"origin": self._path(side, camera), "name": camera.name} for camera in ordered]
+            images = [views.Spatial2DView(contents=contents, **place) for place in places]
+            return views.Grid(*images, grid_columns=min(3, len(ordered)), name=name)
 
-        seen = "image", "coverage", "boxes"
-        of_target = grid("target", seen, "target"), grid("target", ("confidence", "boxes"), "confidence")
-        images = views.Vertical(views.Tabs(grid("source", seen, "source")), views.Tabs(*of_target))
+        of_target = grid("target", "image coverage", "target"), grid("target", "confidence", "confidence")
+        images = views.Vertical(grid("source", "image coverage", "source"), views.Tabs(*of_target))
         layout = views.Horizontal(scene, images, column_shares=[2, 3])
-        panels = [panel(state="collapsed") for panel in (views.SelectionPanel, views.BlueprintPanel, views.TimePanel)]
-        self._stream.send_blueprint(views.Blueprint(layout, *panels))
+        self._stream.send_blueprint(views.Blueprint(layout, collapse_panels=True))
 
     def _path(self, side: str, camera: Camera) -> str:
         return f"/ego/{side}/{self._rr.escape_entity_path_part(camera.name)}"
 
     def add(self, sample: Mapping[str, Any], out: Mapping[str, Any]) -> None:
         """Add a reader's sample, and what ``RigRetarget`` made of it."""
-        self._set_time(sample)
+        self._stream.set_time("frame", sequence=self._frames)
+        if sample.get("time_s") is not None:
+            self._first.setdefault("time_s", float(sample["time_s"]))
+            self._stream.set_time("time", duration=float(sample["time_s"]) - self._first["time_s"])
+        if sample.get("ego2world") is not None:
+            ego2world = np.asarray(sample["ego2world"], np.float64)
+            self._add_pose("/ego", np.linalg.inv(self._first.setdefault("ego2world", ego2world)) @ ego2world)
         source: Rig = sample["rig"]
         boxes = np.zeros((0, 7)) if sample.get("boxes_3d") is None else sample["boxes_3d"].double().numpy()
         self._add_boxes(boxes, sample.get("box_names"))
         clouds = {"source": sample.get("points"), "target": out.get("points") if self._target.lidars else None}
         for side, points in clouds.items():
             positions = np.zeros((0, 3)) if points is None else points[:, :3].numpy()
-            colours = height_colours(positions, source.ground_z_m)
+            colours = coloured((positions[:, 2] - source.ground_z_m - _LOW_M) / (_HIGH_M - _LOW_M))
             self._log(f"/ego/{side}_points", self._rr.Points3D(positions, colors=colours, radii=_THIN))
         for camera, image in zip(source, as_arrays(sample["images"]), strict=True):
             path = self._path("source", camera)
@@ -173,17 +158,6 @@ class SampleRecording:
             self._add_maps(path, view)
         self._frames += 1
 
-    def _set_time(self, sample: Mapping[str, Any]) -> None:
-        self._stream.set_time("frame", sequence=self._frames)
-        if sample.get("time_s") is not None:
-            self._first_s = float(sample["time_s"]) if self._first_s is None else self._first_s
-            self._stream.set_time("time", duration=float(sample["time_s"]) - self._first_s)
-        if sample.get("ego2world") is not None:
-            ego2world = np.asarray(sample["ego2world"], np.float64)
-            if self._world2first is None:
-                self._world2first = np.linalg.inv(ego2world)
-            self._add_pose("/ego", self._world2first @ ego2world)
-
     def _add_pose(self, path: str, pose: FloatArray) -> None:
         self._log(path, self._rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
 
@@ -194,19 +168,16 @@ class SampleRecording:
         self._log("/ego/boxes", self._rr.Boxes3D(**shape, labels=names, show_labels=False))
 
     def _add_camera(self, path: str, camera: Camera, image: Image, boxes: FloatArray, colour: str) -> None:
-        """Add a camera's pose, what it sees in 3D, its image, and boxes bent as its lens bends them.
+        """Add a camera's pose and frustum, its image, and boxes bent as its lens bends them.
 
-        Rerun's cameras have no lenses: only images of cameras without one stand in 3D.
+        Rerun's cameras have no lenses: images of cameras with one are not shown in 3D.
         """
         self._add_pose(path, camera.cam2ego)
-        rgb = tuple(bytes.fromhex(colour[1:]))
-        if camera.is_rectilinear:
-            K = camera.K.copy()
-            K[:2, 2] += _PIXEL_CENTER
-            frustum = {"resolution": camera.size[::-1], "image_plane_distance": _FRUSTUM_M, "color": rgb}
-            self._log(path, self._rr.Pinhole(image_from_camera=K, **frustum))
-        else:
-            self._log(f"{path}/sees", self._rr.LineStrips3D(_field_of_view(camera), colors=rgb, radii=_THIN))
+        K = camera.K.copy()
+        K[:2, 2] += _PIXEL_CENTER
+        frustum = {"resolution": camera.size[::-1], "image_plane_distance": _FRUSTUM_M}
+        pinhole = self._rr.Pinhole(image_from_camera=K, color=tuple(bytes.fromhex(colour[1:])), **frustum)
+        self._log(path if camera.is_rectilinear else f"{path}/frustum", pinhole)
         (pixels,) = as_tensors([image])
         self._log(f"{path}/image", self._rr.EncodedImage(contents=encoded_image(pixels), media_type="image/jpeg"))
         lines = [(segments, colour) for box in boxes for segments, colour in box_lines(camera, box)]
@@ -224,15 +195,3 @@ class SampleRecording:
 
     def _add_classes(self, path: str, classes: Any) -> None:
         self._log(f"{path}/coverage", self._rr.SegmentationImage(classes.astype(np.uint8), opacity=0.5))
-
-
-def _field_of_view(camera: Camera) -> list[FloatArray]:
-    """Lines (n, 3) in a camera's frame around what it sees through its lens, and from its centre to them."""
-    angle = np.linspace(0, 2 * np.pi, 65)
-    toward = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    toward /= np.abs(toward).max(axis=-1, keepdims=True)  # onto the image's border
-    middle = (np.array(camera.size[::-1]) - 1) / 2
-    rays = camera.unproject_cam(middle * (1 + np.linspace(0, 1, 65)[:, None, None] * toward))  # [steps, angles, 2]
-    last = len(rays.valid) - 1 - np.argmax(rays.valid[::-1], axis=0)
-    ring = _FRUSTUM_M * rays.directions[last, np.arange(len(angle))]
-    return [ring, *(np.stack([np.zeros(3), end]) for end in ring[4::8])]

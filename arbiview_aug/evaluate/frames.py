@@ -1,15 +1,15 @@
 """Evaluation of methods on frames: the sample that a method gets, and the references that score its views.
 
-References are true views (synthetic streets), or LiDAR points in the source cameras' colours, as recorded and with even
-exposures. If a method may read points, all methods get those of alternate azimuth sectors (``lidar.lidar_split``) and
-are scored on the others.
+References are true images (of synthetic streets, or photographs), or LiDAR points in the source cameras' colours, as
+recorded and with even exposures. If a method may read points, all methods get those of alternate azimuth sectors
+(``lidar.lidar_split``) and are scored on the others.
 """
 
 from __future__ import annotations
 
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
@@ -20,8 +20,7 @@ import torch
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, RenderedViews, SceneClass
-from arbiview_aug.errors import CalibrationError, SampleError
-from arbiview_aug.evaluate.agreement import OverlapScore, source_overlap, summary, target_consistency
+from arbiview_aug.errors import CalibrationError, DataError, SampleError
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.lidar import ColouredPoints, coloured_points, equalised, lidar_split, sparse_metrics
 from arbiview_aug.evaluate.methods import Method
@@ -30,12 +29,11 @@ from arbiview_aug.sample.boxes_2d import rig_of
 
 Render = Callable[[Mapping[str, Any], Rig], list[RenderedView]]  # a view for each of the target rig
 
-Look = Callable[[str, "ScoredFrame", str, str, Rig, Sequence[RenderedView]], None]
-"""Look at a named frame's views: by a method, for a target, whose rig comes with it."""
+Look = Callable[[str, "ScoredFrame", str, Rig, Sequence[RenderedView]], None]
+"""Look at a named frame's views for a rig, by the method of a name."""
 
 Exposure = Literal["raw", "even"]
 EXPOSURES: tuple[Exposure, ...] = ("raw", "even")  # exposures as recorded, and made even
-_CACHED_TRUTHS = 8  # one for each target would take a gigabyte
 
 
 class LidarReference(NamedTuple):
@@ -45,16 +43,12 @@ class LidarReference(NamedTuple):
     points: ColouredPoints
 
 
-class Photographs(NamedTuple):
-    """Images that the cameras of a rig took, as truth."""
+class Truth(NamedTuple):
+    """True images of a rig."""
 
-    rig: Rig  # in the frame's ego frame, without masks
-    images: torch.Tensor | Sequence[torch.Tensor]
-    valid: Sequence[BoolArray]  # (h, w) pixels that score, by camera
-
-    def of_rig(self, _: Rig) -> Photographs:
-        """``ScoredFrame.truth`` of their own rig."""
-        return self
+    images: Sequence[Image]
+    valid: Sequence[BoolArray]  # (h, w) pixels that score
+    regions: Sequence[Mapping[str, BoolArray]] = ()  # (h, w) parts of each image that have a score by name, if known
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,7 @@ class ScoredFrame:
     sample: dict[str, Any]  # ``rig``, ``images`` and other keys that methods may use
     lidar: Mapping[Exposure, LidarReference] = field(default_factory=dict)  # by exposure; empty without points
     held_out: bool = False  # whether ``sample`` has points, and others score
-    truth: Callable[[Rig], RenderedViews | Photographs] | None = None  # the true views of a rig; None if unknown
+    truth: Callable[[Rig], Truth] | None = None  # the truth of a rig; None if unknown
     target: Rig | None = None  # the rig that alone has a truth, that of photographs; None for any rig
 
     @property
@@ -70,9 +64,23 @@ class ScoredFrame:
         """Sample that methods get for scoring, with even exposures if points score at those."""
         return self.lidar["even"].sample if "even" in self.lidar else self.sample
 
-    def true_images(self, target: Rig) -> list[Image] | None:
+    def true_images(self, target: Rig) -> Sequence[Image] | None:
         """The true views (h, w, 3) of a rig, if the truth is known."""
-        return None if self.truth is None else as_arrays(self.truth(target).images)
+        return None if self.truth is None else self.truth(target).images
+
+
+def photographed(sample: dict[str, Any], rig: Rig, images: Sequence[torch.Tensor] | torch.Tensor) -> ScoredFrame:
+    """Frame whose truth is what the cameras of ``rig``, in its ego frame, photographed outside of their masks."""
+    valid = [np.ones(camera.size, bool) if camera.mask is None else camera.mask for camera in rig]
+    truth = Truth(as_arrays(images), valid)
+    return ScoredFrame(sample, truth=lambda _: truth, target=without_masks(rig))
+
+
+def without_masks(rig: Rig) -> Rig:
+    """The same rig without car-body masks."""
+    if all(camera.mask is None for camera in rig):
+        return rig
+    return rig.with_cameras([replace(camera, mask=None) for camera in rig])
 
 
 def make_frame(
@@ -87,11 +95,11 @@ def make_frame(
     ``truth`` renders the true views of a rig; the last ones are cached. Without ``exposures`` points do not score. With
     ``hand_over_points`` methods get the points of the sectors that do not score, and none of neighbours.
     """
-    truth = None if truth is None else lru_cache(_CACHED_TRUTHS)(truth)
+    true = None if truth is None else lru_cache(1)(lambda rig: _street_truth(truth(rig)))
     inputs = {key: value for key, value in sample.items() if key != "points"}
     points_3d = sample.get("points")
     if points_3d is None or not exposures:
-        return ScoredFrame(dict(sample) if hand_over_points else inputs, truth=truth)
+        return ScoredFrame(dict(sample) if hand_over_points else inputs, truth=true)
     rig, images = rig_of(sample), as_arrays(sample["images"])  # masked: made-up pixels colour no points
     cloud = points_3d.numpy().astype(np.float64)
     if inputs.get("neighbours"):  # their points lie in the sectors that score, too; their images stay unread
@@ -105,7 +113,19 @@ def make_frame(
         if hand_over_points:
             points = points.subset(lidar_split(points.points)[1])
         lidar[exposure] = LidarReference({**inputs, "images": as_tensors(exposed)}, points)
-    return ScoredFrame(inputs, lidar, hand_over_points, truth)
+    return ScoredFrame(inputs, lidar, hand_over_points, true)
+
+
+def _street_truth(views: RenderedViews) -> Truth:
+    classes = [plane.numpy() for plane in views.classes]
+    valid = [plane != SceneClass.VOID for plane in classes]
+    return Truth(as_arrays(views.images), valid, [regions(plane) for plane in classes])
+
+
+def regions(classes: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:
+    """Ground, object and sky of a synthetic view (h, w)."""
+    ground, sky = np.isin(classes, [int(c) for c in GROUND_CLASSES]), classes == SceneClass.SKY
+    return {"ground": ground, "sky": sky, "object": ~ground & ~sky & (classes != SceneClass.VOID)}
 
 
 def scores(
@@ -124,30 +144,16 @@ def scores(
     rows = [{"seen": float(view.coverage.mean())} for view in views]
     if frame.truth is not None:
         truth = frame.truth(target)
-        shown = zip(rows, views, as_arrays(truth.images), valid_pixels(truth), strict=True)
-        for k, (row, view, true, valid) in enumerate(shown):
-            classes = None if isinstance(truth, Photographs) else regions(truth.classes[k].numpy())
-            metrics_of_view = truth_metrics(view.image, true, coverage=view.coverage, classes=classes, valid=valid)
-            row |= {f"true_{name}": value for name, value in metrics_of_view.items()}
+        classes = truth.regions or [{}] * len(views)
+        for row, view, true, valid, parts in zip(rows, views, truth.images, truth.valid, classes, strict=True):
+            found = truth_metrics(view.image, true, coverage=view.coverage, classes=parts, valid=valid)
+            row |= {f"true_{name}": value for name, value in found.items()}
     for k, (exposure, reference) in enumerate(references):
         rendered = views if k == 0 else render(reference.sample, target)
         for row, camera, view in zip(rows, mounted, rendered, strict=True):
-            metrics_of_view = sparse_metrics(view.image, camera, reference.points, coverage=view.coverage) or {}
-            row |= {f"{exposure}_{name}": value for name, value in metrics_of_view.items()}
+            found = sparse_metrics(view.image, camera, reference.points, coverage=view.coverage) or {}
+            row |= {f"{exposure}_{name}": value for name, value in found.items()}
     return views, rows
-
-
-def valid_pixels(truth: RenderedViews | Photographs) -> list[BoolArray]:
-    """Pixels (h, w) of each true image that score: those that the lens sees, and what photographs do not mask."""
-    if isinstance(truth, Photographs):
-        return list(truth.valid)
-    return [classes.numpy() != SceneClass.VOID for classes in truth.classes]
-
-
-def regions(classes: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:
-    """Ground, object and sky of a synthetic view (h, w)."""
-    ground, sky = np.isin(classes, [int(c) for c in GROUND_CLASSES]), classes == SceneClass.SKY
-    return {"ground": ground, "sky": sky, "object": ~ground & ~sky & (classes != SceneClass.VOID)}
 
 
 # --- evaluation of methods --------------------------------------------------------------------------------------------
@@ -157,22 +163,18 @@ PHOTOGRAPHS = "photographs"
 
 @dataclass
 class Evaluation:
-    """Measurements as plain data, and the views of the first frame.
+    """Measurements as plain data, and the views of the first frame."""
 
-    ``views`` has a row for each frame, target, camera and method: metrics beside those four names. ``pairs`` has one
-    for each frame, method and pair of neighbours: ``kind`` is ``overlap`` (two sources) or ``consistency`` (two views).
-    """
-
-    views: list[dict[str, Any]] = field(default_factory=list)
-    pairs: list[dict[str, Any]] = field(default_factory=list)
-    pictures: dict[tuple[str, str], list[RenderedView]] = field(default_factory=dict)  # of ``first``, by target, method
-    targets: dict[str, Rig] = field(default_factory=dict)  # of the first frame, by name
-    first: ScoredFrame | None = None
+    first: ScoredFrame
+    target: Rig  # that of the first frame
+    label: str  # name of the target
+    views: list[dict[str, Any]] = field(default_factory=list)  # metrics by frame, target, camera and method
+    pictures: dict[str, list[RenderedView]] = field(default_factory=dict)  # views of ``first`` by method
     declined: dict[str, str] = field(default_factory=dict)  # why a method could not render
 
-    def means(self, method: str, target: str | None = None) -> dict[str, float]:
-        """Mean the per-image values over cameras and frames; over all targets by default."""
-        return mean_of(row for row in self.views if row["method"] == method and target in (None, row["target"]))
+    def means(self, method: str) -> dict[str, float]:
+        """Mean the per-image values over cameras and frames."""
+        return mean_of(row for row in self.views if row["method"] == method)
 
     def spread(self, method: str, metric: str) -> float:
         """Standard deviation over the frames of a metric's mean."""
@@ -182,54 +184,37 @@ class Evaluation:
                 frames.setdefault(row["frame"], []).append(row[metric])
         return float(np.std([np.mean(values) for values in frames.values()])) if frames else 0.0
 
-    def agreement(self, method: str) -> dict[str, float]:
-        """Summarize the pairs of sources (``overlap_...``) and of rendered views (``consistency_...``)."""
-        row: dict[str, float] = {}
-        for kind in ("overlap", "consistency"):
-            pairs = [p for p in self.pairs if p["method"] == method and p["kind"] == kind]
-            row |= summary(kind, [OverlapScore._make(map(pair.get, OverlapScore._fields)) for pair in pairs])
-        return row
-
 
 def evaluate(
     frames: Iterable[tuple[str, ScoredFrame]],
-    targets: Callable[[Rig], Mapping[str, Rig]],
+    target: Callable[[Rig], Rig],
     methods: Sequence[Method],
     tick: Callable[[str, int], None] = lambda _, __: None,
-    *,
-    agreement: bool = True,
     look: Look | None = None,
 ) -> Evaluation:
-    """Run every method on every named frame and target.
+    """Run every method on every named frame; DataError without frames.
 
-    ``targets`` maps a source rig to the rigs to render, by name, unless a frame has a ``target`` of its own. ``tick``
-    is called before each step with its name and the frame's number of steps. ``agreement`` measures that of neighbours
-    too. ``look`` sees all views.
+    ``target`` maps a source rig to the rig to render, unless a frame has a ``target`` of its own. ``tick`` is called
+    before each step with its name and the frame's number of steps. ``look`` sees all views.
     """
-    done = Evaluation()
+    done: Evaluation | None = None
     for name, frame in frames:
-        rigs = dict(targets(frame.sample["rig"])) if frame.target is None else {PHOTOGRAPHS: frame.target}
-        if done.first is None:
-            done.first, done.targets = frame, rigs
-        steps = len(methods) * (agreement + len(rigs))
+        rig = frame.target or target(frame.sample["rig"])
+        if done is None:
+            done = Evaluation(frame, rig, rig.name or "target" if frame.target is None else PHOTOGRAPHS)
         for method in methods:
-            row = {"frame": name, "method": method.name}
+            tick(f"{name}: {method.name}", len(methods))
             try:
-                if agreement:
-                    tick(f"{name}: {method.name}, overlap", steps)
-                    pairs = source_overlap(frame.sample, method)
-                    done.pairs += [{**row, "kind": "overlap", **pair._asdict()} for pair in pairs]
-                for target, rig in rigs.items():
-                    tick(f"{name}: {method.name}, {target}", steps)
-                    views, metrics = scores(frame, method.render, rig)
-                    if frame is done.first:
-                        done.pictures[target, method.name] = views
-                    if look is not None:
-                        look(name, frame, method.name, target, rig, views)
-                    row["target"] = target
-                    done.views += [{**row, "camera": c.name, **m} for c, m in zip(rig, metrics, strict=True)]
-                    pairs = target_consistency(rig, views) if agreement else []
-                    done.pairs += [{**row, "kind": "consistency", **pair._asdict()} for pair in pairs]
+                views, rows = scores(frame, method.render, rig)
             except (CalibrationError, SampleError) as error:  # lenses, for a method of pinhole cameras
                 done.declined[method.name] = f"frame {name}: {error}"
+                continue
+            if frame is done.first:
+                done.pictures[method.name] = views
+            if look is not None:
+                look(name, frame, method.name, rig, views)
+            where = {"frame": name, "method": method.name, "target": done.label}
+            done.views += [{**where, "camera": c.name, **row} for c, row in zip(rig, rows, strict=True)]
+    if done is None:
+        raise DataError("expected a frame to evaluate, found none")
     return done

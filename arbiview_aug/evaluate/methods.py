@@ -7,25 +7,23 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-import torch
+import cv2
+import numpy as np
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName, Holes, Quality
-from arbiview_aug.errors import WarnOnce
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
-from arbiview_aug.render.overlap_depth import OverlapDepth, overlap_depth
 from arbiview_aug.render.plan import RenderConfig
-from arbiview_aug.sample.inputs import DEPTH_KEYS, MOTION_KEY, read_frames, read_scene
 from arbiview_aug.scene.scene import GEOMETRIES
-from arbiview_aug.temporal.motion_depth import brings_motion, estimate_motion
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import PlanCache, SampleKeys, inpainter_of, render_config
 
 Sample = Mapping[str, Any]
 
-_CACHED_TRANSFORMS = 8  # the targets of a set; full-size plans take 50 MB each
+_CACHED_TRANSFORMS = 8  # targets of a study; full-size plans take 50 MB each
 
 
 @dataclass(frozen=True)
@@ -33,21 +31,11 @@ class Method:
     """A row of a table.
 
     ``render`` maps a sample with ``rig`` and a target rig (in its own ego frame) to one view per target camera.
-    ``render_alone`` maps a sample, the index of a source camera and a one-camera target rig to the view from it
-    alone, with the scene estimated from all cameras; None if nothing is estimated from several.
     """
 
     name: str
     render: Callable[[Sample, Rig], list[RenderedView]]
     reads_points: bool = False  # may use the sample's ``points``, so that only a part of them can score it
-    render_alone: Callable[[Sample, int, Rig], RenderedView] | None = None
-
-    def alone(self, sample: Sample, camera: int, target: Rig) -> RenderedView:
-        """Render a one-camera target from one source camera alone."""
-        if self.render_alone is not None:
-            return self.render_alone(sample, camera, target)
-        (view,) = self.render(one_camera(sample, camera), target)
-        return view
 
 
 def retargeting(
@@ -61,10 +49,9 @@ def retargeting(
     """Wrap ``RigRetarget`` as a method, with its arguments.
 
     Exposures stay as recorded: metrics compare with them. The name is by default made of quality, geometry and what
-    fills holes. A source camera alone is never completed.
+    fills holes.
     """
     inpainter = inpainter_of(holes)  # once, not for each target
-    fills = not isinstance(inpainter, Black)
     settings = dict[str, Any](cache=PlanCache(max_bytes=0)) | settings
     images_alone = replace(settings.get("keys", SampleKeys()), points="source")
     settings |= {"holes": inpainter, "match_exposure": False, "keys": images_alone}
@@ -76,66 +63,31 @@ def retargeting(
     def render(sample: Sample, target: Rig) -> list[RenderedView]:
         return views_of(transform(target)(sample))
 
-    def render_alone(sample: Sample, camera: int, target: Rig) -> RenderedView:
-        """Render with the depth estimated from all cameras, their overlaps and their neighbours."""
-        if not estimates or estimates[0][0] is not sample:  # several views of a sample are rendered in a row
-            known = _with_motion(sample, geometry) if from_motion else sample
-            estimates[:] = [(sample, known, _overlap_depth(sample, geometry) if learns else None)]
-        _, known, depth = estimates[0]
-        alone = one_camera(known, camera)
-        retarget = RigRetarget(
-            target,
-            quality=quality,
-            geometry=geometry,
-            match_exposure=False,
-            cache=PlanCache(share_overlap=depth is not None, max_bytes=0),
-            holes="black",
-            keys=SampleKeys(points="source"),
-        )
-        if depth is not None and retarget.renderer.overlaps is not None:
-            retarget.renderer.overlaps.get((alone["rig"].named_key, None), lambda: depth)
-        (view,) = views_of(retarget(alone))
-        return view
-
-    config = render_config(quality)
     label = name or ", ".join([quality if isinstance(quality, str) else type(quality).__name__, geometry])
-    if not name and fills:
+    if not name and not isinstance(inpainter, Black):
         steps = getattr(inpainter, "steps", None)
         label += f", {holes if isinstance(holes, str) else type(holes).__name__}" + (f" {steps}" if steps else "")
-    is_paper = not isinstance(config, RenderConfig)
-    learns = not is_paper and config.overlap_depth
-    from_motion = not is_paper and GEOMETRIES[geometry].needs == "motion"
-    estimates: list[tuple[Sample, Sample, OverlapDepth | None]] = []
-    reads_points = "points" in GEOMETRIES[geometry].reads and not is_paper
-    alone = render_alone if learns or from_motion or fills else None
-    return Method(label, render, reads_points, alone)
+    reads_points = isinstance(render_config(quality), RenderConfig) and "points" in GEOMETRIES[geometry].reads
+    return Method(label, render, reads_points)
 
 
-def _overlap_depth(sample: Sample, geometry: GeometryName) -> OverlapDepth:
-    """Depth from a sample's overlaps, as ``estimate_overlap`` measures it."""
-    scene = read_scene(read_frames(sample, None, geometry)[0], geometry)
-    row = GEOMETRIES[scene.best if geometry == "auto" else geometry]
-    boxes = scene.boxes if row.overlap_depth and "boxes" in row.reads else None
-    return overlap_depth(sample["rig"], list(sample["images"]), boxes)
+def _copy(sample: Sample, target: Rig) -> list[RenderedView]:
+    images, views = as_arrays(sample["images"]), []
+    for camera in target:
+        image = images[own_index(sample["rig"], camera)]
+        resized: Any = cv2.resize(image, camera.size[::-1], interpolation=cv2.INTER_AREA)
+        views.append(RenderedView(resized, np.ones(camera.size, bool)))
+    return views
 
 
-def _with_motion(sample: Sample, geometry: GeometryName) -> Sample:
-    """The sample with its depth from motion, where that must be estimated."""
-    warn = WarnOnce()
-    frame = read_frames(sample, None, geometry, further=("neighbours",), warn=warn)[0]
-    if brings_motion(frame, geometry):
-        return sample
-    motion = estimate_motion(frame, read_scene(frame, geometry).boxes, warn)
-    return {**sample, MOTION_KEY: list(map(torch.from_numpy, motion.depth_m))}
+COPY = Method("copy", _copy)
+"""The source image of the same name, else of the nearest direction."""
 
 
-def one_camera(sample: Sample, camera: int) -> dict[str, Any]:
-    """Reduce a sample to one camera, its depth and masks; geometry in the ego frame stays, neighbours do not."""
-    rig: Rig = sample["rig"]
-    kept = {key: value for key, value in sample.items() if key not in ("K", "cam2ego", "detections", "neighbours")}
-    of_cameras = (*DEPTH_KEYS, "coverage", "ego_mask")
-    kept |= {key: kept[key][camera : camera + 1] for key in of_cameras if kept.get(key) is not None}
-    return {**kept, "images": [sample["images"][camera]], "rig": rig.with_cameras([rig[camera]])}
+def own_index(source: Rig, camera: Camera) -> int:
+    """Index of the source camera of the same name, or else of the nearest direction."""
+    nearest = int(np.argmax(source.cam2ego[:, :3, 2] @ camera.cam2ego[:3, 2]))
+    return source.names.index(camera.name) if camera.name in source.names else nearest
 
 
 def views_of(out: Sample) -> list[RenderedView]:

@@ -14,7 +14,6 @@ from arbiview_aug.evaluate.images import Image
 
 _PEAK = 255.0
 _SMALLEST_MSE = 1e-9
-_TILE_PX = 32
 
 
 def errors(got: npt.NDArray[Any], want: npt.NDArray[Any], prefix: str = "") -> dict[str, float]:
@@ -53,38 +52,6 @@ def mean_of(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     return {key: float(np.mean(column)) for key, column in values.items()}
 
 
-def spectrum_distance_db(got: npt.NDArray[Any], want: npt.NDArray[Any], region: npt.NDArray[np.bool_]) -> float | None:
-    """Distance of the radial power spectra of two (h, w, 3) images in a region (h, w): root mean square dB of octaves.
-
-    0 for the texture of ``want``; blur lacks power at high frequencies, speckle has too much. Windows of ``_TILE_PX``
-    that overlap by half count with their grey values less the mean. One grey level of noise is added to both. None
-    without pixels.
-    """
-    if not region.any():
-        return None
-    hann = np.hanning(_TILE_PX + 2)[1:-1]
-    masks = _tiles(region.astype(np.float64)) * np.outer(hann, hann)
-    chosen = masks.any((1, 2))
-    masks = masks[chosen]
-    radius = np.hypot(*np.meshgrid(*[np.fft.fftfreq(_TILE_PX, 1 / _TILE_PX)] * 2))
-    octave = np.where(radius > 0, np.log2(radius.clip(1)).astype(int), -1)
-    noise, power = (masks**2).sum(), []
-    for image in (got, want):
-        tiles = _tiles(image.astype(np.float64).mean(-1))[chosen]
-        tiles = tiles - ((tiles * masks).sum((1, 2)) / masks.sum((1, 2)))[:, None, None]
-        spectrum = (np.abs(np.fft.fft2(tiles * masks)) ** 2).sum(0) + noise
-        power.append(np.array([spectrum[octave == k].mean() for k in range(octave.max() + 1)]))
-    return float(np.sqrt(((10 * np.log10(power[0] / power[1])) ** 2).mean()))
-
-
-def _tiles(plane: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(n, _TILE_PX, _TILE_PX) tiles of a plane (h, w) that overlap by half; 0 beyond its border."""
-    half = _TILE_PX // 2
-    plane = np.pad(plane, [(half, half + -side % half) for side in plane.shape])
-    tiles = np.lib.stride_tricks.sliding_window_view(plane, (_TILE_PX, _TILE_PX))[::half, ::half]
-    return tiles.reshape(-1, _TILE_PX, _TILE_PX)
-
-
 def truth_metrics(
     image: Image,
     truth: Image,
@@ -106,9 +73,8 @@ def truth_metrics(
 
     Returns:
         ``psnr_db, mae, rmse, ssim, share`` over all valid pixels, and the same with the prefixes ``covered_``,
-        ``hole_``, ``<class>_``, ``covered_<class>_``, ``hole_<class>_``; ``hole_spectrum_db``, see
-        ``spectrum_distance_db``. ``share`` is the region's part of the valid pixels. A region without pixels has a
-        share of 0 and no other entries.
+        ``hole_``, ``<class>_``, ``covered_<class>_``, ``hole_<class>_``. ``share`` is the
+        region's part of the valid pixels. A region without pixels has a share of 0 and no other entries.
     """
     everywhere = np.ones(image.shape[:2], bool) if valid is None else valid
     regions = {"": everywhere}
@@ -124,5 +90,4 @@ def truth_metrics(
         if region.any():
             row |= errors(image[region], truth[region], prefix)
             row[f"{prefix}ssim"] = float(similarity[region].mean())
-    distance = spectrum_distance_db(image, truth, regions["hole_"]) if coverage is not None else None
-    return row if distance is None else row | {"hole_spectrum_db": distance}
+    return row

@@ -15,6 +15,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 
 OBJECT_HEIGHT_M = 1.6
+_UP = np.array([0.0, 0.0, OBJECT_HEIGHT_M])  # from an object's foot to its top
 _DISTANCES_M = np.geomspace(5.0, 40.0, 13)
 _AZIMUTHS_DEG = np.arange(0.0, 360.0, 2.0)
 _MOST = float(np.log(4.0))
@@ -70,22 +71,18 @@ def _seen(rig: Rig, feet: FloatArray) -> FloatArray:
     """For each object (n, 3), the camera nearest to whose axis its foot and its top are seen; -1: none."""
     cosines = np.full((len(rig), len(feet)), -2.0)
     for k, camera in enumerate(rig):
-        rays = _tops(feet) - camera.center_m
+        rays = feet + _UP - camera.center_m
         seen = np.ones(len(feet), bool)
-        for ends in (feet, _tops(feet)):
+        for ends in (feet, feet + _UP):
             uv, _, valid = camera.project(ends)
             seen &= valid & camera.contains(uv, 0.5)
         cosines[k, seen] = ((rays @ camera.cam2ego[:3, 2]) / np.linalg.norm(rays, axis=-1))[seen]
     return np.where(cosines.max(0) > -2, cosines.argmax(0), -1)
 
 
-def _tops(feet: FloatArray) -> FloatArray:
-    return feet + np.array([0.0, 0.0, OBJECT_HEIGHT_M])
-
-
 def _size(camera: Camera, feet: FloatArray) -> FloatArray:
     """Heights of objects in the image times their distance, as a share of the image's width."""
-    pixels = np.linalg.norm(camera.project(feet).uv - camera.project(_tops(feet)).uv, axis=-1)
+    pixels = np.linalg.norm(camera.project(feet).uv - camera.project(feet + _UP).uv, axis=-1)
     return pixels / camera.width_px * np.linalg.norm(feet - camera.center_m, axis=-1)
 
 

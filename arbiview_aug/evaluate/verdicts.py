@@ -20,7 +20,7 @@ from arbiview_aug.evaluate.detections import (
     match,
     precision_and_recall,
 )
-from arbiview_aug.evaluate.frames import ScoredFrame, valid_pixels
+from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, to_bytes
 from arbiview_aug.evaluate.judges import Detections, Detector, Segmenter
 
@@ -38,10 +38,7 @@ _DRAWS = 1000
 class Verdict(NamedTuple):
     """Verdicts on one image."""
 
-    frame: str
-    camera: int
     method: str  # or ``SOURCES``
-    target: str
     matches: Matches | None = None
     pixels: npt.NDArray[np.int64] | None = None  # (masks, 2) intersection and union with the true image's masks
 
@@ -66,32 +63,25 @@ class Panel:
     segmenter: Segmenter | None = None
     verdicts: list[Verdict] = field(default_factory=list)
     _frame: str = ""
-    _references: dict[str, list[Reference]] = field(default_factory=dict)  # of that frame, by target
+    _references: list[Reference] = field(default_factory=list)  # of that frame, by camera
 
-    def look(
-        self, name: str, frame: ScoredFrame, method: str, target: str, rig: Rig, views: Sequence[RenderedView]
-    ) -> None:
+    def look(self, name: str, frame: ScoredFrame, method: str, rig: Rig, views: Sequence[RenderedView]) -> None:
         """Judge a method's views for a rig; before the first ones, the sources or the true images."""
         if name != self._frame:
-            self._frame, self._references = name, {}
+            self._frame, self._references = name, self._compared_with(frame, rig)
             if frame.truth is None:
-                images = as_arrays(frame.sample["images"])
-                self._judge(Verdict(name, 0, SOURCES, SOURCES), images, self._compared_with(frame, frame.sample["rig"]))
-        if target not in self._references:
-            self._references[target] = self._compared_with(frame, rig)
-        images = [view.image for view in views]
-        self._judge(Verdict(name, 0, method, target), images, self._references[target])
+                sources = self._compared_with(frame, frame.sample["rig"])
+                self._judge(SOURCES, as_arrays(frame.sample["images"]), sources)
+        self._judge(method, [view.image for view in views], self._references)
 
     def _compared_with(self, frame: ScoredFrame, rig: Rig) -> list[Reference]:
         """What views for a rig are compared with, by camera."""
         if frame.truth is None:
             labels = labelled_objects(frame.sample, rig.in_frame_of(frame.sample["rig"]))
-            return [
-                Reference(np.ones(camera.size, bool), None if labels is None else labels[k])
-                for k, camera in enumerate(rig)
-            ]
-        true, references = frame.truth(rig), []
-        for image, valid in zip(map(to_bytes, as_arrays(true.images)), valid_pixels(true), strict=True):
+            objects_of = dict(enumerate(labels or ()))
+            return [Reference(np.ones(camera.size, bool), objects_of.get(k)) for k, camera in enumerate(rig)]
+        truth, references = frame.truth(rig), []
+        for image, valid in zip(map(to_bytes, truth.images), truth.valid, strict=True):
             objects = None
             if self.detector is not None:
                 found = valid_detections(self.detector(image), valid)
@@ -99,9 +89,9 @@ class Panel:
             references.append(Reference(valid, objects, None if self.segmenter is None else self.segmenter(image)))
         return references
 
-    def _judge(self, verdict: Verdict, images: Sequence[Image], references: Sequence[Reference]) -> None:
-        """Add the verdicts on images by the first one's names."""
-        for k, (image, reference) in enumerate(zip(map(to_bytes, images), references, strict=True)):
+    def _judge(self, method: str, images: Sequence[Image], references: Sequence[Reference]) -> None:
+        """Add the verdicts on images."""
+        for image, reference in zip(map(to_bytes, images), references, strict=True):
             matches = pixels = None
             if self.detector is not None and reference.objects is not None:
                 matches = match(valid_detections(self.detector(image), reference.valid), reference.objects)
@@ -109,21 +99,15 @@ class Panel:
                 masks = self.segmenter(image)
                 if len(masks) != len(reference.masks):
                     expected = f"as many masks as in the true image, {len(reference.masks)}"
-                    raise DataError(f"--segmenter: expected {expected}, got {len(masks)} in a view by {verdict.method}")
-                one, two = masks & reference.valid, reference.masks & reference.valid
-                pixels = np.stack([(one & two).sum(axis=(1, 2)), (one | two).sum(axis=(1, 2))], axis=1)
+                    raise DataError(f"--segmenter: expected {expected}, got {len(masks)} in a view by {method}")
+                ours, true = masks & reference.valid, reference.masks & reference.valid
+                pixels = np.stack([(ours & true).sum(axis=(1, 2)), (ours | true).sum(axis=(1, 2))], axis=1)
             if matches is not None or pixels is not None:
-                self.verdicts.append(verdict._replace(camera=k, matches=matches, pixels=pixels))
+                self.verdicts.append(Verdict(method, matches, pixels))
 
-    def rows(self, methods: Sequence[str], targets: Sequence[str]) -> dict[str, dict[str, float]]:
-        """``figures`` of the sources, and of each method by target and over all."""
-        rows = {}
-        for method in (SOURCES, *methods):
-            of_method = [verdict for verdict in self.verdicts if verdict.method == method]
-            several = len(targets) > 1 and method != SOURCES
-            for target in targets if several else ():
-                rows[f"{method}: {target}"] = figures([v for v in of_method if v.target == target])
-            rows[f"{method}: all" if several else method] = figures(of_method)
+    def rows(self, methods: Sequence[str]) -> dict[str, dict[str, float]]:
+        """``figures`` of the sources and of each method."""
+        rows = {name: figures([v for v in self.verdicts if v.method == name]) for name in (SOURCES, *methods)}
         return {name: row for name, row in rows.items() if row}
 
 
@@ -137,36 +121,31 @@ def figures(verdicts: Sequence[Verdict]) -> dict[str, float]:
     """Figures of a row of the tables, from the verdicts on its images.
 
     ``ap`` and ``recall`` of ``objects``; ``iou_1``, ``iou_2``, ... of the masks, their pixels summed over ``images``.
-    Each has a 95 % interval, ``_low`` and ``_high``, by the bootstrap over images; those of one camera and frame are
-    drawn together, for all targets. The same seed and images give the same draws.
+    Each has a 95 % interval, ``_low`` and ``_high``, by the bootstrap over images. The same seed and number of images
+    give the same draws.
     """
     row: dict[str, float] = {}
-    detected = [verdict for verdict in verdicts if verdict.matches is not None]
-    if detected:
-        matches = [verdict.matches for verdict in detected if verdict.matches is not None]
+    if matches := [verdict.matches for verdict in verdicts if verdict.matches is not None]:
         row["objects"] = sum(found.num_true for found in matches)
         if row["objects"]:
-            for name, draws in zip(("ap", "recall"), precision_and_recall(matches, _weights(detected)), strict=True):
-                row |= _interval(name, draws)
-    segmented = [verdict for verdict in verdicts if verdict.pixels is not None]
-    if segmented:
-        row["images"] = len(segmented)
-        pixels = np.stack([verdict.pixels for verdict in segmented if verdict.pixels is not None])
-        sums = np.einsum("rv,vmk->mrk", _weights(segmented), pixels)
+            average, recall = precision_and_recall(matches, draws_of(len(matches)))
+            row |= interval("ap", average) | interval("recall", recall)
+    if pixels := [verdict.pixels for verdict in verdicts if verdict.pixels is not None]:
+        row["images"] = len(pixels)
+        sums = np.einsum("rv,vmk->mrk", draws_of(len(pixels)), np.stack(pixels))
         for k, mask in enumerate(sums, 1):
-            row |= _interval(f"iou_{k}", mask[:, 0] / np.maximum(mask[:, 1], 1))
+            row |= interval(f"iou_{k}", mask[:, 0] / np.maximum(mask[:, 1], 1))
     return row
 
 
-def _weights(verdicts: Sequence[Verdict]) -> FloatArray:
-    """(1 + draws, V) how often each image counts: once, and as drawn with replacement."""
-    _, drawn_as = np.unique([f"{verdict.camera} {verdict.frame}" for verdict in verdicts], return_inverse=True)
-    count = drawn_as.max() + 1
+def draws_of(count: int) -> FloatArray:
+    """(1 + draws, count) how often each of ``count`` things counts: once, and as drawn with replacement."""
     drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=_DRAWS)
-    return np.concatenate([np.ones((1, count)), drawn])[:, drawn_as]
+    return np.concatenate([np.ones((1, count)), drawn])
 
 
-def _interval(name: str, draws: FloatArray) -> dict[str, float]:
+def interval(name: str, draws: FloatArray) -> dict[str, float]:
+    """A figure, the first of its draws, and its 95 % interval."""
     low, high = np.nanpercentile(draws[1:], (2.5, 97.5))  # a draw without objects has no figure
     return {name: float(draws[0]), f"{name}_low": float(low), f"{name}_high": float(high)}
 

@@ -11,9 +11,8 @@ import cv2
 import numpy as np
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.evaluate.displaced import own_index
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors, to_bytes
-from arbiview_aug.evaluate.methods import Method, Sample
+from arbiview_aug.evaluate.methods import Method, Sample, own_index
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.view_planner import build_plan
 

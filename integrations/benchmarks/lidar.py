@@ -25,9 +25,10 @@ from arbiview_aug.datasets.synthetic import ScanErrors, SyntheticDrive, demo_sou
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.lidar import lidar_split
 from arbiview_aug.evaluate.report.tables import markdown_table
-from arbiview_aug.evaluate.scans import chamfer_m, measured_near, rings_dropped, scan_metrics
+from arbiview_aug.evaluate.scans import chamfer_m, scan_metrics
 from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.scene.point_cloud import own_car
+from integrations.benchmarks.scan_baselines import measured_near, rings_dropped
 from integrations.benchmarks.study import run_study, study_parser
 
 COLUMNS = ("recall", "precision", "range_error_m", "chamfer_m", "recall of all")

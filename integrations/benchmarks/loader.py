@@ -19,9 +19,7 @@ from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.arguments import add_data, add_downscale, add_target, count, output_file, seed, size
-from arbiview_aug.cli.bench.data import SOURCES_OVER_VIEWS, Recorded, recorded
-from arbiview_aug.cli.bench.timing import benchmark, machine_line, memory_mib, quartiles, show
+from arbiview_aug.cli.arguments import add_options, count, output_file, seed, size
 from arbiview_aug.cli.parsers import SIZE
 from arbiview_aug.datasets import RetargetedDataset, WithDepth, open_data
 from arbiview_aug.datasets.depth_folder import FOLDERS
@@ -30,7 +28,10 @@ from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from integrations.benchmarks.data import SOURCES_OVER_VIEWS, Recorded, recorded
+from integrations.benchmarks.memory import memory_mib
 from integrations.benchmarks.study import run_study, study_parser
+from integrations.benchmarks.timing import benchmark, machine_line, quartiles, show
 
 PLAIN = "read only"
 
@@ -173,11 +174,11 @@ def parser() -> argparse.ArgumentParser:
         "Frames per second of a DataLoader with and without retargeting, and memory per worker.",
         "--data FOLDER --workers 0 2",
     )
-    add_data(made, "synthetic streets, written as JPEGs")
+    add_options(made, "--data", without="synthetic streets, written as JPEGs")
     add = made.add_argument
     add("--size", type=size, default=SIZE, metavar="HxW", help="of every view")
-    add_downscale(made, 2)
-    add_target(made)
+    add_options(made, "--downscale", default=2)
+    add_options(made, "--target")
     add("--workers", type=seed, nargs="+", default=[0, 1, 2], metavar="N", help="workers")
     add("--geometry", nargs="+", choices=get_args(GeometryName), default=["street", "auto"], help="geometry")
     add("--frames", type=count, default=48, metavar="N", help="frames in an epoch")

@@ -18,10 +18,9 @@ from itertools import product, starmap
 from pathlib import Path
 from typing import Any
 
-from arbiview_aug.choices import TARGET_SETS, Quality, Reduce
+from arbiview_aug.choices import Quality, Reduce
 from arbiview_aug.cli.arguments import (
-    add_data,
-    add_output,
+    add_options,
     count,
     named_steps,
     size,
@@ -35,10 +34,11 @@ from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scor
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
-from arbiview_aug.evaluate.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets
 from arbiview_aug.favs.config import PaperConfig
 from integrations.benchmarks.baselines import BASELINES, method_of
 from integrations.benchmarks.study import run_study, study_parser
+from integrations.benchmarks.targets import TARGET_SETS as SETS
+from integrations.benchmarks.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets
 
 OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")  # presets other than the published method
 
@@ -50,8 +50,6 @@ SYNTHETIC = "synthetic"
 SYNTHETIC_FRAMES, SYNTHETIC_SEED, SYNTHETIC_SIZE = 3, 0, (256, 704)
 
 REDUCE: Reduce = 2  # decoding factor of real images
-
-SETS = TARGET_SETS
 
 PROTOCOL = (
     "Not the same protocol: the paper averages over a fifth of nuScenes' scenes, without saying at which turns and "
@@ -256,10 +254,9 @@ def parser() -> argparse.ArgumentParser:
         "The paper's Tables 1 and 2: baselines, the published stages and ours; about 20 minutes.",
         "--data FOLDER",
     )
-    add_data(parser, "nuscenes-one and ddad-one below ARBIVIEW_DATA, and synthetic streets")
     parser.add_argument("--frames", type=count, metavar="N", help="frames of tables (default: 1; 3 synthetic ones)")
     parser.add_argument("--size", type=size, metavar="HxW", help="of synthetic images (default: 256x704)")
-    add_output(parser)
+    add_options(parser, "--output")
     return parser
 
 

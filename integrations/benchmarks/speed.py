@@ -24,13 +24,14 @@ import argparse
 import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 
@@ -39,23 +40,13 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import Pinhole, intrinsics_for_fov
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Reduce
-from arbiview_aug.cli.arguments import add_data, count, device_named, output_file, size
-from arbiview_aug.cli.bench.data import Recorded, lidar_maps, recorded
-from arbiview_aug.cli.bench.timing import (
-    benchmark,
-    machine_line,
-    process_ms,
-    quartiles,
-    remap_floor,
-    show,
-    timed_rounds,
-)
+from arbiview_aug.cli.arguments import add_options, count, output_file, size
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import DataError, WarnOnce
+from arbiview_aug.evaluate.frames import without_masks
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
-from arbiview_aug.evaluate.targets import without_masks
 from arbiview_aug.image_ops import resized
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.torch_backend import maps_on, render_torch
@@ -65,7 +56,16 @@ from arbiview_aug.temporal.motion_depth import estimate_motion
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.scans import retarget_points
 from arbiview_aug.transforms.warm_up import compile_kernels
+from integrations.benchmarks.data import Recorded, lidar_maps, recorded
 from integrations.benchmarks.study import run_study, study_parser
+from integrations.benchmarks.timing import (
+    benchmark,
+    machine_line,
+    process_ms,
+    quartiles,
+    show,
+    timed_rounds,
+)
 
 BOXES = (10, 30, 75, 150)
 SCANNED = 120_000
@@ -104,6 +104,17 @@ def _run(arguments: argparse.Namespace) -> None:
     with recorded(arguments.data or default_data(), size=FULL_SIZE) as data:
         report = measure(data, arguments.repeats, arguments.size, arguments.only, device)
     show(table(report), report, path)
+
+
+def device_named(name: str) -> torch.device:
+    """Torch device of this name; DataError for one that is not there."""
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise DataError(f"--device: expected cpu, cuda, cuda:1, ..., got {name!r}") from None
+    if device.type != "cpu" and not (device.type == "cuda" and (device.index or 0) < torch.cuda.device_count()):
+        raise DataError(f"--device: expected cpu or a CUDA device that is there, got {name!r}")
+    return device
 
 
 def default_data() -> Path | None:
@@ -190,6 +201,21 @@ def _moment() -> Sample | None:
     """A frame of PandaSet below ``ARBIVIEW_DATA``, read at half size, if there."""
     folder = Path(os.environ.get("ARBIVIEW_DATA", "")) / "pandaset"
     return FrameFolder(folder, reduce=2)[3] if folder.is_dir() else None
+
+
+def remap_floor(images: Iterable[torch.Tensor], size: tuple[int, int]) -> Callable[[], None]:
+    """Bare remaps to views of ``size`` (h, w), one for each of the images (N, 3, >=h, >=w) uint8."""
+    h, w = size
+    sources = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()[:h, :w]) for image in images]
+    y, x = np.indices((h, w), dtype=np.float32)
+    map_x, map_y = 0.97 * x + 0.02 * y + 3, 0.95 * y + 0.01 * x + 5
+    outputs = np.empty((len(sources), h, w, 3), np.uint8)
+
+    def run() -> None:
+        for source, output in zip(sources, outputs, strict=True):
+            cv2.remap(source, map_x, map_y, cv2.INTER_LINEAR, dst=output)
+
+    return run
 
 
 def _cameras_of(name: str) -> Rig:
@@ -349,7 +375,7 @@ def parser() -> argparse.ArgumentParser:
         "Milliseconds of RigRetarget on one thread, and ratios to bare cv2.remap calls of the same views.",
         "--device cuda",
     )
-    add_data(made, "nuscenes-one below ARBIVIEW_DATA where that is, else a synthetic street")
+    add_options(made, "--data", without="nuscenes-one below ARBIVIEW_DATA where that is, else a synthetic street")
     add = made.add_argument
     add("--size", type=size, nargs="+", default=[SIZE, FULL_SIZE], metavar="HxW", help="of views (default: both)")
     add("--repeats", type=count, default=5, metavar="N", help="rounds of timing")

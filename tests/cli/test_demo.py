@@ -35,7 +35,7 @@ def test_each_time_is_of_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
         known.add(plan)
 
     monkeypatch.setattr(demo, "working_s", lambda: clock[0])
-    assert demo.timed(retarget, sample) == pytest.approx((1e3, 11e3, 100e3))
+    assert demo.timed(retarget, sample) == pytest.approx((1e3, 11e3))
 
 
 def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -112,12 +112,3 @@ def test_geometry_that_the_sample_has_and_one_that_it_lacks(tmp_path: Path, caps
     assert numbers(capsys.readouterr().out, "lidar")[0] > 60
     assert main(["demo", *options, "learned"]) == 2
     assert "expected 'learned_depth_m' in the sample" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "arguments", [["--size", "704"], ["--size", "0x3"], ["--seed", "-1"], ["--frames", "0"], ["--geometry", "flat"]]
-)
-def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main(["demo", *arguments])
-    assert "error: argument" in capsys.readouterr().err

@@ -167,7 +167,10 @@ def test_a_broken_frame_is_no_neighbour(recorded: Path, tmp_path: Path) -> None:
         drive[2]
 
 
-@pytest.mark.parametrize("broken", [{"format": [1, 2]}, {"words": None}, {"format": None}, {"K": [1]}, {"depth_00": 3}])
+@pytest.mark.parametrize(
+    "broken",
+    [{"format": [1, 2]}, {"kind": "dreamt"}, {"words": None}, {"format": None}, {"K": [1]}, {"depth_00": 3}],
+)
 def test_files_of_nonsense_are_named(depth_root: Path, recorded: Path, tmp_path: Path, broken: dict) -> None:
     """Arrays that are missing or of other shapes."""
     with np.load(depth_root / "000.npz") as file:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import warnings
 from collections.abc import Mapping
@@ -18,13 +17,12 @@ import pytest
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli import evaluate as command
-from arbiview_aug.cli.arguments import chosen_frames, frames, gathered_warnings
+from arbiview_aug.cli.arguments import chosen_frames, gathered_warnings
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.errors import DataError, SampleError
+from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import retargeting
-from arbiview_aug.evaluate.targets import YAWS_DEG
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 AGREEMENT_DB = 0.01
@@ -35,32 +33,8 @@ def run(arguments: list[str], folder: Path) -> dict:
     return json.loads((folder / "evaluate.json").read_text())
 
 
-@pytest.mark.parametrize(
-    ("asked", "expected"),
-    [
-        ("3", [0, 3, 6]),
-        ("99", [*range(10)]),
-        ("2:8:3", [2, 5]),
-        (":4", [0, 1, 2, 3]),
-        ("8:", [8, 9]),
-        ("::4", [0, 4, 8]),
-    ],
-)
-def test_frames_are_spread_over_the_drive_or_a_slice_of_it(asked: str, expected: list[int]) -> None:
-    assert chosen_frames(frames(asked), 10) == expected
-
-
-@pytest.mark.parametrize("text", ["0", "1:2:3:4", "a:b", "-3:4", "1:9:0", ":"])
-def test_frames_that_are_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
-    if text == ":":
-        with pytest.raises(SystemExit):
-            main(["evaluate", f"--frames={text}"])
-        assert "expected --data FOLDER with A:B:STEP" in capsys.readouterr().err
-    else:
-        with pytest.raises((argparse.ArgumentTypeError, ValueError)):
-            frames(text)
-    with pytest.raises(DataError, match="expected some of the 10 frames, got none"):
-        chosen_frames("10:20", 10)
+def test_frames_are_spread_over_the_drive() -> None:
+    assert chosen_frames(3, 10) == [0, 3, 6] and chosen_frames(99, 10) == [*range(10)]
 
 
 def test_warnings_of_frames_are_one_of_the_run() -> None:
@@ -75,16 +49,14 @@ def test_warnings_of_frames_are_one_of_the_run() -> None:
 def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     report = run(["--size", "48x132", "--quality", "fast", "draft", "--geometry", "street", "infinity"], tmp_path)
     printed = capsys.readouterr().out
-    assert "Against the true views" in printed and "Agreement of neighbours" in printed
+    assert "Against the true views" in printed
     rows = ["fast, street", "fast, infinity", "draft, street", "draft, infinity"]
-    assert list(report["means"]) == list(report["agreement"]) == rows
+    assert list(report["means"]) == rows
     street, far = report["means"]["fast, street"], report["means"]["fast, infinity"]
     assert street["true_covered_ground_psnr_db"] > far["true_covered_ground_psnr_db"] + 3
     assert {"true_hole_object_share", "true_covered_sky_psnr_db", "seen"} <= set(street)
     assert "raw_psnr_db" not in street, "where the truth is known, LiDAR need not score"
     assert len(report["views"]) == 4 * 5 and {row["camera"] for row in report["views"]} >= {"front", "side_left"}
-    kinds = {pair["kind"] for pair in report["pairs"]}
-    assert kinds == {"overlap", "consistency"}
     assert f"{street['true_covered_psnr_db']:.2f}" in printed
     picture = cv2.imread(str(tmp_path / "van-fast-street.png"))
     assert picture is not None and picture.std() > 20
@@ -141,14 +113,6 @@ def test_points_that_methods_may_read_do_not_score(
 
 
 @pytest.mark.slow
-def test_a_set_of_targets(tmp_path: Path) -> None:
-    means = run(["--size", "24x66", "--target-set", "yaw", "--geometry", "infinity"], tmp_path)["means"]
-    assert list(means) == [f"fast, infinity: {of}" for of in (*(f"yaw {yaw:+g}" for yaw in YAWS_DEG), "all")]
-    *each, of_all = (row["true_psnr_db"] for row in means.values())
-    assert of_all == pytest.approx(np.mean(each))
-
-
-@pytest.mark.slow
 def test_lenses_that_a_method_cannot_take(
     fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -159,25 +123,6 @@ def test_lenses_that_a_method_cannot_take(
     assert "no truth and no LiDAR points" in printed
     assert main(["evaluate", *arguments, "--quality", "paper", "--output", str(tmp_path)]) == 2
     assert "pinhole" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--target-set", "left"],
-        ["--target", "waymo", "--target-set", "paper"],
-        ["--displaced"],
-        ["--displaced", "--target", "waymo", "--data", "."],
-        ["--detector-weights", "weights.pth"],
-        ["--detector-classes", "car"],
-        ["--segmenter", "road.ts", "--data", "."],
-        ["--segmenter", "road.ts", "--lidar", "--target", "waymo"],
-    ],
-)
-def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main(["evaluate", *arguments])
-    assert "error: argument" in capsys.readouterr().err
 
 
 # --- judges -----------------------------------------------------------------------------------------------------------
@@ -191,12 +136,6 @@ def detect(rgb):
 def blank(rgb):
     rgb[:] = 0
     return [], [], []
-
-def leave(rgb):
-    raise SystemExit(0)
-
-def wrong(rgb):
-    return [[0, 0, 1, 1]], [0.6]
 
 def segment(rgb):
     return np.stack([rgb[..., 0] > 100, rgb[..., 0] > 200])
@@ -268,17 +207,33 @@ def test_rows_do_not_depend_on_other_rows(tmp_path: Path) -> None:
     assert list(beside) == ["fast, street", "fast, motion"] and beside["fast, street"] == alone["fast, street"]
 
 
-def test_judges_are_refused_in_a_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "own.py").write_text(JUDGES)
-    for function, message in (
-        ("none", "expected a function none"),
-        ("wrong", "expected boxes (n, 4) x0 y0 x1 y1"),
-        ("leave", "raised SystemExit: 0 for an image"),
-    ):
-        judge = ["--detector", f"{tmp_path}/own.py:{function}", "--size", "24x66", "--geometry", "infinity"]
-        assert main(["evaluate", *judge, "--output", str(tmp_path)]) == 2
-        error = capsys.readouterr().err
-        assert f"--detector {tmp_path}/own.py:{function}: {message}" in error.splitlines()[-1]
+NANODET = """
+import sys
+sys.path.insert(0, {folder!r})
+import nanodet, numpy as np
+
+def detect(rgb):
+    boxes, scores, labels = nanodet.detect(rgb, score=0.05)
+    keep = np.isin(labels, (0, 1, 2, 3, 5, 7))
+    return boxes[keep], scores[keep], labels[keep]
+"""
+TWINLITENET = """
+import cv2, numpy as np, torch
+network = torch.jit.load({folder!r} + "/twinlitenet.ts").eval()
+
+def segment(rgb):
+    h, w = rgb.shape[:2]
+    wide, high = min(w, h * 16 // 9), min(h, max(1, w * 9 // 16))  # the 16:9 part that the network knows
+    part = slice(h - high, h), slice((w - wide) // 2, (w - wide) // 2 + wide)
+    small = cv2.resize(rgb[part], (640, 360), interpolation=cv2.INTER_AREA)
+    with torch.inference_mode():
+        out = network(torch.from_numpy(small).permute(2, 0, 1)[None].float() / 255)
+    masks = np.zeros((len(out), h, w), bool)
+    for mask, logits in zip(masks, out):
+        classes = logits[0].argmax(0).byte().numpy()
+        mask[part] = cv2.resize(classes, (wide, high), interpolation=cv2.INTER_NEAREST) > 0
+    return masks
+"""
 
 
 @pytest.mark.slow
@@ -287,8 +242,8 @@ def test_real_judges_of_a_real_frame(judges_root: Path, nuscenes_root: Path, tmp
     pytest.importorskip("ncnn", reason="pip install ncnn")
     FrameFolder(nuscenes_root)[0]["rig"].turned(yaw_deg=11).save(tmp_path / "turned.yaml")
     data = ["--data", f"nuscenes:{nuscenes_root}", "--target", str(tmp_path / "turned.yaml"), "--geometry", "boxes"]
-    detector = ["--detector", f"{judges_root}/nanodet.py:detect", "--detector-classes", *"012357"]
-    rows = run([*data, *detector], tmp_path)["judges"]
+    (tmp_path / "own.py").write_text(NANODET.format(folder=str(judges_root)))
+    rows = run([*data, "--detector", f"{tmp_path}/own.py:detect"], tmp_path)["judges"]
     assert rows["sources"]["objects"] > 10 and rows["sources"]["recall"] > 0.1
     assert rows["fast, boxes"]["recall"] > rows["sources"]["recall"] - 0.1
 
@@ -296,7 +251,8 @@ def test_real_judges_of_a_real_frame(judges_root: Path, nuscenes_root: Path, tmp
 @pytest.mark.slow
 def test_real_judges_of_photographs(judges_root: Path, kitti_root: Path, tmp_path: Path) -> None:
     """Eleven frames of a suburb, 0.54 m aside: lane marks, the second mask, tell the surfaces apart."""
-    network = ["--segmenter", f"{judges_root}/twinlitenet.ts"]
+    (tmp_path / "own.py").write_text(TWINLITENET.format(folder=str(judges_root)))
+    network = ["--segmenter", f"{tmp_path}/own.py:segment"]
     rows = run(["--displaced", "--data", str(kitti_root), "--geometry", "street", *network], tmp_path)["judges"]
     assert rows["copy"]["iou_2"] < 0.1 and rows["fast, street"]["iou_2"] == pytest.approx(0.27, abs=0.03)
     assert rows["copy"]["iou_1"] < rows["fast, street"]["iou_1"] > 0.9

@@ -16,7 +16,7 @@ from arbiview_aug.datasets import FrameFolder, WithDepth
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, DepthFolder
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.errors import DataError, SampleError
+from arbiview_aug.errors import SampleError
 from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from tests.helpers import saved_depth_model
@@ -71,7 +71,7 @@ def knowing(transformers: Any, street: SyntheticDrive, tmp_path: Path, monkeypat
 
 @pytest.mark.slow
 def test_from_the_command_to_views(recorded: Path, knowing: Path, street: SyntheticDrive, capsys: Any) -> None:
-    asked = ["depth", "--data", str(recorded), "--model", str(knowing), "--batch", "3", "--device", "cpu"]
+    asked = ["depth", "--data", str(recorded), "--model", str(knowing), "--batch", "3"]
     assert main(asked) == 0
     out = capsys.readouterr().out
     assert "2 of 2 frames have depth" in out and "front: 2 of 2 frames fitted to LiDAR, residual 0." in out
@@ -93,7 +93,8 @@ def test_from_the_command_to_views(recorded: Path, knowing: Path, street: Synthe
     psnr = [float(-10 * ((one["images"].float() - wanted)[both] ** 2).mean().log10()) for one in (views, flat)]
     assert psnr[0] > psnr[1] + 2, psnr
     report = ["--data", str(recorded), "--geometry", "learned", "street", "--output", str(recorded / "report")]
-    assert main(["evaluate", *report, "--target-set", "truck"]) == 0 and "| fast, learned |" in capsys.readouterr().out
+    target = ["--target", str(TARGET.save(recorded.parent / "truck.yaml"))]
+    assert main(["evaluate", *report, *target]) == 0 and "| fast, learned |" in capsys.readouterr().out
     converted = ["--target", "waymo", "--size", "32x48", "--workers", "1", "--output", str(recorded.parent / "new")]
     assert main(["convert", "--data", str(recorded), *converted, "--geometry", "learned"]) == 0
     before = {path: path.stat().st_mtime_ns for path in (recorded / LEARNED_FOLDER).iterdir()}
@@ -174,12 +175,3 @@ def test_transformers_is_asked_for(recorded: Path, monkeypatch: pytest.MonkeyPat
     assert main(["depth", "--data", str(recorded), "--model", "some/model"]) == 2
     error = capsys.readouterr().err
     assert "transformers is not installed: pip install 'arbiview_aug[depth]'" in error and error.count("\n") == 1
-
-
-def test_files_of_unknown_kinds_are_named(tmp_path: Path) -> None:
-    folder = DepthFolder(tmp_path)
-    folder.write("x", RIG, MotionDepth(tuple(np.ones((64, 176), np.float32) for _ in RIG), ""))
-    with np.load(tmp_path / "x.npz") as file:
-        np.savez(tmp_path / "y.npz", **{name: file[name] for name in file.files} | {"kind": np.array("dreamt")})
-    with pytest.raises(DataError, match=r"y\.npz: expected depth of a frame, got KeyError; delete it"):
-        folder.read("y", RIG)

@@ -57,7 +57,7 @@ def test_one_vehicles_data_becomes_anothers(vehicles: tuple[Path, Path], tmp_pat
     converting = command(tall, tmp_path / "new", "--images", "png")
     converting[converting.index(str(TARGET_FILE))] = str(tmp_path / "small.yaml")
     del converting[converting.index("--size") : converting.index("--size") + 2]
-    assert main(converting) == 0 and main([*converting, "--verify"]) == 0
+    assert main(converting) == 0
     converted, truth = NuScenesDataset(tmp_path / "new"), NuScenesDataset(small, compensate_ego_motion=False)
     assert converted.channels == truth.channels and converted.tokens == truth.tokens
     for k in range(2):

@@ -18,7 +18,7 @@ RIG = Rig([camera("front", 0)])
 
 
 def detections(boxes: np.ndarray, *scores: float) -> Detections:
-    return Detections(boxes, np.array(scores), ["car"] * len(boxes))
+    return Detections(boxes, np.array(scores))
 
 
 def test_iou() -> None:

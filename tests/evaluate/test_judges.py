@@ -1,4 +1,4 @@
-"""Judges by the names of their options: stubs in files, tiny networks, and refusals that name option, file and fix."""
+"""Judges by the names of their options: stubs in files, and refusals that name option, file and fix."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.judges import LEAST_SCORE, SEGMENTED, is_road_user, load_detector, load_segmenter
+from arbiview_aug.evaluate.judges import is_road_user, load_detector, load_segmenter
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (90, 160, 3), np.uint8)
-ONE = "[[10, 20, 30, 40]], [0.9]"
 EXITS = "type('Boxes', (), {'__array__': lambda *_, **__: exit(0)})()"
 
 
@@ -42,24 +40,15 @@ def test_a_function_of_a_file(file: Callable[[str], str]) -> None:
     boxes = "[[-5.0, 2, 200, 50], [1, 2, 3, 4], [1, 2, 3, 4]]"
     found = load_detector(file(f"torch.tensor({boxes}), np.array([0.9, 0.8, 0.7]), ['car', 'cat', 'person']"))(IMAGE)
     assert found.boxes.tolist() == [[0, 2, 160, 50], [1, 2, 3, 4]], "cut at the border; a cat is no road user"
-    assert found.labels == ["car", "person"] and found.scores.tolist() == [0.9, 0.7]
+    assert found.scores.tolist() == [0.9, 0.7]
     nothing = load_detector(file("[], [], []"))(IMAGE)
     assert nothing.boxes.shape == (0, 4) and nothing.scores.shape == (0,)
 
 
-def test_a_function_is_asked_for_all_detections_that_ap_counts(file: Callable[[str], str]) -> None:
-    name = file("[[1, 2, 3, 4]], [score], [0]")
-    path = Path(name.removesuffix(":judge"))
-    path.write_text(path.read_text().replace("judge(rgb)", "judge(rgb, score=0.3)"))
-    assert load_detector(name)(IMAGE).scores.tolist() == [LEAST_SCORE]
+def test_detections_that_count(file: Callable[[str], str]) -> None:
     assert load_detector(file("[[1, 2, 3, 4]] * 2, [0.04, 0.06], [0, 0]"))(IMAGE).scores.tolist() == [0.06]
-
-
-def test_classes_that_count(file: Callable[[str], str]) -> None:
     numbers = file("[[0, 0, 9, 9]] * 3, [0.5] * 3, torch.tensor([2, 7, 9])")
-    assert load_detector(numbers)(IMAGE).labels == ["2", "7", "9"], "numbers say nothing, so all count"
-    assert load_detector(numbers, classes=["2", "9"])(IMAGE).labels == ["2", "9"]
-    assert load_detector(file(f"{ONE}, ['cat']"), classes=["cat"])(IMAGE).labels == ["cat"]
+    assert len(load_detector(numbers)(IMAGE).boxes) == 3, "numbers say nothing, so all count"
 
 
 @pytest.mark.parametrize(
@@ -121,76 +110,3 @@ def test_a_segmenter_of_a_file(file: Callable[[str], str]) -> None:
             DataError, match=r"--segmenter .*expected masks \(n, 90, 160\) of 0 and 1, got " + re.escape(got)
         ):
             load_segmenter(file(wrong))(IMAGE)
-
-
-# --- networks ---------------------------------------------------------------------------------------------------------
-class Half(torch.nn.Module):
-    """Drivable: the lower half; lanes: the left half."""
-
-    def forward(self, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        logits = torch.zeros(2, 1, 2, pixels.size(2), pixels.size(3))
-        logits[0, :, 1, pixels.size(2) // 2 :] = pixels.max()
-        logits[1, :, 1, :, : pixels.size(3) // 2] = 1
-        return logits[0], logits[1]
-
-
-class Wrong(torch.nn.Module):
-    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        return pixels
-
-
-@pytest.mark.parametrize(
-    ("shape", "rows", "columns"),
-    [((90, 160), (0, 90), (0, 160)), ((90, 400), (0, 90), (120, 280)), ((200, 160), (110, 200), (0, 160))],
-)
-def test_torchscript_sees_the_wide_part(
-    shape: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int], tmp_path: Path
-) -> None:
-    torch.jit.save(torch.jit.script(Half()), str(tmp_path / "half.ts"))
-    area, lanes = load_segmenter(str(tmp_path / "half.ts"))(np.full((*shape, 3), 255, np.uint8))
-    for mask, (top, bottom, left, right) in (
-        (area, (sum(rows) // 2, rows[1], *columns)),
-        (lanes, (*rows, columns[0], sum(columns) // 2)),
-    ):
-        expected = np.zeros(shape, bool)
-        expected[top:bottom, left:right] = True
-        np.testing.assert_array_equal(mask, expected)
-
-
-def test_torchscript_of_another_kind(tmp_path: Path) -> None:
-    torch.jit.save(torch.jit.script(Wrong()), str(tmp_path / "wrong.ts"))
-    h, w = SEGMENTED
-    message = rf"wrong\.ts: expected outputs \(1, 2, {h}, {w}\) for \(1, 3, {h}, {w}\), got Tensor"
-    with pytest.raises(DataError, match=message):
-        load_segmenter(str(tmp_path / "wrong.ts"))(IMAGE)
-    (tmp_path / "text.ts").write_text("none")
-    for name in ("text.ts", "missing.ts"):
-        with pytest.raises(DataError, match=rf"--segmenter .*{name}: expected a TorchScript file"):
-            load_segmenter(str(tmp_path / name))
-
-
-@pytest.mark.slow
-def test_torchvisions_detectors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from torchvision import models
-    from torchvision.models.detection import ssdlite320_mobilenet_v3_large as ssdlite
-
-    name, weights = "ssdlite320_mobilenet_v3_large", tmp_path / "weights.pth"
-    torch.manual_seed(0)
-    state = ssdlite(weights=None, weights_backbone=None).state_dict()
-    torch.save({"model": state}, weights)
-    built, get_model = [], models.get_model
-    monkeypatch.setattr(models, "get_model", lambda *of, **kind: built.append(get_model(*of, **kind)) or built[-1])
-    found = load_detector(name, str(weights), classes=["car", "person", "bus"])(IMAGE)
-    assert built[0].score_thresh == LEAST_SCORE, "asked for no more and no less"
-    assert found.boxes.shape == (len(found.labels), 4) and {*found.labels} <= {"car", "person", "bus"}
-    with pytest.raises(DataError, match=r"--detector-classes: expected names that .* has, .*got \['horse-cart'\]"):
-        load_detector(name, str(weights), classes=["horse-cart"])
-    with pytest.raises(DataError, match=r"--detector resnet: expected a torchvision detector .*: .*retinanet"):
-        load_detector("resnet", str(weights))
-    torch.save(dict(list(state.items())[:5]), weights)
-    with pytest.raises(DataError, match=r"expected weights of torchvision's ssdlite.* its 91 classes .*Missing key"):
-        load_detector(name, str(weights))
-    weights.write_text("none")
-    for file in (weights, tmp_path / "none.pth"):
-        with pytest.raises(DataError, match=r"--detector-weights .*\.pth: expected weights of torchvision's ssdlite"):
-            load_detector(name, str(file))

@@ -35,7 +35,7 @@ def done() -> Evaluation:
     drive, target = SyntheticDrive(demo_source_rig(SIZE), num_frames=1), demo_target_rig(SIZE)
     frame = make_frame(drive[0], truth=lambda rig: drive.render(0, rig), exposures=())
     methods = [retargeting("fast", "street", NAMES[0]), Method(NAMES[1], halfway_sure)]
-    return evaluate([("only", frame)], lambda _: {"van": target}, methods)
+    return evaluate([("only", frame)], lambda _: target, methods)
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +57,8 @@ def test_text_is_escaped_and_numbers_are_there(page: str, done: Evaluation) -> N
 
 
 def test_layers(done: Evaluation) -> None:
-    shown = {name: done.pictures["van", name] for name in NAMES}
-    found = layers(0, done.targets["van"], done, shown)
+    shown = {name: done.pictures[name] for name in NAMES}
+    found = layers(0, done, shown)
     expected = ["nearest source camera"]
     for name in NAMES:
         expected += [name] if shown[name][0].coverage.all() else [name, f"{name}: unseen"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from arbiview_aug import Lidar
-from arbiview_aug.evaluate.scans import chamfer_m, measured_near, range_image, returns_of, rings_dropped, scan_metrics
+from arbiview_aug.evaluate.scans import chamfer_m, range_image, returns_of, scan_metrics
 
 LIDAR = Lidar("top", np.eye(4), (10.0, -10.0, 0.0), 90.0, (1.0, 50.0))
 
@@ -31,9 +31,9 @@ def test_points_just_before_the_first_column_are_its() -> None:
     front = replace(LIDAR, azimuth_step_deg=1.0, azimuth_deg=(-30.0, 30.0))
     cloud = np.array([at(5, 0, azimuth) for azimuth in (-30.6, -30.4, -29.6, 29.4, 29.6)])
     assert front.shape[1] == 60
-    assert returns_of(front, cloud).column.tolist() == [0, 0, 59]
+    assert returns_of(front, cloud)[1].tolist() == [0, 0, 59]
     around = np.array([at(5, 0, azimuth) for azimuth in (-136, -134, 134, 136, 180)])
-    assert returns_of(LIDAR, around).column.tolist() == [0, 1, 3, 0, 0]
+    assert returns_of(LIDAR, around)[1].tolist() == [0, 1, 3, 0, 0]
 
 
 def test_metrics() -> None:
@@ -49,33 +49,15 @@ def test_metrics() -> None:
     assert nothing["recall"] == 0 and np.isnan([nothing["precision"], nothing["chamfer_m"]]).all()
 
 
-def test_densities_and_points_in_boxes() -> None:
+def test_numbers_of_points() -> None:
     truth = np.array([at(8, 0, 0), at(8, 0, 90), at(15, 10, 0), at(15, 10, 90)])
     cloud = np.array([at(8, 0, 0), at(8, 0, 0.5), at(8, 0, 90), at(8, -10, 0)])
     box = np.array([[8.0, 0, 0, 2, 2, 2, 0], [0, 8.0, 0, 2, 2, 2, 0.3], [30, 0, 0, 1, 1, 1, 0]])
     metrics = scan_metrics(LIDAR, cloud, truth, boxes=box)
     assert metrics["returns"] == 1
-    assert metrics["by_ring"] == pytest.approx((0.25 + 0.5 + 0.25) / 2)  # rings hold 0, 1, 3 of 4 points, not 2, 0, 2
-    assert metrics["by_range"] == pytest.approx(0.5)  # all within 10 m, where half are
     assert metrics["in_boxes"] == pytest.approx(1 / 2)  # 2, 1 and 0 points instead of 1, 1 and 0
     nothing = scan_metrics(LIDAR, np.zeros((0, 3)), truth)
-    assert nothing["returns"] == 0 and np.isnan([nothing["by_ring"], nothing["by_range"], nothing["in_boxes"]]).all()
-
-
-def test_rings_next_to_the_targets_stay() -> None:
-    fewer = replace(LIDAR, elevations_deg=(11.0, -1.0))
-    cloud = np.array([at(8, elevation, 0) for elevation in (10, 0, -10, 9, 2)])
-    np.testing.assert_array_equal(rings_dropped(LIDAR, fewer, cloud), cloud[[0, 1, 3, 4]])
-
-
-def test_rays_near_which_something_was_measured() -> None:
-    """Half a line spacing above and below, half a column aside."""
-    fine = replace(LIDAR, elevations_deg=tuple(np.arange(-20.0, 21.0, 4)), azimuth_step_deg=30.0)
-    near = measured_near(LIDAR, fine, np.array([at(8, 0, 0), [np.nan] * 3]))
-    assert fine.azimuth_deg == (-180.0, 180.0)
-    rows, columns = np.nonzero(near)
-    assert set(np.array(fine.elevations_deg)[rows]) == {-4.0, 0.0, 4.0}
-    assert set(-180 + 30 * columns) == {-30, 0, 30}
+    assert nothing["returns"] == 0 and np.isnan(nothing["in_boxes"])
 
 
 def test_chamfer() -> None:

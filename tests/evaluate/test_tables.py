@@ -8,7 +8,6 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.report.pictures import HOLE, frame_sheet, hatched_view, left_to_right, shrunk
 from arbiview_aug.evaluate.report.tables import (
-    OVERLAP_COLUMNS,
     SEEN,
     SPARSE_COLUMNS,
     TRUTH_COLUMNS,
@@ -36,7 +35,7 @@ def test_layout() -> None:
 
 
 def test_metrics_are_named_once() -> None:
-    for columns in (TRUTH_COLUMNS, SPARSE_COLUMNS, OVERLAP_COLUMNS):
+    for columns in (TRUTH_COLUMNS, SPARSE_COLUMNS):
         assert len({form for _, form in columns}) == len(columns)
 
 

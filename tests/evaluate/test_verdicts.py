@@ -13,7 +13,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.detections import Matches, labelled_objects
-from arbiview_aug.evaluate.frames import Photographs, ScoredFrame
+from arbiview_aug.evaluate.frames import ScoredFrame, Truth
 from arbiview_aug.evaluate.images import RenderedView, as_tensors
 from arbiview_aug.evaluate.judges import Detections, Detector
 from arbiview_aug.evaluate.report.pictures import Picture
@@ -34,9 +34,9 @@ def plain(colour: int) -> Picture:
 
 def frame(valid: BoolArray = ALL) -> ScoredFrame:
     """A labelled frame with a photograph as truth."""
-    photographs = Photographs(RIG, as_tensors([plain(TRUE)]), [valid])
+    truth = Truth([plain(TRUE)], [valid])
     sample = {"rig": RIG, "images": as_tensors([plain(SOURCE)]), "boxes_3d": BOXES}
-    return ScoredFrame(sample, truth=photographs.of_rig, target=RIG)
+    return ScoredFrame(sample, truth=lambda _: truth, target=RIG)
 
 
 def detector(by_colour: Mapping[int, Sequence[Sequence[float]]], score: float = 0.9) -> Detector:
@@ -44,15 +44,15 @@ def detector(by_colour: Mapping[int, Sequence[Sequence[float]]], score: float = 
 
     def detect(image: Picture) -> Detections:
         boxes = np.array(by_colour.get(int(image[0, 0, 0]), []), float).reshape(-1, 4)
-        return Detections(boxes, np.full(len(boxes), score), ["car"] * len(boxes))
+        return Detections(boxes, np.full(len(boxes), score))
 
     return detect
 
 
 def looked(panel: Panel, shown: ScoredFrame) -> dict[str, dict[str, float]]:
     """Rows of a panel that saw one frame by one method."""
-    panel.look("frame", shown, "own", "van", RIG, [RenderedView(plain(VIEW), ALL)])
-    return panel.rows(["own"], ["van"])
+    panel.look("frame", shown, "own", RIG, [RenderedView(plain(VIEW), ALL)])
+    return panel.rows(["own"])
 
 
 def test_views_are_compared_with_the_true_image() -> None:
@@ -68,7 +68,7 @@ def test_without_a_true_image_they_and_the_sources_are_compared_with_labels() ->
     assert looked(Panel(detector({VIEW: [LEFT]})), unlabelled) == {}
 
 
-def test_several_targets_and_methods_share_the_truth() -> None:
+def test_methods_share_the_truth() -> None:
     calls: list[int] = []
     seen = detector({VIEW: [LEFT], TRUE: [LEFT, RIGHT]})
 
@@ -76,15 +76,12 @@ def test_several_targets_and_methods_share_the_truth() -> None:
         calls.append(int(image[0, 0, 0]))
         return seen(image)
 
-    panel, targets = Panel(detect), ["van", "truck"]
+    panel = Panel(detect)
     for name in ("first", "second"):
         for method in ("own", "other"):
-            for target in targets:
-                panel.look(name, frame(), method, target, RIG, [RenderedView(plain(VIEW), ALL)])
-    assert [calls.count(colour) for colour in (TRUE, VIEW)] == [4, 8]
-    objects = {name: row["objects"] for name, row in panel.rows(["own", "other"], targets).items()}
-    of_method = {"van": 4, "truck": 4, "all": 8}
-    assert objects == {f"{method}: {row}": n for method in ("own", "other") for row, n in of_method.items()}
+            panel.look(name, frame(), method, RIG, [RenderedView(plain(VIEW), ALL)])
+    assert [calls.count(colour) for colour in (TRUE, VIEW)] == [2, 4]
+    assert {name: row["objects"] for name, row in panel.rows(["own", "other"]).items()} == {"own": 4, "other": 4}
 
 
 def test_unsure_detections_in_the_true_image_do_not_count() -> None:
@@ -116,13 +113,9 @@ def test_masks() -> None:
 
 
 # --- intervals --------------------------------------------------------------------------------------------------------
-def verdicts(found: Sequence[bool], copies: int = 1) -> list[Verdict]:
-    """Views of one object each, found or not, for several targets."""
-    rows = []
-    for k, is_found in enumerate(found):
-        matches = Matches(np.array([0.9] * is_found), np.ones(int(is_found), bool), 1)
-        rows += [Verdict(f"{k}", 0, "own", f"target {n}", matches) for n in range(copies)]
-    return rows
+def verdicts(found: Sequence[bool]) -> list[Verdict]:
+    """Views of one object each, found or not."""
+    return [Verdict("own", Matches(np.array([0.9] * hit), np.ones(int(hit), bool), 1)) for hit in found]
 
 
 def test_intervals_are_those_of_a_share() -> None:
@@ -131,13 +124,6 @@ def test_intervals_are_those_of_a_share() -> None:
     assert (row["recall"], row["ap"]) == pytest.approx((0.4, 0.4))
     assert (row["recall_low"], row["recall_high"]) == pytest.approx((0.4 - half, 0.4 + half), abs=0.015)
     assert row == figures(verdicts([True] * 40 + [False] * 60)), "the same draws"
-
-
-def test_more_targets_do_not_narrow_them() -> None:
-    one, four = (figures(verdicts([True] * 8 + [False] * 12, copies)) for copies in (1, 4))
-    assert four["objects"] == 80
-    keys = "recall", "recall_low", "recall_high"
-    assert [one[key] for key in keys] == pytest.approx([four[key] for key in keys])
 
 
 def test_too_few() -> None:

@@ -268,7 +268,6 @@ def test_real_frame(nuscenes_root) -> None:
     from arbiview_aug.datasets import FrameFolder
     from arbiview_aug.evaluate.images import as_arrays, as_tensors
     from arbiview_aug.evaluate.lidar import coloured_points
-    from arbiview_aug.evaluate.targets import named_targets
     from tests.helpers import score_targets
 
     sample = FrameFolder(nuscenes_root)[0]
@@ -284,7 +283,7 @@ def test_real_frame(nuscenes_root) -> None:
         rendered.append(render_paper(rig, target, as_tensors(images)))
         return as_arrays([view.image for view in rendered[-1].targets])
 
-    psnr = score_targets(render, points, [*named_targets("yaw", rig).values()])["psnr_db"]
+    psnr = score_targets(render, points, [rig.turned(yaw_deg=yaw) for yaw in (11, -11, 22, -22, 35)])["psnr_db"]
     print(f"nuscenes-one, yaw, raw: {psnr:.2f} dB")
     assert abs(psnr - 22.5) < 1.5
     for rendering in rendered:

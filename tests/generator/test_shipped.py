@@ -16,7 +16,6 @@ import torch
 import arbiview_aug.generator
 from arbiview_aug import RigRetarget
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.targets import named_targets
 from arbiview_aug.generator import Diffusion, Generator, compact
 from arbiview_aug.generator.checkpoint import read_checkpoint
 from arbiview_aug.generator.training.pseudo_views import retarget
@@ -66,7 +65,7 @@ assert "diffusers" in sys.modules and not found, found
 
 def test_diffusion_works_out_of_the_box() -> None:
     sample = SyntheticDrive(demo_source_rig((48, 84)), num_frames=1, lidar=False)[0]
-    target = named_targets("yaw", sample["rig"])["yaw +22"]
+    target = sample["rig"].turned(yaw_deg=22.0)
     seen = RigRetarget(target)(sample)
     made = RigRetarget(target, holes="diffusion")(sample)
     holes = ~seen["coverage"]

@@ -15,7 +15,6 @@ from torch.utils.data import DataLoader
 
 from arbiview_aug import RetargetedDataset, RigRetarget, SampleKeys, collate
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.bench.timing import peak_mib
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -25,6 +24,7 @@ from arbiview_aug.inpaint import Black, CompletedLoader, PipelineInpainter, Torc
 from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.rendered import RenderedFrame
 from arbiview_aug.sample.inputs import read_frames
+from integrations.benchmarks.memory import peak_mib
 from tests.helpers import ring
 from tests.inpaint.tiny_pipeline import save_tiny_pipeline
 
@@ -220,9 +220,7 @@ def test_a_pipeline_from_disk_completes_frames_everywhere(
         "done": ["--holes", "diffusion", "--generator", str(pipeline), "--steps", "1"],
     }
     for name, way in ways.items():
-        assert (
-            main(["convert", *common, *way, "--workers", "1", "--report", "0", "--output", str(tmp_path / name)]) == 0
-        )
+        assert main(["convert", *common, *way, "--workers", "1", "--output", str(tmp_path / name)]) == 0
     assert_completed(written(tmp_path / "done"), written(tmp_path / "seen"))
 
 

@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys, load_rig
-from arbiview_aug.cameras.rays import ego_rays
+from arbiview_aug.cameras.rays import adjacent_pairs, ego_rays, half_way_view
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import SampleError
-from arbiview_aug.evaluate.agreement import overlap_scores
+from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.render.harmonise import (
     KNEE,
     LEVELS,
@@ -61,16 +61,20 @@ def exposed(images: list[torch.Tensor], camera: int, gain: float) -> list[torch.
 def overlap_db(
     rig: Rig, images: list[torch.Tensor], gains: tuple[float, ...] | None = None, size: tuple[int, int] = (450, 800)
 ) -> np.ndarray:
-    """Raw overlap PSNR of each adjacent pair, by the package's own renderer."""
+    """PSNR of each adjacent pair, rendered to the view half-way between them, where at least 1,000 pixels overlap."""
 
     def render(view: Camera, source: int) -> tuple[np.ndarray, np.ndarray]:
         plan = build_plan(rig.with_cameras([rig[source]]), rig.with_cameras([view]), geometry="street")
         curves = None if gains is None else tone_curves([[gains[source]]])
         image = render_opencv(plan, [images[source]], None, curves)[0]
-        return image.permute(1, 2, 0).numpy(), plan.targets[0].coverage
+        return image.permute(1, 2, 0).numpy().astype(float), plan.targets[0].coverage
 
-    scores = [score.raw_psnr_db for score in overlap_scores(rig, render, size=size)]
-    return np.array([score for score in scores if score is not None])
+    found = []
+    for a, b in adjacent_pairs(rig):
+        (one, sees_one), (two, sees_two) = (render(half_way_view(rig[a], rig[b], size), k) for k in (a, b))
+        if (both := sees_one & sees_two).sum() >= 1000:
+            found.append(psnr_db(float(((one - two)[both] ** 2).mean())))
+    return np.array(found)
 
 
 @pytest.mark.parametrize("gain", [0.7, 1.3])

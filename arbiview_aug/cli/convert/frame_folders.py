@@ -73,26 +73,24 @@ class FrameFolders(Writer):
         links = {} if points is None or is_scanned else {f"{folder}/{file}": files[-1]}
         return {**scan, f"{folder}/{CALIBRATION_FILE}": text}, links, {}
 
-    def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
+    def finish(self, records: Iterable[Record], left_out: set[str]) -> tuple[list[str], list[str]]:
         """Write the frames' sequence, without those that were left out."""
-        self._remove(left_out)
         path = self.data.root / SEQUENCE_FILE
-        if path.is_file():
-            sequence = json.loads(read_text(path, MOST_BYTES))
-            frames = sequence["frames"]
-            sequence["frames"] = [frame for frame in frames if entry_name(frame) not in left_out]
-            write_whole({self.output / SEQUENCE_FILE: json.dumps(sequence, indent=1).encode()})
-        return []
+        if not path.is_file():
+            return self._finish(left_out, None)
+        sequence = json.loads(read_text(path, MOST_BYTES))
+        frames = [frame for frame in sequence["frames"] if entry_name(frame) not in left_out]
+        return self._finish(left_out, {**sequence, "frames": frames})
 
-    def _remove(self, left_out: set[str]) -> None:
-        """Remove the calibrations that make frames of folders: a killed run may have written them without a record."""
+    def _finish(self, left_out: set[str], sequence: Mapping[str, Any] | None) -> tuple[list[str], list[str]]:
+        """Write a sequence; remove the calibrations that make frames of folders: a killed run may have left them."""
         for token in left_out:
             path = self.kept_path(f"{token}/{CALIBRATION_FILE}")
             with writing(path):
                 path.unlink(missing_ok=True)
-
-    def finished(self) -> list[str]:
-        return [SEQUENCE_FILE] if (self.data.root / SEQUENCE_FILE).is_file() else []
+        if sequence is not None:
+            write_whole({self.output / SEQUENCE_FILE: json.dumps(sequence, indent=1).encode()})
+        return [] if sequence is None else [SEQUENCE_FILE], []
 
 
 class LogFrames(FrameFolders):
@@ -121,18 +119,13 @@ class LogFrames(FrameFolders):
             calib["box_names"] = sample["box_names"]
         return {**files, f"{folder}/{CALIBRATION_FILE}": json.dumps(calib, indent=1).encode()}, {}, {}
 
-    def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
+    def finish(self, records: Iterable[Record], left_out: set[str]) -> tuple[list[str], list[str]]:
         """Write the sequence of a single drive."""
-        self._remove(left_out)
         if not self.data.is_one_drive:
-            return [f"no {SEQUENCE_FILE}, which holds one drive: convert each log alone for neighbours"]
+            self._finish(left_out, None)
+            return [], [f"no {SEQUENCE_FILE}, which holds one drive: convert each log alone for neighbours"]
         kept = [(k, token) for k, token in enumerate(self.data.tokens) if token not in left_out]
-        frames = [{"name": token, "time_s": self.data.time_s(k)} for k, token in kept]
-        write_whole({self.output / SEQUENCE_FILE: json.dumps({"frames": frames}, indent=1).encode()})
-        return []
-
-    def finished(self) -> list[str]:
-        return [SEQUENCE_FILE] if self.data.is_one_drive else []
+        return self._finish(left_out, {"frames": [{"name": token, "time_s": self.data.time_s(k)} for k, token in kept]})
 
 
 def _left_out(source: Mapping[str, Any], folder: Path, is_scanned: bool) -> Iterator[str]:

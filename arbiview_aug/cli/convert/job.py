@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -178,7 +178,7 @@ class Jobs(Dataset[Done]):
         cameras = rig.to_dict()["cameras"]
         coverage = [round(float(mask.float().mean()), 6) for mask in out["coverage"]]
         sources = self.source_files(index)
-        sums = {path: checksum_once(path) for path in sources.values()}
+        sums = {path: checksum(path) for path in sources.values()}
         record: dict[str, Any] = {
             **{"token": self.data.tokens[index], "ground_z_m": rig.ground_z_m},
             "cameras": [{**camera, "file": image} for camera, image in zip(cameras, images, strict=True)],
@@ -225,17 +225,6 @@ def _name_from(path: Path, root: Path) -> str:
     if path.is_relative_to(root):
         return path.relative_to(root).as_posix()
     return Path(os.path.relpath(os.path.realpath(path), os.path.realpath(root))).as_posix()
-
-
-def checksum_once(path: Path) -> str:
-    """SHA-256 of a source, computed once in a process: many samples may be read from one file."""
-    status = path.stat()
-    return _checksum_of(path, status.st_size, status.st_mtime_ns)
-
-
-@lru_cache(maxsize=64)
-def _checksum_of(path: Path, size: int, time_ns: int) -> str:
-    return checksum(path)
 
 
 def _sizes(files: Mapping[str, Path]) -> dict[str, int]:

@@ -194,7 +194,7 @@ class NuScenes(Writer):
             facts["num_lidar_pts"] = dict(zip(tokens, out.get(COUNTS_KEY, torch.empty(0)).tolist(), strict=True))
         return files, {}, facts
 
-    def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
+    def finish(self, records: Iterable[Record], left_out: set[str]) -> tuple[list[str], list[str]]:
         """Write the tables and link the files of the remaining sensors."""
         source = self.tables
         remaining = Remaining(source, left_out, self.scanned, self.moment)
@@ -232,20 +232,7 @@ class NuScenes(Writer):
         unknown = sorted({path.stem for path in (self.data.root / self.data.version).glob("*.json")} - {*_TABLES})
         if unknown:
             notes.append(f"left out, since they may describe the source's images: tables {', '.join(unknown)}")
-        return notes
-
-    def finished(self) -> list[str]:
-        return [f"{self.data.version}/{name}.json" for name in self.written]
-
-    def kept(self, left_out: set[str]) -> Iterator[tuple[Path, Path]]:
-        for path in self._maps():
-            yield self._kept(path.relative_to(self.data.root).as_posix(), "maps")
-        remaining = Remaining(self.tables, left_out, self.scanned, self.moment)
-        tables: dict[str, Iterable[Row]] = {"sample_data": remaining.sample_data()}
-        tables |= {name: self.tables.rows(name) for name in _OF_POINTS if name in self.written}
-        for table, rows in tables.items():
-            for row in rows:
-                yield self._kept(row["filename"], self._where(table, row))
+        return [f"{self.data.version}/{name}.json" for name in self.written], notes
 
     def _linked(self, table: str, rows: Iterable[Row]) -> Iterator[Row]:
         for row in rows:

@@ -55,16 +55,11 @@ class Writer(ABC):
         """Files of a sample besides its views, its files that are kept, and further entries of its record."""
 
     @abstractmethod
-    def finish(self, records: Iterable[Record], left_out: set[str]) -> list[str]:
-        """Write what belongs to all samples: ``records`` of the converted ones, tokens of those ``left_out``; notes."""
+    def finish(self, records: Iterable[Record], left_out: set[str]) -> tuple[list[str], list[str]]:
+        """Write what belongs to all samples: ``records`` of the converted ones, tokens of those ``left_out``.
 
-    @abstractmethod
-    def finished(self) -> list[str]:
-        """Names of the files that ``finish`` wrote."""
-
-    def kept(self, left_out: set[str]) -> Iterable[tuple[Path, Path]]:
-        """Source and output of each file that ``finish`` keeps, if the source has it."""
-        return ()
+        Returns the names of the files that it wrote, and notes.
+        """
 
     def kept_path(self, name: str, where: str = "") -> Path:
         """Path of a kept file in the output: it may be a link that leaves the output, its folder may not."""

@@ -30,38 +30,26 @@ _JPEG_QUALITY = 85
 
 
 def html_report(
-    title: str,
-    done: Evaluation,
-    methods: Sequence[str],
-    tables: Sequence[Table],
-    notes: Sequence[str] = (),
+    title: str, done: Evaluation, methods: Sequence[str], tables: Sequence[Table], notes: Sequence[str] = ()
 ) -> str:
     """Build the page: title, notes as paragraphs, tables, and the first frame's views.
 
-    For each target rig it shows one picture per camera, with a slider between two layers (source, methods in their
-    order, holes, confidence, truth), and both rigs from above.
+    It shows one picture per target camera, with a slider between two layers (source, methods in their order, holes,
+    confidence, truth), and both rigs from above.
     """
     parts = [f"<h1>{escape(title)}</h1>", *(f"<p>{escape(note)}</p>" for note in notes)]
     parts += [_table(*table) for table in tables]
-    for target, rig in done.targets.items():
-        shown = {m: done.pictures[target, m] for m in methods if (target, m) in done.pictures}
-        if shown:
-            parts.append(_target_section(target, rig, done, shown))
+    shown = {name: done.pictures[name] for name in methods if name in done.pictures}
+    if shown:
+        parts.append(_views(done, shown))
     page = _PAGE.replace("{title}", escape(title)).replace("{body}", "\n".join(parts))
     return page.encode(errors="backslashreplace").decode()  # names of files that are not UTF-8
 
 
-def layers(
-    camera: int,
-    rig: Rig,
-    done: Evaluation,
-    shown: Mapping[str, Sequence[RenderedView]],
-) -> dict[str, Picture]:
+def layers(camera: int, done: Evaluation, shown: Mapping[str, Sequence[RenderedView]]) -> dict[str, Picture]:
     """Pictures that the slider of one target camera can show, by name."""
-    assert done.first is not None
     source: Rig = done.first.sample["rig"]
-    axis = rig[camera].cam2ego[:3, 2]
-    nearest = int(np.argmax(source.cam2ego[:, :3, 2] @ axis))
+    nearest = int(np.argmax(source.cam2ego[:, :3, 2] @ done.target[camera].cam2ego[:3, 2]))
     pictures = {SOURCE_LAYER: shrunk(as_arrays([done.first.sample["images"][nearest]])[0], _HEIGHT_PX)}
     for method, views in shown.items():
         view = views[camera]
@@ -70,30 +58,23 @@ def layers(
             pictures[f"{method}: unseen"] = hatched_view(view, _HEIGHT_PX)
         if view.confidence is not None:
             pictures[f"{method}: confidence"] = shrunk(overlay_confidence(view.image, view.confidence), _HEIGHT_PX)
-    true = done.first.true_images(rig)
+    true = done.first.true_images(done.target)
     if true is not None:
         pictures[TRUTH_LAYER] = shrunk(true[camera], _HEIGHT_PX)
     return pictures
 
 
-def _target_section(
-    target: str,
-    rig: Rig,
-    done: Evaluation,
-    shown: Mapping[str, Sequence[RenderedView]],
-) -> str:
-    assert done.first is not None
-    source: Rig = done.first.sample["rig"]
-    by_camera = [layers(camera, rig, done, shown) for camera in range(len(rig))]
+def _views(done: Evaluation, shown: Mapping[str, Sequence[RenderedView]]) -> str:
+    rig = done.target
+    by_camera = [layers(camera, done, shown) for camera in range(len(rig))]
     # Every camera offers the same layers: a view without holes stands for its own holes.
     names = list(dict.fromkeys(name for of_camera in by_camera for name in of_camera))
-    after = next(iter(shown))
-    before = TRUTH_LAYER if TRUTH_LAYER in names else SOURCE_LAYER
+    sides = {"before": TRUTH_LAYER if TRUTH_LAYER in names else SOURCE_LAYER, "after": next(iter(shown))}
     choices = "".join(
         f'<label>{where} of the bar <select data-side="{side}">'
-        + "".join(f"<option{' selected' if name == chosen else ''}>{escape(name)}</option>" for name in names)
+        + "".join(f"<option{' selected' * (name == sides[side])}>{escape(name)}</option>" for name in names)
         + "</select></label> "
-        for where, side, chosen in (("left", "before", before), ("right", "after", after))
+        for where, side in (("left", "before"), ("right", "after"))
     )
     cells = []
     for k in left_to_right(rig):
@@ -101,7 +82,7 @@ def _target_section(
         for name in names:
             picture = by_camera[k].get(name, by_camera[k].get(name.split(": ")[0]))
             assert picture is not None
-            side = " before" if name == before else " after" if name == after else ""
+            side = next((f" {side}" for side, chosen in sides.items() if name == chosen), "")
             pictures.append(
                 f'<img class="layer{side}" data-layer="{escape(name)}" alt="{escape(name)}" src="{_data_url(picture)}">'
             )
@@ -112,10 +93,10 @@ def _target_section(
             f'<input type="range" min="0" max="100" value="50" aria-label="{escape(rig[k].name)}">'
             f"<figcaption>{escape(rig[k].name)} &middot; seen: {escape(seen)}</figcaption></figure>"
         )
-    plan = draw_rigs([source, rig])
+    plan = _data_url(draw_rigs([done.first.sample["rig"], rig]))
     return (
-        f'<section><h2>{escape(target)}</h2><p>{choices}</p><div class="sheet">{"".join(cells)}</div>'
-        f'<img class="plan" alt="both rigs from above and from the side" src="{_data_url(plan)}"></section>'
+        f'<section><h2>{escape(done.label)}</h2><p>{choices}</p><div class="sheet">{"".join(cells)}</div>'
+        f'<img class="plan" alt="both rigs from above and from the side" src="{plan}"></section>'
     )
 
 

@@ -32,7 +32,6 @@ _FARTHEST_M = 80.0  # points there, and beyond, are blue
 RIG_COLOURS = ("#1f64c8", "#d65414", "#1e8c3c", "#8c3caa", "#966e14")  # of rigs, in their order
 
 _SCANNER = "#00a0a0"  # colour of scanners
-_BEAM_M, _BEAMS = 1.6, 9  # length and number of their drawn beams
 
 _GAP_PX = 6
 _CAPTION_PX, _CAPTION_SCALE = 20, 0.42
@@ -54,17 +53,17 @@ def contact_sheet(rows: Sequence[tuple[str, Sequence[Image], Sequence[str]]], *,
     """
     strips = []
     for title, images, captions in rows:
-        strips.append(_paper(_TITLE_PX, width_px))
+        strips.append(np.full((_TITLE_PX, width_px, 3), PAPER, np.uint8))
         put_text(strips[-1], title, (_GAP_PX, _TITLE_PX - 8), 0.6)
         strips.append(_row(images, captions, width_px))
-    return np.concatenate([*strips, _paper(_GAP_PX, width_px)])
+    return np.concatenate([*strips, np.full((_GAP_PX, width_px, 3), PAPER, np.uint8)])
 
 
 def _row(images: Sequence[Image], captions: Sequence[str], width_px: int) -> Picture:
     aspects = [image.shape[1] / image.shape[0] for image in images]
     # A row of few images would otherwise be taller than the rest of the sheet.
     height = max(1, round(min((width_px - _GAP_PX * (len(images) + 1)) / sum(aspects), 0.3 * width_px)))
-    strip = _paper(_GAP_PX + height + _CAPTION_PX, width_px)
+    strip = np.full((_GAP_PX + height + _CAPTION_PX, width_px, 3), PAPER, np.uint8)
     x = _GAP_PX
     for image, aspect, caption in zip(images, aspects, captions, strict=True):
         w = max(1, min(round(aspect * height), width_px - x))
@@ -163,10 +162,6 @@ def save_picture(path: str | Path, picture: Picture) -> Path:
     return path
 
 
-def _paper(height: int, width: int) -> Picture:
-    return np.full((height, width, 3), PAPER, np.uint8)
-
-
 _RING_START_DEG = 200.0  # from the left over the front to the right; cameras that look back come last
 
 
@@ -237,7 +232,7 @@ def rig_figure(rigs: Sequence[Rig]) -> Figure:
 
     Wedges show horizontal fields of view above and vertical ones below. A telephoto camera's wedge is longer. All
     columns share one scale, with the other rigs' outlines behind. Heights are over each rig's own road. Scanners are
-    dots above, with the ends of their middle beam where they do not look all around; below are their beams.
+    dots.
     """
     from matplotlib.figure import Figure
 
@@ -246,72 +241,53 @@ def rig_figure(rigs: Sequence[Rig]) -> Figure:
     for column, (above, side) in enumerate(rows.T):
         for k, rig in enumerate(rigs):
             colour, here = RIG_COLOURS[k % len(RIG_COLOURS)], k == column
+            style = {"facecolor": (colour, 0.15 if here else 0), "edgecolor": (colour, 1 if here else 0.3)}
             for camera in rig:
-                for axes, outline in ((above, _wedge_from_above(camera)), (side, _wedge_from_side(camera, rig))):
-                    axes.fill(
-                        *outline.T,
-                        facecolor=(colour, 0.15 if here else 0),
-                        edgecolor=(colour, 1 if here else 0.3),
-                    )
-            if here:
-                _label_from_above(above, rig)
-                _label_from_side(side, rig)
-                _draw_scanners(above, side, rig)
-                above.set_title(f"{rig.name or 'rig'}: {len(rig)} cameras", color=colour)
+                above.fill(*_wedge_from_above(camera).T, **style)
+                side.fill(*_wedge_from_side(camera, rig).T, **style)
+        _label(above, side, rigs[column])
+        above.set_title(f"{rigs[column].name or 'rig'}: {len(rigs[column])} cameras", color=RIG_COLOURS[column % 5])
         above.set(xlabel="left (m)", ylabel="forward (m)", aspect="equal")
         side.set(xlabel="forward (m)", ylabel="height over the road (m)", aspect="equal")
         side.axhline(0, color="grey", linewidth=3)
-        above.grid(alpha=0.3)
-        side.grid(alpha=0.3)
-        above.margins(0.15)
-        side.margins(0.7, 0.05)
+        for axes, margins in ((above, (0.15, 0.15)), (side, (0.7, 0.05))):
+            axes.grid(alpha=0.3)
+            axes.margins(*margins)
     above.invert_xaxis()
     return figure
 
 
-def _draw_scanners(above: Any, side: Any, rig: Rig) -> None:
-    """Scanners' places and azimuths from above; their beams, forward and backward, from the side."""
-    for lidar in rig.lidars:
-        x, y, z = lidar.center_m - (0, 0, rig.ground_z_m)
-        rays = lidar.rays.astype(np.float64)
-        above.plot(y, x, "o", color=_SCANNER, markersize=7, markeredgecolor="white", zorder=3)
-        if lidar.azimuth_deg[1] - lidar.azimuth_deg[0] < 360:
-            ends = np.array([y, x])[:, None] + _BEAM_M * rays[1::-1, len(lidar.elevations_deg) // 2]
-            above.plot(*ends, color=_SCANNER, linewidth=1)
-        some = np.linspace(0, len(lidar.elevations_deg) - 1, _BEAMS).round().astype(int)
-        for column in {int(np.argmax(rays[0, 0])), int(np.argmin(rays[0, 0]))}:
-            to = np.array([x, z])[:, None] + _BEAM_M * rays[::2, some, column]
-            lines = np.stack([np.broadcast_to([[x], [z]], to.shape), to])
-            side.plot(*lines.transpose(1, 0, 2), color=_SCANNER, linewidth=0.5)
-    heights = ((lidar, lidar.center_m[2] - rig.ground_z_m) for lidar in rig.lidars)
-    text = "\n".join(f"{lidar.name} {z:.2f} m, {len(lidar.elevations_deg)} beams" for lidar, z in heights)
-    side.text(0.5, 0.96, text, transform=side.transAxes, ha="center", va="top", fontsize=8, color=_SCANNER)
+def _label(above: Any, side: Any, rig: Rig) -> None:
+    """Write each camera's name and field of view at the end of its wedge, and all heights next to the side's drawing.
 
-
-def _label_from_above(axes: Any, rig: Rig) -> None:
-    """Write each camera's name and field of view at the end of its wedge."""
+    Rear cameras are listed on the left, front ones on the right, scanners between them; scanners are drawn as dots.
+    """
     for camera in rig:
         forward, left = np.cos(np.radians(camera.azimuth_deg)), np.sin(np.radians(camera.azimuth_deg))
-        axes.text(
-            camera.center_m[1] + (_radius_m(camera) + 0.2) * left,
-            camera.center_m[0] + (_radius_m(camera) + 0.2) * forward,
-            f"{camera.name}\n{camera.fov_deg[0]:.0f}° x {camera.fov_deg[1]:.0f}°",
-            fontsize=8,
-            ha="right" if left > 0.3 else "left" if left < -0.3 else "center",
-            va="bottom" if forward > 0 else "top",
-        )
-
-
-def _label_from_side(axes: Any, rig: Rig) -> None:
-    """List names and heights beside the drawing: rear cameras left, front ones right."""
+        y, x = camera.center_m[1::-1] + (_radius_m(camera) + 0.2) * np.array([left, forward])
+        text = f"{camera.name}\n{camera.fov_deg[0]:.0f}° x {camera.fov_deg[1]:.0f}°"
+        aligned = {"ha": "right" if left > 0.3 else "left" if left < -0.3 else "center"}
+        above.text(y, x, text, fontsize=8, va="bottom" if forward > 0 else "top", **aligned)
     order = sorted(rig, key=lambda camera: (camera.center_m[0], camera.azimuth_deg))
-    for side, cameras in (("left", order[: len(order) // 2]), ("right", order[len(order) // 2 :])):
-        lines = [f"{camera.name} {camera.center_m[2] - rig.ground_z_m:.2f} m" for camera in cameras]
-        x = 0.01 if side == "left" else 0.99
-        axes.text(x, 0.96, "\n".join(lines), transform=axes.transAxes, ha=side, va="top", fontsize=8)
+    sensors: list[Any] = [*order, *rig.lidars]
+    heights = [f"{sensor.name} {sensor.center_m[2] - rig.ground_z_m:.2f} m" for sensor in sensors]
+    beams = [f"{text}, {len(s.elevations_deg)} beams" for text, s in zip(heights[len(rig) :], rig.lidars, strict=True)]
+    half = len(rig) // 2
+    for ha, at, lines in (
+        ("left", 0.01, heights[:half]),
+        ("right", 0.99, heights[half : len(rig)]),
+        ("center", 0.5, beams),
+    ):
+        colour = {"color": _SCANNER} if ha == "center" else {}
+        side.text(at, 0.96, "\n".join(lines), transform=side.transAxes, ha=ha, va="top", fontsize=8, **colour)
+    dot = {"marker": "o", "linestyle": "", "color": _SCANNER, "markersize": 7, "markeredgecolor": "white", "zorder": 3}
+    for lidar in rig.lidars:
+        x, y, z = lidar.center_m - (0, 0, rig.ground_z_m)
+        above.plot(y, x, **dot)
+        side.plot(x, z, **dot)
 
 
-def _wedge_from_above(camera: Camera) -> np.ndarray:
+def _wedge_from_above(camera: Camera) -> FloatArray:
     """(n, 2) outline in ego y, x: the horizontal field of view about the optical axis."""
     fov = min(camera.fov_deg[0], 359.0)
     angle = np.radians(camera.azimuth_deg + np.linspace(-fov / 2, fov / 2, max(2, int(fov / 3))))
@@ -319,7 +295,7 @@ def _wedge_from_above(camera: Camera) -> np.ndarray:
     return np.concatenate([camera.center_m[None, 1::-1], arc])
 
 
-def _wedge_from_side(camera: Camera, rig: Rig) -> np.ndarray:
+def _wedge_from_side(camera: Camera, rig: Rig) -> FloatArray:
     """(n, 2) outline in ego x and height over the road: the vertical field of view."""
     row = np.linspace(-0.5, camera.height_px - 0.5, 25)
     rays = camera.unproject(np.stack([np.full_like(row, camera.K[0, 2]), row], -1)).directions

@@ -23,13 +23,11 @@ TRUTH_COLUMNS = (
     ("SSIM", "{true_covered_ssim:.4f}"),
     ("holes", "{true_hole_psnr_db:.2f}"),
     ("hole MAE", "{true_hole_mae:.2f}"),
-    ("texture dB", "{true_hole_spectrum_db:.1f}"),
     ("whole view", "{true_psnr_db:.2f}"),
 )
 TRUTH_NOTES = (
     "seen: share of the target's pixels. ground, objects, sky: PSNR there. MAE in grey levels of 255. holes, hole MAE: "
-    "pixels that no source saw. texture: distance of the radial power spectrum there to the truth's; 0 is the truth's. "
-    "whole view: PSNR of all pixels; holes are black unless they are filled."
+    "pixels that no source saw. whole view: PSNR of all pixels; holes are black unless they are filled."
 )
 PHOTOGRAPH_COLUMNS = (
     SEEN,
@@ -62,20 +60,6 @@ SPARSE_NOTES = (
     "it: the cameras' exposures are made even first. covered: points on seen pixels; points: their share. ground: "
     "points on the road; other: all others."
 )
-OVERLAP_COLUMNS = (
-    ("raw dB", "{overlap_raw_psnr_db:.2f}"),
-    ("fitted dB", "{overlap_fitted_psnr_db:.2f}"),
-    ("worst pair", "{overlap_worst_fitted_psnr_db:.2f}"),
-    ("targets raw", "{consistency_raw_psnr_db:.2f}"),
-    ("fitted", "{consistency_fitted_psnr_db:.2f}"),
-    ("worst", "{consistency_worst_fitted_psnr_db:.2f}"),
-)
-OVERLAP_NOTES = (
-    "Two neighbouring source cameras, each alone rendered to the view half-way between them: PSNR on odd tiles, raw "
-    "and with a gain and an offset per channel fitted on the even ones. targets: neighbouring rendered views, brought "
-    "to their half-way view over the street's surface. Compare methods of one surface: views rendered over the street "
-    "agree there even where the street is wrong."
-)
 DETECTION_COLUMNS = (
     ("objects", "{objects:.0f}"),
     ("AP", "{ap:.2f} [{ap_low:.2f}, {ap_high:.2f}]"),
@@ -92,45 +76,30 @@ SCAN_COLUMNS = (
     ("range m", "{range_error_m:.3f}"),
     ("Chamfer m", "{chamfer_m:.3f}"),
     ("returns", "{returns:.2f}"),
-    ("rings", "{by_ring:.1%}"),
-    ("ranges", "{by_range:.1%}"),
     ("in boxes", "{in_boxes:.1%}"),
 )
 SCAN_NOTES = (
     "recall: true returns that the points have at the scanner's rays, within 0.2 m or 2 % of the range. precision: the "
     "points' returns that are true. range: median error at rays where both return. Chamfer: mean distance to the other "
-    "cloud's nearest point. returns: the number of points over the true one. rings, ranges: share of the points that "
-    "would have to move to another ring, or by 10 m of range, for the true densities. in boxes: how far the numbers of "
-    "points in boxes are apart, over the true ones."
+    "cloud's nearest point. returns: the number of points over the true one. in boxes: how far the numbers of points "
+    "in boxes are apart, over the true ones."
 )
 _HELD_OUT = "Methods get the points of every other degree of azimuth; the points between score (the count above)."
 
 
-def evaluation_tables(done: Evaluation, methods: Sequence[str]) -> list[Table]:
-    """Tabulate views against their reference (a row per method and target) and agreement (a row per method).
-
-    Against photographs there is no agreement.
-    """
-    assert done.first is not None
-    names = [name for name in methods if name not in done.declined]
-    rows: dict[str, dict[str, float]] = {}
-    for name in names:
-        if len(done.targets) > 1:
-            rows |= {f"{name}: {target}": done.means(name, target) for target in done.targets}
-        rows[f"{name}: all" if len(done.targets) > 1 else name] = done.means(name)
-    table: Table = ("Views, no truth and no LiDAR points to compare with", rows, (SEEN,), "")
-    if done.first.target is not None:
+def evaluation_table(done: Evaluation, methods: Sequence[str]) -> Table:
+    """Tabulate views against their reference, a row per method."""
+    rows = {name: done.means(name) for name in methods if name not in done.declined}
+    first = done.first
+    if first.target is not None:
         rows = {name: row | {"spread_db": done.spread(name, "true_covered_psnr_db")} for name, row in rows.items()}
-        return [("Against photographs", rows, PHOTOGRAPH_COLUMNS, PHOTOGRAPH_NOTES)]
-    if done.first.truth is not None:
-        table = ("Against the true views, where some source camera saw", rows, TRUTH_COLUMNS, TRUTH_NOTES)
-    elif done.first.lidar:
-        points = len(done.first.lidar["raw"].points)
-        notes = f"{SPARSE_NOTES} {_HELD_OUT}" if done.first.held_out else SPARSE_NOTES
-        title = f"Against {points} LiDAR points with the colours that the source cameras saw"
-        table = (title, rows, SPARSE_COLUMNS, notes)
-    agreement = {name: done.agreement(name) for name in names}
-    return [table, ("Agreement of neighbours", agreement, OVERLAP_COLUMNS, OVERLAP_NOTES)]
+        return "Against photographs", rows, PHOTOGRAPH_COLUMNS, PHOTOGRAPH_NOTES
+    if first.truth is not None:
+        return "Against the true views, where some source camera saw", rows, TRUTH_COLUMNS, TRUTH_NOTES
+    if first.lidar:
+        title = f"Against {len(first.lidar['raw'].points)} LiDAR points with the colours that the source cameras saw"
+        return title, rows, SPARSE_COLUMNS, f"{SPARSE_NOTES} {_HELD_OUT}" if first.held_out else SPARSE_NOTES
+    return "Views, no truth and no LiDAR points to compare with", rows, (SEEN,), ""
 
 
 def verdict_tables(rows: Mapping[str, Mapping[str, float]]) -> list[Table]:

@@ -18,9 +18,9 @@ import pytest
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.images import as_arrays, as_tensors
 from arbiview_aug.evaluate.lidar import coloured_points, sparse_metrics
-from arbiview_aug.evaluate.targets import UP_M, YAWS_DEG
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from integrations.benchmarks.acceptance.protocol import FRAMES, ProtocolFrame, frame_folder
+from integrations.benchmarks.targets import UP_M, YAWS_DEG
 
 pytestmark = pytest.mark.timeout(1800)
 

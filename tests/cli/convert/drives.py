@@ -21,8 +21,6 @@ SURROUND = demo_source_rig(SIZE)
 TARGET_FILE = Path(__file__).with_name("small.json")
 """Three cameras of argoverse2 and its scanners, with few beams and columns."""
 TARGET = load_rig(TARGET_FILE)
-SAME_FOR_ALL = ("report.html",)
-"""Files that tell where they are: all others are the same bytes wherever they are written."""
 
 
 def write_frames(root: Path, count: int) -> Path:
@@ -72,14 +70,13 @@ def read_tables(root: Path) -> Tables:
 
 
 def tree(root: Path) -> dict[str, bytes]:
-    """All files by name, hidden ones too, but for the report."""
-    files = [path for path in sorted(root.rglob("*")) if path.is_file() and path.name not in SAME_FOR_ALL]
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
+    """All files by name, hidden ones too."""
+    return {p.relative_to(root).as_posix(): p.read_bytes() for p in sorted(root.rglob("*")) if p.is_file()}
 
 
 def command(source: str | Path, output: Path, *more: str) -> list[str]:
-    """Arguments of ``main``, in one process without a report."""
-    fixed = ["--size", "24x40", "--geometry", "street", "--workers", "1", "--report", "0"]
+    """Arguments of ``main``, in one process."""
+    fixed = ["--size", "24x40", "--geometry", "street", "--workers", "1"]
     return ["convert", "--data", str(source), "--target", str(TARGET_FILE), "--output", str(output), *fixed, *more]
 
 

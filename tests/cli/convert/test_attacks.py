@@ -326,14 +326,6 @@ def test_errors_that_nobody_expects(step: str, on_error: str, frames: Home, monk
     assert (frames.output / "0002").exists() == (on_error != "fatal")
 
 
-def test_the_depth_command_goes_on(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
-    sound = FrameFolder.__getitem__
-    monkeypatch.setattr(FrameFolder, "__getitem__", lambda self, index: 1 / 0 if index == 1 else sound(self, index))
-    assert frames.run("depth", "--data", str(frames.source), "--output", str(frames.output)) == 1
-    assert "0001: failed: ZeroDivisionError: division by zero" in frames.said
-    assert sorted(path.name for path in frames.output.iterdir()) == ["0000.npz", "0002.npz"]
-
-
 def test_an_interrupt_is_no_samples_fault(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(FrameFolder, "__getitem__", lambda *_: raises(KeyboardInterrupt()))
     assert frames.convert("--on-error", "skip") == 130
@@ -421,15 +413,3 @@ def test_no_link_leads_out_of_the_output(name: str, tables: Home) -> None:
     (tables.output / name).symlink_to(tables.root / "elsewhere")
     assert tables.convert() == 2 and "links must not leave the folder" in tables.said
     assert not [*(tables.root / "elsewhere").iterdir()]
-
-
-@pytest.mark.parametrize(("option", "value"), [("--output", "a\0b"), ("--output", "x" * 300), ("--depth", "x" * 300)])
-def test_impossible_folders(option: str, value: str, tables: Home, capsys: pytest.CaptureFixture[str]) -> None:
-    given = command(tables.source, tables.output)
-    if option == "--output":
-        given[given.index(option) + 1] = value
-    else:
-        given += [option, value]
-    with pytest.raises(SystemExit):
-        tables.run(*given)
-    assert f"argument {option}: expected a name that a file can have" in capsys.readouterr().err

@@ -89,12 +89,6 @@ def test_an_output_that_may_not_be_written(code: int, conversion: Conversion, mo
     assert os.strerror(code) in conversion.said and tree(conversion.root / "new") == {}
 
 
-def test_an_output_that_cannot_be_a_folder(conversion: Conversion) -> None:
-    (conversion.root / "file").write_text("")
-    assert conversion.run("frames", name="file/new") == 2
-    assert "expected a folder that can be written to, got Not a directory" in conversion.said
-
-
 def test_a_truncated_image(conversion: Conversion, sources: dict[str, Path]) -> None:
     root = conversion.root
     source = Path(shutil.copytree(sources["frames"], root / "frames"))

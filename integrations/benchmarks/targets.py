@@ -1,4 +1,4 @@
-"""Target rigs to evaluate on, made from the source rig and without its car-body masks."""
+"""Target rigs of the studies, made from the source rig and without its car-body masks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING
+from arbiview_aug.evaluate.frames import without_masks
 
+TARGET_SETS = ("paper", "yaw", "vehicles", "truck")
 PAPER_SHARES = (0.2, -0.2, 0.4, -0.4, 0.5, -0.25)  # of the azimuth spacing: 11/14, 22/28, 27.5/35, 13.75/17.5°
 
 YAWS_DEG = (11.0, -11.0, 22.0, -22.0, 35.0)
@@ -69,10 +71,3 @@ def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:
     else:
         targets = {"truck": without_masks(rig.shifted(z_m=TRUCK_UP_M))}
     return {name: replace(target, name=f"{rig.name}, {name}".lstrip(", ")) for name, target in targets.items()}
-
-
-def without_masks(rig: Rig) -> Rig:
-    """The same rig without car-body masks."""
-    if all(camera.mask is None for camera in rig):
-        return rig
-    return rig.with_cameras([replace(camera, mask=None) for camera in rig])

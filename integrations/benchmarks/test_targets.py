@@ -7,14 +7,8 @@ import pytest
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.evaluate.targets import (
-    PAPER_SHARES,
-    VEHICLES,
-    named_targets,
-    paper_target,
-    spacing_deg,
-    without_masks,
-)
+from arbiview_aug.evaluate.frames import without_masks
+from integrations.benchmarks.targets import PAPER_SHARES, VEHICLES, named_targets, paper_target, spacing_deg
 
 
 def turned_by(source: Rig, target: Rig) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Times, memory, machine and report of the benchmarks.
+"""Times, machine and report of the benchmarks.
 
 The clock is the process's CPU time over all of its threads, which leaves out waiting on a busy machine. Each round runs
 every candidate in turn, once unmeasured to warm its caches and once measured, so that other load slows all alike.
@@ -6,8 +6,6 @@ every candidate in turn, once unmeasured to warm its caches and once measured, s
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import json
 import math
 import os
@@ -15,16 +13,14 @@ import platform
 import re
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec
 
-import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
 from tqdm import tqdm
 
 from arbiview_aug.environment import one_thread, versions
@@ -75,29 +71,6 @@ def timed_rounds(
     return {name: np.array(taken) for name, taken in times.items()}
 
 
-def peak_mib(run: Callable[[], Any]) -> float | None:
-    """Peak growth of the process's memory during a call, in MiB; None except on Linux."""
-    gc.collect()
-    with suppress(OSError, AttributeError):  # memory cached by the C library would hide the growth
-        ctypes.CDLL(None).malloc_trim(0)
-    try:
-        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
-        before = memory_mib("status", "VmRSS")
-        run()
-        return memory_mib("status", "VmHWM") - before
-    except OSError:
-        run()
-        return None
-
-
-def memory_mib(file: str, fields: str, pid: int | str = "self") -> float:
-    """Sum the fields (a pattern) of a process's memory file below /proc; OSError except on Linux."""
-    sizes = re.findall(rf"^{fields}:\s+(\d+) kB", Path(f"/proc/{pid}/{file}").read_text(), re.MULTILINE)
-    if not sizes:
-        raise OSError(f"no {fields}")
-    return sum(map(int, sizes)) / 1024
-
-
 def benchmark(measure: Callable[P, dict[str, Any]]) -> Callable[P, dict[str, Any]]:
     """Run a benchmark on one thread, without warnings, and add the machine and the versions to its figures."""
 
@@ -140,18 +113,3 @@ def show(table: str, report: Mapping[str, Any], path: Path) -> None:
     except OSError as error:
         raise DataError(f"--output {path}: expected a file that can be written to, got {error.strerror}") from None
     print(f"report: {path}")
-
-
-def remap_floor(images: Iterable[torch.Tensor], size: tuple[int, int]) -> Callable[[], None]:
-    """Bare remaps to views of ``size`` (h, w), one for each of the images (N, 3, >=h, >=w) uint8."""
-    h, w = size
-    sources = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()[:h, :w]) for image in images]
-    y, x = np.indices((h, w), dtype=np.float32)
-    map_x, map_y = 0.97 * x + 0.02 * y + 3, 0.95 * y + 0.01 * x + 5
-    outputs = np.empty((len(sources), h, w, 3), np.uint8)
-
-    def run() -> None:
-        for source, output in zip(sources, outputs, strict=True):
-            cv2.remap(source, map_x, map_y, cv2.INTER_LINEAR, dst=output)
-
-    return run

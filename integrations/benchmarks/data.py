@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +22,7 @@ from arbiview_aug.datasets.depth_folder import FOLDERS, DepthFolder
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.frames import LidarReference, ScoredFrame, make_frame
-from arbiview_aug.evaluate.targets import without_masks
+from arbiview_aug.evaluate.frames import without_masks
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.temporal.learned_depth import LEAST_POINTS, LearnedDepth, measured_pixels
@@ -44,32 +41,12 @@ class Recorded:
         """Read a frame with images at 1 / ``reduce``."""
         return open_data(self.root, reduce=reduce)[index]
 
-    def reader(self, reduce: Reduce) -> Callable[[], Any]:
-        """Function that reads the first frame from disk, without its points."""
-        return partial(open_data(self.root, reduce=reduce, load_points=False).__getitem__, 0)
-
     def target(self, name: str | None, size: tuple[int, int]) -> Rig:
         """Rig to render, stretched to (h, w), by default the one that other commands take; without scanners, which
         ``bench speed`` times."""
         if name is None and self.truth is not None:
             return replace(demo_target_rig(size), lidars=())
         return replace(without_masks(load_rig(name or REAL_TARGET)).resized(size, "stretch"), lidars=())
-
-    def frame(self, index: int, reduce: Reduce, reference: Reduce) -> ScoredFrame:
-        """Frame with images at 1 / ``reduce``, scored by the colours of images at 1 / ``reference``.
-
-        On real frames methods get the points of every other degree; the others score, and DataError if there are none.
-        """
-        sample = self.sample(index, reduce)
-        if self.truth is not None:
-            return make_frame(sample, truth=partial(self.truth, index), exposures=(), hand_over_points=True)
-        if "points" not in sample:
-            raise DataError(f"data {self.root}: expected LiDAR points to score by, got none")
-        frame = make_frame(sample, exposures=("even",), hand_over_points=True)
-        if reduce == reference:
-            return frame
-        points = make_frame(self.sample(index, reference), exposures=("even",), hand_over_points=True)
-        return replace(frame, lidar={"even": LidarReference(frame.lidar["even"].sample, points.lidar["even"].points)})
 
 
 @contextmanager

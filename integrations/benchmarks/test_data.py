@@ -8,10 +8,10 @@ import torch
 
 from arbiview_aug import RigRetarget
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.bench.data import lidar_maps, recorded
 from arbiview_aug.datasets import WithDepth, open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.scene.depth_map import motion_camera
+from integrations.benchmarks.data import lidar_maps, recorded
 
 
 @pytest.mark.parametrize("surface", ["boxes", "lidar", "motion", "learned", "fused", "auto"])

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from arbiview_aug.cli.bench.timing import peak_mib, quartiles, show, timed_rounds
 from arbiview_aug.errors import DataError
+from integrations.benchmarks.timing import quartiles, show, timed_rounds
 
 
 def test_quartiles() -> None:
@@ -41,18 +41,6 @@ def test_what_takes_long_runs_less_often() -> None:
     times = timed_rounds(work, 8, "test", enough_ms=45, clock=clock)
     assert len(times["long"]) == 5 and len(times["short"]) == 8
     assert len(timed_rounds(work, 8, "test", enough_ms=5, clock=clock)["long"]) == 3
-
-
-def test_peak_memory_is_seen_although_it_is_given_back() -> None:
-    def large() -> None:
-        np.ones(64 * 2**20, np.uint8)
-
-    found = peak_mib(large)
-    if found is None:
-        pytest.skip("this system does not tell the peak of a process")
-    assert 60 < found < 100
-    small = peak_mib(lambda: None)
-    assert small is not None and small < 32  # the kernel counts in batches, for each core
 
 
 def test_report_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
