@@ -38,7 +38,7 @@ def rendered(targets: Rig = TARGETS, sources: Rig = SOURCES) -> tuple[RenderedFr
     for seen in coverage:
         seen[:, -seen.shape[1] // 5 :] = False
     views = [smooth(c) * seen for c, seen in zip(targets, coverage, strict=True)]
-    source = Frame(tuple(smooth(c) for c in sources), sources, sample={"token": "a"})
+    source = Frame(tuple(smooth(c) for c in sources), sources, further={"token": "a"})
     return RenderedFrame(views, targets, coverage), source
 
 
@@ -96,7 +96,7 @@ def test_the_result_depends_on_seed_frame_and_camera_alone(generator: Generator)
     assert all(map(torch.equal, completed(generator).images, base.images))  # not on torch's RNG
     assert not torch.equal(completed(generator, seed=1).images[0], base.images[0])
     frame, source = rendered()
-    other = filled(generator, frame, replace(source, sample={"token": "b"}))
+    other = filled(generator, frame, replace(source, further={"token": "b"}))
     assert not torch.equal(other.images[0], base.images[0])
     order = [3, 1, 0, 2]
     moved = replace(
