@@ -33,7 +33,6 @@ LEAST_POINTS = 20
 AIR_M = 0.2
 """Distance outside an object within which points count as its own, m."""
 
-
 SIDE_CELLS = 8, 16
 """Rows and columns of displacements on each side of an object: 0.2 by 0.3 m on a car, a few scan lines at 10 m."""
 
@@ -65,14 +64,11 @@ class Piece(NamedTuple):
     side_lean: float = 0.0
 
 
-def _car(waist: float, rear: float, rear_lean: float) -> tuple[Piece, Piece]:
-    """A car with a body up to its waist, and a cabin from ``rear`` on."""
-    body = Piece(-0.5, waist, rear_lean=min(0.5 + rear, 0.03), front_lean=0.02, side_lean=0.03)
-    return body, Piece(waist, 0.5, rear, 0.25, 0.47, rear_lean, 0.18, 0.09)
-
-
-def _upright_car(waist: float, rear: float, rear_lean: float) -> tuple[Piece, Piece]:
-    """A car whose cabin hardly leans."""
+def _car(waist: float, rear: float, rear_lean: float, *, leans: bool = True) -> tuple[Piece, Piece]:
+    """A car with a body up to its waist, and a cabin from ``rear`` on, which leans or hardly does."""
+    if leans:
+        body = Piece(-0.5, waist, rear_lean=min(0.5 + rear, 0.03), front_lean=0.02, side_lean=0.03)
+        return body, Piece(waist, 0.5, rear, 0.25, 0.47, rear_lean, 0.18, 0.09)
     body = Piece(-0.5, waist, rear_lean=0.01, front_lean=0.01, side_lean=0.01)
     return body, Piece(waist, 0.5, rear, 0.2, 0.48, rear_lean, 0.04, 0.03)
 
@@ -85,7 +81,7 @@ _LEANING = tuple(
     for rear in ((-0.47, 0.12), (-0.38, 0.18), (-0.49, 0.05))  # hatchback, saloon, estate
 )
 _UPRIGHT = tuple(
-    _upright_car(waist, *rear)
+    _car(waist, *rear, leans=False)
     for waist in _WAISTS
     for rear in ((-0.49, 0.02), (-0.33, 0.04), (-0.15, 0.02))  # off-roader, old saloon, pick-up
 )
@@ -149,9 +145,9 @@ def solids_among(
     """Shapes in boxes (B, 7), as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs; how
     far their sides (B, 5, rows, columns) lie off the shapes, metres.
 
-    Of the profiles that fit a box it is the one whose faces lie nearest to its points; then these faces move to their
-    points. Points within ``AIR_M`` of it are its own: mirrors, and the noise of points and labels. This far over the
-    box's floor they may be the road's.
+    Of the profiles that fit a box it is the one whose faces lie nearest to its points; then cabin and faces fit these.
+    Points within ``AIR_M`` of it are its own: mirrors, and the noise of points and labels. This far over the box's
+    floor they may be the road's.
     """
     from arbiview_aug.scene.shape_kernels import fit_profiles
 
@@ -191,7 +187,6 @@ UNLABELLED = 0.45
 
 BOX_ERROR = 0.08
 """Mean relative error of a box face's inverse distance. Fitted on synthetic streets, seeds 100 to 105."""
-
 
 TOP = 0.9
 """Upward part of a face's normal, above which it is a top: windscreens have up to 0.87."""
@@ -421,7 +416,6 @@ def moved_by(boxes: Any, pose: FloatArray) -> Any:
 
 STAYED_M = 0.4
 """Largest label motion of a parked vehicle: labels jitter by decimetres."""
-
 
 SAME_SIZE_M = 0.2
 """Largest difference of one object's labelled sizes from frame to frame."""

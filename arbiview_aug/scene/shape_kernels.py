@@ -11,8 +11,9 @@ from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE
 from arbiview_aug.environment import called, compiled, inlined
 from arbiview_aug.scene.panorama_kernels import between_nodes
 
-MOST_OFF_M, LEAST_OF_FACE = 0.6, 8
-"""Farthest from a face that a point tells its place, as glass may lie within a label; fewest points that move it."""
+MOST_OFF_M, LEAST_OF_FACE, OUTLIERS = 0.6, 8, 16
+"""Farthest from a face that a point tells its place, as glass may lie within a label; fewest points that move it; one
+of this many may stick out of a flank, as mirrors do."""
 
 ROUNDS, NEIGHBOUR, SHAPE = 4, 0.5, 0.1
 """Rounds in which displacements spread, and weights of a neighbouring cell and of the shape, in points: they fade over
@@ -73,7 +74,8 @@ def fit_profiles(
 ) -> None:  # fmt: skip
     """Give boxes (B, 7) the profile that their points lie nearest to, by the least mean distance up to ``1.5 air``.
 
-    Its faces move to the median of their points; how far these then lie off are the displacements.
+    Its cabin becomes as narrow and low as its points, and its faces move to the median of theirs; how far these then
+    lie off are the displacements.
 
     Args:
         boxes: (B, 7).
@@ -101,15 +103,45 @@ def fit_profiles(
                     total += min(abs(beside(some, points[i])), 1.5 * air)
                 if total < best - 1e-9:
                     best, chosen = total, number
-        planes_of(boxes[k], profiles[chosen], planes[k])
-        floor, n = boxes[k, 2] - boxes[k, 5] / 2 + air, 0
+        floor, n, profile = boxes[k, 2] - boxes[k, 5] / 2 + air, 0, profiles[chosen].copy()
         for i in own:
             own[n] = i
             n += points[i, 2] > floor
         if is_measured:
+            _fit_cabin(boxes[k], profile, points, own[:n], scanner)
+        planes_of(boxes[k], profile, planes[k])
+        if is_measured:
             _fit_faces(boxes[k], planes[k], points, own[:n], air, scanner, displaced[k])
         for i in own[:n]:
             is_own[i] |= beside(planes[k], points[i]) < air
+
+
+@called
+def _fit_cabin(box: Any, profile: Any, points: Any, own: Any, scanner: Any) -> None:
+    """Lean the flanks of a profile (pieces, 8) and lower its top, both as the points of its highest piece bound them.
+
+    Flanks lean as the points on the scanner's side do from the lower half to the upper, and the far one mirrors that.
+    The top lies a beam's spacing, the largest gap between heights, over the highest points within this width: glass
+    without returns widens the gap, and without points above the waist nothing changes.
+    """
+    c, s, cabin = np.cos(box[6]), np.sin(box[6]), profile[-1 if profile[-1, 1] > profile[-1, 0] else 0]
+    toward = 1 if (scanner[1] - box[1]) * c > (scanner[0] - box[0]) * s else -1
+    low, high, n = cabin[0] * box[5], cabin[1] * box[5], 0
+    across, z = np.empty(own.shape[0]), np.empty(own.shape[0])
+    for i in own:
+        across[n] = ((points[i, 1] - box[1]) * c - (points[i, 0] - box[0]) * s) * toward
+        z[n] = points[i, 2] - box[2]
+        n += low < z[n] < box[5] / 2
+    across, z, is_upper = across[:n], z[:n], z[:n] > (low + high) / 2
+    lower, upper = np.sort(across[~is_upper]), np.sort(across[is_upper])
+    if min(lower.shape[0], upper.shape[0]) < LEAST_OF_FACE:
+        return
+    width = upper[-1 - upper.shape[0] // OUTLIERS]
+    slope = (lower[-1 - lower.shape[0] // OUTLIERS] - width) / (np.median(z[is_upper]) - np.median(z[~is_upper]))
+    cabin[7] = min(max(slope * (high - low) / box[4], 0), cabin[4] / 2)
+    heights = np.sort(z[np.abs(across) <= width])
+    if heights.shape[0] >= LEAST_OF_FACE:
+        cabin[1] = min(high, heights[-LEAST_OF_FACE] + np.diff(heights).max()) / box[5]
 
 
 @called
@@ -121,9 +153,7 @@ def _fit_faces(box: Any, planes: Any, points: Any, own: Any, air: float, scanner
     nearest, off, before = np.full(own.shape[0], -1), np.empty(own.shape[0]), np.empty(planes.shape[:2])
     for number in range(before.size):
         before[number // 6, number % 6] = _off(planes[number // 6, number % 6], scanner)
-    is_seen = np.ones(
-        own.shape[0], np.bool_
-    )  # else it was measured from elsewhere, on a side that the scanner sees not
+    is_seen = nearest < 0  # else it was measured from elsewhere, on a side that the scanner sees not
     for k in range(own.shape[0]):
         off[k] = MOST_OFF_M
         for piece in range(planes.shape[0]):
@@ -137,12 +167,16 @@ def _fit_faces(box: Any, planes: Any, points: Any, own: Any, air: float, scanner
             if -MOST_OFF_M < farthest < off[k]:
                 off[k], nearest[k] = farthest, by
             is_seen[k] &= not is_unseen or abs(most) > air / 2
+    roof = 6 * np.argmax(planes[:, 5, 3]) + 5  # lies by its points already, but is rounded
     for number in range(before.size):
-        some = np.sort(off[is_seen & (nearest == number)])
+        some = np.sort(off[is_seen & (nearest == number) & ((number != roof) | (np.abs(off) < air / 2))])
         if some.shape[0] >= LEAST_OF_FACE:
             move = some[(some.shape[0] - 1) // 2]
             planes[number // 6, number % 6, 3] += move
             before[number // 6, number % 6] -= move
+    if roof > 5:  # no slit between body and cabin
+        planes[1, 4, 3] = max(planes[1, 4, 3], -planes[0, 5, 3])
+        before[1, 4] = _off(planes[1, 4], scanner)
     shape, axes = displaced.shape[1:], np.empty((5, 2, 4))
     total, weight = np.zeros(displaced.shape), np.zeros(displaced.shape)
     for side in range(5):

@@ -130,12 +130,15 @@ def test_points_choose_among_profiles() -> None:
     for box in (CAR, pick_up):
         for number in OF_KIND[kinds(box)[0]]:
             planes = profile_planes(box[0], number)
-            chosen, is_own, displaced = solids_among(box, surface_points(planes, box[0]))
-            assert np.allclose(chosen[0], planes) and is_own.mean() > 0.9 and np.abs(displaced).max() < 0.05
+            points = surface_points(planes, box[0])
+            chosen, is_own, displaced = solids_among(box, points)
+            apart = [np.abs(profile_planes(box[0], k) - chosen[0]).max() for k in OF_KIND[kinds(box)[0]]]
+            assert OF_KIND[kinds(box)[0]][np.argmin(apart)] == number and np.abs(beside(chosen[0], points)).max() < 0.06
+            assert min(apart) < 0.15 and is_own.mean() > 0.9 and np.abs(displaced).max() < 0.05
     one, two = (surface_points(profile_planes(CAR[0], number), CAR[0]) for number in OF_KIND[kinds(CAR)[0]][:2])
     count = min(len(one), len(two) // 2, 300)
     mixed = np.concatenate([one[:count, None], two[: 2 * count].reshape(count, 2, 3)], 1).reshape(-1, 3)
-    orders = mixed, mixed[1:], mixed[2:], np.random.default_rng(0).permutation(mixed)
+    orders = mixed, mixed[::-1], np.random.default_rng(0).permutation(mixed)
     assert len(mixed) > 512 and len({solids_among(CAR, points)[0].tobytes() for points in orders}) == 1
     assert len(PROFILES) > len(OF_KIND[0])
 
@@ -165,6 +168,39 @@ def test_what_was_measured_stays_and_the_shape_closes(wider_m: tuple[float, ...]
     off_m = np.abs(1 / drawn - 1 / np.maximum(q, 1e-9))[inner & (faces >= 0)]
     assert np.median(off_m) < 0.03 and np.quantile(off_m, 0.8) < 0.08
     assert (faces >= 0)[inner].mean() > 0.99 and (faces >= 0)[face >= 0].mean() > 0.95
+
+
+@pytest.mark.parametrize("up_m", [0.0, 0.8])
+@pytest.mark.parametrize(
+    ("what", "lost", "above_m"),
+    [
+        ("everything", (2.0, 2.0), (-0.06, 0.06)),
+        ("no windows", (0.15, 0.9), (-0.06, 0.21)),
+        ("no cabin", (0.0, 1.0), (0.19, 0.21)),
+    ],
+)
+def test_highest_points_and_the_width_there_bound_a_roof(
+    what: str, lost: tuple[float, float], above_m: tuple[float, float], up_m: float
+) -> None:
+    """A label 0.2 m higher than its car, whose cabin leans in more than usual; a scanner above the roof and below it.
+
+    Glass that returns nothing, by the share of the cabin's height, must not lower the roof below the true one.
+    """
+    body = CAR[0] + [0, 0.4, up_m / 2, 0, 0, up_m, 0]
+    label = body[None] + np.array([0, 0, 0.1, 0, 0, 0.2, 0])
+    profile, planes = PROFILES[OF_KIND[0, 0]].copy(), np.empty((2, 6, 4))
+    profile[1, 7] = 0.17
+    planes_of(body, profile, planes)
+    rays, _ = SCANNER.unproject(SCANNER.pixel_grid()[::3, ::2])
+    q, _ = solids_ahead(body[None], planes[None], SCANNER.center_m, rays)
+    points = (SCANNER.center_m + rays / np.maximum(q, 1e-9)[..., None])[q > 0]
+    waist, top = body[2] + profile[0, 1] * body[5], body[2] + body[5] / 2
+    share = (points[:, 2] - waist) / (top - waist)
+    cabin = solids_among(label, points[(share < lost[0]) | (share > lost[1])])[0][0, 1]
+    assert above_m[0] < cabin[5, 3] - top < above_m[1]
+    if what == "everything":
+        right, left = ((d - x * body[0] - z * cabin[5, 3]) / y for x, y, z, d in cabin[2:4])
+        assert abs(abs(left - right) / body[4] - 2 * (0.47 - 0.17)) < 0.06
 
 
 def test_points_beside_an_object_are_the_background_s() -> None:
