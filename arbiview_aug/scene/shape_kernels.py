@@ -108,7 +108,7 @@ def fit_profiles(
             own[n] = i
             n += points[i, 2] > floor
         if is_measured:
-            _fit_cabin(boxes[k], profile, points, own[:n], scanner)
+            _fit_cabin(boxes[k], profile, points, own[:n], air, scanner)
         planes_of(boxes[k], profile, planes[k])
         if is_measured:
             _fit_faces(boxes[k], planes[k], points, own[:n], air, scanner, displaced[k])
@@ -117,7 +117,7 @@ def fit_profiles(
 
 
 @called
-def _fit_cabin(box: Any, profile: Any, points: Any, own: Any, scanner: Any) -> None:
+def _fit_cabin(box: Any, profile: Any, points: Any, own: Any, air: float, scanner: Any) -> None:
     """Lean the flanks of a profile (pieces, 8) and lower its top, both as the points of its highest piece bound them.
 
     Flanks lean as the points on the scanner's side do from the lower half to the upper, and the far one mirrors that.
@@ -134,14 +134,15 @@ def _fit_cabin(box: Any, profile: Any, points: Any, own: Any, scanner: Any) -> N
         n += low < z[n] < box[5] / 2
     across, z, is_upper = across[:n], z[:n], z[:n] > (low + high) / 2
     lower, upper = np.sort(across[~is_upper]), np.sort(across[is_upper])
-    if min(lower.shape[0], upper.shape[0]) < LEAST_OF_FACE:
+    if min(lower.shape[0], upper.shape[0]) < LEAST_OF_FACE or n * air**2 < box[4] * (high - low):  # too sparse
         return
     width = upper[-1 - upper.shape[0] // OUTLIERS]
     slope = (lower[-1 - lower.shape[0] // OUTLIERS] - width) / (np.median(z[is_upper]) - np.median(z[~is_upper]))
     cabin[7] = min(max(slope * (high - low) / box[4], 0), cabin[4] / 2)
     heights = np.sort(z[np.abs(across) <= width])
     if heights.shape[0] >= LEAST_OF_FACE:
-        cabin[1] = min(high, heights[-LEAST_OF_FACE] + np.diff(heights).max()) / box[5]
+        above = min(heights.shape[0] // OUTLIERS, LEAST_OF_FACE)
+        cabin[1] = min(high, heights[-1 - above] + np.diff(heights).max()) / box[5]
 
 
 @called
