@@ -76,7 +76,7 @@ def changes(draw: st.DrawFn, part: Any) -> Any:
         return draw(fresh(JUNK))
     if "float8" in str(part.dtype) or not part.numel() or draw(st.integers(0, 2)):
         return draw(st.sampled_from(TENSOR_CHANGES))(part)
-    changed = part.clone().double()
+    changed = part.clone(memory_format=torch.contiguous_format).double()
     changed.view(-1)[draw(st.integers(0, part.numel() - 1))] = draw(st.sampled_from(NUMBERS))
     return changed if draw(st.booleans()) else changed.to(part.dtype)
 

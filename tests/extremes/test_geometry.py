@@ -94,7 +94,7 @@ def check(plan: RenderPlan, surface: str, scene: Scene, worst: Worst) -> None:
             won = view.source_camera == index
             assert ray_valid[won].all()
             over = scene.surface(name, plan.source.ground_z_m)
-            q = inverse_distance(over, target.center_m, directions[won], float(1 / target.K[0, 0]))
+            q = inverse_distance(over, target.center_m, directions[won], float(1 / target.K[0, 0]), target)
             uv, valid = project_rays(source, directions[won], q, target.center_m - source.center_m)
             ahead = (directions[won] + q[:, None] * (target.center_m - source.center_m)) @ source.cam2ego[:3, 2] > 0
             assert source.lens in reference.WIDE or ahead.all(), f"{source.name} over {name}: read behind it"

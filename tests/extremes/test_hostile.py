@@ -123,7 +123,6 @@ class Boundaries:
             "sequence": ([self.drive / "sequence.json"], self._read_drive),
             "depth": ([self.depths.path("0000")], lambda _: self.depths.read("0000", FRAMES)),
             "record": (records, lambda _: self._go_on()),
-            "verified record": (records, lambda _: self._go_on("--verify")),
             "config": ([self.generator / "config.json"], self._read_generator),
             "weights": ([*self.generator.glob("*.safetensors")], self._read_generator),
         }
@@ -164,11 +163,11 @@ class Boundaries:
             load_state(self.generator, asdict(self.training), {}, {}, mock.Mock(shadow_params=[]), self.optimiser)
         Generator.from_pretrained(self.generator)
 
-    def _go_on(self, *more: str) -> None:
-        """Go on with the conversion, or verify it; nothing changes outside its own folder."""
+    def _go_on(self) -> None:
+        """Go on with the conversion; nothing changes outside its own folder."""
         said, before = io.StringIO(), self._outside()
         with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said), mock.patch.object(os, "fsync"):
-            status = main([*self.asked, *more])
+            status = main(self.asked)
         assert status in (0, 1, 2) and not FOREIGN.search(said.getvalue()), said.getvalue()
         assert self._outside() == before
         if status:
