@@ -101,7 +101,7 @@ class ViewPlanner:
     def __init__(self, pair: _Pair, index: int, wanted: BoolArray | None = None) -> None:
         from arbiview_aug.render.kernels import View
 
-        self.pair, self.index, self.camera = pair, index, pair.target[index]
+        self.pair, self.index, self.camera = pair, index, pair.target.cameras[index]
         self.config, self.scene, self.maps = pair.config, pair.scene, pair.maps
         self.name = pair.scene.best if pair.geometry == "auto" else pair.geometry
         # From outside, the far wall is a narrow strip with edges, which cells could step over.
@@ -159,7 +159,7 @@ class ViewPlanner:
         surface: Any = self.scene.surface(self.seen_name, self.pair.source.ground_z_m)
         found, scales = [], []
         for k, level in self.used:
-            hiding, coarser, source = OcclusionMap(_NO_IMAGE, _NO_FACES), level, self.pair.source[k]
+            hiding, coarser, source = OcclusionMap(_NO_IMAGE, _NO_FACES), level, self.pair.source.cameras[k]
             if (surface.is_layered or surface.is_dense) and not self.is_far[k]:
                 # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
                 coarser = level if surface.is_layered else max(level, occlusion_level(source))
@@ -195,7 +195,7 @@ class ViewPlanner:
         parallax_px = worst_parallax_px(baselines_m, float(self.camera.K[0, 0]))
         self.is_far = is_exact | (pair.geometry == "auto") & (parallax_px < FAR_PARALLAX_PX)
         exact = np.flatnonzero(is_exact).tolist()
-        is_served = any(covers_target_exactly(pair.source[k], self.camera, self.config) for k in exact)
+        is_served = any(covers_target_exactly(pair.source.cameras[k], self.camera, self.config) for k in exact)
         asked = is_exact if is_served else np.ones(len(is_exact), bool)
         self.seen_name = "infinity" if self.is_far[asked].all() else self.name
         self.is_far |= self.seen_name == "infinity"
@@ -208,7 +208,7 @@ class ViewPlanner:
         uv = np.empty((len(sources), 2, *surfaces.behind.shape), np.float32)
         for i in np.flatnonzero(read.kind < 0):
             behind = surfaces.behind * np.float32(not self.is_far[sources[i]])
-            uv[i] = source_pixels(self.camera, self.view.rays, behind, pair.source[sources[i]])
+            uv[i] = source_pixels(self.camera, self.view.rays, behind, pair.source.cameras[sources[i]])
         score, border, parallax, resolution = np.empty((4, *shape), np.float32)
         places = np.empty(shape, bool), uv, np.empty(len(sources), np.int64)
         nodes = Nodes(score, border, parallax, resolution, *places)
@@ -235,7 +235,7 @@ class ViewPlanner:
         clean: list[npt.NDArray[Any]] = [_NO_IMAGE] * len(k)
         for i, level in enumerate(self.levels if layout else []):
             assert layout is not None
-            camera, slot = pair.source[sources[i]], layout.slot(sources[i], level)
+            camera, slot = pair.source.cameras[sources[i]], layout.slot(sources[i], level)
             slots[i], clean[i] = (slot.source, slot.x, slot.y), self.maps.clean_pixels(camera, level)
             if level:
                 parameters[i], bounds[i] = camera.parameters_at(0.5**level), source_bounds(camera.size, level)
@@ -243,7 +243,7 @@ class ViewPlanner:
                 q = self._seen("infinity" if self.is_far[sources[i]] else self.seen_name).q
                 uv = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), q, camera)
                 positions[i] = at_level(np.concatenate(uv), level).astype(np.float32)
-        to_mask = [self.maps.to_mask(pair.source[i]) for i in sources]
+        to_mask = [self.maps.to_mask(pair.source.cameras[i]) for i in sources]
         images = (self._images(arrays) for arrays in (positions, to_mask, clean))
         return Sources(A, o, kind, parameters, size, bounds, offset_m, bonus, slots, *images)
 
@@ -365,7 +365,7 @@ class ViewPlanner:
             own_pixels: Any = cv2.inRange(winner, k, k)  # type: ignore[call-overload]
             low, high = (slot.x + 1, slot.y + 1), (slot.x + w - 3, slot.y + h - 3)
             inside: Any = cv2.inRange(fixed.xy, low, high)  # type: ignore[call-overload]
-            clean = self.maps.clean_pixels(self.pair.source[k], level)
+            clean = self.maps.clean_pixels(self.pair.source.cameras[k], level)
             if clean.size:
                 clean = np.asarray(cv2.erode(clean, np.ones((4, 4), np.uint8), anchor=(1, 1)), np.uint8)
                 at = fixed.xy - np.array([slot.x, slot.y], np.int16)
