@@ -176,8 +176,7 @@ def plan_fills(
     the area that may be filled.
     """
     full = scene.surface(surface, plan.source.ground_z_m)
-    shown_q = [scene.images.get((surface, camera.content_key)) for camera in plan.target]
-    holes = [hole for k, q in enumerate(shown_q) if (hole := _hole(plan, k, full, q, reach, maps)) is not None]
+    holes = [hole for k in range(len(plan.target)) if (hole := _hole(plan, k, full, reach, maps)) is not None]
     if not holes:
         return None
     # A neighbour's cameras are not blended: one of them may see a moved object.
@@ -200,8 +199,8 @@ def plan_fills(
     return Fills(holes, fills) if fills else None
 
 
-def _hole(plan: RenderPlan, index: int, surface: Surface, q: Any, reach: Reach, maps: RayCache) -> Hole | None:
-    camera, covered = plan.target[index], plan.targets[index].coverage
+def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: RayCache) -> Hole | None:
+    camera, covered, q = plan.target[index], plan.targets[index].coverage, plan.targets[index].measured
     empty = ~covered if camera.mask is None else ~covered & camera.mask
     height_m = camera.center_m[2] - plan.source.ground_z_m
     if not empty.any() or (reach == "road" and height_m <= 0):

@@ -255,6 +255,8 @@ class ViewPlan:
     # (ny + 1, nx + 1) whether the background is road, up to ``ROAD_M`` high, on the planner's nodes: one a pixel in
     # small views; None without holes, or where all is infinitely far away
     road: BoolArray | None = None
+    # (h, w) float32 inverse distances along the view's rays over measured or labelled geometry; None over others
+    measured: npt.NDArray[np.float32] | None = None
 
     @property
     def coverage(self) -> BoolArray:
@@ -293,7 +295,7 @@ class ViewPlan:
     def nbytes(self) -> int:
         """Memory in bytes."""
         bands = sum(b.at.nbytes + b.weight.nbytes for b in self.bands)
-        parts = self.certainty, self.edge, self.layers, self.paint, self.road
+        parts = self.certainty, self.edge, self.layers, self.paint, self.road, self.measured
         further = sum(part.nbytes for part in parts if part is not None)
         return self.at.nbytes + self.source_camera.nbytes + bands + further
 

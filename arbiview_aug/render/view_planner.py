@@ -147,8 +147,6 @@ class ViewPlanner:
         uncertainty = surface.uncertainty(camera.center_m, self._directions, on_nodes)
         if face.size:
             uncertainty = np.where(face[self.view.y][:, self.view.x] >= 0, BOX_ERROR * on_nodes, uncertainty)
-        if surface.is_layered or surface.is_dense:
-            self.scene.images[name, camera.content_key] = q
         self._surfaces[name] = Surfaces(q, face, behind, uncertainty.astype(np.float32))
         return self._surfaces[name]
 
@@ -276,7 +274,12 @@ class ViewPlanner:
         if interpolation == "nearest":
             at, bands = at.rounded(), tuple(replace(band, at=band.at.rounded()) for band in bands)
         edge = self._edge(at, winner, layout) if interpolation == "cubic" else None
-        plan = ViewPlan(at, winner, bands, tuple(self._reports(winner, won_px)), interpolation, certain, edge)
+        measured = None
+        if self.name in self._surfaces:
+            asked: Any = self.scene.surface(self.name, self.pair.source.ground_z_m)
+            measured = self._seen(self.name).q if asked.is_layered or asked.is_dense else None
+        reports = tuple(self._reports(winner, won_px))
+        plan = ViewPlan(at, winner, bands, reports, interpolation, certain, edge, measured=measured)
         if not self.config.layers or won_px.sum() == winner.size:
             return plan
         layers = ((winner < 0) & (in_image > 0)).view(np.uint8) if hides else np.zeros(size, np.uint8)

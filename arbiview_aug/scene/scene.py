@@ -8,7 +8,6 @@ from functools import cached_property
 from itertools import chain
 
 import numpy as np
-import numpy.typing as npt
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.choices import GeometryName
@@ -32,8 +31,6 @@ class Scene:
         further: Depth maps and arrays of other sample keys that a row of ``GEOMETRIES`` reads.
         corrections: Corrections of the street's distances by depth from overlap.
         known: Surface whose distances are known, in place of all others but ``far``.
-        images: Inverse distances (h, w) of measured geometry along a camera's pixel rays, as far as they were planned
-            with, by the geometry's name and the camera's content key.
     """
 
     boxes: FloatArray | None = None
@@ -43,7 +40,6 @@ class Scene:
     further: Mapping[str, Geometry] = field(default_factory=dict)
     corrections: tuple[Correction, ...] = ()
     known: Surface | None = None
-    images: dict[tuple[str, bytes], npt.NDArray[np.float32]] = field(default_factory=dict, init=False, repr=False)
     _surfaces: dict[tuple[str, float], Surface] = field(default_factory=dict, init=False, repr=False)
 
     def geometry(self, name: str) -> Geometry | None:
