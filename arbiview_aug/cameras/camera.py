@@ -238,11 +238,6 @@ class Camera:
         """Largest angle between the optical axis and a ray of the image; π if the lens cannot be inverted there."""
         return _half_angle_rad(self.size, self.lens, self.distortion, self.K.tobytes())
 
-    @cached_property
-    def cone_rad(self) -> float:
-        """Largest angle off the optical axis at which a point can fall into the image."""
-        return min(self.half_angle_rad, self.lens_model.fold_rad)
-
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Camera):
             return NotImplemented
