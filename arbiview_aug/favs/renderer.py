@@ -28,7 +28,7 @@ from arbiview_aug.favs.stage2_features import NO_MATCHES, FeatureReport, Region,
 from arbiview_aug.favs.stage3_objects import AlignmentReport, align_objects, declined, find_objects
 from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion, source_pixels, warp_perspective
 from arbiview_aug.render.harmonise import Harmoniser
-from arbiview_aug.render.rendered import RenderedFrame, from_winners
+from arbiview_aug.render.rendered import Views, from_winners
 from arbiview_aug.render.requirements import SAME_CENTER_M
 from arbiview_aug.sample.detections import Detection, read_detections
 from arbiview_aug.sample.frame import Frame
@@ -248,7 +248,7 @@ def _as_tensor(image: FloatArray, dtype: torch.dtype) -> torch.Tensor:
     return planes.round().clamp(0, 255).to(dtype) if dtype == torch.uint8 else (planes / 255).clamp(0, 1).to(dtype)
 
 
-def as_rendered(rendering: PaperRendering, outputs: Collection[str] = ()) -> RenderedFrame:
+def as_rendered(rendering: PaperRendering, outputs: Collection[str] = ()) -> Views:
     """Convert a rendering; ``outputs`` as in ``Renderer.render``."""
     views = rendering.targets
     winners, labels = [torch.from_numpy(view.source_camera) for view in views], partial(paper_labels, rendering)

@@ -10,7 +10,7 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator.conditioning import FrameGeometry, Views
+from arbiview_aug.generator.conditioning import FrameGeometry, ViewInputs
 from arbiview_aug.generator.config import GeneratorConfig
 from arbiview_aug.generator.correspondence import TokenWindow
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder
@@ -29,7 +29,7 @@ class Conditions(NamedTuple):
 
     def encoded(
         self, config: GeneratorConfig, autoencoder: Autoencoder, geometry: FrameGeometry
-    ) -> tuple[Views, Views]:
+    ) -> tuple[ViewInputs, ViewInputs]:
         """The denoiser's conditions of the targets and of the sources."""
         latent = autoencoder.encode(shown_condition(config, self.prefilled, self.known)).float()
         sources = autoencoder.encode(self.sources * self.seen[:, :, None]).float()
@@ -70,7 +70,7 @@ def denoised(
     unconditional = (views.dropped(all_frames), geometry.target_windows(all_frames)) if is_guided else None
 
     def predict(x: torch.Tensor, t: int) -> torch.Tensor:
-        def run(views: Views, windows: Sequence[TokenWindow]) -> torch.Tensor:
+        def run(views: ViewInputs, windows: Sequence[TokenWindow]) -> torch.Tensor:
             generator.calls += 1
             return denoiser(x, torch.full((len(x),), t, device=x.device), views, windows, sources).float()
 

@@ -41,7 +41,7 @@ _KNOWN_SHARE = 0.99  # known share of a latent pixel from which it is no hole
 _OCTAVES = 4  # number of Fourier frequencies π, 2π, 4π, 8π
 
 
-class Views(NamedTuple):
+class ViewInputs(NamedTuple):
     """The conditions of the views of B frames, N views each, on the latent grid."""
 
     latent: torch.Tensor  # (B, N, C, h, w) FAVS at a target's pose, pre-filled; a source's image
@@ -50,9 +50,9 @@ class Views(NamedTuple):
     rays: torch.Tensor  # (B, N, 6, h, w) Plücker rays, see ``plucker_rays``
     pose: torch.Tensor  # (B, N, 16) see ``pose_vector``
 
-    def dropped(self, drop: torch.Tensor) -> Views:
+    def dropped(self, drop: torch.Tensor) -> ViewInputs:
         """Zero the conditions of the frames ``drop`` (B,) bool, for classifier-free guidance."""
-        return Views(*(value * ~drop.view(-1, *(1,) * (value.dim() - 1)) for value in self))
+        return ViewInputs(*(value * ~drop.view(-1, *(1,) * (value.dim() - 1)) for value in self))
 
     def channels(self, noisy: torch.Tensor, inpainting: bool = False) -> torch.Tensor:
         """(B, N, 2 C + 8, h, w) the U-Net's input: noisy latent, condition latent, mask, confidence, rays.
@@ -66,7 +66,7 @@ class Views(NamedTuple):
 
 
 def input_channels(latent_channels: int) -> int:
-    """Number of channels of ``Views.channels``."""
+    """Number of channels of ``ViewInputs.channels``."""
     return 2 * latent_channels + 2 + RAY_CHANNELS
 
 
@@ -145,11 +145,11 @@ class FrameGeometry(NamedTuple):
         tensors = (value.to(device, non_blocking=True) for value in self[:4])
         return FrameGeometry._make([*tensors, *([grid.to(device) for grid in reads] for reads in self[4:])])
 
-    def target_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
+    def target_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> ViewInputs:
         """The targets' conditions: latents (B, N, C, h, w), coverage and confidence (B, N, H, W) at any resolution."""
         return _views(latent, mask, confidence, self.target_rays, self.target_pose)
 
-    def source_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> Views:
+    def source_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> ViewInputs:
         """The sources' conditions; the latents are those of their images."""
         return _views(latent, mask, confidence, self.source_rays, self.source_pose)
 
@@ -195,6 +195,6 @@ def batched(frames: Sequence[FrameGeometry]) -> FrameGeometry:
 
 def _views(
     latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor, rays: torch.Tensor, pose: torch.Tensor
-) -> Views:
+) -> ViewInputs:
     size = (latent.shape[-2], latent.shape[-1])
-    return Views(latent, pooled(mask, size)[:, :, None], pooled(confidence, size)[:, :, None], rays, pose)
+    return ViewInputs(latent, pooled(mask, size)[:, :, None], pooled(confidence, size)[:, :, None], rays, pose)

@@ -22,7 +22,7 @@ from torch.utils.checkpoint import checkpoint
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator.attention import CrossViewAttention
-from arbiview_aug.generator.conditioning import PoseContext, Views, input_channels
+from arbiview_aug.generator.conditioning import PoseContext, ViewInputs, input_channels
 from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
 from arbiview_aug.generator.correspondence import LEVELS, TokenWindow
 
@@ -84,7 +84,7 @@ class Denoiser(nn.Module):
         lora = [parameter for name, parameter in self.unet.named_parameters() if ".lora_" in name]
         return [parameter for part in parts for parameter in part.parameters()] + lora
 
-    def read_sources(self, sources: Views, windows: Sequence[TokenWindow]) -> Sources:
+    def read_sources(self, sources: ViewInputs, windows: Sequence[TokenWindow]) -> Sources:
         """Run the source branches, which read sources only; ``windows``: one for each token grid, the finest first."""
         t = torch.zeros(len(sources.latent), dtype=torch.long, device=sources.latent.device)
         outputs: Sources = []
@@ -96,7 +96,7 @@ class Denoiser(nn.Module):
         self,
         noisy: torch.Tensor,
         t: torch.Tensor,
-        targets: Views,
+        targets: ViewInputs,
         windows: Sequence[TokenWindow],
         sources: Sources,
         rows: list[Rows] | None = None,
@@ -131,7 +131,7 @@ class Denoiser(nn.Module):
             predicted = linear - deviation / root * predicted.float()
         return torch.where(is_regression, noisy.to(change.dtype) + change, predicted)
 
-    def output_scale(self, t: torch.Tensor, targets: Views) -> torch.Tensor:
+    def output_scale(self, t: torch.Tensor, targets: ViewInputs) -> torch.Tensor:
         """(B, N, 1, h, w) factor of the network's output in ``forward``'s at t (B,).
 
         Errors divided by it have one size at all t, in holes and outside. 1 without preconditioning.
@@ -141,7 +141,7 @@ class Denoiser(nn.Module):
         _, _, deviation, root = self._deviations(t, targets)
         return torch.where((t == REGRESSION).view(-1, 1, 1, 1, 1), deviation, deviation / root)
 
-    def _deviations(self, t: torch.Tensor, targets: Views) -> tuple[torch.Tensor, ...]:
+    def _deviations(self, t: torch.Tensor, targets: ViewInputs) -> tuple[torch.Tensor, ...]:
         """a, s, σ and √D for preconditioning around the condition c (Karras et al. 2022, there around 0).
 
         With x_t = a x0 + s ε and x0 = c + r, r of variance σ², z = (x_t − a c) / √D with D = a² σ² + s² has unit
@@ -159,7 +159,7 @@ class Denoiser(nn.Module):
         self,
         noisy: torch.Tensor,
         t: torch.Tensor,
-        views: Views,
+        views: ViewInputs,
         windows: Sequence[TokenWindow],
         sources: Sources | None,
         outputs: Sources | None,

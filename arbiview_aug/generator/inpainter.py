@@ -27,7 +27,7 @@ from arbiview_aug.inpaint.inpainter import (
 )
 from arbiview_aug.inpaint.networks import NetworkInpainter, PipelineInpainter, TorchScriptInpainter
 from arbiview_aug.inpaint.telea import telea
-from arbiview_aug.render.rendered import RenderedFrame
+from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.frame import Frame
 
 ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
@@ -91,7 +91,7 @@ class Diffusion(Inpainter, torch.nn.Module):
     def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         raise NotImplementedError("a generator needs whole frames: call fill")
 
-    def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
+    def fill(self, rendered: Sequence[Views], frames: Sequence[Frame]) -> list[Views]:
         """Fill rendered frames; ``frames`` hold their source images.
 
         Views that are almost complete are inpainted by Telea's method. A frame's others are denoised together, so that
@@ -103,7 +103,7 @@ class Diffusion(Inpainter, torch.nn.Module):
 
     @torch.no_grad()
     def _completed(
-        self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]
+        self, rendered: Sequence[Views], frames: Sequence[Frame]
     ) -> tuple[list[list[torch.Tensor]], list[list[torch.Tensor]]]:
         """Images of each frame that are right in the holes, and the holes."""
         check_device(self.generator)
@@ -133,7 +133,7 @@ class Diffusion(Inpainter, torch.nn.Module):
                         images[n][m] = _like(image, images[n][m])
         return images, holes
 
-    def _inputs(self, rendered: RenderedFrame, source: Frame, known: Tensors, left: list[int], name: str) -> _Inputs:
+    def _inputs(self, rendered: Views, source: Frame, known: Tensors, left: list[int], name: str) -> _Inputs:
         """Conditions, cameras and noise of a frame's views ``left``, on the CPU."""
         config = self.generator.config
         rig, size = rendered.rig.in_frame_of(source.rig), config.image_size

@@ -22,7 +22,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.inpaint.inpainter import Inpainter, Tensors
 from arbiview_aug.inpaint.telea import GREY
 from arbiview_aug.render.plan import OBJECT, Paint
-from arbiview_aug.render.rendered import RenderedFrame
+from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.scene.boxes import PARTS
 
@@ -61,7 +61,7 @@ class Continue(Inpainter):
     def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         return fill_holes([view.clone() for view in views], [~hole for hole in holes], only_mean=self.only_mean)
 
-    def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
+    def fill(self, rendered: Sequence[Views], frames: Sequence[Frame]) -> list[Views]:
         """Fill rendered frames, in place where possible; the own car too."""
         filled = []
         for frame in rendered:

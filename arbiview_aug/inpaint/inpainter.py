@@ -12,7 +12,7 @@ import torch
 
 from arbiview_aug.choices import is_number, is_whole
 from arbiview_aug.errors import GeneratorError, SampleError, shown
-from arbiview_aug.render.rendered import MAP_KEYS, LabelFill, RenderedFrame
+from arbiview_aug.render.rendered import MAP_KEYS, LabelFill, Views
 from arbiview_aug.sample.batching import gathered, leading_shape, rewrapped, split, stacked
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import read_frames
@@ -34,7 +34,7 @@ class Inpainter(ABC):
         outcome: The holes' fate, for warnings: "The rest is ...".
         is_random: Whether ``inpaint`` reads its seeds.
         needs_confidence: Whether frames must bring their confidence.
-        needs_layers: Whether they must bring what holes lie behind (``RenderedFrame.layers``).
+        needs_layers: Whether they must bring what holes lie behind (``Views.layers``).
         fills_own_car: Whether ``inpaint`` gets the own car, which is black, as a hole too, so that it does not bleed.
     """
 
@@ -63,7 +63,7 @@ class Inpainter(ABC):
         """``inpaint`` of copies, into which it may write; ``counts`` are how many views each frame has."""
         return self.inpaint([view.clone() for view in views], [hole.clone() for hole in holes], seeds)
 
-    def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
+    def fill(self, rendered: Sequence[Views], frames: Sequence[Frame]) -> list[Views]:
         """Fill rendered ``frames``.
 
         Filled pixels are no longer covered: ``coverage`` False, ``confidence`` 0, ``source_camera`` and
@@ -123,7 +123,7 @@ class Inpainter(ABC):
                 images = [torch.where(seen, image, 0) for seen, image in seen_and_images]
             else:
                 images = [image.clone() for image in view.images]  # some fill in place
-            rendered.append(RenderedFrame(images, view.rig, **{key: frames[b] for key, frames in maps.items()}))
+            rendered.append(Views(images, view.rig, **{key: frames[b] for key, frames in maps.items()}))
         done = [_without_own_car(frame) for frame in self.fill(rendered, sources)]
         out = {key: value for key, value in batch.items() if key != SOURCES_KEY}
         for key in (*maps, "generated"):
@@ -175,7 +175,7 @@ class Black(Inpainter):
     def inpaint(self, views: Tensors, holes: Tensors, seeds: Sequence[int]) -> list[torch.Tensor]:
         return list(views)
 
-    def fill(self, rendered: Sequence[RenderedFrame], frames: Sequence[Frame]) -> list[RenderedFrame]:
+    def fill(self, rendered: Sequence[Views], frames: Sequence[Frame]) -> list[Views]:
         return list(rendered)
 
     def complete_batch(self, batch: Mapping[str, Any]) -> dict[str, Any]:
@@ -184,7 +184,7 @@ class Black(Inpainter):
 
 
 # --- holes ------------------------------------------------------------------------------------------------------------
-def holes_of(frame: RenderedFrame, min_confidence: float) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+def holes_of(frame: Views, min_confidence: float) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     """Pixels (h, w) of each view that are seen with enough confidence, and the others that are not the own car."""
     trust = frame.coverage if frame.confidence is None else frame.confidence
     known = [seen & (c >= min_confidence) for seen, c in zip(frame.coverage, trust, strict=True)]
@@ -192,7 +192,7 @@ def holes_of(frame: RenderedFrame, min_confidence: float) -> tuple[list[torch.Te
     return known, [~k if c.mask is None else ~k & torch.tensor(c.mask, device=k.device) for k, c in views]
 
 
-def put(rendered: RenderedFrame, images: Sequence[torch.Tensor], holes: Sequence[torch.Tensor]) -> RenderedFrame:
+def put(rendered: Views, images: Sequence[torch.Tensor], holes: Sequence[torch.Tensor]) -> Views:
     """The frame with images (3, h, w) in the holes (h, w) of its views, marked as generated."""
 
     def without_holes(maps: Sequence[torch.Tensor], empty: int) -> torch.Tensor | list[torch.Tensor]:
@@ -208,7 +208,7 @@ def put(rendered: RenderedFrame, images: Sequence[torch.Tensor], holes: Sequence
     return replace(rendered.with_maps(without_holes), images=views, generated=stacked(list(holes)), labels=labels)
 
 
-def _without_own_car(frame: RenderedFrame) -> RenderedFrame:
+def _without_own_car(frame: Views) -> Views:
     """The frame, black and not marked as generated where no source shows what its cameras' masks hide."""
     _, holes = holes_of(frame, 0)
     shown = [seen | hole for seen, hole in zip(frame.coverage, holes, strict=True)]

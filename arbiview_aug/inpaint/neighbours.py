@@ -24,7 +24,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.image_ops import FRESH, Memory, bounding_box, of_cells, some_of_cells
 from arbiview_aug.inpaint.merging import Candidate, merged
 from arbiview_aug.render.plan import RenderConfig, RenderPlan, ViewPlan
-from arbiview_aug.render.rendered import Maps, RenderedFrame, Renderer, confidence_of
+from arbiview_aug.render.rendered import Maps, Renderer, Views, confidence_of
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.frame import Neighbour
 from arbiview_aug.sample.neighbours import BOX_MARGIN_M, ChangeRisk, Warn, change_risks, neighbour_images
@@ -257,8 +257,8 @@ def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neig
 
 # --- filling ----------------------------------------------------------------------------------------------------------
 def fill_from_neighbours(
-    rendered: RenderedFrame, fills: Fills, images: Sequence[torch.Tensor], renderer: Renderer, warn: Warn
-) -> RenderedFrame:
+    rendered: Views, fills: Fills, images: Sequence[torch.Tensor], renderer: Renderer, warn: Warn
+) -> Views:
     """Fill the holes of a rendered frame from its neighbours; ``warn`` is called for those that cannot be read.
 
     The frame's maps, and its images where possible, are written into. Its tone curves serve the neighbours' cameras

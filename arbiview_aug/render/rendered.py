@@ -1,6 +1,6 @@
 """The views of one frame, and their label maps: plans executed by OpenCV or torch, and images that are only resized.
 
-Every renderer returns a ``RenderedFrame``, every filler of holes takes and returns one.
+Every renderer returns a ``Views``, every filler of holes takes and returns one.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ LabelRenderer = Callable[[Sequence[torch.Tensor], LabelFill], list[torch.Tensor]
 
 
 @dataclass(frozen=True, eq=False)
-class RenderedFrame:
+class Views:
     """The M views of one frame. It owns the memory of its maps; fillers may write into them.
 
     Attributes:
@@ -228,7 +228,7 @@ class RenderedFrame:
     curves: Curves | None = None
     labels: LabelRenderer | None = None
 
-    def with_maps(self, change: Callable[[Sequence[torch.Tensor], int], Maps]) -> RenderedFrame:
+    def with_maps(self, change: Callable[[Sequence[torch.Tensor], int], Maps]) -> Views:
         """The frame with ``change(map, value where uncovered)`` for each of its maps."""
         changed: dict[str, Any] = {}
         for key in MAP_KEYS:
@@ -236,7 +236,7 @@ class RenderedFrame:
                 changed[key] = change(maps, -1 if key in ("source_camera", "source_frame") else 0)
         return replace(self, **changed)
 
-    def between_bars(self, size: tuple[int, int]) -> RenderedFrame:
+    def between_bars(self, size: tuple[int, int]) -> Views:
         """The frame with every view at ``size`` (h, w), black bars above and at both sides."""
 
         def with_bars(views: Sequence[torch.Tensor], empty: float) -> torch.Tensor:
@@ -251,7 +251,7 @@ class RenderedFrame:
 
 
 MAP_KEYS = ("coverage", "source_camera", "source_frame", "confidence", "generated")
-"""Attributes of a ``RenderedFrame``, and keys of a retargeted sample, that hold maps."""
+"""Attributes of a ``Views``, and keys of a retargeted sample, that hold maps."""
 
 
 # --- by a plan --------------------------------------------------------------------------------------------------------
@@ -273,7 +273,7 @@ class Renderer:
         frames: Sequence[Frame],
         curves: Sequence[Curves | None],
         outputs: Collection[str] = (),
-    ) -> list[RenderedFrame]:
+    ) -> list[Views]:
         """Render frames by a plan each; torch renders those that share a plan in one batch.
 
         ``curves`` are for each frame the tone curves of each view for each source, or None; ``outputs`` the
@@ -281,7 +281,7 @@ class Renderer:
         image on another device or with gradients.
         """
         with_seams = "confidence" in outputs
-        rendered: dict[int, RenderedFrame] = {}
+        rendered: dict[int, Views] = {}
         batches: dict[int, list[int]] = {}
         for b, (plan, frame) in enumerate(zip(plans, frames, strict=True)):
             if self._uses_torch(frame.images):
@@ -325,7 +325,7 @@ def _make_views(
     seams: Sequence[torch.Tensor],
     curves: Curves | None,
     outputs: Collection[str],
-) -> RenderedFrame:
+) -> Views:
     views, on_device = plan.targets, plan.on_devices.get(images[0].device)
     winners = [view.source for view in on_device or ()] or [torch.from_numpy(view.source_camera) for view in views]
     rendered = from_winners(images, plan.target, winners, partial(render_labels, plan), outputs)
@@ -344,9 +344,9 @@ def from_winners(
     winners: Sequence[torch.Tensor],
     labels: Callable[[Sequence[torch.Tensor], float], list[torch.Tensor]],
     outputs: Collection[str],
-) -> RenderedFrame:
+) -> Views:
     """A frame with the maps that follow from the (h, w) int8 winning sources, copied."""
-    return RenderedFrame(
+    return Views(
         images,
         rig,
         covered(winners),
@@ -356,7 +356,7 @@ def from_winners(
     )
 
 
-def confidence_of(rendered: RenderedFrame) -> Maps:
+def confidence_of(rendered: Views) -> Maps:
     """Compute the confidence of a frame's views from their certainty, seams and contrast."""
     of_views = zip(rendered.images, rendered.certainty, rendered.coverage, rendered.seams, strict=True)
     return stacked([confidence(*of_view) for of_view in of_views])
@@ -375,18 +375,18 @@ class Resizer:
         """The frame itself."""
         return frame
 
-    def render(self, plans: Sequence[Frame]) -> list[RenderedFrame]:
+    def render(self, plans: Sequence[Frame]) -> list[Views]:
         """Resize frames."""
         return list(map(self._resize, plans))
 
-    def _resize(self, frame: Frame) -> RenderedFrame:
+    def _resize(self, frame: Frame) -> Views:
         size, outputs, device = self.size, self.outputs, frame.images[0].device
         assert size is not None
         framings = [framing(camera.name, camera.size, size, self.fit) for camera in frame.rig]
         coverage = torch.stack([framed(torch.ones(f.scaled, dtype=torch.bool, device=device), f) for f in framings])
         current = coverage.to(torch.int8) - 1
         numbers = torch.arange(len(coverage), dtype=torch.int8, device=device)[:, None, None]
-        return RenderedFrame(
+        return Views(
             [framed(resized(image, f.scaled), f) for image, f in zip(frame.images, framings, strict=True)],
             frame.rig.resized(size, self.fit),
             coverage,

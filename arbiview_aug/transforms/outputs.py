@@ -16,7 +16,7 @@ from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError, SampleTypeError, shown
 from arbiview_aug.inpaint.inpainter import SOURCES_KEY
-from arbiview_aug.render.rendered import MAP_KEYS, RenderedFrame
+from arbiview_aug.render.rendered import MAP_KEYS, Views
 from arbiview_aug.sample.batching import (
     gathered,
     is_readable,
@@ -47,7 +47,7 @@ class SampleWriter:
         self,
         sample: Mapping[str, Any],
         frames: Sequence[Frame],
-        rendered: Sequence[RenderedFrame],
+        rendered: Sequence[Views],
         labels: Sequence[str],
         target: Rig,
         params: Mapping[str, float],
@@ -126,7 +126,7 @@ _MATRICES = ("K", "cam2ego")
 
 # --- label maps -------------------------------------------------------------------------------------------------------
 def target_labels(
-    key: str, value: Any, frames: Sequence[Frame], lead: tuple[int, ...], rendered: Sequence[RenderedFrame], fill: float
+    key: str, value: Any, frames: Sequence[Frame], lead: tuple[int, ...], rendered: Sequence[Views], fill: float
 ) -> Any:
     """Render label maps, (..., N, H, W) or a list of (..., Hi, Wi), in the target's views.
 

@@ -24,7 +24,7 @@ from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import Harmonise, Harmoniser
 from arbiview_aug.render.overlap_depth import OverlapDepth, estimate_overlap, overlap_cache
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
-from arbiview_aug.render.rendered import Backend, RenderedFrame, Renderer
+from arbiview_aug.render.rendered import Backend, Renderer, Views
 from arbiview_aug.render.requirements import RigPair, boxes_harm, check_reach, harm_remedies, pose_mistakes
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.frame import Frame
@@ -69,7 +69,7 @@ class FrameRenderer(Protocol):
     def plan(self, frame: Frame, target: Rig) -> Any:
         """Plan how a frame is rendered."""
 
-    def render(self, plans: Sequence[Any]) -> list[RenderedFrame]:
+    def render(self, plans: Sequence[Any]) -> list[Views]:
         """Render frames by their plans; holes stay."""
 
 
@@ -186,7 +186,7 @@ class PlannedRenderer:
         check_reach(source, target, coverage, self._unseen, self.warn)
         return plan
 
-    def render(self, plans: Sequence[FramePlan]) -> list[RenderedFrame]:
+    def render(self, plans: Sequence[FramePlan]) -> list[Views]:
         """Render frames by their plans, and fill holes from their neighbours."""
         is_accepted = self.geometry not in ("auto", "boxes") or self.settings.p <= _MIXED_P
         for planned in () if is_accepted or "static" in self.warn.topics else plans:
@@ -265,7 +265,7 @@ class PaperRenderer:
         check_reach(frame.rig, target, rendering.coverage, unseen, self.settings.warn)
         return rendering
 
-    def render(self, plans: Sequence[PaperPlan]) -> list[RenderedFrame]:
+    def render(self, plans: Sequence[PaperPlan]) -> list[Views]:
         """Render frames by the published stages."""
         return [favs.as_rendered(self._render(planned), self.settings.outputs) for planned in plans]
 

@@ -17,7 +17,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, Generator
 from arbiview_aug.generator.config import AutoencoderConfig
-from arbiview_aug.render.rendered import RenderedFrame
+from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.frame import Frame
 from tests.generator.small import ring, small_config, stirred
 from tests.helpers import assert_same_to_a_level
@@ -26,7 +26,7 @@ SOURCES = ring(4, horizontal_fov_deg=100)
 TARGETS = ring(3, horizontal_fov_deg=110, yaw_deg=25, name="t", z_m=1.8)
 
 
-def rendered(targets: Rig = TARGETS, sources: Rig = SOURCES) -> tuple[RenderedFrame, Frame]:
+def rendered(targets: Rig = TARGETS, sources: Rig = SOURCES) -> tuple[Views, Frame]:
     """Smooth views with holes of a fifth on the right, and source images."""
     rng = torch.Generator().manual_seed(0)
 
@@ -39,14 +39,14 @@ def rendered(targets: Rig = TARGETS, sources: Rig = SOURCES) -> tuple[RenderedFr
         seen[:, -seen.shape[1] // 5 :] = False
     views = [smooth(c) * seen for c, seen in zip(targets, coverage, strict=True)]
     source = Frame(tuple(smooth(c) for c in sources), sources, further={"token": "a"})
-    return RenderedFrame(views, targets, coverage), source
+    return Views(views, targets, coverage), source
 
 
-def filled(generator: Generator, frame: RenderedFrame, source: Frame, **settings: Any) -> RenderedFrame:
+def filled(generator: Generator, frame: Views, source: Frame, **settings: Any) -> Views:
     return Diffusion(generator, **{"steps": 2, **settings}).fill([frame], [source])[0]
 
 
-def completed(generator: Generator, targets: Rig = TARGETS, sources: Rig = SOURCES, **settings: Any) -> RenderedFrame:
+def completed(generator: Generator, targets: Rig = TARGETS, sources: Rig = SOURCES, **settings: Any) -> Views:
     return filled(generator, *rendered(targets, sources), **settings)
 
 

@@ -9,14 +9,14 @@ import torch
 from diffusers import UNet2DConditionModel
 
 from arbiview_aug.generator import Generator, compact, paper, small, tiny
-from arbiview_aug.generator.conditioning import FrameGeometry, Views, frame_geometry
+from arbiview_aug.generator.conditioning import FrameGeometry, ViewInputs, frame_geometry
 from arbiview_aug.generator.config import UNetConfig
 from arbiview_aug.generator.correspondence import token_sizes
 from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, Denoiser, Rows
 from tests.generator.small import ring, small_config, stirred
 
 
-def views(geometry: FrameGeometry, of: str, seed: int = 0, channels: int = 3) -> Views:
+def views(geometry: FrameGeometry, of: str, seed: int = 0, channels: int = 3) -> ViewInputs:
     rays = geometry.target_rays if of == "target" else geometry.source_rays
     b, n, _, h, w = rays.shape
     rng = torch.Generator().manual_seed(seed)
@@ -121,8 +121,8 @@ def test_permuting_the_cameras_permutes_the_output(generator: Generator) -> None
     with torch.no_grad():
         read = denoiser.read_sources(of_sources, base.source_windows())
         expected = denoiser(noisy, t, of_targets, base.target_windows(), read)[:, order]
-        of_sources = Views(*(value[:, source_order] for value in of_sources))
-        of_targets = Views(*(value[:, order] for value in of_targets))
+        of_sources = ViewInputs(*(value[:, source_order] for value in of_sources))
+        of_targets = ViewInputs(*(value[:, order] for value in of_targets))
         assert torch.allclose(of_targets.pose, moved.target_pose)
         read = denoiser.read_sources(of_sources, moved.source_windows())
         got = denoiser(noisy[:, order], t, of_targets, moved.target_windows(), read)

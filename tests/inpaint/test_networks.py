@@ -22,7 +22,7 @@ from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, load_inpainter
 from arbiview_aug.inpaint import Black, CompletedLoader, PipelineInpainter, TorchScriptInpainter
 from arbiview_aug.inpaint.telea import telea
-from arbiview_aug.render.rendered import RenderedFrame
+from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.inputs import read_frames
 from integrations.benchmarks.memory import peak_mib
 from tests.helpers import ring
@@ -133,7 +133,7 @@ def test_frames_share_calls_but_no_canvas(lama: Path) -> None:
         read_frames({"images": torch.zeros(1, 3, 40, 40), "rig": rig}, None),
     )
     seen[:, 10:20, 10:20] = False
-    frames = [RenderedFrame([torch.full((3, 40, 40), value) * seen], rig, seen) for value in (0.2, 0.8)]
+    frames = [Views([torch.full((3, 40, 40), value) * seen], rig, seen) for value in (0.2, 0.8)]
     together = [frame.images[0] for frame in filler.fill(frames, unread * 2)]
     assert filler.calls == 1
     for frame, image in zip(frames, together, strict=True):

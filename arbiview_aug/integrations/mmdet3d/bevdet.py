@@ -12,7 +12,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rotations import poses_from, quaternion_from_rotation
 from arbiview_aug.errors import SampleError
 from arbiview_aug.integrations.mmdet3d.images import Norm, levels, normalised
-from arbiview_aug.integrations.mmdet3d.matrices import Views, padded, upper_triangular
+from arbiview_aug.integrations.mmdet3d.matrices import ResultCameras, padded, upper_triangular
 from arbiview_aug.integrations.mmdet3d.results import (
     Retarget,
     geometry,
@@ -113,7 +113,9 @@ def retarget_img_inputs(
     return changed | target_outputs(outs)
 
 
-def _entries(images: torch.Tensor, target: Views, like: Sequence[torch.Tensor], mean_std: Norm) -> list[torch.Tensor]:
+def _entries(
+    images: torch.Tensor, target: ResultCameras, like: Sequence[torch.Tensor], mean_std: Norm
+) -> list[torch.Tensor]:
     """The six entries of a frame of target cameras, in the types of the source's; nothing is augmented."""
     count = len(target.names)
     values = (
@@ -143,7 +145,7 @@ def _checked(inputs: Any) -> list[torch.Tensor]:
 
 def _as_recorded(
     frame: Sequence[torch.Tensor], names: Sequence[str], key2global: FloatArray, width_px: int
-) -> tuple[list[bool], Views]:
+) -> tuple[list[bool], ResultCameras]:
     """Which images are mirrored; the cameras of the others as they are, and of those when mirrored back."""
     sensor2ego, ego2global, intrinsics, post_rots, post_trans = (entry.double().numpy() for entry in frame)
     moved = np.tile(np.eye(3), (len(names), 1, 1))
@@ -156,7 +158,7 @@ def _as_recorded(
     moved[mirrored] = np.array([[-1.0, 0, width_px - 1], [0, 1, 0], [0, 0, 1]]) @ moved[mirrored]
     K, turned = upper_triangular(moved @ intrinsics)
     cam2ego = (np.linalg.inv(key2global) @ ego2global) @ sensor2ego @ np.linalg.inv(padded(turned))
-    return mirrored.tolist(), Views(names, K / K[:, 2:, 2:], cam2ego, np.eye(4), key2global)
+    return mirrored.tolist(), ResultCameras(names, K / K[:, 2:, 2:], cam2ego, np.eye(4), key2global)
 
 
 def _boxes(info: Any) -> dict[str, torch.Tensor]:
@@ -180,7 +182,7 @@ def _lidar2key(info: Any, key2global: FloatArray) -> FloatArray | None:
     return np.asarray(key2ego @ ego2global @ lidar2ego)
 
 
-def _infos(target: Views, key2global: FloatArray) -> dict[str, dict[str, Any]]:
+def _infos(target: ResultCameras, key2global: FloatArray) -> dict[str, dict[str, Any]]:
     """``curr["cams"]``: what ``PointToMultiViewDepth`` reads."""
 
     def pose(prefix: str, matrix: FloatArray) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def entry(key: str, expected: str) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Views:
+class ResultCameras:
     """The cameras of a ``results`` dict.
 
     Attributes:
@@ -74,7 +74,7 @@ class Views:
         }[kind]
 
 
-def read_views(matrices: Mapping[str, Any], count: int, names: Sequence[str], lidar2ego: FloatArray) -> Views:
+def read_views(matrices: Mapping[str, Any], count: int, names: Sequence[str], lidar2ego: FloatArray) -> ResultCameras:
     """The cameras that a dict's matrices describe.
 
     ``cam2ego`` is not read: mmdet3d's is the mounting alone, 0.4 m beside what the image shows at 9 m/s; ``lidar2cam``
@@ -120,7 +120,7 @@ def read_views(matrices: Mapping[str, Any], count: int, names: Sequence[str], li
     with entry("lidar2cam", "matrices that can be inverted"):
         cam2ego = lidar2ego @ np.linalg.inv(lidar2cam)
     ego2global = of["cam2global"][0] @ np.linalg.inv(cam2ego[0]) if "cam2global" in of else None
-    return Views(names, K, cam2ego, lidar2ego, ego2global)
+    return ResultCameras(names, K, cam2ego, lidar2ego, ego2global)
 
 
 def is_transposed(stack: FloatArray) -> bool:

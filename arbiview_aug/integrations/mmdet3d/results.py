@@ -17,7 +17,7 @@ from arbiview_aug.integrations.mmdet3d.images import like_given as images_like
 from arbiview_aug.integrations.mmdet3d.images import norm_of, to_tensors
 from arbiview_aug.integrations.mmdet3d.matrices import (
     MATRICES,
-    Views,
+    ResultCameras,
     entry,
     is_transposed,
     like_array,
@@ -197,7 +197,7 @@ def _recorded(results: Mapping[str, Any]) -> Any:
     return images
 
 
-def source_rig(views: Views, images: Sequence[torch.Tensor], ground_z_m: float) -> Rig:
+def source_rig(views: ResultCameras, images: Sequence[torch.Tensor], ground_z_m: float) -> Rig:
     """The cameras of images (3, H, W)."""
     cameras = [
         Camera(name=name, width_px=image.shape[2], height_px=image.shape[1], K=K, cam2ego=cam2ego)
@@ -267,7 +267,7 @@ def moved_points(points: Any, pose: FloatArray) -> torch.Tensor:
 
 
 # --- target -----------------------------------------------------------------------------------------------------------
-def target_views(out: Mapping[str, Any], source: Views, names: Sequence[str]) -> Views:
+def target_views(out: Mapping[str, Any], source: ResultCameras, names: Sequence[str]) -> ResultCameras:
     """The cameras of a retargeted sample.
 
     Raises:
@@ -279,7 +279,7 @@ def target_views(out: Mapping[str, Any], source: Views, names: Sequence[str]) ->
     if "ego2ego" in out:
         raise SampleError("SampleKeys.frame: expected 'source', since points and boxes stay in the LiDAR's frame")
     check_no_lenses(out.get("lens", ()))
-    return Views(
+    return ResultCameras(
         list(source.names if _is_skipped(out) else names),
         out["K"].double().numpy(),
         out["cam2ego"].double().numpy(),
@@ -345,7 +345,7 @@ def target_outputs(outs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return outputs
 
 
-def _write_numbers(out: dict[str, Any], views: Views, images: torch.Tensor) -> None:
+def _write_numbers(out: dict[str, Any], views: ResultCameras, images: torch.Tensor) -> None:
     """Matrices and sizes; Sparse4D's (w, h) of each image, and geometric mean of its focal lengths."""
     for key, kind in MATRICES.items():
         if out.get(key) is not None:
@@ -374,7 +374,7 @@ def _as_written(original: Any, matrices: FloatArray) -> Any:
     return like_given(original, matrices)
 
 
-def _infos(infos: Mapping[str, Any], views: Views, images: torch.Tensor) -> dict[str, Any]:
+def _infos(infos: Mapping[str, Any], views: ResultCameras, images: torch.Tensor) -> dict[str, Any]:
     """``images``: an entry for each target camera with the keys of the source's that can be told of it."""
     first: Mapping[str, Any] = next((info for info in infos.values() if isinstance(info, Mapping)), {})
     columns = {
