@@ -18,15 +18,13 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import Reduce
 from arbiview_aug.cli.arguments import REAL_TARGET
 from arbiview_aug.datasets import open_data
-from arbiview_aug.datasets.depth_folder import FOLDERS, DepthFolder
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.evaluate.frames import without_masks
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.temporal.learned_depth import LEAST_POINTS, LearnedDepth, measured_pixels
-from arbiview_aug.temporal.motion_depth import MotionDepth
+from arbiview_aug.temporal.learned_depth import LEAST_POINTS, measured_pixels
 
 SOURCES_OVER_VIEWS = 2  # size of synthetic images relative to the views, so that decoding at half size pays
 
@@ -51,21 +49,14 @@ class Recorded:
 
 @contextmanager
 def recorded(data: str | Path | None, *, frames: int = 1, size: tuple[int, int] = (512, 1408)) -> Iterator[Recorded]:
-    """Open a user's frames, or write synthetic ones of ``size`` (h, w) as JPEGs to a temporary folder.
-
-    Those have depth maps of LiDAR in place of the ``depth`` command's.
-    """
+    """Open a user's frames, or write synthetic ones of ``size`` (h, w) as JPEGs to a temporary folder."""
     if data is not None:
         yield Recorded(data_name(data), Path(data))
         return
     drive = SyntheticDrive(demo_source_rig(size), num_frames=frames)
     with tempfile.TemporaryDirectory() as folder:
         for k in range(frames):
-            sample = drive[k]
-            write_frame(Path(folder) / f"{k:04}", sample)
-            for name, kind in zip(FOLDERS.values(), (MotionDepth, LearnedDepth), strict=True):
-                depth = kind(tuple(lidar_maps(sample)), "from LiDAR")
-                DepthFolder(Path(folder) / name).write(f"{k:04}", sample["rig"], depth)
+            write_frame(Path(folder) / f"{k:04}", drive[k])
         yield Recorded("synthetic streets", Path(folder), drive.render)
 
 

@@ -16,24 +16,26 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from arbiview_aug import Lidar, Rig, RigRetarget, retarget_points
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cli.arguments import count, seed
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import ScanErrors, SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.lidar import lidar_split
 from arbiview_aug.evaluate.report.tables import markdown_table
-from arbiview_aug.evaluate.scans import chamfer_m, scan_metrics
+from arbiview_aug.evaluate.scans import chamfer_m, polar, scan_metrics
 from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.scene.point_cloud import own_car
-from integrations.benchmarks.scan_baselines import measured_near, rings_dropped
 from integrations.benchmarks.study import run_study, study_parser
 
 COLUMNS = ("recall", "precision", "range_error_m", "chamfer_m", "recall of all")
 PLACE_M = (0.9, 0.0, 1.9)
 UP_M = 0.7
+_GRID_DEG = 0.05  # of directions near which something was measured
 
 ERRORS = ScanErrors(divergence_deg=0.17, reach_m=150.0)
 """An HDL-32E's divergence, 3 mrad. Among rays between others that return from one surface, 95, 94 and 84 % return at 20
@@ -93,6 +95,33 @@ def synthetic(frames: int, seed: int) -> Iterator[tuple[str, str, dict[str, floa
                 rows.setdefault(name, []).append(scan_metrics(b, cloud, truth, where) | of_all)
         for name, metrics in rows.items():
             yield scene, name, {key: float(np.mean([m[key] for m in metrics])) for key in COLUMNS}
+
+
+def rings_dropped(a: Lidar, b: Lidar, points: FloatArray) -> FloatArray:
+    """The points of those rings of ``a`` that are nearest to a ring of ``b``: LiDAR-Distillation's way to fewer beams.
+
+    It shifts heights too, so that roads coincide: in the ego frame they do.
+    """
+    elevation, _, _ = polar(a, points)
+    table = np.array(a.elevations_deg)
+    kept = np.unique(np.abs(np.array(b.elevations_deg)[:, None] - table).argmin(1))
+    return np.asarray(points[np.isin(np.abs(elevation[:, None] - table).argmin(1), kept)])
+
+
+def measured_near(a: Lidar, b: Lidar, points: FloatArray) -> BoolArray:
+    """(beams, columns) rays of ``b`` within half a line and a column spacing of which ``a`` measured a point."""
+    half = np.diff(np.sort(a.elevations_deg)).mean() / 2, a.azimuth_step_deg / 2 + _GRID_DEG
+    elevation, azimuth, _ = polar(b, points[np.isfinite(points[:, :3]).all(1)])
+    row, column = np.rint((elevation + 90) / _GRID_DEG), np.rint(azimuth / _GRID_DEG)
+    turn = round(360 / _GRID_DEG)
+    grid = np.zeros((turn // 2 + 1, turn), np.uint8)
+    grid[row.astype(int), column.astype(int) % turn] = 1
+    up, aside = (round(angle / _GRID_DEG) for angle in half)
+    around = np.pad(grid, ((0, 0), (aside, aside)), mode="wrap")
+    near = cv2.dilate(around, np.ones((2 * up + 1, 2 * aside + 1), np.uint8))[:, aside : aside + turn]
+    columns_deg = b.azimuth_deg[0] + b.azimuth_step_deg * np.arange(b.shape[1])
+    rows = np.rint((np.array(b.elevations_deg) + 90) / _GRID_DEG).astype(int)
+    return np.asarray(near[rows[:, None], np.rint(columns_deg / _GRID_DEG).astype(int) % turn] > 0)
 
 
 def ddad(data: Path | None) -> Iterator[tuple[str, str, dict[str, float]]]:

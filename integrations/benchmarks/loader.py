@@ -21,9 +21,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.arguments import add_options, count, output_file, seed, size
 from arbiview_aug.cli.parsers import SIZE
-from arbiview_aug.datasets import RetargetedDataset, WithDepth, open_data
-from arbiview_aug.datasets.depth_folder import FOLDERS
-from arbiview_aug.datasets.registry import split_kind
+from arbiview_aug.datasets import RetargetedDataset, open_data
 from arbiview_aug.environment import one_thread
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.scene.scene import GEOMETRIES
@@ -67,12 +65,10 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     datasets: dict[str, Dataset[Any]] = {PLAIN: plain}
     rig: Rig = opened[0]["rig"]
     for surface in arguments.geometry:
-        retarget, source = RigRetarget(target, geometry=surface), plain
-        if surface != "auto" and FOLDERS.keys() & GEOMETRIES[surface].reads:  # what the depth command wrote
-            source = Repeated(WithDepth(opened, split_kind(data.root)[1]), arguments.frames)
+        retarget = RigRetarget(target, geometry=surface)
         if GEOMETRIES[surface].needs is None:
             retarget.prepare(rig)  # workers share static plans
-        datasets[f"retargeted, {surface}"] = RetargetedDataset(source, retarget)
+        datasets[f"retargeted, {surface}"] = RetargetedDataset(plain, retarget)
     return {
         "clock": "on the wall",
         "data": data.name,

@@ -18,6 +18,10 @@ from itertools import product, starmap
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import Quality, Reduce
 from arbiview_aug.cli.arguments import (
     add_options,
@@ -27,23 +31,31 @@ from arbiview_aug.cli.arguments import (
     writable_folder,
 )
 from arbiview_aug.datasets import open_data
+from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import CalibrationError, SampleError
-from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scores
+from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scores, without_masks
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.favs.config import PaperConfig
 from integrations.benchmarks.baselines import BASELINES, method_of
 from integrations.benchmarks.study import run_study, study_parser
-from integrations.benchmarks.targets import TARGET_SETS as SETS
-from integrations.benchmarks.targets import TRUCK_UP_M, VEHICLES, YAWS_DEG, named_targets
 
 OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")  # presets other than the published method
 
 INPAINTED, GENERATED = "fast, inpainted", "generator"
 """Rows of ``fast`` with holes filled by Telea's inpainting, and by the shipped weights."""
+
+SETS = ("paper", "yaw", "vehicles", "truck")
+"""Target rigs, made from the source rig and without its car-body masks."""
+PAPER_SHARES = (0.2, -0.2, 0.4, -0.4, 0.5, -0.25)  # of the azimuth spacing: 11/14, 22/28, 27.5/35, 13.75/17.5°
+
+YAWS_DEG = (11.0, -11.0, 22.0, -22.0, 35.0)
+VEHICLES = ("waymo", "argoverse2", "lyft_l5", "nuplan")  # shipped rigs used as other vehicles
+TRUCK_UP_M = 1.0  # height of a truck's cameras over a sedan's
+_SAME_DIRECTION_DEG = 5.0
 
 REAL_FRAMES = ("nuscenes-one", "ddad-one")
 SYNTHETIC = "synthetic"
@@ -88,7 +100,6 @@ def measure_paper(
     *,
     frames: int | None = None,
     size: tuple[int, int] | None = None,
-    methods: Sequence[Method] | None = None,
     tick: Callable[[str, int], None] = lambda _, __: None,
 ) -> Study:
     """Measure all rows on a folder of real frames; by default on ``REAL_FRAMES`` below ARBIVIEW_DATA and on streets.
@@ -96,10 +107,9 @@ def measure_paper(
     Args:
         frames: Frames per data set; by default 1 of real ones and ``SYNTHETIC_FRAMES``.
         size: (h, w) of the synthetic images.
-        methods: By default ``study_methods``.
         tick: Called before each step with its name and the number of steps so far.
     """
-    study, rows, steps = Study(), methods or study_methods(), 0
+    study, rows, steps = Study(), study_methods(), 0
     for name, data_set in _data_sets(data, frames, size):
         collected: dict[str, dict[str, list[dict[str, float]]]] = {m.name: {kind: [] for kind in SETS} for m in rows}
         for frame in data_set:
@@ -139,6 +149,56 @@ def _data_sets(
 
 def _bare(sample: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in sample.items() if key not in ("boxes_3d", "detections")}
+
+
+# --- targets ----------------------------------------------------------------------------------------------------------
+def spacing_deg(rig: Rig) -> FloatArray:
+    """(N,) azimuth spacing of each camera to its neighbour.
+
+    The paper's figures on rigs with nuScenes' camera names: 55 degrees, 70 for CAM_BACK. Otherwise the gap to the
+    nearest camera that is not within 5 degrees (a telephoto beside a wide camera), or the camera's own field of view.
+    """
+    if set(CAMERA_RING).issuperset(rig.names):
+        return np.array([70.0 if name == "CAM_BACK" else 55.0 for name in rig.names])
+    azimuth = np.array([camera.azimuth_deg for camera in rig])
+    spacing = []
+    for k, camera in enumerate(rig):
+        gaps = np.abs((azimuth - azimuth[k] + 180) % 360 - 180)
+        gaps = gaps[gaps > _SAME_DIRECTION_DEG]
+        spacing.append(float(gaps.min()) if len(gaps) else camera.fov_deg[0])
+    return np.array(spacing)
+
+
+def paper_target(rig: Rig, share: float) -> Rig:
+    """One configuration of the paper: each camera yawed by a share of its spacing, positive to the left."""
+    cameras = [
+        camera.turned(yaw_deg=share * float(spacing)) for camera, spacing in zip(rig, spacing_deg(rig), strict=True)
+    ]
+    return without_masks(rig.with_cameras(cameras))
+
+
+def vehicle_targets(rig: Rig) -> dict[str, Rig]:
+    """``VEHICLES`` by name, as pinhole rigs with the source's image width."""
+    width = float(np.median([camera.width_px for camera in rig]))
+    rigs = {}
+    for name in VEHICLES:
+        vehicle = load_rig(name).undistorted()
+        scaled = [c.resize((max(1, round(c.height_px * width / c.width_px)), round(width))) for c in vehicle]
+        rigs[name] = without_masks(vehicle.with_cameras(scaled))
+    return rigs
+
+
+def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:
+    """Targets of a set, by name: ``paper`` (six), ``yaw`` (``YAWS_DEG``), ``vehicles`` or ``truck``."""
+    if kind == "vehicles":
+        return vehicle_targets(rig)
+    if kind == "paper":
+        targets = {f"paper {share:+g}": paper_target(rig, share) for share in PAPER_SHARES}
+    elif kind == "yaw":
+        targets = {f"yaw {yaw:+g}": without_masks(rig.turned(yaw_deg=yaw)) for yaw in YAWS_DEG}
+    else:
+        targets = {"truck": without_masks(rig.shifted(z_m=TRUCK_UP_M))}
+    return {name: replace(target, name=f"{rig.name}, {name}".lstrip(", ")) for name, target in targets.items()}
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -256,6 +316,7 @@ def parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--frames", type=count, metavar="N", help="frames of tables (default: 1; 3 synthetic ones)")
     parser.add_argument("--size", type=size, metavar="HxW", help="of synthetic images (default: 256x704)")
+    add_options(parser, "--data", without="nuscenes-one and ddad-one below ARBIVIEW_DATA, and synthetic streets")
     add_options(parser, "--output")
     return parser
 

@@ -18,9 +18,7 @@ def run_study(
     parser: argparse.ArgumentParser,
     run: Callable[[argparse.Namespace], int | None],
     argv: Sequence[str] | None,
-    *,
-    resumable: bool = False,
 ) -> int:
     """Parse the arguments and run a study; its exit status is that of ``errors.exit_status``."""
     arguments = parser.parse_args(argv)
-    return exit_status(parser.prog, lambda: run(arguments), resumable=resumable)
+    return exit_status(parser.prog, lambda: run(arguments))

@@ -1,4 +1,4 @@
-"""``python -m integrations.benchmarks.lidar``: the goals, on one street and on DDAD's next scan; times and memory."""
+"""``python -m integrations.benchmarks.lidar``: the goals, on one street and on DDAD's next scan; times."""
 
 from __future__ import annotations
 
@@ -6,18 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from arbiview_aug import retarget_points
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from integrations.benchmarks.data import recorded
-from integrations.benchmarks.lidar import PAIRS, ddad, main, scanner, synthetic
-from integrations.benchmarks.memory import memory_mib
+from integrations.benchmarks.lidar import PAIRS, ddad, main, measured_near, rings_dropped, synthetic
 from integrations.benchmarks.speed import measure
-from integrations.benchmarks.test_loader import MOST_GROWTH_MIB
-
-SOAKED, WARM_UP = 500, 50
+from tests.evaluate.test_scans import LIDAR, at
 
 
 @pytest.mark.slow
@@ -55,16 +51,17 @@ def test_120_000_points(nuscenes_root: Path, report_bound: Callable[..., None]) 
         report_bound(f"ms, {row['name']}", row["median_ms"], at_most=most_ms)
 
 
-@pytest.mark.release
-def test_memory_over_500_frames(report_bound: Callable[..., None]) -> None:
-    """Frames that drift, with boxes."""
-    rig = replace(demo_source_rig((8, 22)), lidars=[scanner(32)])
-    target, sample = replace(rig, lidars=[scanner(64, 0.7)]), SyntheticDrive(rig, num_frames=1)[0]
-    used_mib = []
-    for k in range(SOAKED):
-        moved = {key: sample[key] + 1e-3 * k for key in ("points", "boxes_3d")}
-        retarget_points(moved["points"], target, boxes_3d=moved["boxes_3d"])
-        if k in (WARM_UP, SOAKED - 1):
-            used_mib.append(memory_mib("status", "RssAnon"))
-    print(f"MiB after {WARM_UP} and {SOAKED} frames: {used_mib}")
-    report_bound("MiB by which a process grows", used_mib[1] - used_mib[0], at_most=MOST_GROWTH_MIB)
+def test_rings_next_to_the_targets_stay() -> None:
+    fewer = replace(LIDAR, elevations_deg=(11.0, -1.0))
+    cloud = np.array([at(8, elevation, 0) for elevation in (10, 0, -10, 9, 2)])
+    np.testing.assert_array_equal(rings_dropped(LIDAR, fewer, cloud), cloud[[0, 1, 3, 4]])
+
+
+def test_rays_near_which_something_was_measured() -> None:
+    """Half a line spacing above and below, half a column aside."""
+    fine = replace(LIDAR, elevations_deg=tuple(np.arange(-20.0, 21.0, 4)), azimuth_step_deg=30.0)
+    near = measured_near(LIDAR, fine, np.array([at(8, 0, 0), [np.nan] * 3]))
+    assert fine.azimuth_deg == (-180.0, 180.0)
+    rows, columns = np.nonzero(near)
+    assert set(np.array(fine.elevations_deg)[rows]) == {-4.0, 0.0, 4.0}
+    assert set(-180 + 30 * columns) == {-30, 0, 30}

@@ -5,42 +5,29 @@ from __future__ import annotations
 import json
 import multiprocessing
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 from torch.utils.data import DataLoader, Dataset
 
-from arbiview_aug import RetargetedDataset, RigRetarget
-from arbiview_aug.__main__ import main
-from arbiview_aug.datasets import Neighbours
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
+from arbiview_aug import RetargetedDataset, RigRetarget, load_rig
+from arbiview_aug.datasets.synthetic import demo_target_rig
 from integrations.benchmarks import loader
 from integrations.benchmarks.loader import PLAIN
 from integrations.benchmarks.memory import memory_mib
-from tests.helpers import street_sample, write_drive
+from tests.helpers import street_sample
 
 SOAKED, WARM_UP = 2000, 200  # frames
 AT = (WARM_UP, SOAKED // 2, SOAKED - 20)  # frames after which memory is read: workers that have no more to do end
 MOST_GROWTH_MIB = 8.0
-TINY = ("--size", "24x48", "--frames", "3", "--epochs", "1", "--downscale")
 
 
 def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, before = tmp_path / "new" / "loader.json", set(multiprocessing.active_children())
-    arguments = [
-        "--data",
-        str(nuscenes_root),
-        "--geometry",
-        "street",
-        *TINY,
-        "4",
-        "--epochs",
-        "2",
-        "--workers",
-        "0",
-        "1",
-    ]
+    options = f"--data {nuscenes_root} --geometry street --size 24x48 --frames 3 --epochs 2 --downscale 4 --workers 0 1"
+    arguments = options.split()
     assert loader.main([*arguments, "--output", str(path)]) == 0
     report = json.loads(path.read_text())
     assert report["data"] == "nuscenes-one" and report["target"] == "waymo" and report["size"] == [24, 48]
@@ -56,19 +43,6 @@ def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixt
     assert set(multiprocessing.active_children()) <= before, "none is left behind"
     with pytest.raises(SystemExit, match="2"):
         loader.main([*arguments, "--workers", "-1"])
-
-
-@pytest.mark.slow
-def test_depth_on_disk_is_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    sample = SyntheticDrive(demo_source_rig((48, 96)), num_frames=3, neighbours=Neighbours())[0]
-    write_drive(tmp_path / "drive", [sample, *sample["neighbours"]])
-    data, path = ["--data", str(tmp_path / "drive")], tmp_path / "a.json"
-    asked = [*data, "--geometry", "motion", "fused", *TINY, "1", "--workers", "0", "--output", str(path)]
-    assert loader.main(asked) == 2
-    assert "depth" in capsys.readouterr().err
-    assert main(["depth", *data]) == 0 and loader.main(asked) == 0
-    names = [rate["name"] for rate in json.loads(path.read_text())["rates"]]
-    assert names == [PLAIN, "retargeted, motion", "retargeted, fused"]
 
 
 @pytest.mark.release
@@ -100,9 +74,10 @@ class Drifting(Dataset[dict[str, Any]]):
 @pytest.mark.release
 @pytest.mark.timeout(3600)
 def test_soak(report_bound: Callable[..., None]) -> None:
-    """2,000 frames in two workers with a new plan each, over LiDAR and boxes: the workers' memory stays."""
+    """2,000 frames in two workers with a new plan and a scan each, over LiDAR and boxes: the workers' memory stays."""
     sample = street_sample()
-    retarget = RigRetarget(demo_target_rig((64, 176)), geometry="lidar")
+    target = replace(demo_target_rig((64, 176)), lidars=load_rig("waymo").lidars)
+    retarget = RigRetarget(target, geometry="lidar")
     loader = DataLoader(RetargetedDataset(Drifting(sample, SOAKED), retarget), batch_size=None, num_workers=2)
     before = set(multiprocessing.active_children())
     used_mib: list[list[float]] = []

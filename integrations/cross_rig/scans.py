@@ -27,7 +27,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.scene.boxes import points_by_box
 from arbiview_aug.scene.point_cloud import own_car
-from integrations.benchmarks.scan_baselines import rings_dropped
+from integrations.benchmarks.lidar import rings_dropped
 from integrations.cross_rig.frames import OF_TESTS, Split, code_hash, content_hash, one_thread, street_seed
 from integrations.cross_rig.labels import Grid, box_cells, vehicle_boxes
 from integrations.cross_rig.pillars import PointSet
