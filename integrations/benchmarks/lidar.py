@@ -33,8 +33,7 @@ from arbiview_aug.scene.point_cloud import own_car
 from integrations.benchmarks.study import run_study, study_parser
 
 COLUMNS = ("recall", "precision", "range_error_m", "chamfer_m", "recall of all")
-PLACE_M = (0.9, 0.0, 1.9)
-UP_M = 0.7
+HEIGHT_M, UP_M = 1.9, 0.7
 _GRID_DEG = 0.05  # of directions near which something was measured
 
 ERRORS = ScanErrors(divergence_deg=0.17, reach_m=150.0)
@@ -42,17 +41,17 @@ ERRORS = ScanErrors(divergence_deg=0.17, reach_m=150.0)
 to 30, 30 to 50 and 50 to 100 m; in nuScenes' frame 92, 92 and 83 %."""
 
 
-def scanner(beams: int, up_m: float = 0.0) -> Lidar:
-    """Evenly spaced beams: 32 as an HDL-32E's, or 64 that reach as far up."""
+def scanner(beams: int, height_m: float) -> Lidar:
+    """Evenly spaced beams on the roof: those of an HDL-32E and a VLP-16, and 64 that reach as far up."""
     pose = np.eye(4)
-    pose[:3, 3] = np.add(PLACE_M, (0, 0, up_m))
-    low, step = {32: (-30.67, 0.332), 64: (-24.8, 0.17)}[beams]
-    return Lidar(f"{beams} beams", pose, np.linspace(low, 10.67, beams).tolist(), step, (1.0, 90.0))
+    pose[:3, 3] = 0.9, 0.0, height_m
+    low, high, step = {16: (-15.0, 15.0, 0.2), 32: (-30.67, 10.67, 0.332), 64: (-24.8, 10.67, 0.17)}[beams]
+    return Lidar(f"{beams} beams at {height_m} m", pose, np.linspace(low, high, beams).tolist(), step, (1.0, 90.0))
 
 
 NEIGHBOURS: dict[str, Reach | None] = {"scanned": None, "with neighbours": "road"}
 PAIRS = {
-    f"{a} -> {b}{words}": (scanner(a), scanner(b, up_m))
+    f"{a} -> {b}{words}": (scanner(a, HEIGHT_M), scanner(b, HEIGHT_M + up_m))
     for words, up_m in (("", 0.0), (f", {UP_M} m higher", UP_M))
     for a, b in ((32, 64), (64, 32))
 }

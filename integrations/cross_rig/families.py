@@ -8,6 +8,7 @@ full coverage every pixel counts, as in stock detectors.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -112,47 +113,6 @@ def project(batch: Batch, points: Tensor) -> tuple[Tensor, Tensor]:
     return pixel, inside
 
 
-def voxel_bags(batch: Batch, voxels: Tensor, feature_size: tuple[int, int], stride: int) -> Bags:
-    """Weigh the four features around what voxels project to by bilinearity and coverage.
-
-    Args:
-        batch: Calibration and coverage.
-        voxels: (V, 3) ego frame.
-        feature_size: (h, w) of the feature maps.
-        stride: Pixels of a feature.
-
-    Returns:
-        Weights of one voxel of a frame sum to 1, or to 0 where nothing was covered.
-    """
-    fh, fw = feature_size
-    pixel, inside = project(batch, voxels)
-    num_frames, num_voxels = len(batch.state), len(voxels)
-    image, voxel = inside.nonzero(as_tuple=True)
-    bag = batch.frame[image] * num_voxels + voxel
-    bag, order = bag.sort(stable=True)
-    image, voxel = image[order], voxel[order]
-    # Pixel centres are integers: feature (0, 0) is centred on pixel (stride - 1) / 2.
-    at = (pixel[image, voxel] - (stride - 1) / 2) / stride
-    low = at.floor()
-    share = at - low
-    covered = F.avg_pool2d(batch.coverage[:, None].float(), stride).flatten()
-    rows, weights = [], []
-    for dy in (0, 1):
-        for dx in (0, 1):
-            x, y = low[:, 0].long() + dx, low[:, 1].long() + dy
-            in_map = (x >= 0) & (x < fw) & (y >= 0) & (y < fh)
-            row = (image * fh + y.clamp(0, fh - 1)) * fw + x.clamp(0, fw - 1)
-            wx = share[:, 0] if dx else 1 - share[:, 0]
-            wy = share[:, 1] if dy else 1 - share[:, 1]
-            rows.append(row)
-            weights.append(wx * wy * in_map * covered[row])
-    weight = torch.stack(weights, 1)  # [P / 4, 4]
-    total = torch.zeros(num_frames * num_voxels).index_add_(0, bag, weight.sum(1))
-    weight = weight / total[bag].clamp(min=1e-6)[:, None]
-    count = torch.bincount(bag, minlength=num_frames * num_voxels) * 4
-    return Bags(torch.stack(rows, 1).flatten(), weight.flatten(), count.cumsum(0) - count)
-
-
 class Voxels(nn.Module):
     """Voxel sampling (SimpleBEV, Harley et al., ICRA 2023): no depth distribution, one average for each voxel.
 
@@ -175,8 +135,8 @@ class Voxels(nn.Module):
     def voxel_features(self, features: Tensor, batch: Batch) -> Tensor:
         """(B, heights, side, side, C): what each voxel sees; zero where nothing is covered."""
         with torch.autocast("cpu", enabled=False):  # coordinates are never rounded to bf16
-            bags = voxel_bags(batch, self.voxels, (features.shape[-2], features.shape[-1]), STRIDE)
-        return bags.sums(features).view(len(batch.state), len(VOXEL_HEIGHTS_M), self.side, self.side, -1)
+            read = read_at(features, batch, self.voxels)
+        return read.view(len(batch.state), len(VOXEL_HEIGHTS_M), self.side, self.side, -1)
 
     def forward(self, features: Tensor, batch: Batch) -> Tensor:
         """(B, width, side, side) map of features (T, C, h, w)."""
@@ -281,23 +241,42 @@ class _QueryLayer(nn.Module):
         offsets = self.offsets(query).float().unflatten(-1, (_POINTS, 3)).tanh() * _REACH_M
         with torch.autocast("cpu", enabled=False):
             points = (references[:, None] + offsets).flatten(1, 2)
-            seen = read_at(features.float(), batch, points).unflatten(1, (-1, _POINTS)).flatten(2)
+            seen = read_at(features, batch, points).unflatten(1, (-1, _POINTS)).flatten(2)
         query = self.norms[0](query + self.value(seen))
         query = self.norms[1](query + self.attention(query, query, query, need_weights=False)[0])
         return self.norms[2](query + self.feed(query))
 
 
 def read_at(features: Tensor, batch: Batch, points: Tensor) -> Tensor:
-    """(B, P, C) features where points (B, P, 3) project to, averaged over a frame's images with what they cover."""
+    """(B, P, C) features where points (P, 3) or (B, P, 3) project to, averaged over a frame's images.
+
+    Bilinear and covered shares weigh the four features around a pixel; 0 where nothing is covered.
+    """
     fh, fw = features.shape[-2:]
-    pixel, inside = project(batch, points[batch.frame])
-    at = (pixel - (STRIDE - 1) / 2) / STRIDE
-    place = (2 * (at + 0.5) / torch.tensor([fw, fh]) - 1)[:, :, None]
-    covered = batch.covered()[:, None]
-    maps = torch.cat([features * covered, covered], 1)
-    read = F.grid_sample(maps, place, padding_mode="border", align_corners=False)[..., 0].mT * inside[..., None]
-    summed = torch.zeros(len(points), *read.shape[1:]).index_add_(0, batch.frame, read)
-    return summed[..., :-1] / summed[..., -1:].clamp(min=1e-6)
+    pixel, inside = project(batch, points if points.ndim == 2 else points[batch.frame])
+    num_frames, num_points = len(batch.state), points.shape[-2]
+    image, point = inside.nonzero(as_tuple=True)
+    bag, order = (batch.frame[image] * num_points + point).sort(stable=True)
+    image, point = image[order], point[order]
+    # Pixel centres are integers: feature (0, 0) is centred on pixel (STRIDE - 1) / 2.
+    at = (pixel[image, point] - (STRIDE - 1) / 2) / STRIDE
+    low = at.floor()
+    share, covered = at - low, batch.covered().flatten()
+    rows, weights = [], []
+    for dy, dx in product((0, 1), repeat=2):
+        x, y = low[:, 0].long() + dx, low[:, 1].long() + dy
+        in_map = (x >= 0) & (x < fw) & (y >= 0) & (y < fh)
+        row = (image * fh + y.clamp(0, fh - 1)) * fw + x.clamp(0, fw - 1)
+        wx = share[:, 0] if dx else 1 - share[:, 0]
+        wy = share[:, 1] if dy else 1 - share[:, 1]
+        rows.append(row)
+        weights.append(wx * wy * in_map * covered[row])
+    weight = torch.stack(weights, 1)  # [P / 4, 4]
+    total = torch.zeros(num_frames * num_points).index_add_(0, bag, weight.sum(1))
+    weight = weight / total[bag].clamp(min=1e-6)[:, None]
+    count = torch.bincount(bag, minlength=num_frames * num_points) * 4
+    bags = Bags(torch.stack(rows, 1).flatten(), weight.flatten(), count.cumsum(0) - count)
+    return bags.sums(features).view(num_frames, num_points, -1)
 
 
 def _map_network(channels: int, width: int) -> nn.Sequential:

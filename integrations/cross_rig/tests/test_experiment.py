@@ -1,6 +1,7 @@
 """A whole run, tiny: killed, it continues, and ends with the numbers of an uninterrupted one."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,6 @@ from integrations.cross_rig import __main__ as command
 from integrations.cross_rig import experiment, frames
 from integrations.cross_rig.experiment import Run, Settings, jobs, quick, run, small
 from integrations.cross_rig.frames import FrameStore
-from integrations.cross_rig.labels import FREE, HIDDEN, VEHICLE
 from integrations.cross_rig.report import summary, write_report
 from integrations.cross_rig.training import Schedule
 
@@ -101,18 +101,11 @@ def test_labels_and_draws_are_paired(done):
     assert 75 < sum(from_raw) < 125
 
 
-@pytest.mark.slow
-def test_frames_follow_the_world(tmp_path):
-    settings = replace(TINY, world="cuboids", changes=("up70",), variants=("auto_fill",))
-    setups = [Run(settings=replace(settings, world=world), output=tmp_path) for world in ("cuboids", "drive")]
-    images = []
-    for setup in setups:
-        for source in setup.sources():
-            experiment.make_frames(source, 1, 1)
-        state = setup.source("train").store().stacked("state", 1)
-        assert set(np.unique(state)) <= {FREE, VEHICLE, HIDDEN} and (state == VEHICLE).sum() > 20
-        images.append([source.store().read("images", 0) for source in setup.sources()])
-    assert all((one != other).mean() > 0.8 for one, other in zip(*images, strict=True))
+def test_tables_of_the_page_are_the_reports():
+    page = (Path(__file__).parents[3] / "docs" / "benchmarks.md").read_text()
+    tables = dict(re.findall(r"<!-- cross_rig: (\w+) -->\n(.*?)<!-- /cross_rig -->", page, re.DOTALL))
+    results = (Path(__file__).parents[1] / "results").glob("*.json")
+    assert tables == {path.stem: summary(json.loads(path.read_text())) for path in results} != {}
 
 
 def test_settings_of_the_command(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from integrations.cross_rig.families import DEPTHS_M, FAMILIES, Batch, Depths, read_at, voxel_bags
+from integrations.cross_rig.families import DEPTHS_M, FAMILIES, STRIDE, Batch, Depths, read_at
 from integrations.cross_rig.frames import source_rig
 from integrations.cross_rig.labels import Grid
 from integrations.cross_rig.model import Detector
@@ -41,22 +41,17 @@ def voxels() -> Detector:
     return Detector(GRID).eval()
 
 
-@pytest.mark.parametrize(("family", "stride"), [("voxels", 1), ("voxels", 4), ("queries", 4)])
-def test_points_read_the_pixel_that_they_project_to(family, stride):
+def test_points_read_the_pixel_that_they_project_to():
     """A feature map that holds its own pixel coordinates gives the camera model's projection."""
     front = source_rig(SIZE)["front"]
     frames = batch([source_rig(SIZE).with_cameras([front])])
     rng = np.random.default_rng(0)
     points = np.stack([rng.uniform(4, 20, 200), rng.uniform(-8, 8, 200), rng.uniform(0, 3, 200)], 1)
-    places, size = torch.from_numpy(points).float(), (SIZE[0] // stride, SIZE[1] // stride)
-    v, u = np.indices(size) * stride + (stride - 1) / 2
+    v, u = np.indices((SIZE[0] // STRIDE, SIZE[1] // STRIDE)) * STRIDE + (STRIDE - 1) / 2
     maps = torch.from_numpy(np.stack([u, v])[None]).float()
-    if family == "voxels":
-        read = voxel_bags(frames, places, size, stride).sums(maps).numpy()
-    else:
-        read = read_at(maps, frames, places[None])[0].numpy()
+    read = read_at(maps, frames, torch.from_numpy(points).float()[None])[0].numpy()
     uv, depth, _ = front.project(points)
-    inner = (depth > 0) & (uv > stride / 2).all(-1) & (uv < np.array(SIZE[::-1]) - 1 - stride / 2).all(-1)
+    inner = (depth > 0) & (uv > STRIDE / 2).all(-1) & (uv < np.array(SIZE[::-1]) - 1 - STRIDE / 2).all(-1)
     assert inner.sum() > 50
     np.testing.assert_allclose(read[inner], uv[inner], atol=2e-3)
     outside = (depth <= 0) | (uv < -0.5).any(-1) | (uv > (SIZE[1] - 0.5, SIZE[0] - 0.5)).any(-1)
