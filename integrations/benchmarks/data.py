@@ -1,9 +1,9 @@
-"""Frames on disk to measure on: a user's, or synthetic streets with known true views."""
+"""Frames on disk to measure on: a user's, or a synthetic street."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from arbiview_aug.cli.arguments import REAL_TARGET
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.registry import data_name
-from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig, demo_target_rig
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.evaluate.frames import without_masks
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
@@ -33,31 +33,28 @@ SOURCES_OVER_VIEWS = 2  # size of synthetic images relative to the views, so tha
 class Recorded:
     name: str  # shown in tables
     root: Path  # the folder, or ``KIND:PATH``
-    truth: Callable[[int, Rig], RenderedViews] | None = None  # renders a frame's true views for a rig
+    synthetic: bool = False
 
     def sample(self, index: int, reduce: Reduce = 1) -> dict[str, Any]:
         """Read a frame with images at 1 / ``reduce``."""
         return open_data(self.root, reduce=reduce)[index]
 
     def target(self, name: str | None, size: tuple[int, int]) -> Rig:
-        """Rig to render, stretched to (h, w), by default the one that other commands take; without scanners, which
-        ``bench speed`` times."""
-        if name is None and self.truth is not None:
-            return replace(demo_target_rig(size), lidars=())
+        """Rig to render, stretched to (h, w), by default the one that other commands take; without scanners."""
+        if name is None and self.synthetic:
+            return demo_target_rig(size)
         return replace(without_masks(load_rig(name or REAL_TARGET)).resized(size, "stretch"), lidars=())
 
 
 @contextmanager
-def recorded(data: str | Path | None, *, frames: int = 1, size: tuple[int, int] = (512, 1408)) -> Iterator[Recorded]:
-    """Open a user's frames, or write synthetic ones of ``size`` (h, w) as JPEGs to a temporary folder."""
+def recorded(data: str | Path | None, *, size: tuple[int, int] = (512, 1408)) -> Iterator[Recorded]:
+    """Open a user's frames, or write a synthetic one of ``size`` (h, w) as JPEGs to a temporary folder."""
     if data is not None:
         yield Recorded(data_name(data), Path(data))
         return
-    drive = SyntheticDrive(demo_source_rig(size), num_frames=frames)
     with tempfile.TemporaryDirectory() as folder:
-        for k in range(frames):
-            write_frame(Path(folder) / f"{k:04}", drive[k])
-        yield Recorded("synthetic streets", Path(folder), drive.render)
+        write_frame(Path(folder) / "0000", SyntheticDrive(demo_source_rig(size), num_frames=1)[0])
+        yield Recorded("synthetic streets", Path(folder), synthetic=True)
 
 
 def lidar_maps(sample: Mapping[str, Any]) -> list[Layer]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, Subset
 from tqdm import tqdm
 
 from arbiview_aug.cameras.rig import Rig
@@ -34,19 +34,6 @@ from integrations.benchmarks.timing import benchmark, machine_line, quartiles, s
 PLAIN = "read only"
 
 
-class Repeated(Dataset[Any]):
-    """A data set repeated to a length."""
-
-    def __init__(self, dataset: Any, length: int) -> None:
-        self.dataset, self.length = dataset, length
-
-    def __len__(self) -> int:
-        return self.length
-
-    def __getitem__(self, index: int) -> Any:
-        return self.dataset[index % len(self.dataset)]
-
-
 def _run(arguments: argparse.Namespace) -> None:
     """Measure, print the table, write the JSON."""
     path = output_file(arguments.output)
@@ -61,7 +48,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
     """Measure the rates of reading alone and of retargeting over each surface."""
     target = data.target(arguments.target, arguments.size)
     opened = open_data(data.root, reduce=arguments.reduce)
-    plain: Dataset[Any] = Repeated(opened, arguments.frames)
+    plain: Dataset[Any] = Subset(opened, [k % len(opened) for k in range(arguments.frames)])
     datasets: dict[str, Dataset[Any]] = {PLAIN: plain}
     rig: Rig = opened[0]["rig"]
     for surface in arguments.geometry:

@@ -1,4 +1,7 @@
-"""Four fisheye cameras to four pinhole cameras: the true view on a synthetic street, straight lines on a real frame."""
+"""Four fisheye cameras to four pinhole cameras: straight lines on a real frame.
+
+``test_map_error`` compares the sampling maps of synthetic lenses with exact projections.
+"""
 
 from __future__ import annotations
 
@@ -7,47 +10,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 import torch
 
-from arbiview_aug.cameras.lens import LensName
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import FrameFolder
-from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import camera
-
-PLACES = ((0.0, (2.0, 0.0, 1.0)), (90.0, (1.0, 0.9, 1.0)), (180.0, (-1.0, 0.0, 1.0)), (-90.0, (1.0, -0.9, 1.0)))
-"""Azimuth and position of a surround-view rig."""
-COEFFICIENTS = (-0.06, -0.002, -0.0004, 0.0)
-
-
-def surround(size: tuple[int, int], fov_deg: float, lens: LensName, distortion: tuple[float, ...], pitch: float) -> Rig:
-    own = {"size": size, "horizontal_fov_deg": fov_deg, "lens": lens, "distortion": distortion, "elevation_deg": pitch}
-    return Rig([camera(f"camera {k}", a, position_m=at, **own) for k, (a, at) in enumerate(PLACES)])
 
 
 def lens_ignored(rig: Rig) -> Rig:
     return rig.with_cameras([replace(c, lens="pinhole", distortion=()) for c in rig])
-
-
-@pytest.mark.slow
-def test_synthetic_fisheyes_give_the_true_pinhole_views() -> None:
-    """Measured on seeds 0-2: 32.9 to 38.9 dB a view, the same at twice the source's size; 16 with the lens ignored."""
-    source, target = surround((240, 320), 180, "fisheye", COEFFICIENTS, -10), surround((96, 160), 90, "pinhole", (), 0)
-    drive = SyntheticDrive(source, num_frames=1, lidar=False)
-    sample, truth = drive[0], drive.render(0, target).images
-
-    def score(sample: dict) -> list[float]:
-        out = RigRetarget(target, geometry="infinity", holes="black")(sample)  # centres coincide: exact
-        assert out["coverage"].float().mean() > 0.99
-        squares = (out["images"].float() - truth).square().mean(1)
-        return [psnr_db(float(s[seen].mean())) for s, seen in zip(squares, out["coverage"], strict=True)]
-
-    assert min(score(sample)) > 32
-    assert max(score({**sample, "rig": lens_ignored(source)})) < 20
 
 
 def cloth_edge(view: np.ndarray) -> np.ndarray:

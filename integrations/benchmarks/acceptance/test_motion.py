@@ -14,11 +14,11 @@ import torch
 
 from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.datasets import FrameFolder, Neighbours
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.sample.inputs import MOTION_KEY
 from arbiview_aug.temporal.motion_depth import MotionDepth
-from integrations.benchmarks.acceptance.protocol import IN_BOTH, frame_folder
+from integrations.benchmarks.acceptance.protocol import IN_BOTH, frame_folder, psnr_of
 from tests.helpers import Standing
 from tests.temporal.test_motion_depth import depth_of
 
@@ -35,8 +35,8 @@ def drive(standing: bool) -> SyntheticDrive:
 
 
 @cache
-def true_views(index: int, move: str) -> torch.Tensor:
-    return drive(True).render(index, MOVES[move]).images.float()
+def true_views(index: int, move: str) -> RenderedViews:
+    return drive(True).render(index, MOVES[move])
 
 
 def sample_of(index: int, standing: bool, labels: bool, turned_deg: float) -> dict[str, Any]:
@@ -71,9 +71,8 @@ def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -
         )
         for surface in ("motion", "street")
     ]
-    both = (outs[0]["coverage"] & outs[1]["coverage"])[:, None]
-    squares = [float((((out["images"].float() - true_views(index, move)) ** 2) * both).sum()) for out in outs]
-    return float(10 * np.log10(squares[1] / squares[0]))
+    (ours,), (street,) = psnr_of(outs, true_views(index, move), [np.bool_(True)])
+    return ours - street
 
 
 @pytest.mark.timeout(1800)
