@@ -9,11 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
+from scipy.ndimage import distance_transform_edt
 
-from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import Reduce
 from arbiview_aug.cli.arguments import REAL_TARGET
@@ -24,7 +22,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, dem
 from arbiview_aug.evaluate.frames import without_masks
 from arbiview_aug.scene.depth_map import motion_camera
 from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.temporal.learned_depth import LEAST_POINTS, measured_pixels
+from arbiview_aug.temporal.learned_depth import measured_pixels
 
 SOURCES_OVER_VIEWS = 2  # size of synthetic images relative to the views, so that decoding at half size pays
 
@@ -59,19 +57,10 @@ def recorded(data: str | Path | None, *, size: tuple[int, int] = (512, 1408)) ->
 
 def lidar_maps(sample: Mapping[str, Any]) -> list[Layer]:
     """Depth maps of the size that the ``depth`` command writes: at every pixel the depth of the nearest LiDAR point."""
-    cameras, points = [motion_camera(camera) for camera in sample["rig"]], sample["points"][:, :3].numpy().astype(float)
-    maps = [_dense_depth(camera, points) for camera in cameras]
-    return [np.zeros(c.size, np.float32) if one is None else one for c, one in zip(cameras, maps, strict=True)]
-
-
-def _dense_depth(camera: Camera, points: FloatArray) -> Layer | None:
-    """A depth map (h, w) with the depth of the nearest measured pixel everywhere; None if there are too few."""
-    pixels, depth_m = measured_pixels(camera, points)
-    if len(depth_m) < LEAST_POINTS:
-        return None
-    unknown, known = np.ones(camera.size, np.uint8), np.zeros(camera.size, np.float32)
-    unknown[pixels], known[pixels] = 0, depth_m
-    _, label = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    by_label = np.zeros(int(label.max()) + 1, np.float32)
-    by_label[label[pixels]] = depth_m
-    return by_label[label]
+    points, maps = sample["points"][:, :3].numpy().astype(float), []
+    for camera in map(motion_camera, sample["rig"]):
+        known, (pixels, depth_m) = np.zeros(camera.size, np.float32), measured_pixels(camera, points)
+        known[pixels] = depth_m
+        nearest = distance_transform_edt(known == 0, return_distances=False, return_indices=True)
+        maps.append(known[tuple(nearest)])
+    return maps

@@ -27,9 +27,7 @@ from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from integrations.benchmarks.data import SOURCES_OVER_VIEWS, Recorded, recorded
-from integrations.benchmarks.memory import memory_mib
-from integrations.benchmarks.study import run_study, study_parser
-from integrations.benchmarks.timing import benchmark, machine_line, quartiles, show
+from integrations.benchmarks.study import benchmark, machine_line, memory_mib, quartiles, run_study, show, study_parser
 
 PLAIN = "read only"
 

@@ -57,13 +57,14 @@ from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.scans import retarget_points
 from arbiview_aug.transforms.warm_up import compile_kernels
 from integrations.benchmarks.data import Recorded, lidar_maps, recorded
-from integrations.benchmarks.study import run_study, study_parser
-from integrations.benchmarks.timing import (
+from integrations.benchmarks.study import (
     benchmark,
     machine_line,
     process_ms,
     quartiles,
+    run_study,
     show,
+    study_parser,
     timed_rounds,
 )
 

@@ -1,12 +1,38 @@
-"""Command lines of the studies."""
+"""Command lines, times, memory and reports of the studies.
+
+The clock is the process's CPU time over all of its threads, which leaves out waiting on a busy machine. Each round runs
+every candidate in turn, once unmeasured to warm its caches and once measured, so that other load slows all alike.
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+import ctypes
+import gc
+import json
+import math
+import os
+import platform
+import re
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import wraps
+from pathlib import Path
+from typing import Any, NamedTuple, ParamSpec
+
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
 
 from arbiview_aug.cli.arguments import command_parser
-from arbiview_aug.errors import exit_status
+from arbiview_aug.environment import one_thread, versions
+from arbiview_aug.errors import DataError, exit_status
+
+Clock = Callable[[Callable[[], Any]], float]  # milliseconds of a call
+P = ParamSpec("P")
+_LEAST_ROUNDS = 3  # a median of fewer is a single time
 
 
 def study_parser(name: str, description: str, example: str) -> argparse.ArgumentParser:
@@ -22,3 +48,110 @@ def run_study(
     """Parse the arguments and run a study; its exit status is that of ``errors.exit_status``."""
     arguments = parser.parse_args(argv)
     return exit_status(parser.prog, lambda: run(arguments))
+
+
+class Quartiles(NamedTuple):
+    """Median and quartiles of times, in milliseconds."""
+
+    median_ms: float
+    q1_ms: float
+    q3_ms: float
+
+
+def quartiles(times_ms: npt.NDArray[np.float64]) -> Quartiles:
+    return Quartiles(*np.quantile(times_ms, [0.5, 0.25, 0.75]).tolist())
+
+
+def process_ms(run: Callable[[], Any]) -> float:
+    """CPU milliseconds of the process during a call."""
+    start = time.process_time()
+    run()
+    return 1e3 * (time.process_time() - start)
+
+
+def timed_rounds(
+    candidates: Mapping[str, Callable[[], Any]],
+    rounds: int,
+    label: str,
+    *,
+    enough_ms: float = math.inf,
+    clock: Clock = process_ms,
+) -> dict[str, npt.NDArray[np.float64]]:
+    """Time each candidate in every round: (n,) milliseconds by name.
+
+    A candidate whose times sum to ``enough_ms`` skips further rounds, once it has run in ``_LEAST_ROUNDS``.
+    """
+    times: dict[str, list[float]] = {name: [] for name in candidates}
+    for _ in tqdm(range(rounds), desc=label, unit="round", leave=False):
+        for name, run in candidates.items():
+            if len(times[name]) < _LEAST_ROUNDS or sum(times[name]) < enough_ms:
+                run()
+                times[name].append(clock(run))
+    return {name: np.array(taken) for name, taken in times.items()}
+
+
+def benchmark(measure: Callable[P, dict[str, Any]]) -> Callable[P, dict[str, Any]]:
+    """Run a benchmark on one thread, without warnings, and add the machine and the versions to its figures."""
+
+    @wraps(measure)
+    def measured(*args: P.args, **kwargs: P.kwargs) -> dict[str, Any]:
+        load_before = os.getloadavg()
+        with one_thread(), warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # static surfaces and unseen pixels are part of the measurement
+            figures = measure(*args, **kwargs)
+        machine: dict[str, Any] = {"cpu": _cpu_model(), "cores": os.cpu_count(), "threads": 1}
+        machine |= {"load_before": load_before, "load_after": os.getloadavg()}
+        name = measure.__module__.rpartition(".")[2]
+        return {"benchmark": name, **figures, "machine": machine, "versions": versions()}
+
+    return measured
+
+
+def _cpu_model() -> str:
+    """Processor as the kernel names it; without /proc, at least the architecture."""
+    with suppress(OSError):
+        if match := re.search(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE):
+            return match[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def machine_line(report: Mapping[str, Any]) -> str:
+    """Machine and versions of a ``benchmark``'s report as one line of text."""
+    facts = report["machine"]
+    load = f"load {facts['load_before'][0]:.1f} to {facts['load_after'][0]:.1f}"
+    named = ", ".join(f"{name} {version}" for name, version in report["versions"].items())
+    return f"{facts['cpu']}, one thread of {facts['cores']} cores, {load}; {named}"
+
+
+def show(table: str, report: Mapping[str, Any], path: Path) -> None:
+    """Print a report's table, and write its JSON; DataError if it cannot be written."""
+    print(table)  # first, so that an unwritable file does not lose the figures
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(report, indent=1) + "\n")
+    except OSError as error:
+        raise DataError(f"--output {path}: expected a file that can be written to, got {error.strerror}") from None
+    print(f"report: {path}")
+
+
+def peak_mib(run: Callable[[], Any]) -> float | None:
+    """Peak growth of the process's memory during a call, in MiB; None except on Linux."""
+    gc.collect()
+    with suppress(OSError, AttributeError):  # memory cached by the C library would hide the growth
+        ctypes.CDLL(None).malloc_trim(0)
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+        before = memory_mib("status", "VmRSS")
+        run()
+        return memory_mib("status", "VmHWM") - before
+    except OSError:
+        run()
+        return None
+
+
+def memory_mib(file: str, fields: str, pid: int | str = "self") -> float:
+    """Sum the fields (a pattern) of a process's memory file below /proc; OSError except on Linux."""
+    sizes = re.findall(rf"^{fields}:\s+(\d+) kB", Path(f"/proc/{pid}/{file}").read_text(), re.MULTILINE)
+    if not sizes:
+        raise OSError(f"no {fields}")
+    return sum(map(int, sizes)) / 1024

@@ -16,7 +16,7 @@ from arbiview_aug import RetargetedDataset, RigRetarget, load_rig
 from arbiview_aug.datasets.synthetic import demo_target_rig
 from integrations.benchmarks import loader
 from integrations.benchmarks.loader import PLAIN
-from integrations.benchmarks.memory import memory_mib
+from integrations.benchmarks.study import memory_mib
 from tests.helpers import street_sample
 
 SOAKED, WARM_UP = 2000, 200  # frames

@@ -8,11 +8,12 @@ continues.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator
+from dataclasses import asdict, replace
 from functools import lru_cache
 from itertools import product
 from pathlib import Path
@@ -29,7 +30,7 @@ from arbiview_aug.scene.boxes import points_by_box
 from arbiview_aug.scene.point_cloud import own_car
 from integrations.benchmarks.lidar import rings_dropped
 from integrations.benchmarks.lidar import scanner as benchmark_scanner
-from integrations.cross_rig.frames import OF_TESTS, Split, code_hash, content_hash, one_thread, street_seed
+from integrations.cross_rig.frames import OF_TESTS, SPLITS, Split, code_hash, content_hash, one_thread, street_seed
 from integrations.cross_rig.labels import Grid, box_cells, vehicle_boxes
 from integrations.cross_rig.pillars import PointSet
 from integrations.cross_rig.real import LEAST_POINTS
@@ -46,6 +47,7 @@ TITLES: dict[Kind, str] = {
     "oracle": "B's own points",
 }
 
+SEEDS = (0, 1, 2)
 _STREETS = 200
 _MOST_FRAMES = 1 << 20
 
@@ -62,23 +64,6 @@ CHANGES: dict[str, tuple[Lidar, Lidar]] = {
     "up70": (scanner(32, 1.8), scanner(32, 2.5)),
 }
 """A's and B's scanner by the name of the change."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """A run: numbers of frames, seeds of the trainings, changes, steps."""
-
-    train_frames: int = 150
-    val_frames: int = 50
-    test_frames: int = 150
-    seeds: Sequence[int] = (0, 1, 2)
-    changes: Sequence[str] = tuple(CHANGES)
-    steps: int = 300
-
-    @property
-    def schedule(self) -> Schedule:
-        """The same for every variant."""
-        return Schedule(steps=self.steps, family="pillars", precision="fp32")
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
@@ -132,17 +117,19 @@ def trained(scans: tuple[Lidar, Lidar, Kind], frames: int, schedule: Schedule, s
     return train(Draws(point_set(*scans, "train", frames), None, frames, seed), schedule, seed)
 
 
-def result(settings: Settings, change: str, kind: Kind, seed: int, output: Path) -> dict[str, Any]:
+def result(arguments: argparse.Namespace, change: str, kind: Kind, seed: int) -> dict[str, Any]:
     """A training's counts on B's test streets, made unless they are there."""
-    key = content_hash([code_hash(), asdict(replace(settings, seeds=(), changes=()))])
-    path = output / f"{change}-{kind}-{seed}-{key}.json"
+    frames = {split: getattr(arguments, f"{split}_frames") for split in SPLITS}
+    schedule = Schedule(steps=arguments.steps, family="pillars", precision="fp32")
+    key = content_hash([code_hash(), frames, asdict(schedule)])
+    path = arguments.output / f"{change}-{kind}-{seed}-{key}.json"
     if not path.is_file():
         start = time.process_time()
         (_, b), scans = CHANGES[change], scans_of(change, kind)
-        model, losses = trained(scans, settings.train_frames, settings.schedule, seed)
+        model, losses = trained(scans, frames["train"], schedule, seed)
         tested_on: tuple[Lidar, Lidar, Kind] = (b, scans[0], "dropped") if kind == "below" else (b, b, "raw")
-        val, test = (point_set(*tested_on, split, getattr(settings, f"{split}_frames")) for split in OF_TESTS)
-        tested = evaluate(model, val, test, settings.schedule)
+        val, test = (point_set(*tested_on, split, frames[split]) for split in OF_TESTS)
+        tested = evaluate(model, val, test, schedule)
         write_whole({path: json.dumps(tested | {"losses": losses}).encode()})
         print(f"{path.stem}: {time.process_time() - start:.0f} CPU s", file=sys.stderr, flush=True)
     counts: dict[str, Any] = json.loads(path.read_text())
@@ -171,22 +158,17 @@ def _rows(change: str, results: dict[Kind, list[dict[str, Any]]]) -> Iterator[li
 def main(argv: list[str] | None = None) -> int:
     """Train and test what is missing, and print the table."""
     parser = command_parser("", __doc__, "--changes fewer --seeds 0", program="python -m integrations.cross_rig.scans")
-    defaults = Settings()
-    parser.add_argument("--changes", nargs="+", choices=CHANGES, default=defaults.changes, help="of the scanner")
-    parser.add_argument("--seeds", nargs="+", type=int, default=defaults.seeds, metavar="SEED", help="trainings")
-    for name in ("train_frames", "val_frames", "test_frames", "steps"):
-        option = f"--{name.replace('_', '-')}"
-        parser.add_argument(option, type=count, default=getattr(defaults, name), metavar="N", help=name)
+    parser.add_argument("--changes", nargs="+", choices=CHANGES, default=tuple(CHANGES), help="of the scanner")
+    parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, metavar="SEED", help="trainings")
+    for name, number in (("train-frames", 150), ("val-frames", 50), ("test-frames", 150), ("steps", 300)):
+        parser.add_argument(f"--{name}", type=count, default=number, metavar="N", help="number (default: %(default)s)")
     parser.add_argument("--output", type=Path, default=Path("output/cross_rig_scans"), metavar="DIR", help="results")
-    arguments: dict[str, Any] = vars(parser.parse_args(argv))
-    output = arguments.pop("output")
-    settings = Settings(**arguments)
+    arguments = parser.parse_args(argv)
     one_thread()
     done: dict[str, dict[Kind, list[dict[str, Any]]]] = {}
-    for change in settings.changes:
-        for kind, seed in product(kinds(change), settings.seeds):
-            counts = result(settings, change, kind, seed, output)
-            done.setdefault(change, {}).setdefault(kind, []).append(counts)
+    for change in arguments.changes:
+        for kind, seed in product(kinds(change), arguments.seeds):
+            done.setdefault(change, {}).setdefault(kind, []).append(result(arguments, change, kind, seed))
     print(table(done))
     return 0
 

@@ -24,7 +24,7 @@ from arbiview_aug.inpaint import Black, CompletedLoader, PipelineInpainter, Torc
 from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.inputs import read_frames
-from integrations.benchmarks.memory import peak_mib
+from integrations.benchmarks.study import peak_mib
 from tests.helpers import ring
 from tests.inpaint.tiny_pipeline import save_tiny_pipeline
 

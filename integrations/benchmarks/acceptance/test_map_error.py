@@ -62,7 +62,7 @@ def errors_px(plan: RenderPlan, surface: str, scene: Scene, at_most: int) -> Flo
     return np.concatenate(off)
 
 
-def rig_pairs(scale: float, views: slice = slice(None)) -> Iterator[tuple[str, Rig, Rig]]:
+def rig_pairs(scale: float, views: slice) -> Iterator[tuple[str, Rig, Rig]]:
     """All shipped rigs into all, a rig itself turned and lifted; some of the target's views."""
     rigs = {name: load_rig(name).resized(scale) for name in shipped_rigs()}
     for one, source in rigs.items():
@@ -72,8 +72,23 @@ def rig_pairs(scale: float, views: slice = slice(None)) -> Iterator[tuple[str, R
             yield f"{one} to {two}", source, target.with_cameras(target.cameras[views])
 
 
-def sweep(scale: float, surfaces: tuple[str, ...], at_most: int, views: slice = slice(None)) -> None:
-    """Print and hold the worst error."""
+GEOMETRIES = ("street", "ground", "infinity", "boxes")
+
+
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(
+    ("scale", "surfaces", "at_most", "views"),
+    [
+        # The street's join of road and wall is as narrow as the coarse grid there.
+        pytest.param(0.12, ("street",), 10**6, slice(None, None, 3), marks=pytest.mark.slow),
+        pytest.param(0.12, GEOMETRIES[1:], 3000, slice(None, None, 4), marks=pytest.mark.slow),
+        pytest.param(0.08, GEOMETRIES, 20_000, slice(0, None, 2), marks=pytest.mark.release),
+        pytest.param(0.12, GEOMETRIES, 20_000, slice(None), marks=pytest.mark.release),
+        pytest.param(0.3, GEOMETRIES, 10_000, slice(0, None, 3), marks=pytest.mark.release),
+        pytest.param(1.0, GEOMETRIES, 20_000, slice(1), marks=pytest.mark.release),
+    ],
+)
+def test_worst_error(scale: float, surfaces: tuple[str, ...], at_most: int, views: slice) -> None:
     for surface in surfaces:
         scene = Scene(boxes=BOXES) if surface == "boxes" else Scene()
         worst, where, count = 0.0, "", 0
@@ -85,31 +100,6 @@ def sweep(scale: float, surfaces: tuple[str, ...], at_most: int, views: slice = 
                 worst, where = float(off.max()), pair
         print(f"{surface} at {scale:.0%}: worst of {count} pixels {worst:.4f} px, {where}")
         assert worst <= TOLERANCE_PX, f"{surface} at {scale:.0%}, {where}: {worst:.4f} px"
-
-
-GEOMETRIES = ("street", "ground", "infinity", "boxes")
-
-
-@pytest.mark.slow
-def test_small_images() -> None:
-    """12 % of the recorded sizes: the street's join of road and wall is as narrow as the coarse grid there."""
-    sweep(0.12, ("street",), at_most=10**6, views=slice(None, None, 3))
-    sweep(0.12, GEOMETRIES[1:], at_most=3000, views=slice(None, None, 4))
-
-
-@pytest.mark.release
-@pytest.mark.timeout(1800)
-@pytest.mark.parametrize(
-    ("scale", "at_most", "views"),
-    [
-        (0.08, 20_000, slice(0, None, 2)),
-        (0.12, 20_000, slice(None)),
-        (0.3, 10_000, slice(0, None, 3)),
-        (1.0, 20_000, slice(1)),
-    ],
-)
-def test_all_sizes(scale: float, at_most: int, views: slice) -> None:
-    sweep(scale, GEOMETRIES, at_most, views)
 
 
 def test_placeholders_of_rays_that_are_none_reach_no_pixel() -> None:

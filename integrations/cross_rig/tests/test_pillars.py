@@ -40,7 +40,7 @@ def test_sets_that_are_the_same_have_one_name():
     assert scans_of("sixteen", "below") == scans_of("sixteen", "retargeted")
     assert [change for change in CHANGES if "below" in kinds(change)] == ["sixteen"]
     trainings = {scans_of(change, kind) for change in CHANGES for kind in kinds(change)}
-    assert scans.trained.cache_parameters()["maxsize"] >= len(trainings) * len(scans.Settings().seeds)
+    assert scans.trained.cache_parameters()["maxsize"] >= len(trainings) * len(scans.SEEDS)
 
 
 def test_vehicles_count_by_their_points():

@@ -31,6 +31,8 @@ from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
 from integrations.mmdet3d.fake_results import EGO2GLOBAL, FORMS, LIDAR2EGO, Boxes, Recording, recording, source_rig
 from integrations.mmdet3d.measure import worst_error_px
 
+pytestmark = pytest.mark.filterwarnings("ignore:retarget. drops")
+
 README = (Path(__file__).parents[1] / "README.md").read_text()
 SIZE = (48, 136)
 SOURCE = source_rig((64, 176))
@@ -70,7 +72,6 @@ def psnr(one: np.ndarray, two: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(np.mean((one - two) ** 2), 1e-9)))
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form(given: Recording, form: str) -> None:
     """Cameras where they were when they exposed, not their mounting alone, with which one is up to 0.36 m off; points
@@ -104,7 +105,6 @@ def test_every_form(given: Recording, form: str) -> None:
     assert after["coverage"].shape == (5, *SIZE) and level > (27 if form == "BEVDet" else 45)
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 @pytest.mark.parametrize("form", LIDAR_FORMS)
 def test_the_own_rig_gives_everything_back(given: Recording, form: str) -> None:
     results = FORMS[form](given)
@@ -117,7 +117,6 @@ def test_the_own_rig_gives_everything_back(given: Recording, form: str) -> None:
             assert np.asarray(after[key]).dtype == np.asarray(results[key]).dtype
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_every_key_of_mmdet3d(given: Recording) -> None:
     results = FORMS["mmdet3d"](given)
     results["lidar2img"], single = list(results["lidar2img"]), results["lidar2img"][0]
@@ -137,7 +136,6 @@ def test_every_key_of_mmdet3d(given: Recording) -> None:
     assert set(step()(nested)) == {*nested, "coverage", "generated"}
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_shapes_and_types_of_the_others(given: Recording) -> None:
     mit, petr = step()(FORMS["mit-han-lab BEVFusion"](given)), step()(FORMS["PETR"](given))
     assert mit["img"][0].size == mit["ori_shape"] == SIZE[::-1] and mit["image_paths"] == TARGET.names
@@ -178,7 +176,6 @@ def test_bevdet_takes_augmented_images_and_gives_untouched_ones(given: Recording
     assert np.allclose(np.linalg.norm(front["sensor2ego_rotation"]), 1) and front["data_path"] == "CAM_FRONT"
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_skipped_frames_keep_their_cameras(given: Recording) -> None:
     target = SOURCE.turned(yaw_deg=10)
     skipping = step(target, p=0.01, size=SIZE, keys=SampleKeys(extra=("confidence",)))
@@ -191,7 +188,6 @@ def test_skipped_frames_keep_their_cameras(given: Recording) -> None:
     assert worst_error_px(after, SOURCE.resized(SIZE, "crop")) <= 1e-3
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_entries_that_are_empty(given: Recording) -> None:
     """Datasets leave them so."""
     full = {"img_timestamp": [1.5] * 6, "image_wh": None, "focal": None, "img_shape": [], "timestamp": None}
@@ -262,7 +258,6 @@ MALFORMED: list[tuple[str, Any, str]] = [
 
 
 @pytest.mark.parametrize(("form", "entries", "message"), MALFORMED)
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_malformed_entries_are_named(given: Recording, form: str, entries: Any, message: str) -> None:
     results = FORMS[form](given)
     entries = {"img_inputs": entries(results["img_inputs"])} if callable(entries) else entries
@@ -270,7 +265,6 @@ def test_malformed_entries_are_named(given: Recording, form: str, entries: Any, 
         step()(results | entries)
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_messages(given: Recording) -> None:
     results, bevdet = FORMS["DETR3D"](given), FORMS["BEVDet"](given)
     mixed = Rig([TARGET[0], *(camera.resize((40, 60)) for camera in TARGET.cameras[1:])])

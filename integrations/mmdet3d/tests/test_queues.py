@@ -23,6 +23,8 @@ from integrations.mmdet3d.fake_results import (
 )
 from integrations.mmdet3d.measure import frames_of, lidar2img_of, worst_error_px
 
+pytestmark = pytest.mark.filterwarnings("ignore:retarget. drops")
+
 SIZE = (48, 136)
 SOURCE = source_rig((60, 176))  # BEVFormer pads them to (64, 192)
 TARGET = load_rig("waymo").undistorted().resized(SIZE)
@@ -43,7 +45,6 @@ def grey(images: torch.Tensor) -> np.ndarray:
     return np.moveaxis(images.numpy(), -3, -1) * std + mean
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 @pytest.mark.parametrize("form", QUEUES)
 def test_projections_of_three_frames_are_the_new_rigs(drive: list[Recording], form: str) -> None:
     step = RigRetargetMultiView(TARGET, lidar2ego=LIDAR2EGO, geometry="street")
@@ -58,7 +59,6 @@ def test_projections_of_three_frames_are_the_new_rigs(drive: list[Recording], fo
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 @pytest.mark.parametrize("form", QUEUES)
 def test_one_draw_for_all_frames(drive: list[Recording], form: str) -> None:
     """One draw of the rig, and of whether to retarget at all."""
@@ -87,7 +87,6 @@ def test_one_draw_for_all_frames(drive: list[Recording], form: str) -> None:
     raise AssertionError("p=0.5 drew the same eight times")
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_bevdet4d(drive: list[Recording]) -> None:
     """As each frame by itself, in BEVDet4D's order; what its model makes of the poses leads to the target's cameras."""
     step = RigRetargetMultiView(TARGET, geometry="boxes")
@@ -109,7 +108,6 @@ def test_bevdet4d(drive: list[Recording]) -> None:
         step({**QUEUES["BEVDet4D"](drive), "img_inputs": after["img_inputs"]})
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 @pytest.mark.parametrize("form", ["StreamPETR", "BEVFormer"])
 def test_queues_are_their_frames(drive: list[Recording], form: str) -> None:
     """Pixels of each frame are those of the frame by itself; poses of the vehicle stay; rims are no pixels."""
@@ -134,7 +132,6 @@ def test_queues_are_their_frames(drive: list[Recording], form: str) -> None:
         assert torch.equal(after["img_timestamp"], given["timestamp"][:, None].expand(-1, 5))
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_containers_and_nested_lists_stay(drive: list[Recording]) -> None:
     """mmcv's ``DataContainer``; and queues that are loaded and no more: lists of lists, or one (T, N, h, w, 3)."""
 
@@ -156,7 +153,6 @@ def test_containers_and_nested_lists_stay(drive: list[Recording]) -> None:
     assert np.array_equal(np.stack([np.stack(images) for images in listed["img"]]), stacked["img"])
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_sparse4d_after_its_adaptor(drive: list[Recording]) -> None:
     step = RigRetargetMultiView(TARGET, geometry="street")
     given = QUEUES["Sparse4D"](drive)[1]
@@ -169,7 +165,6 @@ def test_sparse4d_after_its_adaptor(drive: list[Recording]) -> None:
     assert np.abs(grey(after["img"]) - np.stack(loaded["img"])).max() <= 116  # two deviations
 
 
-@pytest.mark.filterwarnings("ignore:retarget. drops")
 def test_frames_of_a_drive_share_a_draw(drive: list[Recording]) -> None:
     """Each frame passes the pipeline by itself, as BEVFormer's and StreamPETR's datasets do."""
     target = RandomRig(SOURCE.resized(SIZE), yaw_deg=10, per="sequence")
