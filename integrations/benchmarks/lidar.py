@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -30,7 +29,7 @@ from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.evaluate.scans import chamfer_m, polar, scan_metrics
 from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.scene.point_cloud import own_car
-from integrations.benchmarks.study import run_study, study_parser
+from integrations.benchmarks.study import run_study, stored, study_parser
 
 COLUMNS = ("recall", "precision", "range_error_m", "chamfer_m", "recall of all")
 HEIGHT_M, UP_M = 1.9, 0.7
@@ -63,12 +62,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    folder: Path | None = arguments.data
-    if folder is None and "ARBIVIEW_DATA" in os.environ:
-        folder = Path(os.environ["ARBIVIEW_DATA"])
-    elif folder is not None and not (folder / "ddad-next").is_dir():
-        raise DataError(f"--data {folder}: expected a folder with ddad-one and ddad-next, found no ddad-next")
-    found = (*synthetic(arguments.frames, arguments.seed), *ddad(folder))
+    following = stored("ddad-next") if arguments.data is None else arguments.data / "ddad-next"
+    if arguments.data is not None and not following.is_dir():
+        raise DataError(f"--data {arguments.data}: expected a folder with ddad-one and ddad-next, found no ddad-next")
+    found = (*synthetic(arguments.frames, arguments.seed), *(ddad(following.parent) if following else ()))
     rows = [[scene, name, *(f"{of[key]:.3f}" if key in of else "" for key in COLUMNS)] for scene, name, of in found]
     print(markdown_table(("scene", "points", *COLUMNS), rows, left=2))
 
@@ -123,7 +120,7 @@ def measured_near(a: Lidar, b: Lidar, points: FloatArray) -> BoolArray:
     return np.asarray(near[rows[:, None], np.rint(columns_deg / _GRID_DEG).astype(int) % turn] > 0)
 
 
-def ddad(data: Path | None) -> Iterator[tuple[str, str, dict[str, float]]]:
+def ddad(data: Path) -> Iterator[tuple[str, str, dict[str, float]]]:
     """DDAD's scan seen from the next frame's place, against the next frame's own scan.
 
     Its four solid-state sensors have no beam table, so a dense scanner on the roof stands for them: the return nearest
@@ -131,8 +128,6 @@ def ddad(data: Path | None) -> Iterator[tuple[str, str, dict[str, float]]]:
     all clouds have. Static is a true point with one of A's within 2 m: the scans are a second apart. Every other degree
     of the next scan is the truth; the other half may serve as a neighbouring scan.
     """
-    if data is None or not (data / "ddad-next").is_dir():
-        return
     from sklearn.neighbors import KDTree
 
     one, two = FrameFolder(data / "ddad-one")[0], FrameFolder(data / "ddad-next")[0]

@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -17,35 +18,49 @@ import numpy as np
 from torch.utils.data import DataLoader, Dataset, Subset
 from tqdm import tqdm
 
-from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
-from arbiview_aug.cli.arguments import add_options, count, output_file, seed, size
+from arbiview_aug.cli.arguments import REAL_TARGET, add_options, count, output_file, seed, size
 from arbiview_aug.cli.parsers import SIZE
 from arbiview_aug.datasets import RetargetedDataset, open_data
+from arbiview_aug.datasets.synthetic import demo_target_rig
 from arbiview_aug.environment import one_thread
+from arbiview_aug.evaluate.frames import without_masks
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from integrations.benchmarks.data import SOURCES_OVER_VIEWS, Recorded, recorded
-from integrations.benchmarks.study import benchmark, machine_line, memory_mib, quartiles, run_study, show, study_parser
+from integrations.benchmarks.study import (
+    benchmark,
+    machine_line,
+    memory_mib,
+    quartiles,
+    recorded,
+    run_study,
+    show,
+    study_parser,
+)
 
 PLAIN = "read only"
+SOURCES_OVER_VIEWS = 2  # size of synthetic images relative to the views, so that decoding at half size pays
 
 
 def _run(arguments: argparse.Namespace) -> None:
     """Measure, print the table, write the JSON."""
     path = output_file(arguments.output)
     h, w = (SOURCES_OVER_VIEWS * side for side in arguments.size)
-    with recorded(arguments.data, size=(h, w)) as data:
-        report = measure(data, arguments)
+    with recorded(arguments.data, (h, w)) as data:
+        report = measure(*data, arguments)
     show(table(report), report, path)
 
 
 @benchmark
-def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
+def measure(name: str, data: Path, arguments: argparse.Namespace) -> dict[str, Any]:
     """Measure the rates of reading alone and of retargeting over each surface."""
-    target = data.target(arguments.target, arguments.size)
-    opened = open_data(data.root, reduce=arguments.reduce)
+    target = demo_target_rig(arguments.size)
+    if arguments.target is not None or arguments.data is not None:
+        shipped = without_masks(load_rig(arguments.target or REAL_TARGET))
+        target = replace(shipped.resized(arguments.size, "stretch"), lidars=())
+    opened = open_data(data, reduce=arguments.reduce)
     plain: Dataset[Any] = Subset(opened, [k % len(opened) for k in range(arguments.frames)])
     datasets: dict[str, Dataset[Any]] = {PLAIN: plain}
     rig: Rig = opened[0]["rig"]
@@ -56,7 +71,7 @@ def measure(data: Recorded, arguments: argparse.Namespace) -> dict[str, Any]:
         datasets[f"retargeted, {surface}"] = RetargetedDataset(plain, retarget)
     return {
         "clock": "on the wall",
-        "data": data.name,
+        "data": name,
         "sources": [list(of_camera) for of_camera in rig.sizes],
         "target": target.name or "target",
         "size": list(target.sizes[0]),

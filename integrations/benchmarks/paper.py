@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,7 +40,7 @@ from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.favs.config import PaperConfig
 from integrations.benchmarks.baselines import BASELINES, method_of
-from integrations.benchmarks.study import run_study, study_parser
+from integrations.benchmarks.study import run_study, stored, study_parser
 
 OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")  # presets other than the published method
 
@@ -132,12 +131,10 @@ def measure_paper(
 def _data_sets(
     data: str | Path | None, frames: int | None, size: tuple[int, int] | None
 ) -> Iterator[tuple[str, Iterator[ScoredFrame]]]:
-    root = os.environ.get("ARBIVIEW_DATA")
-    folders = [Path(data)] if data is not None else [Path(root) / name for name in REAL_FRAMES] if root else []
+    folders = [folder for name in REAL_FRAMES if (folder := stored(name))] if data is None else [Path(data)]
     for folder in folders:
-        if data is not None or folder.is_dir():
-            samples = open_data(folder, reduce=REDUCE)
-            yield data_name(folder), (make_frame(_bare(samples[k])) for k in range(min(frames or 1, len(samples))))
+        samples = open_data(folder, reduce=REDUCE)
+        yield data_name(folder), (make_frame(_bare(samples[k])) for k in range(min(frames or 1, len(samples))))
     if data is None:
         rig, count = demo_source_rig(size or SYNTHETIC_SIZE), frames or SYNTHETIC_FRAMES
         drive = SyntheticDrive(rig, num_frames=count, seed=SYNTHETIC_SEED)

@@ -21,7 +21,6 @@ where ``ARBIVIEW_DATA`` holds that, else this frame with 95. *Points by rays*: `
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -34,6 +33,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 
 from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
@@ -42,7 +42,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Reduce
 from arbiview_aug.cli.arguments import add_options, count, output_file, size
 from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
-from arbiview_aug.datasets import FrameFolder, Neighbours
+from arbiview_aug.datasets import FrameFolder, Neighbours, open_data
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.errors import DataError, WarnOnce
 from arbiview_aug.evaluate.frames import without_masks
@@ -52,18 +52,22 @@ from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.torch_backend import maps_on, render_torch
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, read_frames
+from arbiview_aug.scene.depth_map import motion_camera
+from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.temporal.learned_depth import measured_pixels
 from arbiview_aug.temporal.motion_depth import estimate_motion
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.scans import retarget_points
 from arbiview_aug.transforms.warm_up import compile_kernels
-from integrations.benchmarks.data import Recorded, lidar_maps, recorded
 from integrations.benchmarks.study import (
     benchmark,
     machine_line,
     process_ms,
     quartiles,
+    recorded,
     run_study,
     show,
+    stored,
     study_parser,
     timed_rounds,
 )
@@ -84,6 +88,7 @@ BOUNDS: Mapping[tuple[int, int], Mapping[str, float]] = {
 }
 """Largest ratios of calls by the size of the views, from nuScenes' images."""
 
+DEFAULT = "nuscenes-one"
 _FLOOR = "bare cv2.remap"
 _PLAIN: dict[str, Any] = {"holes": "black", "match_exposure": False}
 _DEFAULT: dict[str, Any] = {"holes": "continue", "match_exposure": True}
@@ -102,8 +107,8 @@ def _run(arguments: argparse.Namespace) -> None:
     """Measure, print the table, write the JSON."""
     path = output_file(arguments.output)
     device = None if arguments.device is None else device_named(arguments.device)
-    with recorded(arguments.data or default_data(), size=FULL_SIZE) as data:
-        report = measure(data, arguments.repeats, arguments.size, arguments.only, device)
+    with recorded(arguments.data or stored(DEFAULT), FULL_SIZE) as data:
+        report = measure(*data, arguments.repeats, arguments.size, arguments.only, device)
     show(table(report), report, path)
 
 
@@ -118,16 +123,10 @@ def device_named(name: str) -> torch.device:
     return device
 
 
-def default_data() -> Path | None:
-    """nuScenes keyframe below ``ARBIVIEW_DATA``, if there."""
-    root = os.environ.get("ARBIVIEW_DATA")
-    folder = Path(root) / "nuscenes-one" if root else None
-    return folder if folder is not None and folder.is_dir() else None
-
-
 @benchmark
 def measure(
-    data: Recorded,
+    name: str,
+    data: Path,
     repeats: int,
     sizes: Sequence[tuple[int, int]],
     only: str = "",
@@ -146,17 +145,17 @@ def measure(
         targets = _calls_of(full, half, (h, w)) if device is None else _batches(full, (h, w), device)
         for target, calls in targets:
             floor, *others = calls
-            chosen = {name: calls[name] for name in (floor, *(name for name in others if only in name))}
+            chosen = {call: calls[call] for call in (floor, *(call for call in others if only in call))}
             if len(chosen) == 1:
                 continue
             times = timed_rounds(chosen, repeats, f"{h}x{w} {target}", enough_ms=_ENOUGH_MS, clock=clock_of(device))
-            for name, taken in times.items():
+            for call, taken in times.items():
                 ratio = statistics.median(a / b for a, b in zip(taken, times[floor], strict=False))
-                row = {"size": [h, w], "target": target, "name": name, **quartiles(taken)._asdict(), "ratio": ratio}
-                rows.append(row | {"bound": BOUNDS.get((h, w), {}).get(name)})
+                row = {"size": [h, w], "target": target, "name": call, **quartiles(taken)._asdict(), "ratio": ratio}
+                rows.append(row | {"bound": BOUNDS.get((h, w), {}).get(call)})
     if not rows:
         raise DataError(f"--only {only}: expected part of a call's name, such as boxes or neighbour")
-    return {"data": data.name, "rounds": repeats, "ready_s": ready_s, "measures": rows}
+    return {"data": name, "rounds": repeats, "ready_s": ready_s, "measures": rows}
 
 
 def clock_of(device: torch.device | None) -> Callable[[Callable[[], Any]], float]:
@@ -200,8 +199,8 @@ def _calls_of(full: Sample, half: Sample, size: tuple[int, int]) -> Iterator[tup
 
 def _moment() -> Sample | None:
     """A frame of PandaSet below ``ARBIVIEW_DATA``, read at half size, if there."""
-    folder = Path(os.environ.get("ARBIVIEW_DATA", "")) / "pandaset"
-    return FrameFolder(folder, reduce=2)[3] if folder.is_dir() else None
+    folder = stored("pandaset")
+    return folder and FrameFolder(folder, reduce=2)[3]
 
 
 def remap_floor(images: Iterable[torch.Tensor], size: tuple[int, int]) -> Callable[[], None]:
@@ -360,13 +359,24 @@ def boxes_around(number: int) -> torch.Tensor:
     return torch.from_numpy(np.stack([x, y, lwh[2] / 2, *lwh, yaw], 1).astype(np.float32))
 
 
-def _sample(data: Recorded, reduce: Reduce) -> dict[str, Any]:
+def _sample(data: Path, reduce: Reduce) -> dict[str, Any]:
     """Images (N, 3, h, w) of the first frame, its rig without masks, its points, and depth maps made of them."""
-    sample = data.sample(0, reduce)
+    sample = open_data(data, reduce=reduce)[0]
     if not isinstance(sample["images"], torch.Tensor) or "points" not in sample:
-        raise DataError(f"--data {data.root}: expected images of one size, and LiDAR points")
+        raise DataError(f"--data {data}: expected images of one size, and LiDAR points")
     kept = {"images": sample["images"], "rig": without_masks(sample["rig"]), "points": sample["points"]}
     return kept | dict.fromkeys((MOTION_KEY, LEARNED_KEY), torch.from_numpy(np.stack(lidar_maps(kept))))
+
+
+def lidar_maps(sample: Mapping[str, Any]) -> list[Layer]:
+    """Depth maps of the size that the ``depth`` command writes: at every pixel the depth of the nearest LiDAR point."""
+    points, maps = sample["points"][:, :3].numpy().astype(float), []
+    for camera in map(motion_camera, sample["rig"]):
+        known, (pixels, depth_m) = np.zeros(camera.size, np.float32), measured_pixels(camera, points)
+        known[pixels] = depth_m
+        nearest = distance_transform_edt(known == 0, return_distances=False, return_indices=True)
+        maps.append(known[tuple(nearest)])
+    return maps
 
 
 def parser() -> argparse.ArgumentParser:

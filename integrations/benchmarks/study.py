@@ -1,4 +1,4 @@
-"""Command lines, times, memory and reports of the studies.
+"""Command lines, data, times, memory and reports of the studies.
 
 The clock is the process's CPU time over all of its threads, which leaves out waiting on a busy machine. Each round runs
 every candidate in turn, once unmeasured to warm its caches and once measured, so that other load slows all alike.
@@ -14,10 +14,11 @@ import math
 import os
 import platform
 import re
+import tempfile
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec
@@ -27,6 +28,9 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from arbiview_aug.cli.arguments import command_parser
+from arbiview_aug.datasets.frame_folder import write_frame
+from arbiview_aug.datasets.registry import data_name
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import DataError, exit_status
 
@@ -48,6 +52,23 @@ def run_study(
     """Parse the arguments and run a study; its exit status is that of ``errors.exit_status``."""
     arguments = parser.parse_args(argv)
     return exit_status(parser.prog, lambda: run(arguments))
+
+
+def stored(name: str) -> Path | None:
+    """A folder of real frames below ``ARBIVIEW_DATA``, if there."""
+    folder = Path(os.environ.get("ARBIVIEW_DATA", "/nowhere")) / name
+    return folder if folder.is_dir() else None
+
+
+@contextmanager
+def recorded(data: str | Path | None, size: tuple[int, int]) -> Iterator[tuple[str, Path]]:
+    """Name in tables and path of a user's frames, or of a synthetic frame of ``size`` (h, w), written as JPEGs."""
+    if data is not None:
+        yield data_name(data), Path(data)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        write_frame(Path(folder) / "0000", SyntheticDrive(demo_source_rig(size), num_frames=1)[0])
+        yield "synthetic streets", Path(folder)
 
 
 class Quartiles(NamedTuple):

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from arbiview_aug.cli.parsers import FULL_SIZE, SIZE
-from integrations.benchmarks.data import recorded
+from arbiview_aug.cli.parsers import SIZE
+from integrations.benchmarks.acceptance.protocol import frame_folder
 from integrations.benchmarks.lidar import PAIRS, ddad, main, measured_near, rings_dropped
 from integrations.benchmarks.speed import measure
 from tests.evaluate.test_scans import LIDAR, at
@@ -33,9 +33,8 @@ def test_scans_meet_their_goals(capsys: pytest.CaptureFixture[str], monkeypatch:
 
 @pytest.mark.slow
 def test_the_next_scan_is_nearer_than_moved_points(data_root: Path) -> None:
+    frame_folder(data_root, "ddad-next")
     rows = {name: metrics for _, name, metrics in ddad(data_root)}
-    if not rows:
-        pytest.skip("DDAD's next frame is missing")
     for key in ("range_error_m", "chamfer_m"):
         assert rows["scanned"][key] < rows["moved"][key]
     for key in ("recall", "precision"):
@@ -44,8 +43,8 @@ def test_the_next_scan_is_nearer_than_moved_points(data_root: Path) -> None:
 
 @pytest.mark.release
 def test_120_000_points(nuscenes_root: Path, report_bound: Callable[..., None]) -> None:
-    with recorded(nuscenes_root, size=FULL_SIZE) as data:
-        rows = [row for row in measure(data, 5, [SIZE], "rays")["measures"] if "rays" in row["name"]]
+    rows = measure("nuscenes-one", nuscenes_root, 5, [SIZE], "rays")["measures"]
+    rows = [row for row in rows if "rays" in row["name"]]
     for row, most_ms in zip(rows, (80, 100), strict=True):
         report_bound(f"ms, {row['name']}", row["median_ms"], at_most=most_ms)
 

@@ -29,9 +29,8 @@ from arbiview_aug.render.overlap_depth import overlap_depth
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.transforms.settings import render_config
 from integrations.benchmarks import speed
-from integrations.benchmarks.data import lidar_maps, recorded
-from integrations.benchmarks.speed import BOUNDS, bytes_moved, default_data, measure, table
-from integrations.benchmarks.study import process_ms, show, timed_rounds
+from integrations.benchmarks.speed import BOUNDS, DEFAULT, bytes_moved, lidar_maps, measure, table
+from integrations.benchmarks.study import process_ms, recorded, show, stored, timed_rounds
 from tests.helpers import street_sample
 
 ATTEMPTS = 3
@@ -76,8 +75,8 @@ def test_every_call_is_timed_against_its_floor(device: str | None) -> None:
     if device == "cuda" and not torch.cuda.is_available():
         pytest.skip("no GPU")
     sizes, threads = [(32, 88), (64, 176)], (cv2.getNumThreads(), torch.get_num_threads())
-    with recorded(None, size=(64, 176)) as data:
-        report = measure(data, 1, sizes, device=None if device is None else torch.device(device))
+    with recorded(None, (64, 176)) as data:
+        report = measure(*data, 1, sizes, device=None if device is None else torch.device(device))
     assert (cv2.getNumThreads(), torch.get_num_threads()) == threads
     measures = json.loads(json.dumps(report))["measures"]
     names = [(*m["size"], m["target"], m["name"]) for m in measures]
@@ -156,8 +155,8 @@ def best_ratios() -> dict[tuple[Any, ...], float]:
     """The smallest ratio of each measure in up to three runs: a machine with other work can only make it larger."""
     best: dict[tuple[Any, ...], float] = {}
     for _ in range(ATTEMPTS):
-        with recorded(default_data(), size=FULL_SIZE) as data:
-            report = measure(data, 5, [SIZE, FULL_SIZE])
+        with recorded(stored(DEFAULT), FULL_SIZE) as data:
+            report = measure(*data, 5, [SIZE, FULL_SIZE])
         print(table(report))
         for m in report["measures"]:
             key = tuple(m["size"]), m["name"], m["target"]
