@@ -45,7 +45,8 @@ def scanner(beams: int, height_m: float) -> Lidar:
     pose = np.eye(4)
     pose[:3, 3] = 0.9, 0.0, height_m
     low, high, step = {16: (-15.0, 15.0, 0.2), 32: (-30.67, 10.67, 0.332), 64: (-24.8, 10.67, 0.17)}[beams]
-    return Lidar(f"{beams} beams at {height_m} m", pose, np.linspace(low, high, beams).tolist(), step, (1.0, 90.0))
+    table = tuple(map(float, np.linspace(low, high, beams)))
+    return Lidar(f"{beams} beams at {height_m} m", pose, table, step, (1.0, 90.0))
 
 
 NEIGHBOURS: dict[str, Reach | None] = {"scanned": None, "with neighbours": "road"}
@@ -62,9 +63,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> None:
-    following = stored("ddad-next") if arguments.data is None else arguments.data / "ddad-next"
-    if arguments.data is not None and not following.is_dir():
-        raise DataError(f"--data {arguments.data}: expected a folder with ddad-one and ddad-next, found no ddad-next")
+    folder: Path | None = arguments.data
+    following = stored("ddad-next") if folder is None else folder / "ddad-next"
+    if folder and following and not following.is_dir():
+        raise DataError(f"--data {folder}: expected a folder with ddad-one and ddad-next, found no ddad-next")
     found = (*synthetic(arguments.frames, arguments.seed), *(ddad(following.parent) if following else ()))
     rows = [[scene, name, *(f"{of[key]:.3f}" if key in of else "" for key in COLUMNS)] for scene, name, of in found]
     print(markdown_table(("scene", "points", *COLUMNS), rows, left=2))
@@ -145,7 +147,7 @@ def ddad(data: Path) -> Iterator[tuple[str, str, dict[str, float]]]:
     truth, away = truth[kept], away[kept]
     pose = np.eye(4)
     pose[:3, 3] = centre
-    dense = Lidar("roof", pose, np.arange(-35.0, 15.0, 0.1).tolist(), 0.1, (1.0, 120.0))
+    dense = Lidar("roof", pose, tuple(map(float, np.arange(-35.0, 15.0, 0.1))), 0.1, (1.0, 120.0))
     clouds = {"moved": moved[~own_car(moved)]}
     for name, sweeps in (("scanned", ()), ("with neighbours", [half])):
         target = replace(rig, lidars=[dense])

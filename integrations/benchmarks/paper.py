@@ -89,10 +89,6 @@ class Study:
     means: dict[str, dict[str, dict[str, dict[str, float]]]] = field(default_factory=dict)
     declined: dict[str, str] = field(default_factory=dict)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON, with the paper's numbers."""
-        return {"means": self.means, "published": PUBLISHED, "protocol": PROTOCOL, "declined": self.declined}
-
 
 def measure_paper(
     data: str | Path | None = None,
@@ -322,7 +318,8 @@ def _run(arguments: argparse.Namespace) -> None:
     folder = writable_folder(Path(arguments.output), arguments.output)
     with named_steps([]) as tick:  # warnings of targets half outside the view are expected
         study = measure_paper(arguments.data, frames=arguments.frames, size=arguments.size, tick=tick)
-    (folder / "paper.json").write_text(json.dumps(study.as_dict(), indent=1) + "\n")
+    report = {**vars(study), "published": PUBLISHED, "protocol": PROTOCOL}
+    (folder / "paper.json").write_text(json.dumps(report, indent=1) + "\n")
     print(f"{paper_report(study)}\n\nnumbers: {folder / 'paper.json'}")
 
 

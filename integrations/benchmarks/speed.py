@@ -151,7 +151,7 @@ def measure(
             times = timed_rounds(chosen, repeats, f"{h}x{w} {target}", enough_ms=_ENOUGH_MS, clock=clock_of(device))
             for call, taken in times.items():
                 ratio = statistics.median(a / b for a, b in zip(taken, times[floor], strict=False))
-                row = {"size": [h, w], "target": target, "name": call, **quartiles(taken)._asdict(), "ratio": ratio}
+                row = {"size": [h, w], "target": target, "name": call, **quartiles(taken), "ratio": ratio}
                 rows.append(row | {"bound": BOUNDS.get((h, w), {}).get(call)})
     if not rows:
         raise DataError(f"--only {only}: expected part of a call's name, such as boxes or neighbour")

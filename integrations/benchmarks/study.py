@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
-from typing import Any, NamedTuple, ParamSpec
+from typing import Any, ParamSpec
 
 import numpy as np
 import numpy.typing as npt
@@ -71,16 +71,9 @@ def recorded(data: str | Path | None, size: tuple[int, int]) -> Iterator[tuple[s
         yield "synthetic streets", Path(folder)
 
 
-class Quartiles(NamedTuple):
-    """Median and quartiles of times, in milliseconds."""
-
-    median_ms: float
-    q1_ms: float
-    q3_ms: float
-
-
-def quartiles(times_ms: npt.NDArray[np.float64]) -> Quartiles:
-    return Quartiles(*np.quantile(times_ms, [0.5, 0.25, 0.75]).tolist())
+def quartiles(times_ms: npt.NDArray[np.float64]) -> dict[str, float]:
+    """Median and quartiles of times in milliseconds."""
+    return dict(zip(("median_ms", "q1_ms", "q3_ms"), np.quantile(times_ms, [0.5, 0.25, 0.75]).tolist(), strict=True))
 
 
 def process_ms(run: Callable[[], Any]) -> float:

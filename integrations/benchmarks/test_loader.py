@@ -35,14 +35,11 @@ def test_command(tmp_path: Path, nuscenes_root: Path, capsys: pytest.CaptureFixt
     assert list(rates) == [(name, n) for name in (PLAIN, "retargeted, street") for n in (0, 1)]
     for (name, workers), rate in rates.items():
         assert 0 < rate["frames_per_s"] <= rate["best_per_s"]
-        assert rate["ms"]["q1_ms"] <= rate["ms"]["median_ms"] <= rate["ms"]["q3_ms"]
         assert (rate["of_reading"] == 1) == (name == PLAIN)
         assert (rate["unique_mib"] is None) == (workers == 0)
     printed = capsys.readouterr().out
     assert "frames/s" in printed and "load" in printed and f"report: {path}" in printed
     assert set(multiprocessing.active_children()) <= before, "none is left behind"
-    with pytest.raises(SystemExit, match="2"):
-        loader.main([*arguments, "--workers", "-1"])
 
 
 @pytest.mark.release

@@ -147,23 +147,6 @@ def plain(colour: tuple[int, int, int]) -> np.ndarray:
     return np.full((91, 181, 3), colour, np.uint8)
 
 
-def noise(seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).integers(1, 255, (91, 181, 3), dtype=np.uint8)
-
-
-@pytest.mark.parametrize("name", BASELINES)
-def test_the_source_rig_comes_back(name: str) -> None:
-    rig = ring(4, radius_m=0.0, name="at ", size=(91, 181), horizontal_fov_deg=90.0)
-    images = [noise(k) for k in range(4)]
-    for image, view in zip(images, BASELINES[name](rig, images, rig), strict=True):
-        assert view.image.shape == image.shape and view.coverage.dtype == bool
-        if name != "crop and slide":  # which knows degrees only to a pixel
-            inside = view.coverage.copy()
-            inside[:, :2] = inside[:, -2:] = False  # edge columns belong to two cameras
-            assert inside.mean() > 0.97
-            np.testing.assert_array_equal(view.image[inside], image[inside])
-
-
 def test_own_camera_is_alone() -> None:
     rig = ring(4, radius_m=0.0, name="at ", size=(91, 181), horizontal_fov_deg=90.0)
     images = [plain(colour) for colour in COLOURS]

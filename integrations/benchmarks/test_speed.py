@@ -34,7 +34,6 @@ from integrations.benchmarks.study import process_ms, recorded, show, stored, ti
 from tests.helpers import street_sample
 
 ATTEMPTS = 3
-TOLERANCE, ROUNDS = 0.02, 121
 IMPORT_S = 0.4
 OVERLAP_MS, REUSED_RATIO = 200.0, 1.5  # depth from overlap, at 1600x900
 
@@ -106,17 +105,9 @@ def test_bytes_of_the_floor_on_a_device() -> None:
     assert bytes_moved(alone, images) == pixels * (2 * 3 + 8 + 2 * 3)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ("--data {folder}", "expected a frame folder (calib.json"),
-        ("--device meta", "--device: expected cpu"),
-        ("--output {folder}", "expected a file, got a folder"),
-    ],
-)
-def test_wrong_usage(given: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert speed.main([part.format(folder=tmp_path) for part in given.split()]) == 2
-    assert message in capsys.readouterr().err
+def test_unknown_devices_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert speed.main(["--device", "meta"]) == 2
+    assert "--device: expected cpu" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("surface", ["boxes", "lidar", "motion", "learned", "fused", "auto"])
@@ -201,27 +192,6 @@ def test_bounds(
     for target, ratio in ratios.items():
         goal = f"ratio, {size}, {name}, {target}, goal {BOUNDS[size][name]:g}"
         report_bound(goal, ratio, at_most=_bound(size, name, fisheye))
-
-
-@pytest.mark.release
-@pytest.mark.filterwarnings("ignore:target cameras")
-def test_fast_costs_the_same_without_neighbours(report_bound: Callable[..., None]) -> None:
-    """A transform that would read neighbours against itself told not to, on a sample that has none: the median of pairs
-    of CPU times, in turn. Two equal transforms may differ by 7 %, by where their memory lies."""
-    sample = SyntheticDrive(demo_source_rig((450, 800)), num_frames=1, lidar=False)[0]
-    del sample["boxes_3d"]
-    retarget = RigRetarget(sample["rig"].turned(yaw_deg=22))
-
-    def frame(reach: Any) -> None:
-        retarget.neighbours = reach
-        retarget(sample)
-
-    work = {"reading": partial(frame, "road"), "not": partial(frame, None)}
-    with one_thread():
-        times = timed_rounds(work, ROUNDS, "without neighbours")
-    ratio, ms = (statistics.median(of.tolist()) for of in (times["reading"] / times["not"], times["reading"]))
-    name = f"share of time that neighbours cost where there are none, fast, {ms:.1f} ms a frame"
-    report_bound(name, abs(ratio - 1), at_most=TOLERANCE)
 
 
 @pytest.mark.release

@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
-from arbiview_aug.cli.arguments import count, seed
-from arbiview_aug.errors import ArbiviewError
+from arbiview_aug.cli.arguments import count, seed, writable_folder
+from arbiview_aug.errors import DataError, exit_status
 from integrations.cross_rig.experiment import LONGER, Length, Run, Settings, fitted, jobs, quick, recorded, run, small
 from integrations.cross_rig.families import FAMILIES
 from integrations.cross_rig.frames import CHANGES, World
@@ -24,15 +24,14 @@ PRESETS = {"quick": quick, "small": small}
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Make what is missing and write the report; killed, the same command continues."""
-    arguments = parser().parse_args(argv)
-    output: Path = arguments.output
-    try:
-        if output.exists() and not output.is_dir():
-            raise ValueError(f"--output: expected a folder, got the file {output}")
-        setup = Run(settings=settings_of(arguments), output=output)
-    except (ValueError, ArbiviewError) as error:
-        print(error, file=sys.stderr)
-        return 2
+    commands = parser()
+    arguments = commands.parse_args(argv)
+    return exit_status(commands.prog, lambda: _run(arguments), resumable=True)
+
+
+def _run(arguments: argparse.Namespace) -> None:
+    output = writable_folder(arguments.output, str(arguments.output))
+    setup = Run(settings=settings_of(arguments), output=output)
     began = time.monotonic()
 
     def log(line: str) -> None:
@@ -42,7 +41,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         log(f"{left} of {len(jobs(setup.settings))} trainings to do, in {output}")
     print(summary(write_report(setup)))
     print(f"{output / 'report.json'}, report.md")
-    return 0
 
 
 def parser() -> argparse.ArgumentParser:
@@ -80,7 +78,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
     if arguments.real:
         settings = recorded(settings, *arguments.real)
         for name in {"changes", "world"} & given.keys():
-            raise ValueError(f"--{name} is for synthetic streets: leave it out with --real")
+            raise DataError(f"--{name} is for synthetic streets: leave it out with --real")
     schedule = replace(settings.schedule, steps=given.get("steps", settings.schedule.steps))
     values: dict[str, Any] = {name: given[name] for name in vars(settings) if name in given}
     values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}

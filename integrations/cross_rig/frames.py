@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import cache, cached_property, lru_cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -70,20 +70,12 @@ class Change:
 
 def source_rig(size: Size, *, fov_deg: float = _FOV_DEG, height_m: float = _HEIGHT_M) -> Rig:
     """Vehicle A: six cameras around a car's roof, all with one field of view."""
+    looking = partial(Camera.looking, width_px=size[1], height_px=size[0], horizontal_fov_deg=fov_deg)
     cameras = []
     for name, azimuth in zip(_NAMES, _AZIMUTHS_DEG, strict=True):
         angle = math.radians(azimuth)
         x, y = _RING_CENTRE_X_M + _RING_RADIUS_M * math.cos(angle), 0.6 * _RING_RADIUS_M * math.sin(angle)
-        cameras.append(
-            Camera.looking(
-                name=name,
-                azimuth_deg=azimuth,
-                position_m=(x, y, height_m),
-                width_px=size[1],
-                height_px=size[0],
-                horizontal_fov_deg=fov_deg,
-            )
-        )
+        cameras.append(looking(name=name, azimuth_deg=azimuth, position_m=(x, y, height_m)))
     return Rig(cameras, name="A")
 
 
@@ -176,6 +168,10 @@ class Source:
         make = CuboidDrive if self.world == "cuboids" else SyntheticDrive
         return make(rig, num_frames=_MAX_FRAMES, seed=street_seed(self.split, self.streets), lidar=False)
 
+    @cached_property
+    def _own_drive(self) -> SyntheticDrive:
+        return self.drive(self.rig)
+
     @property
     def rig(self) -> Rig:
         """The cameras of the images (the base, where they are drawn around it), in A's ego frame."""
@@ -199,24 +195,19 @@ class Source:
 
     def maker(self) -> Callable[[int], Arrays]:
         """Return the function that makes a frame of this set from its index."""
-        return self._true_frames() if self.variant is None else self._views(self.variant)
+        return self._true_frame if self.variant is None else self._views(self.variant)
 
-    def _true_frames(self) -> Callable[[int], Arrays]:
-        """Frames that a rig really sees: images, calibration and labels."""
-        rig, grid = self.rig, Grid()
-        drive = self.drive(rig)
+    def _true_frame(self, index: int) -> Arrays:
+        """A frame that a rig really sees: images, calibration and labels."""
+        rig, grid, drive = self.rig, Grid(), self._own_drive
+        scene, views = drive.scene(index), drive.render(index)
+        boxes = scene.boxes_ego(rig.ground_z_m)
+        visible = visible_objects(views.visible_pixels(len(boxes)).numpy(), self.size)
+        labels: Arrays = {"state": box_cells(grid, boxes, scene.box_classes, visible)}
+        labels |= {"boxes": vehicle_boxes(grid, scene, rig.ground_z_m)}
         calibration = {"K": rig.K.astype(np.float32), "cam2ego": rig.cam2ego.astype(np.float32)}
-
-        def make(index: int) -> Arrays:
-            scene, views = drive.scene(index), drive.render(index)
-            boxes = scene.boxes_ego(rig.ground_z_m)
-            visible = visible_objects(views.visible_pixels(len(boxes)).numpy(), self.size)
-            state = box_cells(grid, boxes, scene.box_classes, visible)
-            labels = {"state": state, "boxes": vehicle_boxes(grid, scene, rig.ground_z_m)}
-            assert isinstance(views.images, torch.Tensor)
-            return {"images": views.images.numpy(), **calibration, **labels}
-
-        return make
+        assert isinstance(views.images, torch.Tensor)
+        return {"images": views.images.numpy(), **calibration, **labels}
 
     def _views(self, variant: Variant) -> Callable[[int], Arrays]:
         """A's frames as a variant re-renders them; points are cast again, since that is cheaper than keeping them."""

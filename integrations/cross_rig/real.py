@@ -145,10 +145,7 @@ class RecordedSource(Source):
         make = super().maker()
         return lambda index: make(self.frames[index])
 
-    def _true_frames(self) -> Callable[[int], Arrays]:
-        return self._recorded
-
-    def _recorded(self, index: int) -> Arrays:
+    def _true_frame(self, index: int) -> Arrays:
         sample = recording(self.recorded_by)[index]
         rig = sample["rig"]
         shrink = RigRetarget(small_rig(rig, self.size, road=rig.ground_z_m), geometry="infinity", holes="black")

@@ -88,7 +88,7 @@ def ap_scores(
     detections: Mapping[str, tuple[Floats, Floats]], drives: Sequence[int] | None = None
 ) -> dict[str, VariantScore]:
     """Scores of the variants of one change, from ``labels.match`` (S, F, k, 5) and boxes that count (S, F)."""
-    num_seeds, num_frames = _one_shape({name: matched for name, (matched, _) in detections.items()})
+    num_seeds, num_frames = next(iter(detections.values()))[1].shape
     drawn_seeds, frames = resampled(num_seeds, num_frames, _DRAWS_OF_AP, drives)
     weights = np.concatenate([np.ones((1, num_frames)), frames])
     by_draw = {
@@ -108,7 +108,8 @@ def matches_of(results: Sequence[Mapping[str, Any]]) -> tuple[Floats, Floats]:
 
 def bootstrap_ious(counts: Mapping[str, Counts], drives: Sequence[int] | None = None) -> dict[str, Floats]:
     """IoUs (draws,) of resampled experiments by variant, from (S, F, 3) counts; the same S and F throughout."""
-    seeds, frames = resampled(*_one_shape(counts), _DRAWS, drives)
+    num_seeds, num_frames, _ = next(iter(counts.values())).shape
+    seeds, frames = resampled(num_seeds, num_frames, _DRAWS, drives)
     by_seed = {name: np.einsum("rf,sfc->rsc", frames, array, optimize=True) for name, array in counts.items()}
     return {name: iou(np.einsum("rs,rsc->rc", seeds, sums)) for name, sums in by_seed.items()}
 
@@ -125,14 +126,6 @@ def resampled(
     names, drive = np.unique(np.arange(num_frames) if drives is None else drives, return_inverse=True)
     alike = [rng.multinomial(n, np.full(n, 1 / n), size=draws).astype(np.float64) for n in (num_seeds, len(names))]
     return alike[0], alike[1][:, drive]
-
-
-def _one_shape(counts: Mapping[str, npt.NDArray[Any]]) -> tuple[int, int]:
-    shapes = {array.shape[:2] for array in counts.values()}
-    if len(shapes) != 1:
-        raise ValueError(f"scores: expected variants with the same seeds and frames, got {sorted(shapes)}")
-    (shape,) = shapes
-    return shape[0], shape[1]
 
 
 def _scores(

@@ -37,17 +37,13 @@ class Pixels(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """Mean errors of bins of equal count, the least confident first; the errors that they claim; ``halving``: the mean
-    error of all pixels over that of the most confident half."""
+    """Mean errors of bins of equal count, the least confident first; the errors that they claim; the correlation of the
+    errors' ranks with the bins' order; the mean error of all pixels over that of the most confident half."""
 
     errors: list[float]
     claimed: list[float]
+    rank_correlation: float
     halving: float
-
-    @property
-    def rank_correlation(self) -> float:
-        """Of the errors with the bins' order."""
-        return float(np.corrcoef(np.arange(len(self.errors)), np.argsort(np.argsort(self.errors)))[0, 1])
 
 
 def binned(pixels: Pixels) -> Bins:
@@ -55,7 +51,8 @@ def binned(pixels: Pixels) -> Bins:
     error = pixels.error[order]
     claims = -EXPECTED_ERROR_LEVELS * np.log(np.maximum(pixels.confidence[order], 1e-6))
     errors, claimed = ([float(part.mean()) for part in np.array_split(values, BINS)] for values in (error, claims))
-    return Bins(errors, claimed, float(error.mean() / error[len(error) // 2 :].mean()))
+    rho = np.corrcoef(np.arange(BINS), np.argsort(np.argsort(errors)))[0, 1]
+    return Bins(errors, claimed, float(rho), float(error.mean() / error[len(error) // 2 :].mean()))
 
 
 @pytest.fixture(scope="module", params=SEEDS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from arbiview_aug import Rig, RigRetarget, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import open_data
 from arbiview_aug.evaluate.frames import make_frame, scores
-from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import views_of
 
 MOST_DB = 0.1
@@ -38,17 +36,11 @@ def test_it_scores_as_on_the_fly(name: Any, target: Rig, nuscenes_root: Path, tm
     written = open_data(output, kind=name, load_points=False)[0]
     order = [written["rig"].names.index(camera) for camera in target.names]
 
-    def on_the_fly(_: Mapping[str, Any], __: Rig) -> list[RenderedView]:
-        return views_of(RigRetarget(target)(sample))
-
-    def converted(_: Mapping[str, Any], __: Rig) -> list[RenderedView]:
-        views = views_of({key: written[key] for key in ("images", "coverage")})
-        return [views[k] for k in order]
-
-    frame = make_frame(sample, exposures=("raw",))
-    means = {}
-    for label, render in (("on the fly", on_the_fly), ("converted", converted)):
-        _, rows = scores(frame, render, target)
+    read = views_of({key: written[key] for key in ("images", "coverage")})
+    converted = [read[k] for k in order]
+    frame, means = make_frame(sample, exposures=("raw",)), {}
+    for label, views in (("on the fly", views_of(RigRetarget(target)(sample))), ("converted", converted)):
+        _, rows = scores(frame, lambda *_, views=views: views, target)
         keys = ("raw_psnr_db", "raw_covered_psnr_db", "seen")
         means[label] = {key: float(np.mean([row[key] for row in rows if key in row])) for key in keys}
         print(f"{name} as {target.name}, {label}: {means[label]}")

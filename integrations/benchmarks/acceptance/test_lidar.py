@@ -9,7 +9,7 @@ Run with ``-s`` for the tables.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -37,15 +37,7 @@ GAINS_DB = {"nuscenes-one": (8.0, 9.0, 3.0), "ddad-one": (7.0, 7.0, 3.5)}
 """Over ``ground``, by move: what naive linear interpolation of inverse depth reaches."""
 
 
-def without_labels(sample: Mapping[str, Any]) -> dict[str, Any]:
-    """A sample and its neighbours without boxes."""
-    near = [{key: entry[key] for key in entry if key != "boxes_3d"} for entry in sample["neighbours"]]
-    kept = {key: value for key, value in sample.items() if key not in ("boxes_3d", "box_classes")}
-    return kept | {"neighbours": near}
-
-
 LARGEST_SHIFT_PX = 1.5
-
 SWEPT_FRAMES = ((0, 0), (0, 1), (5, 0), (5, 1))  # seeds and scenes
 OFF_LINES_PX = (3, 10)  # of the frame's own points
 GAIN_DB = 1.5
@@ -119,9 +111,10 @@ def test_other_frames_show_what_is_between_scan_lines(count: int) -> None:
     shifts: dict[tuple[str, str], list[float]] = {}
     for seed, index in SWEPT_FRAMES[:count]:
         drive = SyntheticDrive(rig, num_frames=2, seed=seed, neighbours=Neighbours())
-        sample, source = without_labels(drive[index]), drive.render(index)
-        near = sample["neighbours"]
-        bare = [{key: value for key, value in frame.items() if key != "points"} for frame in near]
+        sample, source = drive[index], drive.render(index)
+        near = [{key: frame[key] for key in frame if key != "boxes_3d"} for frame in sample["neighbours"]]
+        bare = [{key: frame[key] for key in frame if key != "points"} for frame in near]
+        sample = {key: value for key, value in sample.items() if key not in ("boxes_3d", "box_classes")}
         points = sample["points"].numpy()[:, :3].astype(float)
         for move, by in moves.items():
             target = rig.shifted(**by)

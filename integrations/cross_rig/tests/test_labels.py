@@ -19,7 +19,6 @@ from integrations.cross_rig.labels import (
     decode,
     match,
     real_boxes,
-    visible_objects,
 )
 
 GRID = Grid(side_m=20.0, cells=20)  # cells of 1 m, centres at ±0.5, ±1.5, …
@@ -49,12 +48,6 @@ def test_hidden_vehicles_are_told_apart_and_people_are_not_vehicles():
     for order in (1, -1):  # where footprints overlap the visible one has the cell
         state = cells(*[(0, 0, 1, 4, 2, 2, 0), (1, 0, 1, 4, 2, 2, 0)][::order], visible=[True, False][::order])
         assert (state == VEHICLE).sum() == 8 and (state == HIDDEN).sum() == 2
-
-
-def test_visibility_counts_pixels_of_the_camera_that_sees_most():
-    pixels = np.array([[15, 16, 0], [15, 0, 0]])
-    assert visible_objects(pixels, (96, 256)).tolist() == [False, True, False]
-    assert visible_objects(pixels, (192, 512)).tolist() == [False, False, False]
 
 
 def test_covered_cells_are_those_in_the_field_of_view_over_the_rigs_road():

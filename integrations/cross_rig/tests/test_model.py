@@ -35,12 +35,6 @@ def model(request) -> Detector:
     return Detector(GRID, request.param).eval()
 
 
-@pytest.fixture
-def voxels() -> Detector:
-    torch.manual_seed(0)
-    return Detector(GRID).eval()
-
-
 def test_points_read_the_pixel_that_they_project_to():
     """A feature map that holds its own pixel coordinates gives the camera model's projection."""
     front = source_rig(SIZE)["front"]
@@ -73,7 +67,7 @@ def test_features_are_lifted_to_where_their_rays_lead():
         assert lifted[cell] == 1
 
 
-def test_uncovered_pixels_do_not_matter(model, voxels):
+def test_uncovered_pixels_do_not_matter(model):
     rig = source_rig(SIZE)
     coverage = torch.ones((6, *SIZE), dtype=torch.bool)
     coverage[:, :16, :40] = False
@@ -83,7 +77,7 @@ def test_uncovered_pixels_do_not_matter(model, voxels):
     with torch.no_grad():
         torch.testing.assert_close(model(whole), model(batch([rig], images=painted, coverage=coverage)))
     nothing = batch([rig], coverage=torch.zeros_like(coverage))
-    assert not voxels.family.voxel_features(voxels.features(nothing), nothing).any()
+    assert not read_at(model.features(nothing), nothing, torch.rand(50, 3) * 20).any()
 
 
 def test_calibration_is_read_and_frames_do_not_mix(model):

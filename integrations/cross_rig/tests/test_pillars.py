@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from integrations.cross_rig import scans
 from integrations.cross_rig.labels import VEHICLE, Grid
 from integrations.cross_rig.pillars import PillarDetector, PointSet
-from integrations.cross_rig.scans import CHANGES, kinds, main, point_set, rig_of, scans_of
+from integrations.cross_rig.scans import CHANGES, kinds, main, point_set, scans_of
 
 CELLS = Grid().cells
 
@@ -39,8 +38,6 @@ def test_sets_that_are_the_same_have_one_name():
     assert scans_of("fewer", "dropped") == (*CHANGES["fewer"], "dropped")
     assert scans_of("sixteen", "below") == scans_of("sixteen", "retargeted")
     assert [change for change in CHANGES if "below" in kinds(change)] == ["sixteen"]
-    trainings = {scans_of(change, kind) for change in CHANGES for kind in kinds(change)}
-    assert scans.trained.cache_parameters()["maxsize"] >= len(trainings) * len(scans.SEEDS)
 
 
 def test_vehicles_count_by_their_points():
@@ -50,11 +47,6 @@ def test_vehicles_count_by_their_points():
     assert len(dropped.points[0]) < len(recorded.points[0])
     seen = [(scans.state == VEHICLE).sum() for scans in (recorded, retargeted)]
     assert 0 < seen[1] <= seen[0] and recorded.counts.all()
-    truth = rig_of(b).lidars[0]
-    away = retargeted.points[1][:, :3].astype(float) - truth.center_m
-    elevation = np.degrees(np.arcsin(away[:, 2] / np.linalg.norm(away, axis=1)))
-    off = np.abs(elevation[:, None] - np.array(truth.elevations_deg)).min(axis=1)
-    assert np.median(off) < 0.1  # half precision
 
 
 @pytest.mark.slow

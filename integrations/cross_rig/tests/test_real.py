@@ -111,10 +111,12 @@ def test_data_that_cannot_be_run_is_refused(roots, tmp_path, capsys):
         assert command.main(["--quick", "--output", str(tmp_path), *given]) == 2
         return capsys.readouterr().err
 
+    for option in ("--world cuboids", "--changes up70"):
+        assert "is for synthetic streets: leave it out with --real" in said("--real", *roots, *option.split())
     assert "expected 3 drives or more to split, found 2" in said("--real", roots[1], roots[0])
     assert "expected a folder, found none" in said("--real", roots[0], str(tmp_path / "nothing"))
     (tmp_path / "file").touch()
-    assert "--output: expected a folder, got the file" in said("--output", str(tmp_path / "file"))
+    assert "file: expected a folder that can be written to" in said("--output", str(tmp_path / "file"))
     with pytest.raises(DataError, match="sample t: expected boxes_3d and box_names"):
         real.vehicles_of({"token": "t", "boxes_3d": torch.zeros(0, 7)}, "X")
 

@@ -13,7 +13,6 @@ from torchvision.transforms import v2
 from arbiview_aug import CropRig, ResizeRig, RigRetarget
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.integrations.kornia import OnImages, check_photometric
-from integrations.kornia.example import main
 
 SOURCE = demo_source_rig((64, 176))
 TARGET = SOURCE.turned(pitch_deg=-12)
@@ -124,10 +123,6 @@ def test_images_keep_their_type(sample: dict) -> None:
     for images in (SMALL, BYTES):
         noisy = OnImages(lambda images: images + 0.15 * torch.randn_like(images))({"images": images})["images"]
         assert noisy.dtype == images.dtype
-
-
-def test_example(capsys) -> None:
-    assert main() == 0 and "(5, 3, 128, 352) torch.float32" in capsys.readouterr().out
 
 
 def test_what_was_filled_stays(sample: dict) -> None:
