@@ -36,7 +36,6 @@ MOVES = {"up 0.6 m": (0.0, (0.0, 0.0, 0.6)), "11° and moved": (11.0, (0.5, 0.3,
 GAINS_DB = {"nuscenes-one": (8.0, 9.0, 3.0), "ddad-one": (7.0, 7.0, 3.5)}
 """Over ``ground``, by move: what naive linear interpolation of inverse depth reaches."""
 
-
 LARGEST_SHIFT_PX = 1.5
 SWEPT_FRAMES = ((0, 0), (0, 1), (5, 0), (5, 1))  # seeds and scenes
 OFF_LINES_PX = (3, 10)  # of the frame's own points
