@@ -382,7 +382,7 @@ def _block(floats: Any, ints: Any, q: Any, n: int) -> Block:
 @inlined
 def _fixed(value: Any) -> Any:
     """32nds of a pixel."""
-    return np.int32(np.rint(min(max(value, -_MAP_LIMIT_PX), _MAP_LIMIT_PX) * np.float32(32)))
+    return np.int32(np.rint(min(max(-_MAP_LIMIT_PX, value), _MAP_LIMIT_PX) * np.float32(32)))
 
 
 @inlined
@@ -416,11 +416,12 @@ def _hide(
     x, y, z, hides, limit = floats[6, :n], floats[7, :n], floats[8, :n], floats[9, :n], floats[10, :n]
     scale, columns = occluders.scale[k], np.int32(w)
     shift, right, down = (scale - _ONE) * _HALF, np.float32(w - 1), np.float32(h - 1)
+    # Clamped in this order, a position that is not a number is 0, and nothing is read outside the image.
     is_smooth, before_m = not occluders.is_guess and min(h, w) > 1, occluders.before_m[k]
     if not is_smooth or before_m.shape[0]:
         for i in range(n):
-            column = np.int32(min(max(u[i] * scale + shift, _ZERO), right) + _HALF)
-            place[i] = np.int32(min(max(v[i] * scale + shift, _ZERO), down) + _HALF) * columns + column
+            column = np.int32(min(max(_ZERO, u[i] * scale + shift), right) + _HALF)
+            place[i] = np.int32(min(max(_ZERO, v[i] * scale + shift), down) + _HALF) * columns + column
     # The distance from the source, inverted: what must not be exceeded by what hides.
     if has_faces or not occluders.is_guess:
         turn_row(block.x, block.y, block.z, q, sources.A[k], sources.o[k], x, y, z)
@@ -429,9 +430,9 @@ def _hide(
     if is_smooth:  # what was measured hides smoothly, silhouettes of solids do not
         top, left, one, row = np.float32(h - 2), np.float32(w - 2), np.uint64(1), np.uint64(w)
         for i in range(n):
-            x[i] = min(max(u[i] * scale + shift, _ZERO), right)
+            x[i] = min(max(_ZERO, u[i] * scale + shift), right)
         for i in range(n):
-            y[i] = min(max(v[i] * scale + shift, _ZERO), down)
+            y[i] = min(max(_ZERO, v[i] * scale + shift), down)
         for i in range(n):
             j, m = np.int32(min(x[i], left)), np.int32(min(y[i], top))
             at, s, t = np.uint64(m * columns + j), y[i] - np.float32(m), x[i] - np.float32(j)
