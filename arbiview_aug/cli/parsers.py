@@ -85,6 +85,8 @@ def convert() -> argparse.ArgumentParser:
     add("--workers", type=count, default=cores, metavar="N", help="processes or actors (default: one a core)")
     on_error = "samples that cannot be converted: report them and do not finish (default), leave them out, or stop"
     add("--on-error", choices=get_args(OnError), default="report", help=on_error)
+    report = "number of frames to score and show in conversion/report.html of the output (default: 0, no report)"
+    add("--report", type=seed, default=0, metavar="N", help=report)
     link = (
         "how points, maps and other kept files come along: hard links where the disk allows them (default), copies, or "
         "symbolic links, which readers of this package refuse"

@@ -13,6 +13,7 @@ from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.evaluate.images import Image
 
 _PEAK = 255.0
+_STRIP_PX = 32  # rows at a time: their scratch stays in the cache
 _SMALLEST_MSE = 1e-9
 
 
@@ -38,8 +39,14 @@ def ssim_map(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> npt.NDArray[np.flo
     """
     from kornia.metrics import ssim  # half a second, which those who need errors alone do not pay
 
-    a, b = (torch.from_numpy(image.astype(np.float64)).permute(2, 0, 1)[None] for image in (one, two))
-    return np.asarray(ssim(a, b, window_size=11, max_val=_PEAK)[0].permute(1, 2, 0).numpy())
+    around = ((5, 5), (5, 5), (0, 0))
+    padded = (np.pad(image.astype(np.float64), around, "reflect") for image in (one, two))
+    a, b = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in padded)
+    strips = []
+    for top in range(0, len(one), _STRIP_PX):  # a whole large image takes ten times as long, most of it for memory
+        part = slice(top, top + _STRIP_PX + 10)
+        strips.append(ssim(a[:, :, part], b[:, :, part], window_size=11, max_val=_PEAK, padding="valid")[0])
+    return np.asarray(torch.cat(strips, 1).permute(1, 2, 0).numpy())
 
 
 def mean_of(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:

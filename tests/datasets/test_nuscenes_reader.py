@@ -60,8 +60,9 @@ def test_lookup_scenes_channels_and_switches(tmp_path: Path) -> None:
         for token in (SAMPLES[0], "nonsense"):
             with pytest.raises(DataError, match=f"expected the token of one of 1 samples, got '{token}'"):
                 part.by_token(token)
-    bare = NuScenesDataset(tmp_path, channels=["CAM_BACK", "CAM_FRONT"], load_points=False, reduce=2)[0]
-    assert "points" not in bare and bare["images"].shape == (2, 3, 24, 32)
+    settings: dict[str, Any] = {"load_points": False, "load_boxes": False, "reduce": 2}
+    bare = NuScenesDataset(tmp_path, channels=["CAM_BACK", "CAM_FRONT"], **settings)[0]
+    assert not {"points", "boxes_3d"} & {*bare} and bare["images"].shape == (2, 3, 24, 32)
     assert bare["rig"].names == ["CAM_BACK", "CAM_FRONT"] and bare["rig"].sizes == [(24, 32)] * 2
 
 

@@ -13,18 +13,23 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.atomic_io import inside, remove_parts
+from arbiview_aug.atomic_io import inside, remove_parts, write_whole
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.cli.arguments import told_once, writable_folder
+from arbiview_aug.cli.arguments import gathered_warnings, told_once, writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, State
 from arbiview_aug.cli.convert.ray_runner import ray_results
-from arbiview_aug.cli.convert.settings import READING, RETARGET_OPTIONS, Settings, check_output
+from arbiview_aug.cli.convert.settings import FOLDER, READING, RETARGET_OPTIONS, Settings, check_output
 from arbiview_aug.cli.parallel import results
 from arbiview_aug.datasets.depth_folder import FOLDERS, WithDepth
-from arbiview_aug.datasets.drive import is_converted
-from arbiview_aug.datasets.registry import split_kind
+from arbiview_aug.datasets.drive import Recording, is_converted
+from arbiview_aug.datasets.registry import kinds_of, open_data, split_kind
 from arbiview_aug.environment import one_thread, versions, working_s
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
+from arbiview_aug.evaluate.frames import evaluate, make_frame
+from arbiview_aug.evaluate.images import RenderedView, as_arrays
+from arbiview_aug.evaluate.methods import Method
+from arbiview_aug.evaluate.report.html import html_report
+from arbiview_aug.evaluate.report.tables import evaluation_table
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.warm_up import compile_kernels
 
@@ -51,7 +56,9 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"  {done.token}: {done.state}: {'; '.join(done.messages)}", file=sys.stderr)
     if any(done.state in ("stopped", "failed") for done in records):
         return 1
-    _finish(jobs, facts, arguments.num_shards)
+    converted = _finish(jobs, facts, arguments.num_shards)
+    if arguments.report and converted:
+        print(f"report: {write_report(settings, jobs.data, converted, arguments.report)}")
     return 0
 
 
@@ -160,8 +167,8 @@ def _summary(output: Path, records: Sequence[Done], wall_s: float) -> str:
     )
 
 
-def _finish(jobs: Jobs, facts: Mapping[str, Any], shards: int) -> None:
-    """Write tables and provenance once the samples of all shards are complete."""
+def _finish(jobs: Jobs, facts: Mapping[str, Any], shards: int) -> list[str]:
+    """Write tables and provenance once the samples of all shards are complete; return the converted ones, or none."""
     output, tokens = jobs.settings.output, jobs.data.tokens
     converted, left_out = [], set()
     for record in jobs.manifest.records(tokens):
@@ -175,7 +182,7 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], shards: int) -> None:
         raise OutputError(f"{output}: expected the records of all {len(tokens)} samples, {got}")
     if missing:
         print(f"{missing} samples of other shards are missing so far; the last shard finishes the output")
-        return
+        return []
     if not converted:
         raise DataError(f"{output}: expected at least one sample that can be converted, got none")
     written, notes = jobs.format.finish(jobs.manifest.records(converted), left_out)
@@ -183,3 +190,33 @@ def _finish(jobs: Jobs, facts: Mapping[str, Any], shards: int) -> None:
         print(f"note: {note}", file=sys.stderr)
     jobs.manifest.write_provenance(facts, tokens, written)
     print(f"look at it: python -m arbiview_aug check {output}")
+    return converted
+
+
+def write_report(settings: Settings, data: Recording, tokens: Sequence[str], count: int) -> Path:
+    """Score ``count`` converted frames, spread evenly over ``tokens``, as ``evaluate`` does; return the page's path."""
+    picked = [tokens[int(k)] for k in np.unique(np.linspace(0, len(tokens) - 1, min(count, len(tokens))).round())]
+    kept = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
+    kind = "nuscenes" if settings.version else kept  # its tables may have any name
+    written = open_data(settings.output, kind=kind, version=settings.version, load_points=False)
+
+    def read_views(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:
+        stored = written.by_token(sample["token"])
+        images = dict(zip(stored["rig"].names, as_arrays(stored["images"]), strict=True))  # the reader's own order
+        seen = dict(zip(stored["rig"].names, stored["coverage"], strict=True))
+        return [RenderedView(images[name], seen[name].numpy()) for name in rig.names]
+
+    # The views were rendered at the recorded exposures.
+    frames = ((token, make_frame(data.by_token(token), exposures=("raw",))) for token in picked)
+    with gathered_warnings([]):  # each sample's were told when it was converted
+        done = evaluate(frames, lambda _: settings.sized_target, [Method(CONVERTED, read_views)])
+    title = f"{data.root.resolve().name} as {settings.target.name or 'the target'} would have seen it"
+    notes = [f"{len(picked)} of {len(tokens)} frames. LiDAR points also score views that were made with them."]
+    path = settings.output / FOLDER / "report.html"
+    page = html_report(title, done, [CONVERTED], [evaluation_table(done, [CONVERTED])], notes)
+    write_whole({path: page.encode()})
+    return path
+
+
+CONVERTED = "converted"
+"""The written views, as a row of tables."""

@@ -47,7 +47,7 @@ class NuScenesDataset(WritableRecording):
     A sample is a dict, everything in the ego frame at the LiDAR's time: ``images`` (N, 3, h, w) uint8 RGB; ``rig``;
     ``K`` (N, 3, 3) and ``cam2ego`` (N, 4, 4) float64; ``token``, ``scene_token``; ``ego2world`` (4, 4) float64;
     ``time_s``; with ``load_points`` the ``points`` (P, 5) float32: x y z intensity ring, or other columns after x y z;
-    ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians,
+    with ``load_boxes`` the ``boxes_3d`` (B, 9) float32: centre, length, width, height in metres, yaw in radians,
     velocity x y in m/s over the ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The
     numbers of points and boxes vary: batch with ``collate_fn=arbiview_aug.collate``. If no sample is annotated, they
     have no boxes, with a warning; boxes without a size are left out, with a warning. Cameras have the lens of
@@ -71,6 +71,7 @@ class NuScenesDataset(WritableRecording):
         compensate_ego_motion: Pose each camera as at its exposure, in the ego frame at the LiDAR's time. Without, its
             pose is the mounting alone, which at 9 m/s is 0.4 m away from the pixels.
         load_points: Whether to read the LiDAR's points.
+        load_boxes: Whether to read the boxes.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
         neighbours: Which other frames of the drive come with a sample; None for none. Sweeps make opening half as long
             again. If no sweep's file exists, only keyframes are neighbours, with a warning; if none of the LiDAR's
@@ -95,6 +96,7 @@ class NuScenesDataset(WritableRecording):
         channels: Sequence[str] | None = None,
         compensate_ego_motion: bool = True,
         load_points: bool = True,
+        load_boxes: bool = True,
         reduce: Reduce = 1,
         neighbours: Neighbours | None = None,
         lidar_channel: str | None = None,
@@ -120,9 +122,10 @@ class NuScenesDataset(WritableRecording):
         sweeps = [] if neighbours is None else [*self.channels, *lidars]
         self._recordings = read_recordings(tables, self._index, scenes, self.channels, self.lidar_channel, sweeps)
         times_s = self._recordings.time_s(self._recordings.keyframes[:, -1])
-        if missing := [table for table in _LABELS if not tables.path(table).is_file()]:
+        if load_boxes and (missing := [table for table in _LABELS if not tables.path(table).is_file()]):
             warn(f"nuScenes {self.root} {self.version}: no table {', '.join(missing)}: samples come without boxes_3d")
-        self._annotations = None if missing else read_annotations(tables, self._index, times_s, np.array(scenes))
+            load_boxes = False
+        self._annotations = read_annotations(tables, self._index, times_s, np.array(scenes)) if load_boxes else None
         if self._annotations is not None and self.tokens and not len(self._annotations.tokens):
             self._annotations = None  # an empty list of boxes would mean an empty street
             lacks = "has no rows of these samples (a test split?): they come without boxes_3d"
