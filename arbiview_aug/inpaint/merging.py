@@ -26,13 +26,13 @@ _AGREEMENT_LEVELS = 16.0
 """Largest difference of two frames that agree, in grey levels over a window."""
 
 _CONTRADICTION_LEVELS = 24.0
-"""The same between a frame and the current one, on a seam (``docs/drives.md``, Constants)."""
+"""The same between a frame and the current one, on a seam (``docs/decisions.md``)."""
 
 _WINDOW_PX = 5
 """Side of the window in which two frames are compared, at least 3 samples."""
 
 _CONTRADICTION_REACH = 1.25
-"""A contradiction on the seam reaches to where agreement is nearer by this factor (``docs/drives.md``, Constants)."""
+"""A contradiction on the seam reaches to where agreement is nearer by this factor (``docs/decisions.md``)."""
 
 _SAMPLES_PER_SEAM = 7
 """Rows or columns across a seam in which labelled frames are compared; all of narrower seams."""

@@ -32,7 +32,7 @@ from arbiview_aug.image_ops import level_size
 
 @dataclass(frozen=True, kw_only=True)
 class RenderConfig:
-    """Settings of planned rendering. ``docs/benchmarks.md`` (Ablation) says what each one is worth.
+    """Settings of planned rendering. ``docs/decisions.md`` says what each one is worth.
 
     Attributes:
         interpolation: Sampling of the sources. ``cubic`` applies only where a target camera magnifies what it reads at

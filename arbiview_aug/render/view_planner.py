@@ -48,7 +48,7 @@ the border of an image of 32767 px, where other weights make 1.5e-6 at least; th
 
 MAGNIFIED = 0.8
 """A view is read by cubics where it has at most this many source pixels per pixel, and is mostly read at its own
-centre: docs/benchmarks.md (Ablation)."""
+centre: docs/decisions.md."""
 
 _SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
 _STRIP_PX = 128  # height of strips in which bands along seams are rectangles
@@ -65,6 +65,11 @@ class _Pair:
     scene: Scene
     config: RenderConfig
     maps: RayCache
+
+    @cached_property
+    def order(self) -> list[int]:
+        """Numbers of the sources in content order."""
+        return content_order(self.source.cameras)
 
     @cached_property
     def baselines_m(self) -> FloatArray:
@@ -125,13 +130,17 @@ class ViewPlanner:
         rays = self.view.rays.astype(np.float64)
         return np.moveaxis((self.view.R @ rays.reshape(3, -1)).reshape(rays.shape), 0, -1)
 
+    def _surface(self, name: str) -> Any:
+        """The scene's surface of a name."""
+        return self.scene.surface(name, self.pair.source.ground_z_m)
+
     def _seen(self, name: str) -> Any:
         """A surface as the view sees it: ``kernels.Surfaces``."""
         from arbiview_aug.render.kernels import Surfaces
 
         if name in self._surfaces:
             return self._surfaces[name]
-        surface: Any = self.scene.surface(name, self.pair.source.ground_z_m)
+        surface = self._surface(name)
         camera, rays, memory, face = self.camera, self.rays, self.maps.memory, _NO_FACES
         if name == "infinity":
             q = memory.full(camera.size, 0, np.float32)
@@ -154,11 +163,11 @@ class ViewPlanner:
         """What hides the scene from the sources: ``kernels.Occluders``."""
         from arbiview_aug.render.kernels import Occluders
 
-        surface: Any = self.scene.surface(self.seen_name, self.pair.source.ground_z_m)
+        surface = self._surface(self.seen_name)
         found, scales = [], []
         for k, level in self.used:
             hiding, coarser, source = OcclusionMap(_NO_IMAGE, _NO_FACES), level, self.pair.source.cameras[k]
-            if (surface.is_layered or surface.is_dense) and not self.is_far[k]:
+            if _is_measured(surface) and not self.is_far[k]:
                 # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
                 coarser = level if surface.is_layered else max(level, occlusion_level(source))
                 half = halved_camera(source, coarser) if coarser else source
@@ -200,7 +209,7 @@ class ViewPlanner:
         surfaces = self._seen(self.seen_name)
         apart = look_apart(self.camera, pair.source.cameras, float(surfaces.q.max()))
         # In content order, so that ties never depend on the order of the source list.
-        sources = [k for k in content_order(pair.source.cameras) if asked[k] and not apart[k]]
+        sources = [k for k in pair.order if asked[k] and not apart[k]]
         read = self._read(sources)
         shape = len(sources), *surfaces.behind.shape
         uv = np.empty((len(sources), 2, *surfaces.behind.shape), np.float32)
@@ -275,9 +284,8 @@ class ViewPlanner:
             at, bands = at.rounded(), tuple(replace(band, at=band.at.rounded()) for band in bands)
         edge = self._edge(at, winner, layout) if interpolation == "cubic" else None
         measured = None
-        if self.name in self._surfaces:
-            asked: Any = self.scene.surface(self.name, self.pair.source.ground_z_m)
-            measured = self._seen(self.name).q if asked.is_layered or asked.is_dense else None
+        if self.name in self._surfaces and _is_measured(self._surface(self.name)):
+            measured = self._seen(self.name).q
         reports = tuple(self._reports(winner, won_px))
         plan = ViewPlan(at, winner, bands, reports, interpolation, certain, edge, measured=measured)
         if not self.config.layers or won_px.sum() == winner.size:
@@ -290,8 +298,7 @@ class ViewPlanner:
             surfaces = self._seen(name)
             road = self._road(surfaces.behind)
             if surfaces.face.size or layers.any():
-                surface: Any = self.scene.surface(name, self.pair.source.ground_z_m)
-                parts = surface.face_parts if surfaces.face.size else _NO_PARTS
+                parts = self._surface(name).face_parts if surfaces.face.size else _NO_PARTS
                 paint = find_paint(surfaces.q, surfaces.face, parts, winner, view.step, layers)
         return replace(plan, layers=layers if layers.any() else None, paint=paint, road=road)
 
@@ -435,6 +442,11 @@ def halved_camera(camera: Camera, level: int) -> Camera:
     """The camera of an image that was halved ``level`` times, at least once."""
     h, w = level_size(camera.size, level)
     return camera.crop(0, 0, (h << level, w << level)).resize((h, w))
+
+
+def _is_measured(surface: Any) -> bool:
+    """Whether a surface knows what stands on the street."""
+    return bool(surface.is_layered or surface.is_dense)
 
 
 def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:

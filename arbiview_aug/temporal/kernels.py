@@ -1,6 +1,6 @@
 """Compiled matching: costs of walls, semi-global aggregation (Hirschmüller, PAMI 2008), and the best wall.
 
-Grey levels are int32 sixteenths, so that sums over windows are exact. Costs are uint16. ``docs/drives.md`` (Constants)
+Grey levels are int32 sixteenths, so that sums over windows are exact. Costs are uint16. ``docs/decisions.md``
 says how the constants were chosen.
 """
 

@@ -3,7 +3,7 @@
 Each neighbour is matched by a plane sweep. The costs of both are merged and aggregated. A pixel is kept where one
 distance fits clearly better than all others, away from outlines, and where enough of its neighbours are kept too.
 Labelled objects that moved between the frames are masked in both. Unlabelled traffic is put upright where its foot is
-on the road (``arbiview_aug.temporal.moving``). ``docs/drives.md`` (Constants) says how the constants were chosen.
+on the road (``arbiview_aug.temporal.moving``). ``docs/decisions.md`` says how the constants were chosen.
 """
 
 from __future__ import annotations

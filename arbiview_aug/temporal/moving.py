@@ -4,7 +4,7 @@ Two images show a thing that moves along with the vehicle, or against it, as a c
 stays on its epipolar lines, and both neighbours agree. A copy that is too near hangs above the road. Below it the
 images match the road beyond, so the row where matching changes is the thing's foot, which gives the scale. A copy that
 is too far lies below the road, where nothing is: it moves less than the road that it hides. Crossing traffic leaves its
-epipolar lines. ``docs/drives.md`` (Constants) says how the constants were chosen.
+epipolar lines. ``docs/decisions.md`` says how the constants were chosen.
 """
 
 from __future__ import annotations
