@@ -1,4 +1,4 @@
-"""Photometric augmentation beside retargeting: torchvision's v2 pipelines, and kornia's on the images of a sample."""
+"""Photometric augmentation next to retargeting: torchvision's v2 pipelines, and kornia's on the images of a sample."""
 
 from __future__ import annotations
 
@@ -75,28 +75,18 @@ class OnImages(torch.nn.Module):
 
 
 def check_photometric(module: Callable[[torch.Tensor], torch.Tensor]) -> None:
-    """Refuse modules of kornia and torchvision that move pixels.
-
-    Raises:
-        ValueError: With the module's name and what to use.
-    """
-    for part in _parts(module):
-        if _moves_pixels(type(part)):
-            raise ValueError(
-                f"{type(part).__name__}: moves pixels and leaves K as it was; resize and crop with ResizeRig and "
-                "CropRig, turn and shift cameras with RandomRig"
-            )
-
-
-def _moves_pixels(kind: type) -> bool:
-    for base in kind.__mro__:
+    """Refuse modules of kornia and torchvision that move pixels, by name."""
+    bases = [(type(part).__name__, base) for part in _parts(module) for base in type(part).__mro__]
+    for name, base in bases:
         if base.__module__ == "torchvision.transforms.transforms":  # of both sorts: their namesakes in v2 are apart
             from torchvision.transforms import v2
 
             base = getattr(v2, base.__name__, base)
         if base.__module__.startswith(_MOVING):
-            return True
-    return False
+            raise ValueError(
+                f"{name}: moves pixels and leaves K unchanged; resize and crop with ResizeRig and "
+                "CropRig, turn and shift cameras with RandomRig"
+            )
 
 
 def _parts(module: Any) -> Iterator[Any]:

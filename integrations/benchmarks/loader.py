@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -29,15 +30,7 @@ from arbiview_aug.evaluate.frames import without_masks
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from integrations.benchmarks.study import (
-    benchmark,
-    machine_line,
-    memory_mib,
-    recorded,
-    run_study,
-    show,
-    study_parser,
-)
+from integrations.benchmarks.study import benchmark, machine_line, memory_mib, recorded, run_study, show, study_parser
 
 PLAIN = "read only"
 SOURCES_OVER_VIEWS = 2  # size of synthetic images relative to the views, so that decoding at half size pays
@@ -130,7 +123,11 @@ def loader_rates(datasets: Mapping[str, Dataset[Any]], workers: Sequence[int], e
             row |= {"frames_per_s": frames / np.median(epochs_s), "best_per_s": frames / min(epochs_s)}
             row["of_reading"] = float(np.median(times.get((PLAIN, n), epochs_s) / epochs_s))
             row["cpu_ms"] = 1e3 * used_s[name, n] / frames / epochs or None
-            rows.append(row | {"unique_mib": _unique_mib(pids[name, n]) if n else None})
+            row["unique_mib"] = None
+            with suppress(OSError):  # no Linux
+                unique = [memory_mib("smaps_rollup", "Private_(?:Clean|Dirty)", pid) for pid in pids[name, n]]
+                row["unique_mib"] = float(np.mean(unique)) if n else None
+            rows.append(row)
         return rows
 
 
@@ -139,14 +136,6 @@ def _epoch_s(loader: DataLoader[Any]) -> float:
     for _ in loader:
         pass
     return time.perf_counter() - start
-
-
-def _unique_mib(pids: Sequence[int]) -> float | None:
-    """Mean private memory of processes; None except on Linux."""
-    try:
-        return float(np.mean([memory_mib("smaps_rollup", "Private_(?:Clean|Dirty)", pid) for pid in pids]))
-    except OSError:
-        return None
 
 
 def _children() -> set[int]:

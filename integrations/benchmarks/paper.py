@@ -13,33 +13,30 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib.util import find_spec
-from itertools import product, starmap
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import Quality, Reduce
-from arbiview_aug.cli.arguments import (
-    add_options,
-    count,
-    named_steps,
-    size,
-    writable_folder,
-)
+from arbiview_aug.cli.arguments import add_options, count, named_steps, size, writable_folder
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import CalibrationError, SampleError
 from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scores, without_masks
-from arbiview_aug.evaluate.methods import Method, retargeting
+from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors, to_bytes
+from arbiview_aug.evaluate.methods import Method, Sample, own_index, retargeting
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.favs.config import PaperConfig
-from integrations.benchmarks.baselines import BASELINES, method_of
+from arbiview_aug.render.rendered import render_opencv
+from arbiview_aug.render.view_planner import build_plan
 from integrations.benchmarks.study import run_study, stored, study_parser
 
 OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")  # presets other than the published method
@@ -99,10 +96,7 @@ def measure_paper(
 ) -> Study:
     """Measure all rows on a folder of real frames; by default on ``REAL_FRAMES`` below ARBIVIEW_DATA and on streets.
 
-    Args:
-        frames: Frames per data set; by default 1 of real ones and ``SYNTHETIC_FRAMES``.
-        size: (h, w) of the synthetic images.
-        tick: Called before each step with its name and the number of steps so far.
+    ``frames`` are of each data set, by default 1 of real ones and ``SYNTHETIC_FRAMES``; ``size`` of synthetic images.
     """
     study, rows, steps = Study(), study_methods(), 0
     for name, data_set in _data_sets(data, frames, size):
@@ -127,21 +121,20 @@ def measure_paper(
 def _data_sets(
     data: str | Path | None, frames: int | None, size: tuple[int, int] | None
 ) -> Iterator[tuple[str, Iterator[ScoredFrame]]]:
+    def bare(sample: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in sample.items() if key not in ("boxes_3d", "detections")}
+
     folders = [folder for name in REAL_FRAMES if (folder := stored(name))] if data is None else [Path(data)]
     for folder in folders:
         samples = open_data(folder, reduce=REDUCE)
-        yield data_name(folder), (make_frame(_bare(samples[k])) for k in range(min(frames or 1, len(samples))))
+        yield data_name(folder), (make_frame(bare(samples[k])) for k in range(min(frames or 1, len(samples))))
     if data is None:
         rig, count = demo_source_rig(size or SYNTHETIC_SIZE), frames or SYNTHETIC_FRAMES
         drive = SyntheticDrive(rig, num_frames=count, seed=SYNTHETIC_SEED)
         yield (
             SYNTHETIC,
-            (make_frame(_bare(drive[k]), truth=partial(drive.render, k), exposures=("raw",)) for k in range(count)),
+            (make_frame(bare(drive[k]), truth=partial(drive.render, k), exposures=("raw",)) for k in range(count)),
         )
-
-
-def _bare(sample: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in sample.items() if key not in ("boxes_3d", "detections")}
 
 
 # --- targets ----------------------------------------------------------------------------------------------------------
@@ -162,36 +155,30 @@ def spacing_deg(rig: Rig) -> FloatArray:
     return np.array(spacing)
 
 
-def paper_target(rig: Rig, share: float) -> Rig:
-    """One configuration of the paper: each camera yawed by a share of its spacing, positive to the left."""
-    cameras = [
-        camera.turned(yaw_deg=share * float(spacing)) for camera, spacing in zip(rig, spacing_deg(rig), strict=True)
-    ]
-    return without_masks(rig.with_cameras(cameras))
-
-
-def vehicle_targets(rig: Rig) -> dict[str, Rig]:
-    """``VEHICLES`` by name, as pinhole rigs with the source's image width."""
-    width = float(np.median([camera.width_px for camera in rig]))
-    rigs = {}
-    for name in VEHICLES:
-        vehicle = load_rig(name).undistorted()
-        scaled = [c.resize((max(1, round(c.height_px * width / c.width_px)), round(width))) for c in vehicle]
-        rigs[name] = without_masks(vehicle.with_cameras(scaled))
-    return rigs
-
-
 def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:
-    """Targets of a set, by name: ``paper`` (six), ``yaw`` (``YAWS_DEG``), ``vehicles`` or ``truck``."""
+    """Targets of a set, by name and without masks.
+
+    ``paper``: each camera yawed by a share of its spacing, positive to the left. ``yaw``: all by ``YAWS_DEG``.
+    ``vehicles``: ``VEHICLES`` as pinhole rigs with the source's image width. ``truck``: ``TRUCK_UP_M`` higher.
+    """
     if kind == "vehicles":
-        return vehicle_targets(rig)
+        width, rigs = float(np.median([camera.width_px for camera in rig])), {}
+        for vehicle in (load_rig(name).undistorted() for name in VEHICLES):
+            scaled = [c.resize((max(1, round(c.height_px * width / c.width_px)), round(width))) for c in vehicle]
+            rigs[vehicle.name] = without_masks(vehicle.with_cameras(scaled))
+        return rigs
     if kind == "paper":
-        targets = {f"paper {share:+g}": paper_target(rig, share) for share in PAPER_SHARES}
+        spacing = spacing_deg(rig).tolist()
+        turned = {
+            share: [c.turned(yaw_deg=share * s) for c, s in zip(rig, spacing, strict=True)] for share in PAPER_SHARES
+        }
+        targets = {f"paper {share:+g}": rig.with_cameras(cameras) for share, cameras in turned.items()}
     elif kind == "yaw":
-        targets = {f"yaw {yaw:+g}": without_masks(rig.turned(yaw_deg=yaw)) for yaw in YAWS_DEG}
+        targets = {f"yaw {yaw:+g}": rig.turned(yaw_deg=yaw) for yaw in YAWS_DEG}
     else:
-        targets = {"truck": without_masks(rig.shifted(z_m=TRUCK_UP_M))}
-    return {name: replace(target, name=f"{rig.name}, {name}".lstrip(", ")) for name, target in targets.items()}
+        targets = {"truck": rig.shifted(z_m=TRUCK_UP_M)}
+    names = {name: f"{rig.name}, {name}".lstrip(", ") for name in targets}
+    return {name: replace(without_masks(target), name=names[name]) for name, target in targets.items()}
 
 
 # --- tables -----------------------------------------------------------------------------------------------------------
@@ -266,32 +253,97 @@ def paper_stages() -> dict[str, PaperConfig]:
 
     Without stage 4 the fused image is the plain mean of all sources that see a pixel.
     """
-    full = PaperConfig()
+    weights = {f"use_{weight}_weight": False for weight in ("distance", "gradient", "quality", "primary")}
     return {
-        "paper": full,
-        "paper without stage 2, matching": replace(full, use_feature_matching=False),
-        "paper without stage 3, objects": replace(full, use_object_alignment=False),
-        "paper without stages 2 and 3": replace(full, use_feature_matching=False, use_object_alignment=False),
-        "paper without stage 4, weights": replace(
-            full,
-            use_distance_weight=False,
-            use_gradient_weight=False,
-            use_quality_weight=False,
-            use_primary_weight=False,
-        ),
+        "paper": PaperConfig(),
+        "paper without stage 2, matching": PaperConfig(use_feature_matching=False),
+        "paper without stage 3, objects": PaperConfig(use_object_alignment=False),
+        "paper without stages 2 and 3": PaperConfig(use_feature_matching=False, use_object_alignment=False),
+        "paper without stage 4, weights": PaperConfig(**weights),  # type: ignore[arg-type]
     }
 
 
 def study_methods() -> list[Method]:
     """Rows of the paper's tables and ours, from images and poses alone; the generator's only with diffusers."""
-    published = [retargeting(config, "auto", name) for name, config in paper_stages().items()]
     return [
-        *starmap(method_of, BASELINES.items()),
-        *published,
+        *map(baseline, BASELINES),
+        *(retargeting(config, "auto", name) for name, config in paper_stages().items()),
         *(retargeting(quality, "street", quality) for quality in OURS),
         retargeting("fast", "street", INPAINTED, holes="telea"),
         *([retargeting("fast", "street", GENERATED, holes="diffusion")] if find_spec("diffusers") else []),
     ]
+
+
+# --- other projects' renderers ----------------------------------------------------------------------------------------
+Renderer = Callable[[Rig, Sequence[Image], Rig], list[RenderedView]]  # source rig, its images, target rig to views
+
+
+def own_camera(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
+    """Warp one source camera, of the same name or else the nearest direction, to each target camera.
+
+    "Geometric" of the paper's Table 2: projection by H = K' R' Rᵀ K⁻¹, without fusion.
+    """
+    views = []
+    for camera in target:
+        index = own_index(source, camera)
+        alone = source.with_cameras([source[index]])
+        plan = build_plan(alone, target.with_cameras([camera]), geometry="infinity")
+        (view,) = as_arrays(render_opencv(plan, as_tensors([images[index]])))
+        views.append(RenderedView(view, plan.coverage[0]))
+    return views
+
+
+def crop_and_slide(source: Rig, images: Sequence[Image], target: Rig) -> list[RenderedView]:
+    """Slide a window over the side-cropped images in ring order, as DriveSuprim's rotation augmentation does.
+
+    Each image is cropped (or stretched) to the columns half-way to its neighbours' azimuths, at a constant number of
+    pixels per degree. The strips form a closed panorama, from which a target camera gets the window of its azimuth and
+    field of view. Perspective, pitch and position are ignored; everything is covered.
+    """
+    ring = sorted(range(len(source)), key=lambda k: -source[k].azimuth_deg)  # from left to right
+    azimuth = np.array([source[k].azimuth_deg for k in ring])
+    gap = (azimuth - np.roll(azimuth, -1)) % 360  # to the next on the right
+    if len(ring) == 1:
+        gap = np.array([source[0].fov_deg[0]])
+    height = max(h for h, _ in source.sizes)
+    strips, centre_px, x = [], [], 0.0
+    per_degree = float(np.median([source[k].width_px / source[k].fov_deg[0] for k in ring]))
+    for n, k in enumerate(ring):
+        camera, image = source[k], to_bytes(images[k])
+        left, right = gap[n - 1] / 2, gap[n] / 2
+        px_per_degree = camera.width_px / camera.fov_deg[0]
+        middle = float(camera.K[0, 2]) + 0.5  # counted from the image's edge
+        a = int(np.clip(round(middle - left * px_per_degree), 0, camera.width_px - 1))
+        b = int(np.clip(round(middle + right * px_per_degree), a + 1, camera.width_px))
+        wide = max(1, round((left + right) * per_degree))
+        strips.append(cv2.resize(image[:, a:b], (wide, height), interpolation=cv2.INTER_LINEAR))
+        centre_px.append(x + left * per_degree)
+        x += wide
+    panorama = np.concatenate(strips, axis=1)
+    views = []
+    for camera in target:
+        # The nearest strip's centre, shifted by the turn from it.
+        turn = (azimuth - camera.azimuth_deg + 180) % 360 - 180
+        n = int(np.abs(turn).argmin())
+        middle = centre_px[n] + turn[n] * per_degree
+        half = per_degree * camera.fov_deg[0] / 2
+        columns = np.arange(round(middle - half), round(middle + half)) % panorama.shape[1]
+        view = np.asarray(cv2.resize(panorama[:, columns], camera.size[::-1]), np.uint8)
+        views.append(RenderedView(view, np.ones(camera.size, bool)))
+    return views
+
+
+BASELINES: dict[str, Renderer] = {"own camera": own_camera, "crop and slide": crop_and_slide}
+
+
+def baseline(name: str) -> Method:
+    """One of ``BASELINES`` as a method."""
+
+    def render(sample: Sample, target: Rig) -> list[RenderedView]:
+        rig: Rig = sample["rig"]
+        return BASELINES[name](rig, as_arrays(sample["images"]), target.in_frame_of(rig))
+
+    return Method(name, render)
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

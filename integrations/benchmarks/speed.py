@@ -10,7 +10,7 @@ A time is the median over the rounds; a ratio is the median of call / floor with
 The targets are Waymo's five cameras without and with their lenses, four fisheye cameras, and the source's own, turned,
 or raised and pitched down, all without scanners. *Motion estimate*: nuScenes' six cameras in a synthetic drive. *Depth
 maps* from motion and from a network cost the same; these say at every pixel the depth of the nearest LiDAR point.
-*Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it the plan; every other call plans anew.
+*Fused* is LiDAR with two maps. *Held*: the calibration comes back, and with it the plan; every other call makes a plan.
 Images are decoded at half size where they are then still larger than the views. They lie channels-last in one block, as
 this package's readers give them; contiguous ones are planes, torch's usual layout. Holes stay black and exposures as
 recorded, unless the settings are the *default* ones. *Moment*: a frame of PandaSet with LiDAR and its labelled boxes,
@@ -24,6 +24,7 @@ import argparse
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from itertools import cycle, islice
@@ -114,13 +115,11 @@ def _run(arguments: argparse.Namespace) -> None:
 
 def device_named(name: str) -> torch.device:
     """Torch device of this name; DataError for one that is not there."""
-    try:
+    with suppress(RuntimeError):
         device = torch.device(name)
-    except RuntimeError:
-        raise DataError(f"--device: expected cpu, cuda, cuda:1, ..., got {name!r}") from None
-    if device.type != "cpu" and not (device.type == "cuda" and (device.index or 0) < torch.cuda.device_count()):
-        raise DataError(f"--device: expected cpu or a CUDA device that is there, got {name!r}")
-    return device
+        if device.type == "cpu" or (device.type == "cuda" and (device.index or 0) < torch.cuda.device_count()):
+            return device
+    raise DataError(f"--device: expected cpu or a CUDA device that is there, for example cuda:1, got {name!r}")
 
 
 @benchmark
@@ -154,7 +153,7 @@ def measure(
                 row = {"size": [h, w], "target": target, "name": call, **quartiles(taken), "ratio": ratio}
                 rows.append(row | {"bound": BOUNDS.get((h, w), {}).get(call)})
     if not rows:
-        raise DataError(f"--only {only}: expected part of a call's name, such as boxes or neighbour")
+        raise DataError(f"--only {only}: expected part of a call's name, for example boxes or neighbour")
     return {"data": name, "rounds": repeats, "ready_s": ready_s, "measures": rows}
 
 

@@ -81,9 +81,7 @@ def test_killed_at_any_moment_it_goes_on(kind: str, shards: int, least: int, tmp
             parts = [[*asked, "--num-shards", str(shards), "--shard-index", str(k)] for k in range(shards)]
             kills += killed(parts, draw.uniform(0.05, 1) * took_s / (1 if draw.random() < 0.5 else 3))
             there = tree(output) if output.exists() else {}
-            half = [
-                name for name, content in there.items() if not name.endswith(".part") and expected.get(name) != content
-            ]
+            half = [k for k, content in there.items() if not k.endswith(".part") and expected.get(k) != content]
             assert not half, half
             partial += 0 < len(there) < len(expected)
         for process in started([asked]):
@@ -95,26 +93,12 @@ def test_killed_at_any_moment_it_goes_on(kind: str, shards: int, least: int, tmp
     )
 
 
-def children_of(pid: int | None) -> list[Any]:
-    """All processes that one has started, and theirs."""
-    return pytest.importorskip("psutil").Process(pid).children(recursive=True)
-
-
-def _runs(process: Any) -> bool:
+def runs(process: Any) -> bool:
+    """Whether a process has not ended; one that nobody has asked for its exit code has."""
     try:
         return process.is_running() and process.status() != "zombie"
     except pytest.importorskip("psutil").NoSuchProcess:
         return False
-
-
-def all_end(processes: Sequence[Any], within_s: float = 60) -> bool:
-    """Whether all end within a time; one that nobody has asked for its exit code has ended."""
-    deadline = time.monotonic() + within_s
-    while any(map(_runs, processes)):
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 @pytest.mark.slow
@@ -128,10 +112,13 @@ def test_killed_with_its_workers_it_goes_on(tmp_path: Path) -> None:
         while len(list((tmp_path / "new" / "conversion" / "samples").glob("*.json"))) < records:
             assert process.is_alive()
             time.sleep(0.005)
-        workers = children_of(process.pid)
+        workers = pytest.importorskip("psutil").Process(process.pid).children(recursive=True)
         process.kill()
         process.join()
-        assert all_end(workers)
+        deadline = time.monotonic() + 60
+        while any(map(runs, workers)):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
         assert len(tree(tmp_path / "new")) < len(tree(tmp_path / "whole"))
     assert main(asked) == 0
     assert tree(tmp_path / "new") == tree(tmp_path / "whole")

@@ -15,16 +15,15 @@ import pytest
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.evaluate.methods import retargeting
-from arbiview_aug.favs.config import PaperConfig
 from integrations.benchmarks import paper
-from integrations.benchmarks.baselines import BASELINES, crop_and_slide, method_of, own_camera
 from integrations.benchmarks.paper import (
     PROTOCOL,
     SETS,
     VEHICLES,
+    crop_and_slide,
     main,
     named_targets,
-    paper_stages,
+    own_camera,
     spacing_deg,
 )
 from tests import helpers
@@ -34,7 +33,7 @@ from tests.helpers import ring
 @pytest.fixture
 def study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, dict[str, dict[str, float]]]]:
     """The command's means with two methods, by method and set of targets."""
-    methods = [method_of("own camera", BASELINES["own camera"]), retargeting("fast", "street", "fast")]
+    methods = [paper.baseline("own camera"), retargeting("fast", "street", "fast")]
     monkeypatch.setattr(paper, "study_methods", lambda: methods)
     monkeypatch.setattr(paper, "SETS", ("paper", "truck"))
     monkeypatch.delenv("ARBIVIEW_DATA", raising=False)
@@ -82,17 +81,6 @@ def test_real_frames(study: Callable[..., Any], nuscenes_root: Path, monkeypatch
     assert {"raw_psnr_db", "even_psnr_db"} <= set(own["paper"])
     assert "even_psnr_db" in own["truck"] and "raw_psnr_db" not in own["truck"], "exposure is no geometry"
     assert fast["paper"]["even_psnr_db"] > own["paper"]["even_psnr_db"] + 8
-
-
-def test_stages_are_off_one_at_a_time() -> None:
-    whole = PaperConfig()
-    stages = paper_stages()
-    assert stages["paper"] == whole
-    off = {name: [k for k, v in vars(config).items() if v != getattr(whole, k)] for name, config in stages.items()}
-    assert off["paper without stage 2, matching"] == ["use_feature_matching"]
-    assert off["paper without stage 3, objects"] == ["use_object_alignment"]
-    weights = off["paper without stage 4, weights"]
-    assert len(weights) == 4 and all("weight" in key for key in weights)
 
 
 def test_the_papers_yaws() -> None:

@@ -10,17 +10,7 @@ import torch
 from torch import Tensor
 
 from arbiview_aug.datasets.synthetic.ground import sample_light
-from arbiview_aug.datasets.synthetic.materials import (
-    Surface,
-    band,
-    cell_hash,
-    dot,
-    fade,
-    mix,
-    noise_3d,
-    octave,
-    pulses,
-)
+from arbiview_aug.datasets.synthetic.materials import Surface, band, cell_hash, dot, fade, mix, noise_3d, octave, pulses
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, SKY_ID
 from arbiview_aug.datasets.synthetic.render import Renderer
 from arbiview_aug.datasets.synthetic.scene import BOX, Material, Scene
@@ -38,17 +28,11 @@ class Wall(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class CuboidScene(Scene):
-    """As ``Scene``, with the looks of this world.
+    """As ``Scene``, with the looks of this world."""
 
-    Attributes:
-        cobbled: Whether the road is of stones; otherwise of concrete.
-        lined: Whether it has yellow lines.
-        haze_m: Distance at which 63 % of the light is the air's.
-    """
-
-    cobbled: bool
-    lined: bool
-    haze_m: float
+    cobbled: bool  # the road is of stones; otherwise of concrete
+    lined: bool  # the road has yellow lines
+    haze_m: float  # distance at which 63 % of the light is the air's
 
 
 def shade(tables: SceneTables, hits: Hits, face: Tensor) -> Tensor:
@@ -186,10 +170,8 @@ def _road(s: Surface) -> Tensor:
     else:
         tone, joint = _tiles(x, y, (5.0, street.lane_width_m), 0.06, f, salt + 3)
         grain = 0.08 * octave(x, y, 0.15, f, salt + 4)
-        color = (
-            torch.tensor([1.0, 0.99, 0.95])
-            * (street.asphalt * 1.15 * (1 + 0.07 * tone - 0.5 * joint + stains + grain))[:, None]
-        )
+        grey = street.asphalt * 1.15 * (1 + 0.07 * tone - 0.5 * joint + stains + grain)
+        color = torch.tensor([1.0, 0.99, 0.95]) * grey[:, None]
     edge = street.lanes * street.lane_width_m
     line = band(y.abs(), edge - 0.15, edge, f) + band(y.abs(), -1.0, 0.06, f) * pulses(x, 4.0, 1.5, f)
     return mix(color, torch.tensor([0.86, 0.66, 0.10]), 0.85 * line.clamp(0, 1) * scene.lined)

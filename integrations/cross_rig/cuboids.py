@@ -1,8 +1,4 @@
-"""Another world than ``SyntheticDrive``'s: low houses, lots and cars of cuboids, cast by the same rays.
-
-It shares the package's primitives, ray caster and labels. Layout, shapes, sizes, colours, textures and light are its
-own (``cuboid_colors``).
-"""
+"""Another world than ``SyntheticDrive``'s, by the same primitives and rays: low houses, lots and cars of cuboids."""
 
 from __future__ import annotations
 
@@ -178,7 +174,7 @@ class _World:
     ) -> None:
         """A cuboid along the street."""
         place = self.builder.place((0.0, 0.0, 0.0), 0.0, cls)
-        place.box(x, _sorted(*y), z, look, taper=taper)  # type: ignore[arg-type]
+        place.box(x, (min(y), max(y)), z, look, taper=taper)  # type: ignore[arg-type]
 
     def add_land(self) -> None:
         """Sidewalks, yards behind them, and what closes both ends."""
@@ -191,7 +187,7 @@ class _World:
             far = near + walk, side * _DEPTH_M
             self.block(ends, far, (-0.5, street.kerb_m - 0.01), SceneClass.SIDEWALK, yard)
             x = side * self.rng.uniform(100, 140)
-            self.add_house(_sorted(x, x + side * 9), (-40, 40))
+            self.add_house((x, x + 9) if side > 0 else (x - 9, x), (-40, 40))
 
     def add_house(self, x: Range, y: Range) -> None:
         """A low cuboid with a hipped roof, or a higher one without; walls of one of four kinds."""
@@ -239,7 +235,7 @@ class _World:
         across = room > 4
         for x in np.arange(-60, 60, 2.9 if across else 6.0) if self.street.parking[side > 0] else ():
             if rng.random() < density:
-                yaw = math.pi / 2 * float(rng.choice([-1, 1])) if across else _heading(side)
+                yaw = math.pi / 2 * float(rng.choice([-1, 1])) if across else math.pi * (side > 0)
                 self.add_vehicle(float(x), side * (half - room / 2), yaw, 0.2 if across else 0.0)
         pitch = rng.uniform(9, 25)
         for x in np.arange(-60, 60, pitch) + rng.uniform(0, pitch):
@@ -254,7 +250,7 @@ class _World:
             x = -_TRAFFIC_M + rng.uniform(0, gap)
             while x < _TRAFFIC_M:
                 y = side * (lane + 0.5) * street.lane_width_m + rng.normal(0, 0.15)
-                self.add_vehicle(x, y, _heading(side) + rng.normal(0, 0.03))
+                self.add_vehicle(x, y, math.pi * (side > 0) + rng.normal(0, 0.03))  # it drives on the right
                 x += 6 + gap * rng.uniform(0.4, 1.6)
 
     def add_vehicle(self, x: float, y: float, yaw: float, short: float = 0.0, z: float = 0.0) -> None:
@@ -279,9 +275,8 @@ class _World:
             if not self.claim(x, y, width, width, 0.0):
                 continue
             base, yaw = self.street.kerb_m, float(rng.choice([0, math.pi]))
-            row = self.builder.add_box(
-                np.array([x, y, base + height / 2]), (0.3, width, height), yaw, BoxClass.PEDESTRIAN
-            )
+            centre = np.array([x, y, base + height / 2])
+            row = self.builder.add_box(centre, (0.3, width, height), yaw, BoxClass.PEDESTRIAN)
             place = self.builder.place((x, y, base), yaw, SceneClass.PEDESTRIAN, row)
             hip, neck, half = 0.48 * height, height - 0.27, width / 2
             place.box((-0.15, 0.15), (-half * 0.8, half * 0.8), (0, hip), _plain(self.color(_CLOTHES)))
@@ -332,12 +327,3 @@ def _add_body(place: Placed, kind: _Kind, size: Vector, color: Callable[..., Vec
 
 def _plain(color: Vector) -> Look:
     return Look(Material.PLAIN, color)
-
-
-def _heading(side: int) -> float:
-    """Yaw of traffic on the right (-1) or left (1) side."""
-    return 0.0 if side < 0 else math.pi
-
-
-def _sorted(a: float, b: float) -> Range:
-    return min(a, b), max(a, b)

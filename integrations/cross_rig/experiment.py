@@ -1,7 +1,4 @@
-"""Settings of a run, and what runs that is missing: frames, then trainings and their tests.
-
-Each is a file, and a run can be killed at any time.
-"""
+"""Settings of a run, and what it makes: frames, then trainings with their tests, each a file, so that it may die."""
 
 from __future__ import annotations
 
@@ -33,8 +30,6 @@ from integrations.cross_rig.training import Draws, FrameSet, Schedule, evaluate,
 from integrations.cross_rig.variants import VARIANTS, Variant
 
 Length = Literal["short", "long"]
-"""Names of schedules."""
-
 LONGER = 2.6
 """Steps of the long schedule over those of the short one. It is long enough where B's own frames gain less than a point
 of IoU by twice as many steps."""
@@ -45,35 +40,21 @@ REAL = "real"
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """A run.
-
-    Attributes:
-        size: (h, w) of every image.
-        train_frames, val_frames, test_frames: Sizes of the three sets of frames.
-        streets: The world that all three come from, a whole hundred: ``frames.street_seed``.
-        world: Maker of the streets.
-        recorded: ``open_data``'s names of the data sets of A and B, instead of streets.
-        seeds: Seeds of the trainings; each variant is trained once with each.
-        changes: Names of ``frames.CHANGES``, or ``REAL`` alone.
-        variants: Names of ``variants.VARIANTS``.
-        families: Names of ``families.FAMILIES``.
-        schedules: Every variant is trained on each.
-        schedule: The short one of every training; each job's family and length replace its values.
-    """
+    """A run; every variant is trained with each seed, family and schedule."""
 
     size: Size = (96, 256)
     train_frames: int = 200
     val_frames: int = 100
     test_frames: int = 200
-    streets: int = STREETS
+    streets: int = STREETS  # the world of all three sets, a whole hundred, for ``street_seed``
     world: World = "drive"
-    recorded: tuple[str, str] | None = None
+    recorded: tuple[str, str] | None = None  # names of A's and B's data sets for ``open_data``, instead of streets
     seeds: tuple[int, ...] = (0,)
-    changes: tuple[str, ...] = ("up70",)
+    changes: tuple[str, ...] = ("up70",)  # names of ``frames.CHANGES``, or ``REAL`` alone
     variants: tuple[str, ...] = ("raw", "auto_fill", "auto_fill_mixed", "oracle")
     families: tuple[str, ...] = ("voxels",)
     schedules: tuple[Length, ...] = ("short",)
-    schedule: Schedule = field(default_factory=lambda: Schedule(steps=400))
+    schedule: Schedule = field(default_factory=lambda: Schedule(steps=400))  # the short one
 
     def count(self, split: Split) -> int:
         """Number of frames of a split."""
@@ -82,19 +63,11 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """A training.
-
-    Attributes:
-        variant: How.
-        change: For which vehicle B; None where B does not matter: one training serves every change.
-        seed: Seed of its initialisation and its draws, the same for every variant.
-        family: Family of the detector.
-        length: Length of its schedule.
-    """
+    """A training."""
 
     variant: Variant
-    change: str | None
-    seed: int
+    change: str | None  # for which vehicle B; None where B does not matter: one training serves every change
+    seed: int  # of its initialisation and its draws, the same for every variant
     family: str = "voxels"
     length: Length = "short"
 
@@ -118,15 +91,9 @@ def jobs(settings: Settings) -> list[Job]:
 
 def quick() -> Settings:
     """One change, one seed, both schedules on the streets of cuboids, minutes: is the oracle above raw?"""
-    return Settings(
-        train_frames=100,
-        val_frames=20,
-        test_frames=60,
-        variants=("raw", "auto_fill", "oracle"),
-        world="cuboids",
-        schedules=("short", "long"),
-        schedule=Schedule(steps=150),
-    )
+    frames: dict[str, Any] = {"train_frames": 100, "val_frames": 20, "test_frames": 60}
+    variants, steps = ("raw", "auto_fill", "oracle"), Schedule(steps=150)
+    return Settings(**frames, variants=variants, world="cuboids", schedules=("short", "long"), schedule=steps)
 
 
 def small() -> Settings:
@@ -141,11 +108,7 @@ def recorded(base: Settings, a: str, b: str) -> Settings:
 
 
 def fitted(settings: Settings) -> Settings:
-    """Settings of as many recorded frames as there are: B's own training frames are no more than A's.
-
-    Raises:
-        DataError: A data set cannot be read, has no labels, or too few drives.
-    """
+    """Settings of as many recorded frames as there are, with labels: B's own training frames are no more than A's."""
     assert settings.recorded is not None
     a, b = settings.recorded
     train = min(len(frames_of_a(a, b)), len(frames_of(b, "train")), settings.train_frames)
@@ -153,9 +116,6 @@ def fitted(settings: Settings) -> Settings:
     for data in (a, b):
         vehicles_of(recording(data)[0], data)
     return replace(settings, train_frames=train, **counts)
-
-
-Log = Callable[[str], None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,19 +128,17 @@ class Run:
     # --- frames -------------------------------------------------------------------------------------------------------
     def source(self, split: Split, change: str | None = None, variant: Variant | None = None) -> Source:
         """A set of frames of this run."""
-        s, common = self.settings, {"split": split, "change": change, "variant": variant}
-        root = self.output / "frames"
+        s = self.settings
+        make: Callable[..., Source] = partial(Source, streets=s.streets, world=s.world)
         if s.recorded is not None:
-            return RecordedSource(root=root, size=s.size, data=s.recorded, **common)  # type: ignore[arg-type]
-        return Source(root=root, size=s.size, streets=s.streets, world=s.world, **common)  # type: ignore[arg-type]
+            make = partial(RecordedSource, data=s.recorded)
+        return make(root=self.output / "frames", size=s.size, split=split, change=change, variant=variant)
 
-    def images(self, job: Job) -> Source:
-        """Frames that a job is trained on."""
-        return self.source("train", job.change, job.variant if job.variant.renders else None)
-
-    def labels(self, job: Job) -> Source:
-        """Frames whose labels a job is trained on: objects count that the rig of the recording sees."""
-        return self.source("train") if job.variant.renders else self.images(job)
+    def trained_on(self, job: Job) -> tuple[Source, Source]:
+        """Frames with the images and with the labels of a job: objects count that the rig of the recording sees."""
+        if job.variant.renders:
+            return self.source("train", job.change, job.variant), self.source("train")
+        return (self.source("train", job.change),) * 2
 
     def tests(self, change: str | None) -> list[Source]:
         """A vehicle's true frames, for the threshold and for the test."""
@@ -190,7 +148,7 @@ class Run:
         """Every set that the run needs, in the order in which they can be made."""
         needed = [self.source("train")]
         needed += [true for change in self.settings.changes for true in self.tests(change)]
-        needed += [self.images(job) for job in jobs(self.settings)]
+        needed += [self.trained_on(job)[0] for job in jobs(self.settings)]
         return list({source.store().key: source for source in needed}.values())
 
     def frames(self, images: Source, labels: Source) -> FrameSet:
@@ -209,53 +167,34 @@ class Run:
 
     def draws(self, job: Job) -> Draws:
         """The batches of a job's training."""
-        raw = self.source("train")
-        return Draws(
-            self.frames(self.images(job), self.labels(job)),
-            self.frames(raw, raw) if job.variant.mixed else None,
-            self.settings.train_frames,
-            job.seed,
-            augmented=job.variant.augmented,
-        )
-
-    def tested_on(self, job: Job) -> tuple[str, ...]:
-        """The changes whose vehicle B a job's model is tested on."""
-        return self.settings.changes if job.change is None else (job.change,)
+        frames, raw, count = self.frames(*self.trained_on(job)), self.source("train"), self.settings.train_frames
+        mixed_in = self.frames(raw, raw) if job.variant.mixed else None
+        return Draws(frames, mixed_in, count, job.seed, augmented=job.variant.augmented)
 
     def result_path(self, job: Job) -> Path:
         """File of a job's counts, named after all that they depend on."""
-        tests = [source for change in self.tested_on(job) for source in self.tests(change)]
-        sources = (self.images(job), self.labels(job), self.source("train"), *tests)
+        tested_on = self.settings.changes if job.change is None else (job.change,)
+        tests = [source for change in tested_on for source in self.tests(change)]
+        sources = (*self.trained_on(job), self.source("train"), *tests)
         frames = [[source.store().key, self.settings.count(source.split)] for source in sources]
         key = content_hash([frames, asdict(self.schedule(job)), asdict(job.variant), job.seed])
         return self.output / "results" / f"{job.name}-{key}.json"
-
-    def missing(self) -> list[Job]:
-        """Jobs whose result is not there."""
-        return [job for job in jobs(self.settings) if not self.result_path(job).is_file()]
 
     def do(self, job: Job) -> str:
         """Train and test; returns a line for the log."""
         start, schedule = time.process_time(), self.schedule(job)
         model, losses = train(self.draws(job), schedule, job.seed)
         tested = {}
-        for change in self.tested_on(job):
+        for change in self.settings.changes if job.change is None else (job.change,):
             val, test = (self.frames(true, true) for true in self.tests(change))
             tested[change] = evaluate(model, val, test, schedule)
         cpu_s = time.process_time() - start
         result = {"losses": losses, "cpu_s": cpu_s, "tested": tested}
         write_whole({self.result_path(job): json.dumps(result).encode()})
-        return f"{job.name}: {cpu_s:.0f} s, " + ", ".join(
-            f"{k} val {100 * t['val_iou']:.1f}" for k, t in tested.items()
-        )
+        ious = ", ".join(f"{change} val {100 * counts['val_iou']:.1f}" for change, counts in tested.items())
+        return f"{job.name}: {cpu_s:.0f} s, {ious}"
 
     # --- results ------------------------------------------------------------------------------------------------------
-    def title(self, change: str) -> str:
-        """Title of a change in tables."""
-        if self.settings.recorded is None:
-            return CHANGES[change].title
-        return " to ".join(Path(data).name for data in self.settings.recorded)
-
     def results(self, family: str, length: Length) -> dict[str, dict[str, dict[int, dict[str, Any]]]]:
         """The results of a family on a schedule that are there: by change, variant and seed."""
         found: dict[str, dict[str, dict[int, dict[str, Any]]]] = {name: {} for name in self.settings.changes}
@@ -267,7 +206,7 @@ class Run:
         return found
 
 
-def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
+def run(setup: Run, workers: int, log: Callable[[str], None]) -> Iterator[int]:
     """Make everything that is missing; yields the number of missing trainings, before the first and after each."""
     for source in setup.sources():
         start = time.monotonic()
@@ -275,7 +214,7 @@ def run(setup: Run, workers: int, log: Log) -> Iterator[int]:
         if made := make_frames(source, setup.settings.count(source.split), workers):
             took_s = time.monotonic() - start
             log(f"{source.split} frames, {source.change or 'A'}, {title}: {made} made, {took_s:.0f} s")
-    missing = setup.missing()
+    missing = [job for job in jobs(setup.settings) if not setup.result_path(job).is_file()]
     yield len(missing)
     for done, line in enumerate(in_processes(setup.do, missing, workers), 1):
         log(line)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -36,11 +35,8 @@ _REACH_M = 2.0
 
 def conv(into: int, out: int, *, stride: int = 1, dilation: int = 1) -> nn.Sequential:
     """A convolution of 3×3 with normalisation and ReLU."""
-    return nn.Sequential(
-        nn.Conv2d(into, out, 3, stride, dilation, dilation=dilation, bias=False),
-        nn.BatchNorm2d(out),
-        nn.ReLU(inplace=True),
-    )
+    convolution = nn.Conv2d(into, out, 3, stride, dilation, dilation=dilation, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(out), nn.ReLU(inplace=True))
 
 
 class Residual(nn.Module):
@@ -56,50 +52,29 @@ class Residual(nn.Module):
 
 @dataclass(frozen=True)
 class Batch:
-    """Frames of any rigs whose images have one size; T images in all.
+    """Frames of any rigs whose images have one size; T images in all."""
 
-    Attributes:
-        images: (T, 3, h, w) uint8.
-        coverage: (T, h, w) bool.
-        K: (T, 3, 3) float32.
-        cam2ego: (T, 4, 4) float32, poses in an ego frame whose road is at z = 0.
-        frame: (T,) int64, the frame of each image, ascending.
-        state: (B, cells, cells) uint8 of ``labels``.
-        counts: (B, cells, cells) bool, the cells that count.
-        boxes: (B, n, 7) float32 vehicles, padded with NaN.
-    """
-
-    images: Tensor
-    coverage: Tensor
-    K: Tensor
-    cam2ego: Tensor
-    frame: Tensor
-    state: Tensor
-    counts: Tensor
-    boxes: Tensor
+    images: Tensor  # (T, 3, h, w) uint8
+    coverage: Tensor  # (T, h, w) bool
+    K: Tensor  # (T, 3, 3) float32
+    cam2ego: Tensor  # (T, 4, 4) float32, in an ego frame whose road is at z = 0
+    frame: Tensor  # (T,) int64, the frame of each image, ascending
+    state: Tensor  # (B, cells, cells) uint8 of ``labels``
+    counts: Tensor  # (B, cells, cells) bool, the cells that count
+    boxes: Tensor  # (B, n, 7) float32 vehicles, padded with NaN
 
     def covered(self) -> Tensor:
         """(T, h / 4, w / 4) share of each feature's pixels that is covered."""
         return F.avg_pool2d(self.coverage[:, None].float(), STRIDE)[:, 0]
 
 
-class Bags(NamedTuple):
-    """For each place, the features that it sums: arguments of ``F.embedding_bag``.
-
-    Attributes:
-        rows: (P,) int64 rows of the features (T * h * w, C).
-        weights: (P,) float32.
-        offsets: (places,) int64, where each place's rows begin.
-    """
-
-    rows: Tensor
-    weights: Tensor
-    offsets: Tensor
-
-    def sums(self, features: Tensor) -> Tensor:
-        """(places, C) weighted sums of features (T, C, h, w)."""
-        flat = features.permute(0, 2, 3, 1).reshape(-1, features.shape[1]).float()
-        return F.embedding_bag(self.rows, flat, self.offsets, mode="sum", per_sample_weights=self.weights)
+def sums(features: Tensor, place: Tensor, rows: Tensor, weights: Tensor, places: int) -> Tensor:
+    """(places, C) weighted sums of features (T, C, h, w): rows of (T * h * w, C) and weights (P, n) by place (P,)."""
+    place, order = place.sort(stable=True)
+    flat = features.permute(0, 2, 3, 1).reshape(-1, features.shape[1]).float()
+    count = torch.bincount(place, minlength=places) * rows.shape[1]
+    bags = rows[order].flatten(), flat, count.cumsum(0) - count
+    return F.embedding_bag(*bags, mode="sum", per_sample_weights=weights[order].flatten())
 
 
 def project(batch: Batch, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -114,13 +89,7 @@ def project(batch: Batch, points: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Voxels(nn.Module):
-    """Voxel sampling (SimpleBEV, Harley et al., ICRA 2023): no depth distribution, one average for each voxel.
-
-    Args:
-        grid: Grid of the labels; cells of the map are twice as wide.
-        channels: Channels of the features.
-        width: Width of the map.
-    """
+    """Voxel sampling (SimpleBEV, Harley et al., ICRA 2023): one average a voxel; cells of the map are twice as wide."""
 
     voxels: Tensor
 
@@ -132,23 +101,16 @@ class Voxels(nn.Module):
         self.register_buffer("voxels", torch.cat(slices), persistent=False)  # slice by slice
         self.map = _map_network(channels * len(VOXEL_HEIGHTS_M), width)
 
-    def voxel_features(self, features: Tensor, batch: Batch) -> Tensor:
-        """(B, heights, side, side, C): what each voxel sees; zero where nothing is covered."""
-        with torch.autocast("cpu", enabled=False):  # coordinates are never rounded to bf16
-            read = read_at(features, batch, self.voxels)
-        return read.view(len(batch.state), len(VOXEL_HEIGHTS_M), self.side, self.side, -1)
-
     def forward(self, features: Tensor, batch: Batch) -> Tensor:
         """(B, width, side, side) map of features (T, C, h, w)."""
-        stacked = self.voxel_features(features, batch).permute(0, 1, 4, 2, 3).flatten(1, 2)
-        return self.map(stacked)
+        with torch.autocast("cpu", enabled=False):  # coordinates are never rounded to bf16
+            read = read_at(features, batch, self.voxels)
+        voxels = read.view(len(batch.state), len(VOXEL_HEIGHTS_M), self.side, self.side, -1)
+        return self.map(voxels.permute(0, 1, 4, 2, 3).flatten(1, 2))
 
 
 class Depths(nn.Module):
-    """Lifting by a learned distribution over depths (LSS, Philion and Fidler, ECCV 2020; BEVDet): sums over columns.
-
-    Args: as of ``Voxels``.
-    """
+    """Lifting by a learned distribution over depths (LSS, Philion and Fidler, ECCV 2020; BEVDet): sums over columns."""
 
     depths: Tensor
 
@@ -159,13 +121,8 @@ class Depths(nn.Module):
         self.distribution = nn.Sequential(Residual(channels), nn.Conv2d(channels, len(DEPTHS_M), 1))
         self.map = _map_network(channels, width)
 
-    def bags(self, batch: Batch, probability: Tensor) -> Bags:
-        """Sort the points of all features and depths by the cell of the map that they lie in.
-
-        Args:
-            batch: Calibration and coverage.
-            probability: (T, depths, h, w).
-        """
+    def lifted(self, features: Tensor, batch: Batch, probability: Tensor) -> Tensor:
+        """(B * side * side, C) sums over the map's cells of features (T, C, h, w) at all depths (T, depths, h, w)."""
         fh, fw = probability.shape[-2:]
         side = self.grid.cells
         v, u = torch.meshgrid(torch.arange(fh), torch.arange(fw), indexing="ij")
@@ -178,30 +135,25 @@ class Depths(nn.Module):
         inside = ((cell >= 0) & (cell < side)).all(-1) & (points[..., 2] > low) & (points[..., 2] < high)
         image, depth, feature = inside.nonzero(as_tuple=True)
         x, y = cell[image, depth, feature].unbind(-1)
-        place, order = ((batch.frame[image] * side + x) * side + y).sort(stable=True)
-        image, depth, feature = image[order], depth[order], feature[order]
-        row = image * fh * fw + feature
+        place, row = (batch.frame[image] * side + x) * side + y, image * fh * fw + feature
         weight = probability.flatten(2)[image, depth, feature] * batch.covered().flatten()[row]
-        count = torch.bincount(place, minlength=len(batch.state) * side * side)
-        return Bags(row, weight, count.cumsum(0) - count)
+        return sums(features, place, row[:, None], weight[:, None], len(batch.state) * side * side)
 
     def forward(self, features: Tensor, batch: Batch) -> Tensor:
         """(B, width, side, side) map of features (T, C, h, w)."""
         logits = self.distribution(features)
         with torch.autocast("cpu", enabled=False):
-            bags = self.bags(batch, logits.float().softmax(1))
+            lifted = self.lifted(features, batch, logits.float().softmax(1))
         side = self.grid.cells
-        lifted = bags.sums(features).view(len(batch.state), side, side, -1)
-        return self.map(lifted.permute(0, 3, 1, 2))
+        return self.map(lifted.view(len(batch.state), side, side, -1).permute(0, 3, 1, 2))
 
 
 class Queries(nn.Module):
     """Queries with 3D references (DETR3D, Wang et al., CoRL 2021; PETR): features are read where points project to.
 
-    Reference points lie on a grid; each query answers for its own cell, so that no matching is needed. Each layer
-    reads at learned points around the reference, lets queries attend to each other, and passes on.
-
-    Args: as of ``Voxels``, but that cells of the map are four times as wide.
+    Reference points lie on a grid of cells four times as wide as the labels'; each query answers for its own cell, so
+    that no matching is needed. Each layer reads at learned points around the reference, then queries attend to each
+    other.
     """
 
     references: Tensor
@@ -256,8 +208,7 @@ def read_at(features: Tensor, batch: Batch, points: Tensor) -> Tensor:
     pixel, inside = project(batch, points if points.ndim == 2 else points[batch.frame])
     num_frames, num_points = len(batch.state), points.shape[-2]
     image, point = inside.nonzero(as_tuple=True)
-    bag, order = (batch.frame[image] * num_points + point).sort(stable=True)
-    image, point = image[order], point[order]
+    place = batch.frame[image] * num_points + point
     # Pixel centres are integers: feature (0, 0) is centred on pixel (STRIDE - 1) / 2.
     at = (pixel[image, point] - (STRIDE - 1) / 2) / STRIDE
     low = at.floor()
@@ -272,11 +223,10 @@ def read_at(features: Tensor, batch: Batch, points: Tensor) -> Tensor:
         rows.append(row)
         weights.append(wx * wy * in_map * covered[row])
     weight = torch.stack(weights, 1)  # [P / 4, 4]
-    total = torch.zeros(num_frames * num_points).index_add_(0, bag, weight.sum(1))
-    weight = weight / total[bag].clamp(min=1e-6)[:, None]
-    count = torch.bincount(bag, minlength=num_frames * num_points) * 4
-    bags = Bags(torch.stack(rows, 1).flatten(), weight.flatten(), count.cumsum(0) - count)
-    return bags.sums(features).view(num_frames, num_points, -1)
+    total = torch.zeros(num_frames * num_points).index_add_(0, place, weight.sum(1))
+    weight = weight / total[place].clamp(min=1e-6)[:, None]
+    read = sums(features, place, torch.stack(rows, 1), weight, num_frames * num_points)
+    return read.view(num_frames, num_points, -1)
 
 
 def _map_network(channels: int, width: int) -> nn.Sequential:
@@ -284,9 +234,5 @@ def _map_network(channels: int, width: int) -> nn.Sequential:
     return nn.Sequential(reduce, *(Residual(width, dilation=d) for d in (1, 2, 4)))
 
 
-FAMILIES: dict[str, type[Voxels] | type[Depths] | type[Queries]] = {
-    "voxels": Voxels,
-    "depths": Depths,
-    "queries": Queries,
-}
+FAMILIES: dict[str, type[nn.Module]] = {"voxels": Voxels, "depths": Depths, "queries": Queries}
 """By name on the command line."""

@@ -1,7 +1,6 @@
-"""The vehicles, the streets, and the frames of the experiment on disk: A's, B's, each variant's training set.
+"""The vehicles, the streets, and the frames on disk: A's, B's, each variant's training set.
 
-Each frame is a file in a folder named after what makes it. A file is whole or not there, so that a process may die at
-any time; the next one makes what is missing.
+Each frame is a file, whole or not there, in a folder named after what makes it: a killed run continues.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -27,8 +26,8 @@ from arbiview_aug import Camera, Rig
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_target_rig
 from integrations.cross_rig.cuboids import CuboidDrive
-from integrations.cross_rig.labels import Grid, box_cells, vehicle_boxes, visible_objects
-from integrations.cross_rig.variants import Arrays, Variant, ViewMaker
+from integrations.cross_rig.labels import VISIBLE_SHARE, Grid, labels_of
+from integrations.cross_rig.variants import Arrays, Variant, view_maker
 
 Size = tuple[int, int]
 """(h, w) of every image."""
@@ -51,17 +50,16 @@ def street_seed(split: Split, streets: int = STREETS) -> int:
     return streets + 1 + SPLITS.index(split)
 
 
-_AZIMUTHS_DEG = (0.0, 55.0, -55.0, 110.0, -110.0, 180.0)
+_AZIMUTHS_DEG = {"front": 0.0, "front_left": 55.0, "front_right": -55.0}
+_AZIMUTHS_DEG |= {"back_left": 110.0, "back_right": -110.0, "back": 180.0}
 """nuScenes' six cameras."""
-_NAMES = ("front", "front_left", "front_right", "back_left", "back_right", "back")
 _RING_RADIUS_M = 0.8
 _RING_CENTRE_X_M = 0.9
 _HEIGHT_M = 1.5
 _FOV_DEG = 65.0
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(NamedTuple):
     """A change of vehicle: its title in tables, and vehicle B at a size, in A's ego frame."""
 
     title: str
@@ -72,7 +70,7 @@ def source_rig(size: Size, *, fov_deg: float = _FOV_DEG, height_m: float = _HEIG
     """Vehicle A: six cameras around a car's roof, all with one field of view."""
     looking = partial(Camera.looking, width_px=size[1], height_px=size[0], horizontal_fov_deg=fov_deg)
     cameras = []
-    for name, azimuth in zip(_NAMES, _AZIMUTHS_DEG, strict=True):
+    for name, azimuth in _AZIMUTHS_DEG.items():
         angle = math.radians(azimuth)
         x, y = _RING_CENTRE_X_M + _RING_RADIUS_M * math.cos(angle), 0.6 * _RING_RADIUS_M * math.sin(angle)
         cameras.append(looking(name=name, azimuth_deg=azimuth, position_m=(x, y, height_m)))
@@ -100,11 +98,9 @@ def code_hash() -> str:
 
 
 class FrameStore:
-    """A set of frames below ``root``: each frame a dict of arrays of one shape and type throughout.
+    """A set of frames in a folder below ``root``, named after the code and ``spec``, which says what the frames are.
 
-    Args:
-        root: Folder of all sets.
-        spec: Plain data that says what the frames are; with the code it names the set's folder.
+    Each frame is a dict of arrays of one shape and type throughout.
     """
 
     def __init__(self, root: Path, spec: Any) -> None:
@@ -143,24 +139,14 @@ _MAX_FRAMES = 1 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class Source:
-    """Which frames: plain data, so that worker processes can be told.
+    """Which frames: plain data, so that worker processes can be told."""
 
-    Attributes:
-        root: Folder of all sets.
-        size: (h, w) of the images.
-        split: Streets.
-        change: Vehicle B by its change; None: vehicle A.
-        variant: Whose training set; None: the rig's true frames. Variants that only draw differently share one.
-        streets: The world, by ``frames.street_seed``.
-        world: The generator of the streets.
-    """
-
-    root: Path
+    root: Path  # folder of all sets
     size: Size
     split: Split
-    change: str | None = None
-    variant: Variant | None = None
-    streets: int = STREETS
+    change: str | None = None  # vehicle B by its change; None: vehicle A
+    variant: Variant | None = None  # whose training set; None: the rig's true frames
+    streets: int = STREETS  # the world, for ``street_seed``
     world: World = "drive"
 
     def drive(self, rig: Rig) -> SyntheticDrive:
@@ -199,12 +185,11 @@ class Source:
 
     def _true_frame(self, index: int) -> Arrays:
         """A frame that a rig really sees: images, calibration and labels."""
-        rig, grid, drive = self.rig, Grid(), self._own_drive
+        rig, drive = self.rig, self._own_drive
         scene, views = drive.scene(index), drive.render(index)
         boxes = scene.boxes_ego(rig.ground_z_m)
-        visible = visible_objects(views.visible_pixels(len(boxes)).numpy(), self.size)
-        labels: Arrays = {"state": box_cells(grid, boxes, scene.box_classes, visible)}
-        labels |= {"boxes": vehicle_boxes(grid, scene, rig.ground_z_m)}
+        pixels = views.visible_pixels(len(boxes)).numpy().max(0)  # of the camera that shows most of an object
+        labels = labels_of(Grid(), boxes, scene.box_classes, pixels >= max(1.0, VISIBLE_SHARE * math.prod(self.size)))
         calibration = {"K": rig.K.astype(np.float32), "cam2ego": rig.cam2ego.astype(np.float32)}
         assert isinstance(views.images, torch.Tensor)
         return {"images": views.images.numpy(), **calibration, **labels}
@@ -212,7 +197,7 @@ class Source:
     def _views(self, variant: Variant) -> Callable[[int], Arrays]:
         """A's frames as a variant re-renders them; points are cast again, since that is cheaper than keeping them."""
         original = self.original()
-        store, views, drive = original.store(), ViewMaker(variant, original.rig, self.rig), self.drive(original.rig)
+        store, views, drive = original.store(), view_maker(variant, original.rig, self.rig), self.drive(original.rig)
 
         def make(index: int) -> Arrays:
             boxes = drive.scene(index).boxes_ego(original.rig.ground_z_m).astype(np.float32)

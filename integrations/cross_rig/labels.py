@@ -1,8 +1,4 @@
-"""Labels on a bird's-eye-view grid: occupancy by vehicles, cells that count, boxes; and average precision of boxes.
-
-The grid is square and centred on the ego's origin; row i lies at x = low + (i + 0.5) cells (forward), column j at
-y = low + (j + 0.5) cells (left).
-"""
+"""Labels on a bird's-eye-view grid: occupancy by vehicles, cells that count, boxes; and average precision of boxes."""
 
 from __future__ import annotations
 
@@ -15,7 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from arbiview_aug import Rig
-from arbiview_aug.datasets.synthetic import BoxClass, Scene
+from arbiview_aug.datasets.synthetic import BoxClass
 
 FREE, VEHICLE, HIDDEN = 0, 1, 2
 """Cells without a vehicle, with one that the rig sees, with one that it does not see (which count for nothing)."""
@@ -28,12 +24,12 @@ VISIBLE_SHARE = 16 / (96 * 256)
 _COVER_HEIGHT_M = 0.8
 """A cell is covered where a camera sees this height over its centre: half a car's."""
 
-Cells = npt.NDArray[np.uint8]
+Floats = npt.NDArray[np.floating]
 
 
 @dataclass(frozen=True)
 class Grid:
-    """``cells`` × ``cells`` cells over a square of ``side_m`` metres."""
+    """Square of ``cells`` × ``cells`` cells around the ego's origin; rows go forward, columns to the left."""
 
     side_m: float = 50.0
     cells: int = 100
@@ -49,39 +45,27 @@ class Grid:
         return np.stack(np.meshgrid(axis, axis, indexing="ij"), -1)
 
 
-def box_cells(
-    grid: Grid,
-    boxes: npt.NDArray[np.floating],
-    classes: npt.NDArray[np.integer],
-    visible: npt.NDArray[np.bool_],
-) -> Cells:
-    """The cells whose centres lie in vehicles' footprints.
+def labels_of(
+    grid: Grid, boxes: Floats, classes: npt.NDArray[np.integer], visible: npt.NDArray[np.bool_]
+) -> dict[str, np.ndarray]:
+    """Labels of boxes (B, 7) of classes (B,), visible to the rig or not (B,), as arrays of fixed shapes.
 
-    Args:
-        grid: The grid.
-        boxes: (B, 7) centre x y z, length, width, height, yaw; ego frame.
-        classes: (B,) ``BoxClass``.
-        visible: (B,) whether the rig sees the object.
-
-    Returns:
-        (cells, cells) uint8 ``FREE``, ``VEHICLE`` or ``HIDDEN``.
+    ``state`` (cells, cells) uint8: ``FREE``, ``VEHICLE`` or ``HIDDEN``, by footprints over the cells' centres.
+    ``boxes`` (MAX_BOXES, 7) float32: vehicles with centres on the grid, padded with NaN.
     """
     x, y = np.moveaxis(grid.centres(), -1, 0)
     state = np.zeros((grid.cells, grid.cells), np.uint8)
-    for box, is_visible in sorted(
-        ((box, seen) for box, cls, seen in zip(boxes, classes, visible, strict=True) if cls in VEHICLES),
-        key=lambda pair: pair[1],  # where footprints touch, the visible one has the cell
-    ):
+    is_vehicle = np.isin(classes, VEHICLES)
+    vehicles, visible = boxes[is_vehicle], visible[is_vehicle]
+    for k in np.argsort(visible, kind="stable"):  # where footprints touch, the visible one has the cell
+        box = vehicles[k]
         c, s = np.cos(box[6]), np.sin(box[6])
         dx, dy = x - box[0], y - box[1]
         inside = (np.abs(c * dx + s * dy) <= box[3] / 2) & (np.abs(c * dy - s * dx) <= box[4] / 2)
-        state[inside] = VEHICLE if is_visible else HIDDEN
-    return state
-
-
-def visible_objects(pixels: npt.NDArray[np.integer], size: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """(B,) bool from the (N, B) pixels of each camera that show each object (``RenderedViews.visible_pixels``)."""
-    return np.asarray(pixels.max(0) >= max(1.0, VISIBLE_SHARE * size[0] * size[1]))
+        state[inside] = VEHICLE if visible[k] else HIDDEN
+    vehicles = vehicles[(np.abs(vehicles[:, :2]) < grid.side_m / 2).all(-1)][:MAX_BOXES]
+    padding = (0, MAX_BOXES - len(vehicles)), (0, 0)
+    return {"state": state, "boxes": np.pad(vehicles, padding, constant_values=np.nan).astype(np.float32)}
 
 
 def covered_cells(grid: Grid, rig: Rig) -> npt.NDArray[np.bool_]:
@@ -95,8 +79,6 @@ def covered_cells(grid: Grid, rig: Rig) -> npt.NDArray[np.bool_]:
         covered |= valid & (depth > 0) & inside
     return covered
 
-
-Floats = npt.NDArray[np.floating]
 
 MAX_BOXES = 64
 """Vehicles of a frame within the grid that are kept."""
@@ -114,27 +96,11 @@ _REGRESSION = 0.25
 _ALPHA, _BETA = 2.0, 4.0  # of the focal loss of centres (CenterNet)
 
 
-def vehicle_boxes(grid: Grid, scene: Scene, ground_z_m: float) -> Floats:
-    """``boxes_on_grid`` of a street's vehicles."""
-    return boxes_on_grid(grid, scene.boxes_ego(ground_z_m)[np.isin(scene.box_classes, VEHICLES)])
-
-
-def boxes_on_grid(grid: Grid, boxes: Floats) -> Floats:
-    """(MAX_BOXES, 7) float32 of boxes (B, 7) with centres on the grid, padded with NaN."""
-    boxes = boxes[(np.abs(boxes[:, :2]) < grid.side_m / 2).all(-1)][:MAX_BOXES]
-    return np.pad(boxes, ((0, MAX_BOXES - len(boxes)), (0, 0)), constant_values=np.nan).astype(np.float32)
-
-
 # --- training ---------------------------------------------------------------------------------------------------------
 def box_loss(answer: Tensor, boxes: Tensor, state: Tensor, counts: Tensor, grid: Grid) -> Tensor:
-    """Focal loss of centres and L1 of the boxes there, by the number of boxes.
+    """Focal loss of centres and L1 of the boxes there, by the number of boxes, of a batch on a grid.
 
-    Args:
-        answer: (B, BOX_CHANNELS, side, side).
-        boxes: (B, n, 7), padded with NaN.
-        state: (B, cells, cells) of ``labels``.
-        counts: (B, cells, cells) cells that count.
-        grid: Grid of ``state``.
+    ``answer`` is (B, BOX_CHANNELS, side, side), ``boxes`` (B, n, 7), ``state`` and ``counts`` (B, cells, cells).
     """
     side = answer.shape[-1]
     coarse, known = Grid(grid.side_m, side), counts & (state != HIDDEN)
@@ -156,10 +122,11 @@ def box_loss(answer: Tensor, boxes: Tensor, state: Tensor, counts: Tensor, grid:
     p = logit.sigmoid()
     right = (1 - p) ** _ALPHA * F.logsigmoid(logit) * (heat == 1)
     wrong = (1 - heat) ** _BETA * p**_ALPHA * F.logsigmoid(-logit) * (heat < 1) * weight
-    told = answer[frame, 1:, x, y].float()
-    return (_REGRESSION * (told - _values(box, x, y, coarse)).abs().sum() - right.sum() - wrong.sum()) / max(
-        len(box), 1
-    )
+    at = (box[:, :2] + coarse.side_m / 2) / coarse.cell_m - torch.stack([x, y], -1) - 0.5
+    yaw = box[:, 6:]
+    truth = torch.cat([at, box[:, 2:3], box[:, 3:6].log(), yaw.sin(), yaw.cos()], -1)
+    off = (answer[frame, 1:, x, y].float() - truth).abs().sum()
+    return (_REGRESSION * off - right.sum() - wrong.sum()) / max(len(box), 1)
 
 
 def _cells(boxes: Tensor, grid: Grid) -> Tensor:
@@ -167,20 +134,11 @@ def _cells(boxes: Tensor, grid: Grid) -> Tensor:
     return ((boxes[..., :2].nan_to_num() + grid.side_m / 2) / grid.cell_m).long().clamp(0, grid.cells - 1)
 
 
-def _values(box: Tensor, x: Tensor, y: Tensor, grid: Grid) -> Tensor:
-    at = (box[:, :2] + grid.side_m / 2) / grid.cell_m - torch.stack([x, y], -1) - 0.5
-    yaw = box[:, 6:]
-    return torch.cat([at, box[:, 2:3], box[:, 3:6].log(), yaw.sin(), yaw.cos()], -1)
-
-
 # --- what a detector says ---------------------------------------------------------------------------------------------
 def decode(answer: Tensor, grid: Grid, *, apart: bool) -> Tensor:
-    """(B, k, 8) score and box of the strongest centres, strongest first.
+    """(B, k, 8) score and box of the strongest centres of ``answer`` (B, BOX_CHANNELS, side, side), strongest first.
 
-    Args:
-        answer: (B, BOX_CHANNELS, side, side).
-        grid: Grid of the labels.
-        apart: Whether a centre must be the strongest of its 3×3 cells.
+    With ``apart`` a centre must be the strongest of its 3×3 cells.
     """
     answer = answer.float()
     side = answer.shape[-1]
@@ -200,13 +158,7 @@ def match(detections: Floats, boxes: Floats, state: npt.NDArray[np.uint8], count
     """(k, 1 + len(MATCH_M)) of one frame: scores, and 1 for right detections, 0 for wrong ones, NaN for no matter.
 
     The strongest detection takes the nearest box that is left. Detections nearest to hidden vehicles, or where nothing
-    counts, do not count.
-
-    Args:
-        detections: (k, 8) score and box, strongest first.
-        boxes: (n, 7), padded with NaN.
-        state: (cells, cells) of ``labels``.
-        counts: (cells, cells).
+    counts, do not count. ``detections`` is (k, 8), ``boxes`` (n, 7), ``state`` and ``counts`` (cells, cells).
     """
     grid = Grid(cells=state.shape[-1])
     boxes = boxes[np.isfinite(boxes[:, 0])]
@@ -242,12 +194,9 @@ def cells_at(grid: Grid, places: Floats) -> tuple[npt.NDArray[np.int64], npt.NDA
 
 
 def average_precision(matched: Floats, positives: Floats, weights: Floats) -> Floats:
-    """(R,) average precision over ``MATCH_M``, for R weightings of the frames.
+    """(R,) average precision over ``MATCH_M``, for weights (R, F) of the frames.
 
-    Args:
-        matched: (F, k, 1 + len(MATCH_M)) of ``match``.
-        positives: (F,) boxes of each frame that count.
-        weights: (R, F) how often each frame counts.
+    ``matched`` is (F, k, 1 + len(MATCH_M)) of ``match``, ``positives`` (F,) the number of boxes that count.
     """
     order = np.argsort(-matched[..., 0].ravel(), kind="stable")
     frame = np.repeat(np.arange(len(matched)), matched.shape[1])[order]

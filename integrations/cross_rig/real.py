@@ -1,8 +1,6 @@
-"""Two recorded data sets: A's samples are retargeted to B's cameras, and B's own samples judge.
+"""Two recorded data sets, made small and moved to a road at z = 0, so that grid and detectors are those of the streets.
 
-Both are read as the package reads them (``open_data``), made small, and moved to a road at z = 0, so that the grid and
-the detectors are those of the streets. Drives are split, never frames. Vehicles with fewer than 5 LiDAR points count
-for nothing.
+Drives are split, never frames. Vehicles with fewer than 5 LiDAR points count for nothing.
 """
 
 from __future__ import annotations
@@ -24,8 +22,8 @@ from arbiview_aug.datasets.synthetic import BoxClass
 from arbiview_aug.errors import DataError
 from arbiview_aug.scene.boxes import points_in
 from integrations.cross_rig.frames import OF_TESTS, SPLITS, Arrays, Source, Split
-from integrations.cross_rig.labels import Grid, box_cells, boxes_on_grid
-from integrations.cross_rig.variants import Variant, ViewMaker, arrays_of
+from integrations.cross_rig.labels import Grid, labels_of
+from integrations.cross_rig.variants import Variant, arrays_of, view_maker
 
 _VEHICLES = {"vehicle", "car", "van", "truck", "bus", "trailer"}
 _NO_VEHICLES = {"bicycle", "motorcycle", "cyclist", "human", "pedestrian", "static", "movable"}
@@ -41,11 +39,7 @@ _SHARES = {"val": 0.15, "test": 0.35}
 
 @lru_cache(maxsize=4)
 def recording(data: str) -> Recording:
-    """The data set, opened once in each process.
-
-    Raises:
-        DataError: It cannot be read, or has no drives.
-    """
+    """The data set, opened once in each process; DataError for one without drives."""
     opened = open_data(data)
     if not getattr(opened, "scene_tokens", None):
         raise DataError(f"data {data}: expected the drive of each sample (nuScenes layout), found none")
@@ -65,10 +59,7 @@ def drives_of(data: str) -> list[str]:
 
 
 def frames_of(data: str, split: Split | None) -> list[int]:
-    """Samples of a split, or of all drives (None): one of each drive in turn, so that the first ones are of all drives.
-
-    Those of a drive come in a random order that is always the same.
-    """
+    """Samples of a split, or of all drives (None): one of each drive in turn, in one random order."""
     drives = drives_of(data)
     names = sorted(set(drives))
     if split is not None:
@@ -85,11 +76,7 @@ def frames_of(data: str, split: Split | None) -> list[int]:
 
 
 def frames_of_a(a: str, b: str) -> list[int]:
-    """A's samples, without drives that B's thresholds or tests are of: two vehicles may have driven the same ones.
-
-    Raises:
-        DataError: None are left.
-    """
+    """A's samples, without drives that B's thresholds or tests are of: two vehicles may have driven the same ones."""
     drives, drives_of_b = drives_of(a), drives_of(b)
     held_out = {drives_of_b[k] for split in OF_TESTS for k in frames_of(b, split)}
     frames = [k for k in frames_of(a, None) if drives[k] not in held_out]
@@ -100,36 +87,32 @@ def frames_of_a(a: str, b: str) -> list[int]:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedSource(Source):
-    """As ``Source``, of recorded frames.
+    """As ``Source``, of recorded frames."""
 
-    Attributes:
-        data: ``open_data``'s names of the data sets of A and B.
-    """
-
-    data: tuple[str, str]
+    data: tuple[str, str]  # names of the data sets of A and B for ``open_data``
 
     @property
-    def is_of_a(self) -> bool:
-        """Whether A recorded these frames, or those that they are rendered from."""
-        return self.change is None or self.variant is not None
+    def is_of_b(self) -> bool:
+        """Whether B recorded these frames; else A recorded them, or those that they are rendered from."""
+        return self.change is not None and self.variant is None
 
     @property
     def recorded_by(self) -> str:
         """The data set whose frames these are, or that they are rendered from."""
-        return self.data[not self.is_of_a]
+        return self.data[self.is_of_b]
 
     @cached_property
     def frames(self) -> list[int]:
         """Its samples."""
-        return frames_of_a(*self.data) if self.is_of_a else frames_of(self.data[1], self.split)
+        return frames_of(self.data[1], self.split) if self.is_of_b else frames_of_a(*self.data)
 
     @cached_property
     def rig(self) -> Rig:
-        """The cameras of the first frame, small and without lenses, over a road at z = 0."""
+        """The cameras of the first sample, small and without lenses, over a road at z = 0."""
         return small_rig(first_rig(self.data[self.change is not None]), self.size)
 
     def spec(self) -> dict[str, Any]:
-        """Data set, samples, and the first frame's calibration."""
+        """Data set, samples, and the first sample's calibration."""
         data = self.recorded_by
         samples = [recording(data).tokens[k] for k in self.frames]
         rigs = {"rig": self.rig.content_key.hex(), "recorded": first_rig(data).content_key.hex()}
@@ -151,12 +134,11 @@ class RecordedSource(Source):
         shrink = RigRetarget(small_rig(rig, self.size, road=rig.ground_z_m), geometry="infinity", holes="black")
         boxes, points = vehicles_of(sample, self.recorded_by)
         boxes[:, 2] -= rig.ground_z_m
-        state = box_cells(Grid(), boxes, np.full(len(boxes), BoxClass.CAR), points >= LEAST_POINTS)
-        views = arrays_of(shrink({"images": sample["images"], "rig": rig}))
-        return _over_road(views, rig) | {"state": state, "boxes": boxes_on_grid(Grid(), boxes)}
+        labels = labels_of(Grid(), boxes, np.full(len(boxes), BoxClass.CAR), points >= LEAST_POINTS)
+        return _over_road(arrays_of(shrink({"images": sample["images"], "rig": rig})), rig) | labels
 
     def _views(self, variant: Variant) -> Callable[[int], Arrays]:
-        views = ViewMaker(variant, self.original().rig, self.rig)
+        views = view_maker(variant, self.original().rig, self.rig)
 
         def make(index: int) -> Arrays:
             sample = recording(self.recorded_by)[index]
@@ -178,11 +160,7 @@ def small_rig(rig: Rig, size: tuple[int, int], *, road: float = 0.0) -> Rig:
 
 
 def vehicles_of(sample: dict[str, Any], data: str) -> tuple[np.ndarray, np.ndarray]:
-    """Boxes (B, 7) of a sample's vehicles, and the number of LiDAR points in each (many where there is no LiDAR).
-
-    Raises:
-        DataError: The sample has no boxes, or these have no names.
-    """
+    """Boxes (B, 7) of a sample's vehicles, and the number of LiDAR points in each (enough where there is no LiDAR)."""
     if "boxes_3d" not in sample or "box_names" not in sample:
         raise DataError(f"data {data}: sample {sample['token']}: expected boxes_3d and box_names, found no labels")
     words = [set(re.split(r"[^a-z]+", name.lower())) for name in sample["box_names"]]

@@ -1,9 +1,7 @@
 """``python -m integrations.cross_rig.scans``: does a LiDAR detector trained on retargeted scans of A work on B's?
 
-Both vehicles drive the same streets. A pillar network is trained on A's points as they are, on those of its rings next
-to B's, on A's points as B's scanner would have measured them, and on B's own; all are tested on B's own scans, one also
-without B's rings above all of A's. Scans are cast again for each run; a result is a file, so that a killed run
-continues.
+Both vehicles drive the same streets. ``TITLES`` are the training sets; the tests are on B's own scans. Scans are cast
+again for each run; a result is a file, so that a killed run continues.
 """
 
 from __future__ import annotations
@@ -12,7 +10,6 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from functools import lru_cache
 from itertools import product
@@ -24,15 +21,15 @@ import numpy as np
 from arbiview_aug import Lidar, Rig, retarget_points
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cli.arguments import command_parser, count
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.evaluate.report.tables import markdown_table
 from arbiview_aug.scene.boxes import points_by_box
 from arbiview_aug.scene.point_cloud import own_car
 from integrations.benchmarks.lidar import rings_dropped
 from integrations.benchmarks.lidar import scanner as benchmark_scanner
-from integrations.cross_rig.frames import OF_TESTS, SPLITS, Split, code_hash, content_hash, one_thread, street_seed
-from integrations.cross_rig.labels import Grid, box_cells, vehicle_boxes
-from integrations.cross_rig.pillars import PointSet
+from integrations.cross_rig.frames import OF_TESTS, SPLITS, Source, Split, code_hash, content_hash, one_thread
+from integrations.cross_rig.labels import Grid, labels_of
+from integrations.cross_rig.model import PointSet
 from integrations.cross_rig.real import LEAST_POINTS
 from integrations.cross_rig.scoring import ap_scores, iou_scores, matches_of
 from integrations.cross_rig.training import Draws, Schedule, evaluate, train
@@ -49,7 +46,6 @@ TITLES: dict[Kind, str] = {
 
 SEEDS = (0, 1, 2)
 _STREETS = 200
-_MOST_FRAMES = 1 << 20
 
 
 def scanner(beams: int, height_m: float) -> Lidar:
@@ -75,24 +71,20 @@ def rig_of(lidar: Lidar) -> Rig:
 @lru_cache(maxsize=8)  # trainings of one set follow each other; 150 scans of 64 beams have 80 MB
 def point_set(a: Lidar, b: Lidar, kind: Kind, split: Split, frames: int) -> PointSet:
     """Scans of a variant: points, and as labels the vehicles in which it has ``LEAST_POINTS``."""
-    drive = SyntheticDrive(rig_of(a), num_frames=_MOST_FRAMES, seed=street_seed(split, _STREETS), lidar=False)
-    points, state, boxes = zip(*(_frame(drive, a, b, kind, k) for k in range(frames)), strict=True)
-    return PointSet(points, np.stack(state), np.stack(boxes))
-
-
-def _frame(drive: SyntheticDrive, a: Lidar, b: Lidar, kind: Kind, index: int) -> tuple[Any, ...]:
-    scene, grid = drive.scene(index), Grid()
-    boxes = scene.boxes_ego(0.0)
-    points = drive.points(index).numpy()
-    if kind == "dropped":
-        points = rings_dropped(a, b, points)
-    elif kind == "retargeted":
-        points = retarget_points(points, rig_of(b)).points
-    points = points[~own_car(points)]
-    _, ends = points_by_box(boxes, np.ascontiguousarray(points[:, :3]), 0.0)
-    state = box_cells(grid, boxes, scene.box_classes, np.diff(ends, prepend=0) >= LEAST_POINTS)
-    inside = (np.abs(points[:, :2]) < grid.side_m / 2).all(axis=1)
-    return points[inside].astype(np.float16), state, vehicle_boxes(grid, scene, 0.0)
+    drive = Source(root=Path(), size=(8, 22), split=split, streets=_STREETS).drive(rig_of(a))
+    clouds, labels, grid = [], [], Grid()
+    for index in range(frames):
+        scene, points = drive.scene(index), drive.points(index).numpy()
+        boxes = scene.boxes_ego(0.0)
+        if kind == "dropped":
+            points = rings_dropped(a, b, points)
+        elif kind == "retargeted":
+            points = retarget_points(points, rig_of(b)).points
+        points = points[~own_car(points)]
+        _, ends = points_by_box(boxes, np.ascontiguousarray(points[:, :3]), 0.0)
+        labels.append(labels_of(grid, boxes, scene.box_classes, np.diff(ends, prepend=0) >= LEAST_POINTS))
+        clouds.append(points[(np.abs(points[:, :2]) < grid.side_m / 2).all(axis=1)].astype(np.float16))
+    return PointSet(clouds, *(np.stack([frame[name] for frame in labels]) for name in ("state", "boxes")))
 
 
 # --- trainings and tests ----------------------------------------------------------------------------------------------
@@ -138,21 +130,16 @@ def result(arguments: argparse.Namespace, change: str, kind: Kind, seed: int) ->
 
 def table(done: dict[str, dict[Kind, list[dict[str, Any]]]]) -> str:
     """IoU and AP in %, and the shares of the gap between A's points and B's own."""
-    return markdown_table(
-        ["change", "trained on", "IoU", "closed gap %", "AP", "closed gap % by AP"],
-        [row for change, results in done.items() for row in _rows(change, results)],
-        left=2,
-    )
-
-
-def _rows(change: str, results: dict[Kind, list[dict[str, Any]]]) -> Iterator[list[str]]:
-    ious = iou_scores({str(kind): np.array([row["counts"] for row in rows]) for kind, rows in results.items()})
-    aps = ap_scores({str(kind): matches_of(rows) for kind, rows in results.items()})
-    for kind in results:
-        row = [" -> ".join(lidar.name for lidar in CHANGES[change]), TITLES[kind]]
-        for score in (ious[kind], aps[kind]):
-            row += [f"{100 * score.value:.1f}", "-" if score.share is None else score.share.percent()]
-        yield row
+    table = []
+    for change, results in done.items():
+        ious = iou_scores({str(kind): np.array([row["counts"] for row in rows]) for kind, rows in results.items()})
+        aps = ap_scores({str(kind): matches_of(rows) for kind, rows in results.items()})
+        for kind in results:
+            table.append([" -> ".join(lidar.name for lidar in CHANGES[change]), TITLES[kind]])
+            for score in (ious[kind], aps[kind]):
+                table[-1] += [f"{100 * score.value:.1f}", "-" if score.share is None else score.share.percent()]
+    head = ["change", "trained on", "IoU", "closed gap %", "AP", "closed gap % by AP"]
+    return markdown_table(head, table, left=2)
 
 
 def main(argv: list[str] | None = None) -> int:

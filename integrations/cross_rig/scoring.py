@@ -1,6 +1,6 @@
-"""IoU and AP of variants, and the share of the gap that a variant closes, with its interval.
+"""IoU and AP of variants, and the share of the gap that a variant closes.
 
-The interval is Student's over the seeds from three seeds on, else a hierarchical bootstrap over seeds and frames.
+Its interval is Student's over the seeds from three seeds on, else a hierarchical bootstrap over seeds and frames.
 """
 
 from __future__ import annotations
@@ -45,27 +45,21 @@ class Interval:
 class VariantScore:
     """A variant under one change by one metric.
 
-    Attributes:
-        value: IoU of all seeds' frames together, or mean AP of the seeds.
-        share: Closed gap, (variant - raw) / (oracle - raw); None where the gap is below ``MIN_GAP`` or raw or the
-            oracle was not trained.
-        seeds: Value of each seed.
+    ``share`` is the closed gap, (variant - raw) / (oracle - raw); None where the gap is below ``MIN_GAP`` or raw or the
+    oracle was not trained.
     """
 
-    value: float
+    value: float  # IoU of all seeds' frames together, or mean AP of the seeds
     share: Interval | None
-    seeds: list[float]
+    seeds: list[float]  # value of each seed
 
 
 def cell_counts(
     predicted: npt.NDArray[np.bool_], state: npt.NDArray[np.uint8], covered: npt.NDArray[np.bool_]
 ) -> Counts:
-    """(F, 3) true positives, false positives, false negatives.
+    """(F, 3) true positives, false positives, false negatives of cells (F, cells, cells).
 
-    Args:
-        predicted: (F, cells, cells).
-        state: (F, cells, cells) of ``labels``; hidden cells do not count.
-        covered: (cells, cells), the cells that count at all.
+    ``state`` is of ``labels``, whose hidden cells do not count; ``covered`` (cells, cells) says which count at all.
     """
     counts, truth = covered[None] & (state != HIDDEN), state == VEHICLE
     kinds = (predicted & truth, predicted & ~truth, ~predicted & truth)
@@ -139,18 +133,13 @@ def _scores(
             in_each = seeds if len(seeds[name]) > 2 else draws
             gaps = np.maximum(in_each["oracle"] - in_each["raw"], _LEAST)
             closed = (in_each[name] - in_each["raw"]) / gaps
-            if in_each is seeds:
-                share = t_interval(closed)
+            if in_each is seeds:  # Student's distribution
+                mean = float(np.mean(closed))
+                half = float(stdtrit(len(closed) - 1, 0.975) * np.std(closed, ddof=1) / np.sqrt(len(closed)))
+                share = Interval(mean, mean - half, mean + half)
             else:
                 low, high = np.percentile(closed, (2.5, 97.5))
                 gap = values["oracle"] - values["raw"]
                 share = Interval((value - values["raw"]) / gap, float(low), float(high))
         scores[name] = VariantScore(value, share, seeds[name].tolist())
     return scores
-
-
-def t_interval(values: Floats) -> Interval:
-    """Interval of the mean of independent values (S,), by Student's distribution."""
-    mean = float(np.mean(values))
-    half = float(stdtrit(len(values) - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(len(values)))
-    return Interval(mean, mean - half, mean + half)

@@ -15,8 +15,7 @@ from torch import nn
 from integrations.cross_rig.families import Batch
 from integrations.cross_rig.frames import Arrays, FrameStore
 from integrations.cross_rig.labels import HIDDEN, VEHICLE, Grid, box_loss, decode, match, real_boxes
-from integrations.cross_rig.model import Answer, Detector
-from integrations.cross_rig.pillars import PillarDetector, PointBatch, PointSet
+from integrations.cross_rig.model import Answer, Detector, PillarDetector, PointBatch, PointSet
 from integrations.cross_rig.scoring import cell_counts, iou
 from integrations.cross_rig.variants import scaled_and_cropped
 
@@ -35,42 +34,29 @@ def fast_precision() -> Literal["bf16", "fp32"]:
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """The same for every variant.
+    """The same for every variant."""
 
-    Attributes:
-        family: Family of the model.
-        steps: Steps of the optimiser.
-        batch: Frames a step.
-        lr: The peak of a one-cycle schedule; AdamW's default decay.
-        precision: ``bf16`` runs the networks in bfloat16 (autocast): twice as fast on CPUs with AMX.
-    """
-
-    steps: int
+    steps: int  # of the optimiser
     family: str = "voxels"
-    batch: int = 4
-    lr: float = 3e-3
+    batch: int = 4  # frames a step
+    lr: float = 3e-3  # the peak of a one-cycle schedule; AdamW's default decay
     precision: Literal["bf16", "fp32"] = field(default_factory=fast_precision)
+
+    def autocast(self) -> torch.autocast:
+        """Networks run in bfloat16 where it is fast."""
+        return torch.autocast("cpu", torch.bfloat16, enabled=self.precision == "bf16")
 
 
 @dataclass(frozen=True)
 class FrameSet:
-    """Frames with labels, as the model gets them; every pixel counts as seen, as in stock detectors.
+    """Frames with labels, as the model gets them; every pixel counts as seen, as in stock detectors."""
 
-    Attributes:
-        store: Images.
-        K: (F, N, 3, 3).
-        cam2ego: (F, N, 4, 4).
-        state: (F, cells, cells) of ``labels``.
-        counts: (cells, cells) bool, the cells that count.
-        boxes: (F, n, 7) vehicles, padded with NaN.
-    """
-
-    store: FrameStore
-    K: npt.NDArray[np.float32]
-    cam2ego: npt.NDArray[np.float32]
-    state: npt.NDArray[np.uint8]
-    counts: npt.NDArray[np.bool_]
-    boxes: npt.NDArray[np.float32]
+    store: FrameStore  # of the images
+    K: npt.NDArray[np.float32]  # (F, N, 3, 3)
+    cam2ego: npt.NDArray[np.float32]  # (F, N, 4, 4)
+    state: npt.NDArray[np.uint8]  # (F, cells, cells) of ``labels``
+    counts: npt.NDArray[np.bool_]  # (cells, cells), the cells that count
+    boxes: npt.NDArray[np.float32]  # (F, n, 7) vehicles, padded with NaN
 
     def frame(self, index: int) -> Arrays:
         """One frame's arrays: a ``Batch`` without its first dimension."""
@@ -99,12 +85,7 @@ Frames = FrameSet | PointSet
 class Draws:
     """The batches of a training: which frames they hold depends on the seed alone, so that variants are paired.
 
-    Args:
-        frames: The variant's frames, images or scans.
-        raw: A's frames, half of which are drawn instead; None: none.
-        num_frames: Frames of each.
-        seed: Seed of the training.
-        augmented: Frames are scaled and cropped.
+    Half of them are of ``raw``, A's own, where it is given; with ``augmented`` frames are scaled and cropped.
     """
 
     def __init__(
@@ -131,14 +112,6 @@ class Draws:
         return self.frames.joined(frames)
 
 
-def loss(answer: Answer, batch: Batch | PointBatch) -> torch.Tensor:
-    """Mean binary cross-entropy over the cells that count, and a share of the boxes' loss."""
-    counts = batch.counts & (batch.state != HIDDEN)
-    truth = (batch.state == VEHICLE)[counts].float()
-    cells = F.binary_cross_entropy_with_logits(answer.occupancy.float()[counts], truth)
-    return cells + _BOXES * box_loss(answer.boxes, batch.boxes, batch.state, batch.counts, Grid())
-
-
 def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[float]]:
     """A trained detector and its mean loss over each tenth of the steps."""
     torch.manual_seed(seed)
@@ -151,9 +124,12 @@ def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[
     model.train()
     for _ in range(schedule.steps):
         batch = draws.batch(schedule.batch)
-        with _autocast(schedule):
-            answer = model(batch)
-        value = loss(answer, batch)
+        with schedule.autocast():
+            answer: Answer = model(batch)
+        counts = batch.counts & (batch.state != HIDDEN)
+        truth = (batch.state == VEHICLE)[counts].float()
+        value = F.binary_cross_entropy_with_logits(answer.occupancy.float()[counts], truth)
+        value = value + _BOXES * box_loss(answer.boxes, batch.boxes, batch.state, batch.counts, Grid())
         optimizer.zero_grad(set_to_none=True)
         value.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
@@ -162,48 +138,36 @@ def train(draws: Draws, schedule: Schedule, seed: int) -> tuple[nn.Module, list[
     return model.eval(), [float(np.mean(part)) for part in np.array_split(losses, min(10, len(losses)))]
 
 
-def _autocast(schedule: Schedule) -> torch.autocast:
-    return torch.autocast("cpu", torch.bfloat16, enabled=schedule.precision == "bf16")
-
-
 @torch.no_grad()
 def answers(
-    model: nn.Module, frames: Frames, num_frames: int, schedule: Schedule
+    model: nn.Module, frames: Frames, schedule: Schedule
 ) -> tuple[npt.NDArray[np.float16], npt.NDArray[np.float32]]:
     """Probabilities of cells (F, cells, cells), and detections (F, k, 8) of ``labels.decode``."""
     cells, detections = [], []
-    for start in range(0, num_frames, _EVAL_BATCH):
-        indices = range(start, min(start + _EVAL_BATCH, num_frames))
-        batch = frames.joined([frames.frame(k) for k in indices])
-        with _autocast(schedule):
+    indices = range(len(frames.state))
+    for start in indices[::_EVAL_BATCH]:
+        batch = frames.joined([frames.frame(k) for k in indices[start : start + _EVAL_BATCH]])
+        with schedule.autocast():
             answer = model(batch)
         cells.append(answer.occupancy.float().sigmoid().numpy().astype(np.float16))
         detections.append(decode(answer.boxes, Grid(), apart=schedule.family != "queries").numpy())
     return np.concatenate(cells), np.concatenate(detections)
 
 
-def best_threshold(probability: np.ndarray, frames: Frames) -> tuple[float, float]:
-    """The threshold with the highest IoU on these frames, and that IoU."""
-    scores = [iou(cell_counts(probability > t, frames.state, frames.counts).sum(0)) for t in THRESHOLDS]
-    best = int(np.argmax(scores))
-    return THRESHOLDS[best], float(scores[best])
-
-
 def evaluate(model: nn.Module, val: Frames, test: Frames, schedule: Schedule) -> dict[str, Any]:
-    """Threshold on validation frames, counts on test frames; both as B sees them, with B's calibration.
+    """Plain data: the best ``threshold`` and ``val_iou`` of validation frames; ``counts`` (F, 3) of test frames' cells.
 
-    Returns:
-        Plain data: the best ``threshold`` and ``val_iou`` there; ``counts`` (F, 3) of cells at that threshold;
-        ``matched`` (F, k, 5) of ``labels.match``, with -1 for NaN, which JSON has not; ``positives`` (F,) boxes that
-        count. ``scoring.matches_of`` reads the last two.
+    ``matched`` (F, k, 5) is of ``labels.match``, with -1 for NaN, which JSON has not; ``positives`` (F,) counts boxes.
     """
-    threshold, val_iou = best_threshold(answers(model, val, len(val.state), schedule)[0], val)
-    probability, detections = answers(model, test, len(test.state), schedule)
+    probability, _ = answers(model, val, schedule)
+    ious = [iou(cell_counts(probability > t, val.state, val.counts).sum(0)) for t in THRESHOLDS]
+    threshold = THRESHOLDS[int(np.argmax(ious))]
+    probability, detections = answers(model, test, schedule)
     frames = list(zip(detections, test.boxes, test.state, strict=True))
     matched = np.stack([match(*frame, test.counts) for frame in frames])
     return {
         "threshold": threshold,
-        "val_iou": val_iou,
+        "val_iou": float(max(ious)),
         "counts": cell_counts(probability > threshold, test.state, test.counts).tolist(),
         "matched": np.nan_to_num(np.round(matched, 4), nan=-1).tolist(),
         "positives": [int(real_boxes(boxes, state, test.counts).sum()) for _, boxes, state in frames],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -26,27 +26,16 @@ those who do not know B: as wide as the changes."""
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """One way to train.
+    """One way to train."""
 
-    Attributes:
-        name: On the command line and in files.
-        title: In tables.
-        kind: Source of its images: A's as recorded, B's own, or A's re-rendered, with holes filled.
-        geometry: Geometry of ``RigRetarget``.
-        reads: The frame's geometry that it is given, in addition to the images.
-        mixed: Half of the frames drawn are raw ones.
-        augmented: Frames are scaled and cropped at random as they are drawn.
-        random: Targets are drawn around B, or around A by those who do not know B, one for each frame.
-    """
-
-    name: str
-    title: str
-    kind: Literal["raw", "oracle", "retarget"] = "retarget"
+    name: str  # on the command line and in files
+    title: str  # in tables
+    kind: Literal["raw", "oracle", "retarget"] = "retarget"  # A's images as recorded, B's own, or A's re-rendered
     geometry: GeometryName = "auto"
-    reads: tuple[Literal["points", "boxes_3d"], ...] = ("points", "boxes_3d")
-    mixed: bool = False
-    augmented: bool = False
-    random: Literal["A", "B"] | None = None
+    reads: tuple[Literal["points", "boxes_3d"], ...] = ("points", "boxes_3d")  # what it is given besides images
+    mixed: bool = False  # half of the frames drawn are raw ones
+    augmented: bool = False  # frames are scaled and cropped at random as they are drawn
+    random: Literal["A", "B"] | None = None  # one target a frame, drawn around B, or around A where B is unknown
 
     @property
     def renders(self) -> bool:
@@ -88,35 +77,21 @@ SCALE = (0.75, 1.35)
 under a change of focal length."""
 
 
-class ViewMaker:
-    """Renders A's frames as a variant has them.
+def view_maker(variant: Variant, source: Rig, target: Rig) -> Callable[[int, Mapping[str, Any]], Arrays]:
+    """Function that renders A's samples as a variant has them; a draw of the target depends on the index alone.
 
-    Args:
-        variant: One that renders.
-        source: Vehicle A, of frames that bring no rig.
-        target: Vehicle B, in A's ego frame.
+    ``target`` is in A's ego frame; ``source`` is for samples without a rig.
     """
+    random = RandomRig(target, **RANDOM[variant.random]) if variant.random else None
+    keys = SampleKeys(points="source")
+    retarget = RigRetarget(random or target, source=source, geometry=variant.geometry, keys=keys)
 
-    def __init__(self, variant: Variant, source: Rig, target: Rig) -> None:
-        self.reads = variant.reads
-        self.random = RandomRig(target, **RANDOM[variant.random]) if variant.random else None
-        self.retarget = RigRetarget(
-            self.random or target, source=source, geometry=variant.geometry, keys=SampleKeys(points="source")
-        )
+    def make(index: int, sample: Mapping[str, Any]) -> Arrays:
+        given = {key: sample[key] for key in ("images", "rig", *variant.reads) if key in sample}
+        drawn = None if random is None else random.draw(torch.Generator().manual_seed(index))
+        return arrays_of(retarget(given, drawn))
 
-    def __call__(self, index: int, frame: Mapping[str, Any]) -> Arrays:
-        """Re-render a frame.
-
-        Args:
-            index: Index of the frame: its draw depends on it alone.
-            frame: ``images`` (N, 3, h, w) uint8, the geometry that the variant reads, and perhaps ``rig``.
-
-        Returns:
-            ``images`` (M, 3, h, w) uint8, ``K`` and ``cam2ego`` float32.
-        """
-        given = {key: frame[key] for key in ("images", "rig", *self.reads) if key in frame}
-        drawn = None if self.random is None else self.random.draw(torch.Generator().manual_seed(index))
-        return arrays_of(self.retarget(given, drawn))
+    return make
 
 
 def arrays_of(sample: Mapping[str, Any]) -> Arrays:
@@ -128,16 +103,7 @@ def arrays_of(sample: Mapping[str, Any]) -> Arrays:
 def scaled_and_cropped(
     images: np.ndarray, K: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The usual augmentation: one zoom and one window a frame, with the calibration that goes with them.
-
-    Args:
-        images: (N, 3, h, w) uint8.
-        K: (N, 3, 3).
-        rng: Draws.
-
-    Returns:
-        Images of the same size, coverage (N, h, w) bool, K.
-    """
+    """Zoom images (N, 3, h, w) uint8 once and move them to one window; returns them, coverage (N, h, w) bool, and K."""
     h, w = images.shape[-2:]
     s = float(np.exp(rng.uniform(*np.log(SCALE))))
     # The zoomed image slides over the window's edges no further than it reaches (or than the window does).

@@ -267,38 +267,6 @@ def sparse4d(given: Recording) -> dict[str, Any]:
     }
 
 
-def sparse4d_adapted(given: Recording) -> dict[str, Any]:
-    """The same after ``NormalizeMultiviewImage`` and ``NuScenesSparse4DAdaptor``."""
-    results = sparse4d(given)
-    K = np.array(results["cam_intrinsic"], np.float32)
-    return results | {
-        "img": _normalised(given.arrays)[0],
-        "img_norm_cfg": _NORM,
-        "projection_mat": np.array(results["lidar2img"], np.float32),
-        "image_wh": np.array([size[::-1] for size in given.rig.sizes], np.float32),
-        "T_global": results["lidar2global"],
-        "T_global_inv": np.linalg.inv(results["lidar2global"]),
-        "cam_intrinsic": K,
-        "focal": np.sqrt(np.abs(np.linalg.det(K[:, :2, :2]))),
-    }
-
-
-_NORM: dict[str, Any] = {
-    "mean": np.array([103.53, 116.28, 123.675], np.float32),
-    "std": np.array([57.375, 57.12, 58.395], np.float32),
-    "to_rgb": False,
-}
-"""``img_norm_cfg`` of BGR images."""
-
-
-def _normalised(arrays: Sequence[np.ndarray], divisor: int = 1) -> tuple[torch.Tensor, list[tuple[int, int, int]]]:
-    """``NormalizeMultiviewImage`` and ``PadMultiViewImage``: (N, 3, h, w), and the shapes before padding."""
-    images = np.stack([(array.astype(np.float32) - _NORM["mean"]) / _NORM["std"] for array in arrays])
-    rims = [(0, -side % divisor) for side in images.shape[1:3]]
-    padded = np.pad(images, [(0, 0), *rims, (0, 0)])
-    return torch.from_numpy(padded.transpose(0, 3, 1, 2).copy()), [array.shape for array in arrays]
-
-
 def bevdet4d(drive: Sequence[Recording]) -> dict[str, Any]:
     """After BEVDet's ``PrepareImageInputs(sequential=True)``: the current frame and those before, latest first."""
     frames = [bevdet(given) for given in reversed(drive)]
@@ -307,61 +275,6 @@ def bevdet4d(drive: Sequence[Recording]) -> dict[str, Any]:
     rest = [torch.cat([of_frame[k] for of_frame in entries]) for k in range(1, 6)]
     infos = [{"cams": {}, "ann_infos": frame["ann_infos"], "scene_token": "drive"} for frame in frames]
     return frames[0] | {"img_inputs": (images, *rest, torch.eye(3)), "curr": infos[0], "adjacent": infos[1:]}
-
-
-def streampetr(drive: Sequence[Recording]) -> dict[str, Any]:
-    """Collect as StreamPETR's ``CustomNuScenesDataset.union2one`` does, without ``DataContainer``."""
-    pictures = [_normalised(given.arrays) for given in drive]
-    poses = np.stack([given.ego2global @ LIDAR2EGO for given in drive])
-    seconds = 1.5 + 0.5 * np.arange(len(drive))
-
-    def tensors(arrays: Sequence[np.ndarray]) -> torch.Tensor:
-        return torch.from_numpy(np.stack(arrays)).float()
-
-    return {
-        "img": torch.stack([images for images, _ in pictures]),
-        "lidar2img": tensors([given.K @ given.lidar2cam for given in drive]),
-        "intrinsics": tensors([given.K for given in drive]),
-        "extrinsics": tensors([given.lidar2cam for given in drive]),
-        "timestamp": torch.from_numpy(seconds),
-        "img_timestamp": torch.from_numpy(seconds[:, None] - 0.01 * np.arange(len(drive[0].rig))),
-        "ego_pose": torch.from_numpy(poses).float(),
-        "ego_pose_inv": torch.from_numpy(np.linalg.inv(poses)).float(),
-        "prev_exists": torch.tensor([0.0] + [1.0] * (len(drive) - 1)),
-        "gt_bboxes_3d": [given.labels["gt_bboxes_3d"] for given in drive],
-        "img_metas": [_meta(given, shapes, images) for given, (images, shapes) in zip(drive, pictures, strict=True)],
-    }
-
-
-def bevformer(drive: Sequence[Recording]) -> dict[str, Any]:
-    """Collect as BEVFormer's ``CustomNuScenesDataset.union2one`` does, without ``DataContainer``; images are padded."""
-    pictures = [_normalised(given.arrays, divisor=32) for given in drive]
-    metas = {}
-    for t, (given, (images, shapes)) in enumerate(zip(drive, pictures, strict=True)):
-        can_bus = np.zeros(18)
-        can_bus[0] = SPEED_MPS * 0.5 * (t > 0)  # since the frame before
-        metas[t] = _meta(given, shapes, images) | {
-            "lidar2img": list(given.K @ given.lidar2cam),
-            "can_bus": can_bus,
-            "prev_bev": t > 0,
-        }
-    return {
-        "img": torch.stack([images for images, _ in pictures]),
-        "img_metas": metas,
-        "gt_bboxes_3d": drive[-1].labels["gt_bboxes_3d"],
-    }
-
-
-def _meta(given: Recording, shapes: list[tuple[int, int, int]], images: torch.Tensor) -> dict[str, Any]:
-    padded = [(*images.shape[-2:], 3)] * len(images)
-    return {
-        "filename": [f"{name}.jpg" for name in given.rig.names],
-        "ori_shape": shapes,
-        "img_shape": padded,
-        "pad_shape": padded,
-        "img_norm_cfg": _NORM,
-        "scene_token": "drive",
-    }
 
 
 FORMS: dict[str, Callable[[Recording], dict[str, Any]]] = {
@@ -374,11 +287,3 @@ FORMS: dict[str, Callable[[Recording], dict[str, Any]]] = {
     "Sparse4D": sparse4d,
 }
 """A maker of each form by its framework's name."""
-
-QUEUES: dict[str, Callable[[Sequence[Recording]], Any]] = {
-    "BEVDet4D": bevdet4d,
-    "StreamPETR": streampetr,
-    "BEVFormer": bevformer,
-    "Sparse4D": lambda drive: [sparse4d_adapted(given) for given in drive],  # streams: a dict a frame
-}
-"""A maker of the form of several frames by its framework's name."""

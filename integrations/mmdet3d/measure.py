@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,23 +11,6 @@ from arbiview_aug import Rig
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.integrations.mmdet3d.matrices import MATRICES, stacked
 from integrations.mmdet3d.fake_results import LIDAR2EGO
-
-
-def frames_of(results: Mapping[str, Any] | Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """A dict for each frame of one of ``QUEUES``, with what ``lidar2img_of`` reads."""
-    if isinstance(results, Sequence):
-        return [{key: value for key, value in frame.items() if key != "lidar2img"} for frame in results]
-    if "img_inputs" in results:
-        images, *rest = results["img_inputs"][:6]
-        views = len(results["cam_names"])
-        count = len(images) // views
-        rows = [slice(t * views, (t + 1) * views) for t in range(count)]
-        return [{"img_inputs": (images[t::count], *(entry[rows[t]] for entry in rest))} for t in range(count)]
-    in_metas = "lidar2img" not in results
-    return [
-        {"img": images, "lidar2img": results["img_metas"][t]["lidar2img"] if in_metas else results["lidar2img"][t]}
-        for t, images in enumerate(results["img"])
-    ]
 
 
 def lidar2img_of(results: Mapping[str, Any]) -> FloatArray:

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator
 
 import pytest
 
-
-class Worst:
-    """The largest value noted under each name."""
-
-    def __init__(self) -> None:
-        self.found: dict[str, float] = {}
-
-    def __call__(self, name: str, value: float) -> None:
-        self.found[name] = max(self.found.get(name, 0.0), float(value))
+Worst = Callable[[str, float], None]
 
 
 @pytest.fixture(scope="session")
 def worst() -> Iterator[Worst]:
     """Call it with the name of a figure, unit included, and a value."""
-    noted = Worst()
-    yield noted
+    found: dict[str, float] = defaultdict(float)
+    yield lambda name, value: found.update({name: max(found[name], float(value))})
     print("\nworst values of tests/extremes")
-    for name, value in sorted(noted.found.items()):
-        print(f"  {value:11.4g}  {name}")
+    print("".join(f"  {value:11.4g}  {name}\n" for name, value in sorted(found.items())))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Container
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -117,37 +116,34 @@ def samples(draw: st.DrawFn) -> dict[str, Any]:
 @st.composite
 def wrong_samples(draw: st.DrawFn) -> dict[str, Any]:
     """A sample with one or two things wrong."""
-    sample: dict[str, Any] = draw(samples())
-    for _ in range(draw(st.sampled_from([1, 1, 2]))):
-        sample = draw(mutated(sample, fresh(JUNK), changes))
-    return sample
+    sample: dict[str, Any] = draw(mutated(draw(samples()), fresh(JUNK), changes))
+    return sample if draw(st.integers(0, 2)) else draw(mutated(sample, fresh(JUNK), changes))
 
 
 @st.composite
 def settings(draw: st.DrawFn, keys: Container[str]) -> dict[str, Any]:
     """Right settings of a ``RigRetarget`` for a sample with these keys."""
 
-    def one_of(*values: Any) -> Any:
-        return draw(st.sampled_from(values))
-
-    quality = one_of("fast", "fast", "fast", "fast", "draft", "accurate", "accurate", "paper")
-    chosen: dict[str, Any] = {
-        "quality": quality,
-        "keys": SampleKeys(frame=one_of("source", "source", "target"), labels=("labels",)),
-        **one_of({}, {}, {}, {}, {"size": (12, 16), "p": 0.5}),
-    }
-    if quality == "paper":
-        return chosen
     surfaces = ["auto", "auto", "infinity", "ground", "street"]
     surfaces += ["boxes"] * ("boxes_3d" in keys) + ["lidar"] * ("points" in keys or "depth_m" in keys)
-    chosen["geometry"] = one_of(*surfaces)
-    chosen["match_exposure"] = one_of(True, True, True, False, (1.1, 0.9))
-    chosen["backend"] = one_of("auto", "auto", "auto", "torch")
-    extra = one_of((), (), ("confidence",), ("confidence", "source_camera"))
-    chosen["keys"] = replace(chosen["keys"], extra=extra)
-    if quality == "accurate" and draw(st.booleans()):
-        chosen["cache"] = PlanCache(share_overlap="scene")
-    return chosen
+    choices: dict[str, tuple[Any, ...]] = {
+        "quality": ("fast", "fast", "fast", "fast", "draft", "accurate", "accurate", "paper"),
+        "frame": ("source", "source", "target"),
+        "size": ({}, {}, {}, {}, {"size": (12, 16), "p": 0.5}),
+        "geometry": tuple(surfaces),
+        "match_exposure": (True, True, True, False, (1.1, 0.9)),
+        "backend": ("auto", "auto", "auto", "torch"),
+        "extra": ((), (), ("confidence",), ("confidence", "source_camera")),
+        "cache": (PlanCache(), PlanCache(share_overlap="scene")),
+    }
+    chosen = {name: draw(st.sampled_from(values)) for name, values in choices.items()}
+    is_paper, extra, frame = chosen["quality"] == "paper", chosen.pop("extra"), chosen.pop("frame")
+    chosen |= chosen.pop("size") | {
+        "keys": SampleKeys(frame=frame, labels=("labels",), extra=() if is_paper else extra)
+    }
+    unused = ("geometry", "match_exposure", "backend", "cache") if is_paper else ()
+    unused += ("cache",) if chosen["quality"] != "accurate" else ()
+    return {name: value for name, value in chosen.items() if name not in unused}
 
 
 SETTING_NAMES = (
@@ -157,14 +153,8 @@ SETTING_NAMES = (
 
 SETTING_JUNK: tuple[Callable[[], Any], ...] = (
     *(lambda: (10.5, 20), lambda: (0, 5), lambda: (40_000, 5), lambda: ("8", "9"), lambda: [8, 9], lambda: ["fast"]),
-    *(
-        lambda: {"quality": "fast"},
-        lambda: RenderConfig(seam_width=0.0),
-        lambda: "nuscenes",
-        lambda: Rig,
-        lambda: rig(),
-    ),
-    *(lambda: (1.0, "x"), lambda: (0.0, 1.0), lambda: (1.0,), lambda: ("nothing",)),
+    *(lambda: {"quality": "fast"}, lambda: RenderConfig(seam_width=0.0), lambda: "nuscenes", lambda: Rig),
+    *(lambda: rig(), lambda: (1.0, "x"), lambda: (0.0, 1.0), lambda: (1.0,), lambda: ("nothing",)),
     lambda: PaperConfig(use_feature_matching=False),
 )
 
@@ -181,12 +171,5 @@ def calibration() -> dict[str, Any]:
     for entry, distortion in zip(cameras, (None, {"model": "fisheye", "coeffs": [0.01, 0.0, 0.0, 0.0]}), strict=True):
         entry |= {"file": f"{entry['name']}.png", "distortion": distortion}
     cameras[1]["mask"] = "mask.png"
-    boxes = [[12.0, 1, 0.8, 4, 2, 1.6, 0.3]]
-    return {
-        "name": "fuzz",
-        "cameras": cameras,
-        "ground_z_m": 0.0,
-        "ego2world": np.eye(4).tolist(),
-        "boxes_3d": boxes,
-        "lidar": {"file": "lidar.npy"},
-    }
+    further = {"ground_z_m": 0.0, "ego2world": np.eye(4).tolist(), "boxes_3d": [[12.0, 1, 0.8, 4, 2, 1.6, 0.3]]}
+    return {"name": "fuzz", "cameras": cameras, "lidar": {"file": "lidar.npy"}, **further}

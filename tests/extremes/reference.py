@@ -21,19 +21,12 @@ LEAST_DEPTH = 1e-6  # of unit directions, for lenses that see less than half a t
 
 
 class Seen(NamedTuple):
-    """Pixels (h, w) of a target that a source sees.
+    """Pixels (h, w) of a target that a source sees."""
 
-    Attributes:
-        uv: (h, w, 2) source pixels; NaN where there is none.
-        valid: The point lies in front of the source and on its lens's rising branch.
-        point_m: (h, w, 3) scene points, NaN at infinity.
-        unsure: The target's ray is not known: close to the fold of a radtan lens OpenCV's iteration does not settle.
-    """
-
-    uv: np.ndarray
-    valid: np.ndarray
-    point_m: np.ndarray
-    unsure: np.ndarray
+    uv: np.ndarray  # (h, w, 2) source pixels; NaN where there is none
+    valid: np.ndarray  # the point lies in front of the source and on its lens's rising branch
+    point_m: np.ndarray  # (h, w, 3) scene points, NaN at infinity
+    unsure: np.ndarray  # no ray is known: OpenCV's iteration does not settle close to the fold of a radtan lens
 
 
 WIDE = ("fisheye", "ftheta", "ftheta_backward", "double_sphere", "eucm")
@@ -47,7 +40,6 @@ def wide_radius(camera: Camera, theta: np.ndarray) -> np.ndarray:
         return theta + k1 * theta**3 + k2 * theta**5 + k3 * theta**7 + k4 * theta**9
     if camera.lens.startswith("ftheta"):
         k2, k3, k4, k5 = camera.distortion
-
         if camera.lens == "ftheta":
             return theta + k2 * theta**2 + k3 * theta**3 + k4 * theta**4 + k5 * theta**5
         return np.interp(theta, *backward_table(camera.distortion), right=np.nan)
@@ -166,18 +158,14 @@ def box_distance(box: np.ndarray, origin: np.ndarray, directions: np.ndarray, sh
     return np.where((enter <= leave) & (enter > 0), enter, np.inf)
 
 
-def half_pixel_wider(box: np.ndarray, camera: Camera) -> np.ndarray:
-    """A box (7,) as a camera's view shows it: with the pixels on its border, which mix colours. Its floor stays."""
-    more_m = np.linalg.norm(box[:3] - camera.center_m) / camera.K[0, 0] / 2
-    return box + more_m * np.array([0, 0, 0.5, 2, 2, 1, 0])
-
-
 def seen(source: Camera, target: Camera, surface: str, ground_z_m: float, boxes: np.ndarray | None = None) -> Seen:
     """Positions of the target's pixels in the source; ``valid`` says nothing of image bounds, masks or obstacles."""
     directions, certain = rays(target)
     q = inverse_distance("street" if boxes is not None else surface, target.center_m, directions, ground_z_m)
     if boxes is not None:  # a labelled box wins over the guessed street, even where it stands a little below the road
-        wider = [half_pixel_wider(box, target) for box in boxes]
+        # The view shows it with the pixels on its border, which mix colours: half a pixel wider. Its floor stays.
+        more_m = np.linalg.norm(boxes[:, :3] - target.center_m, axis=1, keepdims=True) / target.K[0, 0] / 2
+        wider = boxes + more_m * np.array([0, 0, 0.5, 2, 2, 1, 0])
         box = np.minimum.reduce([box_distance(box, target.center_m, directions) for box in wider])
         q = np.where(np.isfinite(box), 1 / box, q)
     with np.errstate(all="ignore"):

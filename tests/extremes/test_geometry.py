@@ -46,8 +46,7 @@ TARGETS: dict[str, Callable[[], Camera]] = {
     **{f"field of view {a:g}": (lambda a=a: camera(horizontal_fov_deg=a)) for a in (1.0, 150.0, 179.0)},
     "fisheye 220": lambda: camera(lens="fisheye", horizontal_fov_deg=220.0),
     **{f"yaw {a:g}": (lambda a=a: camera(azimuth_deg=a)) for a in (-180.0, -179.9999999, 90.0, 180.0)},
-    "pitch 90": lambda: camera(elevation_deg=90.0),
-    "pitch -90": lambda: camera(elevation_deg=-90.0),
+    **{f"pitch {a:g}": (lambda a=a: camera(elevation_deg=a)) for a in (90.0, -90.0)},
     "roll 180": lambda: camera(roll_deg=180.0),
     "a centre of a source": lambda: camera(position_m=tuple(ring()[0].center_m)),
     "1e-7 m from a source": lambda: camera(position_m=tuple(ring()[0].center_m + 1e-7)),
@@ -61,10 +60,6 @@ TARGETS: dict[str, Callable[[], Camera]] = {
     "in a box": lambda: camera(position_m=(12.0, 1.0, 0.8)),
     "principal point outside": lambda: camera(K=[[60.0, 0, -200.0], [0, 60.0, 300.0], [0, 0, 1]]),
     "skewed": lambda: camera(K=[[60.0, 30.0, 47.5], [0, 20.0, 35.5], [0, 0, 1]]),
-    "1x1": lambda: camera(width_px=1, height_px=1),
-    "1x64": lambda: camera(width_px=64, height_px=1),
-    "48x1": lambda: camera(width_px=1, height_px=48),
-    "odd": lambda: camera(width_px=61, height_px=37),
     "horizon on a row": lambda: camera(K=[[40.0, 0, 47.0], [0, 40.0, 36.0], [0, 0, 1]]),
 }
 
@@ -80,11 +75,7 @@ def no_numpy_warnings() -> Iterator[None]:
 
 
 def check(plan: RenderPlan, surface: str, scene: Scene, worst: Worst) -> None:
-    """Every covered pixel is read where float64 geometry puts it, inside its source, in front of it.
-
-    How far along each ray measured points lie depends a little on the rays evaluated with it, so over LiDAR only the
-    source's borders are checked.
-    """
+    """Every covered pixel is read where float64 puts it (but over LiDAR), inside its source, in front of it."""
     for view, target in zip(plan.targets, plan.target, strict=True):
         names = {pair.source: pair.surface for pair in view.pairs}
         positions = view.at.to_float()
@@ -109,21 +100,10 @@ def check(plan: RenderPlan, surface: str, scene: Scene, worst: Worst) -> None:
             assert error <= MAP_TOLERANCE_PX, f"{source.name} over {name}: {error:.4f} px from float64"
 
 
-@pytest.mark.parametrize(("name", "surface"), sampled(TARGETS, SCENES))
-def test_targets_at_the_edges(name: str, surface: str, worst: Worst) -> None:
-    source, target, scene = ring(), TARGETS[name](), SCENES[surface]
-    with no_numpy_warnings():
-        plan = build_plan(source, Rig([target]), geometry=surface, scene=scene, config=RenderConfig(certainty=True))
-    check(plan, surface, scene, worst)
-
-
 SOURCES: dict[str, Callable[[], Rig]] = {
     "one camera": lambda: ring(1),
     "twelve cameras": lambda: ring(12),
     "one centre": lambda: ring(position_m=(0.0, 0.0, 1.5)),
-    "1x1": lambda: ring(width_px=1, height_px=1),
-    "1x64": lambda: ring(width_px=64, height_px=1),
-    "2x1": lambda: ring(width_px=1, height_px=2),
     "odd": lambda: ring(width_px=61, height_px=37),
     "179 degrees": lambda: ring(horizontal_fov_deg=179.0),
     "1 degree": lambda: ring(horizontal_fov_deg=1.0),
@@ -138,11 +118,16 @@ SOURCES: dict[str, Callable[[], Rig]] = {
 }
 
 
-@pytest.mark.parametrize(("name", "surface"), sampled(SOURCES, SCENES))
-def test_sources_at_the_edges(name: str, surface: str, worst: Worst) -> None:
-    scene, target = SCENES[surface], Rig([camera("t0"), camera("t1", azimuth_deg=70.0, position_m=(0.0, 0.6, 1.9))])
+EDGES = [*(("target", name) for name in TARGETS), *(("source", name) for name in SOURCES)]
+
+
+@pytest.mark.parametrize(("edge", "surface"), sampled(EDGES, SCENES))
+def test_cameras_at_the_edges(edge: tuple[str, str], surface: str, worst: Worst) -> None:
+    (side, name), scene = edge, SCENES[surface]
+    source, target = ring(), Rig([camera("t0"), camera("t1", azimuth_deg=70.0, position_m=(0.0, 0.6, 1.9))])
+    source, target = (source, Rig([TARGETS[name]()])) if side == "target" else (SOURCES[name](), target)
     with no_numpy_warnings():
-        plan = build_plan(SOURCES[name](), target, geometry=surface, scene=scene)
+        plan = build_plan(source, target, geometry=surface, scene=scene, config=RenderConfig(certainty=True))
     check(plan, surface, scene, worst)
 
 
@@ -221,24 +206,17 @@ def test_a_horizon_exactly_on_a_row(surface: str, worst: Worst) -> None:
     assert np.abs(np.diff(rise_px) + 1).max() <= 2 * MAP_TOLERANCE_PX + 1e-3, "the rows beside it continue it"
 
 
-# --- occlusion from a source, however well the target sees the place --------------------------------------------------
-NEAR = [8.0, 0.0, 1.0, 0.5, 4.0, 2.0, 0.0]
-FAR = [14.0, 0.0, 1.0, 0.5, 4.0, 2.0, 0.0]  # behind it, and no wider: the source sees nothing of its front
 MARGIN_M = 0.4  # two pixels of the source, 14 m away
-
-
-def views(rows: int, side: float) -> tuple[Rig, Rig]:
-    """A source straight before the boxes, and a target far to the side that looks behind the first one."""
-    size = {"height_px": rows, "width_px": rows * 4 // 3, "horizontal_fov_deg": 90.0}
-    source = camera("s", position_m=(0.0, 0.0, 1.5), **size)
-    return Rig([source]), Rig([camera("t", position_m=(0.0, 6.0 * side, 1.8), azimuth_deg=-20.0 * side, **size)])
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 @pytest.mark.parametrize("rows", [48, 192])  # pixel by pixel, and on the coarse grid
 def test_boxes_hide_boxes_and_the_street(rows: int, side: float) -> None:
-    source, target = views(rows, side)
-    boxes = np.array([NEAR, FAR])
+    """The target looks from the side behind a box that hides another, no wider one from the source."""
+    size = {"height_px": rows, "width_px": rows * 4 // 3, "horizontal_fov_deg": 90.0}
+    source = Rig([camera("s", position_m=(0.0, 0.0, 1.5), **size)])
+    target = Rig([camera("t", position_m=(0.0, 6.0 * side, 1.8), azimuth_deg=-20.0 * side, **size)])
+    boxes = np.array([[x, 0.0, 1.0, 0.5, 4.0, 2.0, 0.0] for x in (8.0, 14.0)])
     coverage = build_plan(source, target, geometry="boxes", scene=Scene(boxes=boxes)).targets[0].coverage
     seen = reference.seen(source[0], target[0], "boxes", 0.0, boxes)
     directions, _ = reference.rays(target[0])
@@ -254,34 +232,3 @@ def test_boxes_hide_boxes_and_the_street(rows: int, side: float) -> None:
     clear = street.copy()
     clear[street] = ~reference.hidden(source[0], seen.point_m[street], boxes, -MARGIN_M)
     assert coverage[clear].mean() > 0.98, "and nothing else is hidden"
-
-
-def wall(x: float, half_width: float, height: float) -> np.ndarray:
-    """Points every 4 cm of an upright wall across the way."""
-    y, z = np.meshgrid(np.arange(-half_width, half_width, 0.04), np.arange(0, height, 0.04))
-    return np.stack([np.full(y.shape, x), y, z], -1).reshape(-1, 3)
-
-
-@pytest.mark.parametrize("side", [-1.0, 1.0])
-@pytest.mark.parametrize("rows", [48, 192])
-def test_measured_walls_hide_measured_walls(rows: int, side: float) -> None:
-    source, target = views(rows, side)
-    points = np.concatenate([wall(8.0, 2.0, 3.0), wall(14.0, 9.0, 4.0)])
-    coverage = build_plan(source, target, geometry="lidar", scene=Scene(points=points)).targets[0].coverage
-    eye = target[0].center_m
-    directions, _ = reference.rays(target[0])
-    with np.errstate(divide="ignore"):
-        on_near, on_far = (eye + directions * ((x - eye[0]) / directions[..., :1]) for x in (8.0, 14.0))
-    ahead = directions[..., 0] > 0
-
-    def within(point: np.ndarray, half_width: float, height: float) -> np.ndarray:
-        return (np.abs(point[..., 1]) < half_width) & (point[..., 2] > 0) & (point[..., 2] < height)
-
-    shows_far = ahead & within(on_far, 9.0 - MARGIN_M, 4.0 - MARGIN_M) & ~within(on_near, 2 + MARGIN_M, 3 + MARGIN_M)
-    crossing = source[0].center_m + (on_far - source[0].center_m) * (8.0 / 14.0)  # where the source's ray is at x = 8
-    hidden = shows_far & within(crossing, 2.0 - MARGIN_M, 3.0 - MARGIN_M)
-    assert hidden.sum() > rows / 4
-    assert not coverage[hidden].any(), "the far wall is read through the near one"
-    got = source[0].project(on_far)
-    clear = shows_far & ~within(crossing, 2 + MARGIN_M, 3 + MARGIN_M) & got.valid & source[0].contains(got.uv)
-    assert coverage[clear].mean() > 0.95

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,9 @@ import torch
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rotations import poses_from, quaternion_from_rotation
-from arbiview_aug.errors import SampleError
-from arbiview_aug.integrations.mmdet3d.images import Norm, levels, normalised
+from arbiview_aug.errors import SampleError, shown
 from arbiview_aug.integrations.mmdet3d.matrices import ResultCameras, padded, upper_triangular
 from arbiview_aug.integrations.mmdet3d.results import (
-    Retarget,
     geometry,
     scanned,
     source_rig,
@@ -23,11 +21,17 @@ from arbiview_aug.integrations.mmdet3d.results import (
     without_stale,
 )
 
-MEAN_STD = ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375))
+Norm = tuple[Sequence[float], Sequence[float]]
+"""Three means and three standard deviations: normalised images are (grey level − mean) / std."""
+
+MEAN_STD: Norm = ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375))
 """Mean and deviation of BEVDet's ``mmlabNormalize``, in the order of the channels it leaves."""
 
 _PICTURES = "canvas"
 """The images before BEVDet normalised them, for people: dropped silently."""
+
+_ROUNDING = 0.01
+"""Grey levels of 255 by which a pixel that was normalised in float32 may miss a whole number."""
 
 _KEY_CAMERA = "CAM_FRONT"
 _FORM = "(imgs, sensor2egos, ego2globals, intrins, post_rots, post_trans[, bda])"
@@ -35,13 +39,14 @@ _FORM = "(imgs, sensor2egos, ego2globals, intrins, post_rots, post_trans[, bda])
 
 def retarget_img_inputs(
     results: Mapping[str, Any],
-    retarget: Retarget,
+    retarget: Callable[[dict[str, Any], Mapping[str, float]], dict[str, Any]],
+    params: Mapping[str, float],
     *,
     names: Sequence[str],
     ground_z_m: float = 0.0,
     mean_std: Norm = MEAN_STD,
 ) -> dict[str, Any]:
-    """Re-render ``img_inputs`` of one frame (BEVDet) or several (BEVDet4D, BEVStereo4D), and what goes with it.
+    """Re-render ``img_inputs`` of one frame (BEVDet) or several (BEVDet4D, BEVStereo4D), and what belongs to it.
 
     The source cameras are those of the images as they are: their resizing, cropping, flipping and turning is a part of
     their K and pose. The target's images are not augmented: ``post_rots`` are ones, ``post_trans`` zeros.
@@ -59,7 +64,8 @@ def retarget_img_inputs(
             earlier frame in its entry of ``adjacent``), are read as geometry and stay. ``points`` (LiDAR frame, posed
             by ``curr``), where they are loaded already, become those of the target's scanners, if it has any: depth
             maps that ``PointToMultiViewDepth`` then makes of them are the target's.
-        retarget: A ``RigRetarget``, or what calls one: with the sample of each frame in turn.
+        retarget: A ``RigRetarget``, which is called for each frame in turn.
+        params: Its draw, one for all frames.
         names: Names of the target's cameras.
         ground_z_m: Height of the road in the source's ego frame.
         mean_std: Three numbers each, by which the images are normalised: (grey level − mean) / std.
@@ -91,12 +97,12 @@ def retarget_img_inputs(
         except np.linalg.LinAlgError:
             matrices = "sensor2egos, ego2globals, intrins and post_rots"
             raise SampleError(f"img_inputs: expected {matrices} that can be inverted, got a singular one") from None
-        grey = levels("img_inputs", images, mean_std)
+        grey = levels(images, mean_std)
         views = [image.flip(-1) if flip else image for image, flip in zip(grey, mirrored, strict=True)]
         sample = {"images": torch.stack(views), "rig": source_rig(source, views, ground_z_m)}
         lidar2key = _lidar2key(info, key2global) if t == 0 else None
         points = {} if lidar2key is None else geometry({"points": results.get("points")}, lidar2key)
-        out = retarget(sample | points | _boxes(results if t == 0 else info))
+        out = retarget(sample | points | _boxes(results if t == 0 else info), params)
         target = target_views(out, source, names)
         if lidar2key is not None:
             changed |= scanned(changed, out, lidar2key)
@@ -194,3 +200,37 @@ def _infos(target: ResultCameras, key2global: FloatArray) -> dict[str, dict[str,
         name: {"data_path": name, "cam_intrinsic": K, **pose("sensor2ego", cam2ego), **of_key}
         for name, K, cam2ego in zip(target.names, target.K, target.cam2ego, strict=True)
     }
+
+
+# --- grey levels ------------------------------------------------------------------------------------------------------
+def checked_norm(norm: Any) -> Norm:
+    """Three means and three standard deviations above 0; SampleError for anything else."""
+    try:
+        mean, std = (np.asarray(numbers, np.float64).ravel().tolist() for numbers in norm)
+        valid = len(mean) == len(std) == 3 and min(std) > 0
+    except (TypeError, ValueError):
+        valid = False
+    if not valid:
+        raise SampleError(f"img_norm: expected three means and three positive stds, got {shown(norm)}")
+    return mean, std
+
+
+def levels(images: torch.Tensor, norm: Norm) -> torch.Tensor:
+    """Normalised images (..., 3, h, w) as uint8; SampleError for what was not 8 bit images normalised so."""
+    mean, std = (torch.tensor(numbers, dtype=torch.float64)[:, None, None] for numbers in norm)
+    grey = images.double() * std + mean
+    whole = grey.round()
+    off = float((grey - whole).abs().max())
+    if not (off <= _ROUNDING and whole.min() >= 0 and whole.max() <= 255):  # NaN too
+        raise SampleError(
+            f"img_inputs: expected 8 bit images normalised by mean and std {norm}, got grey levels {off:.2g} off whole "
+            f"numbers, from {grey.min():.1f} to {grey.max():.1f}; pass img_norm=(mean, std), and retarget before "
+            "photometric distortion"
+        )
+    return whole.to(torch.uint8)
+
+
+def normalised(images: torch.Tensor, norm: Norm) -> torch.Tensor:
+    """Images (..., 3, h, w) uint8 as (grey level − mean) / std, float32."""
+    mean, std = (torch.tensor(numbers, dtype=torch.float32)[:, None, None] for numbers in norm)
+    return (images.float() - mean) / std

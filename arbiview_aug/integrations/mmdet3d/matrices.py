@@ -18,7 +18,7 @@ MATRICES = {
     **dict.fromkeys(("lidar2cam", "lidar2camera", "extrinsics"), "lidar2cam"),
     **dict.fromkeys(("cam2lidar", "camera2lidar"), "cam2lidar"),
     **dict.fromkeys(("cam2ego", "camera2ego"), "cam2ego"),
-    **dict.fromkeys(("lidar2img", "lidar2image", "ori_lidar2img", "projection_mat"), "lidar2img"),
+    **dict.fromkeys(("lidar2img", "lidar2image", "ori_lidar2img"), "lidar2img"),
     "cam2global": "cam2global",
 }
 """Matrix of each key, for each camera."""
@@ -42,21 +42,13 @@ def entry(key: str, expected: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class ResultCameras:
-    """The cameras of a ``results`` dict.
-
-    Attributes:
-        names: n of them.
-        K: (n, 3, 3).
-        cam2ego: (n, 4, 4), in the ego frame at the LiDAR's time.
-        lidar2ego: (4, 4).
-        ego2global: (4, 4) the ego at the LiDAR's time, where the dict tells.
-    """
+    """The cameras of a ``results`` dict."""
 
     names: Sequence[str]
-    K: FloatArray
-    cam2ego: FloatArray
-    lidar2ego: FloatArray
-    ego2global: FloatArray | None = None
+    K: FloatArray  # (n, 3, 3)
+    cam2ego: FloatArray  # (n, 4, 4), in the ego frame at the LiDAR's time
+    lidar2ego: FloatArray  # (4, 4)
+    ego2global: FloatArray | None = None  # (4, 4) the ego at the LiDAR's time, where the dict tells
 
     def matrices(self, kind: str) -> FloatArray:
         """(n, 4, 4) of a kind among ``MATRICES``' values."""
@@ -75,19 +67,10 @@ class ResultCameras:
 
 
 def read_views(matrices: Mapping[str, Any], count: int, names: Sequence[str], lidar2ego: FloatArray) -> ResultCameras:
-    """The cameras that a dict's matrices describe.
+    """The cameras that a dict's matrices (values of the keys of ``MATRICES``, each of ``count`` cameras) describe.
 
-    ``cam2ego`` is not read: mmdet3d's is the mounting alone, 0.4 m beside what the image shows at 9 m/s; ``lidar2cam``
-    has the motion between LiDAR and camera in it.
-
-    Args:
-        matrices: Values of the keys of ``MATRICES``, each for all cameras.
-        count: How many images there are.
-        names: Names of the cameras.
-        lidar2ego: (4, 4).
-
-    Raises:
-        SampleError: Too few matrices, or such as contradict each other.
+    ``cam2ego`` is not read: mmdet3d's is the mounting alone, 0.4 m off what the image shows at 9 m/s; ``lidar2cam`` has
+    the motion between LiDAR and camera in it. Missing and contradictory matrices are a ``SampleError``.
     """
     of: dict[str, FloatArray] = {}
     for key, kind in MATRICES.items():
@@ -151,11 +134,7 @@ def upper_triangular(M: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def stacked(key: str, value: Any, count: int) -> FloatArray:
-    """(n, 4, 4) float64 of a value that holds a matrix for each camera.
-
-    Raises:
-        SampleError: Another number or shape.
-    """
+    """(n, 4, 4) float64 of a value that holds a matrix for each camera; SampleError for another number or shape."""
     try:
         array = np.stack([np.asarray(matrix, np.float64) for matrix in value])
     except (TypeError, ValueError):

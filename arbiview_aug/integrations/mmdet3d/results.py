@@ -12,9 +12,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.rotations import rotation_from_quaternion
-from arbiview_aug.errors import CalibrationError, SampleError, warn
-from arbiview_aug.integrations.mmdet3d.images import like_given as images_like
-from arbiview_aug.integrations.mmdet3d.images import norm_of, to_tensors
+from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError, warn
 from arbiview_aug.integrations.mmdet3d.matrices import (
     MATRICES,
     ResultCameras,
@@ -37,14 +35,12 @@ STALE_KEYS = (
     *("centers_2d", "centers2d", "depths", "depth_map", "depth_maps", "gt_depth", "canvas"),
     *("gt_masks", "gt_semantic_seg", "gt_seg_map", "seg_label"),
 )
-"""Keys, also in ``ann_info``, that speak of the source's pixels: dropped (``project_boxes_3d`` makes 2D boxes anew)."""
+"""Keys, also in ``ann_info``, that speak of the source's pixels: dropped (``project_boxes_3d`` makes new 2D boxes)."""
 
 FILE_KEYS = ("filename", "img_path", "img_filename", "image_paths")
 """Lists of image files: no file holds the new images, so they become the cameras' names."""
 
 SHAPE_KEYS = ("img_shape", "ori_shape", "pad_shape")
-_MAX_PADDING_PX = 64
-"""Images are padded at the right and below to multiples of 32 or 64."""
 
 _AS_RECORDED: dict[str, Any] = {
     **dict.fromkeys(("img_aug_matrix", "lidar_aug_matrix", "global_aug_matrix", "bev_flip_matrix"), np.eye(4)),
@@ -77,24 +73,31 @@ def retarget_results(
 
     Args:
         results: As the loading transforms leave it; it is not changed.
-        retarget: A ``RigRetarget``, or what calls one.
+        retarget: A ``RigRetarget``.
         names: Names of the target's cameras.
         lidar2ego: (4, 4), where the dict does not tell it.
         ground_z_m: Height of the road in the source's ego frame.
 
     Raises:
-        SampleError: Matrices that are missing, contradictory or already augmented; target images of several sizes.
+        SampleTypeError: Images of another form.
+        SampleError: Matrices that are missing, contradictory or already augmented; normalised images; target images of
+            several sizes.
         CalibrationError: A target with lenses.
     """
     if results.get("img") is None:
         raise SampleError(f"results: expected 'img', loaded images, got {', '.join(map(str, results))}")
-    norm = norm_of(results.get("img_norm_cfg"))
-    images = to_tensors(_recorded(results), norm)
+    images = to_tensors(results["img"])
     check_as_recorded(results)
     count, infos = len(images), results.get("images")
     by_name: Mapping[str, Any] = infos if isinstance(infos, Mapping) and len(infos) == count else {}
     camera_names = [*map(str, by_name)] or [f"camera {k}" for k in range(count)]
-    source = read_views(_given(results, by_name), count, camera_names, _lidar2ego(results, lidar2ego))
+    matrices: dict[str, Any] = {}  # of all cameras: at the top, else gathered from ``images``
+    for key in MATRICES:
+        if results.get(key) is not None and not _is_of_one(results[key]):
+            matrices[key] = results[key]
+        elif by_name and all(isinstance(info, Mapping) and key in info for info in by_name.values()):
+            matrices[key] = [info[key] for info in by_name.values()]
+    source = read_views(matrices, count, camera_names, _lidar2ego(results, lidar2ego))
     for k, info in enumerate(by_name.values()):  # mmdet3d pads images of several sizes to the largest
         if isinstance(info, Mapping) and info.get("height") and info.get("width"):
             with entry("images", "height and width in pixels"):
@@ -104,7 +107,7 @@ def retarget_results(
     )
     views = target_views(out, source, names)
     kept = without_stale(results)
-    kept["img"] = images_like(results["img"], out["images"], norm)
+    kept["img"] = images_like(results["img"], out["images"])
     _write_numbers(kept, views, out["images"])
     if isinstance(infos, Mapping):
         kept["images"] = _infos(infos, views, out["images"])
@@ -125,18 +128,6 @@ def retarget_results(
 
 
 # --- source -----------------------------------------------------------------------------------------------------------
-def _given(results: Mapping[str, Any], by_name: Mapping[str, Any]) -> dict[str, Any]:
-    """The matrices of all cameras: at the top, else gathered from ``images``."""
-    infos = [*by_name.values()]
-    gathered = {
-        key: [info[key] for info in infos]
-        for key in MATRICES
-        if infos and all(isinstance(info, Mapping) and key in info for info in infos)
-    }
-    at_top = {key: results[key] for key in MATRICES if results.get(key) is not None}
-    return gathered | {key: value for key, value in at_top.items() if not _is_of_one(value)}
-
-
 def _is_of_one(value: Any) -> bool:
     """Whether it is the one matrix that mmdet3d's datasets keep of their ``default_cam_key``."""
     if isinstance(value, list | tuple):
@@ -163,11 +154,7 @@ def _lidar2ego(results: Mapping[str, Any], matrix: Any) -> FloatArray:
 
 
 def check_as_recorded(results: Mapping[str, Any]) -> None:
-    """Refuse frames that are augmented already.
-
-    Raises:
-        SampleError: With the key that says so.
-    """
+    """Refuse frames that are augmented already: SampleError with the key that says so."""
     for key, neutral in _AS_RECORDED.items():
         if results.get(key) is None:
             continue
@@ -178,23 +165,31 @@ def check_as_recorded(results: Mapping[str, Any]) -> None:
             raise SampleError(f"{key}: expected a frame as it was recorded, got an augmented one; {fix}")
 
 
-def _recorded(results: Mapping[str, Any]) -> Any:
-    """``img`` without the rims that ``PadMultiViewImage`` added, which wrote down each image's shape before."""
-    images = results["img"]
-    for key in SHAPE_KEYS:
-        shapes = results.get(key)
-        if not isinstance(shapes, list) or len(shapes) != len(images) or not isinstance(shapes[0], tuple | list):
-            continue
-        cut = []
-        with entry(key, "(h, w) of each image"):
-            for image, (h, w, *_) in zip(images, shapes, strict=True):
-                sides = image.shape[1:] if isinstance(image, torch.Tensor) else np.shape(image)[:2]
-                rims = [side - shape for side, shape in zip(sides, (h, w), strict=False)]
-                if len(rims) == 2 and all(0 <= rim < _MAX_PADDING_PX for rim in rims):
-                    image = image[:, :h, :w] if isinstance(image, torch.Tensor) else image[:h, :w]
-                cut.append(image)
-        images = cut
-    return images
+def to_tensors(images: Any) -> list[torch.Tensor]:
+    """N tensors (3, H, W) uint8, channels in their order, of N arrays (H, W, 3), tensors (3, H, W) or PIL images.
+
+    Floats are grey levels of 0 to 255, as ``to_float32=True`` loads them, and are rounded.
+    """
+    if not isinstance(images, list | tuple | np.ndarray | torch.Tensor) or not len(images):
+        raise SampleTypeError(f"img: expected a list of (H, W, 3) arrays or PIL images, got {type(images).__name__}")
+    tensors = []
+    for k, image in enumerate(images):
+        if isinstance(image, torch.Tensor) and image.ndim == 3:
+            image = image.permute(1, 2, 0).cpu().numpy()
+        array = image if isinstance(image, np.ndarray) else np.array(image)  # PIL's own memory is read-only
+        if array.ndim != 3 or array.shape[2] != 3 or array.dtype.kind not in "uf":
+            fix = "; retarget each frame of a queue in its pipeline, with sequence_key" if array.ndim == 4 else ""
+            raise SampleTypeError(f"img[{k}]: expected (H, W, 3), 8 bit or float, got {array.dtype} {array.shape}{fix}")
+        if array.dtype != np.uint8:
+            low, high = float(array.min()), float(array.max())
+            if not (low > -0.5 and high < 255.5):
+                raise SampleError(
+                    f"img[{k}]: expected grey levels from 0 to 255, got {low:g} to {high:g}; retarget right after "
+                    "loading, before photometric distortion and normalisation"
+                )
+            array = np.rint(array).astype(np.uint8)
+        tensors.append(torch.from_numpy(np.ascontiguousarray(array)).permute(2, 0, 1))
+    return tensors
 
 
 def source_rig(views: ResultCameras, images: Sequence[torch.Tensor], ground_z_m: float) -> Rig:
@@ -210,11 +205,7 @@ def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, tor
     """The sample's ``points`` and ``boxes_3d`` in the ego frame, of what the results hold in the LiDAR's.
 
     Boxes are taken by their corners: what their numbers mean differs between mmdet3d's versions. Those of plain numbers
-    (Sparse4D) are gravity centre, length, width, height and yaw.
-
-    Raises:
-        SampleTypeError: No numbers.
-        SampleError: Numbers of another shape.
+    (Sparse4D) are gravity centre, length, width, height and yaw. Other shapes are a ``SampleError``.
     """
     values = {}
     points = results.get("points")
@@ -236,8 +227,10 @@ def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, tor
         # In both conventions corner 1 is above 0. From 1.0 on corner 4 is ahead of 0, at the yaw, and 3 to its left.
         x = np.asarray(corners, np.float64).reshape(-1, 8, 3)
         centres, along, aside = x.mean(axis=1), x[:, 4] - x[:, 0], x[:, 3] - x[:, 0]
-        if tensor is not None and _is_clockwise(np.asarray(tensor[:, 6], np.float64), along):
-            along, aside = -aside, along
+        if tensor is not None:  # before 1.0 the x axes, of the width, are at minus the yaw
+            yaw, angles = np.asarray(tensor[:, 6], np.float64), np.arctan2(along[:, 1], along[:, 0])
+            if np.cos(angles + yaw).sum() > np.cos(angles - yaw).sum() + 1e-6:
+                along, aside = -aside, along
         sizes = np.linalg.norm([along, aside, x[:, 1] - x[:, 0]], axis=-1)
     along = along @ rotation.T
     columns = [*(centres @ rotation.T + lidar2ego[:3, 3]).T, *sizes, np.arctan2(along[:, 1], along[:, 0])]
@@ -253,12 +246,6 @@ def _rows(key: str, value: Any, least: int) -> Points:
     return array
 
 
-def _is_clockwise(yaw: FloatArray, x_axes: FloatArray) -> bool:
-    """Whether boxes are those of mmdet3d before 1.0: their x axes (B, 3), of the width, are at minus the yaw (B,)."""
-    angles = np.arctan2(x_axes[:, 1], x_axes[:, 0])
-    return bool(np.cos(angles + yaw).sum() > np.cos(angles - yaw).sum() + 1e-6)
-
-
 def moved_points(points: Any, pose: FloatArray) -> torch.Tensor:
     """(P, C) float32 of points (P, C), whose first three columns are moved by a pose (4, 4)."""
     moved = np.asarray(points, np.float64).copy()
@@ -268,12 +255,7 @@ def moved_points(points: Any, pose: FloatArray) -> torch.Tensor:
 
 # --- target -----------------------------------------------------------------------------------------------------------
 def target_views(out: Mapping[str, Any], source: ResultCameras, names: Sequence[str]) -> ResultCameras:
-    """The cameras of a retargeted sample.
-
-    Raises:
-        SampleError: Images of several sizes, or poses in the target's ego frame.
-        CalibrationError: Lenses.
-    """
+    """The cameras of a retargeted sample, of one size, without lenses, in the source's ego frame."""
     if not isinstance(out["images"], torch.Tensor):
         raise SampleError("target: expected images of one size, got several; pass size=(h, w) to the transform")
     if "ego2ego" in out:
@@ -296,12 +278,7 @@ def scanned(results: Mapping[str, Any], out: Mapping[str, Any], lidar2ego: Float
     """``points`` as the target's scanners measured them, of the given type, and ``num_lidar_pts`` of each box.
 
     Empty where the target has none, or the sample was skipped. Numbers are written in ``ann_info`` and ``instances``,
-    where they are there for the same boxes.
-
-    Args:
-        results: With the points as they were.
-        out: The retargeted sample.
-        lidar2ego: (4, 4) to the frame of the sample's points.
+    where they are there for the same boxes. ``lidar2ego`` (4, 4) leads to the frame of the sample's points.
     """
     if RINGS_KEY not in out or _is_skipped(out):
         return {}
@@ -315,18 +292,14 @@ def scanned(results: Mapping[str, Any], out: Mapping[str, Any], lidar2ego: Float
     instances = results.get("instances")
     if isinstance(instances, list) and len(instances) == len(counts):
         changed["instances"] = [
-            {**one, "num_lidar_pts": n} if "num_lidar_pts" in one else one
-            for one, n in zip(instances, counts.tolist(), strict=True)
+            {**box, "num_lidar_pts": count} if "num_lidar_pts" in box else box
+            for box, count in zip(instances, counts.tolist(), strict=True)
         ]
     return changed
 
 
 def check_no_lenses(lenses: Sequence[str]) -> None:
-    """Refuse what the frameworks' matrices cannot say.
-
-    Raises:
-        CalibrationError: Lenses.
-    """
+    """Refuse lenses, which the frameworks' matrices cannot say."""
     if any(lens != "pinhole" for lens in lenses):
         raise CalibrationError(
             f"target: expected pinhole cameras, which is all that these frameworks know, got {', '.join(lenses)}; "
@@ -346,7 +319,7 @@ def target_outputs(outs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _write_numbers(out: dict[str, Any], views: ResultCameras, images: torch.Tensor) -> None:
-    """Matrices and sizes; Sparse4D's (w, h) of each image, and geometric mean of its focal lengths."""
+    """Write matrices, and the images' shapes."""
     for key, kind in MATRICES.items():
         if out.get(key) is not None:
             matrices = out.pop(key)
@@ -354,17 +327,27 @@ def _write_numbers(out: dict[str, Any], views: ResultCameras, images: torch.Tens
                 with entry(key, "a matrix of each image"):
                     out[key] = _as_written(matrices, views.matrices(kind))
     h, w = images.shape[-2:]
-    columns = {"image_wh": [(w, h)] * len(images), "focal": np.sqrt(np.abs(np.linalg.det(views.K[:, :2, :2])))}
-    for key, values in columns.items():
-        if out.get(key) is not None:
-            with entry(key, "numbers of each image"):
-                out[key] = like_array(out[key], values)
     # (h, w), (h, w, 3), (h, w, 3, views) as given; (w, h) where images are PIL's.
     full = (h, w, 3, len(images)) if isinstance(out["img"][0], np.ndarray | torch.Tensor) else (w, h)
     for key in SHAPE_KEYS:
         if isinstance(shape := out.get(key), tuple | list) and shape:
             is_list = isinstance(shape[0], tuple | list)
             out[key] = [full[: len(shape[0])]] * len(images) if is_list else full[: len(shape)]
+
+
+def images_like(original: Sequence[Any], images: torch.Tensor) -> Any:
+    """Images (M, 3, h, w) uint8 as the given ones are: PIL, or arrays or tensors of their type, listed or stacked."""
+    first = original[0]
+    if isinstance(first, torch.Tensor):
+        typed_tensors = images.to(first)
+        return typed_tensors if isinstance(original, torch.Tensor) else list(typed_tensors)
+    arrays = [np.ascontiguousarray(image.permute(1, 2, 0).numpy()) for image in images]
+    if not isinstance(first, np.ndarray):
+        from PIL import Image
+
+        return [Image.fromarray(array) for array in arrays]
+    typed = [array.astype(first.dtype, copy=False) for array in arrays]
+    return np.stack(typed) if isinstance(original, np.ndarray) else typed
 
 
 def _as_written(original: Any, matrices: FloatArray) -> Any:

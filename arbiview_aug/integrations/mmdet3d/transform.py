@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,7 @@ import torch
 from arbiview_aug import CalibrationError, RandomRig, Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.cameras.random_rig import Epochs, names_in, sequence_rng
 from arbiview_aug.choices import is_number
-from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, retarget_img_inputs
-from arbiview_aug.integrations.mmdet3d.images import Norm, checked_norm
-from arbiview_aug.integrations.mmdet3d.queue import OneDraw, is_queue, retarget_queue
+from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, Norm, checked_norm, retarget_img_inputs
 from arbiview_aug.integrations.mmdet3d.results import check_no_lenses, retarget_results
 
 
@@ -24,9 +23,9 @@ class RigRetargetMultiView:
     Points become those of the target's scanners, if it has any; ``keys=dict(points="source")`` keeps them.
 
     It stands right after what loads images (and points and annotations, where they are loaded: geometry), before
-    resizing, cropping, flipping and whatever turns points and boxes. Several frames in one dict (BEVDet4D, collected
-    queues) share one draw of ``p`` and of a ``RandomRig``. If each frame of a drive passes the pipeline by itself,
-    ``sequence_key`` does that.
+    resizing, cropping, flipping and whatever turns points and boxes. Several frames in one dict (BEVDet4D) share one
+    draw of ``p`` and of a ``RandomRig``. If each frame of a drive passes the pipeline by itself (BEVFormer,
+    StreamPETR, Sparse4D), ``sequence_key`` does that.
 
     Args:
         target: A rig's name, file, ``Rig`` or ``RandomRig``; of pinhole cameras (``Rig.undistorted()``).
@@ -35,7 +34,7 @@ class RigRetargetMultiView:
         img_norm: Means and standard deviations (three each) of BEVDet's normalisation.
         sequence_key: Names the drive in the results (``scene_token``; Sparse4D: ``aug_config``): frames where it is
             equal share one draw, in all workers of a DataLoader's epoch. By default that of a
-            ``RandomRig(per="sequence")``; else each dict has a draw of its own. The training loop calls ``set_epoch``
+            ``RandomRig(per="sequence")``; else each dict has its own draw. The training loop calls ``set_epoch``
             before each epoch without workers or with persistent ones: else every epoch repeats the draws.
         settings: Any of ``RigRetarget``'s: ``size``, ``geometry``, ``quality``, ``p``, ``match_exposure``,
             ``holes``, ``keys`` (a dict of ``SampleKeys``' values in a config file).
@@ -73,7 +72,7 @@ class RigRetargetMultiView:
         self.names = rig.names
         self.lidar2ego = lidar2ego
         self.ground_z_m = float(ground_z_m)
-        self.img_norm = checked_norm("img_norm", img_norm)
+        self.img_norm = checked_norm(img_norm)
         by_target = held.sequence_key if isinstance(held, RandomRig) and held.per == "sequence" else None
         self.sequence_key = sequence_key or by_target
         self._epochs = held if isinstance(held, RandomRig) else Epochs()
@@ -83,23 +82,13 @@ class RigRetargetMultiView:
         self._epochs.set_epoch(epoch)
 
     def __call__(self, results: Mapping[str, Any]) -> dict[str, Any]:
-        """A new ``results`` dict: see ``retarget_results``, ``retarget_queue`` and ``retarget_img_inputs``."""
-        of_all = OneDraw(self.retarget)
-
-        def of_frame(frame: Mapping[str, Any]) -> OneDraw:
-            return of_all if self.sequence_key is None else OneDraw(self.retarget, self.draw(frame))
-
-        def retargeted(frame: Mapping[str, Any]) -> dict[str, Any]:
-            return retarget_results(
-                frame, of_frame(frame), names=self.names, lidar2ego=self.lidar2ego, ground_z_m=self.ground_z_m
-            )
-
+        """A new ``results`` dict: see ``retarget_results`` and ``retarget_img_inputs``."""
+        options: dict[str, Any] = {"names": self.names, "ground_z_m": self.ground_z_m}
         if "img_inputs" in results:
-            retarget = of_frame({**(results.get("curr") or {}), **results})
-            return retarget_img_inputs(
-                results, retarget, names=self.names, ground_z_m=self.ground_z_m, mean_std=self.img_norm
-            )
-        return retarget_queue(results, retargeted) if is_queue(results) else retargeted(results)
+            params = self.draw({**(results.get("curr") or {}), **results})
+            return retarget_img_inputs(results, self.retarget, params, mean_std=self.img_norm, **options)
+        retarget = partial(self.retarget, params=self.draw(results))
+        return retarget_results(results, retarget, lidar2ego=self.lidar2ego, **options)
 
     def rng(self, frame: Mapping[str, Any], use: str = "") -> torch.Generator | None:
         """A generator that is the same for all frames of a sequence; None without ``sequence_key``.

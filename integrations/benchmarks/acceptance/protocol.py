@@ -21,12 +21,6 @@ IN_BOTH = (pytest.mark.slow, pytest.mark.release)
 """Marks of what CI runs, and a release too."""
 
 FRAMES = [pytest.param("nuscenes-one", marks=IN_BOTH), pytest.param("ddad-one", marks=pytest.mark.release)]
-MOVES = ("0.6 m higher", "0.5 m forward", "turned by 20°")
-
-
-def moved(rig: Rig) -> dict[str, Rig]:
-    """The rig after each of the moves."""
-    return dict(zip(MOVES, (rig.shifted(z_m=0.6), rig.shifted(x_m=0.5), rig.turned(yaw_deg=20)), strict=True))
 
 
 def psnr_of(outs: Sequence[dict[str, Any]], truth: RenderedViews, parts: Iterable[np.ndarray]) -> list[list[float]]:
@@ -44,26 +38,16 @@ def psnr_of(outs: Sequence[dict[str, Any]], truth: RenderedViews, parts: Iterabl
 
 
 class ProtocolFrame:
-    """A frame at half resolution as the protocol reads it, and as this package does.
-
-    Attributes:
-        cameras: The protocol's cameras, exposures made even.
-        lidar: (P, 3+) points in the ego frame.
-        rig: The cameras as ours.
-        images: (h, w, 3) uint8 for each camera, exposures made even.
-    """
+    """A frame at half resolution, exposures made even: the protocol's cameras and LiDAR points, our rig and images."""
 
     def __init__(self, referee: ModuleType, folder: Path) -> None:
         self.cameras, self.lidar, calibration = referee.load_frame(str(folder), 0.5)
         self.ground_z_m = float(calibration["ground_z_m"])
-        self.rig = Rig(
-            [
-                as_camera(name, c["K"], c["cam2ego"], c["image"].shape[:2], c["mask"] > 0)
-                for name, c in self.cameras.items()
-            ],
-            ground_z_m=self.ground_z_m,
-            name=folder.name,
-        )
+        cameras = [
+            as_camera(name, c["K"], c["cam2ego"], c["image"].shape[:2], c["mask"] > 0)
+            for name, c in self.cameras.items()
+        ]
+        self.rig = Rig(cameras, ground_z_m=self.ground_z_m, name=folder.name)
         self.images = list(equalised(self.rig, [c["image"] for c in self.cameras.values()], self.lidar))
         self.cameras = referee.equalised(self.cameras, self.lidar)
 

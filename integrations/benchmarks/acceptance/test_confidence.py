@@ -29,36 +29,19 @@ TARGETS = (RIG.shifted(z_m=0.7), RIG.shifted(y_m=1.0), RIG.shifted(x_m=1.0), RIG
 BINS = 10
 
 
-class Pixels(NamedTuple):
-    """(n,) float32 each, of covered pixels."""
-
-    confidence: np.ndarray
-    error: np.ndarray
-
-
 class Bins(NamedTuple):
-    """Mean errors of bins of equal count, the least confident first; the errors that they claim; the correlation of the
-    errors' ranks with the bins' order; the mean error of all pixels over that of the most confident half."""
+    """Bins of equal numbers of pixels, the least confident first."""
 
-    errors: list[float]
-    claimed: list[float]
-    rank_correlation: float
-    halving: float
-
-
-def binned(pixels: Pixels) -> Bins:
-    order = np.argsort(pixels.confidence, kind="stable")  # exact pixels, which tie, as they came
-    error = pixels.error[order]
-    claims = -EXPECTED_ERROR_LEVELS * np.log(np.maximum(pixels.confidence[order], 1e-6))
-    errors, claimed = ([float(part.mean()) for part in np.array_split(values, BINS)] for values in (error, claims))
-    rho = np.corrcoef(np.arange(BINS), np.argsort(np.argsort(errors)))[0, 1]
-    return Bins(errors, claimed, float(rho), float(error.mean() / error[len(error) // 2 :].mean()))
+    errors: list[float]  # mean error of each bin
+    claimed: list[float]  # the error that the confidence claims
+    rank_correlation: float  # of the errors' ranks with the bins' order
+    halving: float  # mean error of all pixels over that of the most confident half
 
 
 @pytest.fixture(scope="module", params=SEEDS)
-def all_pixels(request: pytest.FixtureRequest) -> dict[str, Pixels]:
-    """By surface."""
-    parts: dict[str, list[Pixels]] = {surface: [] for surface in GEOMETRIES}
+def all_pixels(request: pytest.FixtureRequest) -> dict[str, list[np.ndarray]]:
+    """Confidence and error (n,) of covered pixels, by surface."""
+    parts: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {surface: [] for surface in GEOMETRIES}
     for seed in range(request.param):
         drive = SyntheticDrive(RIG, num_frames=1, seed=seed, lidar=False)
         sample, keys = drive[0], SampleKeys(extra=("confidence",))
@@ -68,14 +51,20 @@ def all_pixels(request: pytest.FixtureRequest) -> dict[str, Pixels]:
                 out = RigRetarget(target, geometry=surface, keys=keys, holes="black")(sample)
                 error = (out["images"].float() - truth.float()).abs().mean(1)
                 seen = out["coverage"]
-                parts[surface].append(Pixels(out["confidence"][seen].numpy(), error[seen].numpy()))
-    return {surface: Pixels(*map(np.concatenate, zip(*part, strict=True))) for surface, part in parts.items()}
+                parts[surface].append((out["confidence"][seen].numpy(), error[seen].numpy()))
+    return {surface: [*map(np.concatenate, zip(*part, strict=True))] for surface, part in parts.items()}
 
 
 @pytest.fixture(scope="module", params=GEOMETRIES)
-def bins(request: pytest.FixtureRequest, all_pixels: dict[str, Pixels]) -> Bins:
+def bins(request: pytest.FixtureRequest, all_pixels: dict[str, list[np.ndarray]]) -> Bins:
     """All changes together, for one surface; printed."""
-    found = binned(all_pixels[request.param])
+    confidence, error = all_pixels[request.param]
+    order = np.argsort(confidence, kind="stable")  # exact pixels, which tie, as they came
+    error = error[order]
+    claims = -EXPECTED_ERROR_LEVELS * np.log(np.maximum(confidence[order], 1e-6))
+    errors, claimed = ([float(part.mean()) for part in np.array_split(values, BINS)] for values in (error, claims))
+    rho = np.corrcoef(np.arange(BINS), np.argsort(np.argsort(errors)))[0, 1]
+    found = Bins(errors, claimed, float(rho), float(error.mean() / error[len(error) // 2 :].mean()))
     print(f"\nmean absolute error by tenths of confidence, {request.param}: {np.round(found.errors, 1)}")
     print(f"rho {found.rank_correlation:+.3f}, 1/{found.halving:.1f}, claimed {np.round(found.claimed, 1)}")
     return found

@@ -67,28 +67,21 @@ def test_gain_over_ground(name: str, referee: ModuleType, data_root: Path) -> No
         assert gain >= least, move
 
 
-def edge_shifts(rendered: np.ndarray, truth: np.ndarray, covered: np.ndarray) -> Iterator[float]:
-    """Pixels between top and bottom edges of a mask (h, w) and the true ones, column by column.
+def vehicle_shifts(plan: RenderPlan, source: RenderedViews, truth: RenderedViews) -> Iterator[float]:
+    """Pixels between top and bottom edges of vehicles in all views of a plan and the true ones, column by column.
 
     Where nothing covers the true edge it is a hole, not displaced; columns at the image's border are cut off.
     """
-    h = len(truth)
-    for x in np.flatnonzero(rendered.any(0) & truth.any(0)):
-        (ours,), (true,) = np.nonzero(rendered[:, x]), np.nonzero(truth[:, x])
-        for edge in (0, -1):
-            if 0 < true[edge] < h - 1 and covered[true[edge], x]:
-                yield abs(int(ours[edge]) - int(true[edge]))
-
-
-def vehicle_shifts(plan: RenderPlan, source: RenderedViews, truth: RenderedViews) -> Iterator[float]:
-    """Displacements of the vehicles' outlines in all views of a plan."""
     views = render_labels(plan, list(source.instances), -2)
-    for view, true, classes in zip(views, truth.instances, truth.classes, strict=True):
-        vehicles = np.unique(true[classes == SceneClass.VEHICLE].numpy())
+    for view, labels, classes in zip(views, truth.instances, truth.classes, strict=True):
+        vehicles = np.unique(labels[classes == SceneClass.VEHICLE].numpy())
         for k in vehicles[vehicles >= 0]:
-            mask = (true == k).numpy()
-            if mask.sum() >= 200:  # smaller ones are a few pixels high
-                yield from edge_shifts((view == k).numpy(), mask, (view != -2).numpy())
+            mask, rendered = (labels == k).numpy(), (view == k).numpy()
+            for x in np.flatnonzero(rendered.any(0) & mask.any(0)) if mask.sum() >= 200 else ():  # others: a few rows
+                (ours,), (true,) = np.nonzero(rendered[:, x]), np.nonzero(mask[:, x])
+                for edge in (0, -1):
+                    if 0 < true[edge] < len(mask) - 1 and view[true[edge], x] != -2:
+                        yield abs(int(ours[edge]) - int(true[edge]))
 
 
 def off_lines(camera: Camera, points: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import torch
 
 from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.datasets import FrameFolder, Neighbours
-from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.metrics import psnr_db
 from arbiview_aug.sample.inputs import MOTION_KEY
 from arbiview_aug.temporal.motion_depth import MotionDepth
@@ -32,11 +32,6 @@ OFF_MOTION_DEG, FAR_M = 6.0, 80.0
 def drive(standing: bool) -> SyntheticDrive:
     kind = Standing if standing else SyntheticDrive
     return kind(RIG, num_frames=4, seed=9, lidar=False, neighbours=Neighbours())
-
-
-@cache
-def true_views(index: int, move: str) -> RenderedViews:
-    return drive(True).render(index, MOVES[move])
 
 
 def sample_of(index: int, standing: bool, labels: bool, turned_deg: float) -> dict[str, Any]:
@@ -71,7 +66,7 @@ def gain_db(index: int, move: str, sample: dict[str, Any], depth: MotionDepth) -
         )
         for surface in ("motion", "street")
     ]
-    (ours,), (street,) = psnr_of(outs, true_views(index, move), [np.bool_(True)])
+    (ours,), (street,) = psnr_of(outs, drive(True).render(index, MOVES[move]), [np.bool_(True)])
     return ours - street
 
 

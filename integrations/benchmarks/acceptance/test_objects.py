@@ -106,11 +106,6 @@ def grown(mask: np.ndarray) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
 
 
-def edges(mask: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Which columns show anything; their first and last rows."""
-    return mask.any(0), {"top": mask.argmax(0), "bottom": len(mask) - 1 - mask[::-1].argmax(0)}
-
-
 def measure(seed: int, sums: dict[tuple[str, str, str], Sums]) -> None:
     rig = demo_source_rig(SIZE)
     source = rig.with_cameras([rig[name] for name in SOURCES])
@@ -159,15 +154,15 @@ def displaced(true: np.ndarray, shown: np.ndarray, seen: np.ndarray, into: Sums)
     """Median displacement of one object's edges over the columns where a source sees the true edge."""
     if true.sum() < LEAST_PX:
         return
-    (columns, rows), (shown_columns, shown_rows) = edges(true), edges(shown)
     for edge, border in (("top", 0), ("bottom", len(true) - 1)):
-        at = np.flatnonzero(columns & (rows[edge] != border))
-        at = at[seen[rows[edge][at], at]]
+        first = [mask.argmax(0) if edge == "top" else border - mask[::-1].argmax(0) for mask in (true, shown)]
+        at = np.flatnonzero(true.any(0) & (first[0] != border))
+        at = at[seen[first[0][at], at]]
         into.count[f"{edge} columns"] += len(at)
-        at = at[shown_columns[at]]
+        at = at[shown.any(0)[at]]
         into.count[f"{edge} columns shown"] += len(at)
         if len(at):
-            into.edges[edge].append(float(np.median(np.abs(shown_rows[edge][at] - rows[edge][at]))))
+            into.edges[edge].append(float(np.median(np.abs(first[1] - first[0])[at])))
 
 
 @pytest.fixture(scope="module", params=SEEDS)
@@ -177,10 +172,8 @@ def sums(request: pytest.FixtureRequest) -> dict[tuple[str, str, str], Sums]:
     out: dict[tuple[str, str, str], Sums] = defaultdict(Sums)
     for seed in range(request.param):
         measure(seed, out)
-    print(
-        "\nmedian displacement of vehicles' upper and lower edges, px; share of their pixels outside boxes; precision,"
-    )
-    print("recall of holes on road and objects, 2 px of tolerance")
+    print("\nmedian displacement of vehicles' upper and lower edges, px; share of their pixels outside boxes;")
+    print("precision, recall of holes on road and objects, 2 px of tolerance")
     for (world, move, surface), f in sorted(out.items()):
         shares = f.share("outside box", "vehicle"), f.share("right", "marked"), f.share("within 2 px", "hidden")
         print(f"{world:7} {move:16} {surface:8} {f.median('top'):.2f}, {f.median('bottom'):.2f} {np.round(shares, 4)}")

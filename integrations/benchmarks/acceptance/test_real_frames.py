@@ -24,11 +24,7 @@ from integrations.benchmarks.paper import YAWS_DEG
 
 pytestmark = pytest.mark.timeout(1800)
 
-METHODS: dict[str, dict[str, Any]] = {
-    "fast": {},
-    "infinity": {"geometry": "infinity"},
-    "accurate": {"quality": "accurate"},
-}
+METHODS: dict[str, Any] = {"fast": {}, "infinity": {"geometry": "infinity"}, "accurate": {"quality": "accurate"}}
 UP_M = 0.6
 LEAST_GAIN_DB = {
     **{("fast", "yaw"): 0.1, ("fast", "up"): -0.21, ("fast", "paper"): -0.1},

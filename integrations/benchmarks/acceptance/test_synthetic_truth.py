@@ -15,12 +15,13 @@ from arbiview_aug import PlanCache
 from arbiview_aug.choices import GeometryName, Quality
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, SyntheticDrive, demo_source_rig
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from integrations.benchmarks.acceptance.protocol import MOVES, moved, psnr_of
+from integrations.benchmarks.acceptance.protocol import psnr_of
 from tests.helpers import few_or_all
 
 pytestmark = pytest.mark.timeout(1800)
 
 SIZE = (128, 352)
+MOVES = ("0.6 m higher", "0.5 m forward", "turned by 20°")
 NEAR_M = 20.0
 SINGLE = ("street", "ground", "infinity")
 METHODS: tuple[tuple[GeometryName, Quality], ...] = (
@@ -41,14 +42,13 @@ Truth = dict[tuple[str, str, str], np.ndarray]
 def truth(request: pytest.FixtureRequest) -> Truth:
     """All numbers, printed as a table."""
     source = demo_source_rig(SIZE)
-    pairs = [moved(source.with_cameras([source[k], source[k + 1]])) for k in (0, 2, 4)]
+    rigs = [source.with_cameras([source[k], source[k + 1]]) for k in (0, 2, 4)]
+    targets = [(rig.shifted(z_m=0.6), rig.shifted(x_m=0.5), rig.turned(yaw_deg=20)) for rig in rigs]
+    pairs = [dict(zip(MOVES, moved, strict=True)) for moved in targets]
+    caches = {quality: PlanCache(share_overlap="seed" if quality == "accurate" else False) for _, quality in METHODS}
     retargets = {
         (pair, move, geometry, quality): RigRetarget(
-            target,
-            quality=quality,
-            geometry=geometry,
-            cache=PlanCache(share_overlap="seed" if quality == "accurate" else False),
-            holes="black",
+            target, quality=quality, geometry=geometry, cache=caches[quality], holes="black"
         )
         for pair, targets in enumerate(pairs)
         for move, target in targets.items()
@@ -59,15 +59,14 @@ def truth(request: pytest.FixtureRequest) -> Truth:
         warnings.simplefilter("ignore")
         for seed in range(request.param):
             drive = SyntheticDrive(source, num_frames=1, seed=seed, lidar=False)
-            sample = {**drive[0]}
+            sample = drive[0]
             for move, target in pairs[seed % 3].items():
                 views = drive.render(0, target)
                 ground = np.isin(views.classes.numpy(), [int(c) for c in GROUND_CLASSES])
                 near, labelled = (views.depth_m.numpy() < NEAR_M) & ~ground, views.instances.numpy() >= 0
                 # Boxes have a say in what is measured, so geometries share nothing.
                 outs = [
-                    retargets[seed % 3, move, geometry, quality]({**sample, "seed": (seed, geometry)})
-                    for geometry, quality in METHODS
+                    retargets[(seed % 3, move, *method)](sample | {"seed": (seed, method[0])}) for method in METHODS
                 ]
                 scores = psnr_of(outs, views, (np.ones_like(near), ground, near, labelled))
                 for method, row in zip(METHODS, scores, strict=True):

@@ -1,4 +1,6 @@
-"""The model reads the calibration, in the package's conventions, and nothing that no camera saw."""
+"""Detectors read the calibration, in the package's conventions, and nothing that no camera saw; scans by pillars."""
+
+import json
 
 import numpy as np
 import pytest
@@ -6,8 +8,9 @@ import torch
 
 from integrations.cross_rig.families import DEPTHS_M, FAMILIES, STRIDE, Batch, Depths, read_at
 from integrations.cross_rig.frames import source_rig
-from integrations.cross_rig.labels import Grid
-from integrations.cross_rig.model import Detector
+from integrations.cross_rig.labels import VEHICLE, Grid
+from integrations.cross_rig.model import Detector, PillarDetector, PointSet
+from integrations.cross_rig.scans import CHANGES, kinds, main, point_set, scans_of
 
 SIZE = (32, 64)
 GRID = Grid(side_m=20.0, cells=20)
@@ -59,7 +62,7 @@ def test_features_are_lifted_to_where_their_rays_lead():
     for depth in (3, 6):
         probability = torch.zeros(1, len(DEPTHS_M), SIZE[0] // 4, SIZE[1] // 4)
         probability[0, DEPTHS_M.index(depth), 4, 10] = 1
-        lifted = family.bags(frames, probability).sums(torch.ones(1, 1, SIZE[0] // 4, SIZE[1] // 4))[:, 0]
+        lifted = family.lifted(torch.ones(1, 1, SIZE[0] // 4, SIZE[1] // 4), frames, probability)[:, 0]
         (cell,) = lifted.nonzero()
         rays, _ = front.unproject_cam(np.array([[10 * 4 + 1.5, 4 * 4 + 1.5]]))
         point = front.cam2ego[:3, :3] @ (rays[0] / rays[0, 2] * depth) + front.center_m
@@ -77,7 +80,7 @@ def test_uncovered_pixels_do_not_matter(model):
     with torch.no_grad():
         torch.testing.assert_close(model(whole), model(batch([rig], images=painted, coverage=coverage)))
     nothing = batch([rig], coverage=torch.zeros_like(coverage))
-    assert not read_at(model.features(nothing), nothing, torch.rand(50, 3) * 20).any()
+    assert not read_at(torch.ones(6, 4, SIZE[0] // STRIDE, SIZE[1] // STRIDE), nothing, torch.rand(50, 3) * 20).any()
 
 
 def test_calibration_is_read_and_frames_do_not_mix(model):
@@ -91,3 +94,51 @@ def test_calibration_is_read_and_frames_do_not_mix(model):
     assert not torch.allclose(alone[0].occupancy, raised.occupancy, atol=1e-4)
     for whole, *each in zip(together, *alone, strict=True):
         torch.testing.assert_close(whole, torch.cat(each), atol=1e-4, rtol=1e-4)
+
+
+# --- scans ------------------------------------------------------------------------------------------------------------
+def scan(*points) -> dict:
+    boxes, state = np.full((3, 7), np.nan, np.float32), np.zeros((100, 100), np.uint8)
+    return {"points": np.array(points, np.float16), "state": state, "boxes": boxes}
+
+
+def test_a_point_is_in_the_pillar_over_its_cell():
+    """Row by x, column by y, as ``Grid.centres`` says; all other pillars are empty."""
+    x, y = Grid().centres()[70, 20]
+    with torch.no_grad():
+        scans = PointSet.joined([scan([x, y, 1.0, 90.0]), scan([0.0, 0.0, 0.0, 0.0])])
+        pillars = PillarDetector(Grid()).eval().pillars(scans)
+    assert pillars.shape == (2, 32, 100, 100)
+    assert pillars[0].any(0).nonzero().tolist() == [[70, 20]] and pillars[1].any(0).nonzero().tolist() == [[50, 50]]
+
+
+def test_sets_that_are_the_same_have_one_name():
+    assert scans_of("fewer", "oracle") == scans_of("more", "raw") == scans_of("up70", "dropped")
+    assert scans_of("fewer", "dropped") == (*CHANGES["fewer"], "dropped")
+    assert scans_of("sixteen", "below") == scans_of("sixteen", "retargeted")
+    assert [change for change in CHANGES if "below" in kinds(change)] == ["sixteen"]
+
+
+def test_vehicles_count_by_their_points():
+    """Labels are of the points that a detector gets: fewer vehicles where fewer were measured."""
+    a, b = CHANGES["fewer"]
+    recorded, dropped, retargeted = (point_set(a, b, kind, "val", 2) for kind in ("raw", "dropped", "retargeted"))
+    assert len(dropped.points[0]) < len(recorded.points[0])
+    seen = [(scans.state == VEHICLE).sum() for scans in (recorded, retargeted)]
+    assert 0 < seen[1] <= seen[0] and recorded.counts.all()
+
+
+@pytest.mark.slow
+def test_a_study_continues_where_it_was(tmp_path, capsys, monkeypatch):
+    asked = ["--changes", "sixteen", "--seeds", "0", "--train-frames", "2", "--val-frames", "1", "--test-frames", "2"]
+    asked += ["--steps", "2", "--output", str(tmp_path)]
+    assert main(asked) == 0
+    first = capsys.readouterr()
+    assert first.out.count("| 32 beams at 1.8 m -> 16 beams at 1.8 m |") == 5 and first.err.count("CPU s") == 5
+    assert "A's points, rings dropped" in first.out and "without B's rings above A's" in first.out
+    results = sorted(tmp_path.iterdir())
+    assert len(results) == 5 and json.loads(results[0].read_text())["positives"]
+    results[1].unlink()
+    assert main(asked) == 0
+    again = capsys.readouterr()
+    assert again.out == first.out and again.err.count("CPU s") == 1

@@ -71,7 +71,7 @@ def test_frames_have_labels_where_the_lidar_saw_a_vehicle(roots, tmp_path):
             assert arrays["state"][tuple(cell)] == (VEHICLE if inside else HIDDEN)
     assert (arrays["state"] == FREE).mean() > 0.8
     # Views have the other vehicle's cameras, over the same road.
-    views = next(run.images(job) for job in jobs(run.settings) if job.variant.name == "auto_fill").maker()(0)
+    views = next(run.trained_on(job)[0] for job in jobs(run.settings) if job.variant.name == "auto_fill").maker()(0)
     true = run.source("test", REAL).maker()(0)
     np.testing.assert_allclose(views["K"], true["K"], rtol=1e-5)
     np.testing.assert_allclose(views["cam2ego"][:, 2, 3], true["cam2ego"][:, 2, 3], atol=0.02)

@@ -85,7 +85,7 @@ def test_kornias_image_sequential(sample: dict) -> None:
     ids=lambda module: type(module).__name__,
 )
 def test_what_moves_pixels_is_refused(module: torch.nn.Module) -> None:
-    with pytest.raises(ValueError, match=r"moves pixels and leaves K as it was; .* ResizeRig and CropRig"):
+    with pytest.raises(ValueError, match=r"moves pixels and leaves K unchanged; .* ResizeRig and CropRig"):
         OnImages(module)
 
 

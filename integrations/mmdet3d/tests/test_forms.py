@@ -15,6 +15,7 @@ from arbiview_aug import (
     CalibrationError,
     CropRig,
     Lidar,
+    RandomRig,
     ResizeRig,
     Rig,
     RigRetarget,
@@ -28,7 +29,18 @@ from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD
 from arbiview_aug.integrations.mmdet3d.matrices import MATRICES
 from arbiview_aug.integrations.mmdet3d.results import geometry
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
-from integrations.mmdet3d.fake_results import EGO2GLOBAL, FORMS, LIDAR2EGO, Boxes, Recording, recording, source_rig
+from integrations.mmdet3d.fake_results import (
+    EGO2GLOBAL,
+    FORMS,
+    LIDAR2EGO,
+    Boxes,
+    Recording,
+    bevdet,
+    bevdet4d,
+    recorded_drive,
+    recording,
+    source_rig,
+)
 from integrations.mmdet3d.measure import worst_error_px
 
 pytestmark = pytest.mark.filterwarnings("ignore:retarget. drops")
@@ -79,8 +91,7 @@ def test_every_form(given: Recording, form: str) -> None:
     results = FORMS[form](given)
     before = deepcopy({key: value for key, value in results.items() if key not in ("img", "gt_bboxes_3d", "ann_info")})
     transform, read = step(geometry="boxes"), {}
-    retarget = transform.retarget
-    transform.retarget = lambda sample, params: read.update(sample) or retarget(sample, params)
+    transform.retarget.register_forward_pre_hook(lambda _, arguments: read.update(arguments[0]))
     after = transform(results)
     error_px = worst_error_px(after, TARGET.in_frame_of(SOURCE))
     assert error_px <= 1e-3
@@ -176,6 +187,65 @@ def test_bevdet_takes_augmented_images_and_gives_untouched_ones(given: Recording
     assert np.allclose(np.linalg.norm(front["sensor2ego_rotation"]), 1) and front["data_path"] == "CAM_FRONT"
 
 
+# --- several frames ---------------------------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def drive() -> list[Recording]:
+    return recorded_drive(list(SyntheticDrive(SOURCE, num_frames=3)))
+
+
+def test_bevdet4d(drive: list[Recording]) -> None:
+    """As each frame by itself, in BEVDet4D's order; what its model makes of the poses leads to the target's cameras."""
+    transform = step(geometry="boxes")
+    after = transform(bevdet4d(drive))
+    images, sensor2egos, ego2globals, intrins, post_rots, post_trans, _ = after["img_inputs"]
+    views, frames = len(TARGET), len(drive)
+    assert images.shape == (views * frames, 3, *SIZE) and after["coverage"].shape == (frames, views, *SIZE)
+    for t, given in enumerate(reversed(drive)):
+        alone = transform(bevdet(given))
+        assert worst_error_px(alone, TARGET.in_frame_of(SOURCE)) <= 1e-3
+        rows = slice(t * views, (t + 1) * views)
+        assert torch.equal(images.view(views, frames, 3, *SIZE)[:, t], alone["img_inputs"][0])
+        parts = (sensor2egos, ego2globals, intrins, post_rots, post_trans)
+        assert all(torch.equal(part[rows], one) for part, one in zip(parts, alone["img_inputs"][1:6], strict=True))
+    sensor2key = torch.linalg.inv(ego2globals[0]) @ ego2globals @ sensor2egos.double()
+    passed_m = torch.linalg.norm(sensor2key.view(frames, views, 4, 4)[1:, :, :3, 3] - sensor2key[:views, :3, 3], dim=-1)
+    assert torch.allclose(passed_m, torch.tensor([[4.5], [9.0]], dtype=torch.float64).expand(-1, views), atol=1e-3)
+    assert list(after["curr"]["cams"]) == list(after["adjacent"][1]["cams"]) == TARGET.names
+    with pytest.raises(SampleError, match="expected 6 images a frame, as 'cam_names' says, got 15"):
+        transform({**bevdet4d(drive), "img_inputs": after["img_inputs"]})
+
+
+def test_one_draw_for_all_frames_of_a_dict(drive: list[Recording]) -> None:
+    """One draw of the rig, and of whether to retarget at all."""
+    transform = step(RandomRig(SOURCE, yaw_deg=10, height_m=0.2), p=0.5, size=SIZE)
+    skipped = set()
+    for seed in range(8):
+        torch.manual_seed(seed)
+        after = transform(bevdet4d(drive))
+        intrins, poses = (after["img_inputs"][k].view(3, 6, *shape) for k, shape in ((3, (3, 3)), (1, (4, 4))))
+        assert torch.equal(intrins, intrins[:1].expand_as(intrins)) and torch.allclose(poses, poses[:1], atol=1e-5)
+        skipped.add(after["retarget_params"]["skipped"])
+    assert skipped == {0.0, 1.0}
+
+
+@pytest.mark.parametrize(("form", "key"), [("DETR3D", "scene_token"), ("Sparse4D", "aug_config")])
+def test_frames_of_a_drive_share_a_draw(drive: list[Recording], form: str, key: str) -> None:
+    """Each frame passes the pipeline by itself, as BEVFormer's, StreamPETR's and Sparse4D's datasets do."""
+    rig = SOURCE.resized(SIZE)
+    transforms = [step(RandomRig(rig, yaw_deg=10), sequence_key=key)]
+    transforms += [step(RandomRig(rig, yaw_deg=10, per="sequence"))] if key == "scene_token" else []
+    for transform in transforms:
+        one, same, other = (
+            transform({**FORMS[form](drive[t]), key: name if form == "DETR3D" else {"resize": name}})[
+                "retarget_params"
+            ]["yaw_deg"]
+            for t, name in ((0, "a"), (1, "a"), (0, "b"))
+        )
+        assert one == same != other
+        with pytest.raises(SampleError, match=f"sequence_key: expected '{key}' in the results, got"):
+            transform({name: value for name, value in FORMS[form](drive[0]).items() if name != key})
+
+
 def test_skipped_frames_keep_their_cameras(given: Recording) -> None:
     target = SOURCE.turned(yaw_deg=10)
     skipping = step(target, p=0.01, size=SIZE, keys=SampleKeys(extra=("confidence",)))
@@ -190,7 +260,7 @@ def test_skipped_frames_keep_their_cameras(given: Recording) -> None:
 
 def test_entries_that_are_empty(given: Recording) -> None:
     """Datasets leave them so."""
-    full = {"img_timestamp": [1.5] * 6, "image_wh": None, "focal": None, "img_shape": [], "timestamp": None}
+    full = {"img_timestamp": [1.5] * 6, "img_shape": [], "timestamp": None}
     full |= {"ann_info": {"num_lidar_pts": None}}
     after = step(replace(TARGET, lidars=[Lidar("top", LIDAR2EGO, (-5.0, 0.0), 1.0, (1.0, 80.0))]))(
         FORMS["mmdet3d"](given) | full
@@ -239,15 +309,12 @@ MALFORMED: list[tuple[str, Any, str]] = [
     ("DETR3D", {"img": [np.full((64, 176, 3), -1.0)] * 6}, r"img\[0\]: expected grey levels from 0 to 255, got -"),
     ("DETR3D", {"img": [np.zeros((64, 176))] * 6}, r"img\[0\]: expected \(H, W, 3\)"),
     ("DETR3D", {"img": [None] * 6}, r"img\[0\]: expected \(H, W, 3\)"),
-    ("DETR3D", {"img_norm_cfg": {"mean": [1, 2], "std": [1, 1]}}, "img_norm_cfg: expected three means and three pos"),
-    ("mmdet3d", {"img_norm_cfg": {"mean": [1, 2, 3], "std": ["a"]}}, "img_norm_cfg: expected three means"),
+    ("DETR3D", {"img": np.zeros((3, 6, 64, 176, 3))}, r"img\[0\]: .* retarget each frame of a queue in its pipeline"),
     ("Sparse4D", {"lidar2ego_rotation": [1, 0]}, "lidar2ego_rotation, lidar2ego_translation: expected a quaternion"),
     ("Sparse4D", {"lidar2ego_translation": [1, 0]}, "lidar2ego_rotation, lidar2ego_translation: expected a quat"),
     ("mmdet3d", {"flip": "no"}, "flip: expected numbers"),
     ("mmdet3d", {"pcd_rotation": np.eye(2)}, r"pcd_rotation: expected numbers of shape \(3, 3\)"),
-    ("Sparse4D", {"img_shape": [(64,)] * 6}, r"img_shape: expected \(h, w\) of each image"),
     ("mmdet3d", {"images": {name: {"height": "x", "width": 3} for name in SOURCE.names}}, "images: expected height"),
-    ("Sparse4D", {"image_wh": 3.0}, "image_wh: expected numbers of each image"),
     ("PETR", {"img_timestamp": ["a"] * 6, "timestamp": None}, "img_timestamp: expected seconds"),
     ("BEVDet", lambda e: (e[0] * np.nan, *e[1:]), r"img_inputs: expected 8 bit images .* nan off whole numbers"),
     ("BEVDet", lambda e: e[:5], r"img_inputs: expected .* got 5 entries"),

@@ -13,7 +13,7 @@ from arbiview_aug import Lidar, RandomRig, RigRetarget, depth_maps, load_rig
 from arbiview_aug.cameras.rotations import rotation_from_quaternion
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
-from integrations.mmdet3d.fake_results import FORMS, LIDAR2EGO, QUEUES, Recording, recorded_drive, recording, source_rig
+from integrations.mmdet3d.fake_results import FORMS, LIDAR2EGO, Recording, recording, source_rig
 
 SIZE = (48, 136)
 SOURCE = source_rig((64, 176))
@@ -87,17 +87,6 @@ def test_points_of_a_drawn_rig(given: Recording) -> None:
     drawn = random.rig(after["retarget_params"])
     expected = RigRetarget(drawn, geometry="street")(given.sample)["points"]
     np.testing.assert_allclose(in_ego(after["points"]), expected, atol=2e-3)
-
-
-def test_points_of_queues() -> None:
-    drive = recorded_drive(list(SyntheticDrive(SOURCE, num_frames=2)))
-    results = QUEUES["StreamPETR"](drive) | {"points": [one.labels["points"] for one in drive]}
-    after = step()(results)
-    for one, points in zip(drive, after["points"], strict=True):
-        expected = RigRetarget(TARGET, geometry="street")(one.sample)["points"]
-        np.testing.assert_allclose(in_ego(points), expected, atol=2e-3)
-    last = QUEUES["BEVFormer"](drive) | {"points": drive[-1].labels["points"]}
-    np.testing.assert_allclose(in_ego(step()(last)["points"]), expected, atol=2e-3)
 
 
 def pose_of(info: dict[str, Any], name: str) -> np.ndarray:
