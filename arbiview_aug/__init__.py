@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from arbiview_aug.render.plan import RenderConfig as RenderConfig
     from arbiview_aug.sample.boxes_2d import ImageBoxes as ImageBoxes
     from arbiview_aug.sample.boxes_2d import project_boxes_3d as project_boxes_3d
-    from arbiview_aug.sample.collate import collate as collate
-    from arbiview_aug.sample.depth_maps import depth_maps as depth_maps
     from arbiview_aug.sample.mistakes import CheckReport as CheckReport
     from arbiview_aug.sample.mistakes import check as check
+    from arbiview_aug.sample.training import collate as collate
+    from arbiview_aug.sample.training import depth_maps as depth_maps
     from arbiview_aug.sample.training import lift_mask as lift_mask
     from arbiview_aug.sample.training import visible_boxes as visible_boxes
     from arbiview_aug.transforms.resize import CropRig as CropRig

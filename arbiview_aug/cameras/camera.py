@@ -1,6 +1,6 @@
 """Cameras: intrinsics, lens and pose; projection and its inverse; resizing and cropping.
 
-Conventions (pinned by ``tests/conventions``):
+Conventions (pinned by ``tests/cameras/test_camera.py``):
 
 - Pixel centres are integers: (0, 0) is the centre of the top-left pixel, points are (x, y), sizes (h, w).
 - ``cam2ego`` maps camera points to the ego frame: ``p_ego = cam2ego @ p_cam``. Camera axes: x right, y down,
@@ -33,9 +33,7 @@ from arbiview_aug.cameras.validation import (
 )
 from arbiview_aug.errors import CalibrationError, shown
 
-UNPROJECT_TOLERANCE_PX = 1e-6
-"""Largest reprojection error of a valid ray."""
-
+UNPROJECT_TOLERANCE_PX = 1e-6  # largest reprojection error of a valid ray
 _ANGLES, _METRES = "finite angles in degrees", "finite (x, y, z) in metres"
 
 
@@ -103,7 +101,6 @@ class Camera:
     def _where(self) -> str:
         return f"camera {shown(self.name)}"
 
-    # --- construction ---------------------------------------------------------------------------------------------
     @classmethod
     def looking(
         cls,
@@ -145,17 +142,15 @@ class Camera:
             raise CalibrationError(f"camera {name!r}: expected either K or horizontal_fov_deg, got both or none")
         where, angles = f"camera {shown(name)}", (azimuth_deg, elevation_deg, roll_deg)
         azimuth, elevation, roll = checked_numbers(where, "azimuth, elevation, roll", angles, 3, _ANGLES)
-        position = checked_numbers(where, "position_m", position_m, 3, _METRES)
         cam2ego = np.eye(4)
+        cam2ego[:3, 3] = checked_numbers(where, "position_m", position_m, 3, _METRES)
         cam2ego[:3, :3] = rotation_z(azimuth) @ CAMERA_AXES_IN_EGO @ rotation_x(elevation) @ rotation_z(roll)
-        cam2ego[:3, 3] = position
         fields: dict[str, Any] = {"lens": lens, "distortion": distortion, "mask": mask, "cam2ego": cam2ego}
         camera = cls(name=name, width_px=width_px, height_px=height_px, K=np.eye(3) if K is None else K, **fields)
         if horizontal_fov_deg is None:
             return camera
         return replace(camera, K=intrinsics_for_fov(name, horizontal_fov_deg, camera.size, camera.lens_model))
 
-    # --- derived ----------------------------------------------------------------------------------------------------
     @cached_property
     def size(self) -> tuple[int, int]:
         """(height, width) in pixels."""
@@ -193,11 +188,9 @@ class Camera:
     @cached_property
     def content_key(self) -> bytes:
         """Digest of size, lens, K, pose and mask; the name is not part of it."""
-        digest = hashlib.sha256(repr((self.size, self.lens, self.distortion)).encode())
-        digest.update(self.K.tobytes() + self.cam2ego.tobytes())
-        if self.mask is not None:
-            digest.update(np.packbits(self.mask).tobytes())
-        return digest.digest()
+        mask = b"" if self.mask is None else np.packbits(self.mask).tobytes()
+        lens = repr((self.size, self.lens, self.distortion)).encode()
+        return hashlib.sha256(lens + self.K.tobytes() + self.cam2ego.tobytes() + mask).digest()
 
     @cached_property
     def mask_key(self) -> bytes:
@@ -236,7 +229,7 @@ class Camera:
     @cached_property
     def half_angle_rad(self) -> float:
         """Largest angle between the optical axis and a ray of the image; π if the lens cannot be inverted there."""
-        return _half_angle_rad(self.size, self.lens, self.distortion, self.K.tobytes())
+        return _half_angle_rad(*self.size, self.lens, self.distortion, self.K.tobytes())
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Camera):
@@ -257,7 +250,6 @@ class Camera:
             f"at ({x:.2f}, {y:.2f}, {z:.2f}) m{mask})"
         )
 
-    # --- geometry ---------------------------------------------------------------------------------------------------
     def project(self, points_ego: Any) -> Projection:
         """Pixels of ego-frame points (..., 3)."""
         points = np.asarray(points_ego, dtype=np.float64)
@@ -307,7 +299,6 @@ class Camera:
         u, v = np.meshgrid(np.arange(self.width_px, dtype=np.float64), np.arange(self.height_px, dtype=np.float64))
         return np.stack([u, v], -1)
 
-    # --- changed copies -------------------------------------------------------------------------------------------
     def resize(self, size: tuple[int, int], fit: Fit = "stretch") -> Camera:
         """The camera of the image resized to (h, w): outer edges stay, so centres move by half pixels.
 
@@ -402,9 +393,8 @@ def with_mask_of(seen: Camera, camera: Camera, *, outside: bool) -> Camera:
 
 
 @lru_cache(256)  # from frame to frame cameras move, and their lenses stay
-def _half_angle_rad(size: tuple[int, int], lens: LensName, distortion: tuple[float, ...], K: bytes) -> float:
-    h, w = size
-    K_px = np.frombuffer(K).reshape(3, 3)
+def _half_angle_rad(h: int, w: int, lens: LensName, distortion: tuple[float, ...], K: bytes) -> float:
+    K_px: Any = np.frombuffer(K).reshape(3, 3)
     camera = Camera(name="lens", width_px=w, height_px=h, K=K_px, cam2ego=np.eye(4), lens=lens, distortion=distortion)
     border = np.stack(np.meshgrid(np.linspace(-0.5, w - 0.5, 9), np.linspace(-0.5, h - 0.5, 9)), -1)
     directions, valid = camera.unproject_cam(border)

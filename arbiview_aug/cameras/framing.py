@@ -40,15 +40,11 @@ def framing(name: str, size: tuple[int, int], to: tuple[int, int], fit: Fit) -> 
     if fit == "stretch":
         return Framing(to, 0, 0, to)
     # In integers: rounding errors of floats would change the window by a pixel where the aspects are equal.
-    by_height = (h * size[1] >= w * size[0]) == (fit == "crop")
-    scaled = (h, max(1, _rounded(h * size[1], size[0]))) if by_height else (max(1, _rounded(w * size[0], size[1])), w)
+    (old_h, old_w), by_height = size, (h * size[1] >= w * size[0]) == (fit == "crop")
+    scaled = (h, (2 * h * old_w + old_h) // (2 * old_h)) if by_height else ((2 * w * old_h + old_w) // (2 * old_w), w)
+    scaled = max(1, scaled[0]), max(1, scaled[1])
     if max(scaled) > MAX_SIZE_PX:
         got = f"{scaled}, scaled from {size}; use fit='pad' or 'stretch', or a size of the image's shape"
         expected = f"expected at most {MAX_SIZE_PX} px a side before cropping"
         raise CalibrationError(f"camera {name!r}: size={to}, fit={fit!r}: {expected}, got {got}")
     return Framing(scaled, scaled[0] - h, (scaled[1] - w) // 2, to)
-
-
-def _rounded(numerator: int, denominator: int) -> int:
-    """The nearest integer of a quotient of positive integers."""
-    return (2 * numerator + denominator) // (2 * denominator)

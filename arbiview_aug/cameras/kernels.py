@@ -250,15 +250,9 @@ def project_image(rays: Row, q: Row, A: Row, o: Row, kind: int, P: Row, u: Row, 
 
 @compiled
 def edge_distance_row(u: Row, v: Row, size: Any, to_mask: Any, cell_px: int, edge_px: Row) -> None:
-    """Distances (n,) of pixels to the border of what a source sees, as ``rays.edge_distance``.
+    """Distances (n,) of columns ``u`` and rows ``v`` to the border of what a source sees, as ``rays.edge_distance``.
 
-    Args:
-        u: (n,) columns.
-        v: (n,) rows.
-        size: (h, w) of the source.
-        to_mask: (H, W) distance of each cell to the mask, pixels; (0, 0) without one.
-        cell_px: Side of those cells.
-        edge_px: (n,) written.
+    ``to_mask`` (H, W) is the distance of each cell of ``cell_px`` to the mask, pixels; (0, 0) without one.
     """
     h, w = size
     rows, columns = to_mask.shape

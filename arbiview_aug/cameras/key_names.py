@@ -58,8 +58,8 @@ def misnamed(entries: Mapping[Any, Any], read: Sequence[str]) -> dict[str, str]:
 def hint(entries: Iterable[Any], wanted: Sequence[str]) -> str:
     """Suggestions for an error about missing keys; empty where there are none."""
     names = tuple(wanted)
-    hints = [f"found {k!r}: did you mean {m!r}?" for k in entries if isinstance(k, str) and (m := meant_by(k, names))]
-    return "".join(f"; {words}" for words in hints)
+    pairs = [(key, meant) for key in entries if isinstance(key, str) and (meant := meant_by(key, names))]
+    return "".join(f"; found {key!r}: did you mean {meant!r}?" for key, meant in pairs)
 
 
 def plain(key: Any) -> str:

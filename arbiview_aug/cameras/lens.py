@@ -23,9 +23,7 @@ LensName = Literal["pinhole", "radtan", "fisheye", "ftheta", "ftheta_backward", 
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 
-MIN_DEPTH = 1e-6
-"""Smallest z / |p| of a point in front of a pinhole or radtan camera (89.99994 degrees off axis)."""
-
+MIN_DEPTH = 1e-6  # smallest z / |p| of a point in front of a pinhole or radtan camera (89.99994 degrees off axis)
 _NEWTON_STEPS = 40
 _MAX_COORDINATE = 1e12  # polynomials at grazing angles can overflow float32 maps
 
@@ -83,35 +81,38 @@ class Pinhole(Lens):
     """A perspective camera without distortion."""
 
     name = "pinhole"
-    coefficient_counts = (0,)
+    coefficient_counts: ClassVar[tuple[int, ...]] = (0,)
     is_rectilinear = True
     fold_limit = math.inf
 
     def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        return _perspective(x, y, z)
+        valid = z > MIN_DEPTH * np.sqrt(x * x + y * y + z * z)
+        inverse = 1 / np.where(valid, z, 1)
+        return np.where(valid, x * inverse, 0.0), np.where(valid, y * inverse, 0.0), valid
 
     def undistort(self, xd: FloatArray, yd: FloatArray) -> FloatArray:
-        return _unit(xd, yd)
+        norm = np.sqrt(xd * xd + yd * yd + 1)
+        return np.stack([xd / norm, yd / norm, 1 / norm], -1)
 
 
-class RadTan(Lens):
+class RadTan(Pinhole):
     """OpenCV's polynomial or rational model: k1 k2 p1 p2 [k3 [k4 k5 k6]]."""
 
     name = "radtan"
     aliases = ("opencv_radtan",)
     coefficient_counts = (4, 5, 8)
+    is_rectilinear = False
 
     def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        a, b, valid = _perspective(x, y, z)
+        a, b, valid = super().distort(x, y, z)
         valid = valid & (a * a + b * b <= self.fold_limit**2)
         a, b = np.where(valid, a, 0.0), np.where(valid, b, 0.0)
         xd, yd = self._polynomial(a, b)
-        limit = _MAX_COORDINATE
-        return np.clip(xd, -limit, limit), np.clip(yd, -limit, limit), valid
+        return np.clip(xd, -_MAX_COORDINATE, _MAX_COORDINATE), np.clip(yd, -_MAX_COORDINATE, _MAX_COORDINATE), valid
 
     def undistort(self, xd: FloatArray, yd: FloatArray) -> FloatArray:
         """Newton's method in two unknowns, inside the fold; pixels leave the iteration as they converge."""
-        limit = min(self.fold_limit, 1e6)
+        limit, (k1, k2, p1, p2, k3, k4, k5, k6) = min(self.fold_limit, 1e6), self._all
         x_all, y_all = np.ravel(xd), np.ravel(yd)
         a_all, b_all = x_all.copy(), y_all.copy()
         active = np.arange(a_all.size)
@@ -121,7 +122,15 @@ class RadTan(Lens):
                 shrink = np.minimum(1.0, limit / np.maximum(np.hypot(a, b), 1e-300))
                 a, b = a * shrink, b * shrink
                 fa, fb = self._polynomial(a, b)
-                aa, ab, bb = self._jacobian(a, b)
+                # The Jacobian is symmetric: x by a, x by b = y by a, y by b.
+                r2 = a * a + b * b
+                numerator, denominator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+                radial = numerator / denominator
+                slope = k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))
+                slope = slope / denominator
+                aa = radial + 2 * a * a * slope + 2 * p1 * b + 6 * p2 * a
+                ab = 2 * a * b * slope + 2 * p1 * a + 2 * p2 * b
+                bb = radial + 2 * b * b * slope + 6 * p1 * b + 2 * p2 * a
                 determinant = aa * bb - ab * ab
                 determinant = np.where(np.abs(determinant) < 1e-6, 1e-6, determinant)
                 ea, eb = fa - x_all[active], fb - y_all[active]
@@ -136,10 +145,10 @@ class RadTan(Lens):
                     break
             lost = ~np.isfinite(a_all + b_all)
         a_all[lost], b_all[lost] = 0.0, 0.0
-        return _unit(a_all.reshape(np.shape(xd)), b_all.reshape(np.shape(yd)))
+        return super().undistort(a_all.reshape(np.shape(xd)), b_all.reshape(np.shape(yd)))
 
     @cached_property
-    def fold_limit(self) -> float:
+    def fold_limit(self) -> float:  # type: ignore[override]
         if not any(self.distortion):
             return math.inf
         k1, k2, _, _, k3, k4, k5, k6 = self._all
@@ -160,32 +169,13 @@ class RadTan(Lens):
         x = a * radial + 2 * p1 * a * b + p2 * (r2 + 2 * a * a)
         return x, b * radial + p1 * (r2 + 2 * b * b) + 2 * p2 * a * b
 
-    def _jacobian(self, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Derivatives (x by a, x by b = y by a, y by b): the Jacobian is symmetric."""
-        k1, k2, p1, p2, k3, k4, k5, k6 = self._all
-        r2 = a * a + b * b
-        numerator, denominator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        radial = numerator / denominator
-        slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / denominator
-        return (
-            radial + 2 * a * a * slope + 2 * p1 * b + 6 * p2 * a,
-            2 * a * b * slope + 2 * p1 * a + 2 * p2 * b,
-            radial + 2 * b * b * slope + 6 * p1 * b + 2 * p2 * a,
-        )
 
-
-class _AngularLens(Lens):
-    """A lens whose distance from the principal point is a function of the angle off the optical axis alone."""
+class _PolynomialLens(Lens):
+    """A lens whose radius is t + k₁ t^(1 + n) + k₂ t^(1 + 2n) + ... of the angle t off the optical axis, n ``step``."""
 
     sees_behind = True
-
-    @abstractmethod
-    def _radius(self, theta: FloatArray) -> FloatArray:
-        """Distances from the principal point in the normalised image, of angles up to ``fold_limit``."""
-
-    @abstractmethod
-    def _angle(self, radius: FloatArray) -> FloatArray:
-        """The inverse of ``_radius``."""
+    coefficient_counts = (4,)
+    step: ClassVar[int]
 
     def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         r = np.hypot(x, y)
@@ -202,12 +192,12 @@ class _AngularLens(Lens):
         scale = np.sin(theta) / np.where(theta_d > 0, theta_d, 1.0)
         return np.stack([xd * scale, yd * scale, np.cos(theta)], -1)
 
+    def _radius(self, theta: FloatArray) -> FloatArray:
+        """Distances from the principal point in the normalised image, of angles up to ``fold_limit``."""
+        return self._polynomial(theta)
 
-class _PolynomialLens(_AngularLens):
-    """An angular lens with the polynomial t + k₁ t^(1 + n) + k₂ t^(1 + 2n) + ..., n ``step``: the angle's radius."""
-
-    coefficient_counts = (4,)
-    step: ClassVar[int]
+    def _angle(self, radius: FloatArray) -> FloatArray:
+        return self._inverse(radius, self.fold_limit)
 
     @cached_property
     def fold_limit(self) -> float:
@@ -238,12 +228,6 @@ class _PolynomialLens(_AngularLens):
             if np.abs(step).max(initial=0.0) < 1e-14:
                 break
         return arguments
-
-    def _radius(self, theta: FloatArray) -> FloatArray:
-        return self._polynomial(theta)
-
-    def _angle(self, radius: FloatArray) -> FloatArray:
-        return self._inverse(radius, self.fold_limit)
 
 
 class Fisheye(_PolynomialLens):
@@ -311,15 +295,10 @@ class _SphereLens(Lens):
     """Two projections onto spheres, then one onto the image: the general form of double sphere and EUCM.
 
     A unit direction is moved by ξ along the optical axis, and (x, y, z) of it is projected to
-    (x, y) / (α sqrt(β (x² + y²) + z²) + (1 - α) z).
+    (x, y) / (α sqrt(β (x² + y²) + z²) + (1 - α) z). ``kernel_coefficients`` are ξ, α and β.
     """
 
     sees_behind = True
-
-    @property
-    @abstractmethod
-    def kernel_coefficients(self) -> tuple[float, float, float]:
-        """ξ, α, β."""
 
     def distort(self, x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         xi, alpha, beta = self.kernel_coefficients
@@ -394,19 +373,6 @@ LENSES: dict[str, type[Lens]] = {
 def canonical_name(name: str) -> str:
     """The lens name of an alias; other names unchanged."""
     return next((lens.name for lens in LENSES.values() if name in lens.aliases), name)
-
-
-def _perspective(x: FloatArray, y: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """(x / z, y / z) of directions and whether they are in front of the camera; 0 where they are not."""
-    valid = z > MIN_DEPTH * np.sqrt(x * x + y * y + z * z)
-    inverse = 1 / np.where(valid, z, 1)
-    return np.where(valid, x * inverse, 0.0), np.where(valid, y * inverse, 0.0), valid
-
-
-def _unit(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Unit directions (..., 3) through (a, b, 1)."""
-    norm = np.sqrt(a * a + b * b + 1)
-    return np.stack([a / norm, b / norm, 1 / norm], -1)
 
 
 def _series(x: FloatArray, coefficients: Sequence[float]) -> FloatArray:

@@ -16,9 +16,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.validation import checked_numbers, checked_pose, refusal
 from arbiview_aug.errors import CalibrationError, calibration_of, shown
 
-MOST_BEAMS, MOST_RAYS = 1024, 1 << 21
-"""Largest scanner; sensors on sale have 128 beams and 500,000 rays."""
-
+MOST_BEAMS, MOST_RAYS = 1024, 1 << 21  # largest scanner; sensors on sale have 128 beams and 500,000 rays
 _KEYS = ("name", "lidar2ego", "elevations_deg", "azimuth_step_deg", "range_m")
 
 
@@ -49,11 +47,11 @@ class Lidar:
         if not isinstance(self.name, str) or not self.name:
             raise CalibrationError(f"lidar name: expected a non-empty string, got {shown(self.name)}")
         where, elevations = self._where, self.elevations_deg
+        beams = f"1 to {MOST_BEAMS} elevations from -90 to 90 degrees"
         try:
             count = len(elevations)
         except TypeError:  # a generator, which may have no end, or a number
             count = 0
-        beams = f"1 to {MOST_BEAMS} elevations from -90 to 90 degrees"
         is_short = 0 < count <= MOST_BEAMS
         table = checked_numbers(where, "elevations_deg", elevations, count, beams) if is_short else ()
         if not table or max(map(abs, table)) > 90:

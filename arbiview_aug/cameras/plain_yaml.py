@@ -132,6 +132,6 @@ def _size(node: yaml.Node, known: dict[int, int]) -> int:
             if key in keys:
                 raise ValueError(f"the key {key[:80]!r} stands twice")
             keys.add(key)
-        parts = [one for pair in parts for one in pair]
+        parts = [part for pair in parts for part in pair]
     known[id(node)] = 1 + sum(_size(part, known) for part in parts)
     return known[id(node)]

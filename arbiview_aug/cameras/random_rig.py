@@ -139,9 +139,9 @@ class RandomRig(Epochs):
         rig = rig.shifted(p["forward_m"], p["lateral_m"], p["height_m"])
         scale = np.ones((3, 3))
         scale[:2, :2] = p["focal_scale"]
-        zoomed = [replace(camera, K=camera.K * scale) for camera in rig]
-        pairs = zip(self.base, zoomed, strict=True)
-        return rig.with_cameras([with_mask_of(base, camera, outside=True) for base, camera in pairs])
+        pairs = zip(self.base, rig, strict=True)
+        zoomed = [with_mask_of(base, replace(camera, K=camera.K * scale), outside=True) for base, camera in pairs]
+        return rig.with_cameras(zoomed)
 
     def __repr__(self) -> str:
         moving = ", ".join(f"{n} {lo:g}..{hi:g}" for n, (lo, hi) in self.ranges.items() if hi > lo)
@@ -150,14 +150,10 @@ class RandomRig(Epochs):
 
 def _range(name: str, value: Any) -> tuple[float, float]:
     is_scale = name == "focal_scale"
-    neutral = 1.0 if is_scale else 0.0
     try:
-        if any(isinstance(x, bool | str) for x in (value if isinstance(value, tuple | list) else [value])):
-            raise TypeError
-        if isinstance(value, tuple | list):
-            low, high = (float(x) for x in value)
-        else:
-            low, high = neutral - float(value), neutral + float(value)
+        ends = value if isinstance(value, tuple | list) else (is_scale - value, is_scale + value)
+        is_number = not any(isinstance(entry, bool | str) for entry in (value, *ends))
+        low, high = (float(end) if is_number else math.nan for end in ends)
     except (TypeError, ValueError, OverflowError):
         low, high = math.nan, math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low <= high) or (is_scale and low <= 0):

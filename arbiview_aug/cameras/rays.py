@@ -21,8 +21,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.image_ops import Memory, halved
 from arbiview_aug.lru_cache import LRUCache
 
-MAX_INVERSE_DISTANCE = 100.0
-"""Upper limit, 1 cm: keeps points finite when a camera touches a surface."""
+MAX_INVERSE_DISTANCE = 100.0  # upper limit, 1 cm: keeps points finite when a camera touches a surface
 
 
 def ego_rays(camera: Camera, pixels: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -63,14 +62,8 @@ def look_apart(camera: Camera, others: Sequence[Camera], nearest: float) -> list
     return apart
 
 
-VIEW_SIZE = (450, 800)
-"""(h, w) of the half-way view."""
-
-TILE_PX = 32
-"""Side of the chessboard's tiles in that view."""
-
-HALF_VIEW_SIZE, HALF_TILE_PX = (225, 400), 16
-"""The same at half resolution, which exposure and depth from overlap read."""
+VIEW_SIZE, TILE_PX = (450, 800), 32  # (h, w) of the half-way view, and side of the chessboard's tiles in it
+HALF_VIEW_SIZE, HALF_TILE_PX = (225, 400), 16  # the same at half resolution, which exposure and depth from overlap read
 
 
 def adjacent_pairs(rig: Rig) -> list[tuple[int, int]]:
@@ -107,8 +100,7 @@ _NO_PLANES = np.zeros((3, 0, 0), np.float32)
 _NO_MASK, _NO_DISTANCE = np.zeros((0, 0), np.uint8), np.zeros((0, 0), np.float32)
 _ROWS = 64  # unprojected at once: they stay in the cache
 _MAX_BYTES = 256 * 2**20
-CELL_PX = 8
-"""Side of the cells in which cones of rays and distances to a mask are known."""
+CELL_PX = 8  # side of the cells in which cones of rays and distances to a mask are known
 
 
 @dataclass(frozen=True)
@@ -156,9 +148,7 @@ class PixelRays:
         return PixelRays(size, parameters, planes)
 
     def nodes(self, apart: int) -> Planes:
-        """Rays (3, ny + 1, nx + 1) of pixels so far apart, the last ones on the last pixels. Read-only: they are kept,
-        but for those of all pixels.
-        """
+        """Rays (3, ny + 1, nx + 1) of each ``apart``-th pixel and of the last; read-only, as they are kept."""
         nodes = self._nodes.get(apart)
         if nodes is None:
             nodes = self.at(*(np.minimum(np.arange(0, n + apart, apart), n - 1) for n in self.size))
@@ -202,7 +192,12 @@ class RayCache:
 
     def clean_pixels(self, camera: Camera, level: int) -> npt.NDArray[np.uint8]:
         """255 (h, w) where a source halved ``level`` times shows no part of the own car; (0, 0) without a mask."""
-        return self._of_mask(camera, level, lambda mask: clean_pixels(mask, level), _NO_MASK)
+
+        def clean(mask: BoolArray) -> Any:
+            pixels: Any = mask.view(np.uint8) * np.uint8(255)
+            return cv2.inRange(halved(pixels, level), 255, 255) if level else pixels  # type: ignore[call-overload]
+
+        return self._of_mask(camera, level, clean, _NO_MASK)
 
     def to_mask(self, camera: Camera) -> Planes:
         """Distance (px) of each cell of ``CELL_PX`` to a source's mask; (0, 0) without one."""
@@ -222,14 +217,15 @@ def _lens_key(camera: Camera) -> Any:
 
 def pixel_rays(camera: Camera) -> PixelRays:
     """The rays of a camera's pixels."""
-    planes = _NO_PLANES if camera.is_rectilinear else _unprojected(camera)
+    if camera.is_rectilinear:
+        return PixelRays(camera.size, camera.parameters, _NO_PLANES)
+    h, w = camera.size
+    planes = np.empty((3, h, w), np.float32)
+    for first in range(0, h, _ROWS):
+        pixels = np.stack(np.meshgrid(np.arange(w), np.arange(first, min(first + _ROWS, h))), -1)
+        rays, valid = camera.unproject_cam(pixels.astype(np.float64))
+        planes[:, first : first + _ROWS] = np.moveaxis(np.where(valid[..., None], rays, 0), -1, 0)
     return PixelRays(camera.size, camera.parameters, planes)
-
-
-def clean_pixels(mask: BoolArray, level: int) -> Any:
-    """255 (h, w) where a mask halved ``level`` times shows no part of the own car."""
-    clean: Any = mask.view(np.uint8) * np.uint8(255)
-    return cv2.inRange(halved(clean, level), 255, 255) if level else clean  # type: ignore[call-overload]
 
 
 def relative_pose(target: Camera, source: Camera) -> tuple[Planes, Planes]:
@@ -240,16 +236,16 @@ def relative_pose(target: Camera, source: Camera) -> tuple[Planes, Planes]:
 
 
 def source_pixels(target: Camera, rays: Planes, inverse_distance: Planes, source: Camera) -> tuple[Planes, Planes]:
-    """Pixels of a source for scene points on a target's rays; both cameras are in one ego frame.
-
-    ``rays`` are (3, h, w) unit rays in the target's frame, ``inverse_distance`` (h, w) is along them, 1/m. Returns u
-    and v (h, w), ``kernels.FAR_AWAY_PX`` where there is no pixel.
-    """
+    """As ``pixels_of``, for rays in the frame of a target; both cameras are in one ego frame."""
     return pixels_of(rays, inverse_distance, *relative_pose(target, source), source)
 
 
 def pixels_of(rays: Planes, inverse_distance: Planes, A: Any, o: Any, source: Camera) -> tuple[Planes, Planes]:
-    """As ``source_pixels``, by the rotation (3, 3) to the source's frame, and the rays' start (3,) there."""
+    """Pixels u and v (h, w) of a source for scene points on rays; ``kernels.FAR_AWAY_PX`` where there is no pixel.
+
+    ``rays`` are (3, h, w) unit rays, ``inverse_distance`` (h, w) is along them, 1/m. ``A`` (3, 3) turns them to the
+    source's frame, and ``o`` (3,) is their start there.
+    """
     from arbiview_aug.cameras.kernels import FAR_AWAY_PX, LENS_CODES, project_image
 
     rays, A, o = (np.ascontiguousarray(part, np.float32) for part in (rays, A, o))
@@ -276,17 +272,6 @@ def edge_distance(camera: Camera, uv: FloatArray) -> FloatArray:
     distance = np.empty(u.shape)
     edge_distance_row(u, v, camera.size, to_mask, CELL_PX, distance)
     return distance.reshape(uv.shape[:-1])
-
-
-def _unprojected(camera: Camera) -> Planes:
-    """Unit rays (3, h, w), 0 where there is none."""
-    h, w = camera.size
-    planes = np.empty((3, h, w), np.float32)
-    for first in range(0, h, _ROWS):
-        pixels = np.stack(np.meshgrid(np.arange(w), np.arange(first, min(first + _ROWS, h))), -1)
-        rays, valid = camera.unproject_cam(pixels.astype(np.float64))
-        planes[:, first : first + _ROWS] = np.moveaxis(np.where(valid[..., None], rays, 0), -1, 0)
-    return planes
 
 
 def distance_to_mask(mask: Any) -> Any:

@@ -36,9 +36,7 @@ from arbiview_aug.cameras.validation import MAX_SIZE_PX, MOST_M, doubts
 from arbiview_aug.errors import CalibrationError, calibration_of, shown, warn
 from arbiview_aug.files import read_bytes
 
-MOST_CAMERAS, MOST_LIDARS = 128, 32
-"""Largest rig: winning sources are int8."""
-
+MOST_CAMERAS, MOST_LIDARS = 128, 32  # largest rig: winning sources are int8
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
 _NOTES = ("source", "notes", "ego_frame", "ground_source", "dataset", "kind", "license")
 _MOST_MASK_BYTES = 1 << 28
@@ -73,9 +71,8 @@ class Rig:
         lidars = tuple(self.lidars) if isinstance(self.lidars, Sequence) else (self.lidars,)
         sensors: tuple[Any, ...]
         for kind, sensors in ((Camera, cameras), (Lidar, lidars)):
-            for sensor in sensors:
-                if not isinstance(sensor, kind):
-                    raise CalibrationError(f"{where}: expected {kind.__name__} objects, got {type(sensor).__name__}")
+            if others := [type(sensor).__name__ for sensor in sensors if not isinstance(sensor, kind)]:
+                raise CalibrationError(f"{where}: expected {kind.__name__} objects, got {others[0]}")
             twice = sorted(name for name, count in Counter(sensor.name for sensor in sensors).items() if count > 1)
             if twice:
                 kinds, got = kind.__name__.lower(), ", ".join(name[:100] for name in twice[:5])
@@ -87,10 +84,8 @@ class Rig:
         if not abs(ground) <= MOST_M:
             got = f"{shown(self.ground_z_m)}; at most {MOST_M:g} m"
             raise CalibrationError(f"{where}: ground_z_m: expected a finite height in metres, got {got}")
-        object.__setattr__(self, "name", str(self.name or ""))  # numpy's text is no plain YAML
-        object.__setattr__(self, "cameras", cameras)
-        object.__setattr__(self, "lidars", lidars)
-        object.__setattr__(self, "ground_z_m", ground)
+        name = str(self.name or "")  # numpy's text is no plain YAML
+        self.__dict__.update(name=name, cameras=cameras, lidars=lidars, ground_z_m=ground)
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -100,10 +95,9 @@ class Rig:
 
     def __getitem__(self, key: int | str) -> Camera:
         if isinstance(key, str):
-            for camera in self.cameras:
-                if camera.name == key:
-                    return camera
-            raise KeyError(f"no camera {key!r} in rig {self.name!r}: it has {', '.join(self.names)}")
+            if key not in self.names:
+                raise KeyError(f"no camera {key!r} in rig {self.name!r}: it has {', '.join(self.names)}")
+            key = self.names.index(key)
         return self.cameras[key]
 
     def __eq__(self, other: object) -> bool:
@@ -116,12 +110,12 @@ class Rig:
 
     def __repr__(self) -> str:
         """A table with one line per camera and scanner, as ``inspect`` prints it."""
-        head = f"Rig {self.name or '(unnamed)'}: {len(self)} cameras, road at z = {self.ground_z_m:+.2f} m"
+        lines = [f"Rig {self.name or '(unnamed)'}: {len(self)} cameras, road at z = {self.ground_z_m:+.2f} m"]
         width, lens = max(map(len, self.names)), max(7, *(len(c.lens) for c in self.cameras))
-        lines = [
+        lines.append(
             f"  {'camera':<{width}}  {'size':>9}  {'lens':<{lens}}  {'fov h x v':>13}  {'azimuth':>7}  {'elev.':>6}"
             f"  {'x':>6} {'y':>6} {'above road':>10}"
-        ]
+        )
         for c in self.cameras:
             h_fov, v_fov = c.fov_deg
             x, y, z = c.center_m
@@ -134,7 +128,7 @@ class Rig:
             x, y, z = lidar.center_m
             place = f"at ({x:.2f}, {y:.2f}), {z - self.ground_z_m:.2f} m above the road"
             lines.append(f"  lidar {lidar.name}: {lidar.words}, {place}")
-        return "\n".join([head, *lines])
+        return "\n".join(lines)
 
     @property
     def names(self) -> list[str]:
@@ -168,7 +162,6 @@ class Rig:
         names = self.name, *(camera.name for camera in self.cameras), *(lidar.name for lidar in self.lidars)
         return self.content_key + repr(names).encode()
 
-    # --- changed copies -------------------------------------------------------------------------------------------
     def with_cameras(self, cameras: Sequence[Camera]) -> Rig:
         """The same rig with other cameras."""
         return replace(self, cameras=cameras)
@@ -210,18 +203,14 @@ class Rig:
         cameras, lidars = [c.moved(T) for c in self], [lidar.moved(T) for lidar in self.lidars]
         return replace(self, cameras=cameras, lidars=lidars, ground_z_m=other.ground_z_m)
 
-    # --- files ----------------------------------------------------------------------------------------------------
     def to_dict(self) -> dict[str, Any]:
         """Plain data in the rig file's format, without masks, which ``save`` writes as files."""
         lidars = {"lidars": [lidar.to_dict() for lidar in self.lidars]} if self.lidars else {}
-        cameras = [
-            {
-                **{"name": c.name, "width": c.width_px, "height": c.height_px, "K": c.K.tolist()},
-                "distortion": None if c.is_rectilinear else {"model": c.lens, "coeffs": list(c.distortion)},
-                "cam2ego": c.cam2ego.tolist(),
-            }
-            for c in self.cameras
-        ]
+        cameras = []
+        for c in self.cameras:
+            lens = None if c.is_rectilinear else {"model": c.lens, "coeffs": list(c.distortion)}
+            entry = {"name": c.name, "width": c.width_px, "height": c.height_px, "K": c.K.tolist()}
+            cameras.append({**entry, "distortion": lens, "cam2ego": c.cam2ego.tolist()})
         return {"name": self.name, "ground_z_m": self.ground_z_m, **lidars, "cameras": cameras}
 
     @classmethod
@@ -232,8 +221,7 @@ class Rig:
         """
         if not isinstance(data, Mapping) or not isinstance(data.get("cameras"), list):
             raise CalibrationError(f"{where}: expected a mapping with a list 'cameras', got {type(data).__name__}")
-        for key in ("ground_z_m", "lidars"):
-            _refuse_misnamed(data, key, where)
+        _refuse_misnamed(data, ("ground_z_m", "lidars"), where)
         cameras = [_camera_from_dict(entry, k, folder, where) for k, entry in enumerate(data["cameras"])]
         entries = [] if data.get("lidars") is None else data["lidars"]
         if not isinstance(entries, list) or len(entries) > MOST_LIDARS:
@@ -343,19 +331,23 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
     if not isinstance(entry, Mapping):
         raise CalibrationError(f"{where}: camera {index}: expected a mapping, got {type(entry).__name__}")
     label = f"{where}: camera {shown(entry.get('name', index))}"
-    missing = [key for key in ("name", "width", "height", "K", "cam2ego") if entry.get(key) is None]
-    if missing:
+    if missing := [key for key in ("name", "width", "height", "K", "cam2ego") if entry.get(key) is None]:
         expected = ", ".join(sorted(_CAMERA_KEYS))
         raise CalibrationError(f"{label}: expected keys {expected}, missing {', '.join(missing)}{hint(entry, missing)}")
-    _refuse_misnamed(entry, "distortion", label)
-    _refuse_misnamed(entry, "mask", label)
+    _refuse_misnamed(entry, ("distortion", "mask"), label)
     calibration = {key: entry[key] for key in ("name", "K", "cam2ego")}
     distortion = entry.get("distortion")
     if distortion is not None:
         if not isinstance(distortion, Mapping) or not {"model", "coeffs"} <= distortion.keys():
             raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {shown(distortion)}")
         calibration |= {"lens": distortion["model"], "distortion": distortion["coeffs"]}
-        _check_order(distortion, label)
+        unknown, order = unknown_key(distortion, ("model", "coeffs", "order")), distortion.get("order")
+        usual = _ORDERS.get(canonical_name(str(distortion["model"])), "").split()
+        named = re.findall(r"[a-z]+\d", str(order).partition("(")[0])  # k1..k4 (cv2.fisheye)
+        is_usual = order is None or named == usual[: len(named)] or (named == ["k1", "k4"] and len(usual) > 3)
+        if unknown or not is_usual:
+            unknown = unknown or f"order: expected {' '.join(usual)}, got {shown(order)}"
+            raise CalibrationError(f"{label}: distortion: {unknown}")
     for key in ("lens", *USUAL_NAMES["lens"]):
         lens = lens_called(entry.get(key) or "pinhole")
         if lens != "pinhole" and (distortion is None or lens != canonical_name(str(distortion["model"]))):
@@ -366,21 +358,9 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
         return Camera(width_px=entry["width"], height_px=entry["height"], mask=mask, **calibration)
 
 
-def _check_order(distortion: Mapping[str, Any], label: str) -> None:
-    """Refuse coefficients in another order than the lens's, and keys that are not read."""
-    unknown, order = unknown_key(distortion, ("model", "coeffs", "order")), distortion.get("order")
-    usual = _ORDERS.get(canonical_name(str(distortion["model"])), "").split()
-    named = re.findall(r"[a-z]+\d", str(order).partition("(")[0])  # k1..k4 (cv2.fisheye)
-    is_usual = order is None or named == usual[: len(named)] or (named == ["k1", "k4"] and len(usual) > 3)
-    if not unknown and not is_usual:
-        unknown = f"order: expected {' '.join(usual)}, got {shown(order)}"
-    if unknown:
-        raise CalibrationError(f"{label}: distortion: {unknown}")
-
-
-def _refuse_misnamed(entries: Mapping[str, Any], key: str, label: str) -> None:
-    """Refuse another name of a key that is absent or null, which would not be read; of numbers, text may be a note."""
-    for wrong in misnamed(entries, (key,)):
+def _refuse_misnamed(entries: Mapping[str, Any], keys: Sequence[str], label: str) -> None:
+    """Refuse other names of keys that are absent or null, which would not be read; of numbers, text may be a note."""
+    for wrong, key in misnamed(entries, keys).items():
         value = entries[wrong]
         is_zero = not any(value) if isinstance(value, list) else not value
         if (key == "mask" or isinstance(value, Mapping | list | int | float)) and not is_zero:

@@ -10,11 +10,11 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, LensName, canonical_name
+from arbiview_aug.cameras.lens import LENSES, BoolArray, FloatArray, canonical_name
 from arbiview_aug.cameras.rotations import (
     CAMERA_AXES_IN_EGO,
     nearest_rotation,
@@ -47,8 +47,7 @@ the height, are another resolution's. Real ones are off by up to 0.02 of the wid
 
 BODY_AXES = "a body's axes (ROS: x forward, z up)"  # words of messages
 
-MAX_SIZE_PX = 32766
-"""Largest image side: OpenCV's remap needs sizes below 32767."""
+MAX_SIZE_PX = 32766  # largest image side: OpenCV's remap needs sizes below 32767
 
 
 @dataclass(frozen=True)
@@ -79,13 +78,23 @@ def checked_calibration(
         raise CalibrationError(f"camera name: expected a non-empty string of Unicode, got {shown(name)}")
     where = f"camera {shown(name)}"
     w, h = checked_pixels(where, "width_px", width_px), checked_pixels(where, "height_px", height_px)
-    K, cam2ego, lens = checked_intrinsics(where, K), checked_pose(where, cam2ego), checked_lens(where, lens)
-    return {
-        **{"name": str(name), "width_px": w, "height_px": h},  # numpy's text is no plain YAML
-        **{"K": K, "cam2ego": cam2ego, "lens": lens},
-        "distortion": checked_distortion(where, lens, distortion),
-        "mask": None if mask is None else checked_mask(where, mask, (h, w)),
-    }
+    K, cam2ego = _checked_intrinsics(where, K), checked_pose(where, cam2ego)
+    known = canonical_name(lens) if isinstance(lens, str) else ""
+    if known not in LENSES:
+        raise refusal(where, "lens", f"one of {', '.join(LENSES)}", shown(lens))
+    distortion = checked_distortion(where, known, distortion)
+    if mask is not None:
+        try:
+            mask = np.array(mask)
+        except (TypeError, ValueError, RuntimeError) as error:  # rows of several lengths; tensors on other devices
+            raise refusal(where, "mask", "a bool array", one_line(error, 200)) from None
+        if mask.dtype != np.bool_:
+            raise refusal(where, "mask", "bool, True = scene", f"dtype {mask.dtype}", "pass mask > 0")
+        if mask.shape != (h, w):
+            raise refusal(where, "mask", f"shape {(h, w)}, the size (h, w) of the image", f"shape {mask.shape}")
+        mask.setflags(write=False)
+    fields = {"name": str(name), "width_px": w, "height_px": h}  # numpy's text is no plain YAML
+    return {**fields, "K": K, "cam2ego": cam2ego, "lens": known, "distortion": distortion, "mask": mask}
 
 
 def checked_pixels(where: str, field: str, value: Any, least: int = 1) -> int:
@@ -144,10 +153,10 @@ def checked_array(where: str, field: str, value: Any, shape: tuple[int, ...]) ->
 def _holds_booleans(value: Sequence[Any]) -> bool:
     """Whether a list or one of its lists holds true or false, which numpy would read as 1 and 0."""
     rows = [row for row in value if isinstance(row, list | tuple)]
-    return any(isinstance(one, bool) for row in (value, *rows) for one in row)
+    return any(isinstance(entry, bool) for row in (value, *rows) for entry in row)
 
 
-def checked_intrinsics(where: str, value: Any) -> FloatArray:
+def _checked_intrinsics(where: str, value: Any) -> FloatArray:
     """(3, 3) K: upper triangular, normalised, with positive focal lengths."""
     K = checked_array(where, "K", value, (3, 3))
     if K[0, 0] < _SHORTEST_PX or K[1, 1] < _SHORTEST_PX:
@@ -165,9 +174,7 @@ def is_rigid(pose: FloatArray) -> bool:
     """Whether an array is a finite pose (4, 4): a rotation, within 1e-3, and a position over 0 0 0 1."""
     if pose.shape != (4, 4) or not np.isfinite(pose).all() or not np.allclose(pose[3], (0, 0, 0, 1)):
         return False
-    R = pose[:3, :3]
-    if np.abs(R).max() > 2:  # its squares could overflow
-        return False
+    R = pose[:3, :3].clip(-2, 2)  # squares of more could overflow
     return bool(np.abs(R @ R.T - np.eye(3)).max() <= 1e-3 and np.linalg.det(R) > 0)
 
 
@@ -203,14 +210,6 @@ def checked_pose(where: str, value: Any, field: str = "cam2ego") -> FloatArray:
     return pose
 
 
-def checked_lens(where: str, value: Any) -> LensName:
-    """The name of a lens in ``LENSES``, also for its aliases."""
-    lens = canonical_name(value) if isinstance(value, str) else ""
-    if lens not in LENSES:
-        raise refusal(where, "lens", f"one of {', '.join(LENSES)}", shown(value))
-    return cast(LensName, lens)
-
-
 def checked_distortion(where: str, lens: str, value: Any) -> tuple[float, ...]:
     """As many coefficients as the lens takes, up to ``_MAX_COEFFICIENT``."""
     try:
@@ -232,21 +231,6 @@ def checked_distortion(where: str, lens: str, value: Any) -> tuple[float, ...]:
         expected = " and ".join(f"{label} from {low:g} to {high:g}" for label, low, high in ranges)
         raise refusal(where, "distortion", f"{expected} for a {lens} lens", shown(coefficients))
     return coefficients
-
-
-def checked_mask(where: str, value: Any, size: tuple[int, int]) -> BoolArray:
-    """A copy (h, w) bool of the image's size."""
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError, RuntimeError) as error:  # rows of several lengths; tensors on other devices
-        raise refusal(where, "mask", "a bool array", one_line(error, 200)) from None
-    if array.dtype != np.bool_:
-        raise refusal(where, "mask", "bool, True = scene", f"dtype {array.dtype}", "pass mask > 0")
-    if array.shape != size:
-        raise refusal(where, "mask", f"shape {size}, the size (h, w) of the image", f"shape {array.shape}")
-    array = array.copy()
-    array.setflags(write=False)
-    return array
 
 
 def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | None:
@@ -288,10 +272,9 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[Finding]:
     aside = (np.abs(y_m) > 0.1) & (np.abs(y_axes) > 0.5)
     found = []
     if aside.sum() > 1 and (y_m * y_axes)[aside].max() < 0:
+        expected = "cameras that look to the left on the left"
         fix = "positions are left-handed (y to the right): negate cam2ego[1, 3]"
-        found.append(
-            Finding("cam2ego", "cameras that look to the left on the left", "y of all positions mirrored", fix)
-        )
+        found.append(Finding("cam2ego", expected, "y of all positions mirrored", fix))
     has_front = any(_side(camera.name) == (1, 0) for camera in cameras)
     for camera in cameras:
         where, doubt = f"camera {shown(camera.name)}: cam2ego", pose_doubt(camera, has_front)
@@ -300,9 +283,8 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[Finding]:
             as_with, fix = ("", _AS_MOUNTED) if not likely else (f", as with {likely[1]}", likely[2])
             found.append(Finding(where, doubt[0], doubt[1] + as_with, fix))
         elif not is_mounted(camera.cam2ego[None], ground_z_m)[0]:
-            at = "({:.1f}, {:.1f}), {:.1f} m over the road".format(
-                *camera.center_m[:2], camera.center_m[2] - ground_z_m
-            )
+            x, y, z = camera.center_m
+            at = f"({x:.1f}, {y:.1f}), {z - ground_z_m:.1f} m over the road"
             fix = "compare it with the other cameras': metres, and cam2ego instead of its inverse?"
             found.append(Finding(where, "a place on a vehicle", at, fix))
     return (found or general) + _size_doubts(cameras)
@@ -313,8 +295,9 @@ def pose_doubt(camera: Any, has_front: bool) -> tuple[str, str] | None:
     pose, up_deg, side = camera.cam2ego, camera.elevation_deg, _side(camera.name)
     if up_deg > _STEEP_DEG or (up_deg < _DOWN_DEG and side[1]):
         return "a level camera", f"it looks {'up' if up_deg > 0 else 'down'} by {abs(up_deg):.0f} degrees"
-    if up_deg > -_STEEP_DEG and abs(_roll_deg(pose)) > _STEEP_DEG:
-        return "an upright image", f"rolled by {_roll_deg(pose):.0f} degrees"
+    roll_deg = math.degrees(math.atan2(pose[2, 0], -pose[2, 1]))
+    if up_deg > -_STEEP_DEG and abs(roll_deg) > _STEEP_DEG:
+        return "an upright image", f"rolled by {roll_deg:.0f} degrees"
     if _belies(pose, side, has_front):
         return "a camera that looks where its name says", f"it looks to {camera.azimuth_deg:+.0f} degrees"
     return None
@@ -365,10 +348,9 @@ def _size_doubts(cameras: Sequence[Any]) -> list[Finding]:
         is_scaled = abs(x) > (_OFF_CENTER if together else _OFF_CENTER_ALONE) and abs(x - y) < _ALIKE_OFF
         is_turned = max(abs(x), abs(y)) > 0.1 and np.abs(middle / (h, w) - 0.5).max() < 0.05
         if is_scaled or is_turned or max(abs(x), abs(y)) > 0.5:
-            expected = f"a principal point near the middle of {w}x{h} pixels"
+            where, expected = f"camera {shown(camera.name)}: K", f"a principal point near the middle of {w}x{h} pixels"
             is_of = "the middle of about {:.0f}x{:.0f} pixels".format(*2 * middle)
-            fix = "is K of another resolution? Camera.resize scales it"
-            found.append(Finding(f"camera {shown(camera.name)}: K", expected, is_of, fix))
+            found.append(Finding(where, expected, is_of, "is K of another resolution? Camera.resize scales it"))
     return found
 
 
@@ -386,10 +368,6 @@ def _belies(pose: FloatArray, side: tuple[int, int], has_front: bool) -> bool:
     most_deg = 100 if all(side) else 80 if has_front or side[0] else 110
     cosine = np.dot(pose[:2, 2], side) / max(flat * math.hypot(*side), 1e-9)
     return any(side) and flat > 0.5 and bool(cosine < math.cos(math.radians(most_deg)))
-
-
-def _roll_deg(pose: FloatArray) -> float:
-    return math.degrees(math.atan2(pose[2, 0], -pose[2, 1]))
 
 
 def _candidates(cam2ego: FloatArray) -> Iterator[tuple[FloatArray, str, str]]:
@@ -428,5 +406,5 @@ def is_mounted(cam2ego: FloatArray, ground_z_m: float) -> BoolArray:
 
 def refusal(where: str, field: str, expected: str, got: Any, fix: str = "") -> CalibrationError:
     """The error of a value: whose it is, its name, what was expected, what was given."""
-    words = "".join(f"{one}: " for one in (where, field) if one)
-    return CalibrationError(f"{words}expected {expected}, got {got}{f'; {fix}' if fix else ''}")
+    prefix = "".join(f"{part}: " for part in (where, field) if part)
+    return CalibrationError(f"{prefix}expected {expected}, got {got}{f'; {fix}' if fix else ''}")

@@ -130,15 +130,18 @@ _IMAGE_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)  #
 
 def check_container(images: Any) -> None:
     """Refuse images that are neither a tensor (..., N, 3, H, W) nor a list of tensors."""
-    if isinstance(images, torch.Tensor):
-        if images.ndim < 4:
-            raise SampleError(f"images: expected shape (..., N, 3, H, W), got {tuple(images.shape)}")
-    elif isinstance(images, list | tuple):
-        for k, image in enumerate(images):
-            if not isinstance(image, torch.Tensor):
-                raise _not_a_tensor(f"images[{k}]", image)
-    else:
-        raise _not_a_tensor("images", images)
+    if isinstance(images, torch.Tensor) and images.ndim < 4:
+        raise SampleError(f"images: expected shape (..., N, 3, H, W), got {tuple(images.shape)}")
+    is_list = isinstance(images, list | tuple)
+    named = {f"images[{k}]": image for k, image in enumerate(images)} if is_list else {"images": images}
+    for name, value in named.items():
+        if not isinstance(value, torch.Tensor):
+            fix = "a (N, 3, H, W) tensor, or a list of (3, H, W) tensors"
+            if isinstance(value, np.ndarray):
+                fix = "torch.from_numpy(array).permute(2, 0, 1) for an (H, W, 3) RGB array"
+            elif "PIL" in type(value).__module__:
+                fix = "torchvision.transforms.v2.functional.pil_to_tensor(image)"
+            raise SampleTypeError(f"{name}: expected torch tensors, got {type(value).__name__}; use {fix}")
 
 
 def checked_images(images: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
@@ -159,17 +162,6 @@ def checked_images(images: Sequence[torch.Tensor]) -> tuple[torch.Tensor, ...]:
                     fix = "replace NaN and infinity first: torch.nan_to_num(images)"
                 raise SampleError(f"images[{k}]: expected floats in [0, 1], got {low:g} to {high:g}; {fix}")
     return tuple(images)
-
-
-def _not_a_tensor(what: str, value: Any) -> SampleTypeError:
-    kind = type(value).__name__
-    if isinstance(value, np.ndarray):
-        fix = "torch.from_numpy(array).permute(2, 0, 1) for an (H, W, 3) RGB array"
-    elif "PIL" in type(value).__module__:
-        fix = "torchvision.transforms.v2.functional.pil_to_tensor(image)"
-    else:
-        fix = "a (N, 3, H, W) tensor, or a list of (3, H, W) tensors"
-    return SampleTypeError(f"{what}: expected torch tensors, got {kind}; use {fix}")
 
 
 def _check_image(k: int, image: torch.Tensor) -> None:

@@ -58,7 +58,7 @@ def project_boxes_3d(boxes_3d: Any, cameras: Rig | Mapping[str, Any]) -> list[Im
         SampleError: Boxes of another shape, not finite or without size; a batch of samples.
     """
     rig, boxes = rig_of(cameras), checked_boxes(boxes_3d)
-    return [_of_camera(camera, boxes) for camera in rig]
+    return [_project(camera, boxes) for camera in rig]
 
 
 def rig_of(cameras: Rig | Mapping[str, Any]) -> Rig:
@@ -91,7 +91,18 @@ def outline(camera: Camera, box: FloatArray) -> Outline | None:
     border = np.array(list(product(*zip((0.0, 0.0), limits, strict=True))))
     rays = camera.unproject(border)
     corners = border[rays.valid & meets(box, camera.center_m, rays.directions)]
-    within = np.concatenate([_clipped(pixels[:-1][both], pixels[1:][both], limits), corners])
+    # Liang and Barsky (1984): the segments' ends, clipped to the image.
+    start, end = pixels[:-1][both], pixels[1:][both]
+    step = end - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low, high = -start / step, (limits - start) / step
+    parallel = step == 0
+    outside = parallel & ((start < 0) | (start > limits))
+    enter = np.where(parallel, np.where(outside, np.inf, -np.inf), np.minimum(low, high)).max(axis=1).clip(0)
+    leave = np.where(parallel, np.inf, np.maximum(low, high)).min(axis=1).clip(max=1)
+    hit = enter <= leave
+    ends = [start[hit] + share[hit, None] * step[hit] for share in (enter, leave)]
+    within = np.concatenate([np.concatenate(ends).clip(0, limits), corners])
     if not len(within) or not (within.max(axis=0) > within.min(axis=0)).all():
         return None
     around = [pixels[valid], within]
@@ -108,37 +119,21 @@ def edge_points(camera: Camera, box: FloatArray) -> FloatArray:
     c, s = np.cos(box[6]), np.sin(box[6])
     corners = (_CORNERS * box[3:6]) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + box[:3]
     x = (corners - camera.center_m) @ camera.cam2ego[:3, :3]
-    one, two = x[_EDGES[:, 0]], x[_EDGES[:, 1]]
+    start, end = x[_EDGES[:, 0]], x[_EDGES[:, 1]]
     if not camera.lens_model.sees_behind:
-        ahead = np.maximum(one[:, 2], two[:, 2]) >= _NEAR_M
-        one, two = one[ahead], two[ahead]
-        one, two = _cut(one, two), _cut(two, one)
+        ahead = np.maximum(start[:, 2], end[:, 2]) >= _NEAR_M
+        start, end = start[ahead], end[ahead]
+        cut = []
+        for near, far in ((start, end), (end, start)):
+            behind = near[:, 2] < _NEAR_M
+            share = (_NEAR_M - near[:, 2]) / np.where(behind, far[:, 2] - near[:, 2], 1.0)
+            cut.append(np.where(behind[:, None], near + share[:, None] * (far - near), near))
+        start, end = cut
     steps = np.linspace(0, 1, 2 if camera.is_rectilinear else _LENS_STEPS)[:, None, None]
-    return np.asarray((1 - steps) * one + steps * two)
+    return np.asarray((1 - steps) * start + steps * end)
 
 
-def _clipped(one: FloatArray, two: FloatArray, limits: FloatArray) -> FloatArray:
-    """The ends (m, 2) of segments (n, 2) clipped to 0 and ``limits`` (Liang and Barsky 1984)."""
-    step = two - one
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = -one / step, (limits - one) / step
-    parallel = step == 0
-    outside = parallel & ((one < 0) | (one > limits))
-    enter = np.where(parallel, np.where(outside, np.inf, -np.inf), np.minimum(low, high)).max(axis=1).clip(0)
-    leave = np.where(parallel, np.inf, np.maximum(low, high)).min(axis=1).clip(max=1)
-    hit = enter <= leave
-    start, step = one[hit], step[hit]
-    return np.concatenate([start + share[hit, None] * step for share in (enter, leave)]).clip(0, limits)
-
-
-def _cut(one: FloatArray, two: FloatArray) -> FloatArray:
-    """The ends (n, 3) ``one`` of edges to ``two``, clipped at the near plane."""
-    behind = one[:, 2] < _NEAR_M
-    share = (_NEAR_M - one[:, 2]) / np.where(behind, two[:, 2] - one[:, 2], 1.0)
-    return np.where(behind[:, None], one + share[:, None] * (two - one), one)
-
-
-def _of_camera(camera: Camera, boxes: FloatArray) -> ImageBoxes:
+def _project(camera: Camera, boxes: FloatArray) -> ImageBoxes:
     outlines = {k: polygon for k, box in enumerate(boxes) if (polygon := outline(camera, box)) is not None}
     rows = np.array(list(outlines), np.int64)
     uncut, inside = np.array(list(outlines.values())).reshape(-1, 2, 4).swapaxes(0, 1)

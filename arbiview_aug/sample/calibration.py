@@ -67,17 +67,15 @@ def differing_keys(source: Rig, sample: Mapping[str, Any], lead: tuple[int, ...]
 
 def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any], index: tuple[int, ...]) -> Rig:
     """The rig of the sample's K, cam2ego and, where present, lens, distortion and ground_z_m."""
-    missing = [key for key in ("K", "cam2ego") if sample.get(key) is None]
-    if missing:
+    if missing := [key for key in ("K", "cam2ego") if sample.get(key) is None]:
         got = f"missing {', '.join(missing)}{hint(sample, missing)}; or give RigRetarget the rig as source="
         raise SampleError(f"sample: expected calibration, 'rig' or 'K' and 'cam2ego', {got}")
     K, cam2ego = (numbers(key, sample[key], index) for key in ("K", "cam2ego"))
     for key, array, expected in (("K", K, (len(images), 3, 3)), ("cam2ego", cam2ego, (len(images), 4, 4))):
         if array.shape != expected:
-            of_frame = " in a frame of the batch" if index else ""
             fix = "; pass K[..., :3, :3]" if key == "K" and array.shape[1:] in ((3, 4), (4, 4)) else ""
-            got = f"got {array.shape}{of_frame}{fix}"
-            raise SampleError(f"{key}: expected shape {expected} for {len(images)} images, {got}")
+            got = f"{array.shape}{' in a frame of the batch' if index else ''}{fix}"
+            raise SampleError(f"{key}: expected shape {expected} for {len(images)} images, got {got}")
     cameras = []
     for k, (image, (lens, distortion)) in enumerate(zip(images, _lenses(sample, len(images), index), strict=True)):
         h, w = image.shape[-2:]
@@ -94,9 +92,8 @@ def _rig_from_tensors(images: tuple[torch.Tensor, ...], sample: Mapping[str, Any
 
 def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None:
     """Refuse a K that was made for another image size; ``Camera`` refuses NaN."""
-    h, w = size
-    x, y = (K[0, 2] + 0.5) / w - 0.5, (K[1, 2] + 0.5) / h - 0.5  # from the image's centre, as a share of its size
-    off_swapped = max(abs((K[0, 2] + 0.5) / h - 0.5), abs((K[1, 2] + 0.5) / w - 0.5))
+    x, y = (K[:2, 2] + 0.5) / size[::-1] - 0.5  # from the image's centre, as a share of its size
+    off_swapped = np.abs((K[:2, 2] + 0.5) / size - 0.5).max()
     outside = max(abs(x), abs(y)) > 0.5 and min(abs(x), abs(y)) > _ON_CENTER  # crops may leave it out on one side
     scaled = max(x, y) < -_OFF_CENTER or min(x, y) > _OFF_CENTER
     swapped = max(abs(x), abs(y)) > 0.12 and off_swapped < 0.05
@@ -105,7 +102,7 @@ def _check_principal_point(k: int, K: np.ndarray, size: tuple[int, int]) -> None
     where = "inside the image" if outside else "near the middle of the image"
     fix = "height and width are swapped" if swapped else "K of another image size? Camera.resize scales K"
     got = f"({K[0, 2]:g}, {K[1, 2]:g}); {fix}; pass rig= if the camera is really like this"
-    raise SampleError(f"K[{k}]: expected a principal point {where} of (h, w) = {(h, w)}, got {got}")
+    raise SampleError(f"K[{k}]: expected a principal point {where} of (h, w) = {size}, got {got}")
 
 
 def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> list[tuple[Any, tuple[float, ...]]]:
@@ -125,11 +122,9 @@ def _lenses(sample: Mapping[str, Any], count: int, index: tuple[int, ...]) -> li
     if coefficients is None or coefficients.ndim != 2 or len(coefficients) != count:
         got = f"none{hint(sample, ('distortion',))}" if coefficients is None else f"shape {coefficients.shape}"
         raise SampleError(f"distortion: expected shape ({count}, up to 8) for the lenses {lenses}, got {got}")
-    result = []
-    for lens, row in zip(lenses, coefficients.tolist(), strict=True):
-        size = LENSES[lens].coefficient_counts[-1] if lens in LENSES else len(row)
-        result.append((lens, tuple(row) if any(row[size:]) else tuple(row[:size])))
-    return result
+    counts = (LENSES[lens].coefficient_counts[-1] if lens in LENSES else coefficients.shape[1] for lens in lenses)
+    rows = zip(lenses, counts, coefficients.tolist(), strict=True)
+    return [(lens, tuple(row if any(row[count:]) else row[:count])) for lens, count, row in rows]
 
 
 def _lens(name: Any, index: tuple[int, ...]) -> str:

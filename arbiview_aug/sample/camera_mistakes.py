@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, islice, pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -114,36 +114,35 @@ _VIEW_PX, _RATIO, _NEAREST_M, _FALSE_DEG = 800, 0.8, 2.0, 10.0
 def neighbour_errors(rig: Rig, images: Sequence[torch.Tensor]) -> dict[tuple[str, str], FloatArray]:
     """Angles in degrees by which matches in the overlap of two cameras miss each other at any distance of the scene."""
     errors = {}
-    for (one, image), (two, other) in combinations(zip(rig, images, strict=True), 2):
-        view = _common_view(one, two)
-        if view is not None and len(found := _match_errors(view, (one, image), (two, other))) >= _LEAST_MATCHES:
-            errors[one.name, two.name] = found
+    for first, second in combinations(zip(rig, images, strict=True), 2):
+        view = _common_view(first[0], second[0])
+        if view is not None and len(found := _match_errors(view, first, second)) >= _LEAST_MATCHES:
+            errors[first[0].name, second[0].name] = found
     return errors
 
 
-def _common_view(one: Camera, two: Camera) -> Camera | None:
+def _common_view(camera: Camera, other: Camera) -> Camera | None:
     """An upright pinhole camera that looks at what both see far away; None without overlap."""
-    u, v = np.meshgrid(np.linspace(0, one.width_px - 1, 24), np.linspace(0, one.height_px - 1, 24))
-    rays = one.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
+    u, v = np.meshgrid(np.linspace(0, camera.width_px - 1, 24), np.linspace(0, camera.height_px - 1, 24))
+    rays = camera.unproject(np.stack([u, v], axis=-1).reshape(-1, 2))
     directions = rays.directions[rays.valid]
-    seen = two.project(two.center_m + directions)
-    directions = directions[seen.valid & two.contains(seen.uv)]
+    seen = other.project(other.center_m + directions)
+    directions = directions[seen.valid & other.contains(seen.uv)]
     if len(directions) < 8:
         return None
     x, y, z = directions.mean(axis=0)
     azimuth, elevation = np.degrees([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
-    camera = Camera.looking(
-        name="view", azimuth_deg=azimuth, elevation_deg=elevation, width_px=8, height_px=8, horizontal_fov_deg=90
-    )
-    x, y, z = (directions @ camera.cam2ego[:3, :3]).T
+    size: dict[str, Any] = {"width_px": 8, "height_px": 8, "horizontal_fov_deg": 90}
+    view = Camera.looking(name="view", azimuth_deg=azimuth, elevation_deg=elevation, **size)
+    x, y, z = (directions @ view.cam2ego[:3, :3]).T
     ahead = z > 0.3
     if not ahead.any():
         return None
     half = np.minimum([np.abs(x[ahead] / z[ahead]).max(), np.abs(y[ahead] / z[ahead]).max()], 1.1) * 1.1
-    f = min(one.K[0, 0], two.K[0, 0], *(_VIEW_PX / 2 / half))
+    f = min(camera.K[0, 0], other.K[0, 0], *(_VIEW_PX / 2 / half))
     w, h = np.maximum(2 * half * f, 16).astype(int)
     K = np.array([[f, 0, w / 2 - 0.5], [0, f, h / 2 - 0.5], [0, 0, 1]])
-    return replace(camera, width_px=int(w), height_px=int(h), K=K)
+    return replace(view, width_px=int(w), height_px=int(h), K=K)
 
 
 def _match_errors(view: Camera, *pair: tuple[Camera, torch.Tensor]) -> FloatArray:
@@ -164,36 +163,30 @@ def _match_errors(view: Camera, *pair: tuple[Camera, torch.Tensor]) -> FloatArra
             return np.zeros(0)
         keys.append(np.array([point.pt for point in points]))
         features.append(found)
-    ways = [
-        {
-            (best.queryIdx, best.trainIdx)
-            for best, next_ in matcher.knnMatch(a, b, k=2)
-            if best.distance < _RATIO * next_.distance
-        }
-        for a, b in (features, features[::-1])
-    ]
+    ways = []
+    for a, b in (features, features[::-1]):
+        matches = (best for best, other in matcher.knnMatch(a, b, k=2) if best.distance < _RATIO * other.distance)
+        ways.append({(match.queryIdx, match.trainIdx) for match in matches})
     both = [(a, b) for a, b in ways[0] if (b, a) in ways[1]]
     if not both:
         return np.zeros(0)
-    one, two = (
-        view.unproject(points[list(rows)]).directions
-        for points, rows in zip(keys, zip(*both, strict=True), strict=True)
-    )
+    rows = map(list, zip(*both, strict=True))
+    first, second = (view.unproject(points[row]).directions for points, row in zip(keys, rows, strict=True))
     apart = pair[1][0].center_m - pair[0][0].center_m
-    at = one - np.linspace(0, 1 / _NEAREST_M, 40)[:, None, None] * apart
-    cosine = (at / np.linalg.norm(at, axis=-1, keepdims=True) * two).sum(axis=-1)
+    at = first - np.linspace(0, 1 / _NEAREST_M, 40)[:, None, None] * apart
+    cosine = (at / np.linalg.norm(at, axis=-1, keepdims=True) * second).sum(axis=-1)
     errors = np.degrees(np.arccos(np.clip(cosine, -1, 1))).min(axis=0)
     return errors[errors < _FALSE_DEG] if (errors < _FALSE_DEG).mean() > 0.6 else np.zeros(0)
 
 
 def neighbour_findings(errors: dict[tuple[str, str], FloatArray]) -> Iterator[Finding]:
     """Pairs of cameras whose matches disagree alike by more than ``DISAGREE_DEG``."""
-    for (one, two), angles in errors.items():
+    for (name, other), angles in errors.items():
         middle = float(np.median(angles))
         if middle > DISAGREE_DEG and ((angles > middle / 2) & (angles < 2 * middle)).mean() > 0.6:
             found = f"{middle:.1f} degrees apart in the median of {len(angles)} matches"
             fix = "calibrate them again; or were the images taken at different times while the car turned?"
-            yield Finding(f"cameras {one!r} and {two!r}", "the same directions in their overlap", found, fix)
+            yield Finding(f"cameras {name!r} and {other!r}", "the same directions in their overlap", found, fix)
 
 
 # --- the own car ------------------------------------------------------------------------------------------------------
@@ -224,8 +217,8 @@ def own_car_share(
     stays &= rays.valid & (away_m > 0) & (away_m < _ROAD_AHEAD_M)
     road = camera.center_m + away_m[stays][:, None] * rays.directions[stays]
     flow = np.zeros(len(road))
-    for one, two in pairwise(ego2world):
-        pose = np.linalg.inv(two) @ one
+    for before, after in pairwise(ego2world):
+        pose = np.linalg.inv(after) @ before
         moved = camera.project(road @ pose[:3, :3].T + pose[:3, 3])
         past = np.abs(((moved.uv - pixels[stays]) * across[stays]).sum(axis=-1))
         flow = np.maximum(flow, np.where(moved.valid, past, np.inf))

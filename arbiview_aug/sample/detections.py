@@ -39,9 +39,7 @@ def read_detections(frame: Frame) -> OfCameras:
     if frame.boxes is None:
         return {}
     boxes = checked_boxes(as_array("boxes_3d", frame.boxes))
-    names = [UNNAMED_TYPE] * len(boxes)
-    if "box_names" in frame.further:
-        names = _names("box_names", frame.further["box_names"], len(boxes))
+    names = _names("box_names", frame.further.get("box_names", [UNNAMED_TYPE] * len(boxes)), len(boxes))
     of_cameras = {}
     for k, camera in enumerate(frame.rig):
         outlines = [(outline(camera, box), name) for box, name in zip(boxes, names, strict=True)]

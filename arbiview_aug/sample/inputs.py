@@ -88,8 +88,8 @@ def read_frames(
     lead = leading_shape(images)
     if 0 in lead:
         raise SampleError(f"images: expected at least one frame, got the leading dimensions {lead}")
-    frames = []
-    for index, of_frame in zip(np.ndindex(*lead), split("images", images, lead), strict=True):
+    frames, places = [], list(np.ndindex(*lead))
+    for index, of_frame in zip(places, split("images", images, lead), strict=True):
         checked = checked_images(of_frame)
         frames.append(Frame(checked, read_rig(checked, sample, source, lead, index)))
     if source is not None and sample.get("rig") is None and not CHECKED_KEYS.isdisjoint(sample):
@@ -97,38 +97,25 @@ def read_frames(
             fix = f"drop source=, or {key} from the sample"
             raise SampleError(f"{key}: expected the calibration of source=, got another; {fix}")
     row = GEOMETRIES[geometry]
-    _check_needs(sample, geometry, row.needs)
+    if row.needs not in (None, "motion"):  # only moved cameras need depth from motion
+        key = _SAMPLE_KEYS.get(row.needs, row.needs)
+        if sample.get(key) is None and (row.needs != "points" or sample.get("depth_m") is None):
+            expected = _EXPECTED.get(row.needs, f"{row.needs!r} in the sample, got none")
+            raise SampleError(f"geometry={geometry!r}: expected {expected}{hint(sample, (key,))}")
     wanted = [*(_SAMPLE_KEYS.get(name, name) for name in row.reads), *sorted(further)]
     if "neighbours" in wanted and sample.get("neighbours") is not None:
         wanted.append("boxes_3d")  # they tell what moved
     entries = {key: _entries(key, sample[key], lead) for key in wanted if sample.get(key) is not None}
     entries |= {key: _names(key, sample[key], lead) for key in names if sample.get(key) is not None}
-    return [
-        _with_entries(frame, {key: of_frames[k] for key, of_frames in entries.items()}, sample, index, warn)
-        for k, (frame, index) in enumerate(zip(frames, np.ndindex(*lead), strict=True))
-    ]
-
-
-def _with_entries(
-    frame: Frame, entries: dict[str, Any], sample: Mapping[str, Any], index: tuple[int, ...], warn: Warn | None
-) -> Frame:
-    """The frame with its entries of a sample, at an ``index`` into the leading dimensions."""
-    depth = {key: entries.pop(key) for key in DEPTH_KEYS if key in entries}
-    others = entries.pop("neighbours", None)
-    points, boxes = entries.pop("points", None), entries.pop("boxes_3d", None)
-    frame = replace(frame, points=points, boxes=boxes, depth=depth, further=entries)
-    if others is None:
-        return frame
-    return replace(frame, neighbours=read_neighbours(frame, others, sample, index, warn or WarnOnce()))
-
-
-def _check_needs(sample: Mapping[str, Any], geometry: str, needs: str | None) -> None:
-    """SampleError for a sample that lacks what the geometry needs; only moved cameras need depth from motion."""
-    if needs in (None, "motion"):
-        return
-    key, expected = _SAMPLE_KEYS.get(needs, needs), _EXPECTED.get(needs, f"{needs!r} in the sample, got none")
-    if sample.get(key) is None and (needs != "points" or sample.get("depth_m") is None):
-        raise SampleError(f"geometry={geometry!r}: expected {expected}{hint(sample, (key,))}")
+    for k, (frame, index) in enumerate(zip(frames, places, strict=True)):
+        found = {key: of_frames[k] for key, of_frames in entries.items()}
+        depth = {key: found.pop(key) for key in DEPTH_KEYS if key in found}
+        others, points, boxes = (found.pop(key, None) for key in ("neighbours", "points", "boxes_3d"))
+        frame = replace(frame, points=points, boxes=boxes, depth=depth, further=found)
+        if others is not None:
+            frame = replace(frame, neighbours=read_neighbours(frame, others, sample, index, warn or WarnOnce()))
+        frames[k] = frame
+    return frames
 
 
 def _entries(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
@@ -141,13 +128,12 @@ def _entries(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
             return [entry(value, lead, index) for index in np.ndindex(*lead)]
         except (AttributeError, TypeError, ValueError, RuntimeError) as error:
             raise SampleError(f"{key}: expected one map (H, W) for each image ({error})") from None
-    count = math.prod(lead)
+    count, is_list = math.prod(lead), isinstance(value, list | tuple)
     if not lead:
         return [value]
-    if isinstance(value, list | tuple):
-        if len(value) == count:
-            return list(value)
-    elif tuple(getattr(value, "shape", ()))[: len(lead)] == lead:
+    if is_list and len(value) == count:
+        return list(value)
+    if not is_list and tuple(getattr(value, "shape", ()))[: len(lead)] == lead:
         return [value[index] for index in np.ndindex(*lead)]
     got = f"shape {tuple(value.shape)}" if hasattr(value, "shape") else type(value).__name__
     raise SampleError(f"{key}: expected a tensor {lead} + (n, ...), or a list of {count} of them, got {got}")
@@ -155,12 +141,11 @@ def _entries(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
 
 def _names(key: str, value: Any, lead: tuple[int, ...]) -> list[str]:
     """The name of each frame."""
-    count, names = math.prod(lead), [value]
-    if lead:
-        is_whole = isinstance(value, torch.Tensor) and value.numel() and value.numel() % count == 0
-        names = list(value.reshape(count, -1)) if is_whole else value
-        if not isinstance(names, list | tuple) or len(names) != count:
-            raise SampleError(f"{key}: expected a name for each of {count} frames, got {type(names).__name__}")
+    count = math.prod(lead)
+    is_whole = isinstance(value, torch.Tensor) and value.numel() and value.numel() % count == 0
+    names = [value] if not lead else list(value.reshape(count, -1)) if is_whole else value
+    if not isinstance(names, list | tuple) or len(names) != count:
+        raise SampleError(f"{key}: expected a name for each of {count} frames, got {type(names).__name__}")
     return [", ".join(map(str, names_in(key, name))) for name in names]
 
 
@@ -201,12 +186,6 @@ def _depth_maps(key: str, frame: Frame) -> list[DepthMap]:
 
 
 # --- other keys -------------------------------------------------------------------------------------------------------
-PROJECTION_KEYS = (
-    *("lidar2img", "lidar2image", "ego2img", "global2img", "world2img"),
-    *("projection", "projection_mat", "projection_matrix", "proj_mat", "P", "P2"),
-)
-"""Keys that are functions of intrinsics and poses."""
-
 PIXEL_BOUND_KEYS = (
     *("boxes_2d", "boxes2d", "bboxes_2d", "bboxes2d", "gt_boxes_2d", "gt_bboxes_2d", "gt_bboxes"),
     *("labels_2d", "labels2d", "centers_2d", "centers2d"),
@@ -214,17 +193,15 @@ PIXEL_BOUND_KEYS = (
     *("source_camera", "source_frame", "confidence", "generated", "sources"),
     *("img_metas", "img_aug_matrix", "post_rots", "post_trans"),
     *USUAL_NAMES["K"],
-    *PROJECTION_KEYS,
+    *("lidar2img", "lidar2image", "ego2img", "global2img", "world2img"),
+    *("projection", "projection_mat", "projection_matrix", "proj_mat", "P", "P2"),
 )
 """Keys bound to the source's pixels; they are dropped, as they would be stale in the target's views."""
 
-POSE_KEYS = (
+CAMERA_KEYS = (
     *USUAL_NAMES["cam2ego"],
     *("ego2cam", "lidar2cam", "lidar2camera", "cam2lidar", "camera2lidar"),
     *("cam2global", "global2cam", "cam2world", "world2cam"),
-)
-CAMERA_KEYS = (
-    *POSE_KEYS,
     *("distortions", "dist_coeffs", "distortion_coeffs", "distortion_coefficients", "img_filename"),
 )
 """Keys that speak of the source's cameras; they would be stale, too."""
@@ -260,8 +237,7 @@ def check_other_keys(
     for key, value in sample.items():
         if key in (*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *EGO_KEYS, *labels, *pass_keys):
             continue
-        first = value[0] if isinstance(value, list | tuple) and value else value
-        if _tv_tensor(first) == "Mask":
+        if _tv_tensor(value[0] if isinstance(value, list | tuple) and value else value) == "Mask":
             labels.append(key)
             continue
         for leaf in _leaves(value):
@@ -281,7 +257,7 @@ def _stale_map(key: Any, value: Any, leaf: Any, images: Any) -> str:
     """Say what a leaf of an entry is, which has the images' height and width, and what to do with it."""
     shape = tuple(leaf.shape)
     image = images[0] if isinstance(images, list | tuple) else images
-    is_nested = leaf is not value and not (isinstance(value, list | tuple) and any(leaf is one for one in value))
+    is_nested = leaf is not value and not (isinstance(value, list | tuple) and any(leaf is part for part in value))
     has_colours = shape[-3:-2] == (3,) and (len(shape) > 3 or leaf is not value)  # not the maps of three cameras
     if has_colours and str(getattr(leaf, "dtype", "")).removeprefix("torch.") == str(image.dtype)[len("torch.") :]:
         label = "" if is_nested else f"; if they are label maps, name them in SampleKeys(labels=({key!r},))"
@@ -297,8 +273,7 @@ def _stale_map(key: Any, value: Any, leaf: Any, images: Any) -> str:
 
 
 def _tv_tensor(value: Any) -> str:
-    kind = type(value)
-    return kind.__name__ if kind.__module__.startswith("torchvision.tv_tensors") else ""
+    return type(value).__name__ if type(value).__module__.startswith("torchvision.tv_tensors") else ""
 
 
 def _leaves(value: Any) -> Iterator[Any]:

@@ -76,7 +76,7 @@ def label_findings(
     ego2world: FloatArray | None,
 ) -> list[Finding]:
     """Mistakes in boxes and points; ``images`` (3, H, W) tell the points' frame, if there are any."""
-    findings = []
+    findings: list[Finding] = []
     for key, rows in (("boxes_3d", boxes), ("points", points)):
         nearest_m = np.inf if rows is None else np.hypot(rows[:, 0], rows[:, 1]).min(initial=np.inf)
         if ELSEWHERE_M < nearest_m < np.inf:
@@ -103,9 +103,15 @@ def label_findings(
         single = _order_finding(boxes, objects) or (objects is not None and _size_finding(boxes, objects))
         single = single or _elsewhere(rig, boxes, objects, ego2world, is_sure)
         findings += [single] if single else _box_findings(rig, boxes, objects)
-    if road_m is not None and abs(road_m - rig.ground_z_m) > ROAD_M:
-        findings.append(_road_finding(rig, boxes, road_m))
-    return findings
+    if road_m is None or abs(road_m - rig.ground_z_m) <= ROAD_M:
+        return findings
+    seen, bottoms = f"{road_m:+.2f} in the points", None if boxes is None else _bottoms_m(rig, boxes)
+    is_level = bottoms is None or abs(float(np.median(bottoms[0]))) < ROAD_M * 2
+    if road_m - rig.ground_z_m < -_LIDAR_HEIGHT_M and is_level:
+        expected = f"the road at z = {rig.ground_z_m:+.2f} m, as ground_z_m says"
+        return [*findings, Finding("points", expected, seen, _OF_LIDAR)]
+    fix = f"set ground_z_m={road_m:.2f}; or, if points and boxes are in the LiDAR's frame, apply lidar2ego to both"
+    return [*findings, Finding("ground_z_m", f"the road's height, {seen}", f"{rig.ground_z_m:+.2f}", fix)]
 
 
 _FLIPS: tuple[tuple[str, FloatArray, str, str], ...] = (
@@ -234,15 +240,6 @@ def road_height_m(points: Points) -> float | None:
     return float(np.median(low)) if len(low) >= _LEAST_SECTORS else None
 
 
-def _road_finding(rig: Rig, boxes: FloatArray | None, road_m: float) -> Finding:
-    seen = f"{road_m:+.2f} in the points"
-    stand = None if boxes is None else _bottoms_m(rig, boxes)
-    if road_m - rig.ground_z_m < -_LIDAR_HEIGHT_M and (stand is None or abs(float(np.median(stand[0]))) < ROAD_M * 2):
-        return Finding("points", f"the road at z = {rig.ground_z_m:+.2f} m, as ground_z_m says", seen, _OF_LIDAR)
-    fix = f"set ground_z_m={road_m:.2f}; or, if points and boxes are in the LiDAR's frame, apply lidar2ego to both"
-    return Finding("ground_z_m", f"the road's height, {seen}", f"{rig.ground_z_m:+.2f}", fix)
-
-
 def _bottoms_m(rig: Rig, boxes: FloatArray) -> tuple[FloatArray, FloatArray] | None:
     """Heights (n,) of the near boxes' bottoms over the road, and the boxes' own; None where there are too few."""
     near = boxes[np.hypot(boxes[:, 0], boxes[:, 1]) < _NEAR_M]
@@ -280,7 +277,7 @@ def _size_finding(boxes: FloatArray, objects: Points) -> Finding | None:
         speak = whole >= 4 * _LEAST_POINTS
         return float(np.median(of[speak] / whole[speak])) if speak.sum() >= _LEAST_WINS else np.nan
 
-    inner, held, double, beyond = (_counts(boxes * ([1] * 3 + [k] * 3 + [1]), objects) for k in (0.55, 1.0, 2.0, 2.6))
+    inner, inside, double, beyond = (_counts(boxes * ([1] * 3 + [k] * 3 + [1]), objects) for k in (0.55, 1.0, 2.0, 2.6))
     expected, seen = "whole lengths, widths and heights", "the size of what the points show"
     if share(beyond, double) < _ALONE:
         lift = np.array([0, 0, 0.5, 0, 0, 0, 0]) * boxes[:, 5:6]
@@ -288,7 +285,7 @@ def _size_finding(boxes: FloatArray, objects: Points) -> Finding | None:
         if max(share(_counts(other, objects), double) for other in others) < _HALVES:
             fix = "are they extents from the centre? Double them"
             return Finding("boxes_3d", expected, f"half {seen}", fix)
-    if share(inner, held) > _TWICE:
+    if share(inner, inside) > _TWICE:
         return Finding("boxes_3d", expected, f"twice {seen}", "halve them")
     return None
 
@@ -319,18 +316,19 @@ def _order_finding(boxes: FloatArray, objects: Points | None) -> Finding | None:
     return Finding("boxes_3d", expected, seen, "is it width, length, height? Swap columns 3 and 4")
 
 
-def _informative(one: FloatArray, two: FloatArray) -> Any:
+def _informative(boxes: FloatArray, others: FloatArray) -> Any:
     """Boxes (B,) bool of which two readings clearly differ: not square, and not turned by half a turn."""
-    sides = np.sort(one[:, 3:5], axis=1)
-    quarter = np.where(one[:, 3] == two[:, 3], 0.0, math.pi / 2)  # sides were swapped
-    apart = np.abs((two[:, 6] - one[:, 6] + quarter + math.pi / 2) % math.pi - math.pi / 2)
+    sides = np.sort(boxes[:, 3:5], axis=1)
+    quarter = np.where(boxes[:, 3] == others[:, 3], 0.0, math.pi / 2)  # sides were swapped
+    apart = np.abs((others[:, 6] - boxes[:, 6] + quarter + math.pi / 2) % math.pi - math.pi / 2)
     return (sides[:, 1] > 1.5 * sides[:, 0]) & (apart > math.radians(15))
 
 
-def _lead(one: FloatArray, two: FloatArray, objects: Points, which: Any = slice(None)) -> int:
+def _lead(boxes: FloatArray, rivals: FloatArray, objects: Points, which: Any = slice(None)) -> int:
     """By how many points one reading of the boxes holds more than another, if it clearly does; else 0."""
-    counts, others = _counts(one[which], objects), _counts(two[which], objects)
-    wins, losses = _wins(counts, others), _wins(others, counts)
+    counts, others = _counts(boxes[which], objects), _counts(rivals[which], objects)
+    pairs = (counts, others), (others, counts)
+    wins, losses = (((more >= _LEAST_POINTS) & (more > _BETTER * fewer)).sum() for more, fewer in pairs)
     if wins < _LEAST_WINS or wins < _WIN_RATIO * losses:
         return 0
     return max(0, int((counts.clip(max=_MOST_POINTS) - others.clip(max=_MOST_POINTS)).sum()))
@@ -338,8 +336,3 @@ def _lead(one: FloatArray, two: FloatArray, objects: Points, which: Any = slice(
 
 def _counts(boxes: FloatArray, points: Points) -> FloatArray:
     return np.array([len(inside) for inside in points_in(boxes, points)], np.float64)
-
-
-def _wins(counts: FloatArray, others: FloatArray) -> int:
-    """The number of boxes with clearly more points."""
-    return int(((counts >= _LEAST_POINTS) & (counts > _BETTER * others)).sum())

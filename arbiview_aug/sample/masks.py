@@ -67,7 +67,7 @@ def image_circle(camera: Camera, image: torch.Tensor) -> Circle | None:
     if camera.is_rectilinear:
         return None
     image = image.detach().amax(dim=0).cpu()
-    brightest = image.numpy() if image.dtype == torch.uint8 else (image.float() * 255).to(torch.uint8).numpy()
+    brightest = (image if image.dtype == torch.uint8 else (image.float() * 255).to(torch.uint8)).numpy()
     h, w = camera.size
     scale = min(1.0, _SIDE_PX / max(h, w))
     small = cv2.resize(brightest, (max(1, round(w * scale)), max(1, round(h * scale))), interpolation=cv2.INTER_AREA)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,13 +59,22 @@ def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
         Finding(wrong, f"the name {meant!r}", "a key that is not read", f"did you mean {meant}? Rename it")
         for wrong, meant in misnamed_keys(sample, source is not None or sample.get("rig") is not None).items()
     ]
-    findings += _depth_findings(sample.get("depth_m"))
+    depth_m = sample.get("depth_m")
+    maps = depth_m if isinstance(depth_m, list | tuple) else [] if depth_m is None else [depth_m]
+    arrays = [as_array("depth_m", depth) for depth in maps]
+    nearest_m = min((float(array[array > 0].min(initial=np.inf)) for array in arrays), default=np.inf)
+    if ELSEWHERE_M < nearest_m < np.inf:
+        found = f"the nearest pixel {nearest_m:.0f} m away"
+        findings.append(Finding("depth_m", "metres, 0 where unknown", found, "is it in millimetres? Divide by 1000"))
     # Holes of an earlier retargeting are masks too, of any shape.
     is_recorded = sample.get("coverage") is None
     for frame in frames:
         of_rig = check_rig(frame.rig, masks=is_recorded and sample.get("ego_mask") is None)
         findings += of_rig
-        findings += _image_findings(frame)
+        for camera, circle in dark_rims(frame.rig, frame.images):
+            expected = "a mask that hides the dark rim around the image circle"
+            found = f"no mask, and {1 - circle.holds(camera).mean():.0%} of the image that would be read as scene"
+            findings.append(Finding(f"camera {camera.name!r}: image", expected, found, f"mask it: {CLEANING}"))
         boxes = None if frame.boxes is None else checked_boxes(as_array("boxes_3d", frame.boxes))
         points = None if frame.points is None else checked_points(as_array("points", frame.points))
         # Images tell nothing through poses that are all wrong.
@@ -81,14 +90,10 @@ def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
 
 def check_own_car(frames: Sequence[Frame]) -> list[Finding]:
     """Cameras of one moving vehicle that see it, in frames that know their poses."""
-    first = frames[0].rig
+    first, rigs = frames[0].rig, [frame.rig for frame in frames]
     poses = [pose for frame in frames if (pose := _pose(frame)) is not None]
-    same = all(
-        frame.rig.names == first.names
-        and frame.rig.sizes == first.sizes
-        and np.allclose(frame.rig.cam2ego, first.cam2ego, atol=_MOVED)
-        for frame in frames
-    )
+    same = all(rig.names == first.names and rig.sizes == first.sizes for rig in rigs)
+    same = same and all(np.allclose(rig.cam2ego, first.cam2ego, atol=_MOVED) for rig in rigs)
     findings = []
     for k, camera in enumerate(first if same and len(poses) == len(frames) >= _LEAST_FRAMES else ()):
         images = [frame.images[k] for frame in frames]
@@ -122,22 +127,3 @@ def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
             share = f"{hidden:.0%} of the image" if hidden > _MOST_HIDDEN else f"{upper:.0%} of the upper third"
             findings.append(Finding(where, "True on the scene", f"{share} hidden", "pass ~mask"))
     return findings
-
-
-def _image_findings(frame: Frame) -> Iterator[Finding]:
-    for camera, circle in dark_rims(frame.rig, frame.images):
-        yield Finding(
-            f"camera {camera.name!r}: image",
-            "a mask that hides the dark rim around the image circle",
-            f"no mask, and {1 - circle.holds(camera).mean():.0%} of the image that would be read as scene",
-            f"mask it: {CLEANING}",
-        )
-
-
-def _depth_findings(depth_m: Any) -> Iterator[Finding]:
-    maps = depth_m if isinstance(depth_m, list | tuple) else [] if depth_m is None else [depth_m]
-    arrays = [as_array("depth_m", one) for one in maps]
-    nearest_m = min((float(array[array > 0].min(initial=np.inf)) for array in arrays), default=np.inf)
-    if ELSEWHERE_M < nearest_m < np.inf:
-        found = f"the nearest pixel {nearest_m:.0f} m away"
-        yield Finding("depth_m", "metres, 0 where unknown", found, "is it in millimetres? Divide by 1000")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
@@ -21,25 +22,17 @@ from arbiview_aug.scene.boxes import checked_boxes, moved_by, points_in
 from arbiview_aug.scene.surface import Points
 
 MAX_NEIGHBOURS = 120  # frame numbers are int8
-
-STILL_M, STILL_DEG = 0.1, 0.5
-"""A frame with less motion than this sees what the current one sees."""
-
+STILL_M, STILL_DEG = 0.1, 0.5  # a frame with less motion than this sees what the current one sees
 MAX_SWEEPS = 2
 """Nearest neighbours that lend their LiDAR points: four win 0.1 dB on synthetic streets, in twice the time."""
 
-MAX_TRAVEL_M = 60.0
-"""Largest distance to a neighbour: farther on, none of the ground nearby is in view."""
-
+MAX_TRAVEL_M = 60.0  # largest distance to a neighbour: farther on, none of the ground nearby is in view
 MAX_SPEED_MPS = 80.0
-MAX_TILT_DEG = 6.0
-"""Largest angle between two roads that share one plane: ramps have 5 degrees."""
-
+MAX_TILT_DEG = 6.0  # largest angle between two roads that share one plane: ramps have 5 degrees
 _MAX_MOUNTING_M, _MAX_MOUNTING_DEG = 1.5, 10.0
 """Largest change of a camera's pose; allows for ego motion between exposures."""
 
-Warn = Callable[[str, str], None]
-"""Warns of a topic with a message, once per topic."""
+Warn = Callable[[str, str], None]  # warns of a topic with a message, once per topic
 
 
 def read_neighbours(
@@ -65,29 +58,24 @@ def read_neighbours(
         token = entry.get("token") if isinstance(entry, Mapping) else None
         name = str(number) if token is None else shown(token)
         try:
-            neighbour = _neighbour(frame, boxes, entry, sample, index, number, name)
+            neighbours.append(_neighbour(frame, boxes, entry, sample, index, number, name))
         except (ArbiviewError, OSError) as error:
             _warn_lost(warn, name, error)
-            continue
-        if neighbour is not None:
-            neighbours.append(neighbour)
-    return tuple(sorted(neighbours, key=lambda neighbour: (neighbour.travel_m, neighbour.ahead_m)))
+    moved = [neighbour for neighbour in neighbours if neighbour is not None]
+    return tuple(sorted(moved, key=lambda neighbour: (neighbour.travel_m, neighbour.ahead_m)))
 
 
 def points_of_neighbours(frame: Frame, warn: Warn) -> list[FloatArray]:
     """Points (P, C) of a frame's neighbours in its ego frame, metres: an array for each that has some.
 
-    Points that the frame's own contradict are left out, and points that cannot be read, with a warning.
+    Points that the frame's points contradict are left out, and points that cannot be read, with a warning.
     """
     sweeps = list[FloatArray]()
     for neighbour in (frame.neighbours or ())[:MAX_SWEEPS]:
         try:
-            sweep = neighbour.sweep
+            sweeps += [] if neighbour.sweep is None else [neighbour.sweep]
         except (ArbiviewError, OSError) as error:
             warn(f"points of {neighbour.name}", f"points of neighbour {neighbour.name} are left out: {error}")
-            continue
-        if sweep is not None:
-            sweeps.append(sweep)
     return sweeps
 
 
@@ -106,52 +94,52 @@ def _warn_lost(warn: Warn, name: str, error: Exception) -> None:
 
 
 def _neighbour(
-    frame: Frame,
-    current: Points | None,
-    entry: Any,
-    sample: Mapping[str, Any],
-    index: tuple[int, ...],
-    number: int,
-    name: str,
+    frame: Frame, current: Points | None, entry: Any, sample: Mapping[str, Any], index: Any, number: int, name: str
 ) -> Neighbour | None:
     if not isinstance(entry, Mapping):
         raise SampleTypeError(f"expected a mapping with images and a pose, got {type(entry).__name__}")
-    ego2ego = _ego2ego(sample, index, entry)
+    if entry.get("ego2ego") is not None:
+        ego2ego = _pose("ego2ego", entry["ego2ego"])
+    else:
+        missing = [where for where, keys in (("it", entry), ("the sample", sample)) if keys.get("ego2world") is None]
+        if missing:
+            raise SampleError(f"expected ego2ego (4, 4), or ego2world here and in the sample; {missing[-1]} has none")
+        here, there = _pose("ego2world", sample["ego2world"], index), _pose("ego2world", entry["ego2world"])
+        ego2ego = np.asarray(np.linalg.solve(here, there), np.float64)
     travel_m, turned_deg = float(np.linalg.norm(ego2ego[:3, 3])), _angle_deg(ego2ego[:3, :3])
-    seconds = _seconds(sample, index, entry)
-    _check_motion(ego2ego, travel_m, seconds)
+    seconds = _checked_seconds(sample, index, entry, ego2ego, travel_m)
     if travel_m < STILL_M and turned_deg < STILL_DEG:
         return None
-    own_rig = _own_rig(frame, entry)
-    _check_same_vehicle(frame.rig, own_rig)
-    cameras = [camera.moved(ego2ego) for camera in own_rig]
+    cameras = [camera.moved(ego2ego) for camera in _checked_rig(frame, entry)]
     rig = Rig(cameras, ground_z_m=frame.rig.ground_z_m, name=f"{frame.rig.name} {name}".strip())
     now, then = _boxes(current, entry, ego2ego, seconds)
     return Neighbour(number, name, rig, travel_m, float(ego2ego[0, 3]), seconds, then, now, ego2ego, entry, frame)
 
 
-def _own_rig(frame: Frame, entry: Mapping[str, Any]) -> Rig:
-    """Its cameras in its own ego frame; the current images stand for its own, which are read lazily."""
-    if entry.get("rig") is not None or (entry.get("K") is None and entry.get("cam2ego") is None):
-        return read_rig(frame.images, entry, frame.rig)
-    if entry.get("K") is None:
-        entry = {**entry, "K": frame.rig.K}
+def _checked_rig(frame: Frame, entry: Mapping[str, Any]) -> Rig:
+    """The neighbour's cameras in its ego frame, refused if they are another vehicle's.
+
+    The current images stand for the neighbour's, which are read lazily.
+    """
+    given, is_whole = entry, entry.get("rig") is not None or (entry.get("K") is None and entry.get("cam2ego") is None)
+    if entry.get("K") is None and not is_whole:
+        given = {**entry, "K": frame.rig.K}
     cameras = []
-    for camera, now in zip(read_rig(frame.images, entry, None), frame.rig, strict=True):
-        of_lens = camera if entry.get("lens") is not None else now
-        mask = now.mask if camera.mask is None else camera.mask
-        cameras.append(replace(camera, name=now.name, lens=of_lens.lens, distortion=of_lens.distortion, mask=mask))
+    for other, camera in zip(read_rig(frame.images, given, frame.rig if is_whole else None), frame.rig, strict=True):
+        if not is_whole:
+            lens, mask = other if entry.get("lens") is not None else camera, other.mask
+            mask = camera.mask if mask is None else mask
+            other = replace(other, name=camera.name, lens=lens.lens, distortion=lens.distortion, mask=mask)
+        scale = float(np.abs(other.K - camera.K).max()) / camera.width_px
+        if other.lens != camera.lens or scale > 0.02:
+            raise SampleError(f"camera {camera.name!r}: expected the current frame's lens and K, got another rig's")
+        shift_m = float(np.linalg.norm(other.center_m - camera.center_m))
+        turned_deg = _angle_deg(other.cam2ego[:3, :3] @ camera.cam2ego[:3, :3].T)
+        if shift_m > _MAX_MOUNTING_M or turned_deg > _MAX_MOUNTING_DEG:
+            got = f"a pose {shift_m:.2f} m and {turned_deg:.1f} degrees away"
+            raise SampleError(f"camera {camera.name!r}: expected the current frame's mounting, got {got}; another rig?")
+        cameras.append(other)
     return frame.rig.with_cameras(cameras)
-
-
-def _ego2ego(sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[str, Any]) -> FloatArray:
-    if entry.get("ego2ego") is not None:
-        return _pose("ego2ego", entry["ego2ego"])
-    missing = [where for where, of in (("it", entry), ("the sample", sample)) if of.get("ego2world") is None]
-    if missing:
-        raise SampleError(f"expected ego2ego (4, 4), or ego2world here and in the sample; {missing[-1]} has none")
-    here, there = _pose("ego2world", sample["ego2world"], index), _pose("ego2world", entry["ego2world"])
-    return np.asarray(np.linalg.solve(here, there), np.float64)
 
 
 def _pose(key: str, value: Any, index: tuple[int, ...] = ()) -> FloatArray:
@@ -164,40 +152,26 @@ def _pose(key: str, value: Any, index: tuple[int, ...] = ()) -> FloatArray:
     return pose
 
 
-def _seconds(sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[str, Any]) -> float | None:
-    """Time from the current frame to this one; None if either has no time."""
-    if sample.get("time_s") is None or entry.get("time_s") is None:
-        return None
-    here, there = numbers("time_s", sample["time_s"], index), numbers("time_s", entry["time_s"])
-    if here.size != 1 or there.size != 1 or not np.isfinite([here.item(), there.item()]).all():
-        raise SampleError("time_s: expected one finite number of seconds, here and in the sample")
-    return float(there.item() - here.item())
-
-
-def _check_motion(ego2ego: FloatArray, travel_m: float, seconds: float | None) -> None:
-    """Refuse poses that no drive has."""
+def _checked_seconds(
+    sample: Mapping[str, Any], index: tuple[int, ...], entry: Mapping[str, Any], ego2ego: FloatArray, travel_m: float
+) -> float | None:
+    """Time from the current frame to this one, None if either has no time; poses that no drive has are refused."""
+    seconds = None
+    if sample.get("time_s") is not None and entry.get("time_s") is not None:
+        here, there = numbers("time_s", sample["time_s"], index), numbers("time_s", entry["time_s"])
+        if here.size != 1 or there.size != 1 or not np.isfinite([here.item(), there.item()]).all():
+            raise SampleError("time_s: expected one finite number of seconds, here and in the sample")
+        seconds = float(there.item() - here.item())
     if travel_m > MAX_TRAVEL_M:
         raise SampleError(f"ego2ego: expected at most {MAX_TRAVEL_M:g} m of travel, got {travel_m:.1f} m; check poses")
-    tilt_deg = float(np.degrees(np.arccos(np.clip(ego2ego[2, 2], -1, 1))))
-    climb_m = abs(float(ego2ego[2, 3]))
+    tilt_deg, climb_m = math.degrees(math.acos(np.clip(ego2ego[2, 2], -1, 1))), abs(float(ego2ego[2, 3]))
     if tilt_deg > MAX_TILT_DEG or climb_m > travel_m * np.sin(np.radians(2 * MAX_TILT_DEG)) + STILL_M:
         got = f"a tilt of {tilt_deg:.1f} degrees and {climb_m:.2f} m of climb"
         raise SampleError(f"ego2ego: expected both frames on one road plane, got {got}; check poses")
     if seconds is not None and travel_m > MAX_SPEED_MPS * abs(seconds) + STILL_M:
         got = f"{travel_m:.1f} m in {seconds:g} s"
         raise SampleError(f"time_s: expected at most {MAX_SPEED_MPS:g} m/s, got {got}; check poses and clock")
-
-
-def _check_same_vehicle(rig: Rig, neighbour_rig: Rig) -> None:
-    for camera, other in zip(rig, neighbour_rig, strict=True):
-        scale = float(np.abs(other.K - camera.K).max()) / camera.width_px
-        if other.lens != camera.lens or scale > 0.02:
-            raise SampleError(f"camera {camera.name!r}: expected the current frame's lens and K, got another rig's")
-        shift_m = float(np.linalg.norm(other.center_m - camera.center_m))
-        turned_deg = _angle_deg(other.cam2ego[:3, :3] @ camera.cam2ego[:3, :3].T)
-        if shift_m > _MAX_MOUNTING_M or turned_deg > _MAX_MOUNTING_DEG:
-            got = f"a pose {shift_m:.2f} m and {turned_deg:.1f} degrees away"
-            raise SampleError(f"camera {camera.name!r}: expected the current frame's mounting, got {got}; another rig?")
+    return seconds
 
 
 def _angle_deg(R: FloatArray) -> float:
@@ -213,22 +187,16 @@ def _boxes(
         return now, moved_by(checked_boxes(numbers("boxes_3d", entry["boxes_3d"])), ego2ego)
     if now is None or current is None or seconds is None or current.shape[-1] < 9:
         return now, None
-    velocity_mps = current.reshape(-1, current.shape[-1])[:, 7:9]
-    if not np.isfinite(velocity_mps).all():  # nuScenes marks unknown velocities by NaN
-        return now, None
     then = now.copy()
-    then[:, :2] += velocity_mps * seconds
-    return now, then
+    then[:, :2] += current.reshape(-1, current.shape[-1])[:, 7:9] * seconds
+    return now, then if np.isfinite(then).all() else None  # nuScenes marks unknown velocities by NaN
 
 
-BOX_MARGIN_M = 0.4
-"""Margin around labelled objects: contact shadows and mirrors move with them."""
-
+BOX_MARGIN_M = 0.4  # margin around labelled objects: contact shadows and mirrors move with them
 _SHADOW_REACH, _CONTACT_REACH = 1.3, 0.3
 """Length of an object's shadow (sun at 38 degrees) and of its contact shadow, as multiples of its height."""
 
-_BELOW_M = 0.5
-"""Depth below a box in which its shadow is sought: labels may float above the road."""
+_BELOW_M = 0.5  # depth below a box in which its shadow is sought: labels may float above the road
 
 
 class ChangeRisk(IntEnum):

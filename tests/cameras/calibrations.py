@@ -38,9 +38,7 @@ camera_name: front
 camera_matrix:
   rows: 3
   cols: 3
-  data: [536.57137, 0.     , 315.05552,
-           0.     , 537.71384, 241.03827,
-           0.     , 0.     , 1.     ]
+  data: [536.57137, 0.     , 315.05552, 0.     , 537.71384, 241.03827, 0.     , 0.     , 1.     ]
 distortion_model: plumb_bob
 distortion_coefficients:
   rows: 1
@@ -60,9 +58,7 @@ transforms:
     stamp: {sec: 1700000000, nanosec: 84372815}
     frame_id: base_link
   child_frame_id: front_link
-  transform:
-    translation: {x: 1.5, y: 0.2, z: 1.6}
-    rotation: {x: 0.0, y: 0.0, z: 0.0, w: 1.0}
+  transform: {translation: {x: 1.5, y: 0.2, z: 1.6}, rotation: {x: 0.0, y: 0.0, z: 0.0, w: 1.0}}
 - header: {frame_id: front_link}
   child_frame_id: front_optical_frame
   transform: {translation: {x: 0.0, y: 0.0, z: 0.0}, rotation: {x: -0.5, y: 0.5, z: -0.5, w: 0.5}}
@@ -82,12 +78,7 @@ header:
 height: 480
 width: 640
 distortion_model: plumb_bob
-d:
-- -0.271482
-- 0.107643
-- -0.000164
-- -0.005099
-- 0.0
+d: [-0.271482, 0.107643, -0.000164, -0.005099, 0.0]
 k: [536.57137, 0.0, 315.05552, 0.0, 537.71384, 241.03827, 0.0, 0.0, 1.0]
 r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 p: [487.19293, 0.0, 312.29617, 0.0, 0.0, 515.41675, 240.47823, 0.0, 0.0, 0.0, 1.0, 0.0]
@@ -104,21 +95,17 @@ OPENCV_YAML = """\
 calibration_time: "Thu Jan 30 14:43:57 2020"
 image_width: 1920
 image_height: 1080
-board_width: 4
 square_size: 2.5000000000000000e-01
-flags: 0
 camera_matrix: !!opencv-matrix
    rows: 3
    cols: 3
    dt: d
-   data: [ 1.3704890781669139e+03, 0., 9.4620086455694741e+02, 0.,
-       1.3711542706267094e+03, 5.4099755744500317e+02, 0., 0., 1. ]
+   data: [ 1370.4890781669139, 0., 946.20086455694741, 0., 1.3711542706267094e+03, 540.99755744500317, 0., 0., 1. ]
 distortion_coefficients: !!opencv-matrix
    rows: 5
    cols: 1
    dt: d
-   data: [ 9.5598544598107946e-02, 1.5574125902392638e-01,
-       6.2864630028885743e-04, -4.7488130423597530e-03,
+   data: [ 9.5598544598107946e-02, 1.5574125902392638e-01, 6.2864630028885743e-04, -4.7488130423597530e-03,
        -8.3628840603895049e-01 ]
 avg_reprojection_error: 4.7184727361967016e-01
 """
@@ -148,11 +135,7 @@ cam0:
   resolution: [1440, 1080]
   rostopic: /fisheye_left/image_raw
 cam1:
-  T_cn_cnm1:
-  - [1.0, 0.0, 0.0, -0.2]
-  - [0.0, 1.0, 0.0, 0.0]
-  - [0.0, 0.0, 1.0, 0.0]
-  - [0.0, 0.0, 0.0, 1.0]
+  T_cn_cnm1: [[1.0, 0.0, 0.0, -0.2], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
   camera_model: eucm
   distortion_coeffs: []
   distortion_model: none
@@ -170,14 +153,11 @@ cam2:
 
 CAMERAS_TXT = """\
 # Camera list with one line of data per camera:
-#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]
 1 OPENCV_FISHEYE 1504 2048 1067.118 1067.118 765.52792 1027.072215 0.00372 -0.00331 0.00167 -0.00032
 2 SIMPLE_RADIAL 640 480 500.5 320 240 -0.05
 """
 IMAGES_TXT = """\
 # Image list with two lines of data per image:
-#   IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME
-#   POINTS2D[] as (X, Y, POINT3D_ID)
 1 1 0 0 0 0 0 0 1 front/0001.jpg
 2362.39 248.498 58396 1784.7 268.254 59027
 2 0.7071067811865476 0 0.7071067811865475 0 0 0 -2 2 left/0001.jpg

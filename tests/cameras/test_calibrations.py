@@ -38,6 +38,12 @@ from tests.cameras.calibrations import (
 from tests.helpers import camera
 
 
+def refused(rig: Any, message: str) -> None:
+    """``load_rig`` of a path, or a call, refuses with a message."""
+    with pytest.raises(CalibrationError, match=message):
+        rig() if callable(rig) else load_rig(rig)
+
+
 def test_ros_camera_info_with_tf(tmp_path: Path) -> None:
     rig = load_rig(written(tmp_path, front__yaml=CAMERA_INFO, left__yaml=FISHEYE_INFO, tf_static__yaml=TF_STATIC))
     assert rig.names == ["front", "left"] and rig.ground_z_m == 0
@@ -45,19 +51,13 @@ def test_ros_camera_info_with_tf(tmp_path: Path) -> None:
     assert (front.lens, front.distortion) == ("radtan", (-0.271482, 0.107643, -0.000164, -0.005099, 0.0))
     assert (left.lens, left.distortion) == ("fisheye", (-0.0123, 0.0045, -0.0031, 0.0006))
     assert front.size == (480, 640) and front.K.tolist()[0] == [536.57137, 0.0, 315.05552]  # not the projection matrix
-    np.testing.assert_allclose(front.cam2ego, FORWARD, atol=1e-12)
-    np.testing.assert_allclose(left.cam2ego, LEFT, atol=1e-12)
+    np.testing.assert_allclose(rig.cam2ego, [FORWARD, LEFT], atol=1e-12)
     assert load_rig(tmp_path / "front.yaml")[0] == front
     zeros = FISHEYE_INFO.replace("0.0006", "0.0006, 0.0, 0.0, 0.0, 0.0")
     assert load_rig(written(tmp_path, left__yaml=zeros))[1] == left
-
-
-def test_ros_camera_info_as_topic_echo_prints_it(tmp_path: Path) -> None:
-    expected = load_rig(written(tmp_path, front__yaml=CAMERA_INFO, tf_static__yaml=TF_STATIC))
-    written(tmp_path, front__yaml=CAMERA_INFO_MESSAGE)
-    assert load_rig(tmp_path) == expected == load_rig(tmp_path / "front.yaml").with_cameras(expected)
     of_ros_1 = CAMERA_INFO_MESSAGE.replace("\nd:", "\nD:").replace("\nk:", "\nK:")
-    assert load_rig(written(tmp_path, front__yaml=of_ros_1)) == expected
+    for printed in (CAMERA_INFO_MESSAGE, of_ros_1):  # by topic echo
+        assert load_rig(written(tmp_path, front__yaml=printed)) == rig
 
 
 def test_ros_has_one_ego_frame(tmp_path: Path) -> None:
@@ -66,66 +66,48 @@ def test_ros_has_one_ego_frame(tmp_path: Path) -> None:
     link = "---\ntransforms:\n- header: {{frame_id: {}}}\n  child_frame_id: {}\n  transform:\n    translation: "
     link += "{{x: 0.0, y: 0.0, z: {}}}\n    rotation: {{x: 0.0, y: 0.0, z: 0.0, w: 1.0}}\n"
     of_foot = TF_STATIC.replace("/base_link", "/base_footprint").replace("z: 1.5}", "z: 1.8}")
-    for ends in (("base_footprint", "base_link", 0.3), ("base_link", "base_footprint", -0.3)):
-        rig = load_rig(written(tmp_path, tf_static__yaml=of_foot + link.format(*ends)))
+    on_map = TF_STATIC + link.format("map", "base_footprint", 7) + link.format("base_footprint", "base_link", 0.3)
+    ends = ("base_footprint", "base_link", 0.3), ("base_link", "base_footprint", -0.3)
+    for tf in (on_map, *(of_foot + link.format(*end) for end in ends)):
+        rig = load_rig(written(tmp_path, tf_static__yaml=tf))
         np.testing.assert_allclose(rig.cam2ego, expected.cam2ego, atol=1e-12)
-        assert rig.ground_z_m == -0.3  # at base_footprint
-        assert load_rig(tmp_path / "front.yaml").ground_z_m == -0.3
+        assert rig.ground_z_m == load_rig(tmp_path / "front.yaml").ground_z_m == -0.3  # at base_footprint
     assert load_rig(written(tmp_path, mounting__yaml="ground_z_m: 0.1")).ground_z_m == 0.1  # the user's word counts
     (tmp_path / "mounting.yaml").unlink()
     assert load_rig(written(tmp_path, tf_static__yaml=TF_STATIC.replace("base_link", "base_footprint"))) == expected
-    map_above = TF_STATIC + link.format("map", "base_footprint", 7) + link.format("base_footprint", "base_link", 0.3)
-    rig = load_rig(written(tmp_path, tf_static__yaml=map_above))
-    assert rig.ground_z_m == -0.3 and np.allclose(rig.cam2ego, expected.cam2ego)
-    with pytest.raises(CalibrationError, match=r"camera 'left': where is it on the vehicle"):
-        load_rig(written(tmp_path, tf_static__yaml=of_foot))
+    refused(written(tmp_path, tf_static__yaml=of_foot), r"camera 'left': where is it on the vehicle")
+    refused(
+        written(tmp_path, tf_static__yaml=TF_STATIC.replace("base_link", "map")), "which frame is the ego .* got fro"
+    )
+    (tmp_path / "tf_static.yaml").unlink()
+    refused(
+        tmp_path, r"ROS: camera 'front': where is it on the vehicle\? Write its pose.*mounting.yaml.*tf_static.yaml"
+    )
 
 
 def test_ros_frames_with_a_bodys_axes_are_refused(tmp_path: Path) -> None:
     """A camera that looks up or down in earnest is not."""
     of_link = CAMERA_INFO_MESSAGE.replace("front_optical_frame", "front_link")
-    written(tmp_path, front__yaml=of_link, tf_static__yaml=TF_STATIC)
-    message = (
-        r"camera 'front': expected an optical frame .*, got front_link, which seems to have a body's axes .* up by "
+    body = (
+        "camera 'front': expected an optical frame .*, got front_link, which seems to have a body's axes .* up by 90 d"
     )
-    message += (
-        r"90 degrees; write frame_id: front_optical_frame to front.yaml, and add that frame, .*tf_static.yaml below"
-    )
-    with pytest.raises(CalibrationError, match=message):
-        load_rig(tmp_path)
+    fix = ".*; write frame_id: front_optical_frame to front.yaml, and add that frame, .*tf_static.yaml below"
+    refused(written(tmp_path, front__yaml=of_link, tf_static__yaml=TF_STATIC), body + fix)
     bare = TF_STATIC.replace("child_frame_id: front_link", "child_frame_id: front").replace("_optical_frame", "_lens")
     written(tmp_path, front__yaml=CAMERA_INFO, tf_static__yaml=bare)
-    with pytest.raises(
-        CalibrationError, match=r"got front, .*; add a frame front_optical_frame to tf_static.yaml below"
-    ):
-        load_rig(tmp_path)
+    refused(tmp_path, r"got front, .*; add a frame front_optical_frame to tf_static.yaml below")
     written(tmp_path, mounting__yaml=f"poses: {{front: {ROWS}}}")  # the user's word counts
     assert np.array_equal(load_rig(tmp_path)[0].cam2ego, FORWARD)
     (tmp_path / "mounting.yaml").unlink()
-    half = 2**-0.5
-    for frame, elevation_deg, (x, w) in (
-        ("front_optical_frame", 90, (0.0, 1.0)),
-        ("front_link", 45, (-np.sin(np.pi / 8), np.cos(np.pi / 8))),
-        ("front_link", 0, (-half, half)),
-        ("front_link", -90, (1.0, 0.0)),
+    for frame, elevation_deg, half_turn in (
+        *(("front_optical_frame", 90, 0), ("front_link", 45, -np.pi / 8)),
+        *(("front_link", 0, -np.pi / 4), ("front_link", -90, np.pi / 2)),
     ):
-        pose = f"{{translation: {{x: 1, y: 0, z: 2}}, rotation: {{x: {x}, y: 0, z: 0, w: {w}}}}}"
+        rotation = f"{{x: {np.sin(half_turn)}, y: 0, z: 0, w: {np.cos(half_turn)}}}"
+        pose = f"{{translation: {{x: 1, y: 0, z: 2}}, rotation: {rotation}}}"
         tf = f"transforms:\n- header: {{frame_id: base_link}}\n  child_frame_id: {frame}\n  transform: {pose}\n"
         written(tmp_path, front__yaml=of_link.replace("front_link", frame), tf_static__yaml=tf)
         assert load_rig(tmp_path)[0].elevation_deg == pytest.approx(elevation_deg, abs=1e-5)
-
-
-def test_ros_questions(tmp_path: Path) -> None:
-    written(tmp_path, front__yaml=CAMERA_INFO)
-    question = r"ROS: camera 'front': where is it on the vehicle\? Write its pose.*mounting.yaml.*tf_static.yaml"
-    with pytest.raises(CalibrationError, match=question):
-        load_rig(tmp_path)
-    written(tmp_path, tf_static__yaml=TF_STATIC.replace("base_link", "map"))
-    with pytest.raises(CalibrationError, match=r"which frame is the ego frame\? .* got front_link, map"):
-        load_rig(tmp_path)
-    written(tmp_path, tf_static__yaml=TF_STATIC, mounting__yaml=f"ground_z_m: -0.3\nposes: {{front: {LEFT.tolist()}}}")
-    rig = load_rig(tmp_path)  # the user's word counts
-    assert rig.ground_z_m == -0.3 and np.array_equal(rig[0].cam2ego, LEFT)
 
 
 # --- OpenCV, Kalibr, COLMAP -------------------------------------------------------------------------------------------
@@ -140,51 +122,36 @@ def test_opencv_file_storage(tmp_path: Path) -> None:
     storage.write("cameraMatrix", back.K)
     storage.write("distCoeffs", np.array([*back.distortion, *[0.0] * 9]))  # thin prism and tilt of zero
     storage.release()
-    with pytest.raises(CalibrationError, match=r"OpenCV: camera 'back': how large are its images\? .* sizes: "):
-        load_rig(tmp_path)
+    refused(tmp_path, r"OpenCV: camera 'back': how large are its images\? .* sizes: ")
     written(tmp_path, mounting__yaml=f"{mounting}\nsizes: {{back: {{width: 1920, height: 1080}}}}")
     again = load_rig(tmp_path)["back"]
     assert again.distortion == (*back.distortion, 0.0, 0.0, 0.0) and np.array_equal(again.K, back.K)
-    storage = cv2.FileStorage(str(tmp_path / "back.json"), cv2.FILE_STORAGE_WRITE)
-    storage.write("camera_matrix", back.K)
-    storage.write("distortion_coefficients", np.array(back.distortion))
-    storage.release()
-    (tmp_path / "back.yml").unlink()
-    assert load_rig(tmp_path)["back"] == back
 
 
 def test_kalibr_camchain(tmp_path: Path) -> None:
     path = written(tmp_path, camchain__yaml=CAMCHAIN) / "camchain.yaml"
-    question = r"Kalibr: camera 'cam0': where is it .* poses: \{cam0: .*; one camera's is enough, the others follow"
-    with pytest.raises(CalibrationError, match=question):
-        load_rig(path)
+    refused(path, r"Kalibr: camera 'cam0': where .* poses: \{cam0: .*; one camera's is enough, the others follow")
     rig = load_rig(written(tmp_path, mounting__yaml=f"poses: {{cam0: {ROWS}}}"))
     assert [c.lens for c in rig] == ["double_sphere", "eucm", "fisheye"] and rig.sizes[2] == (480, 752)
     assert rig[0].distortion == (-0.19963086, 0.59245903) and rig[0].K[0, 0] == 317.5525596
     assert rig[1].distortion == (0.6, 1.1) and rig[2].distortion == (-0.0132, 0.0501, -0.0451, 0.0124)
     # cam1 is 0.2 m to the right of cam0: its origin is at x = -0.2 in cam1's frame.
     np.testing.assert_allclose(rig[1].center_m, [1.5, 0.0, 1.6], atol=1e-12)
-    assert rig[2].azimuth_deg == pytest.approx(90) or rig[2].azimuth_deg == pytest.approx(-90)
     chain = np.array(yaml.safe_load(CAMCHAIN)["cam2"]["T_cn_cnm1"])
-    point = np.array([3.0, 0.4, 2.0, 1.0])  # of the ego frame
-    np.testing.assert_allclose(
-        np.linalg.inv(rig[2].cam2ego) @ point, chain @ np.linalg.inv(rig[1].cam2ego) @ point, atol=1e-12
-    )
+    to_cam1, to_cam2 = np.linalg.inv(rig.cam2ego[1:])
+    np.testing.assert_allclose(to_cam2, chain @ to_cam1, atol=1e-12)
     written(tmp_path, other_camchain__yaml=CAMCHAIN)
-    with pytest.raises(CalibrationError, match=r"which of camchain.yaml, other_camchain.yaml"):
-        load_rig(tmp_path)
+    refused(tmp_path, r"which of camchain.yaml, other_camchain.yaml")
     (tmp_path / "other_camchain.yaml").unlink()
     ten = yaml.safe_load(CAMCHAIN)
     ten["cam10"] = ten.pop("cam2")
-    assert load_rig(written(tmp_path, camchain__yaml=yaml.safe_dump(ten | {"cam2": ten["cam1"]}))).names[1:] == [
-        *("cam1", "cam2", "cam10")
-    ]
+    written(tmp_path, camchain__yaml=yaml.safe_dump(ten | {"cam2": ten["cam1"]}))
+    assert load_rig(tmp_path).names == ["cam0", "cam1", "cam2", "cam10"]
 
 
 def test_colmap(tmp_path: Path) -> None:
     written(tmp_path, cameras__txt=CAMERAS_TXT, images__txt=IMAGES_TXT)
-    with pytest.raises(CalibrationError, match=r"how many metres is a unit .* metres_per_unit: 1.0, poses: \{front"):
-        load_rig(tmp_path)
+    refused(tmp_path, r"how many metres is a unit .* metres_per_unit: 1.0, poses: \{front")
     rig = load_rig(written(tmp_path, mounting__yaml=COLMAP_MOUNTING) / "cameras.txt")
     front, left = rig
     assert (front.lens, left.lens, left.distortion) == ("fisheye", "radtan", (-0.05, 0.0, 0.0, 0.0))
@@ -193,17 +160,14 @@ def test_colmap(tmp_path: Path) -> None:
     # World to camera is a turn by 90 degrees about y, then 2 units back: the centre is at (-2, 0, 0) in front's frame.
     np.testing.assert_allclose(left.center_m, FORWARD[:3] @ [-2 * 0.5, 0, 0, 1], atol=1e-12)
     assert left.azimuth_deg == pytest.approx(90)
-    text = tmp_path / "text.json"
-    rig.save(text)
-    (tmp_path / "cameras.txt").unlink()
-    (tmp_path / "images.txt").unlink()
+    for file in ("cameras.txt", "images.txt"):
+        (tmp_path / file).unlink()
     colmap_binaries(tmp_path)
-    assert load_rig(tmp_path) == rig == load_rig(text)
+    assert load_rig(tmp_path) == rig
     data = (tmp_path / "images.bin").read_bytes()
     for size in (4, 40, 90, len(data) - 1):
         (tmp_path / "images.bin").write_bytes(data[:size])
-        with pytest.raises(CalibrationError, match=r"expected a calibration as COLMAP writes it"):
-            load_rig(tmp_path)
+        refused(tmp_path, r"expected a calibration as COLMAP writes it")
 
 
 def test_colmap_names_cameras_that_share_a_folder(tmp_path: Path) -> None:
@@ -211,20 +175,13 @@ def test_colmap_names_cameras_that_share_a_folder(tmp_path: Path) -> None:
     written(tmp_path, cameras__txt=CAMERAS_TXT, images__txt=folder, mounting__yaml=COLMAP_MOUNTING)
     assert load_rig(tmp_path).names == ["front", "left"]
     written(tmp_path, images__txt=folder.replace("rig/left.jpg", "rig/front.png"))
-    with pytest.raises(
-        CalibrationError, match=r"different names, got front, front: write .* images: \{front: rig/front.jpg"
-    ):
-        load_rig(tmp_path)
+    refused(tmp_path, r"different names, got front, front: write .* images: \{front: rig/front.jpg")
     written(tmp_path, mounting__yaml=f"{COLMAP_MOUNTING}\nimages: {{front: front.jpg}}")
-    with pytest.raises(CalibrationError, match=r"mounting.yaml: images: expected files that images.txt has, such as "):
-        load_rig(tmp_path)
+    refused(tmp_path, r"mounting.yaml: images: expected files that images.txt has, such as ")
 
-
-def test_colmap_asks_which_images_are_of_one_moment(tmp_path: Path) -> None:
     more = IMAGES_TXT + "3 1 0 0 0 0 0 5 1 front/0002.jpg\n\n"
     written(tmp_path, cameras__txt=CAMERAS_TXT, images__txt=more, mounting__yaml=COLMAP_MOUNTING)
-    with pytest.raises(CalibrationError, match=r"camera 1 has 2 images: which .* images: \{front: front/0001.jpg"):
-        load_rig(tmp_path)
+    refused(tmp_path, r"camera 1 has 2 images: which .* images: \{front: front/0001.jpg")
     chosen = f"{COLMAP_MOUNTING}\nimages: {{front: front/0001.jpg, side: left/0001.jpg}}"
     assert load_rig(written(tmp_path, mounting__yaml=chosen)).names == ["front", "side"]
 
@@ -233,22 +190,15 @@ POSED = f"poses: {{front: {ROWS}}}"
 ENTITY = '<!DOCTYPE a [<!ENTITY b SYSTEM "/etc/passwd">]><a>&b;</a>'
 ROS, CHAIN = {"front__yaml": CAMERA_INFO}, {"camchain__yaml": CAMCHAIN, "mounting__yaml": f"poses: {{cam0: {ROWS}}}"}
 MODEL = {"cameras__txt": CAMERAS_TXT, "images__txt": IMAGES_TXT, "mounting__yaml": COLMAP_MOUNTING}
-MESSAGE = {"front__yaml": CAMERA_INFO_MESSAGE, "mounting__yaml": POSED}
 WIDE = {"wide__xml": OPENCV_XML, "mounting__yaml": f"poses: {{wide: {ROWS}}}"}
 REFUSED_FILES: list[tuple[dict[str, str], str, str, str, str]] = [
     # Files, then the one that changes, the text in it, the new text, the message.
-    (MESSAGE, "front__yaml", "binning_y: 0", "binning_y: 2", "'front': expected full images, got"),
-    (MESSAGE, "front__yaml", " width: 0", " width: 320", "'front': expected full images, got"),
-    (MESSAGE, "front__yaml", " height: 0", " height: 240", "'front': expected full images, got"),
-    (ROS | {"mounting__yaml": POSED}, "front__yaml", "plumb_bob", "thin_prism", "'front': distortion_model: "),
-    (ROS | {"mounting__yaml": POSED}, "front__yaml", "image_width: 640\n", "", r"ROS: camera 'front': how large are"),
     *((ROS | {"mounting__yaml": text}, "mounting__yaml", "", "", message) for text, message in (
         ("poses: [1]", "mounting.yaml: poses: expected values by camera"),
         ("pose: {}", "mounting.yaml: expected the keys poses, ground_z_m"),
         ("poses: {front: {translation: {x: 1}}}", r"camera 'front': pose: expected a 4x4 matrix, or \{translation"),
         (f"poses: {{front: {(2 * FORWARD).tolist()}}}", "camera 'front': pose: expected last row"),
         ("metres_per_unit: abc", "ROS: mounting.yaml: metres_per_unit: expected a positive number, got 'abc'"),
-        ("metres_per_unit: -1", "metres_per_unit: expected a positive number, got -1"),
         (f"ground_z_m: low\n{POSED}", "ground_z_m: expected a finite height"),
         ("poses: !!python/name:os.system ''", "mounting.yaml: expected plain YAML"),
         (f"poses: {{front: {ROWS}, frnt: {ROWS}}}", "poses: expected cameras of front, got frnt: write"),
@@ -279,8 +229,8 @@ def test_files_are_checked(
     tmp_path: Path, files: dict[str, str], changed: str, old: str, new: str, message: str
 ) -> None:
     assert old in files[changed]
-    with pytest.raises(CalibrationError, match=message):
-        load_rig(written(tmp_path, **{**files, changed: files[changed].replace(old, new) if old else files[changed]}))
+    text = files[changed].replace(old, new) if old else files[changed]
+    refused(written(tmp_path, **{**files, changed: text}), message)
 
 
 # --- data sets --------------------------------------------------------------------------------------------------------
@@ -290,14 +240,12 @@ def test_nuscenes_calibrated_sensor(tmp_path: Path) -> None:
     assert rig.names == ["CAM_FRONT"] and rig.sizes == [(900, 1600)] and rig == load_rig(tmp_path)
     np.testing.assert_allclose(rig[0].cam2ego, FORWARD, atol=1e-12)
     (tmp_path / "sample_data.json").unlink()
-    with pytest.raises(CalibrationError, match=r"nuScenes: camera 'CAM_FRONT': how large are its images\?"):
-        load_rig(path)
+    refused(path, r"nuScenes: camera 'CAM_FRONT': how large are its images\?")
     written(tmp_path, mounting__yaml="sizes: {width: 1600, height: 900}")
     assert load_rig(path) == rig
     rows = json.loads(path.read_text())
     path.write_text(json.dumps([*rows, {**rows[0], "token": "c2", "translation": [9.0, 0.0, 1.0]}]))
-    with pytest.raises(CalibrationError, match=r"CAM_FRONT has several calibrations: of which log\? .* tokens: \[c2"):
-        load_rig(path)
+    refused(path, r"CAM_FRONT has several calibrations: of which log\? .* tokens: \[c2")
     written(tmp_path, mounting__yaml="sizes: {width: 1600, height: 900}\ntokens: [c2]")
     assert load_rig(path)[0].center_m.tolist() == [9.0, 0.0, 1.0]
 
@@ -320,8 +268,7 @@ def test_argoverse_2(tmp_path: Path) -> None:
     np.testing.assert_allclose(rig[0].cam2ego, FORWARD, atol=1e-12)
     assert rig.sizes == [(2048, 1550)] and load_rig(folder) == rig == load_rig(folder / "intrinsics.feather")
     (folder / "intrinsics.feather").write_bytes(b"ARROW1")
-    with pytest.raises(CalibrationError, match=r"expected a calibration as Argoverse 2 writes it"):
-        load_rig(tmp_path)
+    refused(tmp_path, r"expected a calibration as Argoverse 2 writes it")
 
 
 INTRINSIC = [2055.556, 2055.556, 939.657, 641.072, 0.032316, -0.321412, 0.000793, -0.000626, 0.0]
@@ -341,8 +288,7 @@ def test_waymo(tmp_path: Path, key: str | None, intrinsic: Any) -> None:
     assert rig.names == ["FRONT"] and rig[0].distortion == tuple(INTRINSIC[4:])
     np.testing.assert_array_equal(rig[0].cam2ego, FORWARD)
     (tmp_path / "calibration.json").write_text(json.dumps([{**entry, "name": -1}]))
-    with pytest.raises(CalibrationError, match=r"expected a calibration as Waymo writes it, missing -1"):
-        load_rig(tmp_path / "calibration.json")
+    refused(tmp_path / "calibration.json", r"expected a calibration as Waymo writes it, missing -1")
     # Waymo's formula: u = c_u - f_u y / x for a point (x, y, z) in its camera frame, without distortion.
     x, y, z = 400.0, -0.3, 0.2  # nearly on the axis, where the lens hardly bends
     uv = rig.undistorted()[0].project(np.array([x + 1.5, y + 0.2, z + 1.6])).uv
@@ -395,62 +341,37 @@ def test_written_rigs_come_back(tmp_path: Path, name: Any, lenses: tuple[str, ..
 @pytest.mark.parametrize("name", ["ros", "kalibr", "colmap"])
 def test_names_that_are_no_file_names_come_back(tmp_path: Path, name: Any) -> None:
     """Nor words of a line; ``camchain`` is a name of Kalibr's files."""
-    rig = Rig(
-        [
-            camera(text, 20.0 * k)
-            for k, text in enumerate([" x", "/a/b", "a/", "front\nleft", "camera5", "my_camchain", "08", "camera1"])
-        ]
-    )
+    names = [" x", "/a/b", "a/", "front\nleft", "camera5", "my_camchain", "08", "camera1", "tf_static", "mounting"]
+    rig = Rig([camera(text, 20.0 * k) for k, text in enumerate(names)])
     again = load_rig(save_rig(rig, tmp_path, format=name))
     assert again.names == rig.names and np.allclose(again.cam2ego, rig.cam2ego)
 
 
-def test_cameras_of_one_frame_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(
-        CalibrationError, match=r"camera 'a': expected another camera.s frame .*, got a_optical_frame twice"
-    ):
-        save_rig(Rig([camera("/a"), camera("a", 40.0)]), tmp_path, format="ros")
+SKEWED, BOTH = Rig([camera(K=[[50, 1, 47.5], [0, 50, 35.5], [0, 0, 1]])]), Rig([camera("a"), camera("b", 40.0)])
+UNWRITTEN: tuple[tuple[Rig, Any, str], ...] = (
+    (lens_rig("ftheta"), "ros", r"ftheta': expected a lens of ROS: pinhole, .*, got ftheta with 4"),
+    (lens_rig("radtan8"), "kalibr", r"expected a lens of Kalibr: .* got radtan with 8"),
+    (SKEWED, "colmap", r"camera 'front': expected K without skew for COLMAP, got 1.0"),
+    (SKEWED, "waymo", r"format: expected rig, colmap, kalibr, ros, got 'waymo'"),
+    (SKEWED, ["ros"], r"format: expected rig, colmap, kalibr, ros, got \['ros'\]"),
+    (Rig([camera("/a"), camera("a", 40.0)]), "ros", "'a': expected another .* frame .*, got a_optical_frame twice"),
+)
 
 
-def test_an_earlier_calibration_is_not_mixed_with_a_new_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("rig", "name", "message"), UNWRITTEN)
+def test_what_a_format_has_not_is_refused(tmp_path: Path, rig: Rig, name: Any, message: str) -> None:
+    refused(lambda: save_rig(rig, tmp_path, format=name), message)
+    assert not list(tmp_path.iterdir()) and load_rig(save_rig(rig, tmp_path / "rig.yaml")) == rig
+
+
+@pytest.mark.parametrize(("earlier", "name"), [("b.yaml", "ros"), ("camchain.yaml", "ros"), ("images.bin", "colmap")])
+def test_an_earlier_calibration_is_not_mixed_with_a_new_one(tmp_path: Path, earlier: str, name: Any) -> None:
     """It was read with the new one, or in its place."""
-    both, one = Rig([camera("a"), camera("b", 40.0)]), Rig([camera("a")])
-    save_rig(both, save_rig(both, tmp_path / "ros", format="ros"), format="ros")
-    with pytest.raises(CalibrationError, match=r"ros: expected no other calibration, got b.yaml, which would be read"):
-        save_rig(one, tmp_path / "ros", format="ros")
-    save_rig(both, tmp_path / "kalibr", format="kalibr")
-    with pytest.raises(CalibrationError, match=r"expected no other calibration, got camchain.yaml"):
-        save_rig(both, tmp_path / "kalibr", format="ros")
-    (tmp_path / "images.bin").write_bytes(b"")
-    with pytest.raises(CalibrationError, match=r"expected no other calibration, got images.bin"):
-        save_rig(both, tmp_path, format="colmap")
-
-
-def test_what_a_format_has_not_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"ftheta': expected a lens of ROS: pinhole, .*, got ftheta with 4"):
-        save_rig(lens_rig("ftheta"), tmp_path / "ros", format="ros")
-    with pytest.raises(CalibrationError, match=r"expected a lens of Kalibr: .* got radtan with 8"):
-        save_rig(lens_rig("radtan8"), tmp_path / "kalibr", format="kalibr")
-    skewed = Rig([camera(K=[[50, 1, 47.5], [0, 50, 35.5], [0, 0, 1]])])
-    with pytest.raises(CalibrationError, match=r"camera 'front': expected K without skew for COLMAP, got 1.0"):
-        save_rig(skewed, tmp_path / "colmap", format="colmap")
-    with pytest.raises(CalibrationError, match=r"format: expected rig, colmap, kalibr, ros, got 'waymo'"):
-        save_rig(skewed, tmp_path / "waymo", format="waymo")  # type: ignore[arg-type]
-    with pytest.raises(CalibrationError, match=r"format: expected rig, colmap, kalibr, ros, got \['ros'\]"):
-        save_rig(skewed, tmp_path / "waymo", format=["ros"])  # type: ignore[arg-type]
-    assert not list(tmp_path.iterdir())
-    assert load_rig(save_rig("waymo", tmp_path / "zeros", format="kalibr")).sizes == load_rig("waymo").sizes
-    assert load_rig(save_rig(skewed, tmp_path / "rig.yaml")) == skewed
-    named = Rig([camera("tf_static"), camera("mounting", 40.0)])  # in no alphabetical order
-    assert load_rig(save_rig(named, tmp_path / "names", format="ros")).names == named.names
-
-
-def test_folders_that_are_no_calibration(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"expected a rig file, or a folder of COLMAP \(cameras and im"):
-        load_rig(tmp_path)
-    (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    with pytest.raises(CalibrationError, match=r"found neither"):
-        load_rig(tmp_path / "loop")
+    save_rig(BOTH, save_rig(BOTH, tmp_path, format="ros"), format="ros")
+    if earlier != "b.yaml":
+        (tmp_path / earlier).write_bytes(b"")
+    message = f"{tmp_path.name}: expected no other calibration, got .*{earlier}.*, which would be read"
+    refused(lambda: save_rig(Rig([camera("a")]), tmp_path, format=name), message)
 
 
 def test_inspect_says_what_was_assumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -488,25 +409,18 @@ def info(**more: Any) -> dict[str, Any]:
 # --- one camera: data of a file, then the lens and coefficients, or the message ---------------------------------------
 LINES = {"fx": 500.0, "fy": 501.0, "cx": 320.0, "cy": 240.0, "w": 640, "h": 480}
 KB = {"k2": 0.05, "k3": 0.03, "k4": -0.03, "k5": 0.016, "mu": 500.0, "mv": 501.0, **AXES}
-MEI = {
-    "model_type": "MEI",
-    "mirror_parameters": {"xi": 2.0},
-    "projection_parameters": {"gamma1": 9.0, "gamma2": 9.0, **AXES},
-}
+MEI = {"mirror_parameters": {"xi": 2.0}, "projection_parameters": {"gamma1": 9.0, "gamma2": 9.0, **AXES}}
 READ: dict[str, tuple[dict[str, Any], str, list[float]]] = {
-    "dist_coeffs": ({"camera_matrix": K, "dist_coeffs": [BENT], **SIZE}, "radtan", BENT),
-    "dist_coeff": ({"camera_matrix": K, "dist_coeff": [[k] for k in BENT], "image_size": [640, 480]}, "radtan", BENT),
+    "dist_coeff": ({"camera_matrix": K, "dist_coeffs": [BENT], "image_size": [640, 480]}, "radtan", BENT),
     "mtx, dist, shape": ({"mtx": K, "dist": [BENT], "image_shape": [480, 640, 3]}, "radtan", BENT),
     "K, D, DIM": ({"K": K, "D": [[k] for k in FOUR], "DIM": [640, 480]}, "fisheye", FOUR),
     "fisheye: true": ({"K": K, "D": FOUR, "fisheye": True, "resolution": "640x480"}, "fisheye", FOUR),
     "Equidistant": (cam(D=FOUR, distortion_model="Equidistant"), "fisheye", FOUR),
     "KANNALA_BRANDT": (cam(D=FOUR, camera_model="KANNALA_BRANDT"), "fisheye", FOUR),
-    "four of radtan": (cam(D=FOUR, distortion_model="plumb_bob"), "radtan", FOUR),
     "pinhole, radtan": (cam(D=FOUR, camera_model="pinhole", distortion_model="radtan"), "radtan", FOUR),
     "by names": ({**LINES, "k1": -0.2, "k2": 0.05, "p1": 0.001, "p2": -0.002}, "radtan", [*BENT, 0.0, 0.0, 0.0]),
     "Plumb Bob": (info(d=[0.0] * 5, distortion_model="Plumb Bob"), "pinhole", []),
     "empty": (info(distortion_model=""), "pinhole", []),
-    "none": (info(d=[0.0] * 5, distortion_model="none"), "pinhole", []),
     "Foxglove": ({**cam(D=BENT, R=EYE, P=P, distortion_model="plumb_bob"), "frame_id": "front"}, "radtan", BENT),
     "zeros": (info(r=[0.0] * 9, p=[0.0] * 12, binning_x=1, roi={"width": 640, "height": 480}), "pinhole", []),
     "DAIR-V2X": ({"cam_K": FLAT, "cam_D": BENT, "P": P, "width": 640, "height": 480}, "radtan", BENT),
@@ -521,13 +435,10 @@ PRISM = [*BENT, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0]
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "four, unmarked": (cam(D=FOUR), "a lens for its coefficients, got .*write distortion_model: plumb_bob"),
     "thin prism": (cam(D=FOUR, distortion_model="thin_prism_fisheye"), "distortion_model: expected plumb_bob"),
-    "inverse": (cam(D=BENT, model="inverse_brown_conrady"), "model: expected plumb_bob"),
     "two models": (cam(D=FOUR, model="fisheye", distortion_model="radtan"), "one lens, got fisheye and radtan"),
     "none, bent": (cam(D=BENT, distortion_model="none"), "a lens for its coefficients"),
-    "empty, bent": (info(d=BENT, distortion_model=""), "a lens for its coefficients"),
     "no coefficients": (cam(distortion_model="equidistant"), "expected coefficients of fisheye, got none"),
     "prism": (cam(D=PRISM), r"8 coefficients of radtan, got 12 \(thin prism"),
-    "tangential": (cam(D=BENT, tangential_distortion=[0.1, 0.1]), "got 'tangential_distortion'"),
     "five": (cam(D=[*FOUR, 0.1], fisheye_model=1), "4 coefficients of fisheye, got 5"),
     "R": (info(d=BENT, r=TURNED), "r: expected the identity.*for rectified ones write P's left 3x3"),
     "P": (info(p=[400.0, *P[1:]]), "p: expected the camera matrix, got .* without distortion"),
@@ -536,16 +447,11 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "two sizes": (cam(D=BENT, dim=[1280, 960]), "expected one size"),
     "no size": (cam(image_width=0, image_height=0), "how large are its images"),
     "two matrices": (cam(camera_matrix=K), "one key of each kind, got K and camera_matrix"),
-    "skew": ({**LINES, "skew": 0.3}, "got 'skew': 0.3"),
-    "rectified, bent": (cam(D=BENT, rectified=True), "got 'rectified': True"),
-    "new matrix": (cam(D=BENT, new_camera_matrix=TURNED), "got 'new_camera_matrix'"),
-    "crop": (cam(crop=[0, 60, 640, 360]), "got 'crop'"),
-    "offset": (cam(y_offset=10), "got 'y_offset': 10"),
     "f-theta": (cam(D=FOUR, model="ftheta"), "model: expected plumb_bob"),
-    "scale": (cam(scale=0.5), "got 'scale': 0.5"),
-    "units": (cam(units="mm"), "got 'units': 'mm'"),
-    "column-major": (cam(storage_order="column"), "got 'storage_order'"),
-    "MEI, bent": ({**MEI, **SIZE, "distortion_parameters": {"k1": 0.1, "p1": 0.0}}, "MEI.*undistort the images"),
+    **{key: (cam(D=BENT, **{key: value}), f"keys that are read, got '{key}'") for key, value in (
+        ("skew", 0.3), ("rectified", True), ("new_camera_matrix", TURNED), ("crop", [0, 60, 640, 360]), ("scale", 0.5),
+        ("y_offset", 10), ("units", "mm"), ("storage_order", "column"), ("tangential_distortion", [0.1, 0.1]))},
+    "MEI, bent": ({"model_type": "MEI", **MEI, **SIZE, "distortion_parameters": {"k1": 0.1}}, "MEI.*undistort the im"),
     "ragged": ({"camera_matrix": [[1, 2], [3]], **SIZE}, "camera_matrix: expected a matrix or list of numbers"),
 }  # fmt: skip
 
@@ -556,20 +462,14 @@ def test_read(tmp_path: Path, name: str) -> None:
     for text in (data, [data], "%YAML:1.0\n---\n" + json.dumps(data)):
         file = "front__yaml" if isinstance(text, str) else "front__json"
         (front,) = load_rig(mounted(tmp_path, **{file: text}) / file.replace("__", "."))
-        assert (front.name, front.lens, front.distortion, front.size) == (
-            "front",
-            lens,
-            tuple(coefficients),
-            (480, 640),
-        )
-        assert front.K.tolist() == K
+        assert (front.name, front.lens, front.size, front.K.tolist()) == ("front", lens, (480, 640), K)
+        assert front.distortion == tuple(coefficients)
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_refused_by_name(tmp_path: Path, name: str) -> None:
     data, message = REFUSED[name]
-    with pytest.raises(CalibrationError, match=message):
-        load_rig(mounted(tmp_path, front__json=data))
+    refused(mounted(tmp_path, front__json=data), message)
 
 
 def test_a_unified_camera_without_distortion_is_an_eucm(tmp_path: Path) -> None:
@@ -594,8 +494,8 @@ def test_woodscapes_polynomial_is_an_ftheta(tmp_path: Path) -> None:
     r = 339.7 * theta - 31.99 * theta**2 + 48.27 * theta**3 - 7.2 * theta**4
     uv = front.project_cam(np.array([[np.sin(theta), 0, np.cos(theta)], [0, np.sin(theta), np.cos(theta)]])).uv
     np.testing.assert_allclose(uv, [[639.5 + 3.9 + r, 482.5 - 3.1], [639.5 + 3.9, 482.5 - 3.1 + 1.1 * r]])
-    with pytest.raises(CalibrationError, match=r"camera 'FV': expected intrinsic .*, got k5"):
-        load_rig(written(tmp_path, FV__json=json.dumps({**data, "intrinsic": {**lens, "k5": 1.0}})))
+    written(tmp_path, FV__json=json.dumps({**data, "intrinsic": {**lens, "k5": 1.0}}))
+    refused(tmp_path, r"camera 'FV': expected intrinsic .*, got k5")
 
 
 @pytest.mark.parametrize(
@@ -614,14 +514,12 @@ def test_newer_models_of_colmap(tmp_path: Path, model: str, numbers: str, lens: 
     if lens:
         assert (load_rig(tmp_path)["left"].lens, load_rig(tmp_path)["left"].distortion) == (lens, found)
     else:
-        with pytest.raises(CalibrationError, match=found):
-            load_rig(tmp_path)
+        refused(tmp_path, found)
 
 
 def test_poses_of_the_imu_alone(tmp_path: Path) -> None:
     text = "%YAML:1.0\n---\n" + CAMCHAIN.replace("T_cn_cnm1", "T_cam_imu")
-    with pytest.raises(CalibrationError, match="T_cam_imu of all cameras, got neither"):
-        load_rig(mounted(tmp_path, imucam_chain__yaml=text))
+    refused(mounted(tmp_path, imucam_chain__yaml=text), "T_cam_imu of all cameras, got neither")
     own = "cam0:\n  T_cam_imu: [[1, 0, 0, 0.3], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
     rig = load_rig(written(tmp_path, imucam_chain__yaml=text.replace("cam0:\n", own, 1)))
     np.testing.assert_allclose(rig[1].center_m, FORWARD[:3] @ [0.5, 0, 0, 1])  # 0.3 and 0.2 m to the right of the IMU
@@ -642,8 +540,7 @@ def test_lenses_of_tables_like_nuscenes(tmp_path: Path, row: dict[str, Any], len
     first, *others = json.loads(path.read_text())
     path.write_text(json.dumps([{**first, **row}, *others]))
     if " " in lens:
-        with pytest.raises(CalibrationError, match=lens):
-            load_rig(path)
+        refused(path, lens)
     else:
         assert load_rig(path)[0].lens == lens
 
@@ -661,14 +558,15 @@ def test_lenses_of_tables_like_nuscenes(tmp_path: Path, row: dict[str, Any], len
 )
 def test_a_camera_that_is_not_read_does_not_vanish(tmp_path: Path, file: str, text: str, message: str) -> None:
     assert load_rig(mounted(tmp_path, front__yaml=CAMERA_INFO)).names == ["front"]
-    with pytest.raises(CalibrationError, match=f"ROS: expected cameras of one tool, got also {message}"):
-        load_rig(written(tmp_path, **{file: text}))
+    refused(written(tmp_path, **{file: text}), f"ROS: expected cameras of one tool, got also {message}")
     (tmp_path / "front.yaml").unlink()
-    with pytest.raises(CalibrationError, match=f"expected a rig file, or a folder of COLMAP.*, got {message}"):
-        load_rig(tmp_path)
+    refused(tmp_path, f"expected a rig file, or a folder of COLMAP.*, got {message}")
 
 
 def test_other_files_of_a_folder_are_named(tmp_path: Path) -> None:
+    refused(tmp_path, r"expected a rig file, or a folder of COLMAP \(cameras and im")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    refused(tmp_path / "loop", "found neither")
     mounted(tmp_path, front__yaml=CAMERA_INFO, front__json="{", launch__yaml="a: 1", notes__txt="camera_matrix")
     load_rig("waymo").save(tmp_path / "rig.json")
     with pytest.warns(UserWarning, match=r"ROS: not read: launch.yaml, rig.json$"):
@@ -683,23 +581,20 @@ def test_names_where_the_files_share_one(tmp_path: Path) -> None:
     (tmp_path / "left.yaml").unlink()
     two = json.dumps([info(camera_name="a"), info(header={"frame_id": "left_optical_frame"})])
     assert load_rig(written(tmp_path, front__yaml=two)).names == ["a", "left"]
-    with pytest.raises(CalibrationError, match=r"without a baseline, got one with; its frame may be the left camera's"):
-        load_rig(written(tmp_path, front__yaml=json.dumps(info(p=[*P[:3], -60.0, *P[4:]]))))
+    written(tmp_path, front__yaml=json.dumps(info(p=[*P[:3], -60.0, *P[4:]])))
+    refused(tmp_path, r"without a baseline, got one with; its frame may be the left camera's")
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
 @pytest.mark.parametrize("text", [CAMERA_INFO, OPENCV_YAML, json.dumps(cam(of="x"))])
-def test_byte_order_marks_and_encodings(tmp_path: Path, encoding: str, text: str) -> None:
-    suffix = "json" if text[0] == "{" else "yaml"
-    mounted(tmp_path, **{f"front__{suffix}": text})
-    text = text.replace("\n", "\r\n") if encoding == "utf-8-sig" else text[:-1] + text[-1].replace("\n", "# ü") + "ü"
-    (tmp_path / f"front.{suffix}").write_bytes(text.encode(encoding))
-    for path in (tmp_path, tmp_path / f"front.{suffix}"):
-        if encoding == "utf-8-sig":
-            assert load_rig(path).names == ["front"]
-        else:
-            with pytest.raises(CalibrationError, match=r"UTF-8, got another encoding.*: save it as UTF-8"):
-                load_rig(path)
+def test_byte_order_marks_and_encodings(tmp_path: Path, text: str) -> None:
+    path = tmp_path / ("front.json" if text[0] == "{" else "front.yaml")
+    mounted(tmp_path, **{path.name.replace(".", "__"): text})
+    path.write_bytes(text.replace("\n", "\r\n").encode("utf-8-sig"))
+    assert load_rig(path).names == load_rig(tmp_path).names == ["front"]
+    for encoding in ("utf-16", "latin-1"):
+        path.write_bytes((text[:-1] + text[-1].replace("\n", "# ü") + "ü").encode(encoding))
+        for name in (path, tmp_path):
+            refused(name, r"UTF-8, got another encoding.*: save it as UTF-8")
 
 
 FILES = "front.yaml front.xml front.json mounting.yaml tf_static.yaml camchain.yaml images.txt images.bin cameras.bin"
@@ -723,8 +618,7 @@ def test_binaries_of_colmap_are_bounded(tmp_path: Path) -> None:
     for file in ("images.bin", "cameras.bin"):
         with (tmp_path / file).open("wb") as large:
             large.truncate((1 << 28) + 1)  # of zeros that take no space
-        with pytest.raises(CalibrationError, match=r"COLMAP.*more than 256.0 MiB"):
-            load_rig(tmp_path)
+        refused(tmp_path, r"COLMAP.*more than 256.0 MiB")
         (tmp_path / file).write_bytes(bytes(8))
 
 
@@ -732,13 +626,10 @@ def test_binaries_of_colmap_are_bounded(tmp_path: Path) -> None:
 def test_names_that_no_file_has(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     mounted(tmp_path, front__yaml=CAMERA_INFO)
-    with pytest.raises(CalibrationError, match="found neither"):
-        load_rig(name)
+    refused(name, "found neither")
     entry = {**Rig([camera()]).to_dict()["cameras"][0], "mask": name}
-    with pytest.raises(CalibrationError, match="mask: expected an image file"):
-        load_rig(written(tmp_path, rig__json=json.dumps({"cameras": [entry]})) / "rig.json")
-    with pytest.raises(CalibrationError, match="path: expected a file's or folder's name"):
-        save_rig("waymo", name, format="ros")
+    refused(written(tmp_path, rig__json=json.dumps({"cameras": [entry]})) / "rig.json", "mask: expected an image file")
+    refused(lambda: save_rig("waymo", name, format="ros"), "path: expected a file's or folder's name")
     if len(name) < 300:
         with pytest.raises(CalibrationError, match="camera name: expected a non-empty string"):
             camera(name)

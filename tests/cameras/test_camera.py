@@ -1,15 +1,18 @@
-"""Cameras: validation by name, derived values, changed copies."""
+"""Cameras: conventions by their right and wrong readings; derived values and changed copies."""
 
 from __future__ import annotations
 
 import copy
 import pickle
+from functools import partial
 
+import cv2
 import numpy as np
 import pytest
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.rotations import nearest_rotation
+from arbiview_aug.cameras.rotations import rotation_z
+from tests import helpers
 
 K = np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]])
 POSE = Camera.looking(
@@ -26,19 +29,6 @@ def edited(matrix: np.ndarray, index: tuple, value: float) -> np.ndarray:
     matrix = matrix.copy()
     matrix[index] = value
     return matrix
-
-
-def test_published_digits_are_accepted_and_orthonormalised() -> None:
-    camera = make(cam2ego=np.round(POSE, 5))
-    R = camera.cam2ego[:3, :3]
-    assert np.abs(R @ R.T - np.eye(3)).max() < 1e-12
-    assert np.abs(camera.cam2ego - POSE).max() < 1e-5
-    # Orthonormalising twice changes nothing: files round-trip exactly.
-    np.testing.assert_array_equal(make(cam2ego=camera.cam2ego).cam2ego, camera.cam2ego)
-
-
-def test_nearest_rotation_of_a_reflection_is_proper() -> None:
-    assert np.linalg.det(nearest_rotation(np.diag([1.0, 1.0, -1.0]))) == pytest.approx(1.0)
 
 
 def test_arrays_are_copies_and_read_only() -> None:
@@ -72,10 +62,7 @@ def test_field_of_view_round_trip(lens: str, distortion: tuple, fov: float) -> N
     assert camera.fov_deg[0] == pytest.approx(fov, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("lens", "distortion"),
-    [("double_sphere", (-0.2, 0.9)), ("radtan", (-0.3, 0.0, 0.0, 0.0))],
-)
+@pytest.mark.parametrize(("lens", "distortion"), [("double_sphere", (-0.2, 0.9)), ("radtan", (-0.3, 0.0, 0.0, 0.0))])
 def test_field_of_view_ends_at_the_image_circle(lens: str, distortion: tuple) -> None:
     camera = make(lens=lens, distortion=distortion, K=[[50, 0, 319.5], [0, 50, 239.5], [0, 0, 1]])
     assert camera.fov_deg == pytest.approx([2 * np.degrees(camera.lens_model.fold_rad)] * 2)
@@ -85,13 +72,11 @@ def test_resize_and_crop_carry_the_mask() -> None:
     mask = np.ones((480, 640), bool)
     mask[400:] = False
     camera = make(mask=mask)
-    half = camera.resize((240, 320))
-    assert half.mask is not None and half.mask.shape == (240, 320)
-    assert half.mask[:200].all() and not half.mask[200:].any()
-    window = camera.crop(top=390, left=-10, size=(20, 40))
-    assert window.mask is not None
-    assert not window.mask[:, :10].any(), "nothing was recorded left of the image"
-    assert window.mask[:10, 10:].all() and not window.mask[10:].any()
+    half, window = camera.resize((240, 320)).mask, camera.crop(top=390, left=-10, size=(20, 40)).mask
+    assert half is not None and window is not None
+    assert half[:200].all() and not half[200:].any()
+    assert not window[:, :10].any(), "nothing was recorded left of the image"
+    assert window[:10, 10:].all() and not window[10:].any()
 
 
 def test_undistorted_keeps_pose_and_intrinsics_and_moves_the_mask() -> None:
@@ -99,9 +84,7 @@ def test_undistorted_keeps_pose_and_intrinsics_and_moves_the_mask() -> None:
     mask[:, :60] = False
     camera = make(lens="radtan", distortion=(-0.2, 0.02, 0.0, 0.0), mask=mask)
     pinhole = camera.undistorted()
-    assert pinhole.lens == "pinhole" and pinhole.distortion == ()
-    np.testing.assert_array_equal(pinhole.K, camera.K)
-    np.testing.assert_array_equal(pinhole.cam2ego, camera.cam2ego)
+    assert pinhole == make(mask=pinhole.mask)
     # Per pixel: the mask of the source pixel that the same ray hits.
     for x, y in [(40, 240), (70, 240), (300, 20), (620, 470)]:
         uv = camera.project(camera.center_m + pinhole.unproject(np.array([x, y], float)).directions).uv
@@ -135,16 +118,10 @@ def test_content_key_is_about_pixels_not_names() -> None:
     assert make(name="other") != camera and make() == camera and hash(make()) == hash(camera)
     assert make(K=edited(K, (0, 1), -0.0)).content_key == camera.content_key
     mask = np.ones((480, 640), bool)
-    changed = [
-        make(K=edited(K, (0, 2), 320.0001)),
-        make(cam2ego=edited(POSE, (0, 3), 1.50001)),
-        make(width_px=641),
-        make(mask=mask),
-        make(mask=edited(mask, (0, 0), False)),
-        make(lens="fisheye", distortion=(0, 0, 0, 0)),
-        make(lens="radtan", distortion=(0, 0, 0, 0)),
-    ]
-    assert len({c.content_key for c in [camera, *changed]}) == len(changed) + 1
+    changed = [{"K": edited(K, (0, 2), 320.0001)}, {"cam2ego": edited(POSE, (0, 3), 1.50001)}, {"width_px": 641}]
+    changed += [{"mask": mask}, {"mask": edited(mask, (0, 0), False)}]
+    changed += [{"lens": lens, "distortion": (0, 0, 0, 0)} for lens in ("fisheye", "radtan")]
+    assert len({camera.content_key, *(make(**change).content_key for change in changed)}) == len(changed) + 1
     assert camera != "front"
 
 
@@ -164,3 +141,100 @@ def test_repr_shows_the_camera_at_a_glance() -> None:
         "Camera(front 640x480 radtan fov 65.2x50.4 deg azimuth +30.0 elevation -4.0 deg "
         "at (1.50, 0.40, 1.60) m mask 100% own car)"
     )
+
+
+# --- conventions
+WIDE = np.array([[100.0, 0, 90], [0, 120.0, 55], [0, 0, 1]])
+posed = partial(helpers.camera, "c", size=(100, 200), position_m=(1.0, 0.5, 1.5), K=WIDE)
+
+
+def test_convention_pixel_centres_are_integers() -> None:
+    # A centred K therefore has cx = (w - 1) / 2: the ray through the middle of an even image lies between two pixels.
+    c = posed(K=None, horizontal_fov_deg=90.0)
+    assert c.K[0, 2] == (200 - 1) / 2 and c.K[1, 2] == (100 - 1) / 2
+    left, right = c.unproject_cam(np.array([[-0.5, 49.5], [199.5, 49.5]])).directions
+    np.testing.assert_allclose(left, [-(0.5**0.5), 0, 0.5**0.5], atol=1e-12)
+    np.testing.assert_allclose(right, [0.5**0.5, 0, 0.5**0.5], atol=1e-12)
+    # Wrong reading: pixel corners at integers would put the left edge at 0.
+    assert abs(c.unproject_cam(np.array([0.0, 49.5])).directions[0] + 0.5**0.5) > 1e-3
+
+
+def test_convention_cam2ego_maps_camera_points_to_the_ego_frame() -> None:
+    c = posed()
+    ahead_right_below = np.array([3.0, 2.0, 10.0])  # 3 m right, 2 m down, 10 m forward
+    p_ego = (c.cam2ego @ np.append(ahead_right_below, 1))[:3]
+    np.testing.assert_allclose(p_ego, [1.0 + 10, 0.5 - 3, 1.5 - 2], atol=1e-12)
+    expected = [100 * 0.3 + 90, 120 * 0.2 + 55]
+    np.testing.assert_allclose(c.project(p_ego).uv, expected, atol=1e-9)
+    # Wrong reading: the inverse pose.
+    wrong = (np.linalg.inv(c.cam2ego) @ np.append(ahead_right_below, 1))[:3]
+    assert not np.allclose(c.project(wrong).uv, expected, atol=1.0)
+
+
+def test_convention_the_papers_rotation_is_the_transpose() -> None:
+    c = posed(azimuth_deg=30.0)
+    R = c.cam2ego[:3, :3].T  # the paper's R_i: ego to camera
+    direction = np.array([5.0, 1.0, -0.3])
+    np.testing.assert_allclose(c.project(c.center_m + direction).depth_m, (R @ direction)[2])
+    assert abs((c.cam2ego[:3, :3] @ direction)[2] - (R @ direction)[2]) > 0.1
+
+
+def test_convention_size_is_height_width_and_points_are_x_y() -> None:
+    c = posed()
+    assert c.size == (100, 200)
+    assert c.pixel_grid().shape == (100, 200, 2)
+    np.testing.assert_array_equal(c.pixel_grid()[7, 150], [150, 7])
+    assert c.contains(np.array([150.0, 7.0])) and not c.contains(np.array([7.0, 150.0]))
+
+
+def test_convention_positive_azimuth_looks_left_positive_elevation_up() -> None:
+    np.testing.assert_allclose(posed(azimuth_deg=90.0).cam2ego[:3, 2], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose(posed(elevation_deg=90.0).cam2ego[:3, 2], [0, 0, 1], atol=1e-12)
+    tilted = posed(azimuth_deg=-40.0, elevation_deg=12.0)
+    assert (tilted.azimuth_deg, tilted.elevation_deg) == (pytest.approx(-40.0), pytest.approx(12.0))
+    # The right axis stays level: elevation turns about the camera's own x, after the azimuth.
+    assert tilted.cam2ego[2, 0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_convention_roll_turns_the_camera_clockwise_seen_from_behind() -> None:
+    rolled = posed(roll_deg=10.0)
+    # The camera's right-hand side sinks, so the world turns the other way in the image: a point to the right rises.
+    assert rolled.cam2ego[2, 0] < 0
+    right = rolled.center_m + np.array([10.0, -3.0, 0.0])
+    assert rolled.project(right).uv[1] < posed().project(right).uv[1]
+
+
+def test_convention_turned_yaws_about_the_ego_z_axis() -> None:
+    c = posed(azimuth_deg=20.0, elevation_deg=-15.0)
+    turned = c.turned(yaw_deg=30.0)
+    assert (turned.azimuth_deg, turned.elevation_deg) == (pytest.approx(50.0), pytest.approx(-15.0))
+    np.testing.assert_array_equal(turned.center_m, c.center_m)
+    # Wrong reading: about the camera's own y axis, which a pitched camera would turn into a roll as well.
+    own_axis = c.cam2ego[:3, :3] @ cv2.Rodrigues(np.array([0.0, -np.radians(30), 0.0]))[0]
+    assert np.abs(own_axis - turned.cam2ego[:3, :3]).max() > 0.05
+    pitched = c.turned(pitch_deg=5.0)
+    assert (pitched.azimuth_deg, pitched.elevation_deg) == (pytest.approx(20.0), pytest.approx(-10.0))
+    np.testing.assert_allclose(rotation_z(90.0) @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(50, 100), (37, 91), (200, 400)])
+def test_convention_resize_keeps_outer_edges(size: tuple[int, int]) -> None:
+    c = posed()
+    small = c.resize(size)
+    corners = np.array([[-0.5, -0.5], [199.5, -0.5], [-0.5, 99.5], [199.5, 99.5]])
+    resized = np.array([[-0.5, -0.5], [size[1] - 0.5, -0.5], [-0.5, size[0] - 0.5], [size[1] - 0.5, size[0] - 0.5]])
+    np.testing.assert_allclose(c.unproject(corners).directions, small.unproject(resized).directions, atol=1e-12)
+    # Wrong reading: K scaled by diag(s, s, 1) is off by (s - 1) / 2 pixels.
+    scaled = np.diag([size[1] / 200, size[0] / 100, 1.0]) @ c.K
+    assert abs(scaled[0, 2] - small.K[0, 2]) == pytest.approx(abs(size[1] / 200 - 1) / 2)
+
+
+def test_convention_resize_agrees_with_opencv() -> None:
+    # A smooth ramp in x resized by area averaging: its values are the positions of the new pixel centres.
+    ramp = np.tile(np.arange(200, dtype=np.float32), (100, 1))
+    half = cv2.resize(ramp, (100, 50), interpolation=cv2.INTER_AREA)
+    c = posed()
+    x = np.array([[10.0, 20.0], [40.0, 30.0]])
+    directions = c.resize((50, 100)).unproject(x).directions
+    uv = c.project(c.center_m + directions).uv
+    np.testing.assert_allclose(half[x[:, 1].astype(int), x[:, 0].astype(int)], uv[:, 0], atol=1e-4)

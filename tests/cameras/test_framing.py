@@ -13,6 +13,7 @@ from arbiview_aug import ArbiviewError, CalibrationError, Camera, Rig, RigRetarg
 from arbiview_aug.cameras.framing import Fit, Framing, framing
 from arbiview_aug.inpaint import Telea
 from arbiview_aug.sample.batching import framed
+from tests.helpers import same
 
 OWN = (24, 48)
 WIDE, TALL = (16, 64), (40, 32)
@@ -45,7 +46,6 @@ def transform(size: tuple[int, int], fit: Fit, **settings: Any) -> RigRetarget:
     return RigRetarget(rig().turned(yaw_deg=9), size=size, fit=fit, **{"keys": keys, **settings})
 
 
-# --- by how much, and where -------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("to", "fit", "expected"),
     [
@@ -87,20 +87,13 @@ def test_masks_follow_and_bars_are_no_scene() -> None:
     assert rig()[0].resize(WIDE, "crop").mask is None
 
 
-# --- one result where nothing is to be decided ------------------------------------------------------------------------
 @pytest.mark.parametrize("params", [None, {"skipped": 1.0}])
 @pytest.mark.parametrize("size", [OWN, (12, 24), (36, 72)])
 def test_all_fits_agree_bit_by_bit_where_the_aspect_is_equal(size: tuple[int, int], params: Any) -> None:
-    p = 1.0 if params is None else 0.5
-    outs = [transform(size, fit, p=p)(sample(), params) for fit in FITS]
-    for other in outs[1:]:
-        assert outs[0].keys() == other.keys()
-        for key, value in outs[0].items():
-            same = torch.equal(value, other[key]) if isinstance(value, torch.Tensor) else value == other[key]
-            assert same, key
+    first, *others = (transform(size, fit, p=0.5 if params else 1.0)(sample(), params) for fit in FITS)
+    assert all(same(first, other) for other in others)
 
 
-# --- views ------------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("skipped", [0.0, 1.0])
 @pytest.mark.parametrize("size", [WIDE, TALL])
 def test_a_crop_is_the_window_of_the_scaled_view(size: tuple[int, int], skipped: float) -> None:
@@ -155,21 +148,8 @@ def test_no_filler_touches_bars() -> None:
     assert (out["images"] - framed(whole["images"], f)).abs().max() < 0.1
 
 
-# --- extremes ---------------------------------------------------------------------------------------------------------
-@pytest.mark.filterwarnings("ignore:the target rig")
-@pytest.mark.parametrize("skipped", [0.0, 1.0])
-@pytest.mark.parametrize("fit", FITS)
-@pytest.mark.parametrize("size", [(1, 1), (1, 48), (24, 1), (1, 400), (400, 1), (48, 96), (100, 49), (3, 2)])
-def test_extreme_sizes_are_finite(size: tuple[int, int], fit: Fit, skipped: float) -> None:
-    out = transform(size, fit, p=0.5)(sample(masked=True), {"skipped": skipped})
-    assert out["images"].shape == (3, 3, *size) and torch.isfinite(out["images"]).all()
-    assert out["coverage"].shape == out["ego_mask"].shape == (3, *size) and torch.isfinite(out["K"]).all()
-    assert (out["K"][:, 0, 0] > 0).all() and (out["K"][:, 1, 1] > 0).all()
-
-
 def test_what_would_be_cut_from_too_large_an_image_is_refused_by_name() -> None:
-    words = r"camera 'c0': size=\(30000, 2\), fit='crop': .*32766 .*\(30000, 60000\)"
-    with pytest.raises(CalibrationError, match=words):
+    with pytest.raises(CalibrationError, match=r"camera 'c0': size=\(30000, 2\), .*32766 .*\(30000, 60000\)"):
         framing("c0", (1, 2), (30000, 2), "crop")
     with pytest.raises(ArbiviewError, match=r"camera 'c0': size=\(20000, 2\), fit='crop'"):
         RigRetarget(rig(), size=(20000, 2))

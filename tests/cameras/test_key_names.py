@@ -37,19 +37,13 @@ def warned(entries: dict[str, Any], calls: int = 2, **settings: Any) -> list[str
     return [str(w.message) for w in caught if "did you mean" in str(w.message)]
 
 
-# --- samples ----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("key", "value", "meant"),
     [
         ("gt_boxes", BOXES, "boxes_3d"),
-        ("gt_bboxes_3d", BOXES, "boxes_3d"),
-        ("boxes3d", BOXES.numpy(), "boxes_3d"),
-        ("boxes", BOXES, "boxes_3d"),
         ("boxes", [BOXES], "boxes_3d"),
-        ("boxes_3D", BOXES, "boxes_3d"),
+        ("boxes_3D", BOXES.numpy(), "boxes_3d"),
         ("lidar_points", torch.rand(5, 3), "points"),
-        ("pts", torch.rand(5, 4), "points"),
-        ("Points", torch.rand(5, 4), "points"),
         ("depth_map", torch.rand(1, 6, 8), "depth_m"),
         ("distortions", torch.zeros(1, 4), "distortion"),
         ("lenses", ["fisheye"], "lens"),
@@ -68,8 +62,7 @@ def test_a_key_that_nobody_reads_is_named_once(key: str, value: Any, meant: str)
         ({"gt_boxes": BOXES, "boxes_3d": BOXES}, {}),  # the right key is there as well
         ({"gt_boxes": BOXES}, {"keys": SampleKeys(keep=("gt_boxes",))}),  # the user knows
         ({"gt_boxes": BOXES}, {"geometry": "street"}),  # nothing would read it
-        ({"boxes": torch.rand(3, 4)}, {}),  # torchvision's, in pixels
-        ({"boxes": [torch.rand(3, 4)]}, {}),
+        ({"boxes": [torch.rand(3, 4)]}, {}),  # torchvision's, in pixels
         ({"boxes": 3, "lidar": "0001.bin", "depth_map": "0001.png"}, {}),
         ({"lenses": ["radtan"], "ground_z": 1.0, "rig": RIG}, {}),  # the rig says it
         ({"lenses": ["radtan"], "ground_z": 1.0}, {"source": RIG}),
@@ -96,10 +89,6 @@ def test_labels_that_would_not_be_moved_are_named() -> None:
     ("change", "words"),
     [
         ({"K": "intrinsics"}, "missing K; found 'intrinsics': did you mean 'K'?"),
-        ({"K": "intrinsic"}, "missing K; found 'intrinsic': did you mean 'K'?"),
-        ({"cam2ego": "extrinsics"}, "missing cam2ego; found 'extrinsics': did you mean 'cam2ego'?"),
-        ({"cam2ego": "cam_to_ego"}, "found 'cam_to_ego': did you mean 'cam2ego'?"),
-        ({"cam2ego": "cam2egos"}, "found 'cam2egos': did you mean 'cam2ego'?"),
         ({"K": "intrinsics", "cam2ego": "camera2ego"}, "'K'?; found 'camera2ego': did you mean 'cam2ego'?"),
         ({"images": "imgs"}, "got imgs, K, cam2ego; found 'imgs': did you mean 'images'?"),
     ],
@@ -112,10 +101,8 @@ def test_errors_name_what_was_found_instead(change: dict[str, str], words: str) 
 
 
 def test_surfaces_that_lack_their_geometry_name_it() -> None:
-    for surface, key, words in (("boxes", "gt_boxes", "'boxes_3d'"), ("lidar", "pts", "'points'")):
-        with pytest.raises(SampleError, match=f"found '{key}': did you mean {words}"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            RigRetarget(RIG.shifted(z_m=1), geometry=surface)(sample(**{key: BOXES}))  # type: ignore[arg-type]
+    with pytest.raises(SampleError, match="found 'pts': did you mean 'points'"):
+        RigRetarget(RIG.shifted(z_m=1), geometry="lidar")(sample(pts=BOXES))
 
 
 def test_the_table_is_of_other_names() -> None:
@@ -147,10 +134,8 @@ def read(folder: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("calib", "camera", "words"),
     [
-        ({"gt_boxes": BOXES.tolist()}, {}, "'gt_boxes' is not read; did you mean 'boxes_3d'?"),
         ({"boxes_3D": BOXES.tolist()}, {}, "'boxes_3D' is not read; did you mean 'boxes_3d'?"),
         ({"lidar_points": "points.npy"}, {}, "'lidar_points' is not read; did you mean 'lidar'?"),
-        ({"ego_to_world": np.eye(4).tolist()}, {}, "'ego_to_world' is not read; did you mean 'ego2world'?"),
         ({}, {"masks": "front_mask.png"}, "'masks' is not read; did you mean 'mask'?"),
     ],
 )
@@ -163,10 +148,8 @@ def test_calibration_files_warn_once(calib: dict[str, Any], camera: dict[str, An
     ("calib", "camera", "words"),
     [
         ({}, {"K": "absent", "intrinsics": RIG.K[0].tolist()}, "missing K; found 'intrinsics': did you mean 'K'?"),
-        ({}, {"cam2ego": "absent", "cam_to_ego": 1}, "missing cam2ego; found 'cam_to_ego': did you mean 'cam2ego'?"),
         ({}, {"file": "absent", "filename": "front.png"}, "found 'filename': did you mean 'file'?"),
         ({}, {"distortion": "absent", "distortions": [0.1, 0, 0, 0]}, "'distortions' is not read: did you mean"),
-        ({}, {"distortion": None, "dist_coeffs": [0.1, 0, 0, 0]}, "'dist_coeffs' is not read: did you mean"),
         ({}, {"distortion": "absent", "dist_coeffs": {"model": "radtan"}}, "'dist_coeffs' is not read: did you mean"),
         ({"ground_z_m": "absent", "ground_z": -0.3}, {}, "'ground_z' is not read: did you mean 'ground_z_m'?"),
         ({"cameras": "absent", "cams": []}, {}, "found 'cams': did you mean 'cameras'?"),
@@ -188,11 +171,9 @@ def test_notes_stay_notes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("alias", "lens"), [("opencv_radtan", "radtan"), ("opencv_fisheye", "fisheye")])
 def test_opencvs_lenses_by_their_other_names(alias: Any, lens: str, tmp_path: Path) -> None:
-    data, bent = RIG.to_dict(), {"model": alias, "coeffs": [0.1, -0.02, 0.003, 0.001]}
-    data["cameras"][0]["distortion"] = bent
-    rig = Rig.from_dict(data)
+    bent: dict[str, Any] = {"model": alias, "coeffs": [0.1, -0.02, 0.003, 0.001]}
+    rig = FrameFolder(write_frame(tmp_path / "a", {}, {"distortion": bent}))[0]["rig"]
     assert rig[0].lens == lens == rig.to_dict()["cameras"][0]["distortion"]["model"]
-    assert FrameFolder(write_frame(tmp_path / "a", {}, {"distortion": bent}))[0]["rig"] == rig
     lensed = sample(distortion=torch.tensor([[*bent["coeffs"], 0, 0, 0, 0]]), ground_z_m=-0.2)
     named, alike = (RigRetarget(RIG.turned(yaw_deg=3))({**lensed, "lens": [name]}) for name in (alias, lens))
     assert torch.equal(named["coverage"], alike["coverage"]) and named["coverage"].any()

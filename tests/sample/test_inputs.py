@@ -1,11 +1,4 @@
-"""Bad samples: each is refused with a message that names the entry, what was expected and how to mend it.
-
-Bad input that other modules refuse is tested with them: rotations, NaN K, lenses and their coefficients in
-``test_camera``; empty rigs and malicious YAML in ``test_rig``; missing and truncated images in
-``datasets/test_images``; missing tables and unknown tokens in ``datasets/test_nuscenes``; stale pixel-bound keys and
-rigs that see nothing of the sources in ``test_transforms``. What a sample's own tensors
-can bring of these is here as well.
-"""
+"""Bad samples: each is refused with a message that names the entry, what was expected and how to mend it."""
 
 from __future__ import annotations
 
@@ -49,11 +42,6 @@ def with_distortion(coefficients: Any, lens: Any = None) -> dict[str, Any]:
     return sample(distortion=torch.tensor(coefficients, dtype=torch.float64), lens=lens)
 
 
-def test_the_good_sample_is_good() -> None:
-    (frame,) = read_frames(sample(), None)
-    assert len(frame.images) == 2 and frame.rig.sizes == [(H, W)] * 2
-
-
 ARRAY = np.zeros((H, W, 3), np.uint8)
 FROM_NUMPY = r"expected torch tensors, got ndarray; use torch.from_numpy\(array\).permute\(2, 0, 1\) for an \(H, W, 3\)"
 IMAGES: dict[str, tuple[Any, str]] = {
@@ -63,11 +51,9 @@ IMAGES: dict[str, tuple[Any, str]] = {
     "PIL": ([Image.new("RGB", (W, H))] * 2, r"images\[0\]: expected torch tensors, got Image; use .*pil_to_tensor"),
     "no images": (None, "sample: expected a key 'images', got K, cam2ego"),
     "no cameras": (torch.zeros(0, 3, H, W), "images: expected at least one image, got none"),
-    "an empty list": ([], "images: expected at least one image, got none"),
     "an empty batch": (torch.zeros(0, 2, 3, H, W), r"images: expected at least one frame, got .* \(0,\)"),
     "one image": (torch.zeros(3, H, W), r"images: expected shape \(..., N, 3, H, W\), got \(3, 36, 64\)"),
     "grey": (torch.zeros(2, 1, H, W), r"images\[0\]: expected an RGB image .* got shape \(1, 36, 64\); expand grey"),
-    "grey, two dimensions": ([torch.zeros(H, W)] * 2, r"images\[0\]: .* got shape \(36, 64\); expand grey"),
     "RGBA": (torch.zeros(2, 4, H, W), r"got shape \(4, 36, 64\); drop the alpha channel: image\[:3\]"),
     "HWC": (torch.zeros(2, H, W, 3), r"got shape \(36, 64, 3\); permute\(2, 0, 1\) puts the channels first"),
     "no pixels": (torch.zeros(2, 3, 0, W), r"images\[0\]: expected pixels, got shape \(3, 0, 64\)"),
@@ -75,7 +61,6 @@ IMAGES: dict[str, tuple[Any, str]] = {
     "0 to 255 as float": (torch.full((2, 3, H, W), 200.0), r"floats in \[0, 1\], got 200 to 200; divide by 255"),
     "normalised": (torch.full((2, 3, H, W), -1.5), r"got -1.5 to -1.5; normalise after retargeting, not before"),
     "NaN": (torch.full((2, 3, H, W), torch.nan), r"floats in \[0, 1\], got nan to nan; .*nan_to_num"),
-    "infinity": (torch.full((2, 3, H, W), torch.inf), r"got inf to inf; .*nan_to_num"),
     "two dtypes": ([torch.zeros(3, H, W), torch.zeros((3, H, W), dtype=torch.uint8)], "one dtype and device, got sev"),
     "another count": (torch.zeros(3, 3, H, W), r"K: expected shape \(3, 3, 3\) for 3 images, got \(2, 3, 3\)"),
     "ragged batch": ([torch.zeros(2, 3, H, W), torch.zeros(3, 3, H, W)], r"images: expected the .* dimensions \(2,\)"),
@@ -87,9 +72,6 @@ def test_bad_images(case: str) -> None:
     images, message = IMAGES[case]
     with pytest.raises(ArbiviewError, match=message):
         read_frames(sample(images=images), None)
-
-
-def test_samples_that_are_none() -> None:
     with pytest.raises(SampleTypeError, match="sample: expected a dict, got list"):
         read_frames([sample()], None)
 
@@ -100,7 +82,6 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "no poses": (sample(cam2ego=None), "missing cam2ego; or give RigRetarget the rig as source="),
     "no rotation": (edited("cam2ego", (1, 0, 0), 2.0), "'camera 1': cam2ego: expected a rotation .* the nearest"),
     "NaN K": (edited("K", (0, 0, 0), torch.nan), "camera 'camera 0': K: expected finite numbers, got NaN"),
-    "NaN principal point": (edited("K", (1, 0, 2), torch.nan), "camera 'camera 1': K: expected finite numbers"),
     "negative focal length": (edited("K", (0, 1, 1), -5.0), "camera 'camera 0': K: expected positive focal lengths"),
     "K of a larger image": (sample(K=HALF * torch.tensor([[5.0], [5.0], [1.0]])), r"K\[0\]: .* inside the image of"),
     "K of a smaller image": (sample(K=HALF), r"K\[0\]: .* near the middle of the image of \(h, w\) = \(36, 64\)"),
@@ -109,15 +90,9 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "text": (sample(K="pinhole"), "K: expected a tensor of numbers, got str"),
     "unknown lens": (with_distortion(np.zeros((2, 4)), ["cubic"] * 2), "lens: expected one of pinhole, .* got 'cubic'"),
     "one lens": (sample(lens=["radtan"]), r"lens: expected a list of 2 names, one for each camera, got \['radtan'\]"),
-    "a lens for all": (sample(lens="radtan"), "lens: expected a list of 2 names"),
     "a number for a lens": (sample(lens=5), "lens: expected a list of 2 names, one for each camera, got 5"),
-    "more cameras than int8 counts": (
-        {"images": torch.zeros(129, 3, 1, 1), "K": np.tile(np.eye(3), (129, 1, 1)), "cam2ego": [np.eye(4)] * 129},
-        "rig: expected at most 128 cameras, got 129",
-    ),
     "no coefficients": (sample(lens=["radtan"] * 2), r"distortion: expected shape \(2, up to 8\) .* got none"),
     "coefficients of one": (with_distortion([0.1] * 4, ["radtan"] * 2), r"distortion: expected shape \(2, up to 8\)"),
-    "three coefficients": (with_distortion([[0.1] * 3] * 2, ["radtan"] * 2), "expected 4 or 5 or 8 coeff.* got 3"),
     "five for a fisheye": (with_distortion([[0.1] * 5] * 2, ["fisheye"] * 2), "expected 4 coefficients .* got 5"),
     "no lens": (with_distortion([[0.1] * 4] * 2), "distortion: expected 'lens' beside it, one of pinhole, radtan"),
     "a mask of bytes": (sample(ego_mask=torch.zeros(2, H, W, dtype=torch.uint8)), "ego_mask: .*bool"),
@@ -129,10 +104,7 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "swapped": (sample(images=torch.zeros(2, 3, W, H), rig=rig()), r"'c0': .* got \(64, 36\); height and width"),
     "swapped, no rig": (sample(images=torch.zeros(2, 3, W, H)), r"K\[0\]: .*; height and width are swapped"),
     "coverage": (sample(coverage=0.7), "coverage: expected a bool tensor of each image's size, .* rename the key"),
-    "ego_mask": (
-        sample(ego_mask=torch.zeros(2, 5, 5, dtype=torch.bool)),
-        "ego_mask: expected a bool tensor of each",
-    ),
+    "ego_mask": (sample(ego_mask=torch.zeros(2, 5, 5, dtype=torch.bool)), "ego_mask: expected a bool tensor of each"),
 }
 
 

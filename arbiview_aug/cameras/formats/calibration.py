@@ -14,8 +14,8 @@ import numpy as np
 import yaml
 
 from arbiview_aug.atomic_io import write_whole
-from arbiview_aug.cameras.formats import camera_files, colmap, datasets, kalibr
-from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting
+from arbiview_aug.cameras.formats import camera_files, rig_files
+from arbiview_aug.cameras.formats.entries import MOUNTING, Mounting
 from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.plain_yaml import MOST_BYTES, dump_yaml, read_calibration_text
 from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line, shown, warn
@@ -40,23 +40,23 @@ FORMATS = {
         "COLMAP", ("images.bin", "images.txt"), "cameras and images, .bin or .txt",
         "images of one moment as cameras; COLMAP's first pixel centre is (0.5, 0.5), so principal points are moved by "
         f"half a pixel; scale and ego frame from {MOUNTING}",
-        colmap.read_colmap, files_of=colmap.colmap_files,
+        rig_files.read_colmap, files_of=rig_files.colmap_files,
     ),
     "argoverse2": Format(
         "Argoverse 2", ("intrinsics.feather", "calibration/intrinsics.feather"), "intrinsics.feather",
         "images are published undistorted, k1 to k3 are not used; ego origin at the rear axle, 0.33 m over the road",
-        datasets.read_argoverse2, -0.33,
+        rig_files.read_argoverse2, -0.33,
     ),
     "nuscenes": Format(
-        "nuScenes", (datasets.CALIBRATED_SENSOR,), "calibrated_sensor.json with sensor.json",
+        "nuScenes", (rig_files.CALIBRATED_SENSOR,), "calibrated_sensor.json with sensor.json",
         "sensor to ego, quaternions w x y z; images are published undistorted; ego origin on the road",
-        datasets.read_nuscenes,
+        rig_files.read_nuscenes,
     ),
     "kalibr": Format(
-        "Kalibr", kalibr.FILES, "cam0, cam1 ... with camera_model and intrinsics",
+        "Kalibr", rig_files.CAMCHAINS, "cam0, cam1 ... with camera_model and intrinsics",
         "T_cn_cnm1 takes points from the camera before to the camera, T_cam_imu from the IMU; "
         f"pose of one camera from {MOUNTING}",
-        kalibr.read_kalibr, files_of=kalibr.kalibr_files,
+        rig_files.read_kalibr, files_of=rig_files.kalibr_files,
     ),
     "opencv": Format(
         "OpenCV", (), "camera_matrix and distortion_coefficients, also mtx and dist, or K and D",
@@ -78,7 +78,7 @@ FORMATS = {
         "Waymo", (), "camera_calibrations",
         "camera to vehicle; its camera axes x forward, y left, z up are turned to x right, y down, z forward; "
         "f_u f_v c_u c_v k1 k2 p1 p2 k3; vehicle origin on the road",
-        datasets.read_waymo,
+        rig_files.read_waymo,
     ),
 }  # fmt: skip
 """Formats by name, in the order in which folders are tried."""
@@ -109,7 +109,7 @@ def read_calibration(path: Path, where: str) -> Any:
         raise CalibrationError(f"{where}: expected files that can be read, got {error.strerror}") from None
     if isinstance(data, Mapping) and isinstance(data.get("cameras"), list):
         return data
-    unread = _unread(path, name) if is_folder else {path: _seems(path)}
+    unread = {file: _seems(file) for file in (_unread(path, name) if is_folder else [path])}
     seems = ", ".join(f"{file.name} ({tool})" for file, tool in unread.items() if tool)
     if name is None:
         known = "; ".join(f"{form.tool} ({form.keys})" for form in FORMATS.values())
@@ -151,28 +151,28 @@ def recognised(path: Path) -> str | None:
         return camera_files.tool_of(files[0]) if files else None
     if path.suffix == ".txt":
         return None if camera_files.unread_tool(read_calibration_text(path, path.name, 1 << 28)) else "colmap"
-    by_name = {".bin": "colmap", ".feather": "argoverse2", datasets.CALIBRATED_SENSOR: "nuscenes"}
+    by_name = {".bin": "colmap", ".feather": "argoverse2", rig_files.CALIBRATED_SENSOR: "nuscenes"}
     if path.name in by_name or path.suffix in by_name:
         return by_name.get(path.name) or by_name[path.suffix]
     data = next(iter(camera_files.documents(path)), None)
-    if datasets.waymo_entries(data):
+    if rig_files.waymo_entries(data):
         return "waymo"
-    if kalibr.entries(data):
+    if rig_files.chain_entries(data):
         return "kalibr"
     return camera_files.tool_of(path) if camera_files.has_cameras(path) else None
 
 
-def _unread(folder: Path, name: str | None) -> dict[Path, str]:
-    """Files of a folder that are not read and could have a camera, with what they seem to be; empty if no camera."""
+def _unread(folder: Path, name: str | None) -> list[Path]:
+    """Files of a folder that are not read and could have a camera."""
     if name in ("nuscenes", "argoverse2"):
-        return {}
+        return []
     patterns = FORMATS[name].files if name else ()
     read = {MOUNTING, camera_files.TF, *(path.name for pattern in patterns for path in folder.glob(pattern))}
     if name and not patterns:
         read |= {path.name for path in camera_files.camera_files(folder)}
     stems = {Path(file).stem for file in read}  # ost.txt beside ost.yaml is the same camera
     files = (path for path in sorted(folder.glob("*.*")) if path.suffix in _LIKE_CAMERAS and path.stem not in stems)
-    return {path: _seems(path) for path in files if not path.is_dir()}
+    return [path for path in files if not path.is_dir()]
 
 
 def _seems(path: Path) -> str:
@@ -201,6 +201,6 @@ def write_calibration(data: Mapping[str, Any], folder: Path, name: str) -> Path:
     if others := {path.name for path in (*there, *camera_files.camera_files(folder))} - files.keys():
         got = f"{', '.join(sorted(others))}, which would be read instead or too: remove them, or name another folder"
         raise CalibrationError(f"save_rig: {folder}: expected no other calibration, got {got}")
-    texts = {folder / file: one if isinstance(one, str) else dump_yaml(one) for file, one in files.items()}
-    write_whole({path: text.encode() for path, text in texts.items()})
+    texts = {file: content if isinstance(content, str) else dump_yaml(content) for file, content in files.items()}
+    write_whole({folder / file: text.encode() for file, text in texts.items()})
     return folder

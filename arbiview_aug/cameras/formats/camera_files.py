@@ -12,9 +12,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import camera_entry, lens_of, matrix, refusal
+from arbiview_aug.cameras.formats.entries import MOUNTING, Mounting, camera_entry, lens_of, matrix, pose_of, refusal
 from arbiview_aug.cameras.formats.fields import has_camera, read_fields
-from arbiview_aug.cameras.formats.mounting import MOUNTING, Mounting, pose_of
 from arbiview_aug.cameras.key_names import plain
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import file_stem, read_calibration_text, read_documents
@@ -77,14 +76,21 @@ def unread_tool(text: str) -> str:
 
 def documents(path: Path) -> list[Any]:
     """Plain data of a file: XML of OpenCV's FileStorage, JSON, or YAML, of which a stream has several."""
-    return [_file_storage(path)] if path.suffix == ".xml" else read_documents(path, path.name)
+    if path.suffix != ".xml":
+        return read_documents(path, path.name)
+    text = read_calibration_text(path, path.name)  # cv2's own reader is not used: broken files corrupt its memory
+    if re.search("<!(?!--)", text):  # entities could name other files, or multiply
+        raise CalibrationError(f"{path.name}: expected XML as OpenCV writes it, without declarations, got <!")
+    try:
+        return [{node.tag: _node_data(node) for node in ElementTree.fromstring(text)}]
+    except ElementTree.ParseError as error:
+        raise CalibrationError(f"{path.name}: expected XML, got {error}") from None
 
 
 def tool_of(path: Path) -> str:
     """Format of a file with cameras: ``ros``, ``woodscape``, or ``opencv`` for FileStorage's and Python's."""
     data = next(iter(_cameras(path).values()))
-    words = {plain(key) for key in data}
-    return "woodscape" if _is_woodscape(data) else "ros" if _ROS_KEYS & words else "opencv"
+    return "woodscape" if _is_woodscape(data) else "ros" if _ROS_KEYS & set(map(plain, data)) else "opencv"
 
 
 def _cameras(path: Path) -> dict[str, Mapping[Any, Any]]:
@@ -95,14 +101,14 @@ def _cameras(path: Path) -> dict[str, Mapping[Any, Any]]:
             keyed |= {str(key): part for key, part in data.items() if _is_camera(part)}
         for part in filter(_is_camera, data if isinstance(data, list) else [data]):
             key = _declared(part) or _frame_id(part).removesuffix("_frame").removesuffix("_optical") or path.stem
-            part = {one: value for one, value in part.items() if one not in ("timestamp", "time_offset")}
+            part = {name: value for name, value in part.items() if name not in ("timestamp", "time_offset")}
             part["header"] = {"frame_id": _frame_id(part)}  # a stream has the same camera again, at other times
             listed[key if listed.get(key, part) == part else f"{key} {len(listed)}"] = part
     return keyed | (listed if len(listed) != 1 else dict(zip([path.stem], listed.values(), strict=True)))
 
 
 def _is_camera(data: Any) -> bool:
-    return isinstance(data, Mapping) and (_is_woodscape(data) or has_camera(data))
+    return _is_woodscape(data) or has_camera(data)
 
 
 def _frame_id(data: Mapping[Any, Any]) -> str:
@@ -124,12 +130,17 @@ def read_camera_files(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
         name = _declared(data)
         is_default = name.startswith(_DEFAULT_NAME) and name not in mounting.poses
         name = key if not name or names[name] > 1 or is_default else name
-        found.append(_read(file, name, data, mounting, frames))
+        if _is_woodscape(data):
+            found.append(_woodscape(name, data, mounting))
+            continue
+        lens, K, coefficients, size, is_shifted = read_fields(name, data)
+        pose = _pose(file, name, _frame_id(data), is_shifted, mounting, frames)
+        found.append(camera_entry(name, size or mounting.size(name), K, pose, lens, coefficients))
     return found
 
 
-def _is_woodscape(data: Mapping[Any, Any]) -> bool:
-    intrinsic = data.get("intrinsic")
+def _is_woodscape(data: Any) -> bool:
+    intrinsic = data.get("intrinsic") if isinstance(data, Mapping) else None
     return isinstance(intrinsic, Mapping) and intrinsic.get("model") == "radial_poly"
 
 
@@ -154,32 +165,29 @@ def _declared(data: Mapping[Any, Any]) -> str:
     return str(data.get("camera_name") or data.get("name") or "").strip('"')
 
 
-def _read(file: Path, name: str, data: Any, mounting: Mounting, frames: Mapping[str, FloatArray]) -> dict[str, Any]:
-    if _is_woodscape(data):
-        return _woodscape(name, data, mounting)
-    lens, K, coefficients, size, is_shifted = read_fields(name, data)
-    frame_id = _frame_id(data)
+def _pose(
+    file: Path, name: str, frame_id: str, is_shifted: bool, mounting: Mounting, frames: Mapping[str, FloatArray]
+) -> FloatArray:
+    """A camera's pose by ``mounting.yaml``, or by its frame in tf; ``is_shifted``: P has a baseline."""
     optical = [frame_id] if frame_id else [name.strip("/") + end for end in _OPTICAL]
     frame = next((frame for frame in optical if frame in frames), None)
     if frame is None or name in mounting.poses:
         is_ros = tool_of(file) == "ros"
         there = f", or a frame {optical[0]} to {TF} as `ros2 topic echo /tf_static` prints it" if is_ros else ""
-        pose = mounting.pose(name, there)
-    else:
-        pose = frames[frame]
-        up_deg = math.degrees(math.atan2(pose[2, 2], math.hypot(*pose[:2, 2])))
-        if up_deg > _BODY_UP_DEG and "optical" not in frame.lower():
-            fix = f"add a frame {optical[0]}"
-            if frame_id:
-                instead = f"{frame.removesuffix('_link')}_optical_frame"
-                fix = f"write frame_id: {instead} to {file.name}, and add that frame, if it is not there,"
-            got = f"{frame}, which seems to have {BODY_AXES}: the camera would look up by {up_deg:.0f} degrees"
-            fix += f" to {TF} below {frame}, with rotation {{x: -0.5, y: 0.5, z: -0.5, w: 0.5}}"
-            raise refusal(name, "an optical frame (x right, y down, z forward)", got, fix)
-        if is_shifted:
-            fix = f"its frame may be the left camera's: write its own pose to {MOUNTING}, poses: {{{name}: ...}}"
-            raise refusal(name, "a projection matrix without a baseline", "one with", fix)
-    return camera_entry(name, size or mounting.size(name), K, pose, lens, coefficients)
+        return mounting.pose(name, there)
+    pose = frames[frame]
+    up_deg = math.degrees(math.atan2(pose[2, 2], math.hypot(*pose[:2, 2])))
+    if up_deg > _BODY_UP_DEG and "optical" not in frame.lower():
+        instead = f"{frame.removesuffix('_link')}_optical_frame"
+        fix = f"write frame_id: {instead} to {file.name}, and add that frame, if it is not there,"
+        fix = fix if frame_id else f"add a frame {optical[0]}"
+        got = f"{frame}, which seems to have {BODY_AXES}: the camera would look up by {up_deg:.0f} degrees"
+        fix += f" to {TF} below {frame}, with rotation {{x: -0.5, y: 0.5, z: -0.5, w: 0.5}}"
+        raise refusal(name, "an optical frame (x right, y down, z forward)", got, fix)
+    if is_shifted:
+        fix = f"its frame may be the left camera's: write its own pose to {MOUNTING}, poses: {{{name}: ...}}"
+        raise refusal(name, "a projection matrix without a baseline", "one with", fix)
+    return pose
 
 
 def ros_road_z_m(path: Path) -> float | None:
@@ -189,17 +197,17 @@ def ros_road_z_m(path: Path) -> float | None:
 
 
 def _frames(path: Path) -> dict[str, FloatArray]:
-    """Poses of the tf beside a file, or in a folder; none without one."""
+    """Poses (4, 4) of the frames of the tf in a file's folder; none without one.
+
+    They are in the ego frame: base_link, or base_footprint where there is none.
+    """
     tf = (path if path.is_dir() else path.parent) / TF
-    return _tf_poses(tf) if tf.is_file() else {}
-
-
-def _tf_poses(path: Path) -> dict[str, FloatArray]:
-    """Poses (4, 4) of the frames of TFMessages in the ego frame: base_link, or base_footprint where there is none."""
+    if not tf.is_file():
+        return {}
     links: dict[str, tuple[str, FloatArray]] = {}
-    for one in (one for message in read_documents(path, path.name) for one in message["transforms"]):
-        child, parent = (frame.strip("/") for frame in (one["child_frame_id"], one["header"]["frame_id"]))
-        links[child] = parent, pose_of(child, one["transform"])
+    for link in (link for message in read_documents(tf, TF) for link in message["transforms"]):
+        child, parent = (frame.strip("/") for frame in (link["child_frame_id"], link["header"]["frame_id"]))
+        links[child] = parent, pose_of(child, link["transform"])
 
     def climbed(at: str, end: str) -> tuple[str, FloatArray]:
         pose: FloatArray = np.eye(4)
@@ -223,18 +231,6 @@ def _tf_poses(path: Path) -> dict[str, FloatArray]:
     return poses
 
 
-def _file_storage(path: Path) -> dict[str, Any]:
-    """Plain data of a FileStorage's XML; cv2's own reader is not used, as broken files corrupt its memory."""
-    text = read_calibration_text(path, path.name)
-    if re.search("<!(?!--)", text):  # entities could name other files, or multiply
-        raise CalibrationError(f"{path.name}: expected XML as OpenCV writes it, without declarations, got <!")
-    try:
-        nodes = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise CalibrationError(f"{path.name}: expected XML, got {error}") from None
-    return {node.tag: _node_data(node) for node in nodes}
-
-
 def _node_data(node: ElementTree.Element) -> Any:
     if not len(node):
         return (node.text or "").strip()
@@ -247,7 +243,7 @@ def _node_data(node: ElementTree.Element) -> Any:
 
 def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
     """A CameraInfo YAML for each camera, as camera_calibration does, and the poses as a TFMessage."""
-    files, transforms = {}, list[dict[str, Any]]()
+    files, transforms = dict[str, Any](), list[dict[str, Any]]()
     for k, camera in enumerate(data["cameras"]):
         name, K, pose = camera["name"], np.array(camera["K"]), np.array(camera["cam2ego"])
         lens, coefficients = lens_of(camera, "ROS", {"radtan": 8, "fisheye": 4})
@@ -263,12 +259,12 @@ def ros_files(data: Mapping[str, Any]) -> dict[str, Any]:
             "projection_matrix": _node(np.column_stack([K, np.zeros(3)])),
         }
         at, wxyz = pose[:3, 3].tolist(), quaternion_from_rotation(pose[:3, :3]).tolist()
-        transform = {"translation": dict(zip("xyz", at, strict=True)), "rotation": dict(zip("wxyz", wxyz, strict=True))}
+        link = {"translation": dict(zip("xyz", at, strict=True)), "rotation": dict(zip("wxyz", wxyz, strict=True))}
         frame = f"{name.strip('/')}_optical_frame"
-        if any(one["child_frame_id"] == frame for one in transforms):
+        if any(transform["child_frame_id"] == frame for transform in transforms):
             raise refusal(name, f"another camera's frame for {TF}", f"{frame} twice: rename it")
         frames = {"header": {"frame_id": _EGO_FRAMES[0]}, "child_frame_id": frame}
-        transforms.append({**frames, "transform": transform})
+        transforms.append({**frames, "transform": link})
     names = {camera["name"]: camera["name"] for camera in data["cameras"]}  # files come in alphabetical order
     return files | {TF: {"transforms": transforms}, MOUNTING: {"ground_z_m": data["ground_z_m"], "names": names}}
 

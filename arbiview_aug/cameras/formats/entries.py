@@ -1,15 +1,21 @@
-"""Cameras as in a rig file: made of what readers found, and taken apart for writers."""
+"""Cameras as in a rig file, made by readers and taken apart by writers; ``mounting.yaml``: what other tools lack."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from arbiview_aug.cameras import validation
 from arbiview_aug.cameras.lens import LENSES, FloatArray
-from arbiview_aug.errors import CalibrationError
+from arbiview_aug.cameras.plain_yaml import read_plain
+from arbiview_aug.cameras.rotations import poses_from
+from arbiview_aug.cameras.validation import checked_numbers, checked_pose
+from arbiview_aug.errors import CalibrationError, shown
 
 WAY_OUT = (
     "undistort the images to a pinhole's, or fit a lens of this package (docs/rigs.md, A lens that is not read), and "
@@ -74,3 +80,111 @@ def lens_of(camera: Mapping[str, Any], tool: str, most: Mapping[str, int]) -> tu
         got = f"{lens} with {len(coefficients)}"
         raise refusal(camera["name"], f"a lens of {tool}: pinhole, {known}", got)
     return lens, coefficients
+
+
+MOUNTING = "mounting.yaml"
+
+
+@dataclass(frozen=True)
+class Mounting:
+    """The file's content.
+
+    Attributes:
+        poses: cam2ego (4, 4) by camera; in the file, rows or tf's ``{translation: {x, ...}, rotation: {x, ..., w}}``.
+        ground_z_m: Height of the road in the ego frame.
+        metres_per_unit: Scale of a calibration without one (COLMAP).
+        images: Image of each camera (COLMAP).
+        sizes: ``{width, height}`` of all cameras, or by camera.
+        names: Names of the cameras by those in the files, in the rig's order; all others come after them.
+        tokens: Rows of calibrated_sensor.json to read, all by default (nuScenes).
+    """
+
+    poses: Mapping[str, FloatArray] = field(default_factory=dict)
+    ground_z_m: float | None = None
+    metres_per_unit: float | None = None
+    images: Mapping[str, str] = field(default_factory=dict)
+    sizes: Mapping[str, Any] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
+    tokens: Sequence[str] = ()
+
+    @classmethod
+    def read(cls, folder: Path) -> Mounting:
+        """The file in a folder, empty without one; CalibrationError for unknown keys or impossible values."""
+        path = folder / MOUNTING
+        data = read_plain(path, MOUNTING) if path.is_file() else {}
+        keys = cls.__dataclass_fields__
+        if not isinstance(data, Mapping) or not set(data) <= set(keys):
+            raise CalibrationError(f"{MOUNTING}: expected the keys {', '.join(keys)}, got {shown(data)}")
+        data = dict(data)
+        for key in {"poses", "images", "sizes", "names"} & set(data):
+            if not isinstance(data[key], Mapping):
+                raise CalibrationError(f"{MOUNTING}: {key}: expected values by camera, got {shown(data[key])}")
+            data[key] = {str(name): value for name, value in data[key].items()}
+        if not isinstance(data.get("tokens", []), list):
+            raise CalibrationError(f"{MOUNTING}: tokens: expected a list, got {shown(data['tokens'])}")
+        poses = {name: pose_of(name, value) for name, value in data.get("poses", {}).items()}
+        scale = data.get("metres_per_unit")
+        if scale is not None and not (type(scale) in (int, float) and 0 < scale < math.inf):
+            raise CalibrationError(f"{MOUNTING}: metres_per_unit: expected a positive number, got {shown(scale)}")
+        return cls(**{**data, "poses": poses})
+
+    def check(self, cameras: Sequence[str]) -> None:
+        """Refuse values of other cameras than a folder's, which would not be read."""
+        sizes = {} if "width" in self.sizes else self.sizes
+        for key, values in (("poses", self.poses), ("sizes", sizes), ("names", self.names)):
+            if unknown := [name for name in values if name not in cameras]:
+                got = f"{', '.join(unknown)}: write names as in the files, or remove it"
+                raise CalibrationError(f"{MOUNTING}: {key}: expected cameras of {', '.join(cameras)}, got {got}")
+
+    def pose(self, name: str, instead: str = "") -> FloatArray:
+        """A camera's pose, or CalibrationError with the question where it is."""
+        if name not in self.poses:
+            rows = "[[r, r, r, x], [r, r, r, y], [r, r, r, z], [0, 0, 0, 1]]"
+            fix = f"Write its pose, camera to ego, to {MOUNTING} beside the calibration, poses: {{{name}: {rows}}}"
+            raise CalibrationError(f"camera {name!r}: where is it on the vehicle? {fix}{instead}")
+        return self.poses[name]
+
+    def size(self, name: str) -> tuple[Any, Any]:
+        """Width and height of a camera's images, or CalibrationError with the question how large they are."""
+        size = self.sizes if "width" in self.sizes else self.sizes.get(name)
+        if not isinstance(size, Mapping) or size.keys() != {"width", "height"}:
+            fix = f"Write it to {MOUNTING} beside the calibration: sizes: {{{name}: {{width: 1600, height: 900}}}}"
+            raise CalibrationError(f"camera {name!r}: how large are its images? {fix}; without the name it is for all")
+        return size["width"], size["height"]
+
+    def named(self, cameras: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """A rig file's cameras by their ``names``, and in that order."""
+        places = {name: place for place, name in enumerate(self.names)}
+        ordered = sorted(cameras, key=lambda camera: places.get(camera["name"], len(places)))
+        return [camera | {"name": self.names.get(camera["name"], camera["name"])} for camera in ordered]
+
+    def mounted(self, relative: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """cam2ego of cameras whose poses (4, 4) in a common frame are known, by the pose of one of them."""
+        if not relative:
+            raise CalibrationError("expected at least one camera, got none")
+        given = [name for name in relative if name in self.poses]
+        if not given:
+            self.pose(next(iter(relative)), "; one camera's is enough, the others follow")
+        if len(given) == len(relative):
+            return {name: self.poses[name] for name in relative}
+        if len(given) > 1:
+            got = ", ".join(given)
+            raise CalibrationError(f"{MOUNTING}: poses: expected those of one camera or of all, got {got}")
+        to_ego = self.poses[given[0]] @ np.linalg.inv(relative[given[0]])
+        return {name: to_ego @ pose for name, pose in relative.items()}
+
+
+def pose_of(name: str, value: Any) -> FloatArray:
+    """(4, 4) pose of a matrix, or of a translation and a quaternion as tf writes them."""
+    where = f"camera {name!r}"
+    if isinstance(value, Mapping):
+        try:
+            numbers = [value["translation"][axis] for axis in "xyz"] + [value["rotation"][axis] for axis in "wxyz"]
+        except (LookupError, TypeError):
+            expected = "a 4x4 matrix, or {translation: {x, y, z}, rotation: {x, y, z, w}}"
+            raise refusal(name, expected, shown(value), key="pose") from None
+        checked_numbers(where, "pose", numbers, 7, "seven finite numbers")
+        if not any(numbers[3:]):
+            raise refusal(name, "a quaternion", "zeros", key="pose")
+        value = poses_from(numbers)
+    return checked_pose(where, value, "pose")

@@ -1,0 +1,356 @@
+"""Calibrations of whole rigs in a file or folder: COLMAP, Kalibr, nuScenes, Argoverse 2 and Waymo."""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from collections import Counter
+from collections.abc import Mapping
+from itertools import count
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from arbiview_aug.cameras.formats.entries import (
+    MOUNTING,
+    WAY_OUT,
+    Mounting,
+    camera_entry,
+    focal_and_center,
+    lens_of,
+    matrix,
+    refusal,
+)
+from arbiview_aug.cameras.formats.fields import read_fields
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.plain_yaml import read_calibration_text, read_plain
+from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, poses_from, quaternion_from_rotation
+from arbiview_aug.cameras.validation import checked_pose
+from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import CalibrationError, shown
+from arbiview_aug.files import read_bytes
+
+# --- COLMAP
+# src/colmap/sensor/models.h: number of the model, name, numbers of focal lengths and coefficients, our lens. Parameters
+# are focal lengths, cx, cy, coefficients.
+_MODELS = (
+    (0, "SIMPLE_PINHOLE", 1, 0, "pinhole"),
+    (1, "PINHOLE", 2, 0, "pinhole"),
+    (2, "SIMPLE_RADIAL", 1, 1, "radtan"),
+    (3, "RADIAL", 1, 2, "radtan"),
+    (4, "OPENCV", 2, 4, "radtan"),
+    (5, "OPENCV_FISHEYE", 2, 4, "fisheye"),
+    (6, "FULL_OPENCV", 2, 8, "radtan"),
+    (8, "SIMPLE_RADIAL_FISHEYE", 1, 1, "fisheye"),
+    (9, "RADIAL_FISHEYE", 1, 2, "fisheye"),
+    (10, "THIN_PRISM_FISHEYE", 2, 8, "fisheye"),  # k1 k2 p1 p2 k3 k4 sx1 sy1
+    (14, "SIMPLE_FISHEYE", 1, 0, "fisheye"),
+    (15, "FISHEYE", 2, 0, "fisheye"),
+    (16, "EUCM", 2, 2, "eucm"),
+)
+_NOT_READ = {7: "FOV", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION", 17: "EQUIRECTANGULAR"}
+_COLMAP_FILES, _MOST_MODEL_BYTES = ("cameras", "images"), 1 << 28  # images with their points
+
+
+class _Image(NamedTuple):
+    name: str
+    camera: int
+    pose: FloatArray  # (4, 4) camera to world, in the reconstruction's units
+
+
+def read_colmap(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+    """Images of one moment as cameras: all, if each camera has one, or those that ``mounting.yaml`` names.
+
+    Source: "Output Format" of COLMAP's documentation.
+    """
+    folder = path if path.is_dir() else path.parent
+    end = path.suffix if path.is_file() else ".bin" if (folder / "images.bin").is_file() else ".txt"
+    models, images = (_binary_model if end == ".bin" else _text_model)(folder)
+    if not mounting.images and len({image.camera for image in images}) < len(images):
+        camera, times = Counter(image.camera for image in images).most_common(1)[0]
+        fix = f"Write one for each camera to {MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
+        raise CalibrationError(f"camera {camera} has {times} images: which were taken at one moment? {fix}")
+    by_file = {image.name: image for image in images}
+    if len(by_file) < len(images):
+        (file, times), *_ = Counter(image.name for image in images).most_common(1)
+        raise CalibrationError(f"images{end}: expected images with different names, got {shown(file)} {times} times")
+    for file in mounting.images.values():
+        if file not in by_file:
+            expected = f"files that images{end} has, such as {images[0].name}"
+            raise CalibrationError(f"{MOUNTING}: images: expected {expected}, got {shown(file)}")
+    names = [os.path.dirname(file) or Path(file).stem for file in by_file]
+    if len({*names}) < len(by_file):  # several cameras in a folder
+        names = [Path(file).stem for file in by_file]
+    if not mounting.images and len({*names}) < len(by_file):
+        fix = f"write one for each to {MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
+        raise CalibrationError(f"expected images with different names, got {', '.join(names[:8])}: {fix}")
+    chosen = {name: by_file[file] for name, file in (mounting.images or dict(zip(names, by_file, strict=True))).items()}
+    if mounting.metres_per_unit is None:
+        example = f"poses: {{{next(iter(chosen), 'front')}: [[r, r, r, x], ...]}}"
+        fix = f"Write it and the pose of one camera to {MOUNTING} beside the files: metres_per_unit: 1.0, {example}"
+        raise CalibrationError(f"how many metres is a unit of the reconstruction? {fix}")
+    scale = np.ones((4, 4))
+    scale[:3, 3] = mounting.metres_per_unit
+    poses = mounting.mounted({name: image.pose * scale for name, image in chosen.items()})
+    return [_camera(name, models[chosen[name].camera], cam2ego) for name, cam2ego in poses.items()]
+
+
+def _camera(name: str, camera: tuple[Any, ...], cam2ego: FloatArray) -> dict[str, Any]:
+    key, width, height, numbers = camera
+    _, model, focals, bends, lens = _model(key)
+    if len(numbers) != (expected := focals + 2 + bends):
+        raise CalibrationError(f"camera {name!r}: expected {expected} parameters of {model}, got {len(numbers)}")
+    cx, cy, *coefficients = numbers[focals:]
+    if model == "THIN_PRISM_FISHEYE":
+        k1, k2, p1, p2, k3, k4, *prism = coefficients
+        if any((p1, p2, *prism)):
+            raise refusal(name, f"{model} with p1, p2, sx1 and sy1 of 0", shown(coefficients), WAY_OUT)
+        coefficients = [k1, k2, k3, k4]
+    if lens != "pinhole":
+        coefficients += [0.0] * (4 - len(coefficients)) if lens != "eucm" else []
+    K = matrix(numbers[0], numbers[focals - 1], cx - 0.5, cy - 0.5)
+    return camera_entry(name, (width, height), K, cam2ego, lens, coefficients)
+
+
+def _model(key: int | str) -> tuple[int, str, int, int, str]:
+    for model in _MODELS:
+        if key in model[:2]:
+            return model
+    got = f"{_NOT_READ.get(int(key), key) if isinstance(key, int) else key}; {WAY_OUT}"
+    raise CalibrationError(f"camera model: expected {', '.join(model[1] for model in _MODELS)}, got {got}")
+
+
+def _text_model(folder: Path) -> tuple[dict[int, tuple[Any, ...]], list[_Image]]:
+    """Model, width, height and parameters of cameras by number, and images."""
+    texts = (read_calibration_text(folder / f"{name}.txt", f"{name}.txt", _MOST_MODEL_BYTES) for name in _COLMAP_FILES)
+    cameras, images = ([line for line in text.splitlines() if not line.startswith("#")] for text in texts)
+    models = {}
+    for number, model, width, height, *numbers in map(str.split, filter(str.strip, cameras)):
+        models[int(number)] = model, int(width), int(height), list(map(float, numbers))
+    for points in filter(str.strip, images[1::2]):  # X, Y and a number of each point
+        if len(points.split()) % 3 or not re.search(r"\s-?\d+\s*$", points):
+            expected = "two lines for each image, the second with its points or empty"
+            raise CalibrationError(f"images.txt: expected {expected}, got {shown(points)}")
+    rows = (line.split(maxsplit=9) for line in filter(str.strip, images[::2]))
+    return models, [_image(name, int(camera), list(map(float, numbers))) for _, *numbers, camera, name in rows]
+
+
+def _binary_model(folder: Path) -> tuple[dict[int, tuple[Any, ...]], list[_Image]]:
+    cameras, images = (read_bytes(folder / f"{name}.bin", _MOST_MODEL_BYTES) for name in _COLMAP_FILES)
+    models, at = {}, 8
+    for _ in range(struct.unpack_from("<Q", cameras)[0]):
+        number, key, width, height = struct.unpack_from("<iiQQ", cameras, at)
+        length = _model(key)[2] + 2 + _model(key)[3]
+        models[number] = key, width, height, list(struct.unpack_from(f"<{length}d", cameras, at + 24))
+        at += 24 + 8 * length
+    found, at = [], 8
+    for _ in range(struct.unpack_from("<Q", images)[0]):
+        _, *numbers, number = struct.unpack_from("<i7di", images, at)
+        end = images.index(b"\0", at + 64)
+        found.append(_image(images[at + 64 : end].decode(), number, numbers))
+        at = end + 9 + 24 * struct.unpack_from("<Q", images, end + 1)[0]  # x, y and a number of each point
+    return models, found
+
+
+def _image(name: str, camera: int, numbers: list[float]) -> _Image:
+    """An image of a quaternion w x y z and a translation, world to camera."""
+    return _Image(name, camera, np.linalg.inv(poses_from([*numbers[4:], *numbers[:4]])))  # type: ignore[arg-type]
+
+
+def colmap_files(data: Mapping[str, Any]) -> dict[str, Any]:
+    """``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``; the world is the ego frame, in metres."""
+    cameras, images, files, names = [], [], dict[str, Any](), dict[str, str]()
+    taken = {camera["name"] for camera in data["cameras"]}
+    for number, camera in enumerate(data["cameras"], 1):
+        lens, coefficients = lens_of(camera, "COLMAP", {"radtan": 8, "fisheye": 4})
+        if len(coefficients) == 5:
+            coefficients += [0.0] * 3
+        model = "OPENCV_FISHEYE" if lens == "fisheye" else "OPENCV" if len(coefficients) == 4 else "FULL_OPENCV"
+        fx, fy, cx, cy = focal_and_center(camera, "COLMAP")
+        cameras.append((number, model, camera["width"], camera["height"], fx, fy, cx + 0.5, cy + 0.5, *coefficients))
+        world2cam = np.linalg.inv(np.array(camera["cam2ego"]))
+        pose = *quaternion_from_rotation(world2cam[:3, :3]).tolist(), *world2cam[:3, 3].tolist()
+        free = next(name for k in count(number) if (name := f"camera{k}") not in taken)
+        name = camera["name"] if re.fullmatch(r"\S*[^\s/]", camera["name"]) else free
+        taken.add(name)
+        names[name] = camera["name"]
+        images.append((number, *pose, number, f"{name}/0.png\n"))  # and no points
+    for file, head, rows in (
+        ("cameras", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", cameras),
+        ("images", "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)", images),
+        ("points3D", "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)", []),
+    ):
+        lines = (" ".join(map(str, row)) for row in rows)
+        files[f"{file}.txt"] = "\n".join([f"# {head}", *lines, ""])
+    poses = {next(iter(names)): data["cameras"][0]["cam2ego"]}
+    mounting = {"metres_per_unit": 1.0, "poses": poses, "names": names}
+    return files | {MOUNTING: {"ground_z_m": data["ground_z_m"], **mounting}}
+
+
+# --- Kalibr
+# By our lens: camera_model, distortion_model, and how many coefficients lead ``intrinsics``.
+_KALIBR_LENSES = {
+    **{"radtan": ("pinhole", "radtan", 0), "fisheye": ("pinhole", "equidistant", 0)},
+    **{"double_sphere": ("ds", "none", 2), "eucm": ("eucm", "none", 2)},
+}
+CAMCHAINS = ("*camchain*.yaml", "*cam_chain*.yaml")
+
+
+def chain_entries(data: Any) -> dict[str, Mapping[str, Any]]:
+    """The cameras of a camchain by name; none of anything else."""
+    pairs = data.items() if isinstance(data, Mapping) else ()
+    return {name: entry for name, entry in pairs if isinstance(entry, Mapping) and "camera_model" in entry}
+
+
+def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+    """Cameras of a camchain, in the order of the chain, also as OpenVINS ships it.
+
+    Source: the wiki pages "yaml formats" and "supported models" of ethz-asl/kalibr.
+    """
+    if path.is_dir():
+        path, *others = sorted({file for pattern in CAMCHAINS for file in path.glob(pattern)})
+        if others:
+            names = ", ".join(file.name for file in (path, *others))
+            raise CalibrationError(f"which of {names}? Name the file")
+    chain = chain_entries(read_plain(path, path.name))
+    if all(re.fullmatch(r"cam\d{1,9}", str(name)) for name in chain):  # other tools sort cam10 before cam2
+        chain = dict(sorted(chain.items(), key=lambda pair: int(pair[0].removeprefix("cam"))))
+    cameras = {}
+    for name, entry in chain.items():  # lenses are refused before poses are asked
+        lens, K, coefficients, size, _ = read_fields(name, entry)
+        cameras[name] = camera_entry(name, size or mounting.size(name), K, np.eye(4), lens, coefficients)
+    poses = mounting.mounted(_relative(chain))
+    return [cameras[name] | {"cam2ego": pose.tolist()} for name, pose in poses.items()]
+
+
+def _relative(chain: Mapping[str, Mapping[str, Any]]) -> dict[str, FloatArray]:
+    """Poses in the first camera's frame, or in the IMU's where the cameras have T_cam_imu or T_imu_cam alone."""
+    first, *others = chain
+    for key, power in (("T_cam_imu", -1), ("T_imu_cam", 1)):
+        if others and all(entry.get(key) and not entry.get("T_cn_cnm1") for entry in chain.values()):
+            poses = {name: checked_pose(f"camera {name!r}", entry[key], key) for name, entry in chain.items()}
+            return {name: np.asarray(np.linalg.matrix_power(pose, power), np.float64) for name, pose in poses.items()}
+    pose: FloatArray = np.eye(4)
+    relative = {first: pose}
+    if chain[first].get("T_cn_cnm1") is not None:
+        raise CalibrationError(f"camera {first!r}: expected no T_cn_cnm1, as it is the first; sort the file")
+    for name in others:
+        if (before := chain[name].get("T_cn_cnm1")) is None:
+            raise refusal(name, "T_cn_cnm1, or T_cam_imu of all cameras", "neither")
+        pose = pose @ np.asarray(np.linalg.inv(checked_pose(f"camera {name!r}", before, "T_cn_cnm1")), np.float64)
+        relative[name] = pose
+    return relative
+
+
+def kalibr_files(data: Mapping[str, Any]) -> dict[str, Any]:
+    """``camchain.yaml``; its cameras are cam0, cam1 and so on, by their names in ``mounting.yaml``."""
+    chain: dict[str, Any] = {}
+    poses = [np.array(camera["cam2ego"]) for camera in data["cameras"]]
+    for k, camera in enumerate(data["cameras"]):
+        lens, coefficients = lens_of(camera, "Kalibr", {"radtan": 4, "fisheye": 4, "double_sphere": 2, "eucm": 2})
+        model, distortion_model, leading = _KALIBR_LENSES[lens]
+        chain[f"cam{k}"] = {
+            **{"camera_model": model, "intrinsics": coefficients[:leading] + focal_and_center(camera, "Kalibr")},
+            **{"distortion_model": distortion_model, "distortion_coeffs": coefficients[leading:]},
+            "resolution": [camera["width"], camera["height"]],
+            "rostopic": f"/{camera['name'].strip('/')}/image_raw",
+        }
+        if k:
+            chain[f"cam{k}"]["T_cn_cnm1"] = (np.linalg.inv(poses[k]) @ poses[k - 1]).tolist()
+    names = {f"cam{k}": camera["name"] for k, camera in enumerate(data["cameras"])}
+    mounting = {"ground_z_m": data["ground_z_m"], "poses": {"cam0": poses[0].tolist()}, "names": names}
+    return {"camchain.yaml": chain, MOUNTING: mounting}
+
+
+# --- data sets
+CALIBRATED_SENSOR = "calibrated_sensor.json"
+
+_MOST_TABLE_BYTES = 64 << 20  # nuScenes' tables of v1.0-trainval have 4 MB, but sample_data 1.2 GB
+_AV2_POSE = "tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz"
+_WAYMO_NAMES = dict(enumerate(("UNKNOWN", "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")))
+
+
+def read_nuscenes(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+    """Cameras of nuScenes' ``calibrated_sensor.json``; names from ``sensor.json``, sizes from ``sample_data.json``.
+
+    Schema: docs/schema_nuscenes.md of nutonomy/nuscenes-devkit.
+    """
+    folder = path if path.is_dir() else path.parent
+    channels = {row["token"]: row["channel"] for row in _table(folder, "sensor") if row["modality"] == "camera"}
+    rows = [row for row in _table(folder, "calibrated_sensor") if row["sensor_token"] in channels]
+    rows = [row for row in rows if not mounting.tokens or row["token"] in mounting.tokens]
+    by_name: dict[str, Mapping[str, Any]] = {}
+    for row in rows:
+        name = channels[row["sensor_token"]]
+        if {**by_name.setdefault(name, row), "token": row["token"]} != row:
+            raise CalibrationError(
+                f"{name} has several calibrations: of which log? Write the tokens of one vehicle's rows to {MOUNTING} "
+                f"beside the file, tokens: [{row['token']}, ...]; or NuScenesDataset(root)[i]['rig'].save(FILE)"
+            )
+    sizes, table, cameras = {}, folder / "sample_data.json", []
+    if not mounting.sizes and table.is_file() and table.stat().st_size <= _MOST_TABLE_BYTES:
+        images = (row for row in _table(folder, "sample_data") if row.get("width"))
+        sizes = {row["calibrated_sensor_token"]: (row["width"], row["height"]) for row in images}
+    for name, row in by_name.items():
+        lens, K, coefficients, _, _ = read_fields(name, row)  # T4's rows have camera_distortion, k1 k2 p1 p2 k3
+        pose = poses_from([*row["translation"], *row["rotation"]])
+        size = sizes.get(row["token"]) or mounting.size(name)
+        cameras.append(camera_entry(name, size, K, pose, lens, coefficients))
+    return cameras
+
+
+def _table(folder: Path, name: str) -> Any:
+    return read_plain(folder / f"{name}.json", f"{name}.json", _MOST_TABLE_BYTES)
+
+
+def read_argoverse2(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+    """Cameras of Argoverse 2's ``calibration`` folder, or of the log that it is in.
+
+    Source: ``PinholeCamera.from_feather`` of argoverse/av2-api.
+    """
+    feather, arrow = optional_package("pyarrow.feather"), optional_package("pyarrow")
+
+    def rows(file: str) -> Any:
+        table = feather.read_table(arrow.BufferReader(read_bytes(folder / file, _MOST_TABLE_BYTES)))
+        table.validate(full=True)  # pyarrow reads outside its buffers in damaged tables
+        return table.to_pylist()
+
+    folder = path.parent if path.is_file() else path
+    folder = folder if (folder / "intrinsics.feather").is_file() else folder / "calibration"
+    mounts = rows("egovehicle_SE3_sensor.feather")
+    poses = {row["sensor_name"]: poses_from([row[key] for key in _AV2_POSE]) for row in mounts}
+    cameras = []
+    for row in rows("intrinsics.feather"):
+        K = matrix(row["fx_px"], row["fy_px"], row["cx_px"], row["cy_px"])
+        size, name = (row["width_px"], row["height_px"]), row["sensor_name"]
+        cameras.append(camera_entry(name, size, K, poses[name]))
+    return cameras
+
+
+def waymo_entries(data: Any) -> list[Mapping[str, Any]]:
+    """Camera calibrations in JSON that protobuf made of a Frame, a Context or its list; none in anything else."""
+    data = data.get("context", data) if isinstance(data, Mapping) else data
+    if isinstance(data, Mapping):
+        data = data.get("cameraCalibrations", data.get("camera_calibrations"))
+    is_waymo = isinstance(data, list) and all(isinstance(entry, Mapping) and "extrinsic" in entry for entry in data)
+    return data if is_waymo else []
+
+
+def read_waymo(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+    """Cameras of Waymo's ``CameraCalibration`` messages (dataset.proto of waymo-research/waymo-open-dataset).
+
+    ``intrinsic`` is the list of version 1, or the mapping of version 2's component.
+    """
+    axes, cameras = np.eye(4), []
+    axes[:3, :3] = CAMERA_AXES_IN_EGO  # this package's camera frame in Waymo's
+    for entry in waymo_entries(read_plain(path, path.name)):
+        name, intrinsic = entry["name"], entry["intrinsic"]
+        if isinstance(intrinsic, Mapping):
+            intrinsic = [intrinsic[key] for key in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")]
+        cam2ego = np.reshape(np.asarray(entry["extrinsic"]["transform"], float), (4, 4)) @ axes
+        name = _WAYMO_NAMES[name] if isinstance(name, int) else name  # CameraName.Name
+        size = entry["width"], entry["height"]
+        cameras.append(camera_entry(name, size, matrix(*intrinsic[:4]), cam2ego, "radtan", intrinsic[4:]))
+    return cameras
