@@ -17,9 +17,9 @@ _MEDIAN, _TOP_SHARE, _RIM_SHARE, _PAINT_SHARE = 0.5, 0.9, 0.6, 0.8
 """Quantiles nearest to the paint: of sides; of tops, which are seen at grazing angles; of their rims, below which
 windows begin; of windows and the paint around them, by their largest channel, from which on all is paint."""
 
-_SURE_SAMPLES, _SAME_HUE, _LEAST_HUE = 6, 0.06, 0.3
+_SURE_SAMPLES, _SAME_HUE = 6, 0.06
 """Samples of a seen top that weigh as much as its paint; largest difference of their hues, as shares of the channels'
-sum; share of the paint's hue that reflected sky leaves at least. Others show what is behind a top."""
+sum. Reflected sky makes a top paler; another hue shows what is behind it."""
 
 _LEAST_SAMPLES = 3
 """Samples of a part that suffice for its colour."""
@@ -406,14 +406,14 @@ def _is_of_rim(windows: Any, body: Any, rim: Any) -> bool:
 
 @borrowing
 def _same_hue(paint: Any, top: Any) -> bool:
-    """Whether a top (3,), shares of white, has the hue of its paint, perhaps paler by reflected sky."""
+    """Whether a top (3,), shares of white, has the hue of its paint, however pale by reflected sky."""
     white = np.float64(1 / 50)
     one, two = paint[0] + paint[1] + paint[2] + 3 * white, top[0] + top[1] + top[2] + 3 * white
     along = across = apart = 0.0
     for c in range(3):
         along += ((paint[c] + white) / one - 1 / 3) * ((top[c] + white) / two - 1 / 3)
         across += ((paint[c] + white) / one - 1 / 3) ** 2
-    kept = min(max(along / max(across, 1e-9), _LEAST_HUE), 1.0)
+    kept = min(max(along / max(across, 1e-9), 0.0), 1.0)
     for c in range(3):
         apart += abs((top[c] + white) / two - 1 / 3 - kept * ((paint[c] + white) / one - 1 / 3))
     return apart < _SAME_HUE
@@ -425,9 +425,10 @@ def colour_objects(sample: Any, part: Any, white: float, colours: Any) -> None:
 
     Sides take the median of what is seen of the body, or of the cabin. A body of which nothing is seen takes the paint
     around the windows. Tops take their paint in the light that lies on the frame's seen tops, and what is seen of them,
-    the more the larger the part that is seen. That light is a line from bodies to seen tops in linear light: its slope
-    is light over that on bodies, and its offset is reflected sky. A black and a white top that are as bright as their
-    bodies count as one seen top each.
+    the more the larger the part that is seen. A top that is darker than its body, and nearer to the brightness of the
+    frame's windows by ratio, does not count: it is glass where a shape has a bonnet. The light is a line from bodies to
+    seen tops in linear light: its slope is light over that on bodies, and its offset is reflected sky. A black and a
+    white top that are as bright as their bodies count as one seen top each.
 
     Args:
         sample: (n, 3) float32 colours.
@@ -449,6 +450,12 @@ def colour_objects(sample: Any, part: Any, white: float, colours: Any) -> None:
     tops, sure = np.empty((objects, 3, 3)), np.empty(objects)  # paint, body and seen top of each, linear
     weight, x_sum, y_sum, xx, xy = 2.0, 1.0, 1.0, 1.0, 1.0  # of a black and a white top
     windows, body, rim, top = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    shades, known = np.empty(objects, np.float32), 0
+    for n in range(objects):
+        if _quantile(ordered, ends[PARTS * n], ends[PARTS * n + 1], _MEDIAN, 0, values, windows):
+            shades[known] = windows.sum()
+            known += 1
+    glass = np.float64(_select(shades, known, _MEDIAN)) if known else 0.0
     for n in range(objects):
         first, seen = PARTS * n, ends[PARTS * n + RIM_PART] - ends[PARTS * n + TOP_PART]
         has_windows = _quantile(ordered, ends[first], ends[first + 1], _MEDIAN, 0, values, windows)
@@ -458,6 +465,8 @@ def colour_objects(sample: Any, part: Any, white: float, colours: Any) -> None:
         has_rim = has_rim and (not has_body or (has_windows and _is_of_rim(windows, body, rim)))
         if has_windows and not has_body:
             has_body = _quantile(ordered, ends[first], ends[first + 1], _MEDIAN, _PAINT_SHARE, values, body)
+        if has_body and top.sum() < body.sum() and top.sum() ** 2 < glass * body.sum():
+            seen = 0  # glass
         sure[n] = seen / (seen + _SURE_SAMPLES) if seen or has_rim or has_body else -1
         for c in range(3):
             for k in range(TOP_PART):

@@ -485,6 +485,26 @@ def test_tops_take_their_bodies_paint_in_the_light_of_seen_tops() -> None:
         assert (out[:, ~seen] * white - top).abs().max() < 0.51 and torch.equal(out[:, seen], image[:, seen])
 
 
+@pytest.mark.parametrize(("bonnet", "is_seen"), [(30, False), (90, True)], ids=["glass", "a shaded bonnet"])
+def test_glass_where_a_shape_has_a_bonnet_is_no_seen_top(bonnet: int, is_seen: bool) -> None:
+    """A van's windscreen is as dark as the frame's windows; a bonnet in the shade is nearer to its body."""
+    painted = (OTHERS_TOP, 11, bonnet), (OTHER, 6, 200), (WINDOWS, 10, 30)
+    view, _, paint = objects(
+        *painted, hidden=[np.s_[10:20, 54:60]], parts=np.where(np.arange(12) == 10, PARTS, FACE_PARTS)
+    )
+    top = object_colours([view.numpy()], [paint])[TOP_OF_OTHER]
+    assert (top < 150).all() if is_seen else (top > 195).all()
+
+
+def test_pale_tops_tell_of_reflected_sky() -> None:
+    """A top on which sky hides the paint's hue counts, one of another hue does not."""
+    red = (np.s_[20:50, 36:60], 6, (180, 60, 50))
+    for top, is_seen in (((230, 228, 227), True), ((60, 200, 60), False)):
+        view, _, paint = objects((OTHERS_TOP, 11, top), red, hidden=[np.s_[10:20, 54:60]])
+        colour = object_colours([view.numpy()], [paint])[TOP_OF_OTHER]
+        assert (np.abs(colour - top).max() < 40) == is_seen
+
+
 def test_rims_of_roofs_are_sampled_below_their_edge() -> None:
     _, _, paint = objects((OTHERS_TOP, 11, 9), *ROOF, hidden=[OTHERS_TOP], parts=np.r_[FACE_PARTS[:10], PARTS, 12])
     edge = paint.sample[paint.sample_part == PARTS + RIM_PART] // 64
