@@ -59,12 +59,11 @@ class DepthFolder:
 
     def write(self, token: str, rig: Rig, depth: MotionDepth, origin: Sequence[str] = ()) -> None:
         """Write a frame's depth atomically, with its token, rig and origin: its neighbours, or a model. OutputError."""
-        maps: dict[str, Any] = {f"depth_{k:02}": one.astype(np.float16) for k, one in enumerate(depth.depth_m)}
+        kind = "learned" if isinstance(depth, LearnedDepth) else "motion"
+        facts: dict[str, Any] = {"format": _FORMAT, "token": token, "kind": kind, "words": depth.words}
+        facts |= {f"depth_{k:02}": layer.astype(np.float16) for k, layer in enumerate(depth.depth_m)}
         with whole_file(self.path(token)) as file:
-            kind = "learned" if isinstance(depth, LearnedDepth) else "motion"
-            facts: dict[str, Any] = {"format": _FORMAT, "token": token, "kind": kind, "words": depth.words}
-            origins = np.array(list(origin), dtype=np.str_)
-            np.savez_compressed(file, **facts, neighbours=origins, **_calibration(rig), **maps)
+            np.savez_compressed(file, neighbours=np.array(list(origin), np.str_), **_calibration(rig), **facts)
 
     def read(self, token: str, rig: Rig) -> MotionDepth:
         """A frame's depth, of either kind; DataError for a file that is missing, broken, or of another calibration."""
@@ -89,16 +88,14 @@ class DepthFolder:
             with np.load(BytesIO(read_bytes(path, _MOST_BYTES)), allow_pickle=False) as file:
                 arrays: dict[str, Any] = {name: file[name] for name in file.files}
             depth = tuple(arrays[f"depth_{k:02}"].astype(np.float32) for k in range(len(arrays["K"])))
-            words, of = str(arrays["words"]), str(arrays.get("token", token))  # older files name no token
-            kind, origin = _KINDS[str(arrays.get("kind", "motion"))], arrays["neighbours"].tolist()
-            if of != token:
-                raise _misfit(path, f"frame {token!r}", f"that of frame {of!r}")
-            _check_fits(path, arrays, rig, depth)
-        except DataError:
-            raise
+            found = _KINDS[str(arrays.get("kind", "motion"))](depth, str(arrays["words"]))
+            misfit = _misfit(arrays, token, rig, depth)
+            origin: list[str] = arrays["neighbours"].tolist()
         except (*BROKEN_ARRAY, KeyError, TypeError, OverflowError) as error:
             raise DataError(f"{path}: expected depth of a frame, got {type(error).__name__}; delete it") from None
-        return kind(depth, words), origin
+        if misfit:
+            raise DataError(f"{path}: expected depth of {misfit}delete it and run the depth command again")
+        return found, origin
 
 
 class WithDepth(Dataset[dict[str, Any]]):
@@ -152,22 +149,21 @@ def _calibration(rig: Rig) -> dict[str, Any]:
     return {"K": np.stack([camera.K for camera in cameras]), "cam2ego": np.stack([c.cam2ego for c in cameras])}
 
 
-def _misfit(path: Path, expected: str, got: str, fix: str = "") -> DataError:
-    fix += "delete it and run the depth command again"
-    return DataError(f"{path}: expected depth of {expected}, got {got}; {fix}")
-
-
-def _check_fits(path: Path, arrays: Mapping[str, Any], rig: Rig, depth: tuple[Layer, ...]) -> None:
-    """Raise DataError for depth of another format, rig, image size or calibration."""
-    if int(arrays["format"]) != _FORMAT:
-        raise _misfit(path, f"format {_FORMAT}", f"format {int(arrays['format'])}")
+def _misfit(arrays: Mapping[str, Any], token: str, rig: Rig, depth: tuple[Layer, ...]) -> str | None:
+    """The expected frame, format, rig, image size or calibration, and what a file has instead; None if it fits."""
+    of, number = str(arrays.get("token", token)), int(arrays["format"])  # older files name no token
+    if of != token:
+        return f"frame {token!r}, got that of frame {of!r}; "
+    if number != _FORMAT:
+        return f"format {_FORMAT}, got format {number}; "
     if len(depth) != len(rig):
-        raise _misfit(path, f"{len(rig)} cameras", f"{len(depth)}")
+        return f"{len(rig)} cameras, got {len(depth)}; "
     for camera, layer in zip(rig, depth, strict=True):
         if layer.shape != (size := motion_camera(camera).size):
             fix = "read the images at their full or half size (--downscale 1 or 2), as it was computed; or "
-            raise _misfit(path, f"camera {camera.name!r} of shape {size}", f"{layer.shape}", fix)
+            return f"camera {camera.name!r} of shape {size}, got {layer.shape}; {fix}"
     for key, atol in (("K", _SAME_PX), ("cam2ego", _SAME_POSE)):
         for camera, recorded, expected in zip(rig, arrays[key], _calibration(rig)[key], strict=True):
             if not np.allclose(recorded, expected, rtol=0, atol=atol):
-                raise _misfit(path, "this calibration", f"another's: {key} of camera {camera.name!r} differs")
+                return f"this calibration, got another's: {key} of camera {camera.name!r} differs; "
+    return None

@@ -43,11 +43,11 @@ def warn_of_unfinished(root: Path, found: int) -> None:
     """Warn of a conversion that is not finished, with the number of frames found."""
     if not is_converted(root) or (root / CONVERSION_FOLDER / FINISHED_FILE).is_file():
         return
-    count = f"{found} frames"
+    count = str(found)
     with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):  # ``convert`` tells what is wrong with it
         begun = json.loads(read_text(root / CONVERSION_FOLDER / BEGUN_FILE, 1 << 28))  # all names of 2 million frames
-        count = f"{found} of {len(begun['source']['frames'])} frames"
-    warn(f"{root}: unfinished conversion: {count}; run convert again")
+        count += f" of {len(begun['source']['frames'])}"
+    warn(f"{root}: unfinished conversion: {count} frames; run convert again")
 
 
 def checked_index(index: Any, count: int) -> int:
@@ -116,19 +116,6 @@ class Neighbours:
         """-1 for the past, 1 for the future."""
         return {"both": (-1, 1), "past": (-1,), "future": (1,)}[self.direction]
 
-    def select(self, travelled_m: FloatArray, index: int) -> list[int]:
-        """Neighbours of frame ``index`` by non-decreasing distance (F,) along a drive, nearest first per direction."""
-        rows: list[int] = []
-        for sign in self.signs:
-            for k in range(1, self.count + 1):
-                # 1 mm of tolerance: the poses of a standing vehicle jitter.
-                target_m = travelled_m[index] + sign * (k * self.step_m - 1e-3)
-                side: Literal["left", "right"] = "left" if sign > 0 else "right"
-                at = int(np.searchsorted(travelled_m, target_m, side)) - (sign < 0)
-                if 0 <= at < len(travelled_m) and at not in rows:
-                    rows.append(at)
-        return rows
-
 
 def check_neighbours(value: Any) -> None:
     """Raise TypeError unless the value is ``Neighbours`` or None."""
@@ -139,40 +126,39 @@ def check_neighbours(value: Any) -> None:
 class Drive:
     """Distance travelled by a vehicle, from its positions (F, 3) in the world, in recording order.
 
-    ``parts`` (F,) are non-decreasing numbers of uninterrupted parts; neighbours share their part.
+    ``parts`` (F,) are non-decreasing numbers of uninterrupted parts; neighbours share their part. Jitter of the poses
+    of a standing vehicle is no travel.
     """
 
     def __init__(self, positions_m: FloatArray, parts: npt.NDArray[np.int64]) -> None:
-        self._travelled_m, self._parts = travelled_m(positions_m), parts
+        total_m, distances_m, last = 0.0, [], None
+        for position in positions_m.tolist():
+            step_m = 0.0 if last is None else math.dist(last, position)
+            if last is None or step_m >= STILL_M:
+                last, total_m = position, total_m + step_m
+            distances_m.append(total_m)
+        self._travelled_m, self._parts = np.array(distances_m), parts
 
     def neighbours(self, index: int, wanted: Neighbours) -> list[int]:
-        """Indices of a frame's neighbours."""
-        part = self._parts[index]
-        first, end = (int(k) for k in np.searchsorted(self._parts, [part, part + 1]))
-        return [first + k for k in wanted.select(self._travelled_m[first:end], index - first)]
-
-
-def travelled_m(positions_m: FloatArray) -> FloatArray:
-    """(F,) distance along positions (F, 3), without the pose jitter of a standing vehicle."""
-    total_m, distances_m = 0.0, []
-    last = None
-    for position in positions_m.tolist():
-        step_m = 0.0 if last is None else math.dist(last, position)
-        if last is None or step_m >= STILL_M:
-            last, total_m = position, total_m + step_m
-        distances_m.append(total_m)
-    return np.array(distances_m)
+        """Indices of a frame's neighbours, nearest first in each direction."""
+        first, end = (int(k) for k in np.searchsorted(self._parts, self._parts[index] + [0, 1]))
+        travelled_m, rows = self._travelled_m[first:end], list[int]()
+        for sign in wanted.signs:
+            for k in range(1, wanted.count + 1):
+                # 1 mm of tolerance: the poses of a standing vehicle jitter.
+                target_m = self._travelled_m[index] + sign * (k * wanted.step_m - 1e-3)
+                at = first + int(np.searchsorted(travelled_m, target_m, "left" if sign > 0 else "right")) - (sign < 0)
+                if first <= at < end and at not in rows:
+                    rows.append(at)
+        return rows
 
 
 def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, where: str) -> npt.NDArray[np.int64]:
     """(F,) parts of a drive with frames ``names``; where the clock goes back, a new one begins, with a warning."""
-    parts = [0] * len(names)
-    for k, (one, two) in enumerate(pairwise(names), 1):
-        goes_back = times_s is not None and times_s[two] <= times_s[one]
-        parts[k] = parts[k - 1] + goes_back
-        if goes_back:
-            warn(clock_message(where, one, two))
-    return np.array(parts, np.int64)
+    goes_back = [times_s is not None and times_s[two] <= times_s[one] for one, two in pairwise(names)]
+    for k in np.flatnonzero(goes_back).tolist():
+        warn(clock_message(where, names[k], names[k + 1]))
+    return np.cumsum([0, *goes_back], dtype=np.int64)[: len(names)]
 
 
 def clock_message(where: str, one: str, two: str) -> str:
@@ -205,7 +191,7 @@ class WritableRecording(Recording, ABC):
             try:
                 frames.append(self._neighbour(k))
             except ArbiviewError as error:
-                frames.append(Unreadable({"token": self._token(k)}, error))
+                frames.append(LazyFrame({"token": self._token(k)}, dict, error=error))
         return frames
 
     def _neighbour(self, place: int) -> LazyFrame:
@@ -219,26 +205,32 @@ class WritableRecording(Recording, ABC):
 
 class LazyFrame(Mapping[str, Any]):
     """A neighbour with ``fields`` (pose, calibration, time, token), whose images ``load`` decodes on first access, and
-    whose LiDAR points ``points`` reads, if given."""
+    whose LiDAR points ``points`` reads, if given. With an ``error`` every access but to the token raises it."""
 
     def __init__(
-        self, fields: Mapping[str, Any], load: Callable[[], Any], points: Callable[[], Any] | None = None
+        self,
+        fields: Mapping[str, Any],
+        load: Callable[[], Any],
+        points: Callable[[], Any] | None = None,
+        error: ArbiviewError | None = None,
     ) -> None:
-        self._fields = dict(fields)
+        self._fields, self._error = dict(fields), error
         self._loads = {"images": load} if points is None else {"images": load, "points": points}
         self.is_broken = False  # whether an access failed
 
     def __getitem__(self, key: str) -> Any:
-        if key in self._loads and key not in self._fields:
-            try:
+        try:
+            if self._error is not None and key != "token":
+                raise self._error
+            if key in self._loads and key not in self._fields:
                 self._fields[key] = self._loads[key]()
-            except (ArbiviewError, OSError):
-                self.is_broken = True
-                raise
+        except (ArbiviewError, OSError):
+            self.is_broken = True
+            raise
         return self._fields[key]
 
     def __contains__(self, key: object) -> bool:
-        return key in self._loads or super().__contains__(key)  # the images need not be decoded
+        return key in self._loads or key in self._fields  # the images need not be decoded
 
     def __iter__(self) -> Iterator[str]:
         return iter({**self._fields, **self._loads})
@@ -248,18 +240,3 @@ class LazyFrame(Mapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"LazyFrame({', '.join(self)})"
-
-
-class Unreadable(LazyFrame):
-    """A broken neighbour, which raises ``error`` on every access but to its token."""
-
-    def __init__(self, fields: Mapping[str, Any], error: ArbiviewError) -> None:
-        super().__init__(fields, self._refuse)
-        self._error = error
-
-    def __getitem__(self, key: str) -> Any:
-        return super().__getitem__(key) if key == "token" else self._refuse()
-
-    def _refuse(self) -> Any:
-        self.is_broken = True
-        raise self._error

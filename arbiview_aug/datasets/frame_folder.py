@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from arbiview_aug.datasets.drive import (
     warn_of_unfinished,
 )
 from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, encoded_image, reduced_rig
-from arbiview_aug.datasets.lidar_files import read_cloud
+from arbiview_aug.datasets.lidar_files import checked_points, read_cloud
 from arbiview_aug.datasets.registry import CALIBRATION_FILE
 from arbiview_aug.errors import (
     ArbiviewError,
@@ -50,7 +51,6 @@ from arbiview_aug.errors import (
 from arbiview_aug.files import read_text
 from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
-from arbiview_aug.scene.point_cloud import returns, shape_mistake
 
 SEQUENCE_FILE = "sequence.json"
 POINTS_FILE = "lidar.npy"
@@ -66,10 +66,11 @@ _CACHED_MASKS = 16  # masks that a worker keeps: those of two eight-camera rigs,
 
 @dataclass(frozen=True)
 class _Frame:
-    """A frame's folder: a child of the data's root, or the root itself."""
+    """A frame's folder, a child of the data's root or the root itself; and its calibration once it is ``read``."""
 
     root: Path
     folder: Path
+    calib: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -80,21 +81,131 @@ class _Frame:
         """Name for messages."""
         return str(self.folder / CALIBRATION_FILE)
 
+    @property
+    def cameras(self) -> list[dict[str, Any]]:
+        cameras: list[dict[str, Any]] = self.calib["cameras"]
+        return cameras
+
+    def read(self) -> _Frame:
+        """The frame with its calibration, a mapping with a list of cameras; other entries are checked where they are
+        read."""
+        path = self.file(CALIBRATION_FILE)
+        try:
+            text = read_text(path, MOST_BYTES)
+            if (count := text.count('"cam2ego"') // 2) > MOST_CAMERAS:  # of which each may name it in a note, too
+                raise CalibrationError(f"{path}: expected at most {MOST_CAMERAS} cameras, got {count} or more")
+            calib = parse_json(text)
+        except CalibrationError:
+            raise
+        except FileNotFoundError:
+            raise DataError(f"{path}: expected a calibration, found no file") from None
+        except (OSError, ValueError, RecursionError) as error:  # ValueError: numbers of thousands of digits too
+            raise DataError(f"{path}: expected JSON, got {getattr(error, 'strerror', None) or error}") from None
+        if not isinstance(calib, dict) or not isinstance(calib.get("cameras"), list):
+            got = type(calib).__name__ + (hint(calib, ("cameras",)) if isinstance(calib, dict) else "")
+            raise DataError(f"{path}: expected an object with a list 'cameras', got {got}")
+        for k, entry in enumerate(calib["cameras"]):
+            if not isinstance(entry, dict):
+                raise CalibrationError(f"{path}: camera {k}: expected a mapping, got {type(entry).__name__}")
+            refused = "distortion", "lens", *USUAL_NAMES["distortion"]  # by ``Rig.from_dict``
+            if entry.get("distortion") is None and (lens := unread_lens(entry, refused)):
+                fix = "write distortion: {model, coeffs} (docs/formats.md), or remove it"
+                raise CalibrationError(f"{path}: camera {shown(entry.get('name', k))}: {lens} is not read; {fix}")
+        return replace(self, calib=calib)
+
     def file(self, name: str, what: str = "") -> Path:
         """Path of a file of this or another frame; DataError for names and links that leave the root."""
         if self.folder != self.root and not os.path.isabs(name):
             name = os.path.normpath(f"{self.name}/{name}")
         return inside(self.root, name, f"{self.where}: {what}" if what else self.where)
 
-    def mask(self, name: str, what: str) -> Path:
-        """Path of a mask, as ``file``; a frame that is itself the root may share masks of a sibling frame."""
-        parts = os.path.normpath(name).split(os.sep, 2) if self.folder == self.root and "\0" not in name else []
-        if len(parts) == 3 and parts[0] == ".." and parts[1] != "..":
-            check_name(os.sep.join(parts[1:]), f"{self.where}: {what}")
-            beside = self.root.parent / parts[1]
-            if not beside.is_symlink() and (beside / CALIBRATION_FILE).is_file():
-                return inside(beside, parts[2], f"{self.where}: {what}")
+    def named(self, entry: Mapping[str, Any], key: str) -> Path | None:
+        """The file that a camera names under a key, None without; its image must be named."""
+        what, name = f"camera {shown(entry.get('name'))}: {key}", entry.get(key)
+        if name is None and key != "file":
+            return None
+        if not isinstance(name, str) or not name:
+            error = CalibrationError if key == "mask" else DataError
+            raise error(f"{self.where}: {what}: expected an image's file name, got {shown(name)}{hint(entry, (key,))}")
+        if key == "mask" and self.folder == self.root and "\0" not in name:  # a single frame may share a sibling's
+            parts = os.path.normpath(name).split(os.sep, 2)
+            if len(parts) == 3 and parts[0] == ".." and parts[1] != "..":
+                check_name(os.sep.join(parts[1:]), f"{self.where}: {what}")
+                sibling = self.root.parent / parts[1]
+                if not sibling.is_symlink() and (sibling / CALIBRATION_FILE).is_file():
+                    return inside(sibling, parts[2], f"{self.where}: {what}")
         return self.file(name, what)
+
+    def of_cameras(self, key: str) -> list[Any]:
+        """What ``named`` finds for each camera."""
+        return [self.named(entry, key) for entry in self.cameras]
+
+    def view_mask_files(self, keys: Sequence[str] = VIEW_MASKS) -> dict[str, list[Path | None]]:
+        """The masks of converted views that are named and exist, for each camera."""
+        found = {key: self.of_cameras(key) for key in keys}
+        return {key: [path and (path if os.path.lexists(path) else None) for path in found[key]] for key in keys}
+
+    def view_masks(self, reduce: Reduce, keys: Sequence[str] = VIEW_MASKS) -> dict[str, Any]:
+        return decode_view_masks(self.view_mask_files(keys), **self._labels(), reduce=reduce)
+
+    def images(self, reduce: Reduce) -> torch.Tensor | list[torch.Tensor]:
+        return decode_images(self.of_cameras("file"), **self._labels(), reduce=reduce)
+
+    def _labels(self) -> dict[str, Any]:
+        sizes = [(int(entry["height"]), int(entry["width"])) for entry in self.cameras]
+        return {"names": [str(entry["name"]) for entry in self.cameras], "sizes": sizes}
+
+    def points_file(self) -> Path | None:
+        entry = self.calib.get("lidar")
+        named = entry.get("file") if isinstance(entry, Mapping) else entry
+        if not (named is None or (isinstance(named, str) and named)):
+            raise DataError(f"{self.where}: lidar: expected {{'file': name}}, got {shown(entry)}")
+        path = self.file(named or POINTS_FILE, "lidar")
+        if path.is_file():
+            return path
+        if named is None and not os.path.lexists(self.folder / POINTS_FILE):
+            return None
+        fix = "copy it, remove the key 'lidar', or pass load_points=False"
+        raise DataError(f"{self.where}: lidar: expected the points {path}, found no file; {fix}")
+
+    def points(self) -> torch.Tensor | None:
+        path, entry = self.points_file(), self.calib.get("lidar")
+        if path is None:
+            return None
+        entry = entry if isinstance(entry, Mapping) else {}
+        unread = [key for key in entry if _OF_POINTS.search(key) and entry[key]]
+        if unread or "ego" not in str(entry.get("frame") or "ego").lower():
+            got = ", ".join(f"{key}: {shown(entry[key])}" for key in unread or ["frame"])
+            expected = "file and columns of float32 points in the ego frame"
+            raise DataError(f"{self.where}: lidar: expected {expected}, got {got}")
+        return checked_points(read_cloud(path, entry.get("columns"), _COLUMNS), str(path))
+
+    def pose(self) -> torch.Tensor | None:
+        """``ego2world``, None without."""
+        if (value := self.calib.get("ego2world")) is None:
+            return None
+        try:
+            pose = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            pose = np.zeros(0)
+        if not is_rigid(pose):
+            expected = "4x4 finite numbers, a rotation beside a position over 0 0 0 1 (not transposed)"
+            raise DataError(f"{self.where}: ego2world: expected {expected}, got {shown(value)}")
+        return torch.from_numpy(pose)
+
+    def boxes(self) -> torch.Tensor | None:
+        """``boxes_3d``, None without."""
+        if (rows := self.calib.get("boxes_3d")) is None:
+            return None
+        try:
+            with np.errstate(over="ignore"):  # infinite in float32, and refused below
+                array = np.array(rows, dtype=np.float64).astype(np.float32)
+            checked_boxes(array)
+        except SampleError as error:
+            raise DataError(f"{self.where}: {error}") from None
+        except (TypeError, ValueError, OverflowError) as error:
+            raise DataError(f"{self.where}: boxes_3d: expected rows of at least 7 numbers, got {error}") from None
+        return torch.from_numpy(array if array.size else array.reshape(0, 7))
 
 
 class FrameFolder(WritableRecording):
@@ -138,7 +249,15 @@ class FrameFolder(WritableRecording):
     ) -> None:
         super().__init__(root, reduce, load_points, neighbours)
         self.clean_masks = clean_masks
-        self._frames = _find_frames(self.root)
+        if not os.path.isdir(self.root):  # unlike Path.is_dir, False for a name that is too long
+            raise DataError(f"frame folder {root}: expected a folder, found none")
+        is_one, one = (self.root / CALIBRATION_FILE).is_file(), self.root.resolve()  # resolved, so that "." has a name
+        folders = () if is_one else sorted(self.root.iterdir())
+        frames = [_Frame(self.root, folder) for folder in folders if (folder / CALIBRATION_FILE).is_file()]
+        self._frames = [_Frame(one, one)] if is_one else frames
+        if not self._frames:
+            expected = f"expected {CALIBRATION_FILE}, or folders that have one, found neither"
+            raise DataError(f"frame folder {root}: {expected}; docs/formats.md has the format")
         self.tokens = [frame.name for frame in self._frames]
         warn_of_unfinished(self.root, len(self))
         self._last_rig: tuple[str, Rig] | None = None
@@ -151,27 +270,22 @@ class FrameFolder(WritableRecording):
 
     def files(self, index: int) -> list[Path]:
         """Source files of a frame: calibration, images, masks, and last the points."""
-        frame = self._frames[checked_index(index, len(self))]
-        calib = _read_calibration(frame)
-        paths = [frame.folder / CALIBRATION_FILE, *(_image_file(entry, frame) for entry in calib["cameras"])]
-        paths += [mask for entry in calib["cameras"] if (mask := _mask_file(entry, frame)) is not None]
-        paths += [file for files in _view_mask_files(calib, frame).values() for file in files if file is not None]
-        points = _points_file(calib, frame) if self.load_points else None
-        return paths if points is None else [*paths, points]
+        frame = self._frames[checked_index(index, len(self))].read()
+        masks = [*frame.of_cameras("mask"), *chain.from_iterable(frame.view_mask_files().values())]
+        paths = [frame.folder / CALIBRATION_FILE, *frame.of_cameras("file"), *masks]
+        return [path for path in (*paths, frame.points_file() if self.load_points else None) if path is not None]
 
     def __getitem__(self, index: int) -> dict[str, Any]:
-        frame = self._frames[checked_index(index, len(self))]
-        calib = _read_calibration(frame)
-        rig = self._rig(calib, frame)
+        frame = self._frames[checked_index(index, len(self))].read()
+        rig = self._rig(frame)
         keys = "boxes_3d", "ego2world", "lidar", "lidars"
-        for entries, read in ((calib, keys), *((c, ("mask",)) for c in calib["cameras"])):
+        for entries, read in ((frame.calib, keys), *((c, ("mask",)) for c in frame.cameras)):
             for wrong, meant in misnamed(entries, read).items():
                 self._warn(wrong, f"{frame.where}: {wrong!r} is not read; did you mean {meant!r}?")
-        sample = camera_fields(rig, _images(calib, frame, rig.names, self.reduce), frame.name)
-        sample |= _view_masks(calib, frame, self.reduce)
-        if self.load_points and (points := _read_points(calib, frame)) is not None:
+        sample = camera_fields(rig, frame.images(self.reduce), frame.name) | frame.view_masks(self.reduce)
+        if self.load_points and (points := frame.points()) is not None:
             sample["points"] = points
-        sample |= self._boxes_pose_time(calib, frame)
+        sample |= self._boxes_pose_time(frame)
         if frame.name in self._order:
             sample["scene_token"] = self.root.resolve().name
         if self._drive is not None:
@@ -181,22 +295,19 @@ class FrameFolder(WritableRecording):
 
     def truth(self, index: int) -> dict[str, Any] | None:
         """``rig`` and ``images`` of a frame's ``truth`` camera, by default of its first camera's size; None without."""
-        frame = self._frames[checked_index(index, len(self))]
-        calib = _read_calibration(frame)
-        entry = calib.get("truth")
+        frame = self._frames[checked_index(index, len(self))].read()
+        entry = frame.calib.get("truth")
         if entry is None:
             return None
         if not isinstance(entry, dict):
             raise CalibrationError(f"{frame.where}: truth: expected a camera's mapping, got {type(entry).__name__}")
-        size = {key: calib["cameras"][0].get(key) for key in ("width", "height")} if calib["cameras"] else {}
-        calib = {**calib, "cameras": [size | entry]}
-        rig = self._rig(calib, frame)
-        return camera_fields(rig, _images(calib, frame, rig.names, self.reduce), frame.name)
+        size = {key: frame.cameras[0].get(key) for key in ("width", "height")} if frame.cameras else {}
+        frame = replace(frame, calib={**frame.calib, "cameras": [size | entry]})
+        return camera_fields(self._rig(frame), frame.images(self.reduce), frame.name)
 
-    def _boxes_pose_time(self, calib: Mapping[str, Any], frame: _Frame) -> dict[str, Any]:
-        checks: dict[str, Callable[[Any, str], Any]] = {"boxes_3d": _boxes, "ego2world": _pose}
-        values = {key: check(calib[key], frame.where) for key, check in checks.items() if calib.get(key) is not None}
-        return values | ({"time_s": self._times_s[frame.name]} if frame.name in self._times_s else {})
+    def _boxes_pose_time(self, frame: _Frame) -> dict[str, Any]:
+        values = {"boxes_3d": frame.boxes(), "ego2world": frame.pose(), "time_s": self._times_s.get(frame.name)}
+        return {key: value for key, value in values.items() if value is not None}
 
     def _find_drive(self) -> Drive:
         """Read the poses of the frames of ``sequence.json``; broken frames, and too few, give warnings."""
@@ -204,8 +315,8 @@ class FrameFolder(WritableRecording):
         for name in self._order:
             frame = self._frames[self._index[name]]
             try:
-                if (pose := _read_calibration(frame).get("ego2world")) is not None:
-                    positions_m[name] = _pose(pose, frame.where).numpy()[:3, 3]
+                if (pose := frame.read().pose()) is not None:
+                    positions_m[name] = pose.numpy()[:3, 3]
             except ArbiviewError as error:
                 warn(f"{error}; this frame is no neighbour")
         names = self._drive_names = list(positions_m)
@@ -220,21 +331,22 @@ class FrameFolder(WritableRecording):
         return self._drive_names[place]
 
     def _neighbour(self, place: int) -> LazyFrame:
-        frame = self._frames[self._index[self._token(place)]]
-        calib = _read_calibration(frame)
-        rig = self._rig(calib, frame)
-        fields = {"token": frame.name, "rig": rig, **self._boxes_pose_time(calib, frame)}
-        fields |= _view_masks(calib, frame, self.reduce, ("coverage",))
-        points = partial(_read_points, calib, frame) if self.load_points else None
-        return LazyFrame(fields, partial(_images, calib, frame, rig.names, self.reduce), points)
+        frame = self._frames[self._index[self._token(place)]].read()
+        fields = {"token": frame.name, "rig": self._rig(frame), **self._boxes_pose_time(frame)}
+        fields |= frame.view_masks(self.reduce, ("coverage",))
+        return LazyFrame(fields, partial(frame.images, self.reduce), frame.points if self.load_points else None)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_last_rig": None}
 
-    def _rig(self, calib: Mapping[str, Any], frame: _Frame) -> Rig:
+    def _rig(self, frame: _Frame) -> Rig:
         """The frame's rig; the last one itself if the calibration is the same."""
-        masks = [_mask_file(entry, frame) for entry in calib["cameras"]]
-        bare = [_calibration_of(entry) for entry in calib["cameras"]]
+        calib, masks, read = frame.calib, frame.of_cameras("mask"), ("name", "width", "height", "K", "cam2ego")
+        bare = []  # entries that decide the rig, without timestamps and files
+        for entry in frame.cameras:
+            has_lens = canonical_name(str(entry.get("lens"))) in LENSES  # which is refused; other words are notes
+            keys = (*read, "distortion", *["lens"] * has_lens, *misnamed(entry, (*read, "distortion")))
+            bare.append({key: entry[key] for key in keys if key in entry})
         data = {"name": calib.get("name", calib.get("dataset", "")), "cameras": bare}
         data |= {key: calib[key] for key in ("ground_z_m", "lidars", *misnamed(calib, ("ground_z_m",))) if key in calib}
         key = json.dumps([data, [mask and (os.path.realpath(mask), _modified_s(mask)) for mask in masks]])
@@ -256,25 +368,13 @@ class FrameFolder(WritableRecording):
             images = []
             for k in sorted({0, len(self) // 2, len(self) - 1}):
                 with suppress(ArbiviewError):  # told when that frame is read
-                    entries = {c.get("name"): c for c in _read_calibration(self._frames[k])["cameras"]}
-                    if camera.name in entries:
-                        file = _image_file(entries[camera.name], self._frames[k])
+                    frame = self._frames[k].read()
+                    for entry in (entry for entry in frame.cameras if entry.get("name") == camera.name):
+                        file: Any = frame.named(entry, "file")
                         images.append(decode_images([file], names=[camera.name], sizes=[camera.size])[0])
             circle = image_circle(camera, torch.stack(images).amax(dim=0)) if images else None
             self._rims[key] = None if circle is None else circle.holds(camera)
         return replace(camera, mask=self._rims[key])
-
-
-def _find_frames(root: Path) -> list[_Frame]:
-    if not os.path.isdir(root):  # unlike Path.is_dir, False for a name that is too long
-        raise DataError(f"frame folder {root}: expected a folder, found none")
-    if (root / CALIBRATION_FILE).is_file():
-        return [_Frame(root.resolve(), root.resolve())]  # resolved, so that "." has a name
-    frames = [_Frame(root, folder) for folder in sorted(root.iterdir()) if (folder / CALIBRATION_FILE).is_file()]
-    if not frames:
-        expected = f"expected {CALIBRATION_FILE}, or folders that have one, found neither"
-        raise DataError(f"frame folder {root}: {expected}; docs/formats.md has the format")
-    return frames
 
 
 def entry_name(entry: Any) -> str:
@@ -310,85 +410,6 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
     return times_s, names
 
 
-def _read_calibration(frame: _Frame) -> dict[str, Any]:
-    path = frame.file(CALIBRATION_FILE)
-    try:
-        text = read_text(path, MOST_BYTES)
-        if (count := text.count('"cam2ego"') // 2) > MOST_CAMERAS:  # of which each may name it in a note, too
-            raise CalibrationError(f"{path}: expected at most {MOST_CAMERAS} cameras, got {count} or more")
-        calib = parse_json(text)
-    except CalibrationError:
-        raise
-    except FileNotFoundError:
-        raise DataError(f"{path}: expected a calibration, found no file") from None
-    except (OSError, ValueError, RecursionError) as error:  # ValueError: numbers of thousands of digits too
-        raise DataError(f"{path}: expected JSON, got {getattr(error, 'strerror', None) or error}") from None
-    if not isinstance(calib, dict) or not isinstance(calib.get("cameras"), list):
-        got = type(calib).__name__ + (hint(calib, ("cameras",)) if isinstance(calib, dict) else "")
-        raise DataError(f"{path}: expected an object with a list 'cameras', got {got}")
-    for k, entry in enumerate(calib["cameras"]):
-        if not isinstance(entry, dict):
-            raise CalibrationError(f"{path}: camera {k}: expected a mapping, got {type(entry).__name__}")
-        refused = "distortion", "lens", *USUAL_NAMES["distortion"]  # by ``Rig.from_dict``
-        if entry.get("distortion") is None and (lens := unread_lens(entry, refused)):
-            fix = "write distortion: {model, coeffs} (docs/formats.md), or remove it"
-            raise CalibrationError(f"{path}: camera {shown(entry.get('name', k))}: {lens} is not read; {fix}")
-    return calib
-
-
-def _calibration_of(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Entries of a camera that decide the rig, without timestamps and files."""
-    read = ("name", "width", "height", "K", "cam2ego", "distortion")
-    has_lens = canonical_name(str(entry.get("lens"))) in LENSES  # which is refused; other words are notes
-    return {key: entry[key] for key in (*read, *["lens"] * has_lens, *misnamed(entry, read)) if key in entry}
-
-
-def _image_file(entry: Mapping[str, Any], frame: _Frame) -> Path:
-    return frame.file(*_named(entry, "file", frame, DataError))
-
-
-def _images(
-    calib: Mapping[str, Any], frame: _Frame, names: Sequence[str], reduce: Reduce
-) -> torch.Tensor | list[torch.Tensor]:
-    files = [_image_file(entry, frame) for entry in calib["cameras"]]
-    return decode_images(files, names=names, sizes=_sizes(calib), reduce=reduce)
-
-
-def _sizes(calib: Mapping[str, Any]) -> list[tuple[int, int]]:
-    return [(int(entry["height"]), int(entry["width"])) for entry in calib["cameras"]]
-
-
-def _view_mask_files(
-    calib: Mapping[str, Any], frame: _Frame, keys: Sequence[str] = VIEW_MASKS
-) -> dict[str, list[Path | None]]:
-    """The masks beside converted views that are named and there, for each camera."""
-
-    def find(entry: Mapping[str, Any], key: str) -> Path | None:
-        path = None if entry.get(key) is None else frame.file(*_named(entry, key, frame, DataError))
-        return path if path is not None and os.path.lexists(path) else None
-
-    return {key: [find(entry, key) for entry in calib["cameras"]] for key in keys}
-
-
-def _view_masks(
-    calib: Mapping[str, Any], frame: _Frame, reduce: Reduce, keys: Sequence[str] = VIEW_MASKS
-) -> dict[str, Any]:
-    names = [str(entry.get("name")) for entry in calib["cameras"]]
-    return decode_view_masks(_view_mask_files(calib, frame, keys), names=names, sizes=_sizes(calib), reduce=reduce)
-
-
-def _mask_file(entry: Mapping[str, Any], frame: _Frame) -> Path | None:
-    return None if entry.get("mask") is None else frame.mask(*_named(entry, "mask", frame, CalibrationError))
-
-
-def _named(entry: Mapping[str, Any], key: str, frame: _Frame, error: type[ArbiviewError]) -> tuple[str, str]:
-    """The file that a camera names under a key, and its description for messages."""
-    label, file = f"camera {shown(entry.get('name'))}: {key}", entry.get(key)
-    if not isinstance(file, str) or not file:
-        raise error(f"{frame.where}: {label}: expected an image's file name, got {shown(file)}{hint(entry, (key,))}")
-    return file, label
-
-
 def _with_mask(camera: Camera, path: Path | None, frame: _Frame, clean: bool) -> Camera:
     if path is None:
         return camera
@@ -409,67 +430,6 @@ def _modified_s(path: Path) -> float:
 def _cached_mask(path: str, clean: bool, modified_s: float) -> BoolArray:
     mask = read_mask(path, Path(path).parent, "rig")
     return without_specks(mask) if clean else mask
-
-
-def _points_file(calib: Mapping[str, Any], frame: _Frame) -> Path | None:
-    entry = calib.get("lidar")
-    named = entry.get("file") if isinstance(entry, Mapping) else entry
-    if not (named is None or (isinstance(named, str) and named)):
-        raise DataError(f"{frame.where}: lidar: expected {{'file': name}}, got {shown(entry)}")
-    path = frame.file(named or POINTS_FILE, "lidar")
-    if path.is_file():
-        return path
-    if named is None and not os.path.lexists(frame.folder / POINTS_FILE):
-        return None
-    fix = "copy it, remove the key 'lidar', or pass load_points=False"
-    raise DataError(f"{frame.where}: lidar: expected the points {path}, found no file; {fix}")
-
-
-def _read_points(calib: Mapping[str, Any], frame: _Frame) -> torch.Tensor | None:
-    path = _points_file(calib, frame)
-    if path is None:
-        return None
-    entry = calib["lidar"] if isinstance(calib.get("lidar"), Mapping) else {}
-    unread = [key for key in entry if _OF_POINTS.search(key) and entry[key]]
-    if unread or "ego" not in str(entry.get("frame") or "ego").lower():
-        got = ", ".join(f"{key}: {shown(entry[key])}" for key in unread or ["frame"])
-        expected = "file and columns of float32 points in the ego frame"
-        raise DataError(f"{frame.where}: lidar: expected {expected}, got {got}")
-    return checked_points(read_cloud(path, entry.get("columns"), _COLUMNS), str(path))
-
-
-def checked_points(array: Any, where: str) -> torch.Tensor:
-    """Check points and convert their ``returns`` to (P, >=3) float32; DataError for another shape or type."""
-    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
-        got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-        raise DataError(f"points {where}: expected a float array of shape (P, >=3), got {got}")
-    if mistake := shape_mistake(array.shape):
-        raise DataError(f"points {where}: {mistake}")
-    array = array.astype(np.float32) if array.dtype == np.float16 else array  # which holds no ``MOST_M``
-    return torch.from_numpy(np.ascontiguousarray(returns(array), dtype=np.float32))
-
-
-def _boxes(rows: Any, where: str) -> torch.Tensor:
-    try:
-        with np.errstate(over="ignore"):  # infinite in float32, and refused below
-            array = np.array(rows, dtype=np.float64).astype(np.float32)
-        checked_boxes(array)
-    except SampleError as error:
-        raise DataError(f"{where}: {error}") from None
-    except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"{where}: boxes_3d: expected rows of at least 7 numbers, got {error}") from None
-    return torch.from_numpy(array if array.size else array.reshape(0, 7))
-
-
-def _pose(value: Any, where: str) -> torch.Tensor:
-    try:
-        pose = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
-        pose = np.zeros(0)
-    if not is_rigid(pose):
-        expected = "4x4 finite numbers, a rotation beside a position over 0 0 0 1 (not transposed)"
-        raise DataError(f"{where}: ego2world: expected {expected}, got {shown(value)}")
-    return torch.from_numpy(pose)
 
 
 def write_frame(folder: Path, sample: Mapping[str, Any]) -> None:

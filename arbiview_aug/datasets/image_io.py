@@ -156,20 +156,15 @@ def decode_view_masks(
             is_filled = key == "coverage"  # a reduced pixel is as its filled ones are only if all of its pixels are
             views = []
             for name, size, path in zip(names, sizes, of_key, strict=True):
-                mask = np.full(size, is_filled)
+                mask, label = np.full(size, is_filled), f"camera {name!r}: {key} {path}"
                 if path is not None:
-                    mask = _view_mask(path, f"camera {name!r}: {key} {path}", size)
+                    mask = _decoded(_content(path, label), label, "file", cv2.IMREAD_GRAYSCALE) > 0
+                if mask.shape != size:
+                    got = f"{mask.shape[1]}x{mask.shape[0]}; convert again"
+                    raise DataError(f"{label}: expected an image of {size[1]}x{size[0]} (w x h), got {got}")
                 views.append(mask if reduce == 1 else _reduced_mask(mask == is_filled, reduce) == is_filled)
             masks[key] = stacked([torch.from_numpy(view) for view in views])
     return masks
-
-
-def _view_mask(path: Path, label: str, size: tuple[int, int]) -> BoolArray:
-    image = _decoded(_content(path, label), label, "file", cv2.IMREAD_GRAYSCALE)
-    if image.shape != size:
-        got = f"{image.shape[1]}x{image.shape[0]}; convert again"
-        raise DataError(f"{label}: expected an image of {size[1]}x{size[0]} (w x h), got {got}")
-    return image > 0
 
 
 def _content(path: Path, label: str) -> bytes:
@@ -185,7 +180,13 @@ def _header(data: bytes, label: str) -> tuple[str, tuple[int, int]]:
     if not data:
         raise DataError(f"{label}: expected a JPEG or PNG, got an empty file (0 bytes); copy it again")
     if data.startswith(_JPEG_START):
-        format, size, ended = "JPEG", *_jpeg_size(data)
+        # Segments before the scan may hold thumbnails with other ends; padding or maker notes may follow the end.
+        format, size, at = "JPEG", (0, 0), len(_JPEG_START)
+        while data[at : at + 1] == b"\xff" and (marker := _number(data, at + 1, 1)) != 0xDA:
+            if marker in _FRAME_HEADERS:
+                size = _number(data, at + 5, 2), _number(data, at + 7, 2)
+            at += 1 if marker == 0xFF else 2 + _number(data, at + 2, 2)  # fill bytes may precede a marker
+        ended = size != (0, 0) and data.rfind(_JPEG_END) >= at
     elif data.startswith(_PNG_START):
         format, size, ended = "PNG", (_number(data, 20, 4), _number(data, 16, 4)), data.rfind(_PNG_END) > 0
     else:
@@ -217,19 +218,6 @@ def _decoded(data: bytes, label: str, format: str, flags: int) -> ByteArray:
     if image is None:
         raise DataError(f"{label}: expected an image, got a {format} that cannot be decoded; copy it again")
     return image  # type: ignore[no-any-return]
-
-
-def _jpeg_size(data: bytes) -> tuple[tuple[int, int], bool]:
-    """(h, w) from a JPEG's frame header, and whether the end follows the first scan.
-
-    Segments before the scan may hold thumbnails with ends of their own; padding or maker notes may follow the end.
-    """
-    size, at = (0, 0), len(_JPEG_START)
-    while data[at : at + 1] == b"\xff" and (marker := _number(data, at + 1, 1)) != 0xDA:
-        if marker in _FRAME_HEADERS:
-            size = _number(data, at + 5, 2), _number(data, at + 7, 2)
-        at += 1 if marker == 0xFF else 2 + _number(data, at + 2, 2)  # fill bytes may precede a marker
-    return size, size != (0, 0) and data.rfind(_JPEG_END) >= at
 
 
 def _number(data: bytes, at: int, length: int) -> int:

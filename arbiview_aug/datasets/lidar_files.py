@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from arbiview_aug.atomic_io import BROKEN_ARRAY
 from arbiview_aug.errors import DataError, shown, warn
 from arbiview_aug.files import read_bytes
+from arbiview_aug.scene.point_cloud import returns, shape_mistake
 
 Array = npt.NDArray[Any]
 
@@ -64,6 +66,17 @@ def read_cloud(path: Path, columns: Any, how: str, assumed: Sequence[str] | None
         raise DataError(f"{where}: expected whole {expected}, got {len(data)} bytes; copy it again, or {how}")
     rows = np.frombuffer(data, row)
     return _stacked({name: rows[name] for name in row.names}, where)
+
+
+def checked_points(array: Any, where: str) -> torch.Tensor:
+    """Check points and convert their ``returns`` to (P, >=3) float32; DataError for another shape or type."""
+    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
+        got = f"{array.dtype} {array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
+        raise DataError(f"points {where}: expected a float array of shape (P, >=3), got {got}")
+    if mistake := shape_mistake(array.shape):
+        raise DataError(f"points {where}: {mistake}")
+    array = array.astype(np.float32) if array.dtype == np.float16 else array  # which holds no ``MOST_M``
+    return torch.from_numpy(np.ascontiguousarray(returns(array), dtype=np.float32))
 
 
 def row_type(columns: Any, where: str) -> Any:

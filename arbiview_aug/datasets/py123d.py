@@ -18,8 +18,8 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.rotations import poses_from, rotation_from_quaternion
 from arbiview_aug.choices import Reduce
 from arbiview_aug.datasets.drive import Drive, LazyFrame, Neighbours, WritableRecording, camera_fields, checked_index
-from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import area_reduced, reduced_rig
+from arbiview_aug.datasets.lidar_files import checked_points
 from arbiview_aug.datasets.registry import log_folders
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import ArbiviewError, CalibrationError, DataError, calibration_of, described
@@ -53,6 +53,20 @@ class _Log:
     ground_z_m: float
     lidars: Sequence[Any]
     dataset: str
+
+    @classmethod
+    def open(cls, folder: Path, scene: Any, names: Sequence[str] | None) -> _Log:
+        where, metadatas = f"py123d log {folder}", scene.get_camera_metadatas().values()
+        read = [m for m in metadatas if names is None or m.camera_name in names]
+        if not read:
+            raise DataError(f"{where}: expected cameras{f' {names}' if names else ''}, found none of them")
+        if (ego := scene.get_ego_state_se3_metadata()) is None:
+            raise DataError(f"{where}: expected the ego's poses (ego_state_se3.arrow), found none")
+        cameras = {m.camera_id: _camera(m, where) for m in sorted(read, key=lambda m: int(m.camera_id))}
+        merged = "lidar.lidar_merged" in scene.get_all_modality_metadatas()
+        lidars = ["lidar_merged"] if merged else [*scene.get_lidar_metadatas()]
+        road_m, dataset = float(ego.center_to_imu_se3.z - ego.half_height), str(scene.get_log_metadata().dataset)
+        return cls(folder, scene, cameras, road_m, lidars, dataset)
 
     def pose(self, iteration: int, column: str, *modality: Any) -> FloatArray | None:
         """(4, 4) pose in the world; None where the modality recorded nothing."""
@@ -102,6 +116,7 @@ class Py123dDataset(WritableRecording):
     ) -> None:
         super().__init__(root, reduce, load_points, neighbours)
         scene_of = optional_package("py123d.api.scene.arrow.arrow_scene_api", "py123d").ArrowSceneAPI
+        arrow = optional_package("pyarrow", "py123d")
         folders = log_folders(self.root)
         if not folders:
             raise DataError(f"py123d {root}: expected logs (folders with sync.arrow), found none")
@@ -110,8 +125,13 @@ class Py123dDataset(WritableRecording):
         frames: list[tuple[int, int, int]] = []
         for folder in folders:
             with _reading(folder):
-                _refuse_damaged(folder)
-                log = _open(folder, scene_of(folder), cameras)
+                for path in sorted(folder.glob("*.arrow")):
+                    if not path.is_file():  # a pipe would be waited for
+                        got = f"expected a regular file {path.name}, got something else"
+                        raise DataError(f"py123d log {folder}: {got}")
+                    with arrow.memory_map(str(path)) as file:  # pyarrow reads outside of it where offsets are damaged
+                        arrow.ipc.open_file(file).read_all().validate(full=True)
+                log = _Log.open(folder, scene_of(folder), cameras)
                 times_us = [int(time.time_us) for time in log.scene.get_all_iteration_timestamps()]
             frames += [(len(self._logs), k, time_us) for k, time_us in enumerate(times_us)]
             self._logs.append(log)
@@ -163,11 +183,9 @@ class Py123dDataset(WritableRecording):
         if ego2world is None:
             raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected the ego's pose, got none")
         world2ego = np.linalg.inv(ego2world).astype(np.float64, copy=False)
-        rig = []
-        for identity, camera in log.cameras.items():
-            cam2world = log.pose(iteration, "camera_to_global_se3", "camera", identity)
-            if cam2world is not None:
-                rig.append(replace(camera, cam2ego=world2ego @ cam2world))
+        poses = [log.pose(iteration, "camera_to_global_se3", "camera", identity) for identity in log.cameras]
+        posed = zip(log.cameras.values(), poses, strict=True)
+        rig = [replace(camera, cam2ego=world2ego @ cam2world) for camera, cam2world in posed if cam2world is not None]
         if not rig:
             raise DataError(f"py123d log {log.folder}: iteration {iteration}: expected a camera's image, got none")
         fields = {"token": self.tokens[index], "time_s": self.time_s(index), "ego2world": torch.from_numpy(ego2world)}
@@ -222,39 +240,13 @@ def _points(log: _Log, iteration: int, token: str) -> torch.Tensor | None:
     return checked_points(np.concatenate(clouds), f"of {token}") if clouds else None
 
 
-def _refuse_damaged(folder: Path) -> None:
-    """Validate a log's tables: pyarrow reads outside of its memory where offsets are damaged."""
-    arrow = optional_package("pyarrow", "py123d")
-    for path in sorted(folder.glob("*.arrow")):
-        if not path.is_file():  # a pipe would be waited for
-            raise DataError(f"py123d log {folder}: expected a regular file {path.name}, got something else")
-        with arrow.memory_map(str(path)) as file:
-            arrow.ipc.open_file(file).read_all().validate(full=True)
-
-
-def _open(folder: Path, scene: Any, names: Sequence[str] | None) -> _Log:
-    cameras = {}
-    for metadata in sorted(scene.get_camera_metadatas().values(), key=lambda one: int(one.camera_id)):
-        if names is None or metadata.camera_name in names:
-            cameras[metadata.camera_id] = _camera(metadata, f"py123d log {folder}")
-    if not cameras:
-        raise DataError(f"py123d log {folder}: expected cameras{f' {names}' if names else ''}, found none of them")
-    ego = scene.get_ego_state_se3_metadata()
-    if ego is None:
-        raise DataError(f"py123d log {folder}: expected the ego's poses (ego_state_se3.arrow), found none")
-    keys = scene.get_all_modality_metadatas()
-    lidars = ["lidar_merged"] if "lidar.lidar_merged" in keys else [*scene.get_lidar_metadatas()]
-    road_m, dataset = float(ego.center_to_imu_se3.z - ego.half_height), str(scene.get_log_metadata().dataset)
-    return _Log(folder, scene, cameras, road_m, lidars, dataset)
-
-
 def _camera(metadata: Any, where: str) -> Camera:
     """A camera at the ego's origin; CalibrationError for another lens."""
     where = f"{where}: camera {metadata.camera_name!r}"
     model = metadata.camera_model.serialize()
     if model == "pinhole" and metadata.intrinsics is not None:
-        intrinsics, bent = metadata.intrinsics, None if metadata.is_undistorted else metadata.distortion
-        K = np.array([[intrinsics.fx, intrinsics.skew, intrinsics.cx], [0, intrinsics.fy, intrinsics.cy], [0, 0, 1]])
+        numbers, bent = metadata.intrinsics, None if metadata.is_undistorted else metadata.distortion
+        K = np.array([[numbers.fx, numbers.skew, numbers.cx], [0, numbers.fy, numbers.cy], [0, 0, 1]])
         distortion: Any = () if bent is None else (bent.k1, bent.k2, bent.p1, bent.p2, bent.k3)
         lens = "pinhole" if bent is None else "radtan"
     elif model == "fisheye_mei" and metadata.projection is not None and metadata.mirror_parameter is not None:

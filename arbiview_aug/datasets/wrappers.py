@@ -29,10 +29,9 @@ class RetargetedDataset(Dataset[Any]):
     """
 
     def __init__(self, dataset: Any, retarget: Retarget) -> None:
-        name = type(self).__name__
         fix = "use RetargetedIterable" if hasattr(dataset, "__iter__") else "pass the dataset first"
-        self.dataset = checked_map_style(dataset, name, fix)
-        self.retarget = _checked_retarget(retarget, name)
+        self.dataset = checked_map_style(dataset, type(self).__name__, fix)
+        self.retarget = _checked_retarget(retarget, type(self).__name__)
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -45,13 +44,13 @@ class RetargetedDataset(Dataset[Any]):
         return _retargeted(self.retarget, self.dataset[index], index)
 
     def __getitems__(self, indices: Sequence[Any]) -> list[Any]:
-        if callable(getattr(self.dataset, "__getitems__", None)):
-            samples = list(self.dataset.__getitems__(indices))
-            if len(samples) != len(indices):
-                name = type(self.dataset).__name__
-                raise DataError(f"{name}.__getitems__: expected {len(indices)} samples, got {len(samples)}")
-            return [_retargeted(self.retarget, *pair) for pair in zip(samples, indices, strict=True)]
-        return [self[index] for index in indices]
+        if not callable(getattr(self.dataset, "__getitems__", None)):
+            return [self[index] for index in indices]
+        samples = list(self.dataset.__getitems__(indices))
+        if len(samples) != len(indices):
+            where = f"{type(self.dataset).__name__}.__getitems__"
+            raise DataError(f"{where}: expected {len(indices)} samples, got {len(samples)}")
+        return [_retargeted(self.retarget, *pair) for pair in zip(samples, indices, strict=True)]
 
 
 class MixedDataset(Dataset[Any]):

@@ -9,12 +9,21 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
-from arbiview_aug.datasets.synthetic.ground import sample_light
-from arbiview_aug.datasets.synthetic.materials import Surface, band, cell_hash, dot, fade, mix, noise_3d, octave, pulses
+from arbiview_aug.datasets.synthetic.materials import (
+    Surface,
+    band,
+    cell_hash,
+    dot,
+    fade,
+    mix,
+    noise_3d,
+    octave,
+    pulses,
+)
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, SKY_ID
 from arbiview_aug.datasets.synthetic.render import Renderer
 from arbiview_aug.datasets.synthetic.scene import BOX, Material, Scene
-from arbiview_aug.datasets.synthetic.shading import Hits, SceneTables
+from arbiview_aug.datasets.synthetic.shading import Hits, SceneTables, sample_light
 
 _CHUNK = 32768  # hits shaded at a time: temporaries stay in the cache
 _SUN, _SHADE = (1.25, 1.02, 0.74), (0.66, 0.70, 0.80)  # warm light, cool ambient

@@ -15,6 +15,7 @@ import numpy as np
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cameras.rotations import quaternion_from_rotation
+from arbiview_aug.datasets.image_io import encoded_image
 from arbiview_aug.datasets.synthetic import Scene, make_scene
 from arbiview_aug.datasets.synthetic.render import Renderer
 
@@ -31,18 +32,11 @@ Tables = dict[str, list[dict[str, Any]]]
 
 @dataclass(frozen=True)
 class Street:
-    """A scene of the data set.
-
-    Attributes:
-        name: Name of the scene.
-        scene: At time 0.
-        travel_m: How far the vehicle has come by a time in seconds.
-        keyframes: How many.
-    """
+    """A scene of the data set."""
 
     name: str
-    scene: Scene
-    travel_m: Callable[[float], float]
+    scene: Scene  # at time 0
+    travel_m: Callable[[float], float]  # of the vehicle by a time in seconds
     keyframes: int
 
     def at(self, time_s: float) -> Scene:
@@ -69,15 +63,13 @@ def tables_of(rig: Rig, scenes: Sequence[Street]) -> Tables:
     sensors += [("LIDAR_TOP", "lidar", np.eye(4)), ("RADAR_FRONT", "radar", np.eye(4))]
     for k, (channel, modality, pose) in enumerate(sensors):
         data["sensor"].append({"token": channel, "channel": channel, "modality": modality})
-        K = rig[k].K.tolist() if modality == "camera" else []
-        row = {"token": f"cs-{channel}", "sensor_token": channel, "camera_intrinsic": K, **_pose(pose)}
-        data["calibrated_sensor"].append(row)
+        row = {"sensor_token": channel, "camera_intrinsic": rig[k].K.tolist() if modality == "camera" else []}
+        data["calibrated_sensor"].append({"token": f"cs-{channel}", **row, **_pose(pose)})
     data["category"].append({"token": "thing", "name": "thing"})
     for street in scenes:
         data["scene"].append({"token": street.name, "name": street.name})
         for k in range(street.keyframes):
-            row = {"token": _sample(street, k), "scene_token": street.name, "timestamp": _us(k / 2)}
-            data["sample"].append(row)
+            data["sample"].append({"token": _sample(street, k), "scene_token": street.name, "timestamp": _us(k / 2)})
             data["sample_annotation"] += _annotations(street, k)
         for b in range(len(street.scene.boxes)):
             data["instance"].append({"token": f"{street.name}-{b}", "category_token": "thing"})
@@ -100,17 +92,10 @@ def recorded(street: Street, channel: str, modality: str, size: tuple[int, int])
         for n, offset_s in enumerate(EXPOSURES_S if k + 1 < street.keyframes else EXPOSURES_S[:1]):
             time_us = _us(k / 2 + offset_s + phase_s)
             kind, ending = ("samples" if n == 0 else "sweeps"), ("png" if modality == "camera" else "bin")
-            row = {
-                "token": f"{street.name}-{channel}-{k}-{n}",
-                "sample_token": _sample(street, k + (n > 0)),
-                "timestamp": time_us,
-                "is_key_frame": n == 0,
-                "filename": f"{kind}/{channel}/{street.name}__{channel}__{time_us}.{ending}",
-                "prev": rows[-1]["token"] if rows else "",
-                "next": "",
-                "height": size[0] if modality == "camera" else 0,
-                "width": size[1] if modality == "camera" else 0,
-            }
+            row = {"token": f"{street.name}-{channel}-{k}-{n}", "sample_token": _sample(street, k + (n > 0))}
+            row |= {"timestamp": time_us, "is_key_frame": n == 0, "prev": rows[-1]["token"] if rows else "", "next": ""}
+            row |= {"filename": f"{kind}/{channel}/{street.name}__{channel}__{time_us}.{ending}"}
+            row |= dict(zip(("height", "width"), size if modality == "camera" else (0, 0), strict=True))
             if rows:
                 rows[-1]["next"] = row["token"]
             rows.append(row)
@@ -139,25 +124,17 @@ def write_views(root: Path, rig: Rig, street: Street, files: set[str]) -> None:
         for row in recorded(street, channel, "camera", camera.size):
             if row["filename"] in files:
                 ((image, *_),) = renderer.render(street.at(seconds(row["timestamp"])), [camera], rig.ground_z_m)
-                cv2.imwrite(
-                    str(root / row["filename"]), np.ascontiguousarray(image.permute(1, 2, 0).numpy()[..., ::-1])
-                )
+                (root / row["filename"]).write_bytes(encoded_image(image, ".png"))
 
 
 def _annotations(street: Street, k: int) -> list[dict[str, Any]]:
     rows = []
     for b, box in enumerate(street.at(k / 2).boxes):
         place, yaw = STREET2WORLD @ [*box[:3], 1], box[6] + np.pi / 2
-        rows.append(
-            {
-                "token": f"{street.name}-{b}-{k}",
-                "sample_token": _sample(street, k),
-                "instance_token": f"{street.name}-{b}",
-                "translation": place[:3].tolist(),
-                "size": box[[4, 3, 5]].tolist(),
-                "rotation": [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)],
-            }
-        )
+        row = {"token": f"{street.name}-{b}-{k}", "sample_token": _sample(street, k)}
+        row |= {"instance_token": f"{street.name}-{b}", "size": box[[4, 3, 5]].tolist()}
+        rotation = [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+        rows.append({**row, "translation": place[:3].tolist(), "rotation": rotation})
     return rows
 
 

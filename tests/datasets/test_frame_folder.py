@@ -4,7 +4,6 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +47,7 @@ def frame(folder: Path, change: Change | None = None, *, lidar: bool = True) -> 
 
 
 def test_the_sample(tmp_path: Path) -> None:
-    dataset = FrameFolder(frame(tmp_path / "one"))
-    assert len(dataset) == 1
-    sample = dataset[0]
+    sample = FrameFolder(frame(tmp_path / "one"))[0]
     assert sorted(sample) == ["K", "boxes_3d", "cam2ego", "ego2world", "images", "points", "rig", "token"]
     assert sample["images"].shape == (2, 3, 48, 64) and sample["images"].dtype == torch.uint8
     assert sample["images"][1, :, 0, 0].tolist() == [31, 20, 10]  # RGB
@@ -58,12 +55,10 @@ def test_the_sample(tmp_path: Path) -> None:
     assert rig.names == ["front", "back"] and rig.ground_z_m == -0.3
     assert rig["back"].lens == "fisheye" and rig["back"].distortion == (0.01, 0.0, 0.0, 0.0)
     assert rig["front"].mask is None and not rig["back"].mask[40:].any() and rig["back"].mask[:40].all()
-    assert sample["K"].dtype == sample["cam2ego"].dtype == sample["ego2world"].dtype == torch.float64
-    np.testing.assert_array_equal(sample["K"], rig.K)
-    np.testing.assert_array_equal(sample["cam2ego"], rig.cam2ego)
-    assert sample["points"].shape == (3, 4) and sample["points"].dtype == torch.float32
-    assert sample["boxes_3d"].shape == (1, 7) and sample["boxes_3d"].dtype == torch.float32
-    assert sample["token"] == "one"
+    for key, expected in (("K", rig.K), ("cam2ego", rig.cam2ego), ("ego2world", np.eye(4))):
+        assert sample[key].dtype == torch.float64 and np.array_equal(sample[key], expected)
+    for key, shape in (("points", (3, 4)), ("boxes_3d", (1, 7))):
+        assert sample[key].shape == shape and sample[key].dtype == torch.float32
 
 
 def test_a_folder_of_frames_in_the_order_of_their_names(tmp_path: Path) -> None:
@@ -71,9 +66,8 @@ def test_a_folder_of_frames_in_the_order_of_their_names(tmp_path: Path) -> None:
         frame(tmp_path / name)
     (tmp_path / "notes").mkdir()
     dataset = FrameFolder(tmp_path)
-    assert dataset.tokens == ["a", "b", "c"]
-    assert [sample["token"] for sample in dataset] == ["a", "b", "c"]  # type: ignore[attr-defined]
-    assert dataset.by_token("b")["token"] == "b"
+    assert len(dataset) == 3 and dataset.by_token("b")["token"] == "b"
+    assert dataset.tokens == [sample["token"] for sample in dataset] == ["a", "b", "c"]  # type: ignore[attr-defined]
     with pytest.raises(DataError, match="expected the token of one of 3 samples, got 'z'; they are a, b, c"):
         dataset.by_token("z")
     for error, index in ((TypeError, slice(0, 2)), (IndexError, 3)):
@@ -87,21 +81,15 @@ def test_frames_of_one_calibration_share_their_rig(tmp_path: Path) -> None:
         calib["cameras"][0]["timestamp"] = 17
         calib["cameras"][1]["mask"] = "../a/mask.png"
 
-    def another_vehicle(calib: dict[str, Any]) -> None:
-        calib["cameras"][0]["cam2ego"][2][3] += 0.1
-
-    frame(tmp_path / "a")
-    frame(tmp_path / "b", next_frame)
-    frame(tmp_path / "c", another_vehicle)
+    for name, change in (("a", None), ("b", next_frame), ("c", edit("name", "other", 0))):
+        frame(tmp_path / name, change)
     a, b, c = (sample["rig"] for sample in FrameFolder(tmp_path))  # type: ignore[attr-defined]
     assert a is b and a != c
 
 
 def test_optional_parts_may_be_absent(tmp_path: Path) -> None:
-    def bare(calib: dict[str, Any]) -> None:
-        del calib["boxes_3d"], calib["ego2world"], calib["cameras"][1]["mask"]
-
-    sample = FrameFolder(frame(tmp_path / "a", bare, lidar=False))[0]
+    bare = {"boxes_3d": None, "ego2world": None}
+    sample = FrameFolder(frame(tmp_path / "a", lambda calib: calib.update(bare), lidar=False))[0]
     assert sorted(sample) == ["K", "cam2ego", "images", "rig", "token"]
     assert "points" not in FrameFolder(frame(tmp_path / "b"), load_points=False)[0]
     empty = FrameFolder(frame(tmp_path / "c", lambda calib: calib.update(boxes_3d=[])))[0]
@@ -110,8 +98,7 @@ def test_optional_parts_may_be_absent(tmp_path: Path) -> None:
 
 def test_reduce_takes_the_rig_along(tmp_path: Path) -> None:
     sample = FrameFolder(frame(tmp_path), reduce=2)[0]
-    assert sample["images"].shape == (2, 3, 24, 32)
-    assert sample["rig"].sizes == [(24, 32)] * 2
+    assert sample["images"].shape == (2, 3, 24, 32) and sample["rig"].sizes == [(24, 32)] * 2
     full = FrameFolder(tmp_path)[0]
     A = np.array([[0.5, 0, -0.25], [0, 0.5, -0.25], [0, 0, 1]])
     np.testing.assert_allclose(sample["K"], A @ full["K"].numpy(), atol=1e-12)
@@ -143,35 +130,26 @@ def edit(key: str, value: Any, camera: int | None = None) -> Change:
     ("change", "error", "message"),
     [
         (edit("K", [[np.nan, 0, 32], [0, 40, 24], [0, 0, 1]], 0), CalibrationError, "'front': K: expected finite"),
-        (edit("K", [[1, 2], [3, 4]], 0), CalibrationError, r"'front': K: expected shape \(3, 3\)"),
         (edit("cam2ego", np.diag([1, 1, -1, 1]).tolist(), 0), CalibrationError, "'front': cam2ego: expected right"),
         (edit("distortion", {"model": "mei", "coeffs": [1]}, 1), CalibrationError, "'back': lens: expected one of"),
-        (edit("distortion", {"model": "fisheye", "coeffs": [1]}, 1), CalibrationError, "4 coefficients for a fisheye"),
-        (edit("name", "front", 1), CalibrationError, "front more than once"),
         (edit("width", 1600, 0), DataError, r"'front': image .*expected 1600x48 \(w x h\) as calibrated, got 64x48"),
         (swapped, DataError, "expected 48x64 .*got 64x48; the calibration's width and height look swapped"),
-        (edit("cameras", []), CalibrationError, "at least one camera"),
         (edit("cameras", None), DataError, "expected an object with a list 'cameras'"),
         (edit("cameras", ["front"]), CalibrationError, "camera 0: expected a mapping, got str"),
         (edit("file", None, 0), DataError, "'front': file: expected an image's file name, got None"),
         (edit("file", "gone.png", 1), DataError, r"'back': image .*gone\.png: expected an image file, found none"),
         (edit("mask", "gone.png", 0), CalibrationError, r"'front': mask: expected an image file .*gone\.png"),
-        (edit("mask", 7, 0), CalibrationError, "'front': mask: expected a"),
         (edit("boxes_3d", [[1, 2, 3]]), DataError, r"boxes_3d: expected shape \(B, >= 7\).*got \(1, 3\)"),
-        (edit("boxes_3d", [[0, 0, 0, 4, -2, 1, 0]]), DataError, r"boxes_3d\[0\]: .*positive sizes, got"),
         (edit("boxes_3d", [[0, 0, 0, 4, 2, 1, 0], [0]]), DataError, "boxes_3d: expected rows"),
         (edit("ego2world", [[1, 0], [0, 1]]), DataError, "ego2world: expected 4x4 finite numbers"),
         (edit("ego2world", (np.eye(4) + np.eye(4, k=-3)).tolist()), DataError, "ego2world: expected .*transposed"),
-        (edit("ego2world", np.diag([2, 2, 2, 1]).tolist()), DataError, "ego2world: expected .* a rotation"),
         (edit("ego2world", np.diag([1e200, 1, 1, 1]).tolist()), DataError, "ego2world: expected .* a rotation"),
-        (edit("ego2world", np.diag([1, -1, 1, 1]).tolist()), DataError, "ego2world: expected .* a rotation"),
         (edit("lidar", {"file": "gone.npy"}), DataError, r"lidar: expected the points .*gone\.npy, found no file"),
         (edit("lidar", 3), DataError, "lidar: expected {'file': name}, got 3"),
         (edit("ego2world", [[0.0] * 500] * 500), DataError, "ego2world: expected 4x4 finite numbers"),
         (edit("lidar", ["a"] * 999), DataError, "lidar: expected {'file': name}, got"),
         (edit("file", ["a"] * 999, 0), DataError, "'front': file: expected an image's file name"),
         (edit("lens", "fisheye", 0), CalibrationError, "'lens' is not read: write distortion: {model: LENS"),
-        (edit("ground_z_m", "low"), CalibrationError, "ground_z_m: expected a finite height"),
         (edit("mask", "small.png", 1), CalibrationError, r"'back': mask: expected shape \(48, 64\)"),
         # what would change the meaning
         (edit("xi", 0.9, 0), CalibrationError, "camera 'front': xi: 0.9 is not read; write distortion"),
@@ -214,21 +192,19 @@ def test_bad_points(tmp_path: Path) -> None:
     (tmp_path / "lidar.npy").write_bytes((tmp_path / "lidar.npy").read_bytes()[:-9])
     with pytest.raises(DataError, match=r"lidar\.npy: expected a \.npy array of numbers"):
         dataset[0]
-    for make in (Path.mkdir, partial(Path.symlink_to, target=tmp_path / "gone.npy")):
-        (tmp_path / "lidar.npy").unlink() if (tmp_path / "lidar.npy").is_file() else (tmp_path / "lidar.npy").rmdir()
-        make(tmp_path / "lidar.npy")
-        with pytest.raises(DataError, match=r"lidar: expected the points .*npy, found no file"):
-            dataset[0]
+    (tmp_path / "lidar.npy").unlink()
+    (tmp_path / "lidar.npy").symlink_to(tmp_path / "gone.npy")
+    with pytest.raises(DataError, match=r"lidar: expected the points .*npy, found no file"):
+        dataset[0]
 
 
 def test_missing_returns_are_left_out(tmp_path: Path) -> None:
     """As RigRetarget leaves them out of a sample of the user's own."""
-    np.save(frame(tmp_path) / "lidar.npy", np.array([[0, 0, np.nan], [1, 2, 3], [np.inf, 0, 0], [0, 0, 1e300]]))
-    with pytest.warns(UserWarning, match="points: rows with NaN, infinity or over 1e.09 m are left out"):
-        assert FrameFolder(tmp_path)[0]["points"].tolist() == [[1, 2, 3]]
-    np.save(tmp_path / "lidar.npy", np.array([[np.inf, 0, 0], [1, 2, 3]], np.float16))
-    with pytest.warns(UserWarning, match="points: rows with NaN"):
-        assert FrameFolder(tmp_path)[0]["points"].tolist() == [[1, 2, 3]]
+    missing = [[0, 0, np.nan], [1, 2, 3], [np.inf, 0, 0], [0, 0, 1e300]]
+    for points in (np.array(missing), np.array(missing[1:3], np.float16)):
+        np.save(frame(tmp_path) / "lidar.npy", points)
+        with pytest.warns(UserWarning, match="points: rows with NaN, infinity or over 1e.09 m are left out"):
+            assert FrameFolder(tmp_path)[0]["points"].tolist() == [[1, 2, 3]]
 
 
 def test_folders_that_are_none(tmp_path: Path) -> None:
@@ -238,8 +214,6 @@ def test_folders_that_are_none(tmp_path: Path) -> None:
         FrameFolder(tmp_path)
     frame(tmp_path)
     dataset = FrameFolder(tmp_path)
-    with pytest.raises(IndexError):
-        dataset[1]
     for text, got in (("{", ""), ('{"cameras": [], "cameras": []}', " the key 'cameras' stands twice")):
         (tmp_path / "calib.json").write_text(text)
         with pytest.raises(DataError, match=rf"calib\.json: expected JSON, got{got}"):
@@ -279,14 +253,11 @@ def test_rims_are_those_of_several_frames(fisheye_root: Path, tmp_path: Path) ->
         shutil.copytree(fisheye_root, tmp_path / name)
         for file in (tmp_path / name).glob("*.png"):
             cv2.imwrite(str(file), (cv2.imread(str(file)) * gain).astype(np.uint8))
-    frames = FrameFolder(tmp_path, clean_masks=True)
-    rigs = [frames[k]["rig"] for k in (2, 0, 1)]
+    rigs = [open_data(tmp_path, clean_masks=True)[k]["rig"] for k in (2, 0, 1)]
     masks = [camera.mask for camera in rigs[0]]
     assert [mask is not None for mask in masks] == [True, False, True, True], "past the left lens's fold all is dark"
     assert all(0.15 < (~mask).mean() < 0.22 for mask in masks if mask is not None)
     assert rigs[0] == rigs[1] == rigs[2] == FrameFolder(fisheye_root, clean_masks=True)[0]["rig"]
-    assert len(frames._rims) == 4, "found once"
     assert all(camera.mask is None for camera in open_data(tmp_path)[0]["rig"])
-    assert open_data(tmp_path, clean_masks=True)[0]["rig"] == rigs[0]
     (tmp_path / "b" / "front.png").write_bytes(b"broken")
     assert FrameFolder(tmp_path, clean_masks=True)[2]["rig"][1:] == rigs[0][1:], "its own message comes when it is read"

@@ -40,8 +40,7 @@ def jpeg(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_rgb_in_channels_last_memory_of_one_block(tmp_path: Path, suffix: str) -> None:
     files = [write(tmp_path / f"{k}{suffix}", ramp(90, 160) / (k + 1)) for k in range(3)]
-    images = decode_images(files)
-    assert isinstance(images, torch.Tensor)
+    images: Any = decode_images(files)
     assert images.shape == (3, 3, 90, 160) and images.dtype == torch.uint8
     assert images.permute(0, 2, 3, 1).is_contiguous()
     for k in range(3):
@@ -51,31 +50,18 @@ def test_rgb_in_channels_last_memory_of_one_block(tmp_path: Path, suffix: str) -
 
 def test_different_sizes_give_a_list(tmp_path: Path) -> None:
     files = [write(tmp_path / "a.jpg", ramp(90, 160)), write(tmp_path / "b.png", ramp(64, 100))]
-    images = decode_images(files, reduce=2)
-    assert isinstance(images, list)
-    assert [tuple(image.shape) for image in images] == [(3, 45, 80), (3, 32, 50)]
-    assert all(image.permute(1, 2, 0).is_contiguous() for image in images)
-
-
-def test_real_frame_equals_a_plain_decode(nuscenes_root: Path) -> None:
-    files = sorted(nuscenes_root.glob("samples/CAM_*/*.jpg"))
-    images = decode_images(files)
-    for image, file in zip(images, files, strict=True):
-        expected = cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
-        assert np.array_equal(image.permute(1, 2, 0).numpy(), expected)
+    assert [tuple(image.shape) for image in decode_images(files, reduce=2)] == [(3, 45, 80), (3, 32, 50)]
 
 
 def test_exif_orientation_does_not_turn_the_image_away_from_its_calibration(jpeg: Path) -> None:
-    upright = decode_images([jpeg])
+    upright: Any = decode_images([jpeg])
     # APP1 with one EXIF tag: Orientation (0x0112) = 6, turn by 90 degrees to show.
     tag = b"\x12\x01\x03\x00\x01\x00\x00\x00\x06\x00\x00\x00"
     exif = b"Exif\x00\x00II*\x00\x08\x00\x00\x00\x01\x00" + tag + b"\x00\x00\x00\x00"
     data = jpeg.read_bytes()
     jpeg.write_bytes(data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:])
     assert cv2.imread(str(jpeg)).shape[:2] == (160, 90)  # OpenCV's default would turn it
-    turned = decode_images([jpeg], sizes=[(90, 160)])
-    assert isinstance(upright, torch.Tensor) and isinstance(turned, torch.Tensor)
-    assert torch.equal(upright, turned)
+    assert torch.equal(upright, decode_images([jpeg], sizes=[(90, 160)]))  # type: ignore[arg-type]
 
 
 # --- reduced decode ---------------------------------------------------------------------------------------------------
@@ -102,13 +88,9 @@ def test_convention_reduced_pixels_and_camera_agree(
 
 
 def test_a_reduced_mask_is_scene_where_all_of_its_pixels_are() -> None:
-    mask = np.ones((5, 7), bool)
-    mask[3, 2] = mask[0, 6] = False
-    small = reduced_camera(camera(size=(5, 7), mask=mask), 2)
-    expected = np.ones((3, 4), bool)
-    expected[1, 1] = expected[0, 3] = False
-    assert small.mask is not None
-    np.testing.assert_array_equal(small.mask, expected)
+    mask, expected = np.ones((5, 7), bool), np.ones((3, 4), bool)
+    mask[3, 2] = mask[0, 6] = expected[1, 1] = expected[0, 3] = False
+    np.testing.assert_array_equal(reduced_camera(camera(size=(5, 7), mask=mask), 2).mask, expected)
 
 
 # --- bad files --------------------------------------------------------------------------------------------------------
@@ -152,7 +134,6 @@ def sixteen_bits(data: bytes) -> bytes:
         (".png", one_byte_off, "got a PNG that cannot be decoded"),
         (".png", sixteen_bits, "expected 8 bits a channel, got a PNG of 16; scale it to 8 bits"),
     ],
-    ids=["missing", "folder", "pipe", "empty", "HTML", "zeros", "no rows", "no tables", "one byte", "16 bits"],
 )
 @pytest.mark.timeout(20)
 def test_bad_files(tmp_path: Path, suffix: str, damage: Callable[[Any], Any] | None, message: str) -> None:
@@ -171,8 +152,7 @@ def test_bad_files(tmp_path: Path, suffix: str, damage: Callable[[Any], Any] | N
 def test_view_masks_that_are_no_images(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.png")
     (tmp_path / "text.png").write_text("none")
-    (tmp_path / "empty.png").touch()
-    for name in ("pipe", "text", "empty", "none"):
+    for name in ("pipe", "text", "none"):
         with pytest.raises(DataError, match=r"camera 'left': coverage .*: expected"):
             decode_view_masks({"coverage": [tmp_path / f"{name}.png"]}, names=["left"], sizes=[(4, 6)])
 
@@ -195,31 +175,21 @@ def test_paths_that_are_not_utf_8(tmp_path: Path, suffix: str, reduce: Any) -> N
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-@pytest.mark.parametrize("share", [0.01, 0.1, 0.5, 0.99])
-def test_truncated_file(tmp_path: Path, suffix: str, share: float) -> None:
-    file = write(tmp_path / f"a{suffix}", ramp(90, 160))
-    data = file.read_bytes()
-    file.write_bytes(data[: max(3, int(len(data) * share))])
-    with pytest.raises(DataError, match=r"camera 'a': image .*a\.(jpg|png): expected a.* got a "):
-        decode_images([file])
+def test_truncated_file(tmp_path: Path, suffix: str) -> None:
+    data = write(file := tmp_path / f"a{suffix}", ramp(90, 160)).read_bytes()
+    for share in (0.01, 0.1, 0.5, 0.99):
+        file.write_bytes(data[: max(3, int(len(data) * share))])
+        with pytest.raises(DataError, match=r"camera 'a': image .*a\.(jpg|png): expected a.* got a "):
+            decode_images([file])
 
 
-def test_bytes_after_the_end_and_fill_bytes_are_no_fault(jpeg: Path) -> None:
-    expected = decode_images([jpeg])
-    data = jpeg.read_bytes()
-    jpeg.write_bytes(data[:2] + b"\xff\xff" + data[2:] + b"\0" * 100)
-    padded = decode_images([jpeg])
-    assert isinstance(expected, torch.Tensor) and isinstance(padded, torch.Tensor)
-    assert torch.equal(expected, padded)
-
-
-def test_a_thumbnail_in_the_header_does_not_hide_a_truncation(jpeg: Path) -> None:
-    data = jpeg.read_bytes()
-    thumbnail = b"\xff\xd8\xff\xd9"
-    whole = data[:2] + b"\xff\xe1" + (len(thumbnail) + 2).to_bytes(2, "big") + thumbnail + data[2:]
-    jpeg.write_bytes(whole)
-    assert decode_images([jpeg]).shape == (1, 3, 90, 160)
-    jpeg.write_bytes(whole[:-20])
+def test_bytes_after_the_end_fill_bytes_and_thumbnails(jpeg: Path) -> None:
+    """They are no fault, and a thumbnail's end in the header does not hide a truncation."""
+    expected, data, thumbnail = decode_images([jpeg]), jpeg.read_bytes(), b"\xff\xe1\0\x06\xff\xd8\xff\xd9"
+    for changed in (data[:2] + b"\xff\xff" + data[2:] + b"\0" * 100, data[:2] + thumbnail + data[2:]):
+        jpeg.write_bytes(changed)
+        assert torch.equal(expected, decode_images([jpeg]))  # type: ignore[arg-type]
+    jpeg.write_bytes(changed[:-20])
     with pytest.raises(DataError, match="truncated file"):
         decode_images([jpeg])
 
@@ -229,9 +199,6 @@ def test_size_that_is_not_the_calibrations(jpeg: Path) -> None:
         decode_images([jpeg], sizes=[(100, 200)])
     with pytest.raises(DataError, match="width and height look swapped"):
         decode_images([jpeg], sizes=[(160, 90)], reduce=2)
-
-
-@pytest.mark.parametrize("given", [{"names": ["front"]}, {"sizes": [(90, 160)]}])
-def test_names_and_sizes_are_one_for_each_image(jpeg: Path, given: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=f"{next(iter(given))}: expected one for each of 2 images, got 1"):
-        decode_images([jpeg, jpeg], **given)
+    for given in ({"names": ["front"]}, {"sizes": [(90, 160)]}):
+        with pytest.raises(ValueError, match=f"{next(iter(given))}: expected one for each of 2 images, got 1"):
+            decode_images([jpeg, jpeg], **given)  # type: ignore[arg-type]

@@ -67,10 +67,8 @@ def test_real_files_are_read_as_they_are(nuscenes_root: Path) -> None:
         np.testing.assert_array_equal(read_cloud(path, None, ""), np.load(path))
 
 
-HEADER = (
-    "# .PCD v0.7\nVERSION 0.7\nFIELDS intensity x y z _ ring\nSIZE 4 4 4 4 1 2\nTYPE F F F F U U\nCOUNT 1 1 1 1 3 1\n"
-)
-HEADER += "WIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA {}\n"
+HEADER = "# .PCD v0.7\nVERSION 0.7\nFIELDS intensity x y z _ ring\nSIZE 4 4 4 4 1 2\nTYPE F F F F U U\n"
+HEADER += "COUNT 1 1 1 1 3 1\nWIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA {}\n"
 ASCII = "7 1 2 3 0 0 0 5\n8 4 nan 6 0 0 0 9\n"
 
 
@@ -83,37 +81,31 @@ def test_pcd_files_say_their_columns(tmp_path: Path, kind: str) -> None:
     np.testing.assert_array_equal(read_cloud(tmp_path / "a", None, "", NUSCENES_COLUMNS), expected)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (HEADER.format("binary_compressed").encode() + b"x", "DATA ascii or binary, got DATA 'binary_compressed'"),
-        (HEADER.format("binary").encode() + b"x", "expected a .pcd file .*, got buffer"),
-        (
-            HEADER.format("ascii").replace(" x ", " u ").encode() + ASCII.encode(),
-            "got u, y.*: no x|expected the columns",
-        ),
-        (b"VERSION 0.7\nDATA ascii\n1 2 3\n", "got no 'FIELDS'"),
-        (b"ply\nformat ascii 1.0\n", "begins with .*ply.*; write it as .npy"),
-        (b"PK\3\4", "begins with .*PK"),
-        (b"\x93NUMPY\1\0", r"expected a \.npy array of numbers"),
-        (b"", "expected whole points of 5 float32, got 0 bytes"),
-    ],
-)
-def test_other_files_are_refused_by_name(tmp_path: Path, content: bytes, message: str) -> None:
-    (tmp_path / "a.bin").write_bytes(content)
-    with pytest.raises(DataError, match=message):
-        read_cloud(tmp_path / "a.bin", None, "fix", NUSCENES_COLUMNS)
+def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
+    text = HEADER.format("ascii") + ASCII
+    for content, message in (
+        (HEADER.format("binary_compressed") + "x", "DATA ascii or binary, got DATA 'binary_compressed'"),
+        (HEADER.format("binary") + "x", "expected a .pcd file .*, got buffer"),
+        (text.replace(" x ", " u "), "got u, y.*: no x|expected the columns"),
+        ("VERSION 0.7\nDATA ascii\n1 2 3\n", "got no 'FIELDS'"),
+        ("ply\nformat ascii 1.0\n", "begins with .*ply.*; write it as .npy"),
+        ("PK\3\4", "begins with .*PK"),
+        ("\x93NUMPY\1\0", r"expected a \.npy array of numbers"),
+        ("", "expected whole points of 5 float32, got 0 bytes"),
+    ):
+        (tmp_path / "a.bin").write_bytes(content.encode("latin-1"))
+        with pytest.raises(DataError, match=message):
+            read_cloud(tmp_path / "a.bin", None, "fix", NUSCENES_COLUMNS)
 
 
-@pytest.mark.parametrize(
-    "columns", ["xyz", ["x", "y"], ["x", "y", "z", "z"], ["x", "y", "z:foo"], ["x", "y", "z", 3], 3]
-)
-def test_wrong_statements_are_refused(tmp_path: Path, columns: Any) -> None:
-    with pytest.raises(DataError, match="lidar_columns: expected different names with x, y and z among them"):
-        NuScenesDataset(write(tmp_path / "a"), lidar_columns=columns)
-    frame(tmp_path / "b", lambda calib: calib.update(lidar={"file": "lidar.npy", "columns": columns}))
-    with pytest.raises(DataError, match="columns: expected different names with x, y and z among them"):
-        FrameFolder(tmp_path / "b")[0]
+def test_wrong_statements_are_refused(tmp_path: Path) -> None:
+    root = write(tmp_path / "a")
+    for columns in ("xyz", ["x", "y"], ["x", "y", "z", "z"], ["x", "y", "z:foo"], ["x", "y", "z", 3], 3):
+        frame(tmp_path / "b", lambda calib, columns=columns: calib.update(lidar={"columns": columns}))
+        with pytest.raises(DataError, match="columns: expected different names with x, y and z among them"):
+            NuScenesDataset(root, lidar_columns=columns)
+        with pytest.raises(DataError, match="columns: expected different names with x, y and z among them"):
+            FrameFolder(tmp_path / "b")[0]
 
 
 def test_frame_folders_state_columns_in_calib_json(street: Any, tmp_path: Path) -> None:
@@ -121,9 +113,7 @@ def test_frame_folders_state_columns_in_calib_json(street: Any, tmp_path: Path) 
     rows = street[:, [3, 0, 1, 2]].astype(np.float32)
     rows.tofile(frame(tmp_path, lambda calib: calib.update(lidar={"file": "lidar.bin"})) / "lidar.bin")
     calib = json.loads((tmp_path / "calib.json").read_text())
-    with pytest.raises(
-        DataError, match=r'a statement of the columns, got a file that looks like 4 columns; .*"columns": '
-    ):
+    with pytest.raises(DataError, match=r'statement of the columns, got .* looks like 4 columns; .*"columns": '):
         FrameFolder(tmp_path)[0]
     np.save(tmp_path / "lidar.npy", rows)
     for name in ("lidar.bin", "lidar.npy"):

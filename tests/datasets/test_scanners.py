@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import torch
 
 from arbiview_aug import Lidar
 from arbiview_aug.datasets import FrameFolder
+from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import ScanErrors, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.scans import range_image
 from tests.helpers import ring
@@ -41,20 +41,10 @@ def test_synthetic_scans_are_those_of_the_rigs_scanners() -> None:
     assert len(road) and road.abs().max() < 0.15
     usual = SyntheticDrive(rig, num_frames=1)
     assert torch.equal(usual.points(0, drive.rig), points) and torch.equal(drive.points(0, rig), usual.points(0))
-
-
-def test_scans_are_in_the_rigs_ego_frame() -> None:
-    high = replace(demo_source_rig((8, 22)), lidars=[SIDE])
-    low = replace(high.shifted(z_m=-0.3), ground_z_m=-0.3)
-    one, two = (SyntheticDrive(rig, num_frames=1).points(0) for rig in (high, low))
-    torch.testing.assert_close(one - torch.tensor([0, 0, 0.3, 0]), two, atol=1e-4, rtol=0)
-
-
-def test_two_scanners_have_their_own_noise() -> None:
-    rig = replace(demo_source_rig((8, 22)), lidars=[SIDE, replace(SIDE, name="again")])
-    points = SyntheticDrive(rig, num_frames=1).points(0)
-    one, two = points.chunk(2)
-    assert 0 < (one - two)[:, :3].abs().max() < 0.3
+    lower = usual.points(0, replace(drive.rig.shifted(z_m=-0.3), ground_z_m=-0.3))  # in the rig's ego frame
+    torch.testing.assert_close(points - torch.tensor([0, 0, 0.3, 0]), lower, atol=1e-4, rtol=0)
+    one, two = usual.points(0, replace(rig, lidars=[SIDE, replace(SIDE, name="again")])).chunk(2)
+    assert 0 < (one - two)[:, :3].abs().max() < 0.3  # each has its noise
 
 
 def _ranges(**errors: Any) -> np.ndarray:
@@ -91,12 +81,7 @@ def test_scan_errors_are_checked() -> None:
 
 
 def test_frame_folders_carry_scanners(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
-    import cv2
-
-    rig = ring(1)
-    cv2.imwrite(str(tmp_path / "c0.jpg"), np.zeros((*rig.sizes[0], 3), np.uint8))
-    calib = replace(rig, lidars=[SIDE]).to_dict()
-    calib["cameras"][0]["file"] = "c0.jpg"
-    (tmp_path / "calib.json").write_text(json.dumps(calib))
+    rig = replace(ring(1), lidars=[SIDE])
+    write_frame(tmp_path, {"rig": rig, "images": torch.zeros(1, 3, *rig.sizes[0], dtype=torch.uint8)})
     assert FrameFolder(tmp_path)[0]["rig"].lidars == (SIDE,)
     assert not list(recwarn)

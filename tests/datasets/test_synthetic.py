@@ -1,6 +1,7 @@
-"""SyntheticDrive: the sample's contract, determinism, lenses, antialiasing."""
+"""SyntheticDrive: the sample's contract, determinism, lenses, rays, boxes, LiDAR."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,12 +10,8 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import Neighbours
-from arbiview_aug.datasets.synthetic import (
-    SceneClass,
-    SyntheticDrive,
-    demo_source_rig,
-    demo_target_rig,
-)
+from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig, demo_target_rig, make_scene
+from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER
 from tests.helpers import same
 
 SIZE = (64, 176)
@@ -40,13 +37,11 @@ def test_sample_follows_the_contract(drive):
 
 def test_mixed_sizes_give_lists():
     rig = demo_target_rig(SIZE)
-    rig = rig.with_cameras([rig[0].resize((50, 150)), *rig.cameras[1:]])
-    sample = SyntheticDrive(rig, num_frames=1, lidar=False)[0]
-    assert isinstance(sample["images"], list) and sample["images"][0].shape == (3, 50, 150)
-    assert "points" not in sample
-    # A size that is no multiple of the tiles is the same picture as any other.
-    views = SyntheticDrive(rig, num_frames=1).render(0)
-    assert isinstance(views.depth_m, list) and views.depth_m[0].shape == (50, 150)
+    rig = rig.with_cameras([rig[0].resize((50, 150)), *rig.cameras[1:]])  # no multiple of the tiles
+    drive = SyntheticDrive(rig, num_frames=1, lidar=False)
+    for images in (drive[0]["images"], drive.render(0).depth_m):
+        assert isinstance(images, list) and images[0].shape[-2:] == (50, 150)
+    assert "points" not in drive[0]
 
 
 def test_truth_is_complete(drive):
@@ -86,54 +81,41 @@ def test_threads_and_global_seeds_change_nothing(drive):
         torch.set_num_threads(usual)
 
 
-@pytest.mark.slow
 def test_pickles_small(drive):
-    drive[0]
     data = pickle.dumps(drive)
     assert len(data) < 20_000  # the caches stay behind
-    assert same(pickle.loads(data)[0], drive[0])
+    assert torch.equal(pickle.loads(data).render(0).images, drive.render(0).images)
 
 
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
+def test_bad_arguments_are_named(drive):
+    for change, error, message in (
         ({"rig": [1]}, TypeError, "expected a Rig .*got list"),
-        ({"num_frames": 0}, ValueError, "num_frames: expected a whole number from 1"),
-        ({"num_frames": 2.5}, ValueError, "num_frames"),
+        ({"num_frames": 2.5}, ValueError, "num_frames: expected a whole number from 1"),
         ({"seed": -1}, ValueError, "seed: expected a whole number from 0"),
         ({"supersampling": 0}, ValueError, "supersampling"),
         ({"lidar": "none"}, TypeError, r"lidar: expected True, False or ScanErrors\(...\), got 'none'"),
-    ],
-)
-def test_bad_arguments_are_named(changes, error, message):
-    with pytest.raises(error, match=message):
-        SyntheticDrive(**{"rig": demo_source_rig(SIZE), "num_frames": 1, **changes})
-
-
-def test_bad_indices_and_rigs_are_named(drive):
-    for index in (5, -6):
-        with pytest.raises(IndexError, match=f"expected one of 5 samples, got {index}"):
-            drive[index]
-    with pytest.raises(IndexError):
-        drive.render(5)
-    with pytest.raises(TypeError, match="index: expected a whole number, got str"):
-        drive["front"]
-    with pytest.raises(TypeError, match="expected a Rig"):
-        drive.render(0, rig=drive.rig[0])
+    ):
+        with pytest.raises(error, match=message):
+            SyntheticDrive(**{"rig": drive.rig, "num_frames": 1, **change})
+    for error, call, message in (
+        (IndexError, lambda: drive[-6], "expected one of 5 samples, got -6"),
+        (IndexError, lambda: drive.render(5), "expected one of 5 samples, got 5"),
+        (TypeError, lambda: drive["front"], "index: expected a whole number, got str"),
+        (TypeError, lambda: drive.render(0, rig=drive.rig[0]), "expected a Rig"),
+    ):
+        with pytest.raises(error, match=message):
+            call()
 
 
 def test_lenses():
     """A fisheye of 190 degrees and a barrel lens agree with pinholes at the same place, direction by direction."""
     place = dict(azimuth_deg=20.0, position_m=(1.5, 0.0, 1.6))
     pinhole = Camera.looking(name="pinhole", width_px=640, height_px=480, horizontal_fov_deg=80.0, **place)
-    fisheye = Camera.looking(
-        name="fisheye", width_px=320, height_px=240, horizontal_fov_deg=190.0, lens="fisheye",
-        distortion=(0.02, -0.01, 0.002, -0.0005), **place,
-    )  # fmt: skip
-    barrel = Camera.looking(
-        name="barrel", width_px=320, height_px=240, horizontal_fov_deg=90.0, lens="radtan",
-        distortion=(-0.3, 0.1, 0.0, 0.0, -0.01), **place,
-    )  # fmt: skip
+    place |= {"width_px": 320, "height_px": 240}
+    bent = {"lens": "fisheye", "distortion": (0.02, -0.01, 0.002, -0.0005)}
+    fisheye = Camera.looking(name="fisheye", horizontal_fov_deg=190.0, **bent, **place)
+    bent = {"lens": "radtan", "distortion": (-0.3, 0.1, 0.0, 0.0, -0.01)}
+    barrel = Camera.looking(name="barrel", horizontal_fov_deg=90.0, **bent, **place)
     views = SyntheticDrive(Rig([pinhole, fisheye, barrel]), num_frames=1, seed=5).render(0)
     for k, camera in ((1, fisheye), (2, barrel)):
         rays = camera.unproject(camera.pixel_grid())
@@ -153,30 +135,22 @@ def test_lenses():
     assert (views.depth_m[1][torch.isfinite(views.depth_m[1])] < 0).any()
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        dict(width_px=1, height_px=1, horizontal_fov_deg=10.0),
-        dict(width_px=300, height_px=1, horizontal_fov_deg=60.0),
-        dict(width_px=1, height_px=90, horizontal_fov_deg=1.0),
-        dict(width_px=32, height_px=32, horizontal_fov_deg=170.0, elevation_deg=-90.0),
-        dict(width_px=50, height_px=50, horizontal_fov_deg=100.0, elevation_deg=90.0),
-        dict(width_px=50, height_px=50, horizontal_fov_deg=100.0, position_m=(0.0, 0.0, -2.0)),
-        dict(width_px=50, height_px=50, horizontal_fov_deg=100.0, elevation_deg=-60.0, position_m=(0.0, 0.0, 80.0)),
-        dict(width_px=50, height_px=50, horizontal_fov_deg=100.0, position_m=(3.0, 9.0, 1.0)),
-        dict(width_px=90, height_px=60, horizontal_fov_deg=0.5),
-        dict(width_px=24, height_px=24, horizontal_fov_deg=359.0, lens="fisheye", distortion=(0.0, 0.0, 0.0, 0.0)),
-        dict(width_px=60, height_px=90, horizontal_fov_deg=60.0, roll_deg=180.0),
-    ],
-)
-def test_extreme_cameras(drive, changes):
+def test_extreme_cameras(drive):
     """One pixel, straight down, below the road, far above, among the buildings, all around: finite and complete."""
-    camera = Camera.looking(**{"name": "c", "azimuth_deg": 0.0, "position_m": (1.5, 0.0, 1.5), **changes})
-    views = drive.render(0, Rig([camera]))
-    assert views.images.shape == (1, 3, *camera.size)
-    assert not views.depth_m.isnan().any()
-    nothing = (views.classes == SceneClass.SKY) | (views.classes == SceneClass.VOID)
-    assert torch.equal(nothing, views.depth_m.isinf())
+    around, above = {"lens": "fisheye", "distortion": (0.0,) * 4}, {"elevation_deg": -60.0, "position_m": (0, 0, 80.0)}
+    for width, height, fov, more in (
+        *((width, height, fov, {}) for width, height, fov in ((1, 1, 10), (300, 1, 60), (1, 90, 1), (90, 60, 0.5))),
+        (60, 90, 60.0, {"roll_deg": 180.0}),
+        *((32, 32, 170.0, {"elevation_deg": -90.0}), (50, 50, 100.0, {"elevation_deg": 90.0}), (24, 24, 359.0, around)),
+        *((50, 50, 100.0, {"position_m": place}) for place in ((0.0, 0.0, -2.0), (3.0, 9.0, 1.0))),
+        (50, 50, 100.0, above),
+    ):
+        place = {"azimuth_deg": 0.0, "position_m": (1.5, 0.0, 1.5), **more}
+        camera = Camera.looking(name="c", width_px=width, height_px=height, horizontal_fov_deg=fov, **place)
+        views = drive.render(0, Rig([camera]))
+        assert views.images.shape == (1, 3, *camera.size) and not views.depth_m.isnan().any()
+        nothing = (views.classes == SceneClass.SKY) | (views.classes == SceneClass.VOID)
+        assert torch.equal(nothing, views.depth_m.isinf())
 
 
 def test_another_default_device_changes_nothing(drive):
@@ -184,3 +158,77 @@ def test_another_default_device_changes_nothing(drive):
         sample = SyntheticDrive(drive.rig, num_frames=1, neighbours=Neighbours())[0]
     assert torch.equal(sample["images"], drive[0]["images"]) and torch.equal(sample["points"], drive[0]["points"])
     assert sample["ego2world"].device.type == "cpu"
+
+
+# --- geometry ---------------------------------------------------------------------------------------------------------
+def holding(scene, points):
+    """(n, P) which primitives hold points (n, 3), float64."""
+    local = np.einsum("pij,npi->npj", scene.rotation, points[:, None] - scene.center) / scene.half
+    in_box = (np.einsum("pfi,ni->npf", scene.planes[..., :3], points) <= scene.planes[..., 3]).all(2)
+    across, along = (local[..., :2] ** 2).sum(2), local[..., 2] ** 2
+    in_cylinder = (across <= 1) & (along <= 1)
+    return np.select([scene.kind == BOX, scene.kind == CYLINDER], [in_box, in_cylinder], across + along <= 1)
+
+
+def test_rays_end_where_something_begins():
+    """Nothing is before the end of a ray, and behind it is what the classes and instances say."""
+    low = replace(demo_source_rig(SIZE).shifted(z_m=-0.4), ground_z_m=-0.4)  # the road is 0.4 m under the ego's origin
+    drive, rng, right = SyntheticDrive(low, num_frames=2, seed=1), np.random.default_rng(0), []
+    scene, views = drive.scene(1), drive.render(1)
+    boxes, R = scene.boxes_ego(-0.4), scene.ego2street[:3, :3]
+    for k, camera in enumerate(low):
+        rays = camera.unproject(camera.pixel_grid()).directions
+        distance = views.depth_m[k].numpy() / (rays @ camera.cam2ego[:3, 2])
+        for y, x in zip(*(rng.integers(0, side, 15) for side in SIZE), strict=True):
+            cls, row, t = views.classes[k, y, x], views.instances[k, y, x], min(distance[y, x], 200.0)
+            steps = np.append(rng.uniform(0, 1 - 1e-3, 30) * t, t + 2e-3 + 2e-4 * t)
+            ego = camera.center_m + steps[:, None] * rays[y, x]
+            street = (ego + np.array([0, 0, 0.4])) @ R.T + scene.ego2street[:3, 3]
+            held = holding(scene, street)
+            assert not held[:-1].any() and (street[:-1, 2] > 0).all()
+            if row >= 0:
+                centre, size, yaw = np.split(boxes[row], [3, 6])
+                x_m, y_m, z_m = ego[-1] - centre
+                turned = np.cos(yaw) * x_m + np.sin(yaw) * y_m, np.cos(yaw) * y_m - np.sin(yaw) * x_m, z_m
+                assert (np.abs(np.concatenate([turned[0], turned[1], [z_m]])) <= size / 2 + 0.05).all()
+            if cls == SceneClass.SKY:
+                right.append(not held.any())
+            elif cls == SceneClass.GROUND:
+                right.append(street[-1, 2] < 0)
+            else:
+                behind = held[-1]
+                right.append((behind & (scene.cls == int(cls)) & (scene.instance == int(row))).any())
+    assert np.mean(right) > 0.98  # the others graze an edge
+
+
+def test_lidar_points_lie_on_what_the_cameras_see():
+    rig = demo_source_rig((160, 440))
+    drive = SyntheticDrive(rig, num_frames=2, seed=6)
+    points = drive.points(1).double().numpy()
+    assert points.shape[1] == 4 and 20_000 < len(points) < 35_000
+    assert points[:, 3].min() >= 0 and points[:, 3].max() <= 255
+    assert np.abs(points[np.hypot(points[:, 0], points[:, 1]) < 4, 2]).max() < 3.0
+    views = drive.render(1)
+    agreeing = []
+    for camera, depth in zip(rig, views.depth_m.numpy(), strict=True):
+        uv, z, valid = camera.project(points[:, :3])
+        seen = valid & camera.contains(uv)
+        x, y = uv[seen].round().astype(int).T
+        agreeing.append(np.abs(depth[y, x] - z[seen]) < 0.1 + 0.03 * z[seen])
+    # The rest is parallax between the roof and the cameras, and outlines.
+    assert np.concatenate(agreeing).mean() > 0.9
+
+
+SUMS = {
+    (0, 0): (88928.956923, 6983.899339, 72701.047655, 1055.480029, 1020.833067, 3945.86686, 192.71783),
+    (3, 6): (64486.001257, 5845.352646, 63063.272061, 755.729504, 829.588737, 3134.906012, 222.354647),
+}
+"""Sums of absolute values of scenes' arrays. All tests and published numbers are of these streets."""
+
+
+@pytest.mark.parametrize("scene", SUMS)
+def test_streets_are_those_that_all_numbers_are_of(scene: tuple[int, int]) -> None:
+    made = make_scene(*scene)
+    names = ("center", "half", "planes", "color", "param", "boxes", "velocities")
+    assert [float(np.abs(getattr(made, name)).sum()) for name in names] == pytest.approx(list(SUMS[scene]), rel=1e-7)
+    assert (len(made), made.salt) == {(0, 0): (1156, 12356), (3, 6): (801, 256994)}[scene]

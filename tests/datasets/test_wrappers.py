@@ -41,11 +41,6 @@ class Stream(IterableDataset[dict[str, Any]]):
             yield {"images": torch.tensor(k)}
 
 
-class StreamOfFour(Stream):
-    def __len__(self) -> int:
-        return 4
-
-
 def add_ten(sample: dict[str, Any]) -> dict[str, Any]:
     return {**sample, "images": sample["images"] + 10}
 
@@ -65,17 +60,16 @@ def test_map_style() -> None:
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_map_style_in_a_data_loader(workers: int) -> None:
-    plain = DataLoader(RetargetedDataset(Numbers(), add_ten), batch_size=2, sampler=range(4), num_workers=workers)
-    assert [batch["images"].tolist() for batch in plain] == [[10, 11], [12, 13]]
-    batched = DataLoader(
-        RetargetedDataset(BatchedNumbers(), add_ten), batch_size=2, sampler=range(4), num_workers=workers
-    )
-    assert [batch["images"].tolist() for batch in batched] == [[110, 111], [112, 113]]
+    settings: dict[str, Any] = {"batch_size": 2, "sampler": range(4), "num_workers": workers}
+    for numbers, expected in ((Numbers(), [[10, 11], [12, 13]]), (BatchedNumbers(), [[110, 111], [112, 113]])):
+        loader = DataLoader(RetargetedDataset(numbers, add_ten), **settings)
+        assert [batch["images"].tolist() for batch in loader] == expected
 
 
 def test_length_of_a_stream() -> None:
     """That of the dataset, if it has one."""
-    assert len(DataLoader(RetargetedIterable(StreamOfFour(), add_ten), batch_size=2)) == 2
+    four = type("Four", (Stream,), {"__len__": lambda self: 4})()
+    assert len(DataLoader(RetargetedIterable(four, add_ten), batch_size=2)) == 2
     endless = RetargetedIterable(Stream(), add_ten)
     assert len(list(endless)) == 6
     with pytest.raises(TypeError, match="has no len"):
@@ -121,9 +115,8 @@ def test_epochs_reach_the_transform_and_the_dataset() -> None:
 UNSIZED = type("Unsized", (), {"__getitem__": lambda self, k: k})()
 
 
-@pytest.mark.parametrize(
-    ("wrapper", "dataset", "transform", "message"),
-    [
+def test_wrong_types() -> None:
+    for wrapper, dataset, transform, message in (
         (RetargetedDataset, Stream(), add_ten, "expected a map-style dataset, got Stream; use RetargetedIterable"),
         (RetargetedDataset, add_ten, Numbers(), "expected a map-style dataset, got function; pass the dataset first"),
         (RetargetedDataset, Numbers(), "waymo", "expected a callable such as RigRetarget, got str"),
@@ -132,50 +125,37 @@ UNSIZED = type("Unsized", (), {"__getitem__": lambda self, k: k})()
         (lambda *given: WithDepth(*given)[0], [1], "folder", "expected samples that are mappings, got int"),
         (RetargetedIterable, Numbers(), add_ten, "expected an iterable dataset, got Numbers; use RetargetedDataset"),
         (RetargetedIterable, iter([1]), add_ten, "iterated again, got list_iterator, which ends after one epoch"),
-    ],
-)
-def test_wrong_types(wrapper: Any, dataset: Any, transform: Any, message: str) -> None:
-    with pytest.raises(SampleTypeError, match=message):
-        wrapper(dataset, transform)
+    ):
+        with pytest.raises(SampleTypeError, match=message):
+            wrapper(dataset, transform)  # type: ignore[arg-type,call-arg]
 
 
 # --- mixing -----------------------------------------------------------------------------------------------------------
-class Views:
-    """Map-style: samples with a number of cameras."""
-
-    def __init__(self, cameras: int, count: int = 40) -> None:
-        self.cameras, self.count = cameras, count
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        return {"index": index, "images": torch.zeros(self.cameras, 3, 2, 2)}
-
-
-def cameras_of(samples: list[dict[str, Any]]) -> list[int]:
-    return [len(sample["images"]) for sample in samples]
+def views(cameras: int, count: int = 40) -> list[dict[str, Any]]:
+    """Samples with a number of cameras."""
+    return [{"index": index, "images": torch.zeros(cameras, 3, 2, 2)} for index in range(count)]
 
 
 def test_mixed_items_are_the_same_samples_in_one_form_or_the_other() -> None:
-    mixed = pickle.loads(pickle.dumps(MixedDataset(Views(6), Views(5), 0.25)))
+    mixed = pickle.loads(pickle.dumps(MixedDataset(views(6), views(5), 0.25)))
     assert len(mixed) == 40
-    torch.manual_seed(0)
-    drawn = [mixed[i] for _ in range(25) for i in range(40)]
-    assert [sample["index"] for sample in drawn] == 25 * list(range(40))
-    assert cameras_of(drawn).count(5) / 1000 == pytest.approx(0.25, abs=0.04)  # three standard deviations
-    torch.manual_seed(0)
-    assert cameras_of([mixed[i] for _ in range(25) for i in range(40)]) == cameras_of(drawn)
-    assert {*cameras_of([MixedDataset(Views(6), Views(5), 0)[i] for i in range(40)])} == {6}
-    assert {*cameras_of([MixedDataset(Views(6), Views(5), 1)[i] for i in range(40)])} == {5}
+    drawn = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        samples = [mixed[i] for _ in range(25) for i in range(40)]
+        assert [sample["index"] for sample in samples] == 25 * list(range(40))
+        drawn.append([len(sample["images"]) for sample in samples])
+    assert drawn[0] == drawn[1] and drawn[0].count(5) / 1000 == pytest.approx(0.25, abs=0.04)  # 3 standard deviations
+    for share, cameras in ((0, 6), (1, 5)):
+        assert {len(MixedDataset(views(6), views(5), share)[i]["images"]) for i in range(40)} == {cameras}
 
 
 def test_wrong_mixtures() -> None:
     with pytest.raises(DataError, match=r"same samples untouched and retargeted, got 40 and 39; take those .*Subset"):
-        MixedDataset(Views(6), Views(5, 39), 0.5)
+        MixedDataset(views(6), views(5, 39), 0.5)
     for share in (-0.1, 1.1, float("nan"), "half", True):
         with pytest.raises(ValueError, match="share: expected a share of retargeted items from 0 to 1, got"):
-            MixedDataset(Views(6), Views(5), share)  # type: ignore[arg-type]
-    for wrong in ((Stream(), Views(5)), (Views(6), Stream())):
+            MixedDataset(views(6), views(5), share)  # type: ignore[arg-type]
+    for wrong in ((Stream(), views(5)), (views(6), Stream())):
         with pytest.raises(SampleTypeError, match="MixedDataset: expected a map-style dataset, got Stream; pass two"):
             MixedDataset(*wrong, 0.5)

@@ -95,12 +95,10 @@ def read_annotations(
     instances = tables.by_token("instance")
     kinds = tables.follow("instance", [*instances.values()], "category_token", "category", categories)
     objects = {token: (k, names.index(kinds[k]["name"])) for k, token in enumerate(instances)}
-    table = "sample_annotation"
+    table, none = "sample_annotation", np.empty((0, 3), np.float32)
     unique = Tokens(tables, table)
-    none = np.empty((0, 3), np.float32)
-    annotations: list[tuple[Any, ...]] = [
-        (np.empty(0, np.int32), np.empty((0, 2), np.int32), np.empty(0, np.bytes_), none.astype(np.float64), none, none)
-    ]
+    empty = np.empty(0, np.int32), np.empty((0, 2), np.int32), np.empty(0, np.bytes_)
+    annotations: list[tuple[Any, ...]] = [(*empty, none.astype(np.float64), none, none)]
     left_out: list[Any] = []
     for batch in tables.batches(table):
         of_samples = tables.column(table, batch, "sample_token", TOKENS)
@@ -123,7 +121,19 @@ def read_annotations(
     columns = [np.concatenate([batch[k] for batch in annotations]) for k in range(len(annotations[0]))]
     order = np.argsort(columns[0], kind="stable")
     sample, instance_and_category, tokens, centers_m, sizes, headings = (column[order] for column in columns)
-    earlier, later = _in_time(instance_and_category[:, 0], scenes[sample], times_s[sample])
+    # Each object's previous and next annotation, and its velocity between them where they are close enough in time.
+    instance, time_s, itself = instance_and_category[:, 0], times_s[sample], np.arange(len(sample))
+    earlier, later = (np.full(len(sample), -1, np.int32) for _ in range(2))
+    in_time = np.lexsort((time_s, scenes[sample], instance))
+    one, two = in_time[:-1], in_time[1:]
+    same = (instance[one] == instance[two]) & (scenes[sample[one]] == scenes[sample[two]])
+    earlier[two[same]], later[one[same]] = one[same], two[same]
+    start, end = (np.where(others < 0, itself, others) for others in (earlier, later))
+    seconds = time_s[end] - time_s[start]
+    longest_s = np.where((earlier >= 0) & (later >= 0), 2 * MAX_STEP_S, MAX_STEP_S)
+    known = (seconds > 0) & (seconds <= longest_s)
+    velocities = np.full(centers_m.shape, np.nan, np.float32)
+    velocities[known] = (centers_m[end] - centers_m[start])[known] / seconds[known, None]
     return Annotations(
         first=np.searchsorted(sample, np.arange(len(samples) + 1)),
         tokens=tokens,
@@ -132,7 +142,7 @@ def read_annotations(
         centers_m=centers_m,
         sizes_m=sizes,
         headings=headings,
-        velocities_mps=_velocities_mps(centers_m, times_s[sample], earlier, later),
+        velocities_mps=velocities,
         sample=sample,
         later=later,
         earlier=earlier,
@@ -149,25 +159,3 @@ def _are_whole(rows: Sequence[Row]) -> npt.NDArray[np.bool_]:
         return np.asarray(np.isfinite(numbers).all(axis=1) & (numbers[:, :3] > 0).all(axis=1))
     except (KeyError, TypeError, ValueError, OverflowError, IndexError):
         return np.ones(len(rows), bool)
-
-
-def _in_time(instance: IntArray, scene: npt.NDArray[np.int64], time_s: FloatArray) -> tuple[IntArray, IntArray]:
-    """(B,) indices of the same instance's previous and next annotation; -1 for none."""
-    earlier, later = (np.full(len(instance), -1, np.int32) for _ in range(2))
-    order = np.lexsort((time_s, scene, instance))
-    one, two = order[:-1], order[1:]
-    same = (instance[one] == instance[two]) & (scene[one] == scene[two])
-    earlier[two[same]], later[one[same]] = one[same], two[same]
-    return earlier, later
-
-
-def _velocities_mps(centers_m: FloatArray, time_s: FloatArray, earlier: IntArray, later: IntArray) -> SingleArray:
-    """(B, 3) world frame, from the previous to the next annotation; NaN where none is close enough in time."""
-    themselves = np.arange(len(centers_m))
-    start, end = np.where(earlier < 0, themselves, earlier), np.where(later < 0, themselves, later)
-    seconds = time_s[end] - time_s[start]
-    longest_s = np.where((earlier >= 0) & (later >= 0), 2 * MAX_STEP_S, MAX_STEP_S)
-    known = (seconds > 0) & (seconds <= longest_s)
-    velocities = np.full(centers_m.shape, np.nan, np.float32)
-    velocities[known] = (centers_m[end] - centers_m[start])[known] / seconds[known, None]
-    return velocities

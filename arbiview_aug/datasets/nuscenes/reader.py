@@ -26,9 +26,8 @@ from arbiview_aug.datasets.drive import (
     checked_index,
     is_converted,
 )
-from arbiview_aug.datasets.frame_folder import checked_points
 from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, reduced_rig
-from arbiview_aug.datasets.lidar_files import NUSCENES_COLUMNS, read_cloud, row_type
+from arbiview_aug.datasets.lidar_files import NUSCENES_COLUMNS, checked_points, read_cloud, row_type
 from arbiview_aug.datasets.nuscenes.boxes import read_annotations
 from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables, is_camera
@@ -140,9 +139,8 @@ class NuScenesDataset(WritableRecording):
         """Source files of a sample: each camera's image, masks of converted views, and last the LiDAR's points."""
         *cameras, lidar = self._recordings.keyframes[checked_index(index, len(self))]
         masks = [path for key in self._view_masks for path in self._mask_files(cameras, key) if path is not None]
-        points = [lidar] if self.lidar_channel else []
-        images, points = ([self.root / self._recordings.file(row) for row in rows] for rows in (cameras, points))
-        return [*images, *masks, *points]
+        files = [self.root / self._recordings.file(row) for row in (*cameras, lidar)]
+        return [*files[:-1], *masks, *(files[-1:] if self.lidar_channel else ())]
 
     def moment_file(self, index: int) -> str:
         """Name of the file that was recorded at a sample's time: the LiDAR's, or without one the first camera's."""
@@ -172,15 +170,12 @@ class NuScenesDataset(WritableRecording):
 
     def _rig(self, cameras: IntArray, ego2global: FloatArray) -> Rig:
         recordings, rig = self._recordings, []
-        own2ego_of_cameras = _inverse(ego2global) @ recordings.ego2global(cameras)
-        for channel, row, own2ego in zip(self.channels, cameras, own2ego_of_cameras, strict=True):
-            sensor = recordings.rows["sensor"][row]
-            cam2ego, K = recordings.sensor2ego[sensor], recordings.K[sensor]
-            if self.compensate_ego_motion:
-                cam2ego = own2ego @ cam2ego
-            height_px, width_px = self._size(row)
-            lens, distortion = recordings.lenses[sensor]
-            optics: dict[str, Any] = {"K": K, "lens": lens, "distortion": tuple(distortion)}
+        then2ego = _inverse(ego2global) @ recordings.ego2global(cameras)  # from each exposure's ego frame
+        for k, (channel, row) in enumerate(zip(self.channels, cameras, strict=True)):
+            sensor, (height_px, width_px) = recordings.rows["sensor"][row], self._size(row)
+            cam2ego, (lens, distortion) = recordings.sensor2ego[sensor], recordings.lenses[sensor]
+            cam2ego = then2ego[k] @ cam2ego if self.compensate_ego_motion else cam2ego
+            optics: dict[str, Any] = {"K": recordings.K[sensor], "lens": lens, "distortion": tuple(distortion)}
             with calibration_of(f"nuScenes {self.root}: image {recordings.file(row)}"):
                 rig.append(Camera(name=channel, width_px=width_px, height_px=height_px, cam2ego=cam2ego, **optics))
         return reduced_rig(Rig(rig, ground_z_m=0.0, name="nuscenes"), self.reduce)
@@ -189,8 +184,7 @@ class NuScenesDataset(WritableRecording):
         """(h, w) of an image: of its row, or where that has none of the first such image of its sensor."""
         size, sensor = self._recordings.size(row), int(self._recordings.rows["sensor"][row])
         if not all(size) and sensor not in self._sizes:
-            height_px, width_px = decode_images([inside(*self._file(row))])[0].shape[-2:]
-            self._sizes[sensor] = height_px, width_px
+            self._sizes[sensor] = tuple(decode_images([inside(*self._file(row))])[0].shape[-2:])  # type: ignore[assignment]
         return size if all(size) else self._sizes[sensor]
 
     def _file(self, row: int) -> tuple[Path, str, str]:
@@ -206,11 +200,9 @@ class NuScenesDataset(WritableRecording):
 
     def _mask_files(self, cameras: Iterable[int], key: str) -> list[Path | None]:
         """The masks beside the views of cameras that are there."""
-        paths = []
-        for root, name, where in map(self._file, cameras):
-            path = inside(root, str(PurePosixPath(name).with_suffix(f".{key}.png")), where)
-            paths.append(path if path.is_file() else None)
-        return paths
+        files = ((PurePosixPath(name).with_suffix(f".{key}.png"), where) for _, name, where in map(self._file, cameras))
+        paths = (inside(self.root, str(name), where) for name, where in files)
+        return [path if path.is_file() else None for path in paths]
 
     def _masks(self, cameras: IntArray, keys: Sequence[str]) -> dict[str, Any]:
         files, sizes = {key: self._mask_files(cameras, key) for key in keys}, [*map(self._size, cameras)]
@@ -230,24 +222,23 @@ class NuScenesDataset(WritableRecording):
         recordings = self._recordings
         rows, is_key = np.arange(len(recordings.tokens)), recordings.rows["key"]
         sweeps = np.flatnonzero(~is_key)
-        _, first_of_channels = np.unique(recordings.rows["channel"][sweeps], return_index=True)
-        for sweep in sweeps[first_of_channels]:
-            folder = (self.root / recordings.file(sweep)).parent
-            is_lidar = recordings.rows["channel"][sweep] == len(self.channels)
+        channels, first = np.unique(recordings.rows["channel"][sweeps], return_index=True)
+        for channel, sweep in zip(channels, sweeps[first], strict=True):
+            folder, is_lidar = (self.root / recordings.file(sweep)).parent, channel == len(self.channels)
             if os.path.isdir(folder):  # False for impossible names too
                 self._has_lidar_sweeps |= is_lidar
-            elif is_lidar:
-                warn(f"nuScenes: {folder}: found no sweeps: only keyframes have points")
-            else:
-                warn(f"nuScenes: {folder}: found no sweeps: only keyframes are neighbours")
+                continue
+            warn(
+                f"nuScenes: {folder}: found no sweeps: only keyframes {'have points' if is_lidar else 'are neighbours'}"
+            )
+            if not is_lidar:
                 return rows[is_key[rows]]
         return rows
 
     def _token(self, place: int) -> str:
         recordings, row = self._recordings, int(self._drive_rows[place])
-        if recordings.is_keyframe(row):
-            return self.tokens[recordings.rows["sample"][row]]
-        return str(recordings.tokens[row].decode())
+        is_key, sample = recordings.is_keyframe(row), recordings.rows["sample"][row]
+        return self.tokens[sample] if is_key else str(recordings.tokens[row].decode())
 
     def _neighbour(self, place: int) -> LazyFrame:
         recordings, row = self._recordings, int(self._drive_rows[place])
@@ -259,14 +250,14 @@ class NuScenesDataset(WritableRecording):
         fields = {"token": self._token(place), "time_s": time_s, "ego2world": torch.from_numpy(ego2global)}
         fields["rig"] = self._rig(cameras, ego2global)
         fields |= self._masks(cameras, self._view_masks[:1])  # coverage
+        global2ego, scene = _inverse(ego2global), int(record["scene"])
         if (boxes := self._annotations) is not None:
-            global2ego, scene = _inverse(ego2global), int(record["scene"])
             there = boxes.at_sample(sample, global2ego) if is_keyframe else boxes.at_time(scene, time_s, global2ego)
             fields["boxes_3d"] = torch.from_numpy(there)
-        lidar = moment if is_keyframe else recordings.lidar_beside(row) if self._has_lidar_sweeps else None
+        lidar = moment if is_keyframe else recordings.nearest_lidar(row) if self._has_lidar_sweeps else None
         points = None
         if self.load_points and lidar is not None:
-            points = self._points(lidar, _inverse(ego2global) @ recordings.ego2global(lidar))
+            points = self._points(lidar, global2ego @ recordings.ego2global(lidar))
         return LazyFrame(fields, self._images(cameras), points)
 
 
@@ -278,43 +269,35 @@ def _inverse(pose: FloatArray) -> FloatArray:
 
 
 def _chosen_samples(tables: Tables, split_scenes: Iterable[str] | None) -> list[Row]:
-    samples = [*tables.by_token("sample").values()]
-    scenes = tables.by_token("scene")
+    samples, scenes = [*tables.by_token("sample").values()], tables.by_token("scene")
     tables.follow("sample", samples, "scene_token", "scene", scenes)
     if split_scenes is None:
         return samples
-    _refuse_text("split_scenes", split_scenes)
-    wanted = set(split_scenes)
+    wanted = {*_checked_names("split_scenes", split_scenes)}
     names = dict(zip(scenes, tables.column("scene", [*scenes.values()], "name", TEXTS), strict=True))
-    unknown = sorted(map(str, wanted - set(names) - set(names.values())))
-    if unknown:
+    if unknown := sorted(map(str, wanted - {*names} - {*names.values()})):
         raise tables.error("scene", f"the scenes {', '.join(unknown[:5])}", f"{len(names)} others")
     return [row for row in samples if row["scene_token"] in wanted or names[row["scene_token"]] in wanted]
 
 
-def _refuse_text(option: str, names: Any) -> None:
+def _checked_names(option: str, names: Any) -> list[Any]:
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise DataError(f"{option}: expected a collection of names such as [{str(names)!r}], got {names!r}")
+    return list(names)
 
 
 def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str]:
     rows = tables.rows("sensor")
     tables.column("sensor", rows, "modality", TEXTS)
-    names = tables.column("sensor", rows, "channel", TOKENS)
-    cameras = {*compress(names, map(is_camera, rows))}
+    cameras = {*compress(tables.column("sensor", rows, "channel", TOKENS), map(is_camera, rows))}
     if LIDAR in cameras:
         raise tables.error("sensor", f"modality lidar of {LIDAR}", "camera")
-    if channels is None:
-        chosen = [channel for channel in CAMERA_RING if channel in cameras]
-        chosen += sorted(cameras - set(CAMERA_RING))
-    else:
-        _refuse_text("channels", channels)
-        chosen = list(channels)
-    unknown = [channel for channel in chosen if channel not in cameras]
-    if len(set(chosen)) < len(chosen):
+    in_order = [*(channel for channel in CAMERA_RING if channel in cameras), *sorted(cameras - {*CAMERA_RING})]
+    chosen = in_order if channels is None else _checked_names("channels", channels)
+    if len({*chosen}) < len(chosen):
         raise DataError(f"nuScenes {tables.root}: channels: expected each once, got {', '.join(map(repr, chosen))}")
-    if unknown or not chosen:
-        expected, got = (", ".join(names) or "none" for names in (sorted(cameras), map(repr, unknown)))
+    if (unknown := [repr(channel) for channel in chosen if channel not in cameras]) or not chosen:
+        expected, got = ", ".join(sorted(cameras)) or "none", ", ".join(unknown) or "none"
         raise DataError(f"nuScenes {tables.root}: channels: expected some of {expected}, got {got}")
     return chosen
 

@@ -86,13 +86,12 @@ class Recordings:
         keyframe_us = self.rows["time_us"][self.keyframes[self.rows["sample"][row]]]
         rows = np.full(len(self.channels) - 1, row)
         for channel in range(1, len(rows)):
-            nearest = self._nearest(channel, row, keyframe_us[channel] - keyframe_us[0])
-            if nearest is None:
+            if (nearest := self._nearest(channel, row, keyframe_us[channel] - keyframe_us[0])) is None:
                 raise DataError(f"expected an image of {self.channels[channel]} within {MAX_APART_S} s, got none")
             rows[channel] = nearest
         return rows
 
-    def lidar_beside(self, row: int) -> int | None:
+    def nearest_lidar(self, row: int) -> int | None:
         """Row of the LiDAR's recording nearest in time to a row of the first camera; None beyond ``MAX_APART_S``."""
         return self._nearest(len(self.channels) - 1, row, 0)
 
@@ -120,12 +119,8 @@ def read_recordings(
     """
     wanted = [*channels, lidar or ""]
     calibrated, channel_of, sensor2ego, K, lenses = _calibrations(tables, wanted)
-    poses: dict[str, int] = {}
-    files: dict[tuple[str, str | None], int] = {}
-    tokens: list[str] = []
-    previous: list[str] = []
-    parts = [np.empty(0, _ROW)]
-    table = "sample_data"
+    poses, files = dict[str, int](), dict[tuple[str, str | None], int]()
+    tokens, previous, parts, table = list[str](), list[str](), [np.empty(0, _ROW)], "sample_data"
     unique = Tokens(tables, table)
     for batch in tables.batches(table):
         is_key = tables.column(table, batch, "is_key_frame", kinds.FLAGS)
@@ -139,9 +134,8 @@ def read_recordings(
         _refuse_calibrations(tables, kept)
         part = np.zeros(len(kept), _ROW)
         part["sensor"], part["channel"] = sensors, [channel_of[sensor] for sensor in sensors]
-        part["sample"] = [samples[row["sample_token"]] for row in kept]
-        part["scene"] = [scenes[sample] for sample in part["sample"].tolist()]
-        part["key"] = [row["is_key_frame"] for row in kept]
+        part["sample"] = of_samples = [samples[row["sample_token"]] for row in kept]
+        part["scene"], part["key"] = [scenes[k] for k in of_samples], [row["is_key_frame"] for row in kept]
         times = tables.column(table, kept, "timestamp", kinds.MICROSECONDS)
         part["time_us"] = times_us = [time // 1000 if time >= kinds.NANOSECONDS else time for time in times]
         for key in ("height", "width"):
@@ -149,9 +143,8 @@ def read_recordings(
         of_poses = tables.column(table, kept, "ego_pose_token", TOKENS)
         part["pose"] = [poses.setdefault(token, len(poses)) for token in of_poses]
         names = tables.column(table, kept, "filename", kinds.FILES)
-        for k, (name, time_us) in enumerate(zip(names, times_us, strict=True)):
-            head, time, tail = name.partition(str(time_us))
-            part["file"][k] = files.setdefault((head, tail if time else None), len(files))
+        names_cut = (name.partition(str(time_us)) for name, time_us in zip(names, times_us, strict=True))
+        part["file"] = [files.setdefault((a, b if time else None), len(files)) for a, time, b in names_cut]
         of_tokens = unique.add(kept)
         if sweeps:
             is_first = part["channel"] == 0
@@ -206,17 +199,16 @@ def _calibrations(
 ) -> tuple[dict[str, int], list[int], FloatArray, FloatArray, list[tuple[str, list[float]]]]:
     """Number of each calibrated sensor, -1 for others such as radars; channels, sensor2ego, K and lenses by number."""
     by_token = tables.by_token("calibrated_sensor")
-    calibrated_rows, by_sensor = [*by_token.values()], tables.by_token("sensor")
-    sensors = tables.follow("calibrated_sensor", calibrated_rows, "sensor_token", "sensor", by_sensor)
+    rows, by_sensor = [*by_token.values()], tables.by_token("sensor")
+    sensors = tables.follow("calibrated_sensor", rows, "sensor_token", "sensor", by_sensor)
     channels = {token: sensor["channel"] for token, sensor in zip(by_token, sensors, strict=True)}
     read = [token for token in by_token if channels[token] in wanted]
     calibrated = dict.fromkeys(by_token, -1) | {token: k for k, token in enumerate(read)}
     rows, channel_of = [by_token[token] for token in read], [wanted.index(channels[token]) for token in read]
     sensor2ego = poses_from(tables.poses("calibrated_sensor", rows))
     K = np.tile(np.eye(3), (len(rows), 1, 1))
-    cameras = [k for k, channel in enumerate(channel_of) if channel < len(wanted) - 1]
     lenses: list[tuple[str, list[float]]] = [("pinhole", [])] * len(rows)
-    for k in cameras:
+    for k in (k for k, channel in enumerate(channel_of) if channel < len(wanted) - 1):  # the cameras
         try:
             lens, K[k], coefficients, *_ = read_fields(rows[k]["token"], rows[k])
             lenses[k] = fitted(rows[k]["token"], lens, coefficients)
@@ -254,10 +246,8 @@ def _ego_poses(tables: Tables, wanted: Mapping[str, int]) -> FloatArray:
 
 
 def _parts(scene: npt.NDArray[Any], tokens: Sequence[str], previous: Sequence[str], where: str) -> IntArray:
-    """(F,) numbers of the uninterrupted drives in one camera's recordings, sorted by scene and time.
-
-    A drive ends with its scene, at a missing ``prev``, and where the clock goes back (with a warning).
-    """
+    """(F,) numbers of the drives in one camera's recordings, sorted by scene and time: one ends with its scene, at a
+    missing ``prev``, and where the clock goes back (with a warning)."""
     number_of = {token: k for k, token in enumerate(tokens)}
     before = np.array([number_of.get(token, -1) for token in previous], np.int64)
     number = np.arange(len(before))

@@ -102,7 +102,11 @@ class Tables:
             with path.open(encoding="utf-8-sig") as file:
                 entries = _entries(file)
                 while batch := list(islice(entries, _BATCH)):
-                    yield self._objects(table, batch, count)
+                    for k, row in enumerate(batch if {*map(type, batch)} - {dict} else ()):
+                        if not isinstance(row, Mapping):
+                            got = f"an entry {type(row).__name__}, number {count + k}"
+                            raise self.error(table, "a list of objects", got)
+                    yield batch
                     count += len(batch)
         except DataError:
             raise
@@ -120,8 +124,7 @@ class Tables:
 
     def by_token(self, table: str) -> dict[str, Row]:
         """A table's rows by token; DataError for invalid or duplicate tokens."""
-        rows = self.rows(table)
-        tokens = Tokens(self, table)
+        rows, tokens = self.rows(table), Tokens(self, table)
         entries = dict(zip(tokens.add(rows), rows, strict=True))
         tokens.check()
         return entries
@@ -184,12 +187,6 @@ class Tables:
     def error(self, table: str, expected: str, got: str, fix: str = _WRITE) -> DataError:
         """Make an error that names data set, version and table."""
         return DataError(f"nuScenes {self.root} {self.version}: table {table}: expected {expected}, got {got}; {fix}")
-
-    def _objects(self, table: str, batch: list[Any], first: int) -> list[Row]:
-        for k, row in enumerate(batch if {*map(type, batch)} - {dict} else ()):
-            if not isinstance(row, Mapping):
-                raise self.error(table, "a list of objects", f"an entry {type(row).__name__}, number {first + k}")
-        return batch
 
 
 def is_camera(sensor: Row) -> bool:

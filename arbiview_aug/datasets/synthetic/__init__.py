@@ -3,11 +3,11 @@
 from arbiview_aug.datasets.synthetic.dataset import (
     GROUND_CLASSES,
     RenderedViews,
+    ScanErrors,
     SyntheticDrive,
     demo_source_rig,
     demo_target_rig,
 )
-from arbiview_aug.datasets.synthetic.scanning import ScanErrors
 from arbiview_aug.datasets.synthetic.scene import BoxClass, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
 

@@ -14,10 +14,8 @@ _PARALLEL, _TINY = np.float32(1e-9), np.float32(1e-12)
 
 @compiled
 def chord_squares(local: Any, rays: Any, packets: Any, primitives: Any, root: Any) -> None:
-    """Write ``root`` (m, R): squares of half the chords of rays of ``packets`` (m,) through ``primitives``, times a.
-
-    It is |d|^2 - |o x d|^2 instead of b^2 - a c, which cancels for distant, thin primitives.
-    """
+    """Write ``root`` (m, R): squares of half the chords of rays of ``packets`` (m,) through ``primitives``, times a, as
+    |d|^2 - |o x d|^2: b^2 - a c cancels for distant, thin primitives."""
     to_unit, origin, round_z = local.to_unit, local.origin, local.round_z
     for m in range(len(root)):
         p, out = primitives[m], root[m]
@@ -42,8 +40,7 @@ def cast_packets(local: Any, rays: Any, ends: Any, primitives: Any, halves: Any,
     order, distance, is_box, normals, offsets = local.order, local.distance, local.is_box, local.normals, local.offsets
     to_unit, origin, round_z = local.to_unit, local.origin, local.round_z
     size = rays.shape[2]
-    enter, leave, speed = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
-    a, b, dz = np.empty(size, np.float32), np.empty(size, np.float32), np.empty(size, np.float32)
+    enter, leave, speed, a, b, dz = np.empty((6, size), np.float32)
     first, curved = 0, -1
     for n in range(len(rays)):
         x, y, z, nearest, rows = rays[n, 0], rays[n, 1], rays[n, 2], t[n], hit[n]

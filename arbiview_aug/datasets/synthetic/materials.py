@@ -20,8 +20,8 @@ _A, _B, _C = 374761393, 668265263, 1274126177  # odd 31-bit multipliers, as in c
 
 
 def cell_hash(i: Tensor, j: Tensor, salt: int) -> Tensor:
-    """Uniform numbers in [0, 1) of int32 lattice cells."""
-    return _mix(i * _A + j * _B, salt)
+    """Uniform numbers in [0, 1) of lattice cells."""
+    return _mix(i.to(torch.int32) * _A + j.to(torch.int32) * _B, salt)
 
 
 def _mix(h: Tensor, salt: int) -> Tensor:
@@ -34,13 +34,11 @@ def _mix(h: Tensor, salt: int) -> Tensor:
 def noise(x: Tensor, y: Tensor, salt: int) -> Tensor:
     """Value noise in [-1, 1] with lattice spacing 1, smooth; x and y any shape."""
     fx, fy = x.floor(), y.floor()
-    hx, hy = fx.to(torch.int32) * _A, fy.to(torch.int32) * _B
+    h = fx.to(torch.int32) * _A + fy.to(torch.int32) * _B
     u, v = x - fx, y - fy
     u, v = u * u * (3 - 2 * u), v * v * (3 - 2 * v)
-    h00, h10 = _mix(hx + hy, salt), _mix(hx + _A + hy, salt)
-    h01, h11 = _mix(hx + hy + _B, salt), _mix(hx + _A + hy + _B, salt)
-    low = h00 + (h10 - h00) * u
-    high = h01 + (h11 - h01) * u
+    low, low_end, high, high_end = (_mix(h + corner, salt) for corner in (0, _A, _B, _A + _B))
+    low, high = low + (low_end - low) * u, high + (high_end - high) * u
     return (low + (high - low) * v) * 2 - 1
 
 
@@ -144,27 +142,23 @@ def _facade(s: Surface) -> Tensor:
     v, top = s.local[:, 2] + s.half[:, 2], 2 * s.half[:, 2]
     storey, glass, shops = s.param[:, 1], s.param[:, 2], s.param[:, 3]
     bay = length / (length / s.param[:, 0]).round().clamp_min(1)
-    salt = s.scene.salt
+    salt, soft = s.scene.salt, torch.maximum(s.across, s.slant)
     k = s.primitive.to(torch.int32) * 8 + s.face.to(torch.int32)
-    soft = torch.maximum(s.across, s.slant)
-    offset = k.float() * 7.3
-    tone = 1 + 0.08 * octave(u + offset, v, 3.0, soft, salt + 100)
-    tone = tone + 0.07 * octave(u + offset, v * 0.3, 0.5, soft, salt + 101)
-    tone = tone + 0.07 * octave(u + offset, v, 0.12, soft, salt + 105)
+    at = u + k.float() * 7.3
+    tone = 1 + 0.08 * octave(at, v, 3.0, soft, salt + 100) + 0.07 * octave(at, v * 0.3, 0.5, soft, salt + 101)
+    tone = tone + 0.07 * octave(at, v, 0.12, soft, salt + 105)
     tone = tone * (1 - 0.18 * pulses(v, 0.30, 0.03, s.across) * (cell_hash(k >> 3, k * 0, salt + 102) < 0.5))
     color = s.color * tone[:, None]
     upper = band(v, storey + 0.3, top - 0.7, s.across)
     i, j = (u / bay).floor(), (v / storey).floor()
-    side = bay * (1 - glass) / 2
-    pane = pulses(u - side, bay, bay * glass, s.slant)
-    pane = pane * pulses(v - 0.28 * storey, storey, 0.52 * storey, s.across) * upper
-    frame = pulses(u - side + 0.09, bay, bay * glass + 0.18, s.slant)
-    frame = frame * pulses(v - 0.28 * storey + 0.14, storey, 0.52 * storey + 0.2, s.across) * upper
-    h = [cell_hash(i.to(torch.int32) + k * 131, j.to(torch.int32), salt + 110 + m) for m in range(3)]
+    side, sill = u - bay * (1 - glass) / 2, v - 0.28 * storey
+    pane = pulses(side, bay, bay * glass, s.slant) * pulses(sill, storey, 0.52 * storey, s.across) * upper
+    frame = pulses(side + 0.09, bay, bay * glass + 0.18, s.slant)
+    frame = frame * pulses(sill + 0.14, storey, 0.52 * storey + 0.2, s.across) * upper
+    h = [cell_hash(i + k * 131, j, salt + 110 + m) for m in range(3)]
     resolved = fade(s.slant, 3.0)
     color = mix(color, torch.tensor([0.74, 0.73, 0.70]), (frame - pane).clamp(0, 1) * 0.75)
-    curtain = torch.tensor([0.50, 0.47, 0.42])
-    inside = mix(_glass(s, 0.40), curtain, 0.65 * h[0] * (h[1] < 0.4) * resolved)
+    inside = mix(_glass(s, 0.40), torch.tensor([0.50, 0.47, 0.42]), 0.65 * h[0] * (h[1] < 0.4) * resolved)
     inside = inside * (1 + (0.5 * h[2] - 0.25) * resolved)[:, None]
     # Shadow of the reveal on the upper edge of the pane.
     lift = v - (j + 0.28) * storey
@@ -182,20 +176,10 @@ def _facade(s: Surface) -> Tensor:
     return torch.where((s.face < 4)[:, None], color, torch.tensor([0.40, 0.39, 0.38]))
 
 
-def _wheel_arch(s: Surface) -> Tensor:
-    """Dark discs on the flanks around the wheels of a car or van."""
-    x, z = s.local[:, 0].abs(), s.point[:, 2]
-    radius = (s.param[:, 1] + 0.07).clamp_min(0.01)
-    d = ((x - s.param[:, 0]) ** 2 + (z - s.param[:, 1]) ** 2).sqrt()
-    disc = ((radius - d) / s.slant.clamp_min(0.01) + 0.5).clamp(0, 1)
-    return disc * (s.face >= 2) * (s.face < 4) * (s.param[:, 1] > 0)
-
-
 def _paint(s: Surface) -> Tensor:
     x, y, z = s.local.unbind(1)
     hx, hy, hz = s.half.unbind(1)
-    v = (z + hz) / (2 * hz)
-    across, slant = s.across, s.slant
+    v, across, slant = (z + hz) / (2 * hz), s.across, s.slant
     shine = _polished(s, 0.14)
     # Flanks: sill, door joints, handles.
     dark = torch.tensor([0.07, 0.07, 0.075])
@@ -204,7 +188,12 @@ def _paint(s: Surface) -> Tensor:
     joints = band(middle, 0.0, 0.012, slant) + band(middle - 0.36 * hx, -0.012, 0.012, slant)
     crease = band(v, 0.62, 0.66, across / (2 * hz))
     flank = mix(shine, dark, (sill * 0.8 + joints * 0.7).clamp(0, 1))
-    flank = mix(flank * (1 - 0.18 * crease)[:, None], dark, _wheel_arch(s))
+    # Arches: dark discs around the wheels of a car or van.
+    middle_m, radius_m = s.param[:, 0], s.param[:, 1]
+    d = ((x.abs() - middle_m) ** 2 + (s.point[:, 2] - radius_m) ** 2).sqrt()
+    arch = (((radius_m + 0.07).clamp_min(0.01) - d) / slant.clamp_min(0.01) + 0.5).clamp(0, 1)
+    arch = arch * (s.face >= 2) * (s.face < 4) * (radius_m > 0)
+    flank = mix(flank * (1 - 0.18 * crease)[:, None], dark, arch)
     # Ends: bumper, lamps, plate; the grille only in front.
     bumper = band(v, -1.0, 0.36, across / (2 * hz))
     end = mix(shine, dark, bumper * 0.55)
@@ -214,8 +203,7 @@ def _paint(s: Surface) -> Tensor:
     end = mix(end, _lamps(s, 0.62), lamp)
     plate = band(y.abs(), 0.0, 0.26, slant) * band(z + hz, 0.17, 0.29, across)
     end = mix(end, torch.tensor([0.85, 0.85, 0.82]), plate)
-    color = torch.where((s.face < 2)[:, None], end, flank)
-    color = torch.where((s.face == 4)[:, None], _polished(s, 0.22), color)
+    color = torch.where((s.face == 4)[:, None], _polished(s, 0.22), torch.where((s.face < 2)[:, None], end, flank))
     return torch.where((s.face == 5)[:, None], dark, color)
 
 
@@ -239,8 +227,7 @@ def _glasshouse(s: Surface) -> Tensor:
 def _coach(s: Surface) -> Tensor:
     x, y, z = s.local.unbind(1)
     hx, hy, hz = s.half.unbind(1)
-    v = (z + hz) / (2 * hz)
-    f = s.across / (2 * hz)
+    v, f = (z + hz) / (2 * hz), s.across / (2 * hz)
     windows = band(v, 0.40, 0.80, f) * (1 - pulses(x, 1.45, 0.10, s.slant))
     flank = mix(s.color, _glass(s), windows * band(x.abs() / hx, -1.0, 0.96, s.slant / hx))
     stripe = torch.stack([s.color[:, 2], s.color[:, 0], s.color[:, 1]], 1) * 0.7

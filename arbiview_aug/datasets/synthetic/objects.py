@@ -6,6 +6,7 @@ Every labelled object touches all six sides of its 3D box.
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 
@@ -32,7 +33,7 @@ _CLOTHES: tuple[Color, ...] = (
 _TROUSERS: tuple[Color, ...] = (
     (0.13, 0.17, 0.28), (0.10, 0.10, 0.11), (0.38, 0.33, 0.26), (0.28, 0.29, 0.31), (0.20, 0.16, 0.14)
 )  # fmt: skip
-_WALLS: tuple[Color, ...] = (
+WALLS: tuple[Color, ...] = (
     (0.62, 0.55, 0.46), (0.55, 0.33, 0.26), (0.70, 0.68, 0.63), (0.48, 0.47, 0.46), (0.66, 0.60, 0.42),
     (0.40, 0.30, 0.26), (0.58, 0.62, 0.64), (0.74, 0.66, 0.58), (0.36, 0.38, 0.42),
 )  # fmt: skip
@@ -51,17 +52,10 @@ def plain(color: Color) -> Look:
     return Look(Material.PLAIN, color)
 
 
-def vehicle_size(rng: np.random.Generator, cls: BoxClass) -> Vector:
-    """Length, width and height in metres."""
-    length, width, height = VEHICLE_SIZES[cls]
-    # The height is independent, so that a detector cannot infer it from the footprint.
-    return rng.uniform(*length), rng.uniform(*width), rng.uniform(*height)
-
-
 def add_vehicle(
     builder: SceneBuilder, rng: np.random.Generator, cls: BoxClass, size: Vector, xy: Range, yaw: float
 ) -> None:
-    """A vehicle on the road plane and its box."""
+    """Add a vehicle on the road plane and its box."""
     length, width, height = size
     row = builder.add_box(np.array([*xy, height / 2]), size, yaw, cls)
     place = builder.place((*xy, 0.0), yaw, SceneClass.VEHICLE, row)
@@ -83,9 +77,7 @@ def add_vehicle(
         cabin, glazed = ((-x, x - 0.75), (-y, y), (waist, height)), 0.35 if rng.random() < 0.5 else 1.0
         place.box(*cabin, Look(Material.GLASSHOUSE, paint, (glazed, 0, 0, 0)), taper=(0.40, 0.03, 0.10, 0.10))
     elif cls is BoxClass.TRUCK:
-        cab = rng.uniform(1.7, 2.2)
-        top = height * rng.uniform(0.72, 0.9)
-        cab_color = pick(rng, PAINTS)
+        cab, top, cab_color = rng.uniform(1.7, 2.2), height * rng.uniform(0.72, 0.9), pick(rng, PAINTS)
         place.box((x - cab, x), (-y + 0.05, y - 0.05), (0.45, 1.35), Look(Material.PAINT, cab_color))
         cabin = (x - cab, x), (-y + 0.05, y - 0.05), (1.35, top)
         place.box(*cabin, Look(Material.GLASSHOUSE, cab_color, (1.0, 0, 0, 0)), taper=(0.22, 0, 0.04, 0.04))
@@ -93,14 +85,13 @@ def add_vehicle(
         place.box((-x + 0.1, x - cab), (-0.45, 0.45), (0.5, 0.95), plain(DARK))
     else:
         place.box((-x, x), (-y, y), (0.32, height), Look(Material.COACH, paint), taper=(0.10, 0.02, 0.02, 0.02))
-    for side in (-1, 1):
-        for end in (-1, 1):
-            center = (end * reach, side * (width / 2 - 0.11), radius)
-            place.cylinder(center, (radius, radius), 0.11, Look(Material.WHEEL, TIRE), lateral=True)
+    for side, end in product((-1, 1), repeat=2):
+        center = (end * reach, side * (width / 2 - 0.11), radius)
+        place.cylinder(center, (radius, radius), 0.11, Look(Material.WHEEL, TIRE), lateral=True)
 
 
 def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
-    """A standing or walking person and their box."""
+    """Add a standing or walking person and their box."""
     height = rng.uniform(1.5, 1.92)
     length, width = rng.uniform(0.34, 0.52), rng.uniform(0.46, 0.60)
     center = np.array([xyz[0], xyz[1], xyz[2] + height / 2])
@@ -112,10 +103,8 @@ def add_pedestrian(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector,
     hip, shoulder = 0.48 * height, 0.83 * height
     stride = length / 2 - 0.075
     for side in (-1, 1):
-        leg = (side * stride * 0.9, side * width * 0.17, hip / 2)
-        place.cylinder(leg, (0.075, 0.07), hip / 2, plain(trousers))
-    torso = Look(Material.ROUGH, jacket, (0.1, 0.06, 0, 0))
-    radii = (0.14 * 0.9, (width / 2 - 0.08) * 0.88)
+        place.cylinder((side * stride * 0.9, side * width * 0.17, hip / 2), (0.075, 0.07), hip / 2, plain(trousers))
+    torso, radii = Look(Material.ROUGH, jacket, (0.1, 0.06, 0, 0)), (0.14 * 0.9, (width / 2 - 0.08) * 0.88)
     place.cylinder((0.0, 0.0, (hip + shoulder) / 2), radii, (shoulder - hip) / 2, torso)
     place.ellipsoid((0, 0, shoulder - 0.03), (0.085, width / 2 - 0.03, 0.075), plain(sleeve))
     place.cylinder((0, 0, shoulder + 0.04), (0.055, 0.055), 0.09, plain(skin))
@@ -147,7 +136,7 @@ def add_tree(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, re
 
 
 def add_bush(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, scale: float = 1.0) -> None:
-    """Low ellipsoids of leaves."""
+    """Add low ellipsoids of leaves."""
     place = builder.place(xyz, rng.uniform(0, 6.28), SceneClass.VEGETATION)
     green = pick(rng, ((0.20, 0.28, 0.13), (0.26, 0.30, 0.15)), 0.02)
     for _ in range(4):
@@ -156,41 +145,12 @@ def add_bush(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, *, sc
         place.ellipsoid((float(x), float(y), height * 0.6), (r, r * 0.9, height), Look(Material.LEAF, green))
 
 
-def add_lamp_post(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
-    """A tall pole whose arm (local x) reaches over the road."""
-    place = builder.place(xyz, yaw, SceneClass.POLE)
-    height, grey = rng.uniform(5.5, 8.5), rng.uniform(0.25, 0.55)
-    metal: Color = (grey, grey, grey * 1.03)
-    place.cylinder((0, 0, height / 2), (0.075, 0.075), height / 2, plain(metal))
-    place.cylinder((0, 0, 0.5), (0.12, 0.12), 0.5, plain(metal))
-    place.box((0, 1.7), (-0.04, 0.04), (height - 0.1, height), plain(metal))
-    place.box((1.2, 1.9), (-0.12, 0.12), (height - 0.16, height - 0.02), plain((0.75, 0.74, 0.68)))
-
-
-def add_sign(builder: SceneBuilder, rng: np.random.Generator, xyz: Vector, yaw: float) -> None:
-    """A post with one or two plates that face local -x."""
-    place = builder.place(xyz, yaw, SceneClass.POLE)
-    height = rng.uniform(2.3, 3.0)
-    place.cylinder((0, 0, height / 2), (0.035, 0.035), height / 2, plain((0.52, 0.53, 0.54)))
-    colors: tuple[Color, ...] = ((0.78, 0.12, 0.12), (0.10, 0.25, 0.62), (0.85, 0.72, 0.10), (0.90, 0.90, 0.90))
-    for k in range(int(rng.integers(1, 3))):
-        w, z = rng.uniform(0.25, 0.36), height - 0.35 - 0.7 * k
-        place.box((-0.06, -0.04), (-w, w), (z - 0.3, z + 0.3), Look(Material.SIGN, pick(rng, colors, 0.02)))
-
-
-def add_traffic_light(builder: SceneBuilder, xyz: Vector, yaw: float) -> None:
-    """A signal head on a post, facing local -x."""
-    place = builder.place(xyz, yaw, SceneClass.POLE)
-    place.cylinder((0, 0, 1.7), (0.06, 0.06), 1.7, plain((0.25, 0.26, 0.26)))
-    place.box((-0.28, -0.07), (-0.16, 0.16), (2.5, 3.4), Look(Material.SIGN, DARK, (1.0, 0, 0, 0)))
-
-
 def add_building(
     builder: SceneBuilder, rng: np.random.Generator, x: Range, y: Range, z: Range, *, detailed: bool = True
 ) -> None:
     """A block with windows; detailed ones have a cornice, now and then bays or an awning over the ground floor."""
     place, (base_m, height) = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING), z
-    wall = pick(rng, _WALLS)
+    wall = pick(rng, WALLS)
     bay, storey = rng.uniform(2.2, 4.2), rng.uniform(2.9, 3.6)
     # bay width, storey height, share of the wall that is glass, whether the ground floor is shops
     param = (bay, storey, rng.uniform(0.42, 0.72), float(rng.random() < 0.55))
@@ -213,16 +173,3 @@ def add_building(
             ends = sorted((front, front + outward * 0.7))
             bounds = (a, min(a + 2.6, x[1])), (ends[0], ends[1]), (storey, height * 0.85)
             place.box(*bounds, Look(Material.FACADE, wall, (2.6, storey, 0.7, 0.0)))
-
-
-def add_barrier(
-    builder: SceneBuilder, rng: np.random.Generator, x: Range, y: Range, base_m: float, *, hedge: bool
-) -> None:
-    """A garden wall or a hedge between buildings."""
-    height = base_m + rng.uniform(0.9, 1.4 if hedge else 2.0)
-    if hedge:
-        place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.VEGETATION)
-        place.box(x, y, (base_m - 0.05, height), Look(Material.LEAF, pick(rng, ((0.19, 0.27, 0.12),), 0.02)))
-        return
-    place = builder.place((0.0, 0.0, 0.0), 0.0, SceneClass.BUILDING)
-    place.box(x, y, (base_m - 0.05, height), Look(Material.ROUGH, pick(rng, _WALLS), (1.2, 0.08, 0, 0)))

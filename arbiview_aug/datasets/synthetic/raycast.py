@@ -124,7 +124,9 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
     """
     from arbiview_aug.datasets.synthetic.kernels import cast_packets, chord_squares
 
-    t, hit = _ground(start[:, 2:], rays)
+    height_m, down = start[:, 2:], -rays[:, 2]
+    t = torch.where((down > 1e-7) & (height_m > 0), height_m * down.clamp_min(1e-7).reciprocal(), torch.inf)
+    hit = torch.where(torch.isfinite(t), GROUND_ID, SKY_ID)
     curved = (~local.is_box[candidates.primitive]).nonzero()[:, 0]
     ends = torch.bincount(candidates.packet, minlength=len(rays)).cumsum(0)
     rest = rays, candidates.packet[curved], candidates.primitive[curved], ends, candidates.primitive, t, hit
@@ -138,9 +140,3 @@ def cast(local: LocalScene, start: Tensor, rays: Tensor, candidates: Candidates)
     halves = torch.sqrt(torch.as_tensor(roots).clamp_min(0)).numpy()
     cast_packets(scene, packets, end, primitives, halves, out_t, out_hit)
     return torch.as_tensor(out_t), torch.as_tensor(out_hit)
-
-
-def _ground(height_m: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    down = -rays[:, 2]
-    t = torch.where((down > 1e-7) & (height_m > 0), height_m * down.clamp_min(1e-7).reciprocal(), torch.inf)
-    return t, torch.where(torch.isfinite(t), GROUND_ID, SKY_ID)

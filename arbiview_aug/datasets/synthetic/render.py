@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial, reduce
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,14 +33,9 @@ from arbiview_aug.environment import one_thread
 from arbiview_aug.lru_cache import LRUCache
 
 TILE_PX = 16
-_PACKET_PX = 16
-"""Outline pixels that share a packet in the second pass."""
-_THIN_PX = 1.5
-"""Primitives thinner than this are supersampled."""
-_BATCH_PX = 1_500_000
-"""Maximum number of pixels shaded together, with 150 MB of intermediate results."""
-_CACHED_BYTES = 512 << 20
-"""Memory of rays that are kept: six cameras of 1600x900 have 350 MB."""
+_THIN_PX = 1.5  # primitives thinner than this are supersampled
+_BATCH_PX = 1_500_000  # most pixels shaded together, with 150 MB of intermediate results
+_CACHED_BYTES = 512 << 20  # of rays that are kept: six cameras of 1600x900 have 350 MB
 _TABLES: LRUCache[int, SceneTables] = LRUCache(4)
 """Tables of the last scenes, which they keep, so that no other scene has the same id."""
 
@@ -62,9 +58,11 @@ def camera_rays(camera: Camera) -> CameraRays:
     rays = np.where(valid[..., None], rays, camera.cam2ego[:3, 2])
     right, down = _differences(rays, valid, 1), _differences(rays, valid, 0)
     pitch = np.sqrt(np.linalg.norm(right, axis=-1) * np.linalg.norm(down, axis=-1)).clip(1e-6, 0.3)
-    if not valid.all():
-        rays = _fill_by_tile(rays, valid)
-
+    for top, left in product(*(range(0, side, TILE_PX) for side in camera.size)) if not valid.all() else ():
+        # Invalid pixels get a valid ray of their own tile, so that they do not widen its pyramid.
+        tile = np.s_[top : top + TILE_PX, left : left + TILE_PX]
+        if valid[tile].any() and not valid[tile].all():
+            rays[tile][~valid[tile]] = rays[tile][valid[tile]][0]
     tiles = [_to_tiles(torch.as_tensor(array.astype(np.float32))) for array in (rays, right, down, pitch)]
     axis = torch.as_tensor(camera.cam2ego[:3, 2].astype(np.float32)).expand(len(tiles[0]), 3)
     seen = _to_tiles(torch.as_tensor(valid))[:, 0]
@@ -73,29 +71,16 @@ def camera_rays(camera: Camera) -> CameraRays:
 
 def _differences(rays: np.ndarray, valid: np.ndarray, axis: int) -> np.ndarray:
     """Central differences between valid neighbours, one-sided at the borders."""
-    if rays.shape[axis] < 2:
-        other = 1 - axis
-        return np.full_like(rays, 1e-3) if rays.shape[other] < 2 else _differences(rays, valid, other)
     n = rays.shape[axis]
+    if n < 2:
+        return np.full_like(rays, 1e-3) if rays.shape[1 - axis] < 2 else _differences(rays, valid, 1 - axis)
     before, after = np.arange(n).clip(1) - 1, np.arange(n).clip(max=n - 2) + 1
-    sides = []
+    total, count = np.zeros_like(rays), np.zeros((*valid.shape, 1), int)
     for a, b in ((np.arange(n), after), (before, np.arange(n))):
         apart = (a != b)[:, None] if axis == 0 else a != b
         good = (valid.take(a, axis) & valid.take(b, axis) & apart)[..., None]
-        sides.append((np.where(good, rays.take(b, axis) - rays.take(a, axis), 0), good))
-    count = sides[0][1].astype(int) + sides[1][1]
-    return (sides[0][0] + sides[1][0]) / np.maximum(count, 1)
-
-
-def _fill_by_tile(rays: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Give invalid pixels a valid ray of their own tile, so that they do not widen its pyramid."""
-    rays = rays.copy()
-    for top in range(0, rays.shape[0], TILE_PX):
-        for left in range(0, rays.shape[1], TILE_PX):
-            tile = np.s_[top : top + TILE_PX, left : left + TILE_PX]
-            if valid[tile].any() and not valid[tile].all():
-                rays[tile][~valid[tile]] = rays[tile][valid[tile]][0]
-    return rays
+        total, count = total + np.where(good, rays.take(b, axis) - rays.take(a, axis), 0), count + good
+    return total / np.maximum(count, 1)
 
 
 def _to_tiles(a: Tensor) -> Tensor:
@@ -194,7 +179,16 @@ class Renderer:
         """Second pass: rows (m,) of the supersampled pixels, and their (m * s * s) hits."""
         rays, candidates, s = first.rays, first.candidates, self.supersampling
         of_cameras = zip(first.cameras, key.view_as(first.hit).split(first.tiles), strict=True)
-        outline = torch.cat([_to_tiles(_outlines(_from_tiles(k, camera.size)))[:, 0] for camera, k in of_cameras])
+        outlines = []
+        for camera, keys in of_cameras:  # pixels with a direct neighbour of another key
+            pixels = _from_tiles(keys, camera.size)
+            differs = torch.zeros_like(pixels, dtype=torch.bool)
+            for one, across in ((pixels, differs), (pixels.T, differs.T)):
+                step = one[1:] != one[:-1]
+                across[1:] |= step
+                across[:-1] |= step
+            outlines.append(_to_tiles(differs)[:, 0])
+        outline = torch.cat(outlines)
         distance = first.local.distance[candidates.primitive].clamp_min(0.1)
         pixel = rays.pitch.amax(1)[candidates.packet] * distance
         busy = torch.zeros(len(outline), dtype=torch.bool)
@@ -205,19 +199,14 @@ class Renderer:
         d, r, b = (a[tile, :, slot] for a in (rays.directions, rays.right, rays.down))  # [m, 3]
         sub = torch.stack([d + u * r + v * b for v in offsets for u in offsets], 1)  # [m, s*s, 3]
         sub = sub / (sub[..., 0] ** 2 + sub[..., 1] ** 2 + sub[..., 2] ** 2).sqrt()[..., None]
-        # Pixels of a tile share packets; the last one is filled up with its tile's first ray.
-        counts = torch.bincount(tile, minlength=len(outline))
-        packets = (counts + _PACKET_PX - 1) // _PACKET_PX
-        first_pixel, first_packet = counts.cumsum(0) - counts, packets.cumsum(0) - packets
-        rank = ranks(tile, counts)
-        packet, place = first_packet[tile] + rank // _PACKET_PX, rank % _PACKET_PX
-        owner = torch.repeat_interleave(torch.arange(len(outline)), packets)
-        packed = sub[first_pixel[owner]][:, None, :1].expand(-1, _PACKET_PX, s * s, -1).clone()
-        packed[packet, place] = sub
-        packed = _to_street(packed.view(len(owner), _PACKET_PX * s * s, 3).transpose(1, 2), scene)
-        t, hit = cast(first.local, first.start[owner], packed, _for_packets(candidates, owner, len(outline)))
-        t, hit = (a.view(len(owner), _PACKET_PX, s * s)[packet, place].reshape(-1) for a in (t, hit))
-        direction = packed.transpose(1, 2).reshape(len(owner), _PACKET_PX, s * s, 3)[packet, place].reshape(-1, 3)
+        found = torch.bincount(
+            candidates.packet, minlength=len(outline)
+        )  # a pixel is a packet with its tile's candidates
+        packet = torch.repeat_interleave(torch.arange(len(tile)), found[tile])
+        at = (found.cumsum(0) - found)[tile[packet]] + ranks(packet, found[tile])
+        packets = _to_street(sub.transpose(1, 2).contiguous(), scene)
+        t, hit = cast(first.local, first.start[tile], packets, Candidates(packet, candidates.primitive[at]))
+        t, hit, direction = t.reshape(-1), hit.reshape(-1), packets.transpose(1, 2).reshape(-1, 3)
         pitch = (rays.pitch[tile, slot] / s).repeat_interleave(s * s)
         start = first.start[tile].repeat_interleave(s * s, 0)
         return tile * outline.shape[1] + slot, _hits(start, direction, t, hit, pitch)
@@ -229,9 +218,10 @@ class Renderer:
         depth = torch.where(torch.isfinite(first.t), depth, torch.inf)
         row = hit.clamp_min(0)
         classes = torch.tensor(scene.cls)[row]
-        classes = torch.where(hit == GROUND_ID, int(SceneClass.GROUND), classes)
-        classes = torch.where(hit == SKY_ID, int(SceneClass.SKY), classes)
-        classes = torch.where(rays.valid, classes, int(SceneClass.VOID))
+        others = (GROUND_ID, SceneClass.GROUND), (SKY_ID, SceneClass.SKY)
+        of_others = *((hit == k, cls) for k, cls in others), (~rays.valid, SceneClass.VOID)
+        for there, cls in of_others:
+            classes = torch.where(there, int(cls), classes)
         instances = torch.where(hit >= 0, torch.tensor(scene.instance)[row], -1)
         image = (color.view(*hit.shape, 3) * 255 + 0.5).to(torch.uint8) * rays.valid[..., None]
         maps = image, depth, classes.to(torch.uint8), instances.to(torch.int16)
@@ -266,22 +256,3 @@ def _to_street(rays: Tensor, scene: Scene) -> Tensor:
 def _hits(start: Tensor, direction: Tensor, t: Tensor, hit: Tensor, pitch: Tensor) -> Hits:
     reach = torch.where(torch.isfinite(t), t, 0.0)
     return Hits(start + direction * reach[:, None], direction, reach, pitch, hit)
-
-
-def _outlines(key: Tensor) -> Tensor:
-    """(h, w) bool: pixels with a direct neighbour of another key."""
-    out = torch.zeros_like(key, dtype=torch.bool)
-    for pixels, across in ((key, out), (key.T, out.T)):
-        differs = pixels[1:] != pixels[:-1]
-        across[1:] |= differs
-        across[:-1] |= differs
-    return out
-
-
-def _for_packets(candidates: Candidates, owner: Tensor, tiles: int) -> Candidates:
-    """Repeat the tiles' candidates for packets (m,) of the tiles ``owner``."""
-    counts = torch.bincount(candidates.packet, minlength=tiles)
-    first = counts.cumsum(0) - counts
-    packet = torch.repeat_interleave(torch.arange(len(owner)), counts[owner])
-    rank = ranks(packet, counts[owner])
-    return Candidates(packet, candidates.primitive[first[owner[packet]] + rank])

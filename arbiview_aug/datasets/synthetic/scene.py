@@ -1,8 +1,7 @@
 """A scene as plain data: convex primitives with materials, 3D boxes, the street's layout and the light.
 
-Everything stands in the *street frame*: x along the road, y left, z up, the road plane at z = 0. The vehicle stands on
-the road at ``ego2street``. Two kinds of primitive suffice: boxes with slanted sides (six half-spaces), and quadrics
-(ellipsoids and capped elliptic cylinders). All are convex, so that one interval along a ray describes each.
+The *street frame* has x along the road, y left, z up, and the road plane at z = 0. Primitives are boxes with slanted
+sides (six half-spaces), ellipsoids and capped elliptic cylinders: one interval along a ray describes each.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class SceneClass(IntEnum):
 
 
 class BoxClass(IntEnum):
-    """Classes of the 3D boxes."""
+    """Class of a 3D box."""
 
     CAR, VAN, TRUCK, BUS, PEDESTRIAN = range(5)
 
@@ -132,8 +131,7 @@ class Scene:
         ego2street[:3, 3] += self.speed_mps * seconds * ego2street[:3, 0]
         moves = np.zeros((len(self.boxes) + 1, 3))  # the last row serves primitives without a box
         moves[:-1, :2] = self.velocities * seconds
-        move = moves[self.instance]
-        planes, boxes = self.planes.copy(), self.boxes.copy()
+        move, planes, boxes = moves[self.instance], self.planes.copy(), self.boxes.copy()
         planes[..., 3] += (planes[..., :3] * move[:, None]).sum(-1)
         boxes[:, :3] += moves[:-1]
         center, corners = self.center + move, self.corners + move[:, None]
@@ -165,13 +163,10 @@ class SceneBuilder:
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """The collected rows in ``Scene``'s shapes."""
-        columns = {name: [row[name] for row in self.primitives] for name in self.primitives[0]}
-        integer = {"kind", "material", "cls", "instance"}
-        return {
-            **{name: np.array(column, np.int64 if name in integer else np.float64) for name, column in columns.items()},
-            "boxes": np.array(self.boxes, np.float64).reshape(-1, 7),
-            "box_classes": np.array(self.box_classes, np.int64),
-        }
+        arrays = {name: np.array([row[name] for row in self.primitives]) for name in self.primitives[0]}
+        arrays = {name: a.astype(np.int64 if a.dtype.kind == "i" else np.float64) for name, a in arrays.items()}
+        boxes, classes = np.array(self.boxes, np.float64).reshape(-1, 7), np.array(self.box_classes, np.int64)
+        return {**arrays, "boxes": boxes, "box_classes": classes}
 
 
 class Look(NamedTuple):
@@ -197,9 +192,8 @@ class Placed:
         lo, hi = np.array([x, y, z], np.float64).T
         hx, hy, hz = half = (hi - lo) / 2
         front, rear, left, right = taper
-        normals = np.array(
-            [[2 * hz, 0, front], [-2 * hz, 0, rear], [0, 2 * hz, left], [0, -2 * hz, right], [0, 0, 1], [0, 0, -1]]
-        )
+        ends, sides = [[2 * hz, 0, front], [-2 * hz, 0, rear]], [[0, 2 * hz, left], [0, -2 * hz, right]]
+        normals = np.array([*ends, *sides, [0, 0, 1], [0, 0, -1]])
         offsets = np.array([2 * hx - front, 2 * hx - rear, 2 * hy - left, 2 * hy - right, 1, 1]) * hz
         norm = np.linalg.norm(normals, axis=1)
         corners = _SIGNS * half

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 
@@ -30,6 +31,7 @@ _KINDS = (BoxClass.CAR, BoxClass.VAN, BoxClass.TRUCK, BoxClass.BUS)
 _MOVING_SHARES = (0.62, 0.18, 0.14, 0.06)
 _PARKED_SHARES = (0.76, 0.19, 0.05, 0.0)
 _SPEED_MPS = (6.0, 14.0)
+_SIGNS = ((0.78, 0.12, 0.12), (0.10, 0.25, 0.62), (0.85, 0.72, 0.10), (0.90, 0.90, 0.90))
 _WAITING = 0.2  # share of the people and of the traffic in other directions that stands still
 
 
@@ -38,16 +40,23 @@ def make_scene(seed: int, index: int) -> Scene:
     rng = np.random.default_rng(np.random.SeedSequence([seed, index]))
     street, ego2street = _layout(rng)
     world = _World(rng, street, ego2street)
-    world.add_blocks()
     world.add_buildings()
     world.add_background()
     world.add_parked()
     parked = len(world.builder.boxes)
     world.add_moving()
-    world.add_cross_traffic()
     world.add_furniture()
     world.add_pedestrians()
-    speed_mps, velocities = _motion(np.random.SeedSequence([seed, index, 2]), world.builder, parked)
+    # Traffic in the vehicle's direction keeps about its speed, so that it stays off the place before and behind it.
+    motion = np.random.default_rng(np.random.SeedSequence([seed, index, 2]))
+    speed_mps = motion.uniform(*_SPEED_MPS)
+    velocities = np.zeros((len(world.builder.boxes), 2))
+    for row, (box, cls) in enumerate(zip(world.builder.boxes, world.builder.box_classes, strict=True)):
+        walks = cls == BoxClass.PEDESTRIAN
+        own_mps = motion.uniform(0.8, 1.7) if walks else speed_mps * motion.uniform(0.9, 1.1)
+        waits = motion.random() < _WAITING and math.cos(box[6]) < 0.5
+        if row >= parked and not waits:
+            velocities[row] = own_mps * math.cos(box[6]), own_mps * math.sin(box[6])
     return Scene(
         speed_mps=speed_mps,
         velocities=velocities,
@@ -57,23 +66,6 @@ def make_scene(seed: int, index: int) -> Scene:
         salt=int(rng.integers(1 << 20)),
         **world.builder.arrays(),
     )
-
-
-def _motion(seed: np.random.SeedSequence, builder: SceneBuilder, parked: int) -> tuple[float, np.ndarray]:
-    """The vehicle's own speed and all velocities (B, 2): the first ``parked`` vehicles stand, some others wait.
-
-    Traffic in the vehicle's direction keeps about its speed, so that it stays off the place before and behind it.
-    """
-    rng = np.random.default_rng(seed)
-    speed_mps = rng.uniform(*_SPEED_MPS)
-    velocities = np.zeros((len(builder.boxes), 2))
-    for row, (box, cls) in enumerate(zip(builder.boxes, builder.box_classes, strict=True)):
-        yaw, walks = box[6], cls == BoxClass.PEDESTRIAN
-        own_speed_mps = rng.uniform(0.8, 1.7) if walks else speed_mps * rng.uniform(0.9, 1.1)
-        waits = rng.random() < _WAITING and math.cos(yaw) < 0.5
-        if row >= parked and not waits:
-            velocities[row] = own_speed_mps * math.cos(yaw), own_speed_mps * math.sin(yaw)
-    return speed_mps, velocities
 
 
 def _layout(rng: np.random.Generator) -> tuple[Street, np.ndarray]:
@@ -134,6 +126,10 @@ class _World:
         self.taken: list[tuple[float, float, float]] = []  # x, y, radius of vehicles
         x, half = street.crossing_x_m, street.crossing_half_m
         self.blocks = [(-END_M, END_M)] if math.isinf(x) else [(-END_M, x - half), (x + half, END_M)]
+        land = self.builder.place((0, 0, 0), 0.0, SceneClass.SIDEWALK)  # kerb, verge, paving, yards
+        for side, block in product((-1, 1), self.blocks):
+            y = _span(self.side_y(side, 0), side * BLOCK_DEPTH_M)
+            land.box(block, y, (-0.5, street.kerb_m), Look(Material.SLAB, (0.52, 0.51, 0.49)))
 
     def is_clear(self, x: float, y: float, length: float, width: float, yaw: float) -> bool:
         """True if a footprint overlaps neither the ego vehicle nor another one."""
@@ -150,10 +146,10 @@ class _World:
     def add_vehicle(self, shares: tuple[float, ...], x: float, y: float, yaw: float) -> float:
         """Add a vehicle if there is room; returns its length either way."""
         cls = BoxClass(int(self.rng.choice(_KINDS, p=shares)))
-        size = objects.vehicle_size(self.rng, cls)
-        length, width, _ = size
+        # The height is independent, so that a detector cannot infer it from the footprint.
+        length, width, height = (self.rng.uniform(*bounds) for bounds in objects.VEHICLE_SIZES[cls])
         if self.is_clear(x, y, length, width, yaw):
-            objects.add_vehicle(self.builder, self.rng, cls, size, (x, y), yaw)
+            objects.add_vehicle(self.builder, self.rng, cls, (length, width, height), (x, y), yaw)
             self.taken += _discs(x, y, length, width, yaw)
         return length
 
@@ -169,59 +165,53 @@ class _World:
         """y range between two distances behind the kerb."""
         return _span(self.side_y(side, start), self.side_y(side, end))
 
-    def add_blocks(self) -> None:
-        """The raised land on both sides of the road: kerb, verge, paving, yards."""
-        place = self.builder.place((0, 0, 0), 0.0, SceneClass.SIDEWALK)
-        for side in (-1, 1):
-            y = _span(self.side_y(side, 0), side * BLOCK_DEPTH_M)
-            for x in self.blocks:
-                place.box(x, y, (-0.5, self.street.kerb_m), Look(Material.SLAB, (0.52, 0.51, 0.49)))
-
     def add_buildings(self) -> None:
         rng, base = self.rng, self.street.kerb_m
-        for side in (-1, 1):
+        for side, (start, end) in product((-1, 1), self.blocks):
             walk = self.street.sidewalk_m[side > 0]
-            for start, end in self.blocks:
-                x = max(start + walk, -170.0)
-                while x < min(end - walk - 7, 170.0):
-                    width = min(rng.uniform(8, 26), end - walk - x)
-                    setback = walk + float(rng.choice([rng.uniform(0, 0.8), rng.uniform(1.5, 7)]))
-                    height = float(rng.choice([rng.uniform(5, 10), rng.uniform(10, 18), rng.uniform(18, 38)]))
-                    depth = rng.uniform(9, 16)
-                    built = rng.random() < 0.88
-                    if built:
-                        y = self.band_y(side, setback, setback + depth)
-                        objects.add_building(self.builder, rng, (x, x + width), y, (base, height))
-                    if rng.random() < 0.35:
-                        y = self.band_y(side, setback + 22, setback + 40)
-                        objects.add_building(self.builder, rng, (x, x + width), y, (base, rng.uniform(25, 60)))
-                    gap = float(rng.choice([0.05, 0.05, rng.uniform(2, 9)]))
-                    if not built or (gap > 1 and rng.random() < 0.7):
-                        y = self.band_y(side, walk + 0.3, walk + 0.8)
-                        span = (x + width if built else x, min(x + width + gap, end - walk))
-                        hedge = rng.random() < 0.5
-                        if span[1] > span[0] + 0.3:
-                            objects.add_barrier(self.builder, rng, span, y, base, hedge=hedge)
-                    x += width + gap
+            x = max(start + walk, -170.0)
+            while x < min(end - walk - 7, 170.0):
+                width = min(rng.uniform(8, 26), end - walk - x)
+                setback = walk + float(rng.choice([rng.uniform(0, 0.8), rng.uniform(1.5, 7)]))
+                height = float(rng.choice([rng.uniform(5, 10), rng.uniform(10, 18), rng.uniform(18, 38)]))
+                depth = rng.uniform(9, 16)
+                built = rng.random() < 0.88
+                if built:
+                    y = self.band_y(side, setback, setback + depth)
+                    objects.add_building(self.builder, rng, (x, x + width), y, (base, height))
+                if rng.random() < 0.35:
+                    y = self.band_y(side, setback + 22, setback + 40)
+                    objects.add_building(self.builder, rng, (x, x + width), y, (base, rng.uniform(25, 60)))
+                gap = float(rng.choice([0.05, 0.05, rng.uniform(2, 9)]))
+                if not built or (gap > 1 and rng.random() < 0.7):
+                    y = self.band_y(side, walk + 0.3, walk + 0.8)
+                    span = (x + width if built else x, min(x + width + gap, end - walk))
+                    hedge = rng.random() < 0.5
+                    if span[1] > span[0] + 0.3:
+                        top = base + rng.uniform(0.9, 1.4 if hedge else 2.0)
+                        cls = SceneClass.VEGETATION if hedge else SceneClass.BUILDING
+                        leaves = Look(Material.LEAF, objects.pick(rng, ((0.19, 0.27, 0.12),), 0.02)) if hedge else None
+                        look = leaves or Look(Material.ROUGH, objects.pick(rng, objects.WALLS), (1.2, 0.08, 0, 0))
+                        self.builder.place((0.0, 0.0, 0.0), 0.0, cls).box(span, y, (base - 0.05, top), look)
+                x += width + gap
 
     def add_background(self) -> None:
         """A closed row of houses or trees far behind, and tall buildings where the street ends."""
         rng, base = self.rng, self.street.kerb_m
-        for side in (-1, 1):
-            for start, end in self.blocks:
-                x = max(start + 3, -200.0)
-                while x < min(end - 10, 200.0):
-                    width = min(rng.uniform(14, 34), end - 3 - x)
-                    distance = rng.uniform(44, 62)
-                    if rng.random() < 0.7:
-                        y = self.band_y(side, distance, distance + 14)
-                        height = rng.uniform(7, 24)
-                        objects.add_building(self.builder, rng, (x, x + width), y, (base, height), detailed=False)
-                    else:
-                        for k in range(int(width / 6)):
-                            xyz = (x + 6 * k, self.side_y(side, distance - rng.uniform(0, 6)), base)
-                            objects.add_bush(self.builder, rng, xyz, scale=rng.uniform(4, 8))
-                    x += width + 0.1
+        for side, (start, end) in product((-1, 1), self.blocks):
+            x = max(start + 3, -200.0)
+            while x < min(end - 10, 200.0):
+                width = min(rng.uniform(14, 34), end - 3 - x)
+                distance = rng.uniform(44, 62)
+                if rng.random() < 0.7:
+                    y = self.band_y(side, distance, distance + 14)
+                    height = rng.uniform(7, 24)
+                    objects.add_building(self.builder, rng, (x, x + width), y, (base, height), detailed=False)
+                else:
+                    for k in range(int(width / 6)):
+                        xyz = (x + 6 * k, self.side_y(side, distance - rng.uniform(0, 6)), base)
+                        objects.add_bush(self.builder, rng, xyz, scale=rng.uniform(4, 8))
+                x += width + 0.1
         for direction in (-1, 1):
             if rng.random() < 0.7:
                 xs = _span(direction * rng.uniform(185, 240), direction * 258.0)
@@ -245,22 +235,18 @@ class _World:
 
     def add_moving(self) -> None:
         street = self.street
-        for side in (-1, 1):
-            for lane in range(street.lanes):
-                gap = self.rng.uniform(8, 30)
-                x = -_MOVING_REACH_M + self.rng.uniform(0, 20)
-                while x < _MOVING_REACH_M:
-                    y = side * (lane + 0.5) * street.lane_width_m + self.rng.normal(0, 0.15)
-                    yaw = _heading(side) + math.radians(self.rng.normal(0, 1.2))
-                    length = 0.0 if self.at_crossing(x, 3) else self.add_vehicle(_MOVING_SHARES, x, y, yaw)
-                    x += length + gap * self.rng.uniform(0.6, 1.8) + 3
+        for side, lane in product((-1, 1), range(street.lanes)):
+            gap = self.rng.uniform(8, 30)
+            x = -_MOVING_REACH_M + self.rng.uniform(0, 20)
+            while x < _MOVING_REACH_M:
+                y = side * (lane + 0.5) * street.lane_width_m + self.rng.normal(0, 0.15)
+                yaw = _heading(side) + math.radians(self.rng.normal(0, 1.2))
+                length = 0.0 if self.at_crossing(x, 3) else self.add_vehicle(_MOVING_SHARES, x, y, yaw)
+                x += length + gap * self.rng.uniform(0.6, 1.8) + 3
 
-    def add_cross_traffic(self) -> None:
-        """Vehicles on the crossing street, and sometimes one in the junction."""
-        street = self.street
         if math.isinf(street.crossing_x_m):
             return
-        for direction in (-1, 1):
+        for direction in (-1, 1):  # on the crossing street, and sometimes in the junction
             x = street.crossing_x_m + direction * street.crossing_half_m / 2
             y = -45.0 + self.rng.uniform(0, 20)
             while y < 45:
@@ -279,7 +265,14 @@ class _World:
             for k in range(-5, 6):
                 x = offset + k * lamps
                 if abs(x) < 90 and not self.at_crossing(x, 1):
-                    objects.add_lamp_post(self.builder, rng, (x, self.side_y(side, 0.45), base), -side * math.pi / 2)
+                    post = self.builder.place((x, self.side_y(side, 0.45), base), -side * math.pi / 2, SceneClass.POLE)
+                    height, grey = rng.uniform(5.5, 8.5), rng.uniform(0.25, 0.55)
+                    metal = objects.plain((grey, grey, grey * 1.03))
+                    post.cylinder((0, 0, height / 2), (0.075, 0.075), height / 2, metal)
+                    post.cylinder((0, 0, 0.5), (0.12, 0.12), 0.5, metal)
+                    post.box((0, 1.7), (-0.04, 0.04), (height - 0.1, height), metal)  # an arm over the road
+                    lamp = objects.plain((0.75, 0.74, 0.68))
+                    post.box((1.2, 1.9), (-0.12, 0.12), (height - 0.16, height - 0.02), lamp)
             for k in range(-8, 9):
                 x = k * trees + rng.normal(0, 0.5)
                 on_lamp = abs((x - offset + lamps / 2) % lamps - lamps / 2) < 1.5
@@ -292,7 +285,13 @@ class _World:
                 x = rng.uniform(-45, 60)
                 if not self.at_crossing(x, 1):
                     yaw = _heading(side) + rng.normal(0, 0.1)
-                    objects.add_sign(self.builder, rng, (x, self.side_y(side, 0.3), base), yaw)
+                    post = self.builder.place((x, self.side_y(side, 0.3), base), yaw, SceneClass.POLE)
+                    height = rng.uniform(2.3, 3.0)
+                    post.cylinder((0, 0, height / 2), (0.035, 0.035), height / 2, objects.plain((0.52, 0.53, 0.54)))
+                    for k in range(int(rng.integers(1, 3))):  # plates that face the traffic
+                        w, z = rng.uniform(0.25, 0.36), height - 0.35 - 0.7 * k
+                        plate = Look(Material.SIGN, objects.pick(rng, _SIGNS, 0.02))
+                        post.box((-0.06, -0.04), (-w, w), (z - 0.3, z + 0.3), plate)
             for _ in range(int(rng.integers(0, 6))):
                 x = rng.uniform(-60, 70)
                 if not self.at_crossing(x, 3):
@@ -300,7 +299,9 @@ class _World:
                     objects.add_bush(self.builder, rng, (x, self.side_y(side, behind), base))
             if not math.isinf(self.street.crossing_x_m):
                 x = self.street.crossing_x_m + side * (self.street.crossing_half_m + 0.5)
-                objects.add_traffic_light(self.builder, (x, self.side_y(side, 0.5), base), _heading(side))
+                post = self.builder.place((x, self.side_y(side, 0.5), base), _heading(side), SceneClass.POLE)
+                post.cylinder((0, 0, 1.7), (0.06, 0.06), 1.7, objects.plain((0.25, 0.26, 0.26)))
+                post.box((-0.28, -0.07), (-0.16, 0.16), (2.5, 3.4), Look(Material.SIGN, objects.DARK, (1.0, 0, 0, 0)))
 
     def add_pedestrians(self) -> None:
         """People on the sidewalks, at the zebra crossing and now and then between the lanes."""
