@@ -239,7 +239,10 @@ def _kernel_cache() -> type:
             self._save_index({**self._load_index(), key: name})
 
         def _load_index(self) -> Any:
-            return super()._load_index() if is_intact(Path(self._index_path)) else {}
+            try:
+                return super()._load_index() if is_intact(Path(self._index_path)) else {}
+            except (ImportError, AttributeError):  # of another version, whose arguments' classes are elsewhere now
+                return {}
 
         def _load_data(self, name: str) -> Any:
             path = self._data_path(name)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -31,6 +32,10 @@ def twice(x: int) -> int:
     return 2 * x
 
 
+def first(pair: Any) -> int:
+    return pair[0]
+
+
 @pytest.fixture
 def kernel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Any]:
     """A kernel as a new process has it, whose cache lies below ``tmp_path``."""
@@ -54,6 +59,23 @@ def test_damaged_kernels_are_compiled_anew(
     third = kernel()
     assert third(5) == 10 and sum(third.stats.cache_hits.values()) == 1
     assert capsys.readouterr().err == ""
+
+
+class Pair(NamedTuple):
+    x: int
+    y: int
+
+
+def test_kernels_of_a_version_with_other_classes_are_compiled_again(
+    kernel: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A class of an argument that is in another module since an upgrade."""
+    kernel()
+    monkeypatch.setattr(first, "__module__", "arbiview_aug.environment")
+    assert compiled(first)(Pair(3, 4)) == 3
+    monkeypatch.delattr(sys.modules[__name__], "Pair")
+    again = compiled(first)
+    assert again((2, 5)) == 2 and not again.stats.cache_hits
 
 
 def test_kernels_are_cached_where_their_folder_can_be_written_only(

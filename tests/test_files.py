@@ -12,7 +12,7 @@ from arbiview_aug.generator.inpainter import load_inpainter
 from arbiview_aug.generator.training.losses import load_perceptual
 from arbiview_aug.inpaint import PipelineInpainter
 from arbiview_aug.inpaint.networks import load_torchscript
-from arbiview_aug.temporal.transformers_depth import TransformersDepth
+from arbiview_aug.temporal.learned_depth import TransformersDepth
 
 
 def test_a_byte_order_mark_is_dropped(tmp_path: Path) -> None:

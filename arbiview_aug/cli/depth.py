@@ -31,9 +31,8 @@ from arbiview_aug.sample.frame import Neighbour
 from arbiview_aug.sample.inputs import read_frames, read_scene
 from arbiview_aug.sample.neighbours import neighbour_images
 from arbiview_aug.scene.depth_map import points_of
-from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, DepthModel, learned_depth
+from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, TransformersDepth, learned_depth
 from arbiview_aug.temporal.motion_depth import motion_depth, warm_up
-from arbiview_aug.temporal.transformers_depth import TransformersDepth
 
 
 class Done(NamedTuple):
@@ -152,7 +151,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _learned(
-    model: DepthModel, data: Any, depths: DepthFolder, motion: DepthFolder, arguments: argparse.Namespace
+    model: TransformersDepth, data: Any, depths: DepthFolder, motion: DepthFolder, arguments: argparse.Namespace
 ) -> Iterator[Done]:
     """Predict, fit and write the frames that have no depth of this model yet."""
     facts = [f"model {model.name}", f"revision {model.revision}", f"licence {model.licence}"]

@@ -21,7 +21,7 @@ from arbiview_aug.files import read_bytes
 from arbiview_aug.sample.batching import stacked
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY
 from arbiview_aug.scene.depth_map import motion_camera
-from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.scene.surface import Layer
 from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import BEST_TRAVEL_M, MotionDepth
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +22,8 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rays import CELL_PX, PixelRays, pixel_rays
 from arbiview_aug.errors import SampleError, SampleTypeError, one_line
 from arbiview_aug.image_ops import FRESH, Memory
-from arbiview_aug.scene.surface import LayeredSurface, OcclusionMap, Points, Surface
+from arbiview_aug.scene.point_cloud import PointCloudSurface
+from arbiview_aug.scene.surface import Layer, OcclusionMap, Points, Surface
 
 PIECES = 2
 """Pieces of an object."""
@@ -41,25 +42,14 @@ SCANNER_M = 1.0, 0.0, 1.9
 
 
 class Piece(NamedTuple):
-    """A tapered slab in shares of its box's length, width and height, from -0.5 to 0.5.
-
-    Attributes:
-        bottom: Height.
-        top: Height.
-        rear: At its bottom.
-        front: At its bottom.
-        side: Half its width at its bottom.
-        rear_lean: How far the rear leans in, up to its top.
-        front_lean: The front.
-        side_lean: Each side.
-    """
+    """A tapered slab in shares of its box's length, width and height, from -0.5 to 0.5."""
 
     bottom: float
     top: float
-    rear: float = -0.5
+    rear: float = -0.5  # this, the front and the side are those of its bottom
     front: float = 0.5
-    side: float = 0.5
-    rear_lean: float = 0.0
+    side: float = 0.5  # half its width
+    rear_lean: float = 0.0  # how far the rear leans in, up to its top
     front_lean: float = 0.0
     side_lean: float = 0.0
 
@@ -97,26 +87,25 @@ _CONE = ((Piece(-0.5, 0.5, rear_lean=0.4, front_lean=0.4, side_lean=0.4),),)
 _TWO_WHEELER = (
     (Piece(-0.5, 0.04, side=0.2, rear_lean=0.1, front_lean=0.1), Piece(0.04, 0.5, -0.2, 0.25, 0.4, 0.02, 0.1, 0.25)),
 )
-_KINDS = (_CARS, _VANS, _LARGE, _PERSON, _LOOSE_PERSON, _BARRIER, _CONE, _TWO_WHEELER, (_BOX,))
-_FROM_M = (
-    *((3.0, 1.3, 1.1), (3.0, 1.3, 1.1), (3.0, 1.3, 1.95)),
-    *((0.0, 0.0, 1.2), (0.0, 0.0, 1.2), (0.3, 1.2, 0.7), (0.0, 0.0, 0.3), (1.4, 0.35, 0.9)),
-    (0.0, 0.0, 0.0),
+_KINDS: tuple[tuple[Any, tuple[float, ...], tuple[float, ...]], ...] = (
+    (_CARS, (3.0, 1.3, 1.1), (5.6, 2.8, 1.95)),
+    (_VANS, (3.0, 1.3, 1.1), (6.6, 2.8, 2.8)),
+    (_LARGE, (3.0, 1.3, 1.95), (30.0, 3.5, 5.0)),  # lorries and buses
+    (_PERSON, (0.0, 0.0, 1.2), (0.65, 0.65, 2.2)),  # in a tight box
+    (_LOOSE_PERSON, (0.0, 0.0, 1.2), (1.2, 1.2, 2.2)),
+    (_BARRIER, (0.3, 1.2, 0.7), (1.1, 2.6, 1.4)),
+    (_CONE, (0.0, 0.0, 0.3), (0.7, 0.7, 1.2)),
+    (_TWO_WHEELER, (1.4, 0.35, 0.9), (2.7, 1.1, 2.1)),
+    ((_BOX,), (0.0, 0.0, 0.0), (np.inf, np.inf, np.inf)),  # all others
 )
-_TO_M = (
-    *((5.6, 2.8, 1.95), (6.6, 2.8, 2.8), (30.0, 3.5, 5.0)),
-    *((0.65, 0.65, 2.2), (1.2, 1.2, 2.2), (1.1, 2.6, 1.4), (0.7, 0.7, 1.2), (2.7, 1.1, 2.1)),
-    (np.inf,) * 3,
-)
-KIND_M = np.array([_FROM_M, _TO_M])
-"""Least and largest length, width and height (2, kinds, 3) of cars, vans, lorries and buses, people in tight boxes and
-in loose ones, barriers, cones, bicycles and motorcycles, and others. An object is of the first kind that it fits."""
+KIND_M = np.array([[least, most] for _, least, most in _KINDS]).transpose(1, 0, 2)
+"""Least and largest length, width and height (2, kinds, 3) of the kinds. An object is of the first one that it fits."""
 
 _NOTHING = Piece(0.5, 0.5, 0.0, 0.0, 0.0)
-PROFILES = np.array([[*one, _NOTHING][:PIECES] for kind in _KINDS for one in kind], np.float64)
+PROFILES = np.array([[*one, _NOTHING][:PIECES] for kind, *_ in _KINDS for one in kind], np.float64)
 """All profiles (K, 2, 8), kind after kind."""
 
-_COUNTS = np.array([len(kind) for kind in _KINDS])
+_COUNTS = np.array([len(kind) for kind, *_ in _KINDS])
 OF_KIND = np.cumsum(_COUNTS)[:, None] - _COUNTS[:, None] + np.minimum(np.arange(_COUNTS.max()), _COUNTS[:, None] - 1)
 """Numbers (kinds, most) of each kind's profiles, the last again where it has fewer."""
 
@@ -136,12 +125,7 @@ def solids(boxes: FloatArray) -> FloatArray:
     return _planes(boxes, PROFILES[OF_KIND[kinds(boxes), 0]])
 
 
-ByBox = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
-
-
-def solids_among(
-    boxes: FloatArray, points: Points, ground_z_m: float = 0.0
-) -> tuple[FloatArray, BoolArray, npt.NDArray[np.float32]]:
+def solids_among(boxes: FloatArray, points: Points, ground_z_m: float = 0.0) -> tuple[FloatArray, BoolArray, Layer]:
     """Shapes in boxes (B, 7), as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs; how
     far their sides (B, 5, rows, columns) lie off the shapes, metres.
 
@@ -160,7 +144,9 @@ def solids_among(
     return planes, is_own, displaced
 
 
-def points_by_box(boxes: FloatArray, points: Points, air_m: float) -> ByBox:
+def points_by_box(
+    boxes: FloatArray, points: Points, air_m: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Indices (n,) of the points (P, 3) in boxes (B, 7) widened by ``air_m``, box by box; where each box ends (B,)."""
     from arbiview_aug.scene.kernels import points_in
 
@@ -201,26 +187,34 @@ _WIDER = np.array([1, 1, 1, 1, 0, 1])  # all planes of a piece but its floor
 
 
 @dataclass(frozen=True, eq=False)
-class BoxSurface(LayeredSurface):
-    """Labelled objects standing on the street: what their boxes hold.
+class BoxSurface(Surface):
+    """Labelled objects on the street or among points: what their boxes hold.
 
-    Attributes:
-        street: The surface behind the objects.
-        boxes: (B, 7) centre x, y, z, length, width, height (metres), yaw (radians), in the ego frame.
-        solids: (B, pieces, 6, 4) planes of what they hold.
+    Pixels that show an object are mapped one by one, the others by the background. ``occlusion_map`` hides both. Among
+    points a shape decides within its silhouette, and what was measured before it wins. An object's points choose its
+    shape, move its faces and displace them where they were measured. They are left out of the panoramas, where they
+    would blur over its outline.
     """
 
-    street: Surface
-    boxes: FloatArray
-    solids: FloatArray
-    _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
+    street: Surface  # behind the objects: static, or of the points that are of no object
+    boxes: FloatArray  # (B, 7) centre x, y, z, length, width, height (metres), yaw (radians), in the ego frame
+    solids: FloatArray  # (B, pieces, 6, 4) planes of what they hold
+    displaced: Layer | None = None  # (B, 5, rows, columns) of their sides, as ``solids_among`` gives it
+    _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, init=False, repr=False)
+    is_layered: ClassVar[bool] = True
 
     @property
     def background(self) -> Surface:
         """The street."""
         return self.street
 
-    # --- images -------------------------------------------------------------------------------------------------------
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
+        """Inverse distances (h, w) of objects and background along the rays of a camera's pixel centres, 1/m."""
+        q = self.background.image(camera, rays, memory)
+        objects, face = self.drawn(camera, rays, memory)
+        np.copyto(q, objects, where=face >= 0)
+        return q
+
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
         """Find what objects hide from a source; kept for the next target."""
         key = camera.content_key
@@ -234,48 +228,43 @@ class BoxSurface(LayeredSurface):
             self._shadows[key] = OcclusionMap(*drawn, before_m)
         return self._shadows[key]
 
-    def drawn(
-        self, camera: Camera, rays: PixelRays, memory: Memory = FRESH
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+    def drawn(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> tuple[Layer, npt.NDArray[np.int32]]:
         """Inverse distances (h, w) of the objects' faces along a camera's rays where nothing hides them; faces, or -1.
 
-        A face's number is 6 x its piece + that of its plane; ``face_objects`` and ``face_is_top`` tell what it is.
+        A face's number is 6 x its piece + that of its plane; ``face_parts`` tells what it shows.
         """
         onto = self._hidden(camera, rays, memory, coarse=False)
         widened = self._widened(camera.center_m, float(1 / camera.K[0, 0]))
-        return draw_solids(camera, *widened, rays, memory, onto=onto)
+        q, face = draw_solids(camera, *widened, rays, memory, onto=onto)
+        if self.displaced is not None:
+            from arbiview_aug.scene.shape_kernels import displace
 
-    def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> npt.NDArray[np.float32]:
-        """Inverse distances (h, w) beyond which something else hides, 0 where nothing does."""
-        return np.asarray(memory.full(camera.size, 0, np.float32))
+            pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), np.ascontiguousarray(camera.center_m)
+            displace(rays.planes, rays.parameters, *pose, self.boxes, self.solids, self.displaced, face, q)
+        return q, face
+
+    def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> Layer:
+        """Inverse distances (h, w) beyond which measured points hide, 0 where none do."""
+        if isinstance(self.street, PointCloudSurface):
+            return self.street.hidden(camera, rays, memory, coarse=coarse)
+        return memory.full(camera.size, 0, np.float32)
 
     def before_faces(self, origin: FloatArray) -> FloatArray:
         """By how many metres a point lies before the planes of all faces (n,)."""
         return np.asarray((self.solids[..., :3] @ origin - self.solids[..., 3]).reshape(-1))
 
-    @property
-    def face_objects(self) -> npt.NDArray[np.int64]:
-        """Rows (n,) of the boxes that the faces belong to."""
-        return np.repeat(np.arange(len(self.boxes)), 6 * self.solids.shape[1])
-
-    @property
-    def face_is_top(self) -> BoolArray:
-        """Whether faces (n,) are roofs and bonnets, which look upwards."""
-        is_large = self.boxes[:, 3] * self.boxes[:, 4] > ROOF_M2
-        return np.asarray((self.solids[..., 2] > TOP) & is_large[:, None, None]).reshape(-1)
-
     @cached_property
     def face_parts(self) -> npt.NDArray[np.int32]:
-        """Part that each face (n,) shows: ``PARTS`` times its object, and ``TOP_PART`` more for tops.
+        """Part that each face (n,) shows: ``PARTS`` times its object, and ``TOP_PART`` more for roofs and bonnets.
 
         The sides of the lowest piece, the body under the windows, have 1 to 4 in the order of their planes. All else
         has 0, also small objects.
         """
-        pieces = self.solids.shape[1]
-        body = np.tile([1, 2, 3, 4, 0, 0] + [0] * 6 * (pieces - 1), len(self.boxes))
-        is_large = np.repeat(self.boxes[:, 3] * self.boxes[:, 4] > ROOF_M2, 6 * pieces)
-        part = np.where(self.face_is_top, TOP_PART, body * is_large)
-        return np.asarray(PARTS * self.face_objects + part, np.int32)
+        count, pieces = self.solids.shape[:2]
+        is_large = (self.boxes[:, 3] * self.boxes[:, 4] > ROOF_M2)[:, None, None]
+        body = np.array([[1, 2, 3, 4, 0, 0], *[[0] * 6] * (pieces - 1)])
+        part = np.where(self.solids[..., 2] > TOP, TOP_PART, body) * is_large
+        return np.asarray(PARTS * np.arange(count)[:, None, None] + part, np.int32).reshape(-1)
 
     def _widened(self, origin: FloatArray, pixel_rad: float, lift: float = 0.0) -> tuple[FloatArray, FloatArray]:
         """Boxes and planes half a pixel wider, as border pixels mix colours; floors ``lift`` pixels higher."""
@@ -288,21 +277,21 @@ class BoxSurface(LayeredSurface):
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """Expected error (...,) in 1/m of the street because of unlabelled objects; faces have ``BOX_ERROR``."""
-        return UNLABELLED * self.street.uncertainty(origin, directions, inverse_distance)
+        error = self.street.uncertainty(origin, directions, inverse_distance)
+        return error if self.street.is_dense else UNLABELLED * error
 
 
-def solid_rows(
+def _solid_rows(
     camera: Camera, boxes: FloatArray, planes: FloatArray, rays: PixelRays
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+) -> tuple[Layer, npt.NDArray[np.int64]]:
     """Pieces (B, pieces, 6, 4) that a camera may see as ``kernels.draw_solids`` reads them, and their numbers (n,)."""
-    from arbiview_aug.scene.kernels import ROW
-    from arbiview_aug.scene.kernels import solid_rows as describe
+    from arbiview_aug.scene.kernels import ROW, solid_rows
 
     most = planes.shape[0] * planes.shape[1] + 1
     rows, numbers = np.empty((most, ROW), np.float32), np.empty(most, np.int64)
     pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), np.ascontiguousarray(camera.center_m)
     boxes, planes = np.ascontiguousarray(boxes), np.ascontiguousarray(planes)
-    count = describe(boxes, planes, pose[1], pose[0], rays.cone, rows, numbers)
+    count = solid_rows(boxes, planes, pose[1], pose[0], rays.cone, rows, numbers)
     return rows[:count], numbers[:count]
 
 
@@ -315,33 +304,27 @@ def draw_solids(
     *,
     scale: float = 1.0,
     faces: bool = True,
-    onto: npt.NDArray[np.float32] | None = None,
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-    """Rasterise the pieces (B, pieces, 6, 4) of what boxes (B, 7) hold.
+    onto: Layer | None = None,
+) -> tuple[Layer, npt.NDArray[np.int32]]:
+    """Rasterise the pieces (B, pieces, 6, 4), as ``solids`` gives them, of what boxes (B, 7) hold.
 
-    Args:
-        camera: The camera.
-        boxes: (B, 7).
-        planes: (B, pieces, 6, 4) as ``solids`` gives them.
-        rays: The camera's rays, if they are known.
-        memory: Memory of the images.
-        scale: Factor of the inverse distances.
-        faces: Number the faces: 6 x piece + plane; else the pieces.
-        onto: (h, w) inverse distances that stand there, drawn over by what is nearer; 0 by default.
+    ``rays`` are the camera's, if they are known; ``scale`` is a factor of inverse distances. With ``faces`` these are
+    numbered, 6 x piece + plane, else the pieces. ``onto`` (h, w) inverse distances, 0 by default, is drawn over by what
+    is nearer.
 
     Returns:
-        (h, w) inverse distances of the nearest faces, or of what stands there; (h, w) the pieces or faces, or -1.
+        (h, w) inverse distances of the nearest faces, or of ``onto``; (h, w) the pieces or faces, or -1.
     """
     from arbiview_aug.scene.kernels import draw_solids as draw
 
     rays = rays or pixel_rays(camera)
     q = memory.full(camera.size, 0, np.float32) if onto is None else onto
-    number, rows = memory.full(camera.size, -1, np.int32), solid_rows(camera, boxes, planes, rays)
+    number, rows = memory.full(camera.size, -1, np.int32), _solid_rows(camera, boxes, planes, rays)
     draw(rays.planes, rays.parameters, *rows, rays.cones, CELL_PX, scale, faces, q, number)
     return q, number
 
 
-def draw_boxes(camera: Camera, boxes: FloatArray) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
+def draw_boxes(camera: Camera, boxes: FloatArray) -> tuple[Layer, npt.NDArray[np.int32]]:
     """Rasterise whole boxes (B, 7): inverse distances (h, w) of the nearest, 0 for none; (h, w) its row, or -1."""
     return draw_solids(camera, boxes, whole(boxes), faces=False)
 
@@ -351,7 +334,7 @@ def silhouette_sums(camera: Camera, boxes: FloatArray, weight: FloatArray) -> Fl
     from arbiview_aug.scene.kernels import sum_silhouettes
 
     rays, sums = pixel_rays(camera), np.zeros(len(boxes))
-    rows = solid_rows(camera, boxes, whole(boxes), rays)
+    rows = _solid_rows(camera, boxes, whole(boxes), rays)
     sum_silhouettes(rays.planes, rays.parameters, *rows, rays.cones, CELL_PX, weight, sums)
     return sums
 

@@ -53,12 +53,8 @@ def elevations(points: Any, origin: Any) -> tuple[float, float]:
 def find_visible(points: Any, mapped: int, origin: Any, window: Any, scratch: Any) -> int:
     """Find the points that ``origin`` sees in a ``Window``, the nearest one in each cell; return their number n.
 
-    Args:
-        points: (3, P) float32 in the ego frame.
-        mapped: Number of the last points that are of depth maps.
-        origin: (3,) float64.
-        window: The window.
-        scratch: ``Scratch`` of the window, written.
+    Points (3, P) are float32 in the ego frame, the last ``mapped`` of depth maps; ``origin`` (3,) is float64. The
+    ``Scratch`` of the window is written.
     """
     q, number, side, n = scratch.q, scratch.number, window.cells.side, 0
     line = np.empty(q.shape[1] + 2 * side, np.float32)
@@ -208,12 +204,8 @@ def hidden_below(known: Any) -> Any:
 def complete(n: int, static: Any, window: Any, scratch: Any, layers: Any) -> None:
     """Make the ``n`` points of ``find_visible`` dense over a static surface.
 
-    Args:
-        n: Number of points.
-        static: (n,) inverse distances of the static surface along their rays.
-        window: The window.
-        scratch: That of ``find_visible``; written over.
-        layers: (5, h, w) float32 ``Panorama.layers``, written.
+    ``static`` (n,) are inverse distances of the static surface along their rays. ``find_visible``'s ``scratch`` is
+    written over; ``layers`` (5, h, w) float32, those of ``Panorama``, are written.
     """
     (_, h, w), cells, thin, code = layers.shape, scratch.cells[:n], scratch.thin[:n], scratch.code
     # What is known by now gives its place to residuals and inverse distances of all cells, and their maxima.
@@ -304,14 +296,9 @@ def _average_sides(r: Any, q: Any, high: Any, low: Any, smooth: int, work: Any, 
 
     All that is averaged about a step then knows of it. Near the border, which only filters read, nothing is averaged.
 
-    Args:
-        r: (h, w) residuals, 1/m.
-        q: (h, w) inverse distances of the cells' nearest points.
-        high: ``_window_max`` of ``r`` over ``2 * smooth`` cells.
-        low: ``_window_max`` of ``-r``.
-        smooth: Half the window, cells.
-        work: (10 + 6 * smooth, w) scratch.
-        layers: Those of ``Panorama``; the first three are written.
+    ``r`` and ``q`` (h, w) are residuals and inverse distances of the cells' nearest points, 1/m; ``high`` and ``low``
+    are ``_window_max`` of ``r`` and ``-r`` over ``2 * smooth`` cells, half of the window. ``work`` (10 + 6 * smooth, w)
+    is scratch; the first three of ``Panorama.layers`` are written.
     """
     h, w = r.shape
     near, far, share = layers[0], layers[1], layers[2]
@@ -367,12 +354,9 @@ def _draw_thin(cells: Any, thin: Any, residuals: Any, code: Any, layers: Any) ->
     Neighbouring cells blend, so three rings of cells around are prepared. In the outermost both sides of a step become
     what is shown; the next one shows the farther side; the innermost has the point's residual on the nearer side.
 
-    Args:
-        cells: (n,) flat indices of all points' cells.
-        thin: (n,) which of them are of thin things.
-        residuals: (n,) their residuals.
-        code: That of ``_spread_nearest``, of the other points.
-        layers: ``Panorama.layers``; the first three are updated.
+    ``cells`` (n,) are flat indices of all points' cells, ``thin`` (n,) which of them are of thin things, and
+    ``residuals`` (n,) theirs; ``code`` is that of ``_spread_nearest``, of the other points. The first three of
+    ``Panorama.layers`` are updated.
     """
     (_, h, w), (up, side) = layers.shape, _THIN_CELLS
     near, far, share = layers[0], layers[1], layers[2]

@@ -13,11 +13,23 @@ import numpy as np
 import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.rays import PixelRays, pixel_rays, pixels_of
+from arbiview_aug.cameras.rays import pixel_rays, pixels_of
 from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import SampleError
-from arbiview_aug.scene.panorama import CELL_RAD, OWN_CAR_M, SHRINK_RAD, SUPPORT_RAD, Layer
-from arbiview_aug.scene.surface import Points
+from arbiview_aug.scene.surface import Layer, Points
+
+CELL_RAD = math.radians(0.2)
+"""Side of a fine cell: two pixels of a camera of 800 px and 65 degrees. Spinning LiDARs sample 0.1 to 0.4 degrees."""
+
+SUPPORT_RAD = math.radians(0.75)
+"""A ray this near to a point is measured: just over half the spacing of 32 scan lines."""
+
+SHRINK_RAD = math.radians(0.4)
+"""A measured surface hides what is behind it; this closes gaps between scan lines without widening outlines by all of
+``SUPPORT_RAD``."""
+
+OWN_CAR_M = ((-1.5, 4.0), (-1.3, 1.3))
+"""(x, y) ranges in the ego frame whose returns are the own car's: a car's about the middle of its rear axle."""
 
 MOTION_WIDTH_PX = 450
 """Images are halved until their width is nearest to this, by ratio: to 318 to 636 px."""
@@ -35,15 +47,10 @@ GAP_RAD = (SUPPORT_RAD - SHRINK_RAD) / 2
 
 
 class DepthMap(NamedTuple):
-    """The known depths of a camera's pixels.
+    """The known depths of a camera's pixels."""
 
-    Attributes:
-        camera: The camera, at the size of the map.
-        depth_m: (h, w) float32 z-depth in metres, 0 where it is unknown.
-    """
-
-    camera: Camera
-    depth_m: Layer
+    camera: Camera  # at the size of the map
+    depth_m: Layer  # (h, w) float32 z-depth in metres, 0 where it is unknown
 
     @classmethod
     def of(cls, camera: Camera, depth_m: Any, key: str = "depth_m") -> DepthMap:
@@ -65,9 +72,8 @@ class DepthMap(NamedTuple):
 
     def is_of(self, camera: Camera) -> bool:
         """Whether it is of a camera, of whatever size."""
-        one = self.camera
-        same_lens = one.lens == camera.lens and one.distortion == camera.distortion
-        return same_lens and np.array_equal(one.cam2ego, camera.cam2ego)
+        same_lens = (self.camera.lens, self.camera.distortion) == (camera.lens, camera.distortion)
+        return same_lens and np.array_equal(self.camera.cam2ego, camera.cam2ego)
 
     def at(self, camera: Camera) -> Layer:
         """Its depth (h, w) at the pixels of the camera that it ``is_of``, the nearest pixel's; 0 beyond it."""
@@ -103,9 +109,7 @@ def halvings(camera: Camera) -> int:
     return min(max(0, round(math.log2(camera.width_px / MOTION_WIDTH_PX))), most)
 
 
-@lru_cache(16)
-def _rays(camera: Camera) -> PixelRays:
-    return pixel_rays(camera)
+_rays = lru_cache(16)(pixel_rays)
 
 
 # --- fusion -----------------------------------------------------------------------------------------------------------
@@ -163,11 +167,8 @@ def joined(maps: Iterable[DepthMap]) -> list[DepthMap]:
     """One map of each camera and size: the nearest of what its maps know."""
     by_camera: dict[Camera, Layer] = {}
     for camera, depth_m in maps:
-        known = by_camera.get(camera)
-        if known is None:
-            by_camera[camera] = depth_m.copy()  # pixels are left out of it
-        else:
-            np.copyto(known, depth_m, where=(depth_m > 0) & ((known == 0) | (depth_m < known)))
+        known = by_camera.setdefault(camera, np.zeros_like(depth_m))  # a copy: pixels are left out of it
+        np.copyto(known, depth_m, where=(depth_m > 0) & ((known == 0) | (depth_m < known)))
     return list(map(DepthMap._make, by_camera.items()))
 
 

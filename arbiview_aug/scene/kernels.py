@@ -21,16 +21,11 @@ _USUAL_STEP = 8  # ``render.plan.GRID_STEP_PX``; other steps take a slower loop
 
 @compiled
 def static_image(planes: Any, P: Any, R: Any, kind: int, S: Any, q: Any) -> None:
-    """Inverse distances of a static surface along a camera's rays (``surface.Street``, ``surface.Ground``).
+    """Write inverse distances ``q`` (h, w) of a ``surface.Street`` or, by ``kind`` ``GROUND``, a ``surface.Ground``.
 
-    Args:
-        planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
-        P: ``Camera.parameters``.
-        R: (3, 3) float32 camera to ego.
-        kind: ``GROUND`` or ``STREET``.
-        S: (6,) float32: 1 / height over the road, 0 on or under it; 1 / semi-axes of the wall; the camera's centre in
-            the wall's frame, in semi-axes; c = its squared length - 1.
-        q: (h, w) float32, written.
+    Rays are ``planes`` (3, h, w), or (3, 0, 0) for a pinhole of ``Camera.parameters`` P, turned to the ego frame by R
+    (3, 3) float32. ``S`` (6,) float32 has 1 / height over the road, 0 on or under it; 1 / semi-axes of the wall; the
+    camera's centre in the wall's frame, in semi-axes; c = its squared length - 1.
     """
     h, w = q.shape
     work = np.empty((7, w), np.float32)
@@ -76,14 +71,9 @@ def solid_rows(boxes: Any, planes: Any, center: Any, R: Any, axis: Any, rows: An
     A box that holds the camera is its own vehicle, and is not seen. The inverse distance at which a ray meets a plane
     n x = d is -n r / (n c - d): planes that the camera lies before are entered, others left.
 
-    Args:
-        boxes: (B, 7) float64 centre, length, width, height, yaw, ego frame.
-        planes: (B, pieces, 6, 4) float64.
-        center: (3,) the camera's.
-        R: (3, 3) float64 camera to ego.
-        axis: (4,) middle of a cone around the camera's rays, camera frame, and its half angle.
-        rows: (B x pieces, ROW) float32, written.
-        numbers: (B x pieces,) int64, written: the pieces among all.
+    Boxes (B, 7) and planes (B, pieces, 6, 4) are float64, in the ego frame. The camera is at ``center`` (3,), R (3, 3)
+    leads to the ego frame, and ``axis`` (4,) is the middle of a cone around its rays and the cone's half angle. Written
+    are ``rows`` (B x pieces, ROW) float32 and the ``numbers`` (B x pieces,) int64 of the pieces among all.
     """
     count, pieces = 0, planes.shape[1]
     away, middle = np.empty(3), np.empty(3)
@@ -126,21 +116,13 @@ def solid_rows(boxes: Any, planes: Any, center: Any, R: Any, axis: Any, rows: An
 def draw_solids(
     planes: Any, P: Any, rows: Any, numbers: Any, cones: Any, step: int, scale: float, faces: bool, q: Any, number: Any
 ) -> None:
-    """Rasterise pieces into a z-buffer, run of cells by run of cells.
+    """Rasterise pieces into a z-buffer ``q`` (h, w) and their ``number`` (h, w) int32, run of cells by run of cells.
 
-    Args:
-        planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
-        P: ``Camera.parameters``.
-        rows: (n, ROW) float32: six planes, those that the camera lies before first, each as the inverse distance along
-            rays x, y, z and its slope (24); how many are before; the direction of its box's middle (3) and the cosine
-            of its cone; the planes' numbers (6).
-        numbers: (n,) the pieces among all.
-        cones: ``cell_cones``.
-        step: Side of a cell, pixels.
-        scale: Factor of the inverse distances.
-        faces: Number the faces: 6 x piece + plane, else the pieces.
-        q: (h, w) float32 inverse distance of the nearest face so far, 0 where there is none; updated.
-        number: (h, w) int32 the nearest face or piece; updated.
+    Each of ``rows`` (n, ROW) float32 has six planes, those that the camera lies before first, each as the inverse
+    distance along rays x, y, z and its slope (24); how many are before; the direction of its box's middle (3) and the
+    cosine of its cone; the planes' numbers (6). ``numbers`` (n,) are the pieces among all. Rays are those of
+    ``static_image``, in ``cell_cones`` of cells ``step`` pixels wide. ``scale`` is a factor of inverse distances. With
+    ``faces`` the numbers are 6 x piece + plane, else the pieces.
     """
     h, w = q.shape
     nx = cones.shape[2]

@@ -73,16 +73,9 @@ def put_points(
 ) -> int:
     """Put the points of a depth map (h, w) behind the first ``count``; return how many there are then.
 
-    Args:
-        planes: (3, h, w) rays, or (3, 0, 0) for a pinhole.
-        P: ``Camera.parameters``.
-        depth: (h, w) z-depths; those of points within ``car`` become 0.
-        pose: (4, 4) float32 from the camera's frame to the ego frame.
-        car: Least and largest x, least and largest y.
-        first: Number of the map's first pixel.
-        points: (n, 3) float32, written.
-        pixels: (n,) int32 numbers of their pixels, written.
-        count: Points that are there.
+    The map's rays are ``planes`` (3, h, w), or (3, 0, 0) for a pinhole of ``Camera.parameters`` P, its ``pose`` (4, 4)
+    float32 leads to the ego frame, and its first pixel has the number ``first``. Depths of points within ``car``, least
+    and largest x and y, become 0. ``points`` (n, 3) float32 and the numbers of their ``pixels`` (n,) int32 are written.
     """
     (h, w), work, is_known = depth.shape, np.empty((4, depth.shape[1]), np.float32), np.empty(depth.shape[1], np.bool_)
     x0, x1, y0, y1 = np.float32(car[0]), np.float32(car[1]), np.float32(car[2]), np.float32(car[3])

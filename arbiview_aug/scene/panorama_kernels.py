@@ -186,14 +186,10 @@ def _between_rows(nodes: Any, step: int, y: int, h: int, around: Any, out: Any) 
 
 @compiled
 def add_residuals(rows: Any, columns: Any, step: int, layers: Any, q: Any) -> None:
-    """Add a panorama's residuals to inverse distances (h, w), clipped to what a surface may say.
+    """Add the residuals of ``Panorama.layers`` to inverse distances ``q`` (h, w), clipped to what a surface may say.
 
-    Args:
-        rows: (ny + 1, nx + 1) rows of the panorama at nodes.
-        columns: (ny + 1, nx + 1) its columns.
-        step: Distance of the nodes, pixels; the last ones lie on the last pixel.
-        layers: ``Panorama.layers``.
-        q: (h, w) float32, updated.
+    ``rows`` and ``columns`` (ny + 1, nx + 1) in the panorama are known at nodes ``step`` pixels apart, the last ones on
+    the last pixel.
     """
     (h, w), (_, height, width) = q.shape, layers.shape
     around, first, work = np.full((2, 2, w + 1), -2, np.float32), np.empty(w, np.uint32), np.empty((4, w), np.float32)

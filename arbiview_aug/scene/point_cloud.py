@@ -1,7 +1,11 @@
-"""Measured points as a surface: LiDAR or depth maps, with labelled boxes before them and the street behind.
+"""Measured points as a surface: LiDAR or depth maps, made dense as one centre sees them, with the street behind them.
 
-No sensor's place is assumed: points are z-buffered and made dense for each centre (``arbiview_aug.scene.panorama``), a
-target's to find what it sees and a source's to find what is hidden from it.
+No sensor's place is assumed: points are z-buffered and made dense for each centre, a target's to find what it sees and
+a source's to find what is hidden from it. A panorama has one cell per 0.2 degrees of azimuth and elevation, or per 0.4
+for a coarse view. Its cells hold *residuals* against a static surface, so that a road stays a plane between the scan
+lines, and what no point tells fades back to the static surface. A cell at a step from near to far holds both, and the
+share of near ones around it; the outline runs where the share is one half. Interpolating the two layers and the share
+apart keeps outlines sharp between the cells too.
 """
 
 from __future__ import annotations
@@ -10,6 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,10 +26,31 @@ from arbiview_aug.cameras.rays import PixelRays
 from arbiview_aug.cameras.validation import MOST_M
 from arbiview_aug.errors import SampleError, warn
 from arbiview_aug.image_ops import FRESH, Memory
-from arbiview_aug.scene.boxes import BoxSurface
-from arbiview_aug.scene.depth_map import DepthMap, hidden_by
-from arbiview_aug.scene.panorama import CELL_RAD, OWN_CAR_M, SIDE_RAD, Cells, Layer, Panorama, Scratch, Window
-from arbiview_aug.scene.surface import DenseSurface, OcclusionMap, Points, StaticSurface
+from arbiview_aug.scene.depth_map import CELL_RAD, OWN_CAR_M, SHRINK_RAD, SUPPORT_RAD, DepthMap, hidden_by
+from arbiview_aug.scene.surface import DenseSurface, Layer, OcclusionMap, Points, StaticSurface
+
+SEE_THROUGH_RAD = math.radians(2.0)
+"""A point is occluded where nearer ones lie on both sides of it within this angle: 1.5 spacings of 32 scan lines."""
+
+SIDE_RAD = math.radians(0.75)
+"""... and off that line by no more than this: half the spacing of 32 scan lines."""
+
+SMOOTH_RAD = math.radians(1.3)
+"""Window in which residuals are averaged and outlines straightened: the spacing of 32 scan lines, over which an average
+of nearest values is linear interpolation."""
+
+REACH_RAD = math.radians(12.0)
+"""Beyond this angle from any point the static surface is all that is known. From half of it the points fade out: above
+the highest scan line houses and trees continue, and a fade over a few degrees bends them."""
+
+BASE_STEP = 4  # cells between nodes of the static surface, which is smooth
+HALO_RAD = math.radians(4.0)
+"""Room around a window that its filters need."""
+
+ROOM_CELLS = 5
+"""Cells by which a window is wider than the rays that it must hold: nodes of plans lie on its border."""
+
+_BLOCK = 1 << 16  # cells by which scratch grows
 
 NODES_RAD = 4 * CELL_RAD
 """Distance of nodes between which positions in a panorama are interpolated, to 1/50 of a cell."""
@@ -34,9 +60,134 @@ _MOST_FEATURES = 16  # of a point: 3 or 4 rows that are longer are points turned
 MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
 
-
 KNOWN_SHARE = 0.9
 """Share of a camera's pixels with a depth, from which on its map alone tells what is hidden from it."""
+
+
+class Cells(NamedTuple):
+    """The side of a panorama's cells, radians, and lengths in cells."""
+
+    rad: float
+    turn: int
+    halo: int
+    see_through: int
+    side: int
+    smooth: int
+    shrink: int
+    reach: np.float32
+    support: np.float32
+
+    @classmethod
+    def of(cls, rad: float) -> Cells:
+        """Cell counts for a cell side of ``rad`` radians."""
+        angles = 2 * math.pi, HALO_RAD, SEE_THROUGH_RAD, SIDE_RAD, (SMOOTH_RAD - rad) / 2
+        turn, halo, see_through, side, smooth = (round(angle / rad) for angle in angles)
+        reach, support = np.float32(REACH_RAD / rad), np.float32(SUPPORT_RAD / rad)
+        return cls(rad, turn, halo, see_through, side, smooth, round(SHRINK_RAD / rad), reach, support)
+
+    @property
+    def beyond(self) -> float:
+        """Angle below and above all points beyond which a window's halo shows the static surface too, radians."""
+        return (math.ceil(self.reach) + 4 * self.smooth + 1 - self.halo) * self.rad
+
+
+class Window(NamedTuple):
+    """A part of the sphere, in cells: row 0 begins at the horizon, column 0 straight ahead."""
+
+    row: int
+    column: int
+    rows: int
+    columns: int
+    cells: Cells
+
+    @classmethod
+    def around(
+        cls, rays: Layer, R: FloatArray, cells: Cells, low: float = -4.0, high: float = 4.0
+    ) -> tuple[Window, bool]:
+        """The smallest window, and some room, that holds rays (3, ny, nx), and whether positions may be interpolated.
+
+        ``R`` (3, 3) turns the rays to the ego frame; those of elevations below ``low`` and above ``high``, radians, do
+        not count if there are others. Azimuths bend near the zenith, and jump in a window all around.
+        """
+        from arbiview_aug.scene.panorama_kernels import span_of
+
+        row, column, rows, columns, is_smooth = span_of(rays, np.ascontiguousarray(R), cells.rad, low, high)
+        bottom, top = max(row - ROOM_CELLS, -cells.turn // 4), min(row + rows + ROOM_CELLS, cells.turn // 4)
+        column, columns = column - ROOM_CELLS, columns + 2 * ROOM_CELLS
+        if columns + cells.halo > cells.turn:
+            column, columns, is_smooth = 0, cells.turn, False
+        return cls(bottom, column, top - bottom, columns, cells), is_smooth
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns, with the halo."""
+        return self.rows + 2 * self.cells.halo + 1, self.columns + 2 * self.cells.halo + 1
+
+
+class Scratch(NamedTuple):
+    """Arrays for a panorama of (h, w) cells, which kernels write into."""
+
+    q: Layer  # (h, w) largest inverse distance of the points in each cell, 0 without any
+    number: npt.NDArray[np.int32]  # (h, w) the point that is so near
+    most: Layer  # (h, w) maximum of ``q`` over a window
+    rays: Layer  # (3 h w,) or more: rays (3, n) to the n points that are seen, ego frame
+    cells: npt.NDArray[np.int32]  # (h w,) or more: flat indices of their cells
+    thin: npt.NDArray[np.int32]  # (h w,) or more: 1 for those on thin things, else 0
+    code: npt.NDArray[np.int32]  # (h + 4, w + 4) the nearest point around each cell
+
+    @classmethod
+    def of(cls, window: Window, memory: Memory = FRESH) -> Scratch:
+        """Scratch for a window; blocks of few sizes are found again, as windows differ by some rows."""
+        (h, w), around = window.shape, (window.shape[0] + 4, window.shape[1] + 4)
+        size, room = h * w, math.prod(around)
+        planes = memory.empty((9, _BLOCK * math.ceil(room / _BLOCK)), np.float32)
+        q, most, ints = planes[0, :size].reshape(h, w), planes[1, :size].reshape(h, w), planes.view(np.int32)
+        number, code = ints[2, :size].reshape(h, w), ints[3, :room].reshape(around)
+        return cls(q, number, most, planes[4:7].reshape(-1), ints[7], ints[8], code)
+
+
+class Panorama:
+    """Depth by points within a window of the view from one centre, made dense over a static surface.
+
+    Nearest point first in each cell, none next to the centre; points that shine through gaps of what is nearer are
+    dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart.
+    What one scan line alone met is drawn last.
+
+    Attributes:
+        window: The window.
+        layers: (5, rows, columns) residual of the nearer side of a step, or of everything where there is none, 1/m;
+            that of the farther side; the nearer side's share of the neighbourhood; 1 where a point lies within
+            ``SUPPORT_RAD``, else 0; 1 where no step lies between a cell and those above and next to it, else 0.
+    """
+
+    def __init__(
+        self, window: Window, origin: FloatArray, points: Layer, mapped: int, street: StaticSurface,
+        memory: Memory = FRESH,
+    ) -> None:  # fmt: skip
+        """Complete the points (3, P), of which the last ``mapped`` are of depth maps, around ``origin`` (3,)."""
+        from arbiview_aug.scene.completion import complete, find_visible
+
+        self.window, self._origin, self._street = window, origin, street
+        scratch, size = Scratch.of(window, memory), 5 * math.prod(window.shape)
+        self.layers = memory.empty((_BLOCK * math.ceil(size / _BLOCK),), np.float32)[:size].reshape(5, *window.shape)
+        n = find_visible(points, mapped, origin, window, scratch)
+        static = street.along(origin, scratch.rays[: 3 * n].reshape(3, 1, n))[0]
+        complete(n, static, window, scratch, self.layers)
+
+    @cached_property
+    def hidden_below(self) -> Layer:
+        """Points of a smaller inverse distance are hidden by what was certainly measured; 0 where it is silent."""
+        from arbiview_aug.scene.completion import hidden_depths
+
+        (rad, _, halo, *_), shape = self.window.cells, self.layers.shape[1:]
+        rows, columns = (np.arange(0, n + BASE_STEP, BASE_STEP, dtype=np.float32) * np.float32(rad) for n in shape)
+        azimuth = np.float32((self.window.column - halo) * rad) + columns
+        elevation = (np.float32((self.window.row - halo) * rad) + rows)[:, None]
+        level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(rows), len(columns)))
+        static = self._street.along(self._origin, np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up]))
+        hidden = np.empty(shape, np.float32)
+        hidden_depths(self.layers, static, BASE_STEP, self.window.cells.shrink, hidden)
+        return hidden
 
 
 FINE, COARSE = Cells.of(CELL_RAD), Cells.of(2 * CELL_RAD)
@@ -54,22 +205,14 @@ degrees."""
 
 @dataclass(frozen=True, eq=False)
 class PointCloudSurface(DenseSurface):
-    """Points made dense over the street.
+    """Points made dense over the street."""
 
-    Attributes:
-        street: Surface where nothing was measured.
-        points: (P, 3) in the ego frame, finite, metres; none of the own car's.
-        mapped: Number of the last points that are of depth maps.
-        swept: Whether points of neighbouring frames are among them.
-        maps: These depth maps, which tell what is hidden from their own cameras.
-    """
-
-    street: StaticSurface
-    points: Points
-    mapped: int = 0
-    swept: bool = False
-    maps: Sequence[DepthMap] = ()
-    _ends: dict[bytes, tuple[float, float]] = field(default_factory=dict, repr=False)
+    street: StaticSurface  # where nothing was measured
+    points: Points  # (P, 3) in the ego frame, finite, metres; none of the own car's
+    mapped: int = 0  # number of the last points that are of depth maps
+    swept: bool = False  # whether points of neighbouring frames are among them
+    maps: Sequence[DepthMap] = ()  # these depth maps, which tell what is hidden from their own cameras
+    _elevations: dict[bytes, tuple[float, float]] = field(default_factory=dict, repr=False)
     _panoramas: dict[bytes, dict[Window, Panorama]] = field(default_factory=dict, repr=False)
     _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
     _nodes: dict[tuple[bytes, Cells], tuple[Panorama, Layer, Layer, int]] = field(default_factory=dict, repr=False)
@@ -99,7 +242,7 @@ class PointCloudSurface(DenseSurface):
         from arbiview_aug.scene.panorama_kernels import add_residuals
 
         q = self.street.image(camera, rays, memory)
-        panorama, *nodes = self._located(camera, rays, self._cells(camera), memory)
+        panorama, *nodes = self._locate_nodes(camera, rays, self._cells(camera), memory)
         add_residuals(*nodes, panorama.layers, q)
         return q
 
@@ -129,7 +272,7 @@ class PointCloudSurface(DenseSurface):
             return known
         measured = coarse and not self.swept and not self.mapped
         cells = COARSE if measured else self._cells(None if coarse else camera)
-        panorama, *nodes = self._located(camera, rays, cells, memory)
+        panorama, *nodes = self._locate_nodes(camera, rays, cells, memory)
         cell_px = min(cells.rad * float(camera.K[0, 0]), max(camera.size))
         apart = max(1, round(cell_px) if cells.rad == CELL_RAD else int(cell_px))  # a coarse cell at most
         hidden: Layer = memory.empty(camera.size, np.float32)
@@ -158,16 +301,16 @@ class PointCloudSurface(DenseSurface):
         from arbiview_aug.scene.completion import elevations
 
         key, origin = origin.tobytes(), origin.copy()  # a copy has one layout: kernels are compiled for each
-        if key not in self._ends:
-            self._ends[key] = (-math.pi, math.pi) if self.mapped else elevations(self._rows, origin)
-        low, high = self._ends[key]
-        window, is_smooth = Window.around(rays, R, cells, low - cells.beyond, high + cells.beyond)
+        if key not in self._elevations:
+            self._elevations[key] = (-math.pi, math.pi) if self.mapped else elevations(self._rows, origin)
+        (low, high), beyond = self._elevations[key], cells.beyond
+        window, is_smooth = Window.around(rays, R, cells, low - beyond, high + beyond)
         known = self._panoramas.setdefault(key, {})
         if window not in known:
             known[window] = Panorama(window, origin, self._rows, self.mapped, self.street, memory)
         return known[window], is_smooth
 
-    def _located(
+    def _locate_nodes(
         self, camera: Camera, rays: PixelRays, cells: Cells, memory: Memory
     ) -> tuple[Panorama, Layer, Layer, int]:
         """The panorama around a camera; rows and columns in it (ny + 1, nx + 1) of nodes, and how far these are apart.
@@ -180,46 +323,15 @@ class PointCloudSurface(DenseSurface):
         if key not in self._nodes:
             R = camera.cam2ego[:3, :3]
             step = max(1, int(min(NODES_RAD * float(rays.parameters[0]), max(rays.size))))  # two nodes span any image
-            panorama, is_smooth = self.panorama(camera.center_m, rays.nodes(step), R, cells, memory)
-            step = step if is_smooth else 1
-            local = rays.planes if step == 1 and rays.planes.size else rays.nodes(step)
+            local = rays.nodes(step)
+            panorama, is_smooth = self.panorama(camera.center_m, local, R, cells, memory)
+            if not is_smooth and step > 1:
+                step, local = 1, rays.nodes(1)
+            local = rays.planes if step == 1 and rays.planes.size else local
             rows, columns = np.empty((2, *local.shape[1:]), np.float32)
             cells_of(local, R.astype(np.float32), panorama.window, rows, columns)
             self._nodes[key] = panorama, rows, columns, step
         return self._nodes[key]
-
-
-@dataclass(frozen=True, eq=False)
-class PointCloudWithBoxes(BoxSurface):
-    """Labelled objects among points: a shape decides within its silhouette, what was measured before it wins.
-
-    An object's points choose its shape, move its faces and displace them where they were measured. They are left out of
-    the panoramas, where they would blur over its outline.
-
-    Attributes:
-        street: The surface of the points that are of no object.
-        boxes: (B, 7), as in ``BoxSurface``.
-        displaced: (B, 5, rows, columns) how far the objects' sides lie off their shapes, as in ``solids_among``.
-    """
-
-    street: PointCloudSurface
-    displaced: Layer = field(kw_only=True)
-
-    def drawn(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> tuple[Layer, npt.NDArray[np.int32]]:
-        """Rasterise the objects, and move their faces to where they were measured."""
-        from arbiview_aug.scene.shape_kernels import displace
-
-        q, face = super().drawn(camera, rays, memory)
-        pose = np.ascontiguousarray(camera.cam2ego[:3, :3]), np.ascontiguousarray(camera.center_m)
-        displace(rays.planes, rays.parameters, *pose, self.boxes, self.solids, self.displaced, face, q)
-        return q, face
-
-    def _hidden(self, camera: Camera, rays: PixelRays, memory: Memory, *, coarse: bool) -> Layer:
-        return self.street.hidden(camera, rays, memory, coarse=coarse)
-
-    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
-        """Small where a point is near, the street's elsewhere: 1/m (...,)."""
-        return self.street.uncertainty(origin, directions, inverse_distance)
 
 
 def occlusion_level(camera: Camera) -> int:
@@ -261,14 +373,12 @@ def own_car(points: Points) -> BoolArray:
 
 def shape_mistake(shape: tuple[int, ...]) -> str | None:
     """Say what is wrong with the shape of points that should be (P, >= 3); None if nothing is."""
-    expected = "expected shape (P, >= 3), x y z in the ego frame"
-    if len(shape) != 2 or shape[1] < 3:
-        turned = len(shape) == 2 and shape[0] in (3, 4)
-    else:
-        turned = shape[0] in (3, 4) and shape[1] > _MOST_FEATURES
-        if not turned:
-            return None
-    return f"{expected}, got {shape}" + ("; transpose them: points.T" if turned else "")
+    is_table = len(shape) == 2
+    turned = is_table and shape[0] in (3, 4) and not 3 <= shape[1] <= _MOST_FEATURES
+    if is_table and shape[1] >= 3 and not turned:
+        return None
+    fix = "; transpose them: points.T" if turned else ""
+    return f"expected shape (P, >= 3), x y z in the ego frame, got {shape}{fix}"
 
 
 def finite_rows(points: Points) -> BoolArray:

@@ -13,7 +13,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.scene.boxes import BoxSurface, solids, solids_among
 from arbiview_aug.scene.depth_map import Maps, forget, joined, points_of
-from arbiview_aug.scene.point_cloud import PointCloudSurface, PointCloudWithBoxes, own_car
+from arbiview_aug.scene.point_cloud import PointCloudSurface, own_car
 from arbiview_aug.scene.surface import CorrectedSurface, Correction, Far, Ground, Points, StaticSurface, Street, Surface
 
 Geometry = Points | Maps
@@ -21,25 +21,16 @@ Geometry = Points | Maps
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The geometry of a sample, in the source's ego frame.
+    """The geometry of a sample, in the source's ego frame."""
 
-    Attributes:
-        boxes: (B, 7) labelled objects: centre x, y, z, length, width, height (metres), yaw (radians).
-        points: (P, 3) measured points, metres.
-        motion: Depth maps from motion.
-        sweeps: (P, 3) points of neighbouring frames beside ``points``, metres.
-        further: Depth maps and arrays of other sample keys that a row of ``GEOMETRIES`` reads.
-        corrections: Corrections of the street's distances by depth from overlap.
-        known: Surface whose distances are known, in place of all others but ``far``.
-    """
-
-    boxes: FloatArray | None = None
-    points: Points | None = None
-    motion: Maps | None = None
-    sweeps: Points | None = None
+    boxes: FloatArray | None = None  # (B, 7) centre x, y, z, length, width, height (metres), yaw (radians)
+    points: Points | None = None  # (P, 3) measured points, metres
+    motion: Maps | None = None  # depth maps from motion
+    sweeps: Points | None = None  # (P, 3) points of neighbouring frames beyond ``points``, metres
+    # depth maps and arrays of other sample keys that a row of ``GEOMETRIES`` reads
     further: Mapping[str, Geometry] = field(default_factory=dict)
-    corrections: tuple[Correction, ...] = ()
-    known: Surface | None = None
+    corrections: tuple[Correction, ...] = ()  # of the street's distances by depth from overlap
+    known: Surface | None = None  # surface whose distances are known, in place of all others but ``far``
     _surfaces: dict[tuple[str, float], Surface] = field(default_factory=dict, init=False, repr=False)
 
     def geometry(self, name: str) -> Geometry | None:
@@ -80,21 +71,13 @@ class Scene:
 
 @dataclass(frozen=True)
 class GeometryRow:
-    """A row of ``GEOMETRIES``.
+    """A row of ``GEOMETRIES``."""
 
-    Attributes:
-        make: Makes the surface of a scene, over a road at a height in metres.
-        reads: The geometry that it uses: ``boxes``, ``points``, ``motion``, or any other key of the sample.
-        needs: The geometry that it cannot be made without.
-        overlap_depth: Whether depth from overlap may correct it.
-        has_wall: Whether it ends in the far wall, which has edges when seen from outside.
-    """
-
-    make: Callable[[Scene, float], Surface]
-    reads: tuple[str, ...] = ()
-    needs: str | None = None
-    overlap_depth: bool = False
-    has_wall: bool = True
+    make: Callable[[Scene, float], Surface]  # the surface of a scene, over a road at a height in metres
+    reads: tuple[str, ...] = ()  # geometry that it uses: ``boxes``, ``points``, ``motion``, or other keys of the sample
+    needs: str | None = None  # the geometry that it cannot be made without
+    overlap_depth: bool = False  # whether depth from overlap may correct it
+    has_wall: bool = True  # whether it ends in the far wall, which has edges when seen from outside
 
     @cached_property
     def is_static(self) -> bool:
@@ -135,7 +118,7 @@ def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: 
     if known:
         forget(known, pixels[is_own_pixel])
     others = together[: close_gaps(together, is_own)], int(np.count_nonzero(~is_own_pixel))
-    return PointCloudWithBoxes(PointCloudSurface(street, *others, swept, known), boxes, planes, displaced=displaced)
+    return BoxSurface(PointCloudSurface(street, *others, swept, known), boxes, planes, displaced)
 
 
 GEOMETRIES: dict[str, GeometryRow] = {

@@ -25,6 +25,9 @@ from arbiview_aug.image_ops import FRESH, Memory
 Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 """(P, 3) points in their recorded precision; surfaces use float32."""
 
+Layer = npt.NDArray[np.float32]
+"""float32 values of pixels, cells or rays."""
+
 _TYPICAL_OBJECT_M = 20.0
 _ROWS = 64  # of pixels, evaluated at once: they stay in the cache
 
@@ -33,7 +36,7 @@ class Surface(ABC):
     """A hashable scene surface, seen from any centre.
 
     Attributes:
-        is_layered: Objects are rasterised in front of ``background``, see ``LayeredSurface``.
+        is_layered: Objects are rasterised in front of ``background``, see ``scene.boxes.BoxSurface``.
         is_dense: Points or depth maps, see ``DenseSurface``.
         is_guess: Not measured; occluders also hide its points in front of them.
     """
@@ -48,7 +51,7 @@ class Surface(ABC):
         return self
 
     @abstractmethod
-    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
         """Inverse distances (h, w) along a camera's pixel rays, 1/m, at most ``MAX_INVERSE_DISTANCE``."""
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
@@ -57,48 +60,14 @@ class Surface(ABC):
 
 
 class OcclusionMap(NamedTuple):
-    """Occluders in a source image, slightly enlarged.
+    """Occluders in a source image, slightly enlarged."""
 
-    Attributes:
-        beyond: (h, w) float32, 1/m: points with a smaller inverse distance are occluded, and so is a background with
-            ``is_guess``. 0 without an occluder.
-        solid: (h, w) int32 index of the occluder, -1 for none.
-        before_m: (F,) float32 metres by which the camera lies before the planes of all faces; (0,) without objects.
-    """
-
-    beyond: npt.NDArray[np.float32]
-    solid: npt.NDArray[np.int32]
-    before_m: npt.NDArray[np.float32] = np.zeros(0, np.float32)
-
-
-class LayeredSurface(Surface):
-    """Objects in front of a smooth background.
-
-    Pixels that show an object are mapped one by one, the others by the background. ``occlusion_map`` hides both.
-    """
-
-    is_layered: ClassVar[bool] = True
-
-    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
-        """Inverse distances (h, w) of objects and background along the rays of a camera's pixel centres, 1/m."""
-        q = self.background.image(camera, rays, memory)
-        objects, face = self.drawn(camera, rays, memory)
-        np.copyto(q, objects, where=face >= 0)
-        return q
-
-    @abstractmethod
-    def drawn(
-        self, camera: Camera, rays: PixelRays, memory: Memory = FRESH
-    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
-        """Rasterise the objects: inverse distances (h, w), 1/m, and faces, -1 elsewhere."""
-
-    @abstractmethod
-    def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """The objects as occluders in a source image."""
-
-    @abstractmethod
-    def before_faces(self, origin: FloatArray) -> FloatArray:
-        """Signed distances (6 B,) of a point (3,) in front of the planes of all faces, metres."""
+    # (h, w) float32, 1/m: points with a smaller inverse distance are occluded, and so is a background with
+    # ``is_guess``; 0 without an occluder
+    beyond: Layer
+    solid: npt.NDArray[np.int32]  # (h, w) int32 index of the occluder, -1 for none
+    # (F,) metres by which the camera lies before the planes of all faces; (0,) without objects
+    before_m: Layer = np.zeros(0, np.float32)
 
 
 class DenseSurface(Surface):
@@ -125,24 +94,20 @@ class StaticSurface(Surface):
             directions: (..., 3) unit directions in the ego frame.
         """
 
-    def along(self, origin: FloatArray, rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def along(self, origin: FloatArray, rays: Layer) -> Layer:
         """Inverse distances (h, w) along unit rays (3, h, w) in the ego frame, 1/m."""
         return self.inverse_distance(origin, np.moveaxis(rays.astype(np.float64), 0, -1)).astype(np.float32)
 
-    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
         """Inverse distances (h, w) along the rays of a camera's pixel centres, 1/m."""
         h, w = camera.size
-        q = memory.empty((h, w), np.float32)
+        q: Layer = memory.empty((h, w), np.float32)
         for first in range(0, h, _ROWS):
             rows = np.arange(first, min(first + _ROWS, h))
             local = rays.at(rows, np.arange(w)).astype(np.float64)
             directions = np.moveaxis(np.tensordot(camera.cam2ego[:3, :3], local, 1), 0, -1)
             q[rows] = self.inverse_distance(camera.center_m, directions)
         return q
-
-
-WALL_CENTER_M = (1.0, 0.0)
-"""Centre of the far wall in the ego frame: the middle of a car's cameras if the origin is the rear axle."""
 
 
 @dataclass(frozen=True)
@@ -154,73 +119,11 @@ class Far(StaticSurface):
         return np.zeros(directions.shape[:-1])
 
 
+WALL_CENTER_M = (1.0, 0.0)
+"""Centre of the far wall in the ego frame: the middle of a car's cameras if the origin is the rear axle."""
+
 FREE_SHARE, OBJECT_DENSITY = 0.1, 1.33
 """Free share of the way to the wall, and object density beyond. Fitted on synthetic streets, seeds 100 to 105."""
-
-
-class _RoadAndWall(StaticSurface):
-    """A street without objects."""
-
-    ground_z_m: float
-
-    @property
-    @abstractmethod
-    def semi_axes_m(self) -> tuple[float, float]:
-        """Semi-axes of the wall along the road and across it, m."""
-
-    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
-        """As ``inverse_distance``, compiled."""
-        q: npt.NDArray[np.float32] = memory.empty(camera.size, np.float32)
-        self._draw(camera.center_m, camera.cam2ego[:3, :3], rays.planes, rays.parameters, q)
-        return q
-
-    def along(self, origin: FloatArray, rays: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        """As ``inverse_distance``, compiled."""
-        q = np.empty(rays.shape[1:], np.float32)
-        self._draw(origin, np.eye(3), rays, np.zeros(14, np.float32), q)
-        return q
-
-    def _draw(self, origin: FloatArray, R: FloatArray, planes: Any, parameters: Any, q: Any) -> None:
-        from arbiview_aug.scene.kernels import GROUND, STREET, static_image
-
-        height, axes = origin[2] - self.ground_z_m, self.semi_axes_m
-        ox, oy = (origin[:2] - WALL_CENTER_M) / axes
-        settings = 1 / height if height > 0 else 0.0, 1 / axes[0], 1 / axes[1], ox, oy, ox * ox + oy * oy - 1
-        kind = STREET if isinstance(self, Street) else GROUND
-        static_image(planes, parameters, R.astype(np.float32), kind, np.array(settings, np.float32), q)
-
-    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
-        """Mean error (...,) in 1/m caused by unknown objects, within a quarter on most of six synthetic streets.
-
-        A ray meets objects between ``FREE_SHARE`` of the way to the wall and the surface, at ``OBJECT_DENSITY`` per
-        such way: the integral of (1/t - 1/t_surface) over t. The road nearby is certain, the wall is not.
-        """
-        wall = wall_inverse_distance(origin, directions, Street.half_length_m, Street.half_width_m)
-        t = np.minimum(np.maximum(wall / np.maximum(inverse_distance, 1e-9), FREE_SHARE), 1.0)
-        return np.asarray(OBJECT_DENSITY * wall * (np.log(t / FREE_SHARE) - 1 + FREE_SHARE / t))
-
-
-@dataclass(frozen=True)
-class Ground(_RoadAndWall):
-    """The road plane up to a cylinder: the reference surface.
-
-    Attributes:
-        ground_z_m: Height of the road in the ego frame.
-        radius_m: Radius of the upright cylinder about ``WALL_CENTER_M``.
-    """
-
-    ground_z_m: float = 0.0
-    radius_m: float = 40.0
-
-    @property
-    def semi_axes_m(self) -> tuple[float, float]:
-        """Radii of the cylinder."""
-        return self.radius_m, self.radius_m
-
-    def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """The nearer of plane and cylinder, 1/m (...,)."""
-        wall = wall_inverse_distance(origin, directions, self.radius_m, self.radius_m)
-        return np.maximum(plane_inverse_distance(origin, directions, self.ground_z_m), wall)
 
 
 SHARPNESS = 4
@@ -228,7 +131,7 @@ SHARPNESS = 4
 
 
 @dataclass(frozen=True)
-class Street(_RoadAndWall):
+class Street(StaticSurface):
     """The road joined smoothly to an elliptical far wall, which is nearer at the sides than ahead.
 
     The norm of two inverse distances, (q_road^4 + q_wall^4)^(1/4), is a smooth minimum of the distances. It shortens
@@ -244,20 +147,54 @@ class Street(_RoadAndWall):
     ground_z_m: float = 0.0
     half_length_m: float = 40.0
     half_width_m: float = 20.0
-
-    @property
-    def semi_axes_m(self) -> tuple[float, float]:
-        """Those of the wall."""
-        return self.half_length_m, self.half_width_m
+    is_smooth: ClassVar[bool] = True
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """The smooth join of plane and wall, 1/m (...,)."""
+        """The join of plane and wall, 1/m (...,)."""
         road = plane_inverse_distance(origin, directions, self.ground_z_m)
         wall = wall_inverse_distance(origin, directions, self.half_length_m, self.half_width_m)
         nearer, farther = np.maximum(road, wall), np.minimum(road, wall)
+        if not self.is_smooth:
+            return nearer
         ratio = farther / np.maximum(nearer, 1e-300)
-        joined = nearer * (1 + ratio**SHARPNESS) ** (1 / SHARPNESS)
-        return np.minimum(joined, MAX_INVERSE_DISTANCE)
+        return np.minimum(nearer * (1 + ratio**SHARPNESS) ** (1 / SHARPNESS), MAX_INVERSE_DISTANCE)
+
+    def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
+        """As ``inverse_distance``, compiled."""
+        q: Layer = memory.empty(camera.size, np.float32)
+        return self._draw(camera.center_m, camera.cam2ego[:3, :3], rays.planes, rays.parameters, q)
+
+    def along(self, origin: FloatArray, rays: Layer) -> Layer:
+        """As ``inverse_distance``, compiled."""
+        return self._draw(origin, np.eye(3), rays, np.zeros(14, np.float32), np.empty(rays.shape[1:], np.float32))
+
+    def _draw(self, origin: FloatArray, R: FloatArray, planes: Layer, parameters: Layer, q: Layer) -> Layer:
+        from arbiview_aug.scene.kernels import GROUND, STREET, static_image
+
+        height, axes = origin[2] - self.ground_z_m, (self.half_length_m, self.half_width_m)
+        ox, oy = (origin[:2] - WALL_CENTER_M) / axes
+        settings = 1 / height if height > 0 else 0.0, 1 / axes[0], 1 / axes[1], ox, oy, ox * ox + oy * oy - 1
+        kind = STREET if self.is_smooth else GROUND
+        static_image(planes, parameters, R.astype(np.float32), kind, np.array(settings, np.float32), q)
+        return q
+
+    def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
+        """Mean error (...,) in 1/m caused by unknown objects, within a quarter on most of six synthetic streets.
+
+        A ray meets objects between ``FREE_SHARE`` of the way to the wall and the surface, at ``OBJECT_DENSITY`` per
+        such way: the integral of (1/t - 1/t_surface) over t. The road nearby is certain, the wall is not.
+        """
+        wall = wall_inverse_distance(origin, directions, Street.half_length_m, Street.half_width_m)
+        t = np.minimum(np.maximum(wall / np.maximum(inverse_distance, 1e-9), FREE_SHARE), 1.0)
+        return np.asarray(OBJECT_DENSITY * wall * (np.log(t / FREE_SHARE) - 1 + FREE_SHARE / t))
+
+
+@dataclass(frozen=True)
+class Ground(Street):
+    """The road plane up to a cylinder about ``WALL_CENTER_M``, whichever is nearer: the reference surface."""
+
+    half_width_m: float = 40.0
+    is_smooth: ClassVar[bool] = False
 
 
 def plane_inverse_distance(origin: FloatArray, directions: FloatArray, ground_z_m: float) -> FloatArray:
@@ -295,7 +232,6 @@ def is_within_wall(origin: FloatArray) -> bool:
 NEAREST_SCENE_M = 2.0
 """Distance of the nearest scene point assumed for worst-case parallax."""
 
-
 FAR_PARALLAX_PX = 0.5
 """Worst-case parallax below which ``auto`` takes a pair of cameras as far."""
 
@@ -311,17 +247,11 @@ _ROW = 4096  # remap's sizes must stay below 32767
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """The distance corrections of one pair of cameras; read-only.
+    """The distance corrections of one pair of cameras; read-only."""
 
-    Attributes:
-        view: The view between the two, in the ego frame.
-        change: (h, w) float32 relative change of the surface's inverse distance, > -1.
-        share: (h, w) float32 weight in [0, 1], which fades to 0 towards the borders of the view.
-    """
-
-    view: Camera
-    change: npt.NDArray[np.float32]
-    share: npt.NDArray[np.float32]
+    view: Camera  # between the two, in the ego frame
+    change: Layer  # (h, w) float32 relative change of the surface's inverse distance, > -1
+    share: Layer  # (h, w) float32 weight in [0, 1], which fades to 0 towards the borders of the view
 
     @cached_property
     def key(self) -> bytes:
@@ -329,7 +259,7 @@ class Correction:
         return hashlib.sha256(self.view.content_key + self.change.tobytes() + self.share.tobytes()).digest()
 
     @cached_property
-    def planes(self) -> npt.NDArray[np.float32]:
+    def planes(self) -> Layer:
         """(h, w, 2): change times share, and share."""
         return np.dstack([self.change * self.share, self.share])
 
@@ -352,32 +282,28 @@ class CorrectedSurface(StaticSurface):
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
         """Inverse distance of the base times one plus the change, 1/m (...,)."""
-        base = self.base.inverse_distance(origin, directions)
-        q = base
+        base = q = self.base.inverse_distance(origin, directions)
+        rays = np.moveaxis(directions, -1, 0).reshape(3, -1)
         for _ in range(_STEPS):
-            q = np.minimum(base * (1 + self._change(origin, directions, q)), MAX_INVERSE_DISTANCE)
+            total = np.zeros((q.size, 2), np.float32)
+            for correction in self.corrections:
+                view = correction.view
+                P = view.K @ view.cam2ego[:3, :3].T
+                x, y, z = P @ rays + np.outer(P @ (origin - view.center_m), q.reshape(-1))  # views are pinholes
+                h, w = view.size
+                inside = np.flatnonzero((z > 0) & (x >= 0) & (x <= (w - 1) * z) & (y >= 0) & (y <= (h - 1) * z))
+                uv = np.stack([x[inside], y[inside]], axis=-1) / z[inside, None]
+                total[inside] += _read(correction.planes, uv)
+            change = (total[:, 0] / np.maximum(total[:, 1], 1)).astype(np.float64).reshape(q.shape)
+            q = np.minimum(base * (1 + change), MAX_INVERSE_DISTANCE)
         return q
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
         """The base's."""
         return self.base.uncertainty(origin, directions, inverse_distance)
 
-    def _change(self, origin: FloatArray, directions: FloatArray, q: FloatArray) -> FloatArray:
-        """Relative change (...,) at the points on rays."""
-        rays, inverse = np.moveaxis(directions, -1, 0).reshape(3, -1), q.reshape(-1)
-        total = np.zeros((inverse.size, 2), np.float32)
-        for correction in self.corrections:
-            view = correction.view
-            P = view.K @ view.cam2ego[:3, :3].T
-            x, y, z = P @ rays + np.outer(P @ (origin - view.center_m), inverse)  # homogeneous: views are pinholes
-            h, w = view.size
-            inside = np.flatnonzero((z > 0) & (x >= 0) & (x <= (w - 1) * z) & (y >= 0) & (y <= (h - 1) * z))
-            uv = np.stack([x[inside], y[inside]], axis=-1) / z[inside, None]
-            total[inside] += _read(correction.planes, uv)
-        return (total[:, 0] / np.maximum(total[:, 1], 1)).astype(np.float64).reshape(q.shape)
 
-
-def _read(planes: npt.NDArray[np.float32], uv: FloatArray) -> npt.NDArray[np.float32]:
+def _read(planes: Layer, uv: FloatArray) -> Layer:
     """Bilinear samples (n, 2) of (h, w, 2) at pixels (n, 2)."""
     padded = np.pad(uv.astype(np.float32), ((0, -len(uv) % _ROW), (0, 0))).reshape(-1, _ROW, 2)
     if not len(padded):

@@ -8,6 +8,5 @@ if TYPE_CHECKING:
     from arbiview_aug.temporal.motion_depth import MotionDepth as MotionDepth
     from arbiview_aug.temporal.motion_depth import brings_motion as brings_motion
     from arbiview_aug.temporal.motion_depth import estimate_motion as estimate_motion
-    from arbiview_aug.temporal.motion_depth import warn_of_declined as warn_of_declined
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -20,7 +20,7 @@ PER_CORRELATION = 2500  # the cost of one unit of correlation: four paths togeth
 INVALID = PER_CORRELATION * 7 // 10  # the largest cost, that of points which the neighbour does not see
 STEP, JUMP = np.uint16(PER_CORRELATION // 10), np.uint16(PER_CORRELATION * 6 // 5)  # of a change by one wall, by more
 PEAK, CLEAR = 2, np.float32(1.3)
-"""The least cost must be so much less than those of walls farther from it than so many steps."""
+"""Uniqueness test: the best cost must be ``CLEAR`` times below every cost more than ``PEAK`` steps away."""
 
 SCALES = 64  # steps of the scale of things that hang above the road
 _FARTHEST_SCALE = 0.1  # of a road that can be told from infinity
@@ -336,7 +336,7 @@ def find_feet(
     """Scale things that hang above the road, in place, to where matching changes from them to the road below.
 
     ``labels`` (h, w) and ``boxes`` (n, 5) are OpenCV's of the things, the background first. ``surfaces`` and ``limits``
-    are made by ``moving``; other arguments are those of ``moving.stand_on_road``.
+    are made by ``plane_sweep.stand_on_road``, whose other arguments these are.
     """
     horizontal, road, slope = surfaces
     least_scale, evidence, standing, least_gap_px, height_m, tallest_m = limits

@@ -1,4 +1,4 @@
-"""Depth of a network, brought to metres by what is known of the frame.
+"""Depth of a network of transformers, brought to metres by what is known of the frame.
 
 A network knows depth up to a scale and a shift, or assumes a focal length. Both are fitted for each camera, robustly
 and in inverse depth, to LiDAR points, else to depth from motion, else to the road below the camera. A camera whose fit
@@ -7,22 +7,27 @@ fails stays without learned depth.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol, get_args
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
 
 import cv2
 import numpy as np
 import torch
 
+from arbiview_aug.atomic_io import checksum
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import Reference
+from arbiview_aug.environment import optional_package
+from arbiview_aug.errors import DataError
+from arbiview_aug.files import check_regular
 from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.depth_map import motion_camera
-from arbiview_aug.scene.panorama import Layer
-from arbiview_aug.scene.surface import plane_inverse_distance
+from arbiview_aug.scene.surface import Layer, plane_inverse_distance
 from arbiview_aug.temporal.motion_depth import FARTHEST_M, MotionDepth
 
 LEAST_POINTS = 50
@@ -63,18 +68,6 @@ class Prediction(NamedTuple):
     scale_px: float | None = None
 
 
-class DepthModel(Protocol):
-    """A depth network."""
-
-    name: str
-    revision: str
-    licence: str
-
-    def predict(self, views: Sequence[View]) -> list[Prediction]:
-        """Predict the depth of images of one size in one batch."""
-        ...
-
-
 class DepthInputs(NamedTuple):
     """A frame, and what is known of its depth: (P, 3) LiDAR points, depth from motion, (B, 7) labelled objects."""
 
@@ -95,28 +88,28 @@ class CameraFit(NamedTuple):
     declined: str = ""
 
     def __str__(self) -> str:
-        to = f"{self.points} points of {self.reference}"
+        to, error = f"{self.points} points of {self.reference}", f"residual {self.residual or 0:.1%}"
         if self.declined:
-            by = "" if self.residual is None else f" (residual {self.residual:.1%}, {to})"
-            return f"{self.camera}: declined, {self.declined}{by}"
-        if self.residual is None:
-            return f"{self.camera}: scale of the other cameras, at its own focal length"
-        return f"{self.camera}: fitted to {to}, residual {self.residual:.1%}"
+            return f"{self.camera}: declined, {self.declined}{'' if self.residual is None else f' ({error}, {to})'}"
+        fitted = f"fitted to {to}, {error}"
+        others = "scale of the other cameras, at its own focal length"
+        return f"{self.camera}: {others if self.residual is None else fitted}"
 
 
 def learned_depth(
-    model: DepthModel, frames: Sequence[DepthInputs], batch: int, wanted: Sequence[Reference] = get_args(Reference)
+    model: TransformersDepth,
+    frames: Sequence[DepthInputs],
+    batch: int,
+    wanted: Sequence[Reference] = get_args(Reference),
 ) -> Iterator[tuple[LearnedDepth, list[CameraFit]]]:
     """Predict the depth of frames, ``batch`` images at a time, and fit it to their geometry.
 
     A camera is fitted to the first reference of ``wanted`` that it has enough points of.
     """
     views = {(n, k): View.of(frame, k) for n, frame in enumerate(frames) for k in range(len(frame.rig))}
-    alike: dict[Any, list[tuple[int, int]]] = {}
-    for key, view in views.items():
-        alike.setdefault(view.image.shape, []).append(key)
     predictions: dict[tuple[int, int], Prediction] = {}
-    for keys in alike.values():
+    for shape in dict.fromkeys(view.image.shape for view in views.values()):
+        keys = [key for key, view in views.items() if view.image.shape == shape]
         for part in (keys[start : start + batch] for start in range(0, len(keys), batch)):
             predictions |= zip(part, model.predict([views[key] for key in part]), strict=True)
     for n, frame in enumerate(frames):
@@ -134,11 +127,6 @@ class View(NamedTuple):
     ground_z_m: float  # height of the road in their ego frame
     image: torch.Tensor  # (3, h, w) uint8, a copy
 
-    @property
-    def focal_px(self) -> float:
-        """Focal length along the rows."""
-        return float(self.pinhole.K[0, 0])
-
     @staticmethod
     def of(frame: DepthInputs, k: int) -> View:
         """The image of a frame's camera, its lens taken out."""
@@ -151,8 +139,12 @@ class View(NamedTuple):
             image = torch.from_numpy(pixels).permute(2, 0, 1)
         return View(motion_camera(camera), pinhole, frame.rig.ground_z_m, image)
 
-    def sampled(self, values: Layer) -> tuple[Layer, BoolArray]:
-        """A prediction over the pinhole image at the pixels of the depth map, and where it has any."""
+    def sampled(self, prediction: Prediction) -> tuple[Layer, BoolArray]:
+        """A prediction over the pinhole image at the pixels of the depth map, and where it is known.
+
+        Metric networks are read as if all cameras had one focal length.
+        """
+        values, output, scale_px = prediction
         rays, valid = self.camera.unproject_cam(self.camera.pixel_grid())
         uv, z, _ = self.pinhole.project_cam(np.where(valid[..., None], rays, [0.0, 0.0, 1.0]))
         seen = valid & (z > 0) & self.pinhole.contains(uv, 0.5)
@@ -161,7 +153,8 @@ class View(NamedTuple):
         scale = np.array(values.shape[::-1]) / self.pinhole.size[::-1]
         at = ((uv + 0.5) * scale - 0.5).astype(np.float32)
         layer: Any = cv2.remap(values, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-        return layer, seen & np.isfinite(layer)
+        focal = np.float32(1 if scale_px is None else scale_px / 1000)  # any common one: the fit finds the network's
+        return (layer * focal if output == "depth" else layer / focal), seen & np.isfinite(layer)
 
 
 def measured_pixels(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray]:
@@ -186,29 +179,20 @@ def _references(frame: DepthInputs, k: int, view: View, seen: BoolArray) -> Iter
     if frame.motion is not None:
         pixels = np.nonzero(seen & (frame.motion.depth_m[k] > 0))
         yield "motion", pixels, frame.motion.depth_m[k][pixels].astype(float)
-    road_m = _road_depth(camera, frame.rig.ground_z_m)
+    rays, _ = camera.unproject(camera.pixel_grid())
+    q = plane_inverse_distance(camera.center_m, rays, frame.rig.ground_z_m)
+    road_m = np.divide(rays @ camera.cam2ego[:3, 2], q, out=np.full(q.shape, np.inf), where=q > 0)  # inf above it
     near = seen & (road_m > _NEAREST_M) & (road_m < _ROAD_M)
     if frame.boxes is not None and len(frame.boxes):
         near &= draw_boxes(camera, frame.boxes)[1] < 0
     yield "road", np.nonzero(near), road_m[near]
 
 
-def _road_depth(camera: Camera, ground_z_m: float) -> FloatArray:
-    """z-depth (h, w) of the road's plane, inf above the horizon."""
-    rays, _ = camera.unproject(camera.pixel_grid())
-    q = plane_inverse_distance(camera.center_m, rays, ground_z_m)
-    return np.divide(rays @ camera.cam2ego[:3, 2], q, out=np.full(q.shape, np.inf), where=q > 0)
-
-
 # --- fits -------------------------------------------------------------------------------------------------------------
 _Form = Literal["inverse", "depth", "affine depth"]
 """Inverse depth is affine in the output, or in its inverse; or depth is affine in it."""
 
-_FORMS: Mapping[str | None, tuple[_Form, ...]] = {
-    "inverse": ("inverse",),
-    "depth": ("depth", "affine depth"),
-    None: ("inverse", "depth", "affine depth"),
-}
+_FORMS: Mapping[str | None, tuple[_Form, ...]] = {"inverse": ("inverse",), "depth": ("depth", "affine depth")}
 
 
 class _Line(NamedTuple):
@@ -234,47 +218,38 @@ def _fitted(
 ) -> tuple[list[Layer], list[CameraFit]]:
     """The depth map and the fit of each camera."""
     fits: list[CameraFit] = []
-    lines: list[_Line | None] = []
+    lines: list[_Line | None] = [None] * len(predicted)
     ratios: list[float] = []  # true over predicted inverse depth, of metric networks
-    samples = [_at_one_focal_length(view, one) for view, one in predicted]
+    samples = [view.sampled(prediction) for view, prediction in predicted]
     too_few = f"fewer than {LEAST_POINTS} points of {', '.join(wanted)}"
-    for k, ((view, one), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
+    for k, ((view, prediction), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
         known = (of for of in _references(frame, k, view, seen) if of[0] in wanted and len(of[2]) >= LEAST_POINTS)
         reference, pixels, depth_m = next(known, (None, (), np.zeros(0)))
         if reference is None:
             fits.append(CameraFit(view.camera.name, declined=too_few))
-            lines.append(None)
             continue
         step = -(-len(depth_m) // _MOST_POINTS)
         x, depth_m = values[pixels][::step].astype(float), depth_m[::step]
-        line, residual, declined = fit_depth(x, depth_m, one.output)
+        line, residual, declined = fit_depth(x, depth_m, prediction.output)
         fits.append(CameraFit(view.camera.name, reference, len(depth_m), residual, declined))
-        lines.append(None if declined else line)
-        if one.scale_px is not None and one.output is not None and not declined:
-            ratios.append(float(np.median(1 / depth_m / _feature(one.output, x))))
+        if not declined:
+            lines[k] = line
+            if prediction.scale_px is not None and prediction.output is not None:
+                ratios.append(float(np.median(1 / depth_m / _feature(prediction.output, x))))
     depth = []
-    for k, ((_, one), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
+    for k, ((_, (_, output, scale_px)), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
+        if fits[k].reference is None and scale_px is not None and output is not None and ratios:
+            lines[k], fits[k] = _Line(output, float(np.median(ratios)), 0.0), CameraFit(fits[k].camera)
         line = lines[k]
-        if fits[k].reference is None and one.scale_px is not None and one.output is not None and ratios:
-            line, fits[k] = _Line(one.output, float(np.median(ratios)), 0.0), CameraFit(fits[k].camera)
         metres = np.zeros(values.shape) if line is None else line.depth(np.where(seen, values, 1.0).astype(float))
         depth.append(np.where(seen & (metres > _NEAREST_M), metres.clip(max=FARTHEST_M), 0).astype(np.float32))
     return depth, fits
 
 
-def _at_one_focal_length(view: View, one: Prediction) -> tuple[Layer, BoolArray]:
-    """A prediction at the pixels of the depth map as if all cameras had one focal length, and where it is known."""
-    values, seen = view.sampled(one.values)
-    if one.scale_px is None:
-        return values, seen
-    focal = np.float32(one.scale_px / 1000)  # any common one: the fit finds the network's
-    return (values * focal if one.output == "depth" else values / focal), seen
-
-
 def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[_Line | None, float | None, str]:
     """Fit a network's output (P,) to depths (P,): the fit, its residual, and why it is declined, or nothing."""
     fits: list[tuple[float, float, _Line]] = []
-    for form in _FORMS[output]:
+    for form in _FORMS.get(output, get_args(_Form)):
         x, y = _feature(form, values), depth_m if form == "affine depth" else 1 / depth_m
         limit = np.minimum(y, _RELATIVE_M) if form == "affine depth" else np.maximum(y, 1 / _RELATIVE_M)
         scale, shift = _robust_line(x, y, 1 / limit)
@@ -313,3 +288,76 @@ def _robust_line(x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[floa
         trust = weight * np.sqrt(np.where(trusted, np.minimum(1, _HUBER / np.maximum(error, 1e-9)), 0))
         line = np.linalg.lstsq(columns * trust[:, None], y * trust, rcond=None)[0]
     return float(line[0]), float(line[1])
+
+
+# --- networks of transformers -----------------------------------------------------------------------------------------
+class TransformersDepth:
+    """A model of ``AutoModelForDepthEstimation``, with its image processor.
+
+    Args:
+        name: A folder, or a name on the Hugging Face Hub.
+        device: Device that it runs on.
+
+    Raises:
+        DataError: transformers is not installed, there is no such model, or it does not estimate depth.
+    """
+
+    def __init__(self, name: str, device: torch.device | str = "cpu") -> None:
+        try:
+            transformers = optional_package("transformers", "depth")
+        except ImportError as error:
+            raise DataError(f"--model: {error}") from None
+        folder = Path(name)
+        option, known = f"--model {name}", "a folder with config.json, or a model of the Hugging Face Hub"
+        config = load_pretrained(transformers.AutoConfig, option, name, known)
+        if type(config) not in transformers.MODEL_FOR_DEPTH_ESTIMATION_MAPPING:
+            raise DataError(
+                f"{option}: expected a model that estimates depth, such as "
+                f"depth-anything/Depth-Anything-V2-Metric-Outdoor-Small-hf, got {type(config).__name__}"
+            )
+        beside = "preprocessor_config.json beside the model"
+        self._processor = load_pretrained(transformers.AutoImageProcessor, option, name, beside)
+        model = load_pretrained(transformers.AutoModelForDepthEstimation, option, name, "weights of the model")
+        self.model, self.device = model.float().eval().to(device), device
+        commit = str(getattr(config, "_commit_hash", None) or "unknown")[:12]
+        self.name, self.revision, card = name, commit, name
+        if folder.is_dir():
+            files = sorted(path for pattern in ("*.safetensors", "*.bin") for path in folder.glob(pattern))
+            self.revision = hashlib.sha256("".join(map(checksum, files)).encode()).hexdigest()[:12]
+            self.name, card = folder.resolve().name, str(folder / "README.md")
+        try:
+            self.licence = str(optional_package("huggingface_hub").ModelCard.load(card).data.license or "unknown")
+        except Exception:  # no card, no network, a card that cannot be read
+            self.licence = "unknown"
+        stated = getattr(config, "depth_estimation_type", "")
+        self._output: Output = {"metric": "depth", "relative": "inverse"}.get(stated)  # type: ignore[assignment]
+
+    @torch.inference_mode()
+    def predict(self, views: Sequence[View]) -> list[Prediction]:
+        """Predict the depth of images of one size in one batch.
+
+        Raises:
+            DataError: The batch does not fit on the device.
+        """
+        images = [view.image for view in views]
+        inputs = self._processor(images=images, return_tensors="pt").to(self.device)
+        try:
+            out = self.model(**inputs)
+        except torch.OutOfMemoryError:
+            raise DataError(f"--batch: {len(images)} images do not fit on {self.device}; halve it") from None
+        size = tuple(images[0].shape[-2:])
+        done = self._processor.post_process_depth_estimation(out, [size] * len(images))  # takes padding away
+        seen = inputs["pixel_values"].shape[-1] / size[1]  # pixels of the network's for one of the image's
+        depths = [entry["predicted_depth"].float().cpu().numpy() for entry in done]
+        focal_px = [float(view.pinhole.K[0, 0]) * seen if self._output == "depth" else None for view in views]
+        return [Prediction(depth, self._output, px) for depth, px in zip(depths, focal_px, strict=True)]
+
+
+def load_pretrained(kind: Any, option: str, name: str, expected: str) -> Any:
+    """Load a part of a model of transformers, a folder or hub id; DataError names the option and what was expected."""
+    try:
+        check_regular(name)
+        return kind.from_pretrained(name)
+    except Exception as error:  # of many types, some of many lines
+        why = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        raise DataError(f"{option}: expected {expected}: {why.strip()[:300]}") from None

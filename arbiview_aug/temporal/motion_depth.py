@@ -3,19 +3,19 @@
 Each neighbour is matched by a plane sweep. The costs of both are merged and aggregated. A pixel is kept where one
 distance fits clearly better than all others, away from outlines, and where enough of its neighbours are kept too.
 Labelled objects that moved between the frames are masked in both. Unlabelled traffic is put upright where its foot is
-on the road (``arbiview_aug.temporal.moving``). ``docs/decisions.md`` says how the constants were chosen.
+on the road (``plane_sweep.stand_on_road``). ``docs/decisions.md`` says how the constants were chosen.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.camera import Camera
@@ -25,14 +25,13 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.environment import compilation_announced
 from arbiview_aug.errors import SampleError, WarnOnce
 from arbiview_aug.sample.frame import Frame, Neighbour
-from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY
+from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY
 from arbiview_aug.sample.neighbours import BOX_MARGIN_M, neighbour_images
 from arbiview_aug.scene.boxes import SAME_SIZE_M, STAYED_M, draw_boxes
 from arbiview_aug.scene.depth_map import DepthMap, Maps, anchored_maps, motion_camera
-from arbiview_aug.scene.panorama import Layer
 from arbiview_aug.scene.scene import GEOMETRIES, Geometry
-from arbiview_aug.temporal.moving import stand_on_road
-from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, read_at, reduced_grey
+from arbiview_aug.scene.surface import Layer
+from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, read_at, reduced_grey, stand_on_road
 
 BEST_TRAVEL_M, TRAVEL_M = 1.2, (0.4, 3.0)
 """Best travel to a neighbour, and the range allowed: shorter baselines measure nothing, longer ones hide too much."""
@@ -89,12 +88,8 @@ class _Side(NamedTuple):
     images: list[SweptImage]
 
 
-class _Estimate(NamedTuple):
-    """Inverse distances (h, w) of one camera, 1/m, and their validity."""
-
-    inverse_distance: Layer
-    valid: BoolArray
-
+Estimate = tuple[Layer, BoolArray]
+"""Inverse distances (h, w) of one camera, 1/m, and their validity."""
 
 Load = Callable[[Neighbour], Sequence[torch.Tensor] | None]
 """Reads the images of a neighbour; None if they cannot be read, and another one is taken."""
@@ -116,10 +111,16 @@ def motion_depth(
     def declined(reason: str) -> MotionDepth:
         return MotionDepth(tuple(np.zeros(motion_camera(camera).size, np.float32) for camera in rig), reason)
 
-    sides = list(_sides(neighbours, labels, load, rig.ground_z_m))
+    usable = [one for one in neighbours if TRAVEL_M[0] <= one.travel_m <= TRAVEL_M[1]]
+    usable.sort(key=lambda one: abs(one.travel_m - BEST_TRAVEL_M))
+    sides = []
+    for is_ahead in (False, True):
+        loaded = ((one, seen) for one in usable if (one.ahead_m > 0) == is_ahead and (seen := load(one)) is not None)
+        for one, seen in islice(loaded, 1):
+            then = np.zeros((0, 7)) if one.boxes is None else one.boxes
+            sides.append(_Side(one, _swept(one.rig, seen, then[_moved_m(then, labels) > STAYED_M], rig.ground_z_m)))
     if not sides:
-        least, most = TRAVEL_M
-        return declined(f"no frame {least:g} to {most:g} m before or after it can be used")
+        return declined(f"no frame {TRAVEL_M[0]:g} to {TRAVEL_M[1]:g} m before or after it can be used")
     moved, unsure = _motion_of_labels(labels, [side.neighbour for side in sides])
     swept = _swept(rig, images, labels[moved], rig.ground_z_m)
     if any(min(one.camera.size) < 2 for part in (swept, *(side.images for side in sides)) for one in part):
@@ -128,7 +129,7 @@ def motion_depth(
     for correction in range(MAX_CORRECTIONS + 1):
         others = [[side.images[k] for side in sides] for k in range(len(swept))]
         coarse = [_coarse(one, of_sides) for one, of_sides in zip(swept, others, strict=True)]
-        errors = [pose_error(_pose_samples(swept, coarse, side)) for side in sides]
+        errors = [pose_error(swept, side.images, coarse) for side in sides]
         measured = [error for error in errors if error is not None]
         if len(measured) < len(sides):
             lost = sides[errors.index(None)].neighbour.name
@@ -146,18 +147,6 @@ def motion_depth(
             return declined(f"the pose of frame {sides[measured.index(worst)].neighbour.name} errs by {worst}")
     fine = map(partial(_match, stands=True), swept, others, map(_walls, swept, coarse))
     return MotionDepth(tuple(map(partial(_depth_m, unsure=labels[unsure]), swept, fine)), words)
-
-
-def _sides(neighbours: Sequence[Neighbour], labels: FloatArray, load: Load, ground_z_m: float) -> Iterator[_Side]:
-    """A neighbour behind the vehicle and one ahead of it: those of the best travel that can be loaded."""
-    usable = [one for one in neighbours if TRAVEL_M[0] <= one.travel_m <= TRAVEL_M[1]]
-    usable.sort(key=lambda one: abs(one.travel_m - BEST_TRAVEL_M))
-    for is_ahead in (False, True):
-        for one in usable:
-            if (one.ahead_m > 0) == is_ahead and (images := load(one)) is not None:
-                then = np.zeros((0, 7)) if one.boxes is None else one.boxes
-                yield _Side(one, _swept(one.rig, images, then[_moved_m(then, labels) > STAYED_M], ground_z_m))
-                break
 
 
 def _swept(rig: Rig, images: Sequence[torch.Tensor], moved: FloatArray, ground_z_m: float) -> list[SweptImage]:
@@ -197,15 +186,17 @@ def without_objects(camera: Camera, boxes: FloatArray, margin_m: float = BOX_MAR
     return replace(camera, mask=mask if camera.mask is None else mask & camera.mask)
 
 
-def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands: bool = False) -> _Estimate:
+def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands: bool = False) -> Estimate:
     """Estimate the distances of one camera's pixels from the costs of all sides together.
 
     Valid are clear matches away from the outlines of objects, which windows blur. With ``stands``, things that hang
     above the road are put upon it.
     """
-    from arbiview_aug.temporal.kernels import aggregate, find_least
+    from arbiview_aug.temporal.kernels import aggregate, find_least, merge_costs
 
-    costs = _costs(image, others, walls)
+    of_sides = [image.costs(other, walls) for other in others]
+    costs = np.empty((*image.camera.size, len(walls)), np.uint16)
+    merge_costs(of_sides[0], of_sides[-1], costs)
     wall, clear = find_least(aggregate(costs), walls[1], image.road / np.maximum(image.horizontal, np.float32(1e-6)))
     q = image.inverse_distance(wall)
     step = cv2.dilate(q, _AROUND) - cv2.erode(q, _AROUND)
@@ -213,17 +204,7 @@ def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands
     valid = clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0)
     if stands:
         q, valid = stand_on_road(image, others, costs, float(walls[1]), q, valid)
-    return _Estimate(q, valid)
-
-
-def _costs(image: SweptImage, others: Sequence[SweptImage], walls: Layer) -> npt.NDArray[np.uint16]:
-    """Merge the costs of walls over all sides, (h, w, K)."""
-    from arbiview_aug.temporal.kernels import merge_costs
-
-    costs = [image.costs(other, walls) for other in others]
-    merged = np.empty((*image.camera.size, len(walls)), np.uint16)
-    merge_costs(costs[0], costs[-1], merged)
-    return merged
+    return q, valid
 
 
 def warm_up() -> None:
@@ -233,28 +214,23 @@ def warm_up() -> None:
     _match(image, [image], WALLS[:2], stands=True)
 
 
-def _coarse(image: SweptImage, others: Sequence[SweptImage]) -> _Estimate:
+def _coarse(image: SweptImage, others: Sequence[SweptImage]) -> Estimate:
     """Estimate the distances at half the size, and enlarge them."""
-    small = _match(image.halved, [other.halved for other in others], WALLS[::2])
-    both = small.inverse_distance, small.valid.astype(np.float32)
+    small, is_valid = _match(image.halved, [other.halved for other in others], WALLS[::2])
+    both = small, is_valid.astype(np.float32)
     q, valid = (np.asarray(cv2.resize(layer, image.camera.size[::-1]), np.float32) for layer in both)
-    return _Estimate(q, valid > 0.5)
+    return q, valid > 0.5
 
 
-def _walls(image: SweptImage, coarse: _Estimate) -> Layer:
+def _walls(image: SweptImage, coarse: Estimate) -> Layer:
     """The walls up to the nearest that was confirmed, and some more; noise does not confirm any."""
-    wall = coarse.inverse_distance / np.maximum(image.horizontal, 1e-6)
-    upright = wall[coarse.valid & (coarse.inverse_distance > 1.02 * image.road)]
+    q, valid = coarse
+    upright = (q / np.maximum(image.horizontal, 1e-6))[valid & (q > 1.02 * image.road)]
     nearest = np.quantile(upright, 1 - _NEARER) if len(upright) else WALLS[-1]
     return WALLS[: int(nearest / WALLS[1]) + _MORE]
 
 
-def _pose_samples(images: Sequence[SweptImage], estimates: Sequence[_Estimate], side: _Side) -> list[PoseSamples]:
-    parts = zip(images, side.images, estimates, strict=True)
-    return [PoseSamples(image, other, estimate.inverse_distance, estimate.valid) for image, other, estimate in parts]
-
-
-def _depth_m(image: SweptImage, estimate: _Estimate, unsure: FloatArray) -> Layer:
+def _depth_m(image: SweptImage, estimate: Estimate, unsure: FloatArray) -> Layer:
     """z-depth (h, w), 0 outside the mask, where invalid, in small patches, and off the faces of ``unsure`` labels."""
     camera, (q, valid) = image.camera, estimate
     q = np.maximum(q, 1 / FARTHEST_M)
@@ -276,14 +252,12 @@ def brings_motion(frame: Frame, geometry: str) -> bool:
     Raises:
         SampleError: The frame has no neighbours to estimate it from.
     """
-    keys = [key for key in (MOTION_KEY, LEARNED_KEY) if key == MOTION_KEY or key in GEOMETRIES[geometry].reads]
-    if not frame.depth.keys().isdisjoint(keys):
-        return True
-    if frame.neighbours is None:
-        made = " or ".join(map(repr, keys))
-        expected = f"'neighbours' in the sample, or {made} from the depth command"
+    keys = [MOTION_KEY, LEARNED_KEY] if LEARNED_KEY in GEOMETRIES[geometry].reads else [MOTION_KEY]
+    is_brought = not frame.depth.keys().isdisjoint(keys)
+    if not is_brought and frame.neighbours is None:
+        expected = f"'neighbours' in the sample, or {' or '.join(map(repr, keys))} from the depth command"
         raise SampleError(f"geometry={geometry!r}: expected {expected}, got none")
-    return False
+    return is_brought
 
 
 def estimate_motion(frame: Frame, boxes: FloatArray | None, warn: WarnOnce) -> MotionDepth:
@@ -296,14 +270,7 @@ def estimate_motion(frame: Frame, boxes: FloatArray | None, warn: WarnOnce) -> M
     return motion
 
 
-def warn_of_declined(frame: Frame, from_motion: bool, warn: WarnOnce) -> None:
-    """Warn once that the depth that a sample brings, from motion or learned, is known nowhere."""
-    key, words_key = (MOTION_KEY, MOTION_WORDS_KEY) if from_motion else (LEARNED_KEY, LEARNED_WORDS_KEY)
-    warn("motion", frame.further.get(words_key, f"{key}: 0 everywhere; what else the sample offers stands"))
-
-
 # --- errors of poses --------------------------------------------------------------------------------------------------
-
 CORRECTED_PX = 0.15
 """Mean displacement in matched images above which a pose is corrected; exact poses measure 0.02 to 0.1."""
 
@@ -325,36 +292,31 @@ _TURN_DEG, _SHIFT_M = 0.1, 0.02  # steps of the derivatives
 _REWEIGHTINGS = 5  # of iteratively reweighted least squares, against moving objects
 
 
-class PoseSamples(NamedTuple):
-    """Correspondences of one camera's pixels in a neighbour's image."""
-
-    image: SweptImage  # the camera's image
-    other: SweptImage  # the neighbour's
-    inverse_distance: Layer  # (h, w) along the camera's rays, 1/m
-    valid: BoolArray  # (h, w) bool
-
-
 @dataclass(frozen=True, eq=False)
 class PoseError:
     """Error of a neighbour's pose."""
 
     error_px: float  # mean displacement of pixels
-    turn_deg: FloatArray  # (3,) correcting turn about the current ego frame's axes
-    shift_m: FloatArray  # (2,) correcting shift along its y and z; a shift along x cannot be told from scale
+    # (5,) correcting turns about the current ego frame's axes, degrees, and shifts along its y and z, metres; a shift
+    # along x cannot be told from scale
+    change: FloatArray
 
     @property
     def correction(self) -> FloatArray:
         """(4, 4) motion of the neighbour's cameras to their estimated poses, in the current ego frame."""
-        return _pose(np.concatenate([self.turn_deg, self.shift_m]))
+        return _pose(self.change)
 
     def __str__(self) -> str:
-        degrees, metres = float(np.linalg.norm(self.turn_deg)), float(np.linalg.norm(self.shift_m))
+        degrees, metres = np.linalg.norm(self.change[:3]), np.linalg.norm(self.change[3:])
         return f"{self.error_px:.2f} px ({degrees:.2f} degrees, {metres:.2f} m)"
 
 
-def pose_error(samples: Sequence[PoseSamples]) -> PoseError | None:
-    """Estimate the error of one neighbour's pose from all its cameras; None if too few pixels match."""
-    parts = [equations for sample in samples if (equations := _equations(sample)) is not None]
+def pose_error(
+    images: Sequence[SweptImage], others: Sequence[SweptImage], estimates: Sequence[Estimate]
+) -> PoseError | None:
+    """Estimate the error of one neighbour's pose from all its images ``others``; None if too few pixels match."""
+    samples = zip(images, others, estimates, strict=True)
+    parts = [equations for sample in samples if (equations := _equations(*sample)) is not None]
     if sum(len(b) for _, b, _ in parts) < _MIN_PIXELS:
         return None
     A, b, J = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -364,32 +326,41 @@ def pose_error(samples: Sequence[PoseSamples]) -> PoseError | None:
         scale = 1.5 * np.median(np.abs(residual)) + 1e-9
         weighted = A * (1 / (1 + (residual / scale) ** 2))[:, None]
         x = np.linalg.lstsq(weighted.T @ A + 1e-9 * np.eye(5), weighted.T @ b, rcond=None)[0]
-    return PoseError(float(np.linalg.norm(J @ x, axis=-1).mean()), x[:3], x[3:])
+    return PoseError(float(np.linalg.norm(J @ x, axis=-1).mean()), x)
 
 
-def _equations(sample: PoseSamples) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+def _equations(
+    image: SweptImage, other: SweptImage, estimate: Estimate
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     """Linear equations A x = b, (n, 5) and (n,), and the motion J of pixels (n, 2, 5); None without usable pixels.
 
     x holds turns about the ego's axes in degrees and shifts along its y and z in metres. Images are compared at their
     local mean and contrast, as in the sweep's correlation.
     """
-    other, q = sample.other, sample.inverse_distance
-    at, nearer = (sample.image.positions(other.camera, np.float32(factor) * q) for factor in (1, 1.1))
+    q, valid = estimate
+    at, nearer = (image.positions(other.camera, np.float32(factor) * q) for factor in (1, 1.1))
     warped = read_at(other.grey, at)
-    one, two = _normalised(sample.image.grey), _normalised(warped)
-    mean = (sample.image.grey + warped) / 2
+    one, two = _normalised(image.grey), _normalised(warped)
+    mean = (image.grey + warped) / 2
     # Gradients of the warped image stand for those of the neighbour's: the warp is close to the identity.
     gx, gy = (cv2.Sobel((one + two) / 2, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))
     contrast = cv2.magnitude(*(cv2.Sobel(mean, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1))))
     ex, ey = nearer - at
     length = cv2.magnitude(ex, ey)
     across = np.abs(gx * ex + gy * ey) <= _ACROSS * length * cv2.magnitude(gx, gy)
-    use = np.flatnonzero(sample.valid & (length >= LEAST_SHIFT_PX) & (contrast > _CONTRAST_LEVELS) & across)
+    use = np.flatnonzero(valid & (length >= LEAST_SHIFT_PX) & (contrast > _CONTRAST_LEVELS) & across)
     if not len(use):
         return None
     use = use[:: max(1, len(use) // _MANY_PIXELS)]
     ex, ey, length, gx, gy, difference = (np.ravel(part)[use] for part in (ex, ey, length, gx, gy, one - two))
-    motion = _motion(sample, use, at.reshape(2, -1)[:, use])
+    # (n, 2, 5) motion of the corresponding pixels per unit of turn and shift of the neighbour
+    rays, q, at = image.rays.reshape(3, 1, -1)[..., use], q.reshape(1, -1)[:, use], at.reshape(2, -1)[:, use]
+    columns = []
+    for step in np.diag([_TURN_DEG] * 3 + [_SHIFT_M] * 2):
+        to_other = np.linalg.inv(_pose(step) @ other.camera.cam2ego) @ image.camera.cam2ego
+        uv = pixels_of(rays, q, to_other[:3, :3], to_other[:3, 3], other.camera)
+        columns.append((np.concatenate(uv) - at).T / step.sum())
+    motion = np.stack(columns, -1)
     normal = np.stack([-ey, ex], -1) / length[:, None]
     off_line = np.einsum("nk,nkp->np", normal, motion)  # [n, 5] px per unit
     gradient = gx * normal[:, 0] + gy * normal[:, 1]
@@ -401,18 +372,6 @@ def _normalised(image: Layer) -> Layer:
     mean = cv2.blur(image, (15, 15))
     spread = np.sqrt(np.maximum(cv2.blur(image * image, (15, 15)) - mean * mean, 0) + 4)
     return np.asarray((image - mean) / spread)
-
-
-def _motion(sample: PoseSamples, use: npt.NDArray[np.int64], at: Layer) -> FloatArray:
-    """(n, 2, 5) motion of the corresponding pixels per unit of turn and shift of the neighbour."""
-    image, source = sample.image, sample.other.camera
-    rays, q = image.rays.reshape(3, 1, -1)[..., use], sample.inverse_distance.reshape(1, -1)[:, use]
-    columns = []
-    for step in np.diag([_TURN_DEG] * 3 + [_SHIFT_M] * 2):
-        to_source = np.linalg.inv(_pose(step) @ source.cam2ego) @ image.camera.cam2ego
-        uv = pixels_of(rays, q, to_source[:3, :3], to_source[:3, 3], source)
-        columns.append((np.concatenate(uv) - at).T / step.sum())
-    return np.stack(columns, -1)
 
 
 def _pose(x: FloatArray) -> FloatArray:

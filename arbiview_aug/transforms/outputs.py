@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,8 @@ from arbiview_aug.sample.batching import (
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import CALIBRATION_KEYS, CAMERA_KEYS, PIXEL_BOUND_KEYS
 from arbiview_aug.transforms.settings import SampleKeys
+
+_MATRICES = ("K", "cam2ego")
 
 
 # --- one sample -------------------------------------------------------------------------------------------------------
@@ -86,16 +87,14 @@ class SampleWriter:
     def _passed_on(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
         """The entries that do not depend on the images, as the same objects."""
         named = (*labels, *self.keys.keep)
-        bound = (*PIXEL_BOUND_KEYS, *CAMERA_KEYS)
-        stale = [key for key in sample if key in bound and key not in named]
+        stale = [key for key in sample if key in (*PIXEL_BOUND_KEYS, *CAMERA_KEYS) and key not in named]
         # The coverage of an earlier retargeting already masks what it generated.
         dropped = [key for key in stale if key not in (*self.keys.extra, "generated", "depth_m")]
         if dropped:
             meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
             message = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels or cameras{meant}"
             self.warn(f"dropped {dropped}", message)
-        replaced = ("images", "K", "cam2ego")  # these keep their places in the dict
-        kept = (*replaced, *named)
+        kept = ("images", "K", "cam2ego", *named)  # the first three are replaced in their places in the dict
         return {k: v for k, v in sample.items() if k in kept or k not in (*CALIBRATION_KEYS, *stale)}
 
 
@@ -121,9 +120,6 @@ def calibration_entries(
     return entries | {"ground_z_m": grounds.reshape(lead)}
 
 
-_MATRICES = ("K", "cam2ego")
-
-
 # --- label maps -------------------------------------------------------------------------------------------------------
 def target_labels(
     key: str, value: Any, frames: Sequence[Frame], lead: tuple[int, ...], rendered: Sequence[Views], fill: float
@@ -132,13 +128,27 @@ def target_labels(
 
     SampleError for maps that do not fit the images, or a fill value that their type cannot hold.
     """
+
+    def checked_fill(dtype: torch.dtype) -> float:
+        if dtype == torch.bool:
+            return False
+        limits: Any = torch.finfo(dtype) if dtype.is_floating_point else torch.iinfo(dtype)
+        is_held = limits.min <= fill <= limits.max  # not NaN
+        if dtype.is_floating_point:
+            is_held |= not math.isfinite(fill)
+        else:
+            is_held = is_held and fill == int(fill)
+        if not is_held:
+            fix = "give SampleKeys another ignore_index, or the map another type"
+            raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {shown(fill)}; {fix}")
+        return fill
+
     views = []
     for of_frame, maps in zip(rendered, label_maps(key, value, frames, lead), strict=True):
         assert of_frame.labels is not None
         if (dtype := maps[0].dtype) in (torch.uint16, torch.uint32, torch.uint64):  # torch cannot index them by masks
             raise SampleTypeError(f"{key}: expected uint8 or signed label maps, got {dtype}; use .to(torch.int32)")
-        plain = [label.as_subclass(torch.Tensor) for label in maps]
-        views.append(stacked(of_frame.labels(plain, partial(_checked_fill, key, fill))))
+        views.append(stacked(of_frame.labels([label.as_subclass(torch.Tensor) for label in maps], checked_fill)))
     return rewrapped(gathered(views, lead), value)
 
 
@@ -154,36 +164,17 @@ def label_maps(key: str, value: Any, frames: Sequence[Frame], lead: tuple[int, .
         raise SampleError(f"{key}: expected label maps of shape (..., N, H, W), got {tuple(value.shape)}")
     of_frames = split(key, value, lead)
     for frame, maps in zip(frames, of_frames, strict=True):
-        _check_maps(key, maps, frame)
+        if len(maps) != len(frame.images):
+            raise SampleError(f"{key}: expected {len(frame.images)} label maps, one an image, got {len(maps)}")
+        for camera, label in zip(frame.rig, maps, strict=True):
+            where, size = f"{key}: camera {camera.name!r}", tuple(label.shape[-2:])
+            if size != camera.size:
+                raise SampleError(f"{where}: expected a map of (h, w) = {camera.size}, got {size}")
+            if (label.shape[:-2], label.dtype) != (maps[0].shape[:-2], maps[0].dtype):
+                first, this = ((str(m.dtype), *m.shape[:-2], "H", "W") for m in (maps[0], label))
+                fix = "merge masks of instances into one map of their numbers"
+                raise SampleError(f"{where}: expected {first} as of the first, got {this}; {fix}")
     return of_frames
-
-
-def _check_maps(key: str, maps: Any, frame: Frame) -> None:
-    if len(maps) != len(frame.images):
-        raise SampleError(f"{key}: expected {len(frame.images)} label maps, one an image, got {len(maps)}")
-    for camera, label in zip(frame.rig, maps, strict=True):
-        size = tuple(label.shape[-2:])
-        if size != camera.size:
-            raise SampleError(f"{key}: camera {camera.name!r}: expected a map of (h, w) = {camera.size}, got {size}")
-        if (label.shape[:-2], label.dtype) != (maps[0].shape[:-2], maps[0].dtype):
-            expected, got = ((str(m.dtype), *m.shape[:-2], "H", "W") for m in (maps[0], label))
-            fix = "merge masks of instances into one map of their numbers"
-            raise SampleError(f"{key}: camera {camera.name!r}: expected {expected} as of the first, got {got}; {fix}")
-
-
-def _checked_fill(key: str, fill: float, dtype: torch.dtype) -> float:
-    if dtype == torch.bool:
-        return False
-    limits: Any = torch.finfo(dtype) if dtype.is_floating_point else torch.iinfo(dtype)
-    is_held = limits.min <= fill <= limits.max  # not NaN
-    if dtype.is_floating_point:
-        is_held |= not math.isfinite(fill)
-    else:
-        is_held = is_held and fill == int(fill)
-    if not is_held:
-        fix = "give SampleKeys another ignore_index, or the map another type"
-        raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {shown(fill)}; {fix}")
-    return fill
 
 
 # --- labels in the ego frame ------------------------------------------------------------------------------------------
@@ -199,29 +190,23 @@ def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, 
     for key in ("points", "boxes_3d"):
         if out.get(key) is not None:
             out[key] = _translated(key, out[key], offset_m, lead)
-    if out.get("ego2world") is not None:
-        pose = out["ego2world"]
+    if (pose := out.get("ego2world")) is not None:
+        where = "ego2world: SampleKeys.frame='target'"
         if tuple(getattr(pose, "shape", (4, 4)))[-2:] != (4, 4):
-            raise SampleError(f"ego2world: SampleKeys.frame='target': expected shape (..., 4, 4), got {pose.shape}")
-        if isinstance(pose, np.ndarray) and pose.dtype.kind in "fiu":
-            out["ego2world"] = _before_move(torch.from_numpy(pose.astype(np.float64)), offset_m).numpy()
-        elif is_readable(pose) and pose.is_floating_point():
-            out["ego2world"] = _before_move(pose, offset_m)
-        else:
+            raise SampleError(f"{where}: expected shape (..., 4, 4), got {pose.shape}")
+        is_array = isinstance(pose, np.ndarray) and pose.dtype.kind in "fiu"
+        if not is_array and not (is_readable(pose) and pose.is_floating_point()):
             kind = pose.dtype if isinstance(pose, torch.Tensor) else type(pose).__name__
-            raise SampleTypeError(f"ego2world: SampleKeys.frame='target': expected a float tensor, got {kind}")
-
-
-def _before_move(pose: torch.Tensor, offset_m: torch.Tensor) -> torch.Tensor:
-    """Poses (*lead, 4, 4) of an ego frame whose coordinates are larger by (*lead, 3)."""
-    try:
-        lead = torch.broadcast_shapes(pose.shape[:-2], offset_m.shape[:-1])
-    except RuntimeError:
-        expected = (*offset_m.shape[:-1], 4, 4)
-        raise SampleError(f"ego2world: expected shape {tuple(expected)}, got {tuple(pose.shape)}") from None
-    moved = pose.expand(*lead, 4, 4).clone()
-    moved[..., :3, 3] -= (pose[..., :3, :3] * offset_m[..., None, :].to(pose)).sum(-1)
-    return moved
+            raise SampleTypeError(f"{where}: expected a float tensor, got {kind}")
+        moved = torch.from_numpy(pose.astype(np.float64)) if is_array else pose
+        try:
+            whole = torch.broadcast_shapes(moved.shape[:-2], offset_m.shape[:-1])
+        except RuntimeError:
+            expected = (*offset_m.shape[:-1], 4, 4)
+            raise SampleError(f"ego2world: expected shape {expected}, got {tuple(pose.shape)}") from None
+        moved = moved.expand(*whole, 4, 4).clone()
+        moved[..., :3, 3] -= (moved[..., :3, :3] * offset_m[..., None, :].to(moved)).sum(-1)
+        out["ego2world"] = moved.numpy() if is_array else moved
 
 
 def _translated(key: str, value: Any, offset_m: torch.Tensor, lead: tuple[int, ...]) -> Any:

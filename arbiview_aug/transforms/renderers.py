@@ -28,39 +28,32 @@ from arbiview_aug.render.rendered import Backend, Renderer, Views
 from arbiview_aug.render.requirements import RigPair, boxes_harm, check_reach, harm_remedies, pose_mistakes
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.frame import Frame
-from arbiview_aug.sample.inputs import LEARNED_KEY, read_scene
+from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY, read_scene
 from arbiview_aug.sample.neighbours import points_of_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.transforms.settings import PlanCache, unseen_note
 
+_MIXED_P = 0.5
+"""At most this share of retargeted samples, views over a static street do not harm a detector
+(``integrations/cross_rig``)."""
+
+_MAX_RIG_PAIRS = 64  # one or two kilobytes each, in addition to the target's cameras
+
 
 @dataclass(frozen=True, kw_only=True)
 class RendererSettings:
-    """Settings that renderers share.
+    """Settings that renderers share."""
 
-    Attributes:
-        target: The target, or the base of drawn ones, in its own ego frame.
-        geometry: A name in ``GEOMETRIES``.
-        reach: Area that neighbouring frames may fill; None for none.
-        match_exposure: How sources are brought to one exposure.
-        backend: Executes plans.
-        cache: Limits of plans, and of depth from overlap that frames share.
-        outputs: Requested maps, as in ``Renderer.render``.
-        inpainter: Fills the holes that stay.
-        p: Share of samples that are retargeted.
-        warn: Warns once per topic.
-    """
-
-    target: Rig
+    target: Rig  # the target, or the base of drawn ones, in its own ego frame
     geometry: GeometryName
-    reach: Reach | None
+    reach: Reach | None  # area that neighbouring frames may fill
     match_exposure: Harmonise
     backend: Backend
     cache: PlanCache
-    outputs: Collection[str]
-    inpainter: Inpainter
-    p: float
-    warn: WarnOnce
+    outputs: Collection[str]  # requested maps, as in ``Renderer.render``
+    inpainter: Inpainter  # fills the holes that stay
+    p: float  # share of samples that are retargeted
+    warn: WarnOnce  # once per topic
 
 
 class FrameRenderer(Protocol):
@@ -95,12 +88,7 @@ class FramePlan:
 
 
 class PlannedRenderer:
-    """Renders frames over their scenes, by plans; holes are filled from neighbouring frames alone.
-
-    Attributes:
-        plans: Plans of calibrations that come back.
-        overlaps: Depth from overlap that frames share; None if they share none.
-    """
+    """Renders frames over their scenes, by plans; holes are filled from neighbouring frames alone."""
 
     def __init__(self, config: RenderConfig, settings: RendererSettings) -> None:
         inpainter, cache = settings.inpainter, settings.cache
@@ -109,8 +97,8 @@ class PlannedRenderer:
         self.settings, self.geometry, self.warn = settings, settings.geometry, settings.warn
         self.outputs = (*settings.outputs, "confidence") if certainty else tuple(settings.outputs)
         self.harmoniser, self.backend = Harmoniser(settings.match_exposure), Renderer(settings.backend)
-        self.overlaps = overlap_cache(cache.share_overlap, config)
-        self.plans: LRUCache[Any, RenderPlan] = LRUCache(cache.max_bytes, attrgetter("nbytes"))
+        self.overlaps = overlap_cache(cache.share_overlap, config)  # that frames share, or None
+        self.plans: LRUCache[Any, RenderPlan] = LRUCache(cache.max_bytes, attrgetter("nbytes"))  # that come back
         self._maps, self._unseen = RayCache(), unseen_note(inpainter)
         self._pairs: LRUCache[Any, RigPair] = LRUCache(_MAX_RIG_PAIRS)
 
@@ -151,7 +139,11 @@ class PlannedRenderer:
             if row.needs == "motion" and not temporal.brings_motion(frame, self.geometry):
                 motion = temporal.estimate_motion(frame, scene.boxes, self.warn)
             elif row.needs in ("motion", LEARNED_KEY) and scene.geometry(row.needs) == ():
-                temporal.warn_of_declined(frame, scene.motion is not None, self.warn)
+                key, words = (
+                    (LEARNED_KEY, LEARNED_WORDS_KEY) if scene.motion is None else (MOTION_KEY, MOTION_WORDS_KEY)
+                )
+                declined = f"{key}: 0 everywhere; what else the sample offers stands"
+                self.warn("motion", frame.further.get(words, declined))
             sweeps = points_of_neighbours(frame, self.warn) if self.settings.reach and scene.points is not None else []
             if sweeps:
                 scene = replace(scene, sweeps=np.concatenate([sweep[:, :3] for sweep in sweeps]))
@@ -190,10 +182,9 @@ class PlannedRenderer:
         """Render frames by their plans, and fill holes from their neighbours."""
         is_accepted = self.geometry not in ("auto", "boxes") or self.settings.p <= _MIXED_P
         for planned in () if is_accepted or "static" in self.warn.topics else plans:
-            if planned.harm is not None:
+            if (harm := planned.harm) is not None:
                 better = harm_remedies(planned.frame.rig, planned.pair.target)
-                message = f"{planned.harm}. Better: {better}; geometry='street' accepts it"
-                self.warn("static", message, GeometryWarning)
+                self.warn("static", f"{harm}. Better: {better}; geometry='street' accepts it", GeometryWarning)
         frames = [planned.frame for planned in plans]
         curves = [self.harmoniser.curves(p.frame.rig, p.frame.images, p.plan) for p in plans]
         views = self.backend.render([planned.plan for planned in plans], frames, curves, self.outputs)
@@ -204,11 +195,10 @@ class PlannedRenderer:
 
     def _plan_neighbours(self, planned: FramePlan) -> Fills | None:
         """Plan what a frame's neighbours fill."""
-        neighbours = planned.frame.neighbours
-        if self.settings.reach is None or not neighbours:
+        neighbours, reach = planned.frame.neighbours, self.settings.reach
+        if reach is None or not neighbours:
             return None
-        settings = planned.geometry, self.config, self.settings.reach, self._maps
-        return plan_fills(planned.plan, neighbours, planned.scene, *settings)
+        return plan_fills(planned.plan, neighbours, planned.scene, planned.geometry, self.config, reach, self._maps)
 
     def explain(self, frame: Frame, target: Rig, outcome: str, points: str | None = None) -> transforms.Explanation:
         """Explain how a frame is rendered; ``outcome`` is what becomes of holes, ``points`` what scanners measure."""
@@ -217,20 +207,12 @@ class PlannedRenderer:
         return transforms.Explanation(planned, outcome, gains, self._plan_neighbours(planned), points)
 
 
-_MIXED_P = 0.5
-"""At most this share of retargeted samples, views over a static street do not harm a detector
-(``integrations/cross_rig``)."""
-
-_MAX_RIG_PAIRS = 64  # one or two kilobytes each, in addition to the target's cameras
-
-
 # --- by the paper -----------------------------------------------------------------------------------------------------
-PaperPlan = tuple[Frame, Rig]
-"""A frame, and the target in its ego frame."""
-
-
 class PaperRenderer:
-    """Renders frames by the paper's stages 1 to 4, which depend on every image: no plan comes back."""
+    """Renders frames by the paper's stages 1 to 4, which depend on every image: no plan comes back.
+
+    The plan of a frame is the frame, and the target in its ego frame.
+    """
 
     geometry: ClassVar[GeometryName] = "infinity"
     overlaps: ClassVar[None] = None
@@ -255,20 +237,19 @@ class PaperRenderer:
         """Raises ValueError."""
         raise ValueError("quality='paper' depends on every image: there is no plan; call the transform itself")
 
-    def plan(self, frame: Frame, target: Rig) -> PaperPlan:
+    def plan(self, frame: Frame, target: Rig) -> tuple[Frame, Rig]:
         """Bring the target into the frame's ego frame."""
         return frame, target.in_frame_of(frame.rig)
 
-    def _render(self, planned: PaperPlan) -> favs.PaperRendering:
-        (frame, target), unseen = planned, unseen_note(self.settings.inpainter)
+    def _render(self, frame: Frame, target: Rig) -> favs.PaperRendering:
         rendering = favs.render_frame(frame, target, self.config)
-        check_reach(frame.rig, target, rendering.coverage, unseen, self.settings.warn)
+        check_reach(frame.rig, target, rendering.coverage, unseen_note(self.settings.inpainter), self.settings.warn)
         return rendering
 
-    def render(self, plans: Sequence[PaperPlan]) -> list[Views]:
+    def render(self, plans: Sequence[tuple[Frame, Rig]]) -> list[Views]:
         """Render frames by the published stages."""
-        return [favs.as_rendered(self._render(planned), self.settings.outputs) for planned in plans]
+        return [favs.as_rendered(self._render(*planned), self.settings.outputs) for planned in plans]
 
     def explain(self, frame: Frame, target: Rig, outcome: str, *_: str) -> transforms.PaperExplanation:
         """Explain what the stages made of a frame; ``outcome`` is what becomes of holes."""
-        return transforms.PaperExplanation(self._render(self.plan(frame, target)), outcome)
+        return transforms.PaperExplanation(self._render(*self.plan(frame, target)), outcome)

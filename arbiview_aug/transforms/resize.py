@@ -50,6 +50,11 @@ class _PixelTransform(torch.nn.Module, ABC):
         """
         frames = read_frames(sample, None)
         images, lead = sample["images"], leading_shape(sample["images"])
+
+        def changed(of_frames: Sequence[Any], change: Callable[[torch.Tensor], torch.Tensor], like: Any) -> Any:
+            parts = [torch.stack([change(part.as_subclass(torch.Tensor)) for part in frame]) for frame in of_frames]
+            return rewrapped(torch.stack(parts).reshape(*lead, *parts[0].shape), like)
+
         sizes = [tuple(image.shape[-2:]) for image in frames[0].images]
         labels = check_other_keys(sample, sizes, self.keys.labels, self.keys.keep)
         out = dict(sample)
@@ -57,12 +62,10 @@ class _PixelTransform(torch.nn.Module, ABC):
             if key in out and key not in (*_MAPS, *labels, *self.keys.keep):
                 del out[key]
                 self._warn(key, f"{type(self).__name__} drops {key}: it speaks of pixels that have moved")
-        out["images"] = rewrapped(_each([frame.images for frame in frames], self._image, lead), images)
+        out["images"] = changed([frame.images for frame in frames], self._image, images)
         for key in {*_MAPS, *labels} & out.keys() - {*self.keys.keep}:
-            maps = out[key]
-            if maps is None and key in _MAPS:
-                continue
-            out[key] = rewrapped(_each(label_maps(key, maps, frames, lead), self._map, lead), maps)
+            if (maps := out[key]) is not None or key not in _MAPS:
+                out[key] = changed(label_maps(key, maps, frames, lead), self._map, maps)
         if isinstance(sample.get("rig"), Rig):
             out["rig"] = sample["rig"].with_cameras([self._camera(camera) for camera in sample["rig"]])
         if sample.get("K") is not None:
@@ -118,14 +121,7 @@ class CropRig(_PixelTransform):
         keys: As for ``ResizeRig``.
     """
 
-    def __init__(
-        self,
-        top: int,
-        left: int,
-        size: tuple[int, int],
-        *,
-        keys: SampleKeys = SampleKeys(),  # noqa: B008 - frozen
-    ) -> None:
+    def __init__(self, top: int, left: int, size: tuple[int, int], *, keys: SampleKeys = SampleKeys()) -> None:  # noqa: B008
         super().__init__(keys)
         self.top, self.left = checked_pixels((top, left), "top, left", "two numbers", 0)
         self.size = checked_pixels(size)
@@ -136,21 +132,11 @@ class CropRig(_PixelTransform):
     def _image(self, image: torch.Tensor) -> torch.Tensor:
         (h, w), (to_h, to_w) = image.shape[-2:], self.size
         if self.top + to_h > h or self.left + to_w > w:
-            raise SampleError(
-                f"CropRig: expected a window within the image of (h, w) = {(h, w)}, got rows {self.top} to "
-                f"{self.top + to_h}, columns {self.left} to {self.left + to_w}"
-            )
+            got = f"rows {self.top} to {self.top + to_h}, columns {self.left} to {self.left + to_w}"
+            raise SampleError(f"CropRig: expected a window within the image of (h, w) = {(h, w)}, got {got}")
         return image[..., self.top : self.top + to_h, self.left : self.left + to_w]
 
     _map = _image
 
     def _camera(self, camera: Camera) -> Camera:
         return camera.crop(self.top, self.left, self.size)
-
-
-def _each(
-    frames: Sequence[Sequence[torch.Tensor]], change: Callable[[torch.Tensor], torch.Tensor], lead: tuple[int, ...]
-) -> torch.Tensor:
-    """The images or maps of frames' cameras, changed to one size: (*lead, N, ...)."""
-    changed = [torch.stack([change(one.as_subclass(torch.Tensor)) for one in of_frame]) for of_frame in frames]
-    return torch.stack(changed).reshape(*lead, *changed[0].shape)

@@ -40,9 +40,9 @@ from arbiview_aug.transforms.settings import (
     PlanCache,
     SampleKeys,
     checked_instance,
-    checked_p,
     checked_params,
     checked_pixels,
+    checked_probability,
     inpainter_of,
     render_config,
     size_mistake,
@@ -124,12 +124,14 @@ class RigRetarget(torch.nn.Module):
         self.source = None if source is None else load_rig(source)
         self.geometry: GeometryName = choice("geometry", geometry, GEOMETRIES)
         self.neighbours = None if neighbours is None else choice("neighbours", neighbours, get_args(Reach))
-        self.fit, self.p = choice("fit", fit, get_args(Fit)), checked_p(p, size)
+        self.fit, self.p = choice("fit", fit, get_args(Fit)), checked_probability(p)
+        if self.p < 1 and size is None:
+            raise ValueError("p < 1: expected size=(h, w), so that skipped samples collate with retargeted ones")
         self.size = None if size is None else checked_pixels(size)
         self.keys, self.cache = checked_instance("keys", keys, SampleKeys), checked_instance("cache", cache, PlanCache)
         refuse_camera_values(self.keys.labels)
         self.inpainter = inpainter_of(holes)  # moves with this module
-        self._warn = WarnOnce()
+        self._warn, self._checked = WarnOnce(), set[frozenset[Any]]()  # keys and types of samples that were checked
         self.renderer = self._make_renderer(quality, match_exposure, backend)
         self._resizer = Resizer(self.size, self.fit, self.keys.extra)
         if self.size is not None and (mistake := size_mistake(self._base, self.size, self.fit)):
@@ -139,7 +141,6 @@ class RigRetarget(torch.nn.Module):
         if isinstance(self.target, Rig):
             self._fixed_target = self._sized(self.target)
             warn_of_target(self._fixed_target, self._warn)
-        self._checked: set[frozenset[Any]] = set()  # keys and types of samples that were checked for misnamed keys
 
     def _make_renderer(self, quality: Any, exposure: Harmonise, backend: Backend) -> PlannedRenderer | PaperRenderer:
         config = render_config(quality)
@@ -177,12 +178,12 @@ class RigRetarget(torch.nn.Module):
     def extra_repr(self) -> str:
         """Target and settings, for ``repr``."""
         target = self.target if isinstance(self.target, RandomRig) else (self.target.name or "unnamed rig")
-        holes, exposure = type(self.inpainter).__name__, self.renderer.harmoniser
         settings = (
-            f"geometry={self.geometry}, holes={holes}, match_exposure={exposure}, size={self.size}, fit={self.fit}"
+            f"geometry={self.geometry}, holes={type(self.inpainter).__name__}, size={self.size}, fit={self.fit}, "
+            f"match_exposure={self.renderer.harmoniser}, p={self.p:g}"
         )
         cache = "" if self.cache.share_overlap is False else f"{self.cache!r}, "
-        return f"target={target}, {settings}, p={self.p:g}, {cache}{self.renderer.config}"
+        return f"target={target}, {settings}, {cache}{self.renderer.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
     @eager_on_cpu
@@ -245,9 +246,8 @@ class RigRetarget(torch.nn.Module):
         types = frozenset([(key, type(value)) for key, value in sample.items()])
         if types not in self._checked:
             calibrated = sample.get("rig") is not None or self.source is not None
-            named = (*self.keys.labels, *self.keys.keep)
             reads_ego_frame = not GEOMETRIES[self.geometry].is_static or self.keys.frame == "target"
-            warn_of_misnamed(sample, calibrated, not reads_ego_frame, named, self._warn)
+            warn_of_misnamed(sample, calibrated, not reads_ego_frame, (*self.keys.labels, *self.keys.keep), self._warn)
             warn_of_cameras(frames, self._warn)
             self._checked.add(types)
         labels = check_other_keys(sample, list(sizes), self.keys.labels, self.keys.keep)

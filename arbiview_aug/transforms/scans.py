@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError
 from arbiview_aug.sample.batching import is_readable
@@ -19,8 +18,6 @@ from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.neighbours import Warn, points_of_neighbours
 from arbiview_aug.scene.boxes import checked_boxes, points_by_box
 from arbiview_aug.scene.point_cloud import checked_points, finite_rows
-from arbiview_aug.scene.scan import scan
-from arbiview_aug.scene.surface import Points
 
 RINGS_KEY, COUNTS_KEY = "point_rings", "num_points"
 
@@ -67,6 +64,8 @@ def retarget_points(
         SampleTypeError: Points that are no floats.
         CalibrationError: A rig without scanners, or with one that is not over the road.
     """
+    from arbiview_aug.scene.scan import scan  # compiled
+
     target = load_rig(target)
     if not (target.lidars or skip):
         raise CalibrationError(f"rig {target.name!r}: expected lidars, which measure the points, got none")
@@ -88,39 +87,34 @@ def retarget_points(
         if not isinstance(sweeps, Sequence | np.ndarray | torch.Tensor) or getattr(sweeps, "ndim", 1) == 0:
             raise SampleTypeError(f"sweeps: expected a list of points (Q, C), got {type(sweeps).__name__}")
         if len(sweeps):
-            points = _joined(points, [as_array(f"sweeps[{k}]", sweep) for k, sweep in enumerate(sweeps)])
+            arrays = [as_array(f"sweeps[{k}]", sweep) for k, sweep in enumerate(sweeps)]
+            for k, sweep in enumerate(arrays):
+                if points.ndim != 2 or sweep.ndim != 2 or sweep.shape[1] != points.shape[1]:
+                    expected = f"expected the columns of points {tuple(points.shape)}"
+                    raise SampleError(f"sweeps[{k}]: {expected}, got {sweep.shape}")
+            if isinstance(points, np.ndarray):
+                points = np.concatenate([points, *arrays], dtype=points.dtype)
+            else:
+                tensors = [torch.from_numpy(np.ascontiguousarray(sweep)).to(points) for sweep in arrays]
+                points = torch.cat([points.detach(), *tensors])
             array = as_array("points", points)
             measured = checked_points(array)
         hits, nearest, rings_of, unsupported = scan(lidars, measured, ground_z_m, len(measured) - own)
         rows = np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest
-        points, measured, rings = _at(points, rows, hits), hits, torch.from_numpy(rings_of)
+        places: Any = hits
+        if isinstance(points, np.ndarray):
+            points = points[rows]
+        else:
+            points = points.detach()[torch.from_numpy(rows).to(points.device, torch.int64)]
+            places = torch.from_numpy(hits).to(points)
+        if points.ndim == 2:  # an empty list is points too
+            points[:, :3] = places
+        measured, rings = hits, torch.from_numpy(rings_of)
     counts = None
     if boxes is not None:
         _, ends = points_by_box(boxes, measured, 0.0)
         counts = torch.from_numpy(np.diff(ends, prepend=0))
     return RetargetedPoints(points, rings, counts, unsupported)
-
-
-def _joined(points: Any, sweeps: Sequence[Points]) -> Any:
-    """Points (P, C), then those of sweeps (Q, C)."""
-    for k, sweep in enumerate(sweeps):
-        if points.ndim != 2 or sweep.ndim != 2 or sweep.shape[1] != points.shape[1]:
-            raise SampleError(f"sweeps[{k}]: expected the columns of points {tuple(points.shape)}, got {sweep.shape}")
-    if isinstance(points, np.ndarray):
-        return np.concatenate([points, *sweeps], dtype=points.dtype)
-    return torch.cat([points.detach(), *(torch.from_numpy(np.ascontiguousarray(sweep)).to(points) for sweep in sweeps)])
-
-
-def _at(points: Any, rows: Any, hits: Any) -> Any:
-    """The rows (n,) of points (P, C), with places (n, 3)."""
-    if isinstance(points, np.ndarray):
-        out = points[rows]
-    else:
-        out = points.detach()[torch.from_numpy(rows).to(points.device, torch.int64)]
-        hits = torch.from_numpy(hits).to(out)
-    if out.ndim == 2:  # an empty list is points too
-        out[:, :3] = hits
-    return out
 
 
 def retarget_frames(
@@ -132,26 +126,17 @@ def retarget_frames(
     """
     if frames[0].points is None:
         return []
-    return [
-        retarget_points(
-            frame.points,
-            target,
-            boxes_3d=None if frame.boxes is None else as_array("boxes_3d", frame.boxes),
-            ground_z_m=frame.rig.ground_z_m,
-            skip=skip,
-            sweeps=_sweeps(frame, warn) if neighbours and not skip else (),
-        )
-        for frame in frames
-    ]
-
-
-def _sweeps(frame: Frame, warn: Warn) -> list[FloatArray]:
-    """Points (Q, C) of a frame's neighbours with the columns of its own."""
-    points, parts = as_array("points", frame.points), points_of_neighbours(frame, warn)
-    columns = [part.shape[1] for part in parts]
-    if any(count != points.shape[-1] for count in columns):
-        warn("columns of points", f"points of neighbours: expected {points.shape[-1]} columns, got {columns}")
-    return [part for part in parts if part.shape[1] == points.shape[-1]]
+    parts = []
+    for frame in frames:
+        sweeps = points_of_neighbours(frame, warn) if neighbours and not skip else []
+        count, counts = as_array("points", frame.points).shape[-1], [sweep.shape[1] for sweep in sweeps]
+        if counts != [count] * len(counts):
+            warn("columns of points", f"points of neighbours: expected {count} columns, got {counts}")
+        boxes_3d = None if frame.boxes is None else as_array("boxes_3d", frame.boxes)
+        settings: dict[str, Any] = {"boxes_3d": boxes_3d, "ground_z_m": frame.rig.ground_z_m, "skip": skip}
+        fitting = [sweep for sweep in sweeps if sweep.shape[1] == count]
+        parts.append(retarget_points(frame.points, target, sweeps=fitting, **settings))
+    return parts
 
 
 def entries_of(parts: Sequence[RetargetedPoints], lead: tuple[int, ...]) -> dict[str, Any]:

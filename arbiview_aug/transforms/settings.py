@@ -67,8 +67,8 @@ class SampleKeys:
             choice("SampleKeys.extra", key, EXTRA_KEYS)
         if not is_number(self.ignore_index):
             raise ValueError(f"SampleKeys.ignore_index: expected a number, got {self.ignore_index!r}")
-        choice("SampleKeys.frame", self.frame, ("source", "target"))
-        choice("SampleKeys.points", self.points, ("source", "target"))
+        for name in ("frame", "points"):
+            choice(f"SampleKeys.{name}", getattr(self, name), ("source", "target"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,20 +96,13 @@ class PlanCache:
 
 
 def render_config(quality: Any) -> Any:
-    """Look up a preset by name; a ``RenderConfig`` or ``PaperConfig`` is passed through.
-
-    Raises:
-        ValueError: Anything else.
-    """
-    if isinstance(quality, str) and quality in PRESETS:
-        return PRESETS[quality]
+    """A preset by its name, or the ``RenderConfig`` or ``PaperConfig`` itself; ValueError for anything else."""
+    if isinstance(quality, str) and quality in (*PRESETS, "paper"):
+        return PRESETS[quality] if quality in PRESETS else favs.PaperConfig()
     if isinstance(quality, RenderConfig) or isinstance(quality, favs.PaperConfig):
         return quality
-    if isinstance(quality, str) and quality == "paper":
-        return favs.PaperConfig()
-    raise ValueError(
-        f"quality: expected one of {', '.join(PRESETS)}, paper, a RenderConfig or a PaperConfig, got {shown(quality)}"
-    )
+    expected = f"expected one of {', '.join(PRESETS)}, paper, a RenderConfig or a PaperConfig"
+    raise ValueError(f"quality: {expected}, got {shown(quality)}")
 
 
 def inpainter_of(holes: Any) -> Inpainter:
@@ -133,9 +126,8 @@ _INPAINTERS = {
 
 def unseen_note(inpainter: Inpainter) -> str:
     """Say what becomes of pixels that no source sees, and what to do about them in training."""
-    if isinstance(inpainter, Black):
-        return f"The rest is {inpainter.outcome}."
-    return f"The rest is {inpainter.outcome} and marked in 'generated': leave it out of losses that compare pixels."
+    marked = " and marked in 'generated': leave it out of losses that compare pixels"
+    return f"The rest is {inpainter.outcome}{'' if isinstance(inpainter, Black) else marked}."
 
 
 def checked_instance(name: str, value: Any, kind: type[T]) -> T:
@@ -150,14 +142,6 @@ def checked_probability(p: Any) -> float:
     if not is_number(p) or not 0 <= p <= 1:
         raise ValueError(f"p: expected a probability from 0 to 1, got {shown(p)}")
     return float(p)
-
-
-def checked_p(p: Any, size: Any) -> float:
-    """A probability; ValueError for anything else, or where samples are skipped and ``size`` is None."""
-    probability = checked_probability(p)
-    if p < 1 and size is None:
-        raise ValueError("p < 1: expected size=(h, w), so that skipped samples collate with retargeted ones")
-    return probability
 
 
 def checked_params(params: Any) -> dict[str, float]:
@@ -191,10 +175,9 @@ def size_mistake(rig: Rig, size: tuple[int, int], fit: Fit) -> str | None:
     lost = [text for camera in rig if (text := _lost(camera, size, fit))]
     if len(lost) < len(rig) / 2:
         return None
-    swapped = size[::-1]
-    is_swapped = not any(_lost(camera, swapped, fit) for camera in rig)
-    other = "'pad' or 'stretch'" if fit == "crop" else "'crop'"
-    fix = f"size is (h, w): did you mean {swapped}" if is_swapped else f"choose a size of the images' shape, or {other}"
+    fix = "choose a size of the images' shape, or " + ("'pad' or 'stretch'" if fit == "crop" else "'crop'")
+    if not any(_lost(camera, size[::-1], fit) for camera in rig):
+        fix = f"size is (h, w): did you mean {size[::-1]}"
     return f"size={size}, fit={fit!r}: {lost[0]}; {fix}?"
 
 

@@ -26,7 +26,7 @@ GROUPS = {
     "plans": ("render.view_planner:warm_up", "render.kernels:read_ahead"),
     "points": (
         "transforms.warm_up:warm_up_points scene.scan:warm_up",
-        "scene.completion:hidden_depths scene.scan_kernels:continue_road",
+        "scene.completion:hidden_depths scene.scan:continue_road",
     ),
     "motion": ("temporal.motion_depth:warm_up", "temporal.kernels:find_feet"),
 }

@@ -54,7 +54,7 @@ from arbiview_aug.render.torch_backend import maps_on, render_torch
 from arbiview_aug.render.view_planner import build_plan
 from arbiview_aug.sample.inputs import LEARNED_KEY, MOTION_KEY, read_frames
 from arbiview_aug.scene.depth_map import motion_camera
-from arbiview_aug.scene.panorama import Layer
+from arbiview_aug.scene.surface import Layer
 from arbiview_aug.temporal.learned_depth import measured_pixels
 from arbiview_aug.temporal.motion_depth import estimate_motion
 from arbiview_aug.transforms.rig_retarget import RigRetarget

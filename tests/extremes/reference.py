@@ -135,7 +135,8 @@ def inverse_distance(surface: str, origin: np.ndarray, directions: np.ndarray, g
         return np.zeros(directions.shape[:-1])
     height = origin[2] - ground_z_m
     road = np.maximum(-directions[..., 2] / height, 0) if height > 0 else np.zeros(directions.shape[:-1])
-    size = (Ground().radius_m,) * 2 if surface == "ground" else (Street().half_length_m, Street().half_width_m)
+    street = Ground() if surface == "ground" else Street()
+    size = street.half_length_m, street.half_width_m
     o, d = (origin[:2] - WALL_CENTER_M) / size, directions[..., :2] / size
     a, b, c = (d * d).sum(-1), (d * o).sum(-1), o @ o - 1
     with np.errstate(all="ignore"):

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import MAX_INVERSE_DISTANCE, pixel_rays
 from arbiview_aug.image_ops import FRESH
 from arbiview_aug.scene.boxes import BoxSurface
-from arbiview_aug.scene.panorama import Cells, Panorama
-from arbiview_aug.scene.point_cloud import COARSE, PointCloudSurface, PointCloudWithBoxes
+from arbiview_aug.scene.point_cloud import COARSE, Cells, Panorama, PointCloudSurface
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.surface import StaticSurface, Surface
 
 
-def points_and_boxes(points: np.ndarray, boxes: np.ndarray) -> PointCloudWithBoxes:
+def points_and_boxes(points: np.ndarray, boxes: np.ndarray) -> Any:
     """Boxes (B, 7) among points (P, 3) on a street at 0 m."""
-    surface = Scene(boxes, points).surface("lidar", 0.0)
-    assert isinstance(surface, PointCloudWithBoxes)
-    return surface
+    return Scene(boxes, points).surface("lidar", 0.0)
 
 
 def inverse_distance(
@@ -30,7 +29,7 @@ def inverse_distance(
     if isinstance(surface, BoxSurface):
         first, _ = solids_ahead(*surface._widened(origin, pixel_rad), origin, directions)
         shown = first > 0
-        if isinstance(surface, PointCloudWithBoxes):
+        if isinstance(surface.street, PointCloudSurface):
             shown &= first >= occlusion_depth(surface.street, origin, directions, coarse=False)
         return np.where(shown, first, inverse_distance(surface.street, origin, directions))
     assert isinstance(surface, PointCloudSurface)
@@ -70,7 +69,7 @@ def panorama(
 ) -> Panorama:
     """The panorama that shows unit rays (..., 3), or the one that a camera's image is read from."""
     if camera is not None:
-        return surface._located(camera, pixel_rays(camera), cells, FRESH)[0]
+        return surface._locate_nodes(camera, pixel_rays(camera), cells, FRESH)[0]
     rays = directions.reshape(1, -1, 3).transpose(2, 0, 1).astype(np.float32, order="C")
     return surface.panorama(np.asarray(origin, np.float64), rays, np.eye(3), cells)[0]
 

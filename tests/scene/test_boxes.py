@@ -1,8 +1,9 @@
 """Boxes as solids: rays by hand, what they hide, and objects that keep their height when cameras rise."""
 
-import dataclasses
+import re
 import warnings
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 from arbiview_aug import Rig, RigRetarget, SampleError, SampleTypeError, project_boxes_3d
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import pixel_rays
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.errors import GeometryWarning
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.requirements import STATIC_HARM
@@ -31,44 +32,21 @@ def solid_boxes(boxes: np.ndarray) -> BoxSurface:
     return BoxSurface(Street(), boxes, whole(boxes))
 
 
-def unit(*vector: float) -> np.ndarray:
-    return np.array(vector) / np.linalg.norm(vector)
-
-
-def test_rays_meet_the_nearest_face() -> None:
-    scene = solid_boxes(CAR)
-    rays = np.stack([unit(8, 0, -0.5), unit(8, 0.9, -0.5), unit(8, 1.1, -0.5), unit(8, 0, 0.5), unit(-1, 0, -0.1)])
-    q = inverse_distance(scene, EYE, rays)
-    distance = np.linalg.norm([8, 0, -0.5])
-    assert 1 / q[0] == pytest.approx(distance) and 1 / q[1] == pytest.approx(np.linalg.norm([8, 0.9, -0.5]))
-    assert np.allclose(q[2:], Street().inverse_distance(EYE, rays[2:]))  # beside, above, behind
-
-
-def test_a_box_that_reaches_below_the_road_is_not_cut_off_by_it() -> None:
-    sunk = CAR + np.array([0, 0, -0.3, 0, 0, 0, 0])
-    ray = unit(8, 0, -1.6)[None]
-    assert Street().inverse_distance(EYE, ray) > 1 / np.linalg.norm([8, 0, -1.6])  # a guess
-    assert 1 / inverse_distance(solid_boxes(sunk), EYE, ray)[0] == pytest.approx(np.linalg.norm([8, 0, -1.6]))
-
-
-def test_a_turned_box_shows_its_corner() -> None:
-    turned = CAR.copy()
-    turned[0, 6] = np.pi / 2  # 2 m deep now
-    q = inverse_distance(solid_boxes(turned), EYE, unit(9, 0, -0.5)[None])
-    assert 1 / q[0] == pytest.approx(np.linalg.norm([9, 0, -0.5]))
-
-
-def test_the_vehicle_with_the_camera_is_no_obstacle() -> None:
-    around = np.array([[0.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]])
-    rays = np.stack([unit(1, 0, -0.1), unit(0, 1, -0.3)])
-    assert np.allclose(inverse_distance(solid_boxes(around), EYE, rays), Street().inverse_distance(EYE, rays))
-
-
-def test_boxes_hide_whatever_a_static_street_says_of_the_distance() -> None:
-    scene = solid_boxes(CAR)
-    rays = np.stack([unit(8, 0, -0.5), unit(8, 0, -0.5), unit(8, 0, 0.5), unit(8, 1.5, -0.5)])
-    hidden = occludes(scene, EYE, rays, 1 / np.array([12.0, 7.0, 12.0, 12.0]), 0.001)
-    assert hidden.tolist() == [True, True, False, False]  # behind, before (a wall, by guess), above, beside
+def test_the_reference_meets_faces_by_hand() -> None:
+    """A ray is met where it first enters a box, else it meets the street."""
+    sunk, turned = CAR - np.array([0, 0, 0.3, 0, 0, 0, 0]), CAR + np.array([0, 0, 0, 0, 0, 0, np.pi / 2])
+    around = np.array([[0.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]])  # the vehicle with the camera
+    for boxes, away, is_met in (
+        *((CAR, (8, y, -0.5), y < 1) for y in (0.0, 0.9, 1.1)),
+        *((CAR, away, False) for away in ((8, 0, 0.5), (-1, 0, -0.1))),
+        (sunk, (8, 0, -1.6), True),  # not cut off by the road
+        (turned, (9, 0, -0.5), True),  # 2 m deep now
+        *((around, away, False) for away in ((1, 0, -0.1), (0, 1, -0.3))),
+    ):
+        distance_m = np.linalg.norm(away)
+        ray = np.array([away]) / distance_m
+        expected = 1 / distance_m if is_met else Street().inverse_distance(EYE, ray)[0]
+        assert inverse_distance(solid_boxes(boxes), EYE, ray)[0] == pytest.approx(expected)
 
 
 def crowd(count: int) -> np.ndarray:
@@ -83,7 +61,7 @@ def test_drawn_boxes_equal_cast_rays(lens: dict) -> None:
         name="c", azimuth_deg=20, elevation_deg=-10, roll_deg=7, position_m=(0.5, -0.2, 1.6), width_px=173,
         height_px=97, horizontal_fov_deg=80,
     )  # fmt: skip
-    camera = dataclasses.replace(camera, **lens)
+    camera = replace(camera, **lens)
     boxes = np.concatenate([crowd(60), [[12, 2, 0.8, 4.5, 1.8, 1.5, 2.5], [9, 6, 0.8, 0.7, 0.6, 1.7, 0.5]]])
     scene = BoxSurface(Street(), boxes, solids(boxes))
     widened = scene._widened(camera.center_m, 1 / camera.K[0, 0])
@@ -137,20 +115,6 @@ def test_extreme_boxes_render_finite_maps(boxes: np.ndarray, size: tuple[int, in
     assert all(np.isfinite(r.parallax_px) for r in plan.targets[0].pairs)
 
 
-def test_any_number_of_rays_gives_the_same_answers() -> None:
-    rng = np.random.default_rng(0)
-    boxes = np.column_stack(
-        [rng.uniform(-30, 30, (20, 2)), np.full(20, 0.8), rng.uniform(1, 5, (20, 3)), rng.uniform(-3, 3, 20)]
-    )
-    rays = rng.normal(size=(37, 41, 3))
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    scene = solid_boxes(boxes)
-    together = inverse_distance(scene, EYE, rays)
-    alone = np.array([inverse_distance(scene, EYE, ray[None])[0] for ray in rays.reshape(-1, 3)[::7]])
-    assert np.allclose(together.reshape(-1)[::7], alone)
-    assert inverse_distance(scene, EYE, np.zeros((0, 3))).shape == (0,)
-
-
 def test_what_a_car_hid_is_a_hole_and_not_its_colour() -> None:
     """A lifted camera looks over a red box onto grey ground that no source saw."""
     camera = Camera.looking(
@@ -175,23 +139,6 @@ def test_what_a_car_hid_is_a_hole_and_not_its_colour() -> None:
     assert red[on_car & coverage].mean() > 0.9
 
 
-@pytest.mark.parametrize("size", [(128, 352), (64, 176)])
-def test_coarse_grid_equals_pixel_by_pixel_evaluation(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    """64x176 reads halved images: their shadows are drawn at that size."""
-    source = demo_source_rig((128, 352))
-    boxes = checked_boxes(SyntheticDrive(source, num_frames=1, seed=0, lidar=False).scene(0).boxes_ego(0.0))
-    target = source.shifted(z_m=0.7).resized(size)
-    coarse = build_plan(source, target, geometry="boxes", scene=Scene(boxes))
-    monkeypatch.setattr("arbiview_aug.render.view_planner.GRID_STEP_PX", 1)
-    exact = build_plan(source, target, geometry="boxes", scene=Scene(boxes))
-    for a, b in zip(coarse.targets, exact.targets, strict=True):
-        assert (a.coverage != b.coverage).mean() < 0.001
-        same = (a.source_camera == b.source_camera) & a.coverage
-        assert same.mean() > 0.5
-        apart = np.abs(a.at.to_float() - b.at.to_float())[same]
-        assert np.quantile(apart, 0.999) < 1 / 32 + 1 / 64
-
-
 def test_in_a_sample() -> None:
     rig = demo_source_rig((64, 176))
     images = torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8)
@@ -206,47 +153,38 @@ def test_in_a_sample() -> None:
     assert "boxes surface" in str(retarget.explain(sample | {"boxes_3d": torch.from_numpy(CAR)}))
     batch = {"images": images.expand(2, 6, 3, 64, 176), "rig": rig, "boxes_3d": torch.from_numpy(CAR).expand(2, 1, 7)}
     assert torch.equal(retarget(batch)["images"][1], with_car["images"])
-    with pytest.raises(SampleError, match=r"geometry='boxes': expected 'boxes_3d'"):
-        retarget({"images": images, "rig": rig})
-    for shape in ((2, 5), (0, 5), (2, 0)):
-        with pytest.raises(SampleError, match=r"boxes_3d: expected shape \(B, >= 7\)"):
-            retarget(sample | {"boxes_3d": torch.zeros(shape)})
-    with pytest.raises(SampleError, match=r"boxes_3d\[0\]: expected finite numbers and positive sizes"):
-        retarget(sample | {"boxes_3d": torch.full((1, 7), float("nan"))})
-    with pytest.raises(SampleError, match=r"boxes_3d\[0\]: .*; leave out rows that pad: a batch takes a list of boxes"):
-        retarget(sample | {"boxes_3d": torch.zeros(2, 7)})
+    bad = r"boxes_3d\[0\]: expected finite numbers and positive sizes"
+    for boxes, message in (
+        (None, r"geometry='boxes': expected 'boxes_3d'"),
+        *((torch.zeros(shape), r"boxes_3d: expected shape \(B, >= 7\)") for shape in ((2, 5), (0, 5), (2, 0))),
+        (torch.full((1, 7), float("nan")), bad),
+        (torch.zeros(2, 7), f"{bad}.*; leave out rows that pad: a batch takes a list of boxes"),
+    ):
+        with pytest.raises(SampleError, match=message):
+            retarget(sample | {"boxes_3d": boxes})
     with pytest.raises(SampleTypeError, match="boxes_3d: expected rows of numbers, of one frame, got list"):
         project_boxes_3d([torch.zeros(2, 7), torch.zeros(0, 7)], rig)
+    pair = {"images": images.expand(2, 6, 3, 64, 176), "rig": rig}
+    mixed = retarget(pair | {"boxes_3d": [torch.zeros(0, 7), torch.from_numpy(CAR)]})  # their number may differ
+    assert torch.equal(mixed["images"][1], with_car["images"])
+    with pytest.raises(SampleError, match=r"boxes_3d: expected a tensor \(2,\) \+ \(n, \.\.\.\), or a list of 2"):
+        retarget(pair | {"boxes_3d": [torch.zeros(0, 7)]})
 
 
-def test_auto_takes_boxes_where_there_are_some_and_warns_where_cameras_move_without() -> None:
-    rig = demo_source_rig((64, 176))
-    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
-    boxes = {"boxes_3d": torch.from_numpy(CAR)}
-    lifted = RigRetarget(rig.shifted(z_m=0.5))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert torch.equal(
-            lifted(sample | boxes)["images"], RigRetarget(lifted.target, geometry="boxes")(sample | boxes)["images"]
-        )
-        RigRetarget(rig.shifted(z_m=0.1))(sample)  # little harm
-        RigRetarget(rig.shifted(z_m=0.5), geometry="street")(sample)  # asked for
-    ahead = RigRetarget(rig.shifted(x_m=0.5))
-    with pytest.warns(UserWarning, match=r"target cameras stand up to 0\.50 m from the nearest source camera") as said:
-        bare = ahead(sample)
-    assert said[0].filename == __file__  # the user's line, not one of ours
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        ahead(sample)  # said once
-    assert torch.equal(bare["images"], RigRetarget(ahead.target, geometry="street")(sample)["images"])
+# --- cameras that move over a street without objects ------------------------------------------------------------------
+RIG = demo_source_rig((64, 176))
+MOVED = "target cameras stand up to 0.50 m from the nearest source camera"
 
 
-@pytest.mark.parametrize("change", ["narrow", "lower", "higher", "turned"])
-def test_auto_renders_the_target_that_was_asked_for(change: str) -> None:
-    """Whatever differs, and although nothing is known of what stands on the street: a warning says what that does."""
-    rig = demo_source_rig((64, 176))
-    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
-    target = rig.shifted(z_m=-0.5 if change == "lower" else 0.5)
+@pytest.fixture
+def sample() -> dict[str, Any]:
+    return {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": RIG}
+
+
+@pytest.mark.parametrize("change", ["narrow", "lower", "higher", "turned", "ahead"])
+def test_auto_renders_the_target_that_was_asked_for(sample: dict[str, Any], change: str) -> None:
+    """Although nothing is known of what is on the street: a warning says once what that does, in the user's line."""
+    target = RIG.shifted(x_m=0.5) if change == "ahead" else RIG.shifted(z_m=-0.5 if change == "lower" else 0.5)
     if change == "narrow":
         target = target.with_cameras([c.crop(8, 16, (40, 120)) for c in target])
     if change == "turned":
@@ -255,46 +193,34 @@ def test_auto_renders_the_target_that_was_asked_for(change: str) -> None:
     with pytest.warns(UserWarning) as said:
         out = retarget(sample)
     message = str(said[0].message)
-    assert len(said) == 1 and message.startswith("target cameras stand up to 0.50 m from the nearest source camera")
-    assert STATIC_HARM in message
-    assert all(word in message for word in ("'points'", "'boxes_3d'", "arbiview_aug depth", "p=0.5"))
+    assert len(said) == 1 and said[0].filename == __file__ and message.startswith(MOVED)
+    parts = (STATIC_HARM, "'points'", "'boxes_3d'", "arbiview_aug depth", "mixing with untouched samples (p=0.5)")
+    assert all(part in message for part in parts)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert torch.equal(retarget(sample)["images"], out["images"])  # said once
+        assert torch.equal(retarget(sample)["images"], out["images"])
         assert torch.equal(RigRetarget(target, geometry="street")(sample)["images"], out["images"])
     assert np.allclose(out["cam2ego"], target.cam2ego) and np.allclose(out["K"], target.K)
 
 
-def test_a_filter_makes_errors_of_what_auto_warns_of() -> None:
-    rig = demo_source_rig((64, 176))
-    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
-    raised = RigRetarget(rig.shifted(z_m=0.5))
+def test_a_filter_makes_errors_of_what_auto_warns_of(sample: dict[str, Any]) -> None:
+    raised, boxes = RigRetarget(RIG.shifted(z_m=0.5)), {"boxes_3d": torch.from_numpy(CAR)}
     with warnings.catch_warnings():
         warnings.simplefilter("error", GeometryWarning)
         for _ in range(2):  # not once: no sample passes
-            with pytest.raises(GeometryWarning, match=r"target cameras stand up to 0\.50 m .* Better: 'points'"):
+            with pytest.raises(GeometryWarning, match=rf"{re.escape(MOVED)}.* Better: 'points'"):
                 raised(sample)
         assert "objects lean and stretch" in str(raised.explain(sample))  # that says why, and does not raise
-        raised(sample | {"boxes_3d": torch.from_numpy(CAR)})
-        RigRetarget(rig.shifted(z_m=0.1))(sample)
-        RigRetarget(rig.turned(yaw_deg=20))(sample)
-        RigRetarget(rig.shifted(z_m=0.5), geometry="street")(sample)  # asked for
-        RigRetarget(rig.shifted(z_m=0.5), size=(64, 176), p=0.5)(sample, params={"skipped": 0.0})
-
-
-def test_the_warning_names_the_mixing_that_works() -> None:
-    """``p < 1`` needs equal camera counts; half untouched samples silence the warning, fewer do not."""
-    rig = demo_source_rig((64, 176))
-    sample = {"images": torch.randint(0, 255, (6, 3, 64, 176), dtype=torch.uint8), "rig": rig}
-    raised = rig.shifted(z_m=0.5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        mixed = RigRetarget(raised, size=(64, 176), p=0.5)(sample, params={"skipped": 0.0})
-    assert np.allclose(mixed["cam2ego"], raised.cam2ego)
+        over_boxes = RigRetarget(raised.target, geometry="boxes")(sample | boxes)
+        assert torch.equal(raised(sample | boxes)["images"], over_boxes["images"])
+        RigRetarget(RIG.shifted(z_m=0.1))(sample)  # little harm
+        RigRetarget(RIG.turned(yaw_deg=20))(sample)
+        mixed = RigRetarget(RIG.shifted(z_m=0.5), size=(64, 176), p=0.5)  # half untouched samples, not fewer
+        assert np.allclose(mixed(sample, params={"skipped": 0.0})["cam2ego"], raised.target.cam2ego)
     with pytest.warns(UserWarning, match=r"mixing with untouched samples \(p=0\.5\)"):
-        RigRetarget(raised, size=(64, 176), p=0.9)(sample, params={"skipped": 0.0})
+        RigRetarget(RIG.shifted(z_m=0.5), size=(64, 176), p=0.9)(sample, params={"skipped": 0.0})
     with pytest.warns(UserWarning, match=r"mixing with untouched samples \(arbiview_aug\.MixedDataset, since camera"):
-        RigRetarget(Rig(raised.cameras[:5]))(sample)
+        RigRetarget(Rig(RIG.shifted(z_m=0.5).cameras[:5]))(sample)  # ``p < 1`` needs equal camera counts
 
 
 def test_cameras_are_where_they_were_asked_for_if_no_pixel_depends_on_the_street() -> None:
@@ -314,14 +240,3 @@ def test_auto_plans_once_where_objects_cannot_matter() -> None:
         boxes = torch.from_numpy(CAR + np.array([x, 0, 0, 0, 0, 0, 0]))
         turned({"images": torch.zeros((1, 3, 64, 176)), "rig": one, "boxes_3d": boxes})
     assert (turned.plans.misses, turned.plans.hits) == (1, 2)
-
-
-def test_boxes_of_a_batch_may_differ_in_number() -> None:
-    rig = demo_source_rig((64, 176))
-    images = torch.randint(0, 255, (2, 6, 3, 64, 176), dtype=torch.uint8)
-    retarget = RigRetarget(rig.shifted(z_m=0.5))
-    batch = retarget({"images": images, "rig": rig, "boxes_3d": [torch.zeros(0, 7), torch.from_numpy(CAR)]})
-    alone = retarget({"images": images[1], "rig": rig, "boxes_3d": torch.from_numpy(CAR)})
-    assert torch.equal(batch["images"][1], alone["images"])
-    with pytest.raises(SampleError, match=r"boxes_3d: expected a tensor \(2,\) \+ \(n, \.\.\.\), or a list of 2"):
-        retarget({"images": images, "rig": rig, "boxes_3d": [torch.zeros(0, 7)]})

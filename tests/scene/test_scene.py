@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug import Camera, Rig, RigRetarget
+from arbiview_aug import Rig, RigRetarget
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.errors import SampleError
 from arbiview_aug.scene.depth_map import DepthMap, anchored
 from arbiview_aug.scene.scene import GEOMETRIES, GeometryRow, Scene
 from arbiview_aug.scene.surface import StaticSurface
+from tests import helpers
 
 
 def test_names_of_the_type_are_those_of_the_table() -> None:
@@ -34,7 +35,7 @@ def test_auto_takes_all_that_was_measured() -> None:
 @pytest.mark.parametrize("surface", ["auto", "fused", "lidar", "motion"])
 def test_points_and_depth_from_motion_are_fused(surface: GeometryName) -> None:
     """A near wall that only LiDAR saw, left, and one that only motion saw, right."""
-    camera = Camera.looking(name="front", azimuth_deg=0, width_px=96, height_px=64, horizontal_fov_deg=80)
+    camera = helpers.camera(size=(64, 96))
     target = Rig([camera.shifted(z_m=0.5)])
     y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(0.5, 4, 120), np.linspace(0.5, 2.5, 60)))
     depth = torch.zeros(1, 64, 96)
@@ -56,7 +57,7 @@ def test_points_and_depth_from_motion_are_fused(surface: GeometryName) -> None:
 
 def test_learned_depth_follows_what_was_measured() -> None:
     """A wall at 8 m that a network puts 8 % too far: it keeps its outline, and comes to where scan lines meet it."""
-    camera = Camera.looking(name="front", azimuth_deg=0, width_px=96, height_px=64, horizontal_fov_deg=80)
+    camera = helpers.camera(size=(64, 96))
     depth = torch.full((64, 96), 40.0)
     depth[16:52, 20:76] = 8.0 * 1.08
     y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-3, 3, 300), np.arange(0.2, 3, 0.18)))
@@ -79,7 +80,7 @@ def test_learned_depth_follows_what_was_measured() -> None:
 
 def test_a_network_overrules_motion_where_they_contradict_each_other() -> None:
     """A wall at 10 m, which a network puts 5 % too far, and a car before it at 5 m, which moved: motion says 8 m."""
-    camera = Camera.looking(name="front", azimuth_deg=0, width_px=96, height_px=64, horizontal_fov_deg=80)
+    camera = helpers.camera(size=(64, 96))
     car = np.s_[24:44, 30:60]
     network, motion = torch.full((64, 96), 10.5), torch.full((64, 96), 10.0)
     network[car], motion[car] = 5.0, 8.0
@@ -115,9 +116,7 @@ def test_a_surface_is_added_by_its_row_alone(monkeypatch: pytest.MonkeyPatch) ->
     def ramp(scene: Scene, ground_z_m: float) -> Ramp:
         return Ramp(ground_z_m, float(scene.further["slope"][0]))
 
-    camera = Camera.looking(
-        name="front", azimuth_deg=0, elevation_deg=-10, width_px=96, height_px=64, horizontal_fov_deg=80
-    )
+    camera = helpers.camera(size=(64, 96), elevation_deg=-10)
     rig = Rig([camera])
     target = Rig([camera.shifted(z_m=0.5)])
     sample = {"images": torch.rand(1, 3, 64, 96), "rig": rig, "slope": torch.tensor([0.1])}

@@ -22,7 +22,7 @@ from arbiview_aug.scene.boxes import (
 from arbiview_aug.scene.scene import Scene
 from arbiview_aug.scene.shape_kernels import planes_of
 from arbiview_aug.scene.surface import Street
-from tests.scene.single_rays import inverse_distance, occlusion_depth, points_and_boxes, solids_ahead
+from tests.scene.single_rays import points_and_boxes, solids_ahead
 
 SIZES = {
     "car": (4.5, 1.8, 1.45),
@@ -65,10 +65,6 @@ def surface_points(planes: np.ndarray, box: np.ndarray, count: int = 400) -> np.
     return np.array([a + ray / q for a, ray, q in zip(start, rays, hits, strict=True) if q > 0])
 
 
-def test_kinds_by_size() -> None:
-    assert kinds(boxes_of(SIZES)).tolist() == list(range(len(KIND_M[0])))
-
-
 @pytest.mark.parametrize("away_m", [0.0, 5000.0])
 def test_points_in_boxes_against_the_boxes_inequalities(away_m: float) -> None:
     """Boxes of any size beside, over and far from each other: the grid that finds them repeats."""
@@ -96,32 +92,12 @@ def test_objects_lie_within_their_boxes() -> None:
         assert np.isin(within, inside).all() and len(within) > 0.1 * len(inside)
 
 
-def test_kinds_of_thin_objects_stay_apart() -> None:
-    """nuScenes' mean sizes of bicycles and motorcycles, and the longest and widest of the others."""
+def test_kinds_by_size() -> None:
+    """Also nuScenes' mean sizes of bicycles and motorcycles, and the longest and widest of the others."""
+    assert kinds(boxes_of(SIZES)).tolist() == list(range(len(KIND_M[0])))
     sizes = [(1.70, 0.60, 1.28), (2.11, 0.77, 1.47), (1.2, 1.2, 1.8), (1.1, 1.2, 1.1), (2.0, 1.2, 1.5), (3.0, 1.3, 1.5)]
     names = [list(SIZES)[kind] for kind in kinds(boxes_of({str(k): size for k, size in enumerate(sizes)}))]
     assert names == ["two-wheeler"] * 2 + ["person in a loose box", "barrier", "trailer", "car"]
-
-
-def test_people_in_loose_boxes_barriers_and_two_wheelers_leave_room() -> None:
-    """Points at half their height and at the top, by the share of the box's length and width from its middle."""
-    boxes = boxes_of(SIZES)
-    boxes[:, 6] = 0
-    for name, height, along, across, inside in (
-        ("person in a loose box", 0.0, 0.2, 0.2, True),
-        ("person in a loose box", 0.0, 0.3, 0.0, False),
-        ("person in a loose box", 0.0, 0.0, 0.3, False),
-        ("barrier", -0.45, 0.3, 0.45, True),
-        ("barrier", 0.4, 0.08, 0.45, True),
-        ("barrier", 0.4, 0.2, 0.0, False),
-        ("two-wheeler", -0.3, 0.45, 0.15, True),
-        ("two-wheeler", -0.3, 0.0, 0.25, False),
-        ("two-wheeler", 0.2, 0.1, 0.25, True),
-        ("two-wheeler", 0.3, 0.3, 0.0, False),
-    ):
-        row = list(SIZES).index(name)
-        point = boxes[row, :3] + np.array([along, across, height]) * boxes[row, 3:6]
-        assert (beside(solids(boxes)[row], point[None])[0] <= 0) == inside
 
 
 @pytest.mark.slow
@@ -211,22 +187,14 @@ def test_points_beside_an_object_are_the_background_s() -> None:
     assert len(among.street.points) == 2
 
 
-def test_faces_tell_their_object_and_whether_they_are_roofs_or_bonnets() -> None:
-    boxes = np.concatenate([CAR, boxes_of({"lorry": SIZES["lorry"]})])
+def test_parts_tell_the_sides_of_the_body_from_the_cabin_and_roofs_and_bonnets() -> None:
+    names = ("lorry", "person", "barrier", "cone")  # the last three are too small for tops of their own
+    boxes = np.concatenate([CAR, boxes_of({name: SIZES[name] for name in names})])
     surface = BoxSurface(Street(), boxes, solids(boxes))
-    assert surface.face_objects.tolist() == [0] * 12 + [1] * 12
-    assert np.flatnonzero(surface.face_is_top).tolist() == [5, 11, 17, 23]  # bonnet, roof, the lorry's roof, nothing
-    assert len(surface.before_faces(np.zeros(3))) == 24
-    small = boxes_of({name: SIZES[name] for name in ("person", "barrier", "cone")})
-    assert not BoxSurface(Street(), small, solids(small)).face_is_top.any()
-
-
-def test_parts_tell_the_sides_of_the_body_from_the_cabin_and_the_tops() -> None:
-    surface = BoxSurface(Street(), CAR, solids(CAR))
-    assert surface.face_parts.tolist() == [1, 2, 3, 4, 0, 5, 0, 0, 0, 0, 0, 5]
-    person = boxes_of({"person": SIZES["person"]})  # one colour
-    both = np.concatenate([CAR, person])
-    assert BoxSurface(Street(), both, solids(both)).face_parts[12:].tolist() == [PARTS] * 12
+    objects, parts = np.divmod(surface.face_parts.reshape(5, 12), PARTS)
+    assert (objects == np.arange(5)[:, None]).all() and len(surface.before_faces(np.zeros(3))) == 60
+    assert (parts[:2] == [1, 2, 3, 4, 0, 5, 0, 0, 0, 0, 0, 5]).all()  # body, bonnet, cabin, roof
+    assert not parts[2:].any()
 
 
 @pytest.mark.parametrize("surface", ["boxes", "lidar"])
@@ -247,26 +215,6 @@ def test_a_roof_that_no_source_saw_is_a_hole(surface: str) -> None:
     assert inner.sum() > 50 and not plan.coverage[0][inner & (faces == 11)].any()
     rear = cv2.erode((faces == 1).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     assert rear.sum() > 200 and plan.coverage[0][rear].all()
-
-
-def test_images_say_what_single_rays_say() -> None:
-    view = Camera.looking(
-        name="rolled", azimuth_deg=8, position_m=(1.0, 0.5, 2.4), width_px=320, height_px=200, horizontal_fov_deg=80
-    ).turned(pitch_deg=10, roll_deg=20)
-    wall = np.stack(np.meshgrid(32.0, np.arange(-20, 20, 0.12), np.arange(-1.0, 9.0, 0.12)), -1).reshape(-1, 3)
-    boxes = np.concatenate([CAR, [[18.0, 3.0, 1.0, 4.0, 2.0, 2.0, 0.7]]])
-    near = surface_points(solids(CAR)[0], CAR[0])
-    surface = points_and_boxes(np.concatenate([near, wall]), boxes)
-    rays, valid = view.unproject(view.pixel_grid())
-    rays, street = rays[valid], surface.street
-    off = np.abs(
-        street.image(view, pixel_rays(view))[valid] - inverse_distance(street, view.center_m, rays, camera=view)
-    )
-    assert np.quantile(off, 0.99) < 2e-5 and (off > 1e-3).mean() < 0.003
-    for coarse in (False, True):
-        before = occlusion_depth(street, view.center_m, rays, coarse=coarse, camera=view)
-        off = np.abs(street.hidden(view, pixel_rays(view), coarse=coarse)[valid] - before)
-        assert np.median(off) < 1e-5 and (off > 1e-3).mean() < 0.03
 
 
 def true_holes(rig: Rig, depth: np.ndarray, target: Rig, far: np.ndarray) -> np.ndarray:
@@ -290,23 +238,19 @@ def true_holes(rig: Rig, depth: np.ndarray, target: Rig, far: np.ndarray) -> np.
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("surface", "least"), [("boxes", (0.72, 0.60)), ("lidar", (0.80, 0.84))])
-def test_holes_are_the_true_ones(surface: str, least: tuple[float, float]) -> None:
-    """Streets of shaped cars seen from 0.7 m higher: precision and recall of holes, and hidden objects called covered.
-
-    Boxes alone know nothing of poles, trees and houses: most of what they miss is hidden by those.
-    """
+def test_holes_among_points_are_the_true_ones() -> None:
+    """Streets of shaped cars seen from 0.7 m higher: precision and recall of holes."""
     rig = demo_source_rig((128, 352))
     target, counts, hidden = rig.shifted(z_m=0.7), np.zeros(3), np.zeros(2)
     drive = SyntheticDrive(rig, num_frames=2, seed=7)
     for i in range(2):
         sample, view = drive[i], drive.render(i, target)
         scene = Scene(np.asarray(sample["boxes_3d"], np.float64)[:, :7], np.asarray(sample["points"]))
-        holes = ~np.stack(build_plan(rig, target, geometry=surface, scene=scene).coverage)
+        holes = ~np.stack(build_plan(rig, target, geometry="lidar", scene=scene).coverage)
         true = true_holes(rig, np.asarray(drive.render(i).depth_m), target, np.asarray(view.depth_m))
         counts += [(holes & true).sum(), holes.sum(), true.sum()]
         on_object = true & (np.asarray(view.instances) >= 0)
         hidden += [(on_object & ~holes).sum(), on_object.sum()]
     print(f"precision {counts[0] / counts[1]:.2f}, recall {counts[0] / counts[2]:.2f}, {hidden[0] / hidden[1]:.2f}")
-    assert counts[0] > least[0] * counts[1] and counts[0] > least[1] * counts[2]
+    assert counts[0] > 0.80 * counts[1] and counts[0] > 0.84 * counts[2]
     assert hidden[0] < 0.12 * hidden[1]

@@ -39,8 +39,12 @@ class Oracle:
         self.batches = [*getattr(self, "batches", []), len(views)]
         predictions = []
         for view in views:
-            seen = self.truth[view.image.numpy().tobytes()] * (self.assumed_px or view.focal_px) / view.focal_px
-            scale_px = view.focal_px if self.assumed_px is not None else None
+            seen = (
+                self.truth[view.image.numpy().tobytes()]
+                * (self.assumed_px or float(view.pinhole.K[0, 0]))
+                / float(view.pinhole.K[0, 0])
+            )
+            scale_px = float(view.pinhole.K[0, 0]) if self.assumed_px is not None else None
             predictions.append(Prediction(self.form(seen).astype(np.float32), self.output, scale_px))
             view.image.zero_()  # a copy: the truth knows the images by their bytes
         return predictions
@@ -158,7 +162,7 @@ def test_one_picture_with_two_focal_lengths() -> None:
 
     class OfOnePicture(Oracle):
         def predict(self, views: Sequence[View]) -> list[Prediction]:
-            return [Prediction(np.float32(0.7 * true), "depth", view.focal_px) for view in views]
+            return [Prediction(np.float32(0.7 * true), "depth", float(view.pinhole.K[0, 0])) for view in views]
 
     model = OfOnePicture({image.numpy().tobytes(): true}, lambda z: z)
     depth, fits = depth_of(model, DepthInputs(Rig([wide, tele]), [image, image]))

@@ -1,8 +1,9 @@
-"""Plane sweep: the family of surfaces, and kernels against plain loops in float64."""
+"""Plane sweep: kernels against plain loops in float64, and things on a road that two neighbours show elsewhere."""
 
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -10,6 +11,7 @@ import torch
 from arbiview_aug import Camera
 from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.scene.depth_map import motion_camera
+from arbiview_aug.temporal import plane_sweep
 from arbiview_aug.temporal.kernels import (
     INVALID,
     JUMP,
@@ -18,9 +20,9 @@ from arbiview_aug.temporal.kernels import (
     STEP,
     aggregate,
     find_least,
-    merge_costs,
 )
-from arbiview_aug.temporal.plane_sweep import NEAREST_M, WALLS, SweptImage, reduced_grey
+from arbiview_aug.temporal.motion_depth import _match
+from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, reduced_grey
 from tests import helpers
 
 SIZE = (48, 80)
@@ -36,23 +38,6 @@ def textured(size: tuple[int, int], seed: int = 0) -> np.ndarray:
 
 def swept(seen_by: Camera, seed: int = 0, ground_z_m: float = 0.0) -> SweptImage:
     return SweptImage(seen_by, textured(seen_by.size, seed), ground_z_m)
-
-
-def test_surfaces_are_the_road_and_upright_walls() -> None:
-    family = swept(camera(position_m=(1, 2, 1.5)), ground_z_m=-0.3)
-    origin = family.camera.center_m
-    for wall in (0.0, 0.1, float(WALLS[-1])):
-        q = family.inverse_distance(wall)
-        points = origin + family.directions / np.maximum(q, 1e-9)[..., None]
-        down = family.directions[..., 2] < 0
-        road = down & (-family.directions[..., 2] / 1.8 >= wall * family.horizontal)
-        np.testing.assert_allclose(points[road][:, 2], -0.3, atol=1e-5)
-        if wall:
-            radius = np.hypot(*(points[~road] - origin)[:, :2].T)
-            np.testing.assert_allclose(radius, 1 / wall, rtol=1e-5)
-        else:
-            assert not q[~down].any()
-    assert WALLS[-1] == pytest.approx(1 / NEAREST_M)
 
 
 def correlation(image: SweptImage, other: SweptImage, wall: float) -> Any:
@@ -102,12 +87,7 @@ def test_costs_are_correlations(lens: str) -> None:
         assert error.max() < 0.02 and error.mean() < 1e-3
 
 
-def test_a_neighbour_that_looks_away_sees_nothing() -> None:
-    image, other = swept(camera()), swept(camera(position_m=(0.5, 0, 1.5)).turned(yaw_deg=180))
-    assert (image.costs(other, WALLS) == INVALID).all()
-
-
-@pytest.mark.parametrize("yaw_deg", [-25.0, 25.0])
+@pytest.mark.parametrize("yaw_deg", [-25.0, 25.0, 180.0])
 def test_all_that_a_turned_neighbour_sees_is_matched(yaw_deg: float) -> None:
     """On the border of what it sees, and nowhere else, single precision may differ."""
     image, other = swept(camera()), swept(camera(position_m=(1.5, 0.3, 1.5)).turned(yaw_deg=yaw_deg))
@@ -118,24 +98,13 @@ def test_all_that_a_turned_neighbour_sees_is_matched(yaw_deg: float) -> None:
         assert ((costs[:, k] != INVALID) != inside).mean() < 2e-3
 
 
-def test_exposure_does_not_matter() -> None:
-    image, there = swept(camera()), camera(position_m=(0.5, 0, 1.5))
-    one = image.costs(SweptImage(there, image.grey, 0.0), WALLS).astype(float)
-    two = image.costs(SweptImage(there, 0.6 * image.grey + 20, 0.0), WALLS).astype(float)
-    assert np.abs(one - two).max() < 1e-2 * PER_CORRELATION
-
-
 def test_images_are_halved_to_about_400_px() -> None:
     rig = demo_source_rig((451, 1601))
     small = motion_camera(rig[0])
-    assert small.size == (112, 400)
-    image = torch.randint(0, 255, (3, 451, 1601), dtype=torch.uint8)
-    assert reduced_grey(rig[0], image).shape == small.size
-    point = rig[0].center_m + np.array([[10.0, 1.0, -0.5]])
-    big, little = rig[0].project(point).uv[0], small.project(point).uv[0]
+    assert small.size == reduced_grey(rig[0], torch.zeros(3, 451, 1601, dtype=torch.uint8)).shape == (112, 400)
+    big, little = (view.project(rig[0].center_m + np.array([10.0, 1.0, -0.5])).uv for view in (rig[0], small))
     np.testing.assert_allclose((big + 0.5) / 4 - 0.5, little, atol=1e-9)
-    assert motion_camera(demo_source_rig((96, 256))[0]).size == (96, 256)
-    assert motion_camera(demo_source_rig((256, 704))[0]).size == (128, 352)
+    assert [motion_camera(demo_source_rig(s)[0]).size for s in ((96, 256), (256, 704))] == [(96, 256), (128, 352)]
 
 
 def test_aggregation_is_semi_global_matching_along_four_paths() -> None:
@@ -162,12 +131,6 @@ def test_aggregation_is_semi_global_matching_along_four_paths() -> None:
     np.testing.assert_array_equal(aggregate(costs), total)
 
 
-def test_the_least_is_refined_by_a_parabola() -> None:
-    total = np.array([[[9, 4, 1, 2, 7], [1, 4, 5, 6, 7], [5, 5, 5, 5, 5]]], np.uint16)
-    wall, _ = find_least(total, np.float32(0.5), np.zeros((1, 3), np.float32))
-    np.testing.assert_allclose(wall, [[0.5 * 2.25, 0, 0]])
-
-
 def test_a_least_is_clear_if_no_other_wall_is_nearly_as_good() -> None:
     """Walls next to it do not count, nor those behind the road, which show the road too."""
     total = np.array([[[30, 12, 10, 12, 30, 30], [30, 12, 10, 12, 30, 12], [14, 12, 10, 12, 30, 30]]] * 2, np.uint16)
@@ -177,9 +140,79 @@ def test_a_least_is_clear_if_no_other_wall_is_nearly_as_good() -> None:
     assert clear.tolist() == [[True, False, True], [True, True, False]]
 
 
-def test_costs_of_two_sides_are_three_quarters_of_the_better() -> None:
-    one = np.array([100, 1000, INVALID, 400, INVALID], np.uint16)
-    two = np.array([1100, 200, 700, INVALID, INVALID], np.uint16)
-    out = np.empty((5, 1, 1), np.uint16)
-    merge_costs(one[:, None, None], two[:, None, None], out)
-    np.testing.assert_array_equal(out.ravel(), [350, 400, 700, 400, INVALID])
+# --- traffic that moves -----------------------------------------------------------------------------------------------
+CAMERA = helpers.camera(size=(224, 400), position_m=(0, 0, 1.5), horizontal_fov_deg=65)
+TRAVEL_M, BOARD_M, ASIDE_M = 1.2, 12.0, 2.0
+
+
+@cache
+def texture() -> Any:
+    noise = np.random.default_rng(3).uniform(0, 255, (1200, 1200)).astype(np.float32)
+    return np.clip(128 + 2.5 * (cv2.GaussianBlur(noise, (0, 0), 1.5) - 128), 0, 255)
+
+
+def painted(along_m: Any, aside_m: Any) -> Any:
+    """Grey levels of a texture of 5 cm, positions in metres."""
+    at = (np.float32(20 * along_m % 1190), np.float32((20 * aside_m + 595) % 1190))
+    return cv2.remap(texture(), *at, cv2.INTER_LINEAR)
+
+
+def photograph(ahead_m: float, board_m: float, aside_m: float, legs: bool = False) -> SweptImage:
+    """An image of a road from a camera so far ahead, and of an upright board, 2 m wide and 1.5 m high, on the road.
+
+    With ``legs``, its lower 0.6 m are two legs.
+    """
+    camera = CAMERA.moved(np.block([[np.eye(3), np.array([[ahead_m], [0], [0]])], [np.zeros((1, 3)), np.eye(1)]]))
+    rays, eye = SweptImage(camera, np.zeros(camera.size, np.float32), 0.0).directions, camera.center_m
+    road = eye + rays * (eye[2] / np.maximum(-rays[..., 2], 1e-2))[..., None]
+    far = eye + rays * ((60 - eye[0]) / np.maximum(rays[..., 0], 1e-2))[..., None]
+    board = eye + rays * ((board_m - eye[0]) / np.maximum(rays[..., 0], 1e-2))[..., None]
+    y, z = board[..., 1] - aside_m, board[..., 2]
+    asphalt, wall = 70 + painted(road[..., 0], road[..., 1]) / 5, painted(far[..., 2] / 4, far[..., 1] / 4)
+    grey = np.where(road[..., 0] < 60, asphalt, wall)
+    on = (np.abs(y) < 1) & (z > 0) & (z < 1.5) & ((z > 0.6) | (np.abs(y) > 0.6) | (not legs))
+    return SweptImage(camera, np.where(on, painted(z + 7, y + 11), grey).astype(np.float32), 0.0)
+
+
+def distances(stands: bool, by_m: tuple[float, float], legs: bool = False) -> tuple[float, float]:
+    """Median distance of the board's middle, and the largest relative error of the road's before it.
+
+    The board moves by so much, along and aside, while the camera travels ``TRAVEL_M``.
+    """
+    before, now, after = (
+        photograph(k * TRAVEL_M, BOARD_M + k * by_m[0], ASIDE_M + k * by_m[1], legs) for k in (-1, 0, 1)
+    )
+    q, valid = _match(now, [before, after], WALLS, stands=stands)
+    upper, lower = (CAMERA.project(np.array([[BOARD_M, ASIDE_M + y, z]])).uv[0] for y, z in ((0.6, 1.2), (-0.6, 0.8)))
+    part = np.s_[int(upper[1]) : int(lower[1]), int(upper[0]) : int(lower[0])]
+    road = now.road[190:, 100:300]
+    error = np.abs(q[190:, 100:300] / road - 1)[valid[190:, 100:300]].max()
+    return float(1 / np.median((q / now.horizontal)[part])), float(error)
+
+
+def test_what_stands_stays() -> None:
+    assert distances(True, (0, 0)) == distances(False, (0, 0))
+    for legs in (False, True):  # the road that is seen below a board does not make it hang
+        assert distances(True, (0, 0), legs=legs)[0] == pytest.approx(BOARD_M, rel=0.05)
+
+
+@pytest.mark.parametrize("by_m", [(-1.2, 0.0), (1.2, 0.0), (0.0, -0.8)], ids=["comes", "drives along", "crosses"])
+def test_what_moves_stands_where_its_foot_is(by_m: tuple[float, float]) -> None:
+    assert distances(False, by_m)[0] != pytest.approx(BOARD_M, rel=0.25)
+    found_m, road_error = distances(True, by_m)
+    assert found_m == pytest.approx(BOARD_M, rel=0.15) and road_error < 0.05
+
+
+@pytest.mark.parametrize("rows", [2, 3])
+def test_a_thing_in_the_uppermost_rows_stands_on_the_road_there(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = helpers.camera(size=(80, 120), elevation_deg=-35, horizontal_fov_deg=60, position_m=(0, 0, 1.6))
+    image = SweptImage(camera, np.zeros(camera.size, np.float32), 0.0)
+    thing = np.zeros(camera.size, bool)
+    thing[:rows, 40:80] = True
+    monkeypatch.setattr(plane_sweep, "_road_flow", lambda *_: None)
+    monkeypatch.setattr(plane_sweep, "_off_road", lambda *_: iter([thing]))
+    monkeypatch.setattr(plane_sweep, "_correlations", lambda *of: np.where(thing[of[-1]], 0.9, 0.1))
+    costs = np.where(thing, 0.8 * PER_CORRELATION, 0.1 * PER_CORRELATION).astype(np.float32)
+    q, valid = image.road.copy(), np.ones(camera.size, bool)
+    plane_sweep._stand_off_road(image, [image], costs, costs, q, valid)
+    assert q[0, 60] == pytest.approx(image.road[0, 60], rel=0.2)

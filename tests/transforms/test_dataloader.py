@@ -12,8 +12,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, default_collate
 
-from arbiview_aug import MixedDataset, RandomRig, RetargetedDataset, RigRetarget, SampleKeys, load_rig
-from arbiview_aug.datasets import FrameFolder, NuScenesDataset
+from arbiview_aug import MixedDataset, RandomRig, RetargetedDataset, RigRetarget, SampleKeys
 from tests.helpers import same
 
 STARTS = [(0, None), (2, "fork"), pytest.param(2, "spawn", marks=pytest.mark.slow)]  # spawned ones import torch anew
@@ -45,17 +44,6 @@ def test_workers_give_the_same_bits(workers: int, start: str | None, samples: Mo
     expected = [default_collate([dataset[k], dataset[k + 1]]) for k in range(0, len(dataset), 2)]
     assert expected[0]["images"].shape == (2, 4, 3, 30, 50)
     assert same(batches(dataset, workers, start), expected)
-
-
-@pytest.mark.slow
-def test_forked_and_spawned_workers_draw_alike(samples: ModuleType) -> None:
-    random_rig = RandomRig(samples.rig(), yaw_deg=20, height_m=0.5)
-    dataset = RetargetedDataset(samples.Frames(), RigRetarget(random_rig, p=0.7, size=samples.SIZE))
-    epochs = []
-    for start in ("fork", "spawn"):
-        torch.manual_seed(11)
-        epochs.append(batches(dataset, 2, start))
-    assert same(*epochs)
 
 
 def test_plans_built_before_the_fork_are_shared(samples: ModuleType) -> None:
@@ -143,17 +131,3 @@ def test_workers_have_a_thread_each(samples: ModuleType, start: str) -> None:
 
 
 # --- real data --------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("reader", ["frame folder", "nuscenes"])
-def test_real_frames_through_workers(nuscenes_root: Path, reader: str) -> None:
-    dataset: Any
-    if reader == "frame folder":
-        dataset = FrameFolder(nuscenes_root, reduce=4)
-    else:
-        dataset = NuScenesDataset(nuscenes_root, reduce=4)
-    retarget = RigRetarget(load_rig("nuscenes").turned(yaw_deg=11), size=(128, 352))
-    wrapped = RetargetedDataset(dataset, retarget)
-    expected = [wrapped[k] for k in range(len(wrapped))]
-    got = batches(wrapped, 2, batch_size=None)
-    assert same(got, expected)
-    assert got[0]["images"].shape == (6, 3, 128, 352) and got[0]["coverage"].float().mean() > 0.9
-    assert "points" in got[0]

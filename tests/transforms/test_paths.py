@@ -7,11 +7,9 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch.utils.data import DataLoader, default_collate
@@ -20,7 +18,6 @@ from arbiview_aug import Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, Generator
 from arbiview_aug.inpaint import CompletedLoader, Inpainter, Telea
-from arbiview_aug.inpaint.telea import telea
 from tests.generator.small import ring, small_config, stirred
 from tests.helpers import assert_same_to_a_level
 
@@ -57,53 +54,6 @@ def on(mask: torch.Tensor, images: torch.Tensor) -> torch.Tensor:
 
 
 # --- in the transform -------------------------------------------------------------------------------------------------
-def test_inpainting_fills_uncovered_pixels_only() -> None:
-    seen = RigRetarget(TARGET, holes="black")(a_sample())
-    filled = RigRetarget(TARGET, holes="telea")(a_sample())
-    holes = ~seen["coverage"]
-    assert holes.any() and torch.equal(filled["generated"], holes) and torch.equal(filled["coverage"], ~holes)
-    assert torch.equal(filled["images"][on(~holes, filled["images"])], seen["images"][on(~holes, seen["images"])])
-    for image, view, hole in zip(filled["images"], seen["images"], holes, strict=True):
-        assert torch.equal(image, telea(view, hole))
-    assert "generated" not in seen
-
-
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
-def test_a_generator_fills_uncovered_pixels_only(generator: Generator, dtype: torch.dtype) -> None:
-    sample = a_sample()
-    if dtype == torch.float32:
-        sample["images"] = sample["images"].float() / 255
-    seen = RigRetarget(TARGET)(sample)
-    retarget = RigRetarget(TARGET, holes=Diffusion(generator, steps=2))
-    filled = retarget(sample)
-    holes = ~seen["coverage"]
-    assert filled["images"].dtype == dtype and torch.equal(filled["generated"], holes)
-    assert torch.equal(filled["images"][on(~holes, filled["images"])], seen["images"][on(~holes, seen["images"])])
-    assert (filled["images"][on(holes, filled["images"])] > 0).any()
-    assert torch.equal(retarget(sample)["images"], filled["images"])
-    other = RigRetarget(TARGET, holes=Diffusion(generator, steps=2, seed=1))
-    assert not torch.equal(other(sample)["images"], filled["images"])
-    assert not torch.equal(retarget({**sample, "token": "two"})["images"], filled["images"])
-
-
-def test_covered_targets_never_call_the_generator(generator: Generator) -> None:
-    before = generator.calls
-    out = RigRetarget(SOURCE, holes=Diffusion(generator))(a_sample())
-    assert generator.calls == before and not out["generated"].any() and out["coverage"].all()
-    narrow = Rig([replace(c, K=c.K * [[2], [2], [1]]) for c in SOURCE])
-    assert RigRetarget(narrow, holes=Diffusion(generator))(a_sample())["coverage"].all()
-    assert generator.calls == before
-
-
-def test_the_own_car_stays_and_is_not_generated(generator: Generator) -> None:
-    mask = np.ones(TARGET[0].size, bool)
-    mask[-8:] = False
-    target = Rig([replace(c, mask=mask) for c in TARGET])
-    for holes in ("telea", Diffusion(generator)):
-        out = RigRetarget(target, holes=holes)(a_sample())  # type: ignore[arg-type]
-        assert out["generated"].any() and not (out["generated"] & out["ego_mask"]).any()
-
-
 def test_pixels_of_low_confidence_are_filled_too(generator: Generator) -> None:
     plain = RigRetarget(TARGET, keys=SampleKeys(extra=("confidence",)))(a_sample())
     least = float(plain["confidence"][plain["coverage"]].median())
@@ -115,25 +65,6 @@ def test_pixels_of_low_confidence_are_filled_too(generator: Generator) -> None:
     assert torch.equal(out["coverage"], ~out["generated"])
     assert (out["confidence"][out["generated"]] == 0).all()
     assert (out["source_camera"][out["generated"]] == -1).all() and (out["source_frame"][out["generated"]] == -1).all()
-
-
-def test_pixels_that_are_seen_keep_their_gradients(generator: Generator) -> None:
-    sample = a_sample()
-    images = (sample["images"].float() / 255).requires_grad_()
-    out = RigRetarget(TARGET, holes=Diffusion(generator, steps=1))({**sample, "images": images})
-    out["images"].sum().backward()
-    assert images.grad is not None and (images.grad != 0).any()
-
-
-def test_skipped_samples_collate_with_completed_ones(generator: Generator) -> None:
-    size = SOURCE.sizes[0]
-    outs = []
-    for p in (0.0, 1e-9, 1.0):
-        retarget = RigRetarget(TARGET, holes=Diffusion(generator, steps=1), p=p, size=size)
-        outs.append(retarget(a_sample()))
-    kept = ("images", "coverage", "generated")
-    batch = default_collate([{key: out[key] for key in kept} for out in outs])
-    assert not batch["generated"][0].any() and batch["generated"][2].any()
 
 
 def test_generated_pixels_are_masked_when_retargeted_again() -> None:

@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -69,14 +70,6 @@ def test_the_output(dtype: torch.dtype, execution: str) -> None:
     assert out["generated"].any() and torch.equal(out["generated"], ~out["coverage"])
 
 
-def test_every_dtype_shows_the_same() -> None:
-    source, retarget = ring(), RigRetarget(ring().turned(yaw_deg=20))
-    expected = retarget(sample_of(source))["images"].float() / 255
-    for dtype in (torch.float32, torch.float16, torch.float64, torch.bfloat16):
-        images = retarget(sample_of(source, dtype))["images"]
-        assert images.dtype == dtype and (images.float() - expected).abs().max() < 0.01
-
-
 def test_mixed_target_sizes_give_lists_unless_a_size_is_asked_for() -> None:
     base = ring()
     target = base.with_cameras([base[0].resize((18, 32)), *base.cameras[1:]])
@@ -115,14 +108,6 @@ def test_the_rig_wins_and_is_consumed() -> None:
     assert same(both["images"], expected["images"])
 
 
-def test_target_masks_become_ego_masks() -> None:
-    target = with_mask(ring())
-    out = RigRetarget(target)(sample_of(ring()))
-    assert out["ego_mask"].shape == (4, *SIZE) and out["ego_mask"].dtype == torch.bool
-    np.testing.assert_array_equal(out["ego_mask"][0], ~target[0].mask)
-    assert not out["ego_mask"][1:].any()
-
-
 @pytest.mark.parametrize("lens", ["radtan", "fisheye"])
 def test_lens_targets_and_retargeting_again(lens: str) -> None:
     source, target = ring(), with_lens(ring(), lens)
@@ -141,16 +126,6 @@ def test_lens_targets_and_retargeting_again(lens: str) -> None:
     collated = default_collate([out, out])
     again = RigRetarget(source)(collated)
     assert same(again["images"], torch.stack([back["images"]] * 2))
-
-
-def test_uncovered_pixels_stay_uncovered_when_retargeted_again() -> None:
-    source = ring().with_cameras([ring()[0]])
-    turned = source.turned(yaw_deg=40)
-    first = RigRetarget(turned)(sample_of(source))
-    assert not first["coverage"].all()
-    again = RigRetarget(turned)(first)
-    assert not (again["coverage"] & ~first["coverage"]).any()
-    assert again["coverage"].sum() > 0.8 * first["coverage"].sum()
 
 
 def test_a_batch_of_sources_with_different_lenses() -> None:
@@ -189,20 +164,6 @@ def test_other_entries_are_the_same_objects_and_the_input_stays() -> None:
     assert sample.keys() == before.keys() and all(sample[key] is before[key] for key in sample)
     assert torch.equal(sample["images"], images)
     assert list(out)[:5] == list(others)  # order kept
-
-
-def test_outputs_collate() -> None:
-    source = ring()
-    retarget = RigRetarget(
-        RandomRig(with_mask(with_lens(source)), yaw_deg=20),
-        keys=SampleKeys(labels=["classes"], extra=["source_camera"]),
-    )
-    sample = sample_of(source, token="t", classes=torch.zeros((4, *SIZE), dtype=torch.uint8))
-    batch = default_collate([retarget(sample) for _ in range(2)])
-    assert batch["images"].shape == (2, 4, 3, *SIZE) and batch["coverage"].shape == (2, 4, *SIZE)
-    assert batch["classes"].shape == (2, 4, *SIZE) and batch["ego_mask"].shape == (2, 4, *SIZE)
-    assert batch["distortion"].shape == (2, 4, 8) and batch["ground_z_m"].shape == (2,)
-    assert batch["retarget_params"]["yaw_deg"].shape == (2,) and batch["token"] == ["t", "t"]
 
 
 def test_pixel_bound_keys_are_dropped_with_one_warning() -> None:
@@ -385,20 +346,6 @@ def test_tv_tensors_are_wrapped_again() -> None:
     assert type(retarget(lists)["images"]) is tv_tensors.Image
 
 
-def test_inside_a_torchvision_pipeline() -> None:
-    tv_tensors = pytest.importorskip("torchvision.tv_tensors")
-    from torchvision.transforms import v2
-
-    source = ring()
-    sample = sample_of(source)
-    sample["images"] = tv_tensors.Image(sample["images"])
-    retarget = RigRetarget(source.turned(yaw_deg=10))
-    out = v2.Compose([retarget, v2.RandomPhotometricDistort(p=1), v2.ToDtype(torch.float32, scale=True)])(sample)
-    plain = retarget(sample)
-    assert out["images"].dtype == torch.float32 and out["images"].shape == plain["images"].shape
-    assert torch.equal(out["K"], plain["K"]) and torch.equal(out["coverage"], plain["coverage"])
-
-
 # --- batches ----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("execution", EXECUTIONS)
 @pytest.mark.parametrize("lead", [(2,), (1, 2)])
@@ -429,16 +376,6 @@ def test_leading_dimensions_equal_the_single_calls(lead: tuple[int, ...], execut
         if isinstance(value, torch.Tensor):
             assert same(out[key], value.reshape(*lead, *value.shape[1:])), key
     assert out["lens"] == [camera.lens for camera in target]
-
-
-def test_frames_of_one_calibration_go_through_torch_together() -> None:
-    source = ring()
-    retarget = RigRetarget(ring().turned(yaw_deg=10), backend="torch")
-    singles = [sample_of(source, torch.float32, seed=k) for k in range(3)]
-    out = retarget(default_collate(singles))
-    for k, single in enumerate(singles):
-        assert torch.allclose(out["images"][k], retarget(single)["images"], atol=1e-6)
-    assert len(retarget.plans) == 1 and retarget.plans.misses == 1
 
 
 def test_a_batch_of_lists() -> None:
@@ -484,6 +421,8 @@ def test_skipped_samples_collate_with_retargeted_ones(masked: str, lensed: str) 
     np.testing.assert_array_equal(skipped["cam2ego"], source.cam2ego)
     if masked != "target":
         assert not outs[0.0]["ego_mask"].any()
+    if masked == "target":
+        np.testing.assert_array_equal(outs[0.0]["ego_mask"][0], ~target.resized((18, 32))[0].mask)
     if masked == "source":
         np.testing.assert_array_equal(skipped["ego_mask"][0], ~source.resized((18, 32))[0].mask)
 
@@ -858,20 +797,18 @@ def test_explain_changes_nothing_but_the_random_state() -> None:
 
 
 # --- what surrounds a call --------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("how", ["context", "default"])
-def test_another_default_device_changes_nothing(how: str) -> None:
+def test_another_default_device_changes_nothing() -> None:
     sample = SyntheticDrive(demo_source_rig((36, 64)), num_frames=1)[0]
     expected = RigRetarget("waymo", size=(36, 64))(sample)
+    outs = []
     try:
-        if how == "default":
-            torch.set_default_device("meta")
-            rendered = RigRetarget("waymo", size=(36, 64))(sample)
-        else:
-            with torch.device("meta"):
-                rendered = RigRetarget("waymo", size=(36, 64))(sample)
+        with torch.device("meta"):
+            outs.append(RigRetarget("waymo", size=(36, 64))(sample))
+        torch.set_default_device("meta")
+        outs.append(RigRetarget("waymo", size=(36, 64))(sample))
     finally:
         torch.set_default_device(None)
-    for key in ("images", "coverage", "K", "cam2ego", "points", "boxes_3d"):
+    for rendered, key in product(outs, ("images", "coverage", "K", "cam2ego", "points", "boxes_3d")):
         assert torch.equal(rendered[key], expected[key]), key
 
 
