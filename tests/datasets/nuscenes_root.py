@@ -92,7 +92,8 @@ def recorded(street: Street, channel: str, modality: str, size: tuple[int, int])
         for n, offset_s in enumerate(EXPOSURES_S if k + 1 < street.keyframes else EXPOSURES_S[:1]):
             time_us = _us(k / 2 + offset_s + phase_s)
             kind, ending = ("samples" if n == 0 else "sweeps"), ("png" if modality == "camera" else "bin")
-            row = {"token": f"{street.name}-{channel}-{k}-{n}", "sample_token": _sample(street, k + (n > 0))}
+            token, sample = f"{street.name}-{channel}-{k}-{n}", _sample(street, k + (n > 0))
+            row: dict[str, Any] = {"token": token, "sample_token": sample}
             row |= {"timestamp": time_us, "is_key_frame": n == 0, "prev": rows[-1]["token"] if rows else "", "next": ""}
             row |= {"filename": f"{kind}/{channel}/{street.name}__{channel}__{time_us}.{ending}"}
             row |= dict(zip(("height", "width"), size if modality == "camera" else (0, 0), strict=True))
