@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from arbiview_aug.errors import GeometryWarning as GeometryWarning
     from arbiview_aug.errors import SampleError as SampleError
     from arbiview_aug.errors import SampleTypeError as SampleTypeError
-    from arbiview_aug.evaluate.report.show import show as show
+    from arbiview_aug.evaluate.report.pictures import show as show
     from arbiview_aug.favs.config import PaperConfig as PaperConfig
     from arbiview_aug.render.export import export_plan as export_plan
     from arbiview_aug.render.plan import RenderConfig as RenderConfig

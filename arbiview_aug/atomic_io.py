@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 from arbiview_aug.errors import DataError, OutputError
@@ -27,9 +27,6 @@ BROKEN_ARRAY = (
     *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
 """Errors that ``numpy.load`` raises for damaged files."""
-
-Link = Literal["hard", "copy", "symlink"]
-"""Kinds of links to kept files."""
 
 _SEPARATOR = re.compile(r"[/\\]")
 LONGEST_NAME = 255  # bytes of a name in all common file systems
@@ -43,11 +40,7 @@ _FLUSHES = 16  # files flushed in parallel: 3 ms for 16 files of 100 kB on ext4,
 
 
 def check_name(name: Any, what: str) -> None:
-    """Refuse a name, relative to a folder, that no file below it can have, without disk access.
-
-    Absolute names and ``..`` are refused, as are names that file systems cannot hold. ``what`` is the origin of the
-    name for errors: data set, table and row.
-    """
+    """Refuse a name that no file below a folder can have, absolute or with ``..``; ``what`` names its origin."""
     try:
         coded = name.encode()
         short = len(coded) <= LONGEST_NAME or max(map(len, coded.split(b"/"))) <= LONGEST_NAME
@@ -62,10 +55,7 @@ def check_name(name: Any, what: str) -> None:
 
 
 def inside(root: Path, name: Any, what: str) -> Path:
-    """The path of a file below a folder, checked by ``check_name``; it need not exist.
-
-    Links that leave the folder are refused, as are pipes, sockets and devices. The folder itself may be a link.
-    """
+    """The path of a file below a folder, which need not exist; DataError for links that leave it, pipes and devices."""
     check_name(name, what)
     path, at, mode = root / name, str(root), stat.S_IFDIR
     try:
@@ -73,7 +63,12 @@ def inside(root: Path, name: Any, what: str) -> Path:
             at = f"{at}{os.sep}{part}"
             mode = os.lstat(at).st_mode
             if stat.S_ISLNK(mode):
-                mode = _followed(root, path, name, what)
+                base, real = os.path.realpath(root), os.path.realpath(path)
+                if real != base and not real.startswith(os.path.join(base, "")):
+                    fix = "pass the folder that holds the files themselves, move them into it, or pass a copy (cp -rL)"
+                    got = f"{name}, which a link leads to {real}: links must not leave the folder; {fix}"
+                    raise DataError(f"{what}: expected a file in {root}, got {got}")
+                mode = os.stat(real).st_mode
                 break
     except (FileNotFoundError, NotADirectoryError, PermissionError):  # reported when it is opened
         return path
@@ -86,22 +81,11 @@ def inside(root: Path, name: Any, what: str) -> Path:
     return path
 
 
-def _followed(root: Path, path: Path, name: str, what: str) -> int:
-    """Mode of a path's target, which must lie below the folder."""
-    base, real = os.path.realpath(root), os.path.realpath(path)
-    if real != base and not real.startswith(os.path.join(base, "")):
-        fix = "pass the folder that holds the files themselves, move them into it, or pass a copy (cp -rL)"
-        got = f"{name}, which a link leads to {real}: links must not leave the folder; {fix}"
-        raise DataError(f"{what}: expected a file in {root}, got {got}")
-    return os.stat(real).st_mode
-
-
 def file_name(token: str) -> str:
     """A token as a file name: escaped; a long one is cut and gets a checksum."""
     name = quote(token, safe="", errors="surrogatepass")
-    if len(name) <= _LONGEST_TOKEN:
-        return name
-    return f"{name[: _LONGEST_TOKEN // 2]}-{hashlib.sha256(name.encode()).hexdigest()[:32]}"
+    digest = hashlib.sha256(name.encode()).hexdigest()[:32]
+    return name if len(name) <= _LONGEST_TOKEN else f"{name[: _LONGEST_TOKEN // 2]}-{digest}"
 
 
 @contextmanager
@@ -140,11 +124,16 @@ def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
                 parts[path] = _part(path, owner)
                 with parts[path].open("xb") as file:
                     file.write(content)
+
+        def flush(part: Path) -> None:
+            with part.open("rb") as file:
+                os.fsync(file.fileno())
+
         with ThreadPoolExecutor(_FLUSHES) as pool:
-            flushed = [(path, pool.submit(_flush, part)) for path, part in parts.items()]
-        for path, flush in flushed:
+            flushed = [(path, pool.submit(flush, part)) for path, part in parts.items()]
+        for path, is_flushed in flushed:
             with writing(path):
-                flush.result()
+                is_flushed.result()
                 os.replace(parts[path], path)
     finally:
         for part in parts.values():
@@ -172,56 +161,52 @@ def write_new(path: Path, content: bytes) -> None:
             part.unlink()
 
 
-def link_whole(source: Path, path: Path, owner: str = "", how: Link = "hard") -> None:
-    """Link a file, or copy it, also where its disk allows no such links; a source that is a link is followed.
+def link_whole(source: Path, path: Path, owner: str = "") -> None:
+    """Link a file, or copy it where its disk allows no hard links; a source that is a link is followed.
 
-    An existing file of the same content stays, unless it is of another kind: a link instead of a copy. So does the
-    source itself. FileNotFoundError without a source, DataError for one that cannot be read, OutputError for the link.
+    An existing file of the same content stays. FileNotFoundError without a source, DataError for one that cannot be
+    read, OutputError for the link.
     """
-    try:
+    with _reading(source):
         status = source.stat()
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise DataError(f"{source}: expected a file that can be read, got {error.strerror}") from None
     if not stat.S_ISREG(status.st_mode):
         raise DataError(f"{source}: expected a regular file, got none: remove its row, or put the file there")
     with suppress(OSError):  # no such file yet, or one that cannot be read
-        if path.name == source.name and path.parent.samefile(source.parent):
-            return
-        if path.samefile(source):
-            is_same = how != "copy"
-        else:
-            has_same_size = how != "symlink" and path.stat().st_size == status.st_size
-            is_same = has_same_size and checksum(path) == checksum(source)
-        if is_same and path.is_symlink() == (how == "symlink"):
+        same_size = path.stat().st_size == status.st_size
+        if path.samefile(source) or (same_size and checksum(path) == checksum(source)):
             return
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         try:
-            if how != "copy":
-                (os.symlink if how == "symlink" else os.link)(source.resolve(), path)
-                return
+            os.link(source.resolve(), path)
+            return
         except FileExistsError:  # another process was faster
             return
         except OSError as error:
             if error.errno not in _NO_LINKS:
                 raise
-    with whole_file(path, owner) as file:
-        try:
-            for block in _blocks(source):
-                with writing(path):
-                    file.write(block)
-        except OSError as error:
-            raise DataError(f"{source}: expected a file that can be read, got {error.strerror}") from None
+    with whole_file(path, owner) as file, _reading(source):
+        for block in _blocks(source):
+            with writing(path):
+                file.write(block)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn operating system errors into DataError with the file's name, but for FileNotFoundError."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DataError(f"{path}: expected a file that can be read, got {error.strerror}") from None
 
 
 def remove_parts(root: Path, owned: Callable[[str], bool]) -> None:
-    """Remove files that killed processes left half-written below a folder.
+    """Remove files that ended processes left half-written below a folder.
 
-    Those of this machine are removed if their process has ended. ``owned`` tells whether this process alone writes an
-    owner's files, also those from other machines.
+    ``owned`` tells whether this process alone writes an owner's files, also those from other machines.
     """
     for folder, _, names in os.walk(root):
         for name in names:
@@ -230,6 +215,12 @@ def remove_parts(root: Path, owned: Callable[[str], bool]) -> None:
                 owner, host, pid, _ = name.removesuffix(_PART).rpartition(".")[2].split("-")
                 if not _runs(int(pid)) if host == _host() else owner and owned(owner):
                     path.unlink(missing_ok=True)
+
+
+def remove(path: Path) -> None:
+    """Remove a file, if there is one; OutputError if it cannot be removed."""
+    with writing(path):
+        path.unlink(missing_ok=True)
 
 
 def is_part(path: Path) -> bool:
@@ -285,8 +276,3 @@ def _runs(pid: int) -> bool:
         state = Path("/proc", str(pid), "stat").read_text(errors="replace").rpartition(")")[2].split()
         return state[:1] not in (["Z"], ["X"])  # zombies have ended: not every container's init reaps them
     return True
-
-
-def _flush(part: Path) -> None:
-    with part.open("rb") as file:
-        os.fsync(file.fileno())

@@ -26,10 +26,6 @@ Reduce = Literal[1, 2, 4]
 Reference = Literal["LiDAR", "motion", "road"]
 """References that a network's depth is fitted to, the best first."""
 
-OnError = Literal["report", "skip", "fatal"]
-"""Treatments of samples that cannot be converted: ``report`` converts the others and leaves the output unfinished,
-``skip`` leaves the sample out and reports it, ``fatal`` stops."""
-
 TRAINING_PRESETS = ("paper", "inpaint", "small", "compact", "tiny")
 """Presets of all settings of a training."""
 

@@ -10,14 +10,13 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
-from functools import cache, wraps
+from contextlib import contextmanager, suppress
+from functools import cache
 from hashlib import sha256
 from importlib import import_module, metadata
 from io import BytesIO
 from numbers import Number
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 from arbiview_aug.errors import MissingPackageError, warn
@@ -38,9 +37,8 @@ def cv2_wheels() -> dict[str, str]:
     return {name: version for name in _CV2_WHEELS if (version := installed_version(name)) is not None}
 
 
-def cv2_conflict() -> str | None:
-    """Warning that several wheels provide ``cv2``, and the fix."""
-    wheels = cv2_wheels()
+def cv2_conflict(wheels: dict[str, str]) -> str | None:
+    """Warning that several wheels provide ``cv2``, and the fix; None for one."""
     if len(wheels) < 2:
         return None
     versions = " and ".join(f"{name} {version}" for name, version in wheels.items())
@@ -53,7 +51,7 @@ def cv2_conflict() -> str | None:
 @cache
 def warn_about_cv2_wheels() -> None:
     """Warn once per process if several wheels provide ``cv2``."""
-    if (conflict := cv2_conflict()) is not None:
+    if (conflict := cv2_conflict(cv2_wheels())) is not None:
         warn(conflict, RuntimeWarning)
 
 
@@ -97,8 +95,7 @@ def optional_package(name: str, extra: str | None = None) -> Any:
 def compiled(function: Any, **options: Any) -> Any:
     """Compile a function by numba at its first call, and keep the result in a cache folder where one can be written.
 
-    Division by zero gives infinity, as in numpy. Operations keep their order, so results do not depend on the number of
-    threads or processes; kinds of CPU may differ in the last bit. ``options`` are those of ``numba.njit``.
+    Division by zero gives infinity, as in numpy. Operations keep their order; kinds of CPU may differ in the last bit.
     """
     from numba import njit
 
@@ -118,8 +115,7 @@ def called(function: Any) -> Any:
 def borrowing(function: Any, *, no_cpython_wrapper: bool = True) -> Any:
     """Compile a function as ``called`` does, without counting references to arrays, which takes a fifth of the time.
 
-    It must not allocate or return an array, nor call a function that does: its caller hands it scratch.
-    Python can call it with ``no_cpython_wrapper=False``.
+    It must not allocate or return an array, nor call a function that does. Python can call it with the wrapper.
     """
     from numba.core.cpu import CPUTargetOptions
 
@@ -137,41 +133,12 @@ def inlined(function: Any) -> Any:
 @contextmanager
 def compilation_announced() -> Iterator[None]:
     """Say on stderr that kernels are compiled, where numba's cache does not hold them."""
-    compilation = _compilation()
-    with compilation.lock:
-        compilation.announcers += 1
+    announcers = _compilation().announcers
+    announcers.append(None)  # threads announce at the same time
     try:
         yield
     finally:
-        with compilation.lock:
-            compilation.announcers -= 1
-
-
-def eager_on_cpu(method: Any) -> Any:
-    """Run a method outside ``torch.compile``, with new tensors on the CPU; say where kernels are compiled."""
-
-    def run_on_cpu(*args: Any, **options: Any) -> Any:
-        torch = sys.modules["torch"]
-        if torch.utils.data.get_worker_info() is not None:
-            _one_thread_of_opencv(os.getpid())
-        # Under another default device, numbers of plans would be made there, or nowhere (meta).
-        is_cpu = torch.empty(0).device.type == "cpu"  # get_default_device of torch 2.6 misses contexts
-        with nullcontext() if is_cpu else torch.device("cpu"), compilation_announced():
-            return method(*args, **options)
-
-    @wraps(method)
-    def run(*args: Any, **options: Any) -> Any:
-        if "torch._dynamo" in sys.modules:  # importing it takes a second
-            return sys.modules["torch"].compiler.disable(run_on_cpu)(*args, **options)
-        return run_on_cpu(*args, **options)
-
-    return run
-
-
-@cache
-def _one_thread_of_opencv(process: int) -> None:
-    """Leave OpenCV one thread in a DataLoader's worker: more would fight for the cores."""
-    sys.modules["cv2"].setNumThreads(0)
+        announcers.pop()
 
 
 def is_kept(kernel: Any) -> bool:
@@ -197,8 +164,8 @@ def _compilation() -> Any:
     from numba.core import event
 
     class Compilation(event.Listener):  # type: ignore[misc]
-        seconds, announcers, lock = 0.0, 0, Lock()  # threads announce beside each other
-        depth, start_s, collects = 0, 0.0, False
+        seconds, depth, start_s, collects = 0.0, 0, 0.0, False
+        announcers: list[None] = []  # noqa: RUF012  # there is one listener
 
         def on_start(self, event: Any) -> None:
             if not self.depth and not event.data["dispatcher"].py_func.__module__.startswith("arbiview_aug."):
@@ -289,22 +256,13 @@ def is_intact(path: Path) -> bool:
         return True
     with suppress(OSError):
         path.unlink()
-    _say_damaged(path.parent)
+    print(f"arbiview_aug: the damaged kernel {path} is deleted and compiled again", file=sys.stderr)
     return False
-
-
-@cache
-def _say_damaged(folder: Path) -> None:
-    print(f"arbiview_aug: damaged kernels in {folder} are deleted and compiled anew", file=sys.stderr)
 
 
 @contextmanager
 def repeatable_opencv() -> Iterator[None]:
-    """Run OpenCV on one thread without Intel's IPP, so that the same images give the same bits.
-
-    The last bits of IPP's ``distanceTransform`` and ``magnitude`` depend on memory alignment, and SIFT's angles on
-    those (OpenCV 5.0, IPP 2026.0). IPP can only be disabled for the calling thread. The thread count is process-wide.
-    """
+    """Run OpenCV on one thread without Intel's IPP, whose last bits depend on memory alignment (OpenCV 5.0)."""
     import cv2
 
     ipp, threads = cv2.ipp.useIPP(), cv2.getNumThreads()

@@ -10,9 +10,7 @@ from contextlib import contextmanager
 from multiprocessing import parent_process
 from types import FrameType
 
-INTERRUPTED = 130
-"""Exit status of a process that Ctrl-C ended: 128 + SIGINT, as shells report it."""
-
+INTERRUPTED = 130  # 128 + SIGINT, as shells report Ctrl-C
 
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 4, 100, 100, 100
@@ -44,27 +42,19 @@ def exit_status(program: str, command: Callable[[], int | None], *, resumable: b
     Returns the command's exit status (None is 0), 2 after an error, 130 after Ctrl-C and the other signals, where a
     ``resumable`` command may be run again to go on.
     """
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    in_main = threading.current_thread() is threading.main_thread()
+    taken = [number for number in numbers if in_main and signal.getsignal(number) == signal.SIG_DFL]  # not by nohup
+    for number in taken:
+        signal.signal(number, signal.default_int_handler)
     try:
-        with _signals_as_interrupts():
-            return int(command() or 0)
+        return int(command() or 0)
     except KeyboardInterrupt:
         print(f"{program}: interrupted{'; run it again to go on' if resumable else ''}", file=sys.stderr)
         return INTERRUPTED
     except (ArbiviewError, OSError) as error:
         print(f"{program}: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return 2
-
-
-@contextmanager
-def _signals_as_interrupts() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise KeyboardInterrupt, unless someone handles or ignores them (nohup)."""
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    in_main = threading.current_thread() is threading.main_thread()
-    taken = [number for number in numbers if in_main and signal.getsignal(number) == signal.SIG_DFL]
-    for number in taken:
-        signal.signal(number, signal.default_int_handler)
-    try:
-        yield
     finally:
         for number in taken:
             signal.signal(number, signal.SIG_DFL)

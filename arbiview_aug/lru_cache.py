@@ -12,7 +12,7 @@ V = TypeVar("V")
 
 
 class LRUCache(Generic[K, V]):
-    """Thread-safe LRU cache bounded by total value size, with counts of ``hits`` and ``misses``.
+    """Thread-safe LRU cache bounded by total value size, with a count of ``misses``.
 
     The last value always stays. Threads that miss the same key at once each make the value and all get the first one.
     Pickles as empty. ``size`` of one value is picklable; None counts values. Values may grow: all sizes are read again
@@ -20,8 +20,7 @@ class LRUCache(Generic[K, V]):
     """
 
     def __init__(self, limit: int, size: Callable[[V], int] | None = None) -> None:
-        self.limit, self.hits, self.misses = limit, 0, 0
-        self._size = size or _one
+        self.limit, self.misses, self._size = limit, 0, size or _one
         self._values: OrderedDict[K, V] = OrderedDict()
         self._lock = threading.Lock()
         self._total = self._next_count = 0
@@ -29,7 +28,6 @@ class LRUCache(Generic[K, V]):
     def get(self, key: K, make: Callable[[], V]) -> V:
         with self._lock:
             if key in self._values:
-                self.hits += 1
                 self._values.move_to_end(key)
                 return self._values[key]
             self.misses += 1

@@ -109,15 +109,6 @@ def fisheye_root(data_root: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def judges_root(data_root: Path) -> Path:
-    """A detector and a segmenter that were trained on photographs; skipped where they are missing."""
-    root = data_root.parent / "judges"
-    if not root.is_dir():
-        pytest.skip(f"no judges {root}: their folder lies beside the data folder")
-    return root
-
-
-@pytest.fixture(scope="session")
 def referee(data_root: Path) -> ModuleType:
     """The evaluation protocol, which ``evaluate`` must agree with; the test is skipped where it is missing."""
     path = data_root.parent / "referee.py"

@@ -50,18 +50,12 @@ def test_long_names_are_written(tmp_path: Path, name: str) -> None:
     assert names(tmp_path) == [name] and (tmp_path / name).read_bytes() == b"2"
 
 
-@pytest.mark.parametrize("how", ["hard", "copy", "symlink"])
-def test_a_file_linked_to_itself_stays(tmp_path: Path, how: atomic_io.Link) -> None:
+def test_a_file_linked_to_itself_stays(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"only")
     (tmp_path / "folder").symlink_to(tmp_path)
     for path in (tmp_path / "a", tmp_path / "folder" / "a"):
-        link_whole(tmp_path / "a", path, how=how)
+        link_whole(tmp_path / "a", path)
         assert (tmp_path / "a").read_bytes() == b"only" and not (tmp_path / "a").is_symlink()
-
-
-def test_what_is_written_is_there(tmp_path: Path) -> None:
-    write_whole({tmp_path / "deep" / "a": b"1", tmp_path / "b": b"2"}, owner="7")
-    assert (tmp_path / "deep" / "a").read_bytes() == b"1" and names(tmp_path) == ["a", "b"]
 
 
 @pytest.mark.parametrize("code", ["EXDEV", "ENOSYS", "EOPNOTSUPP"])
@@ -78,13 +72,11 @@ def test_links_and_copies(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
     link_whole(tmp_path / "a", tmp_path / "c")
     assert (tmp_path / "c").read_bytes() == b"points" and not (tmp_path / "c").samefile(tmp_path / "a")
     (tmp_path / "a").write_bytes(b"other!")  # of the same size
-    for how in ("hard", "copy"):
-        link_whole(tmp_path / "a", tmp_path / "c", how=how)
-        assert (tmp_path / "c").read_bytes() == b"other!"
-        kept = (tmp_path / "c").stat().st_ino
-        link_whole(tmp_path / "a", tmp_path / "c", how=how)
-        assert (tmp_path / "c").stat().st_ino == kept
-        (tmp_path / "c").write_bytes(b"points")
+    link_whole(tmp_path / "a", tmp_path / "c")
+    assert (tmp_path / "c").read_bytes() == b"other!"
+    kept = (tmp_path / "c").stat().st_ino
+    link_whole(tmp_path / "a", tmp_path / "c")
+    assert (tmp_path / "c").stat().st_ino == kept
     with pytest.raises(FileNotFoundError):
         link_whole(tmp_path / "nothing", tmp_path / "d")
     assert names(tmp_path) == ["a", "b", "c"]
@@ -94,23 +86,7 @@ def test_links_and_copies(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(atomic_io, "_blocks", broken)  # not the disk that is written to
     with pytest.raises(DataError, match="a: expected a file that can be read, got Input/output error"):
-        link_whole(tmp_path / "a", tmp_path / "d", how="copy")
-
-
-@pytest.mark.parametrize("code", [0, atomic_io.errno.EPERM])
-def test_a_file_that_is_there_stays(code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two processes that write it at once: one of them; where there are no hard links, the last one."""
-    link = os.link
-
-    def beaten(part: Path, path: Path) -> None:
-        path.write_bytes(b"another's")
-        if code:
-            raise OSError(code, os.strerror(code))
-        link(part, path)
-
-    monkeypatch.setattr(os, "link", beaten)
-    atomic_io.write_new(tmp_path / "new" / "a", b"mine")
-    assert (tmp_path / "new" / "a").read_bytes() == (b"mine" if code else b"another's") and names(tmp_path) == ["a"]
+        link_whole(tmp_path / "a", tmp_path / "d")
 
 
 def test_only_what_nobody_writes_is_removed(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import re
 import runpy
@@ -23,12 +22,11 @@ from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import shipped_rigs
 from arbiview_aug.choices import GeometryName, Quality
-from arbiview_aug.cli.bench import pareto
+from arbiview_aug.cli import bench
 from arbiview_aug.datasets import registry
 from arbiview_aug.errors import MissingPackageError
 from arbiview_aug.generator.training import command as train_command
 from arbiview_aug.render.requirements import HELPFUL_DATA, STATIC_HARM
-from integrations.benchmarks.paper import REAL_FRAMES, SETS, SYNTHETIC, Study, paper_report, study_methods
 from tests.generator.training.small import frames as drawn_frames
 from tests.generator.training.test_command import SMALLER
 from tests.helpers import saved_depth_model
@@ -107,21 +105,10 @@ def prose(page: Path) -> str:
     return re.sub(r"^```.*?^```", "", text_of(page), flags=re.DOTALL | re.MULTILINE)
 
 
-def measured(mark: str) -> str:
-    """The text between two marks."""
-    (text,) = re.findall(rf"<!-- {mark}\b.*?-->\n(.*?)<!-- /{mark} -->", BENCHMARKS, re.DOTALL)
-    return text
-
-
 def tables(markdown: str) -> list[list[list[str]]]:
     """The cells of each table, row by row."""
     parts = re.findall(r"(?:^\|.*\n?)+", markdown, re.MULTILINE)
     return [[[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()] for table in parts]
-
-
-def words(markdown: str) -> list[str]:
-    """The paragraphs that are no tables."""
-    return [part.strip() for part in markdown.split("\n\n") if part.strip() and not part.lstrip().startswith("|")]
 
 
 def anchors(page: Path) -> set[str]:
@@ -250,30 +237,10 @@ def test_the_trade_is_the_commands() -> None:
     (block,) = re.findall(r"<!-- pareto -->\n(.*?)<!-- /pareto -->", BENCHMARKS, re.DOTALL)
     (table,) = re.findall(r"((?:^\|.*\n)+)", block, re.MULTILINE)
     head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
-    assert head == ["", "", *(heading for heading, _ in pareto.COLUMNS)]
-    known = {setting.name for setting in pareto.settings(["infinity", "ground", "street", "lidar"])}
+    assert head == ["", "", *(heading for heading, _ in bench.COLUMNS)]
+    known = {setting.name for setting in bench.settings(["infinity", "ground", "street", "lidar"])}
     assert {name for name, *_ in rows} <= known and sum(mark == "front" for _, mark, *_ in rows) >= 3
-    assert pareto.NOTES in block and f"Better: {HELPFUL_DATA}.\n" in block
-
-
-def test_the_papers_tables_are_the_commands() -> None:
-    """``integrations.benchmarks.paper``: headings, methods, the paper's own numbers and the words between."""
-    metrics = ("raw_psnr_db", "raw_ssim", "raw_mae", "raw_rmse")
-    real = dict.fromkeys((*metrics, "even_psnr_db"), 1.0)
-    true = dict.fromkeys((*metrics, "true_psnr_db", "true_covered_psnr_db"), 1.0)
-    of_sets = {**dict.fromkeys(REAL_FRAMES, real), SYNTHETIC: true}
-    study = Study({of: {m.name: dict.fromkeys(SETS, row) for m in study_methods()} for of, row in of_sets.items()})
-    for shown, printed in zip(tables(measured("paper")), tables(paper_report(study)), strict=True):
-        assert shown[0] == printed[0]
-        by_method = {cells[0]: cells for cells in shown}
-        for wanted in printed[2:]:
-            cells = by_method[wanted[0]]
-            assert len(cells) == len(wanted)
-            assert all(re.fullmatch(r"-|[\d.]+( / [\d.]+)?", cell) for cell in cells[1:])
-            assert [c == "-" for c in cells] == [w == "-" for w in wanted]
-        if "published" in printed[0][1]:
-            assert all(by_method[row[0]][:5] == row[:5] for row in printed[2:])
-    assert set(words(paper_report(study))) <= set(words(measured("paper")))
+    assert bench.NOTES in block and f"Better: {HELPFUL_DATA}.\n" in block
 
 
 def test_the_detectors_numbers_are_the_reports() -> None:
@@ -372,18 +339,38 @@ def test_names_are_complete() -> None:
             assert f"`{name}`" in text_of(ROOT / "docs" / page)
 
 
-def test_the_site_hook_parses_and_knows_its_files() -> None:
-    (patterns,) = (
-        ast.literal_eval(node.value)
-        for node in ast.parse((ROOT / "docs" / "site_hook.py").read_text()).body
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "BESIDE_CODE"
-    )
-    assert all(list(ROOT.glob(pattern)) for pattern in patterns)
+README = (ROOT / "README.md").read_text()
 
 
-def test_the_citation_is_complete() -> None:
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
-    paper = citation["preferred-citation"]
-    authors = ", ".join(f"{author['given-names']} {author['family-names']}" for author in paper["authors"])
-    readme = text_of(ROOT / "README.md")
-    assert authors in readme and paper["title"] in readme
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+
+
+def test_the_readmes_code_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    (code,) = blocks("python")
+    sample = re.sub(r"^import .*|^from .*|^$", "", code, flags=re.MULTILINE)
+    assert len([line for line in sample.splitlines() if line.strip()]) <= 10
+    exec(compile(code, "README.md", "exec"), {})
+    printed = capsys.readouterr().out
+    assert "[5, 3, 256, 704]" in printed and "[5, 3, 3]" in printed
+    assert re.search(r"\b9\d%|100% seen by a camera", printed)
+
+
+def test_install_lines() -> None:
+    small, demo, tests = blocks("bash")[:3]
+    venv = "python -m venv .venv && .venv/bin/"
+    assert small == f"{venv}pip install torch torchvision --index-url https://download.pytorch.org/whl/cpu\n"
+    assert demo == f"{venv}pip install . && .venv/bin/python -m arbiview_aug demo\n"
+    assert tests == f"{venv}pip install -e '.[dev]' && .venv/bin/python -m pytest -n 2\n"
+
+
+def test_one_version_everywhere() -> None:
+    (cited,) = re.findall(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    newest, *older = re.findall(r"^## (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert cited == newest == arbiview_aug.__version__ and older == ["0.3.0", "0.2.0", "0.1.0"]
+
+
+def test_the_sdist_holds_what_its_tests_read() -> None:
+    """By MANIFEST.in; built and installed before a release (docs/contributing.md)."""
+    manifest = (ROOT / "MANIFEST.in").read_text().split()
+    assert {"tests", "integrations", "docs", ".ci", "mkdocs.yml", "CHANGELOG.md", "CITATION.cff"} <= set(manifest)

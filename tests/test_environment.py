@@ -54,7 +54,7 @@ def test_damaged_kernels_are_compiled_anew(
     path.write_bytes(DAMAGE[how](path.read_bytes()))
     capsys.readouterr()
     assert kernel()(4) == 8
-    words = f"arbiview_aug: damaged kernels in {path.parent} are deleted and compiled anew\n"
+    words = f"arbiview_aug: the damaged kernel {path} is deleted and compiled again\n"
     assert capsys.readouterr().err == words
     third = kernel()
     assert third(5) == 10 and sum(third.stats.cache_hits.values()) == 1
@@ -125,18 +125,6 @@ def test_compiling_is_announced_and_not_timed(kernel: Callable[[], Any], capsys:
     with compilation_announced():
         assert kernel()(3) == 6
     assert capsys.readouterr().err == ""
-
-
-def test_threads_announce_beside_each_other(kernel: Callable[[], Any], capsys: pytest.CaptureFixture[str]) -> None:
-    environment.say_compiling.cache_clear()
-    one, two = compilation_announced(), compilation_announced()
-    one.__enter__()
-    two.__enter__()
-    one.__exit__(None, None, None)
-    two.__exit__(None, None, None)
-    with compilation_announced():
-        assert kernel()(3) == 6
-    assert "compiling kernels" in capsys.readouterr().err
 
 
 def test_processes_that_save_a_kernel_at_the_same_time_do_not_mix_its_versions(

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -54,13 +53,6 @@ def street() -> dict[str, Any]:
     return sample
 
 
-def real(folder: str | Path) -> dict[str, Any]:
-    """A real frame at half size."""
-    from arbiview_aug.datasets import FrameFolder
-
-    return FrameFolder(folder, reduce=2)[0]
-
-
 def in_another_process(seed: int, *arguments: str) -> list[str]:
     """The digests by this file as a program, on memory that holds other rubbish (glibc) and on other threads."""
     environment = {
@@ -84,24 +76,11 @@ def test_opencv_is_left_as_it_was() -> None:
     assert (cv2.getNumThreads(), cv2.ipp.useIPP()) == before
 
 
-def test_tests_run_on_the_threads_of_their_environment() -> None:
-    """``conftest.py`` sets them before anything reads them, in the processes of ``-n`` too."""
-    assert torch.get_num_threads() == int(os.environ["OMP_NUM_THREADS"])
-    assert cv2.getNumThreads() == int(os.environ["OPENCV_FOR_THREADS_NUM"])
-
-
 @pytest.mark.slow
 def test_a_street_in_two_processes() -> None:
     one, two = (in_another_process(seed) for seed in (1, 2))
     assert one == two and len(set(one)) == 2 * len(SETTINGS)
 
 
-@pytest.mark.slow
-def test_a_real_frame_here_and_there(ddad_root: Path) -> None:
-    here = digests(real(ddad_root), repeats=2)
-    assert all(len(line.split()) == 3 for line in here), "in one process"
-    assert in_another_process(2, str(ddad_root)) == here
-
-
 if __name__ == "__main__":
-    print("\n".join(digests(real(sys.argv[1]) if len(sys.argv) > 1 else street())))
+    print("\n".join(digests(street())))

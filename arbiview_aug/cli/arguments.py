@@ -10,14 +10,16 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
 from tqdm import tqdm
 
 from arbiview_aug.atomic_io import LONGEST_NAME
+from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import GeometryName, Holes, Quality, Reduce
+from arbiview_aug.choices import TRAINING_PRESETS, GeometryName, Holes, Quality, Reduce, Reference
 from arbiview_aug.datasets.registry import READERS, kinds_of, split_kind
 from arbiview_aug.errors import DataError, shown
 
@@ -90,35 +92,31 @@ def reading(arguments: argparse.Namespace) -> dict[str, Any]:
     return {name: getattr(arguments, name) for name in names if hasattr(arguments, name)}
 
 
-def count(text: str) -> int:
-    """Integer above 0."""
-    return _integer(text, 1, "above 0")
-
-
 def chosen_frames(asked: int, count_of: int) -> list[int]:
     """Indices of the frames that ``--frames`` asks for, spread over all ``count_of``."""
     number = min(asked, count_of)
     return [k * count_of // number for k in range(number)]
 
 
-def seed(text: str) -> int:
+def seed(text: str, least: int = 0) -> int:
     """Integer from 0."""
-    return _integer(text, 0, "from 0")
-
-
-def _integer(text: str, least: int, expected: str) -> int:
     value = int(text)
     if not least <= value <= 1 << 60:
-        raise argparse.ArgumentTypeError(f"expected a whole number {expected}, at most 2**60, got {text!r}")
+        raise argparse.ArgumentTypeError(f"expected a whole number from {least}, at most 2**60, got {text!r}")
     return value
+
+
+def count(text: str) -> int:
+    """Integer from 1."""
+    return seed(text, 1)
 
 
 def size(text: str) -> tuple[int, int]:
     """Height and width from ``256x704``."""
-    height, _, width = text.partition("x")
-    if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+    found = re.fullmatch(r"0*([1-9]\d*)x0*([1-9]\d*)", text, re.ASCII)
+    if found is None:
         raise argparse.ArgumentTypeError(f"expected HEIGHTxWIDTH such as 256x704, got {text!r}")
-    return int(height), int(width)
+    return int(found[1]), int(found[2])
 
 
 def pair(text: str) -> tuple[str, str]:
@@ -129,10 +127,12 @@ def pair(text: str) -> tuple[str, str]:
     return old, new
 
 
+@cache
 def options() -> dict[str, dict[str, Any]]:
-    """Options that several commands have, as argparse takes them."""
+    """Options of the commands, as argparse takes them: type or choices, metavar, default, text."""
     default_target = f"(default: a higher five-camera rig; of real frames, {REAL_TARGET})"
-    known: dict[str, dict[str, Any]] = {"--downscale": {"dest": "reduce", "type": int, "choices": get_args(Reduce)}}
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    references, known = get_args(Reference), dict[str, dict[str, Any]]()
     for flag, kind, metavar, default, text in (
         ("--data", data, "[KIND:]PATH", None, f"real frames, by their path alone or with their kind. {kinds_text()}"),
         ("--target", path, "RIG", None, f"rig to render: {', '.join(shipped_rigs())}, or a file {default_target}"),
@@ -145,28 +145,59 @@ def options() -> dict[str, dict[str, Any]]:
         ("--frames", count, "N", 1, "number of frames"),
         ("--seed", seed, "N", 0, "seed of the synthetic streets"),
         ("--size", size, "HxW", None, "cut the target to this height and width (default: its own; synthetic: 256x704)"),
-        ("--downscale", int, None, 1, "decode images at 1/N of their size"),
+        ("--downscale", get_args(Reduce), None, 1, "decode images at 1/N of their size"),
+        ("--clean-masks", None, None, False, "clean specks from frame folders' masks, mask fisheyes' dark rims"),
         ("--lidar-channel", path, "NAME", None, "nuScenes: the LiDAR to read (default: LIDAR_TOP, or the only one)"),
         ("--lidar-columns", str, "NAME", None, "nuScenes: columns of LiDAR files without a header (docs/formats.md)"),
+        ("--workers", count, "N", cores, "processes or actors (default: one a core)"),
+        # convert
+        ("--version", path, "NAME", None, "nuScenes' folder of tables (default: v1.0-mini, -trainval)"),
+        ("--names", pair, "OLD=NEW", [], "new names of the target's cameras, such as ring_front_center=CAM_FRONT"),
+        ("--fit", get_args(Fit), None, "crop", "with --size: cut top and sides (default), pad in black, or stretch"),
+        (
+            "--points",
+            ("target", "source"),
+            None,
+            "target",
+            "by the target's scanners, if any (default), or as recorded",
+        ),
+        ("--neighbours", seed, "N", 0, "let N frames of the drive before and after each fill holes (default: none)"),
+        ("--depth", path, "DIR", None, "what the depth command wrote (default: its folder in the data; auto: none)"),
+        ("--images", ("jpg", "png"), None, "jpg", "jpg: quality 96, 4:4:4; png: lossless"),
+        ("--shard-index", seed, "I", 0, "this shard, from 0"),
+        ("--num-shards", count, "N", 1, "number of shards"),
+        ("--runner", ("local", "ray"), None, "local", "processes here, or Ray actors"),
+        ("--on-error", ("report", "skip"), None, "report", "bad samples: do not finish (default), or leave them out"),
+        ("--report", seed, "N", 0, "frames to score and show in conversion/report.html of the output (default: 0)"),
+        # demo, depth, evaluate, train
+        ("--width", count, "PX", 1800, "width of the contact sheet"),
+        ("--model", path, "ID_OR_PATH", None, "depth model of transformers: a folder, or a name on its Hub"),
+        ("--batch", count, "N", 8, "images that the model sees at once"),
+        ("--reference", references, None, [*references], "what a model's depth is fitted to, the first that there is"),
+        ("--displaced", None, None, False, "score by photographs: the frames' `truth` camera, else the next frame"),
+        ("--lidar", None, None, False, "score scanned points by the next frame's scan (docs/lidar.md)"),
+        ("--detector", path, "MODEL", None, "FILE.py:function (docs/benchmarks.md): AP and recall of its boxes"),
+        ("--segmenter", path, "MODEL", None, "FILE.py:function (docs/benchmarks.md): IoU of its masks"),
+        ("--config", TRAINING_PRESETS, None, "tiny", "preset of all settings"),
+        ("--set", str, "KEY=VALUE", [], "a setting, such as steps=100 or loss.geo=0"),
+        ("--weights", path, "DIR", None, "config paper or inpaint: Stable Diffusion 1.5, or its inpainting model"),
+        ("--vgg-weights", path, "FILE", None, "torchvision's vgg16 weights (default: cache or download)"),
+        ("--quiet", None, None, False, "no progress bars"),
     ):
         typed = {"choices": kind} if isinstance(kind, tuple) else {"type": kind, "metavar": metavar}
-        known[flag] = {**typed, "default": default, "help": text, **known.get(flag, {})}
-    known["--lidar-columns"]["nargs"] = "+"
-    text = "take specks out of frame folders' masks, and mask the dark rims of fisheye images without a mask"
-    return known | {"--clean-masks": {"action": "store_true", "help": text}}
+        known[flag] = {"default": default, "help": text, **({"action": "store_true"} if kind is None else typed)}
+    for flag in ("--lidar-columns", "--names", "--reference"):
+        known[flag]["nargs"] = "+"
+    known["--set"]["action"] = "append"
+    known["--downscale"] |= {"dest": "reduce", "type": int}
+    known["--depth"]["dest"] = "motion_depth"
+    return known
 
 
 def add_options(parser: argparse.ArgumentParser, *flags: str, without: str = "", **changes: Any) -> None:
-    """Add shared options; ``changes`` replace what ``options`` says of them.
-
-    Args:
-        parser: The command's parser.
-        flags: Names in ``options``.
-        without: What is used without the option, for its text.
-        changes: As argparse takes them.
-    """
+    """Add options; ``changes`` replace what ``options`` says of them, ``without`` tells their default."""
     for flag in flags:
-        option = {**options()[flag], **changes}
+        option = {**options().get(flag, {}), **changes}
         option["help"] += f" (default: {without})" if without else ""
         if option.get("required"):
             option["help"] = option["help"].partition(" (default")[0]
@@ -193,8 +224,7 @@ def writable_folder(path: Path, asked: str) -> Path:
     return path
 
 
-PICTURES = ".png", ".jpg", ".jpeg"
-"""Endings of pictures that commands write."""
+PICTURES = ".png", ".jpg", ".jpeg"  # endings of pictures that commands write
 
 
 def output_file(asked: str, endings: Sequence[str] = ()) -> Path:
@@ -210,10 +240,7 @@ def output_file(asked: str, endings: Sequence[str] = ()) -> Path:
 
 @contextmanager
 def gathered_warnings(lines: list[str]) -> Iterator[None]:
-    """Collect warnings in ``lines``, as ``told_once`` tells them, instead of printing them across a progress bar.
-
-    What libraries deprecate is left out, as Python does.
-    """
+    """Collect warnings but for deprecations in ``lines``, as ``told_once`` tells them."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -231,11 +258,7 @@ def told_once(texts: Iterable[str]) -> list[str]:
 
 @contextmanager
 def named_steps(notes: list[str], frames: int = 1) -> Iterator[Callable[[str, int], None]]:
-    """Show a progress bar and collect warnings in ``notes``.
-
-    Yields:
-        A function to call before each step, with its name and the number of steps of each of the ``frames``.
-    """
+    """Collect warnings in ``notes``; yields a function to call before each step with its name and steps a frame."""
     with gathered_warnings(notes), tqdm(unit="step", leave=False) as bar:
 
         def tick(name: str, steps: int) -> None:

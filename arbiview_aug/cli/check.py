@@ -12,7 +12,7 @@ import numpy as np
 from arbiview_aug.atomic_io import file_name
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import load_rig
-from arbiview_aug.cli.arguments import data, gathered_warnings, is_rig, reading, writable_folder
+from arbiview_aug.cli.arguments import chosen_frames, data, gathered_warnings, is_rig, reading, writable_folder
 from arbiview_aug.datasets.registry import open_data
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.report.pictures import draw_labels, save_picture
@@ -34,8 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     notes: list[str] = []
     with gathered_warnings(notes):
         samples = open_data(data(arguments.data), **reading(arguments))
-        count = min(arguments.frames, len(samples))
-        chosen = np.unique(np.linspace(0, len(samples) - 1, count).round().astype(int)).tolist()
+        chosen = chosen_frames(arguments.frames, len(samples))
         lines: dict[tuple[str, str], list[str]] = {}
         frames: list[Frame] = []
         errors: dict[tuple[str, str], list[FloatArray]] = {}

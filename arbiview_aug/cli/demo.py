@@ -13,13 +13,13 @@ from typing import Any
 import cv2
 
 from arbiview_aug.cameras.rig import load_rig
-from arbiview_aug.choices import GeometryName, Holes, Quality
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.arguments import PICTURES, frames_text, gathered_warnings, writable_folder
 from arbiview_aug.cli.evaluate import measured, open_frames
 from arbiview_aug.cli.parsers import SIZE
 from arbiview_aug.environment import working_s
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.methods import Method, retargeting, views_of
+from arbiview_aug.evaluate.methods import retargeting, views_of
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.tables import evaluation_table, text_table
 from arbiview_aug.sample.inputs import read_frames
@@ -47,12 +47,17 @@ def run(arguments: argparse.Namespace) -> None:
     with compiling("objects", "plans", *(() if arguments.data is None else ("points",))):
         sample = data[0]
         read_frames(sample, None, arguments.geometry)  # refuses what the sample lacks before any work
-    methods = _compared(arguments.quality, arguments.geometry, arguments.holes)
+    quality, geometry, holes = arguments.quality, arguments.geometry, arguments.holes
+    is_paper, filled = quality == "paper", {"telea": "inpainted", "diffusion": "generated"}.get(holes)
+    chosen = "paper" if is_paper else geometry
+    others = [retargeting("fast" if is_paper else quality, name, name) for name in _COMPARED if name != chosen]
+    methods = [retargeting(quality, geometry, chosen), *others]
+    methods += [] if filled is None else [retargeting(quality, geometry, f"{chosen}, {filled}", holes=holes)]
     notes: list[str] = []
     done = measured(arguments, data, methods, notes)
     target = done.target
     with gathered_warnings(notes):
-        retarget = RigRetarget(target, quality=arguments.quality, geometry=arguments.geometry, holes=arguments.holes)
+        retarget = RigRetarget(target, quality=quality, geometry=geometry, holes=holes)
         same_ms, other_ms = timed(retarget, sample)
         views, explained = views_of(retarget(sample)), retarget.explain(sample)
     for note in dict.fromkeys(notes):
@@ -63,11 +68,10 @@ def run(arguments: argparse.Namespace) -> None:
     count_of = frames_text(min(arguments.frames, len(data)))
     print(text_table(f"{title} ({len(target)} cameras, {count_of})", rows, columns, table_notes))
     planned = f"{other_ms:.1f} ms with another calibration or other boxes, whose plan is new."
-    if arguments.quality == "paper":
-        planned = "nothing can be planned ahead."
+    planned = "nothing can be planned ahead." if is_paper else planned
     print(
         f"\n{same_ms:.1f} ms a frame: {len(source)} source images to {len(target)} views of "
-        f"{target[0].height_px}x{target[0].width_px}, quality {arguments.quality}, {cv2.getNumThreads()} threads; "
+        f"{target[0].height_px}x{target[0].width_px}, quality {quality}, {cv2.getNumThreads()} threads; "
         f"{planned}"
     )
     images, truth = as_arrays(sample["images"]), done.first.true_images(target)
@@ -86,12 +90,3 @@ def timed(retarget: Callable[[Mapping[str, Any]], Any], sample: Mapping[str, Any
         ms.append((held, planned))
     held_ms, planned_ms = (statistics.median(times) for times in zip(*ms[1:], strict=True))  # the first has other work
     return held_ms, planned_ms
-
-
-def _compared(quality: Quality, geometry: GeometryName, holes: Holes) -> list[Method]:
-    """The chosen settings with black holes, other geometries, and the chosen fill of the holes."""
-    chosen = "paper" if quality == "paper" else geometry
-    name = {"telea": "inpainted", "diffusion": "generated"}.get(holes)
-    filled = [] if name is None else [retargeting(quality, geometry, f"{chosen}, {name}", holes=holes)]
-    others = [retargeting("fast" if quality == "paper" else quality, s, s) for s in _COMPARED if s != chosen]
-    return [retargeting(quality, geometry, chosen), *others, *filled]

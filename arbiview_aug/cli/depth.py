@@ -12,8 +12,8 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from statistics import median
-from typing import Any, NamedTuple, get_args
+from statistics import mean, median
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -39,12 +39,10 @@ class Done(NamedTuple):
     """Result of a frame."""
 
     token: str
-    density: float  # share of pixels with known distance; 0 if depth was declined
-    message: str  # how depth was found, or why not
-    failed: bool = False  # whether the frame could not be read
-    existed: bool = False  # whether its file existed before
+    state: Literal["made", "kept", "failed", "stopped"]  # kept: made by an earlier run; stopped: so will the others be
+    message: str = ""  # how depth was found, or why not
+    density: float = 0.0  # share of pixels with known distance; 0 if depth was declined
     fits: Sequence[CameraFit] = ()  # of a network's depth
-    is_last: bool = False  # whether the other frames would fail alike
 
 
 class _Loaded(NamedTuple):
@@ -69,9 +67,9 @@ class _Frames(Dataset[Any]):
         try:
             return self.work(token, self.data[index])
         except OutputError as error:  # a full disk
-            return Done(token, 0.0, str(error), failed=True, is_last=True)
-        except Exception as error:  # the other frames go on
-            return Done(token, 0.0, described(error), failed=True)
+            return Done(token, "stopped", str(error))
+        except Exception as error:  # the other frames are not affected
+            return Done(token, "failed", described(error))
 
 
 def _from_motion(depths: DepthFolder, token: str, sample: dict[str, Any]) -> Done:
@@ -81,7 +79,7 @@ def _from_motion(depths: DepthFolder, token: str, sample: dict[str, Any]) -> Don
     used = [neighbour.name for neighbour in frame.neighbours or ()]
     known = depths.find(token, sample["rig"], used)
     if known is not None:
-        return Done(token, known.density, "", existed=True)
+        return Done(token, "kept", density=known.density)
     boxes = None if sample.get("boxes_3d") is None else sample["boxes_3d"].numpy().astype(float)
 
     def load(neighbour: Neighbour) -> Sequence[torch.Tensor] | None:
@@ -92,7 +90,7 @@ def _from_motion(depths: DepthFolder, token: str, sample: dict[str, Any]) -> Don
 
     depth = motion_depth(frame.rig, frame.images, frame.neighbours or (), boxes, load)
     depths.write(token, sample["rig"], depth, used)
-    return Done(token, depth.density, str(depth))
+    return Done(token, "made", str(depth), depth.density)
 
 
 def _for_network(
@@ -119,7 +117,7 @@ def _for_network(
     origin = [*model, *used, *(["road"] if "road" in wanted else [])]
     there = depths.find(token, sample["rig"], origin, "learned")
     if there is not None:
-        return Done(token, there.density, "", existed=True)
+        return Done(token, "kept", density=there.density)
     return _Loaded(token, DepthInputs(frame.rig, frame.images, points, from_motion, scene.boxes), origin)
 
 
@@ -135,19 +133,39 @@ def run(arguments: argparse.Namespace) -> int:
         depths = DepthFolder(writable_folder(folder, str(folder)))
         remove_parts(folder, lambda owner: False)
         if model is not None:
-            done = list(_learned(model, data, depths, DepthFolder(inside(root, FOLDER, "depth")), arguments))
+            steps = _learned(model, data, depths, DepthFolder(inside(root, FOLDER, "depth")), arguments)
         else:
             with compilation_announced():
                 warm_up()  # here, once, and not in every worker
-            frames = _Frames(data, partial(_from_motion, depths))
-            done = []
-            for one in results(frames, arguments.workers, "depth from motion"):
-                done.append(one)
-                if one.is_last:
-                    break
+            steps = results(_Frames(data, partial(_from_motion, depths)), arguments.workers, "depth from motion")
+        done: list[Done] = []
+        for frame in steps:
+            done.append(frame)
+            if frame.state == "stopped":
+                break
     for line in warned:
         print(line, file=sys.stderr)
-    return _summary(done, depths)
+    known, kept = [frame.density for frame in done if frame.density], sum(frame.state == "kept" for frame in done)
+    share = f", {mean(known):.0%} of their pixels on average" if known else ""
+    print(f"{depths.root}: {len(known)} of {len(done)} frames have depth{share}; {kept} were there before")
+    by_camera: dict[str, list[CameraFit]] = defaultdict(list)
+    for fit in chain.from_iterable(frame.fits for frame in done):
+        by_camera[fit.camera].append(fit)
+    for camera, fits in by_camera.items():
+        used = [fit for fit in fits if not fit.declined]
+        residuals = [fit.residual for fit in used if fit.residual is not None]
+        to = ", ".join(sorted({fit.reference for fit in used if fit.reference is not None}))
+        fitted = f" to {to}, residual {median(residuals):.1%} (worst {max(residuals):.1%})" if residuals else ""
+        print(f"  {camera}: {len(used)} of {len(fits)} frames fitted{fitted}")
+        for reason, count in Counter(fit.declined for fit in fits if fit.declined).most_common(3):
+            print(f"    declined in {count}: {reason}")
+    failed = [frame for frame in done if frame.state in ("failed", "stopped")]
+    for frame in done:
+        if frame in failed:
+            print(f"  {frame.token}: failed: {frame.message}", file=sys.stderr)
+        elif frame.state == "made" and not frame.density:
+            print(f"  {frame.token}: {frame.message}")
+    return int(bool(failed) or not known)
 
 
 def _learned(
@@ -157,51 +175,16 @@ def _learned(
     facts = [f"model {model.name}", f"revision {model.revision}", f"licence {model.licence}"]
     wanted = [name for name in get_args(Reference) if name in arguments.reference]
     waiting: list[_Loaded] = []
-
-    def written() -> Iterator[Done]:
-        fitted = learned_depth(model, [one.inputs for one in waiting], arguments.batch, wanted)
-        for one, (depth, fits) in zip(waiting, fitted, strict=True):
-            depths.write(one.token, one.inputs.rig, depth, one.origin)
-            yield Done(one.token, depth.density, "; ".join(map(str, fits)), fits=fits)
-        waiting.clear()
-
-    frames = _Frames(data, partial(_for_network, depths, motion, facts, wanted))
-    for one in results(frames, arguments.workers, "learned depth"):
-        if isinstance(one, Done):
-            yield one
-            continue
-        waiting.append(one)
-        if sum(len(loaded.inputs.rig) for loaded in waiting) >= arguments.batch:
-            yield from written()
-    yield from written()
-
-
-def _summary(done: Sequence[Done], depths: DepthFolder) -> int:
-    failed = [one for one in done if one.failed]
-    existed = [one for one in done if one.existed]
-    known = [one.density for one in done if one.density > 0]
-    share = f", {sum(known) / len(known):.0%} of their pixels on average" if known else ""
-    print(f"{depths.root}: {len(known)} of {len(done)} frames have depth{share}; {len(existed)} were there before")
-    for line in _camera_lines(list(chain.from_iterable(one.fits for one in done))):
-        print(f"  {line}")
-    for one in done:
-        if one.failed:
-            print(f"  {one.token}: failed: {one.message}", file=sys.stderr)
-        elif one.density == 0 and not one.existed:
-            print(f"  {one.token}: {one.message}")
-    return 1 if failed or not known else 0
-
-
-def _camera_lines(fits: Sequence[CameraFit]) -> Iterator[str]:
-    """How well each camera's depth fits, over all frames, and why some were declined."""
-    by_camera: dict[str, list[CameraFit]] = defaultdict(list)
-    for fit in fits:
-        by_camera[fit.camera].append(fit)
-    for camera, of_camera in by_camera.items():
-        used = [fit for fit in of_camera if not fit.declined]
-        residuals = [fit.residual for fit in used if fit.residual is not None]
-        to = ", ".join(sorted({fit.reference for fit in used if fit.reference is not None}))
-        fitted = f" to {to}, residual {median(residuals):.1%} (worst {max(residuals):.1%})" if residuals else ""
-        yield f"{camera}: {len(used)} of {len(of_camera)} frames fitted{fitted}"
-        for reason, frames in Counter(fit.declined for fit in of_camera if fit.declined).most_common(3):
-            yield f"  declined in {frames}: {reason}"
+    dataset = _Frames(data, partial(_for_network, depths, motion, facts, wanted))
+    frames = results(dataset, arguments.workers, "learned depth")
+    for frame in chain(frames, [None]):
+        if isinstance(frame, Done):
+            yield frame
+        elif frame is not None:
+            waiting.append(frame)
+        if frame is None or sum(len(loaded.inputs.rig) for loaded in waiting) >= arguments.batch:
+            fitted = learned_depth(model, [loaded.inputs for loaded in waiting], arguments.batch, wanted)
+            for loaded, (depth, fits) in zip(waiting, fitted, strict=True):
+                depths.write(loaded.token, loaded.inputs.rig, depth, loaded.origin)
+                yield Done(loaded.token, "made", "; ".join(map(str, fits)), depth.density, fits)
+            waiting.clear()

@@ -8,7 +8,6 @@ import platform
 import re
 import shutil
 import statistics
-import time
 from collections.abc import Iterator
 from functools import partial
 from importlib import metadata
@@ -55,7 +54,12 @@ def run(arguments: argparse.Namespace) -> int:
 def _lines(size: tuple[int, int]) -> Iterator[Line]:
     found = {**versions(), "numba": installed_version("numba") or "not installed"}
     yield True, f"{', '.join(f'{name} {version}' for name, version in found.items())}; {platform.platform()}"
-    yield _opencv()
+    conflict, wheels = (
+        cv2_conflict(cv2_wheels()),
+        [f"{name} {version}, alone" for name, version in cv2_wheels().items()],
+    )
+    alone = wheels[0] if wheels else f"{cv2.__version__}, not from a wheel: {cv2.__file__}"
+    yield conflict is None, f"OpenCV: {conflict or alone}"
     variables = [f"{name}={value}" for name in _LIMITS if (value := os.environ.get(name)) is not None]
     threads = f"OpenCV {cv2.getNumThreads()}, torch {torch.get_num_threads()}; {', '.join(variables) or 'no limit set'}"
     yield True, f"threads: {os.cpu_count()} cores; {threads}"
@@ -65,44 +69,25 @@ def _lines(size: tuple[int, int]) -> Iterator[Line]:
     free_mb = shutil.disk_usage(".").free / 1e6
     frames = f"about {free_mb / _FRAME_MB:,.0f} converted frames of five views of 704x256"
     yield free_mb > 1000, f"free disk here: {free_mb / 1000:.1f} GB, {frames}"
-    yield True, f"extras: {'; '.join(_extras())}"
+    lacking: dict[str, set[str]] = {}
+    for requirement in (installed_version("arbiview_aug") and metadata.requires("arbiview_aug")) or []:
+        name, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
+        if name and extra and extra[1] not in ("dev", "docs"):
+            lacking.setdefault(extra[1], set()).update({name[0]} if installed_version(name[0]) is None else ())
+    extras = [f"{extra} {'lacks ' + ', '.join(sorted(names)) if names else 'yes'}" for extra, names in lacking.items()]
+    yield True, f"extras: {'; '.join(extras) or 'unknown, since arbiview_aug is not installed'}"
     yield _frame(size)
-
-
-def _opencv() -> Line:
-    if (conflict := cv2_conflict()) is not None:
-        return False, f"OpenCV: {conflict}"
-    wheels = [f"{name} {version}, alone" for name, version in cv2_wheels().items()]
-    return True, f"OpenCV: {wheels[0] if wheels else f'{cv2.__version__}, not from a wheel: {cv2.__file__}'}"
 
 
 def _kernels(path: str | None) -> Line:
     """The compiled kernels in the folder of one room and in those of the others; None if numba found none to write."""
     if path is None:
         return False, "compiled kernels: not kept; set NUMBA_CACHE_DIR to a writable folder"
-    folder = Path(path)
-    root = folder.parent.parent if folder.name == "__pycache__" else folder.parent
-    files = list(root.rglob("*.sha256*.nb[ic]"))
-    damaged = sum(not is_intact(path) for path in files)  # which deletes them
-    states = [path.stat() for path in files if path.exists()]
-    if not states:
-        return not damaged, f"compiled kernels: none in {root}; the first frames wait half a minute for them"
-    age_h = (time.time() - max(state.st_mtime for state in states)) / 3600
-    size_mb = sum(state.st_size for state in states) / 1e6
-    text = f"compiled kernels: {len(states)} files, {size_mb:.1f} MB in {root}, the newest {age_h:.1f} h old"
-    return not damaged, f"{text}; {damaged} damaged files are deleted, and compiled anew" if damaged else text
-
-
-def _extras() -> list[str]:
-    """Each extra, and what it lacks."""
-    if installed_version("arbiview_aug") is None:
-        return ["unknown, since arbiview_aug is not installed"]
-    lacking: dict[str, set[str]] = {}
-    for requirement in metadata.requires("arbiview_aug") or []:
-        name, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
-        if name and extra and extra[1] not in ("dev", "docs"):
-            lacking.setdefault(extra[1], set()).update({name[0]} if installed_version(name[0]) is None else ())
-    return [f"{extra} {'lacks ' + ', '.join(sorted(names)) if names else 'yes'}" for extra, names in lacking.items()]
+    root = Path(path).parents[1 if Path(path).name == "__pycache__" else 0]
+    sound = [is_intact(file) for file in root.rglob("*.sha256*.nb[ic]")]  # which deletes the others
+    again = f"; {sound.count(False)} damaged files are deleted, and compiled again" if not all(sound) else ""
+    first = "" if any(sound) else "; the first frames wait half a minute for them"
+    return all(sound), f"compiled kernels: {sum(sound)} files in {root}{first}{again}"
 
 
 def _frame(size: tuple[int, int]) -> Line:

@@ -11,12 +11,16 @@ import argparse
 import json
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from arbiview_aug.atomic_io import file_name, inside
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName
 from arbiview_aug.cli.arguments import (
@@ -27,25 +31,37 @@ from arbiview_aug.cli.arguments import (
     reading,
     writable_folder,
 )
-from arbiview_aug.cli.scans import evaluate_scans
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, WANTED, WithDepth
 from arbiview_aug.datasets.registry import split_kind
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.displaced import displaced_frames, surfaces_for
+from arbiview_aug.evaluate.displaced import NOT_DISPLACED, displaced_frames, later_neighbour, surfaces_for
 from arbiview_aug.evaluate.frames import EXPOSURES, Evaluation, Look, ScoredFrame, evaluate, make_frame
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.judges import load_detector, load_segmenter
 from arbiview_aug.evaluate.methods import COPY, Method, retargeting
+from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.html import html_report
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
-from arbiview_aug.evaluate.report.tables import evaluation_table, text_table, verdict_tables
+from arbiview_aug.evaluate.report.tables import (
+    SCAN_COLUMNS,
+    SCAN_NOTES,
+    evaluation_table,
+    text_table,
+    verdict_tables,
+)
+from arbiview_aug.evaluate.scans import scan_metrics
 from arbiview_aug.evaluate.verdicts import TOO_FEW, Panel, too_few
 from arbiview_aug.generator import load_inpainter
 from arbiview_aug.sample.inputs import LEARNED_KEY
+from arbiview_aug.scene.point_cloud import own_car
 from arbiview_aug.scene.scene import GEOMETRIES
+from arbiview_aug.transforms.scans import retarget_points
 from arbiview_aug.transforms.settings import SampleKeys
+
+_STATIC_M = 2.0  # a true point without a measured one so near may be of something that moved
+_PARKED_M = 0.3  # a box of the next frame so near one of this frame did not move
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -61,7 +77,17 @@ def run(arguments: argparse.Namespace) -> None:
     )
     look = panel.look if arguments.detector or arguments.segmenter else None
     if arguments.displaced:
-        methods, done = _displaced(arguments, notes, look)
+        # A copy and the surfaces, on photographs; holes are not read from neighbours.
+        everything: GeometryName = "fused" if arguments.geometry == ["auto"] else "motion"
+        data = open_frames(arguments, [everything, *arguments.geometry])
+        chosen = chosen_frames(arguments.frames or len(data), len(data))
+        with named_steps(notes, len(chosen)) as tick:
+            frames = displaced_frames(data, chosen)
+            first = next(frames)
+            if arguments.geometry == ["auto"]:
+                arguments.geometry = surfaces_for(first[1].sample)
+            methods = [COPY, *_methods(arguments, neighbours=None)]
+            done = evaluate(chain([first], frames), lambda rig: rig, methods, tick, look)
     else:
         methods, data = _methods(arguments), open_frames(arguments, arguments.geometry)
         done = measured(arguments, data, methods, notes, look)
@@ -102,33 +128,18 @@ def measured(
     """Evaluate methods on the frames of ``--frames``, behind a progress bar; warnings go to ``notes``."""
     chosen = None if arguments.target is None else load_rig(arguments.target)
     indices = chosen_frames(arguments.frames or 1, len(data))
-    frames = _scored_frames(data, indices, any(method.reads_points for method in methods))
+    is_synthetic, reads_points = isinstance(data, SyntheticDrive), any(method.reads_points for method in methods)
+
+    def frame(index: int) -> tuple[str, ScoredFrame]:
+        """Name and frame of a sample; synthetic ones are scored by the true views, not by points."""
+        truth, exposures = (partial(data.render, index), ()) if is_synthetic else (None, EXPOSURES)
+        sample = data[index]
+        scored = make_frame(sample, truth=truth, exposures=exposures, hand_over_points=reads_points)
+        return str(sample.get("token", index)), scored
+
+    frames = map(frame, indices)
     with named_steps(notes, len(indices)) as tick:
         return evaluate(frames, partial(target_rig, arguments, chosen), methods, tick, look)
-
-
-def _scored_frames(data: Any, indices: Sequence[int], hand_over_points: bool) -> Iterator[tuple[str, ScoredFrame]]:
-    """Name and frame of samples; synthetic ones are scored by the true views, not by points."""
-    for index in indices:
-        sample, is_synthetic = data[index], isinstance(data, SyntheticDrive)
-        truth = partial(data.render, index) if is_synthetic else None
-        exposures = () if is_synthetic else EXPOSURES
-        frame = make_frame(sample, truth=truth, exposures=exposures, hand_over_points=hand_over_points)
-        yield str(sample.get("token", index)), frame
-
-
-def _displaced(arguments: argparse.Namespace, notes: list[str], look: Look | None) -> tuple[list[Method], Evaluation]:
-    """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
-    everything: GeometryName = "fused" if arguments.geometry == ["auto"] else "motion"
-    data = open_frames(arguments, [everything, *arguments.geometry])
-    chosen = chosen_frames(arguments.frames or len(data), len(data))
-    with named_steps(notes, len(chosen)) as tick:
-        frames = displaced_frames(data, chosen)
-        first = next(frames)
-        if arguments.geometry == ["auto"]:
-            arguments.geometry = surfaces_for(first[1].sample)
-        methods = [COPY, *_methods(arguments, neighbours=None)]
-        return methods, evaluate(chain([first], frames), lambda rig: rig, methods, tick, look)
 
 
 def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
@@ -141,6 +152,71 @@ def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
         keys = SampleKeys(extra=() if quality == "paper" else ("confidence",))
         methods.append(retargeting(quality, geometry, holes=fills, keys=keys, **reads))
     return [*{method.name: method for method in methods}.values()]  # a name given twice is one row
+
+
+# --- scans ------------------------------------------------------------------------------------------------------------
+def evaluate_scans(arguments: argparse.Namespace, folder: Path) -> None:
+    """Score points as the target's scanners would have measured them, against the next frame's scan."""
+    data = open_data(arguments.data, neighbours=WANTED, **reading(arguments))
+    chosen = chosen_frames(arguments.frames or len(data), len(data))
+    rows: list[dict[str, Any]] = []
+    notes: list[str] = []
+    with named_steps(notes, len(chosen)) as tick:
+        for token, rig, points, boxes, truth in _scans(arguments, data, chosen):
+            tick(token, 1)
+            true, measured = (cloud[~own_car(cloud)] for cloud in (truth, points))
+            for lidar in rig.lidars:
+                alone = replace(rig, lidars=[lidar])
+                scanned = retarget_points(points, alone, boxes_3d=boxes, ground_z_m=rig.ground_z_m)
+                clouds = {"as they are": measured, "scanned": np.asarray(scanned.points)}
+                for name, cloud in clouds.items():
+                    metrics = scan_metrics(lidar, cloud, true, boxes=boxes)
+                    known = {key: value for key, value in metrics.items() if np.isfinite(value)}
+                    rows.append({"frame": token, "lidar": lidar.name, "points": name, **known})
+    means = {name: mean_of(row for row in rows if row["points"] == name) for name in clouds}
+    (folder / "evaluate.json").write_text(json.dumps({"arguments": vars(arguments), "scans": means, "rows": rows}))
+    for note in notes:
+        print(f"note: {note}\n")
+    frames = len({row["frame"] for row in rows})
+    title = f"Points of {frames_text(frames)} against true scans by {rig.name or 'the target'}"
+    print(text_table(title, means, SCAN_COLUMNS, SCAN_NOTES))
+    print(f"\nnumbers: {folder / 'evaluate.json'}")
+
+
+def _scans(
+    arguments: argparse.Namespace, data: Any, indices: Sequence[int]
+) -> Iterator[tuple[str, Rig, FloatArray, FloatArray, FloatArray]]:
+    """Token, rig, points, boxes and true points of frames, of static things, in the ego frame of the next one.
+
+    DataError if no frame has a next one with points.
+    """
+    from sklearn.neighbors import KDTree
+
+    chosen = None if arguments.target is None else load_rig(arguments.target)
+    problems, found = list[str](), False
+    for index in indices:
+        sample = data[index]
+        found_later = later_neighbour(sample, problems)
+        if found_later is None or "points" not in (later := found_later[1].given) or "points" not in sample:
+            continue
+        found, move = True, np.linalg.inv(found_later[1].ego2ego)
+        points, boxes = sample["points"].double().numpy(), np.zeros((0, 7))
+        points[:, :3] = points[:, :3] @ move[:3, :3].T + move[:3, 3]
+        if "boxes_3d" in later and "boxes_3d" in sample:
+            boxes, before = (np.asarray(frame["boxes_3d"], np.float64)[:, :7] for frame in (later, sample))
+            apart = boxes[:, None, :3] - (before[:, :3] @ move[:3, :3].T + move[:3, 3])
+            boxes = boxes[(np.linalg.norm(apart, axis=-1) < _PARKED_M).any(axis=1)]
+        truth = later["points"].double().numpy()
+        truth = truth[KDTree(points[:, :3]).query(truth[:, :3])[0][:, 0] <= _STATIC_M]
+        rig: Rig = later["rig"]
+        if chosen is not None:
+            rig = replace(rig, lidars=chosen.in_frame_of(rig).lidars, name=chosen.name)
+        if not rig.lidars:
+            fix = "lidars in calib.json, or --target with a rig file that has them"
+            raise DataError(f"--lidar: {arguments.data}: expected {fix}, found none; see docs/lidar.md")
+        yield str(sample["token"]), rig, points, boxes, truth
+    if not found:
+        raise DataError(problems[0] if problems else f"{arguments.data}: {NOT_DISPLACED}")
 
 
 # --- frames and targets -----------------------------------------------------------------------------------------------

@@ -66,15 +66,14 @@ def unchanged(value: Any) -> Any:
 
 
 def _begin(_: int) -> None:
+    """Set up a worker, which ends with its parent, so that a killed run leaves no process behind."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # handled by the parent
     threads = one_thread()
     threads.__enter__()
-    threading.Thread(target=_end_with_parent, args=(threads,), daemon=True).start()
 
+    def end_with_parent(threads: object) -> None:  # which stay limited while it refers to them
+        if (parent := multiprocessing.parent_process()) is not None:
+            parent.join()
+            os._exit(1)
 
-def _end_with_parent(threads: object) -> None:
-    """End this worker with its parent, so that a killed run leaves no process behind; keeps ``threads`` alive."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+    threading.Thread(target=end_with_parent, args=(threads,), daemon=True).start()

@@ -1,30 +1,24 @@
-"""Command lines: the options of every command, without imports that take time."""
+"""Command lines: every command with its options, without imports that take time."""
 
 from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterable
-from typing import get_args
+from collections.abc import Sequence
+from typing import Any, NamedTuple, get_args
 
-from arbiview_aug.atomic_io import Link
-from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.shipped import shipped_rigs
-from arbiview_aug.choices import TRAINING_PRESETS, OnError, Quality, Reduce, Reference
+from arbiview_aug.choices import Quality, Reduce
 from arbiview_aug.cli.arguments import (
     LIDAR,
     READING,
     RENDERING,
     add_options,
     command_parser,
-    count,
-    data,
     is_rig,
     kinds_text,
-    pair,
+    options,
     path,
-    seed,
-    size,
 )
 from arbiview_aug.datasets.registry import READERS
 
@@ -34,252 +28,201 @@ SIZE, FULL_SIZE = (256, 704), (900, 1600)
 SCORED = {"infinity": "rig", "ground": "rig", "street": "rig", "boxes": "boxes_3d", "lidar": "points"}
 """Geometry that ``bench`` scores, and the sample key that offers it."""
 
+_DATA, _RENDERING, _READING = options()["--data"], " ".join(RENDERING), " ".join(READING)
+_EVALUATED = "fast", "auto", "black"  # defaults of ``RENDERING`` in tables
+_CHECKED = "real frames, by their path alone or with their kind; a rig file or a calibration"
+_TRAINED = f"synthetic, or real frames: {' or '.join(f'{kind}:PATH' for kind in READERS)} (default: synthetic)"
+_RIGS = (
+    f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), another tool's calibration "
+    "(docs/rigs.md), or data as other commands' --data takes it: the rig of its first frame"
+)
 
-def check() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "check",
+
+class Command(NamedTuple):
+    """A command: its module has ``run``, a function of the parsed arguments."""
+
+    module: str
+    summary: str
+    description: str
+    example: str
+    options: Sequence[tuple[str, dict[str, Any]]]  # flags, and what differs from ``arguments.options``
+    resumable: bool = False
+
+
+COMMANDS = {
+    "bench": Command(
+        "cli.bench",
+        "measure speed against accuracy, on your own data too",
+        "Speed against accuracy: every quality, geometry and decoded size, for one target rig.",
+        "--data FOLDER --target waymo",
+        [
+            ("--data", {"without": "synthetic streets"}),
+            ("--target --output", {}),
+            ("--size", {"default": SIZE, "help": "of every view"}),
+            ("--frames", {"help": "frames for accuracy"}),
+            ("--quality", {"nargs": "+", "default": [*get_args(Quality)], "help": "presets"}),
+            ("--geometry", {"nargs": "+", "choices": [*SCORED], "default": None, "without": "what the samples offer"}),
+            ("--downscale", {"nargs": "+", "default": [*get_args(Reduce)]}),
+        ],
+    ),
+    "check": Command(
+        "cli.check",
+        "find silent mistakes in a data set, and draw its labels into its images",
         "Look for silent mistakes: other columns, axes, frames and units, a wrong road, cameras that disagree, "
         "the own car, K of another resolution, specks in masks, unread keys. Draws boxes and points into the images.",
         "/data/frames --frames 5",
-    )
-    text = f"real frames, by their path alone or with their kind; a rig file or a calibration. {kinds_text()}"
-    parser.add_argument("data", type=path, metavar="[KIND:]PATH", help=text)
-    add_options(parser, "--frames", default=3, help="number of frames, spread over the data")
-    add_options(parser, *READING)
-    add_options(parser, "--output", help="folder for the pictures")
-    return parser
-
-
-def convert() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "convert",
+        [
+            ("data", {"type": path, "metavar": "[KIND:]PATH", "help": f"{_CHECKED}. {kinds_text()}"}),
+            ("--frames", {"default": 3, "help": "number of frames, spread over the data"}),
+            (_READING, {}),
+            ("--output", {"help": "folder for the pictures"}),
+        ],
+    ),
+    "convert": Command(
+        "cli.convert.command",
+        "write a data set as another vehicle's cameras would have seen it",
         "Write a data set as another vehicle's cameras would have recorded it, in the source's format: nuScenes "
-        "tables, or frame folders. Files that are there are left as they are: run it again to go on.",
+        "tables, or frame folders. Files that are there are left unchanged: run it again to go on.",
         "--data nuscenes:ROOT --target argoverse2 --output converted --size 256x704",
-    )
-    add_options(parser, "--data", "--target", required=True)
-    add = parser.add_argument
-    add("--version", type=path, metavar="NAME", help="nuScenes' folder of tables (default: v1.0-mini, -trainval)")
-    names = "new names of the target's cameras, such as ring_front_center=CAM_FRONT, by which detectors find them"
-    add("--names", nargs="+", type=pair, default=[], metavar="OLD=NEW", help=names)
-    add_options(parser, "--output", required=True, default=None)
-    add_options(parser, *RENDERING, "--generator", "--steps")
-    add("--size", type=size, metavar="HxW", help="height and width of every view (default: the target's own)")
-    fit = "with --size: cut at the top and the sides (default), add black bars there, or stretch"
-    add("--fit", choices=get_args(Fit), default="crop", help=fit)
-    points = "as the target's scanners would have measured them, if it has any (default), or as they are"
-    add("--points", choices=("target", "source"), default="target", help=points)
-    add_options(parser, *READING)
-    neighbours = "let N frames of the drive before and after each fill holes (default: none)"
-    add("--neighbours", type=seed, default=0, metavar="N", help=neighbours)
-    depth = (
-        "what the depth command wrote, for --geometry auto, motion, fused or learned (default: its folder in the data; "
-        "auto: none)"
-    )
-    add("--depth", dest="motion_depth", type=path, metavar="DIR", help=depth)
-    add("--images", choices=("jpg", "png"), default="jpg", help="jpg: quality 96, 4:4:4; png: lossless")
-    add("--shard-index", type=seed, default=0, metavar="I", help="this shard, from 0")
-    add("--num-shards", type=count, default=1, metavar="N", help="number of shards")
-    add("--runner", choices=("local", "ray"), default="local", help="processes here, or Ray actors")
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    add("--workers", type=count, default=cores, metavar="N", help="processes or actors (default: one a core)")
-    on_error = "samples that cannot be converted: report them and do not finish (default), leave them out, or stop"
-    add("--on-error", choices=get_args(OnError), default="report", help=on_error)
-    report = "number of frames to score and show in conversion/report.html of the output (default: 0, no report)"
-    add("--report", type=seed, default=0, metavar="N", help=report)
-    link = (
-        "how points, maps and other kept files come along: hard links where the disk allows them (default), copies, or "
-        "symbolic links, which readers of this package refuse"
-    )
-    add("--link", choices=get_args(Link), default="hard", help=link)
-    return parser
-
-
-def demo() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "demo",
+        [
+            ("--data --target", {"required": True}),
+            ("--output", {"required": True, "default": None}),
+            (f"--version --names {_RENDERING} --generator --steps", {}),
+            ("--size", {"help": "height and width of every view (default: the target's own)"}),
+            (f"--fit --points {_READING} --neighbours --depth --images --shard-index --num-shards", {}),
+            ("--runner --workers --on-error --report", {}),
+        ],
+        resumable=True,
+    ),
+    "demo": Command(
+        "cli.demo",
+        "retarget a synthetic street or real frames, with numbers and a picture",
         "Retarget a synthetic street, or real frames, to another vehicle's cameras: the plan in words, metrics, time, "
         "and one contact sheet.",
         "--data FOLDER --target waymo",
-    )
-    add_options(parser, "--data", without="a synthetic street")
-    add_options(parser, "--output", help="folder for demo.png, or a picture file ending in .png or .jpg")
-    add_options(parser, "--target", *RENDERING, "--frames", "--seed", "--size", *LIDAR)
-    parser.add_argument("--width", type=count, default=1800, metavar="PX", help="width of the contact sheet")
-    parser.set_defaults(reduce=1, clean_masks=False)
-    return parser
-
-
-def depth() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "depth",
+        [
+            ("--data", {"without": "a synthetic street"}),
+            ("--output", {"help": "folder for demo.png, or a picture file ending in .png or .jpg"}),
+            (f"--target {_RENDERING} --frames --seed --size {' '.join(LIDAR)} --width", {}),
+        ],
+    ),
+    "depth": Command(
+        "cli.depth",
+        "compute the depth of a drive's frames, from motion or by a network",
         "Compute the depth of every frame of a drive: from motion, for --geometry motion, or with --model by a "
-        "network, for --geometry learned. Frames whose depth is there, of the same origin, stay: run it again to "
-        "go on.",
+        "network, for --geometry learned. Frames whose depth is there, of the same origin, stay.",
         "--data nuscenes:ROOT --workers 4",
-    )
-    add_options(parser, "--data", required=True)
-    add = parser.add_argument
-    output = "where to write (default: motion_depth or learned_depth beside the data)"
-    add("--output", type=path, metavar="FOLDER", help=output)
-    add("--workers", type=count, default=1, metavar="N", help="processes")
-    add("--model", type=path, metavar="ID_OR_PATH", help="depth model of transformers: a folder, or a name on its Hub")
-    add("--batch", type=count, default=8, metavar="N", help="images that the model sees at once")
-    references = list(get_args(Reference))
-    reference = "what scale and shift of the model are fitted to, the first that a camera has"
-    add("--reference", nargs="+", choices=references, default=references, help=reference)
-    add_options(parser, *LIDAR)
-    return parser
-
-
-def doctor() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "doctor",
+        [
+            ("--data", {"required": True}),
+            ("--output", {"default": None, "help": "(default: motion_depth or learned_depth in the data)"}),
+            ("--workers", {"default": 1, "help": "processes"}),
+            (f"--model --batch --reference {' '.join(LIDAR)}", {}),
+        ],
+        resumable=True,
+    ),
+    "doctor": Command(
+        "cli.doctor",
+        "check this installation, and time one frame",
         "Check this installation: versions, OpenCV's wheels, threads, compiled kernels, disk, extras; time one frame.",
         "--size 256x704",
-    )
-    add_options(parser, "--size", default=SIZE, help="of the views")
-    return parser
-
-
-def evaluate() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "evaluate",
+        [("--size", {"default": SIZE, "help": "of the views"})],
+    ),
+    "evaluate": Command(
+        "cli.evaluate",
+        "measure the quality of rendered views: metrics, pictures, a report",
         "Measure the quality of rendered views: LiDAR points or photographs as truth on real frames, true views on "
         "synthetic streets. Writes tables, evaluate.json, pictures, and a self-contained report.html.",
         "--data FOLDER --target waymo --geometry auto street",
-    )
-    add_options(parser, "--data", without="synthetic streets")
-    add_options(parser, "--target")
-    for option, default in zip(RENDERING, ("fast", "auto", "black"), strict=True):
-        add_options(parser, option, nargs="+", default=[default])
-    text = "number of frames, spread over the data (default: 1; --displaced, --lidar: all)"
-    add_options(parser, "--frames", default=None, help=text)
-    add_options(parser, "--generator", "--steps", "--seed", "--size", *READING, "--output")
-    add = parser.add_argument
-    displaced = (
-        "photographs as truth: of the frames' `truth` camera (docs/formats.md), else of the next frame of the drive. "
-        "Geometries: a copy, and all that the data offers"
-    )
-    add("--displaced", action="store_true", help=displaced)
-    lidar = (
-        "instead of images, score points as the target's scanners, or those in calib.json, would have measured them "
-        "from where the next frame was taken, against that frame's scan"
-    )
-    add("--lidar", action="store_true", help=lidar)
-    detector = (
-        "AP and recall of a detector in the views, against true images or labels: FILE.py:function (RGB (H, W, 3) "
-        "uint8 to boxes (n, 4) xyxy, scores, labels; docs/benchmarks.md)"
-    )
-    add("--detector", type=path, metavar="MODEL", help=detector)
-    segmenter = (
-        "IoU of a segmenter's masks in the views with those in true images: FILE.py:function (RGB (H, W, 3) uint8 to "
-        "masks (n, H, W))"
-    )
-    add("--segmenter", type=path, metavar="MODEL", help=segmenter)
-    return parser
-
-
-def inspect() -> argparse.ArgumentParser:
-    parser = command_parser("inspect", "Show rigs: tables, differences, a picture.", "nuscenes waymo")
-    rigs = (
-        f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), another tool's calibration "
-        "(docs/rigs.md), or data as other commands' --data takes it: the rig of its first frame"
-    )
-    parser.add_argument("rigs", type=path, nargs="+", metavar="RIG", help=rigs)
-    parser.add_argument("--output", type=path, default="inspect.png", metavar="FILE", help="the picture")
-    return parser
-
-
-def train() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "",
-        "CVC-SSL: train a generator to reconstruct real views from pseudo views beside them. The same command with the "
+        [
+            ("--data", {"without": "synthetic streets"}),
+            ("--target", {}),
+            *((flag, {"nargs": "+", "default": [name]}) for flag, name in zip(RENDERING, _EVALUATED, strict=True)),
+            (
+                "--frames",
+                {"default": None, "help": "spread over the data (default: 1; --displaced, --lidar: all)"},
+            ),
+            (f"--generator --steps --seed --size {_READING} --output", {}),
+            ("--displaced --lidar --detector --segmenter", {}),
+        ],
+    ),
+    "inspect": Command(
+        "cli.rigs",
+        "show rigs: tables, differences, a picture",
+        "Show rigs: tables, differences, a picture.",
+        "nuscenes waymo",
+        [
+            ("rigs", {"type": path, "nargs": "+", "metavar": "RIG", "help": _RIGS}),
+            ("--output", {"default": "inspect.png", "metavar": "FILE", "help": "the picture"}),
+        ],
+    ),
+    "train": Command(
+        "generator.training.command",
+        "train the generator that completes what no camera saw",
+        "CVC-SSL: train a generator to reconstruct real views from pseudo views around them. The same command with the "
         "same --output goes on where it stopped. Several GPUs: accelerate launch -m arbiview_aug.train …, or torchrun "
         "--nproc_per_node N -m arbiview_aug.train …",
         "--data nuscenes:ROOT --output output/tiny --set steps=100",
-        program="python -m arbiview_aug.train",
-    )
-    add = parser.add_argument
-    add("--config", choices=TRAINING_PRESETS, default="tiny", help="preset of all settings")
-    kinds = " or ".join(f"{kind}:PATH" for kind in READERS)
-    text = f"synthetic, or real frames with their kind: {kinds} (default: synthetic)"
-    add("--data", type=path, metavar="DATA", help=text)
-    add_options(parser, "--output", help="folder of the run")
-    add("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting, such as steps=100 or loss.geo=0")
-    weights = "config paper or inpaint: Stable Diffusion 1.5, or its inpainting model: a folder or hub id"
-    add("--weights", type=path, metavar="DIR", help=weights)
-    add("--vgg-weights", type=path, metavar="FILE", help="torchvision's vgg16 weights (default: cache or download)")
-    add("--quiet", action="store_true", help="no progress bars")
-    return parser
-
-
-def view() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "view",
+        [
+            ("--config", {}),
+            ("--data", {"type": path, "metavar": "DATA", "help": _TRAINED}),
+            ("--output", {"help": "folder of the run"}),
+            ("--set --weights --vgg-weights --quiet", {}),
+        ],
+        resumable=True,
+    ),
+    "view": Command(
+        "cli.view",
+        "write a recording of frames and their views for Rerun's viewer",
         "Write a recording for Rerun's viewer: frames along a time line, with cameras, points and boxes in 3D, and "
-        "source images beside the target's views, their coverage and confidence. Needs the extra viewer.",
+        "source images next to the target's views, their coverage and confidence. Needs the extra viewer.",
         "/data/frames --target waymo --frames 10",
-    )
-    text = f"real frames, by their path alone or with their kind. {kinds_text()} (default: a synthetic street)"
-    parser.add_argument("data", nargs="?", type=data, metavar="[KIND:]PATH", help=text)
-    add_options(parser, "--frames", default=5)
-    add_options(parser, "--target", *RENDERING, "--seed", "--size", *READING)
-    add_options(parser, "--output", default="output/view.rrd", metavar="FILE", help="recording to write")
-    return parser
+        [
+            ("data", {**_DATA, "nargs": "?", "without": "a synthetic street"}),
+            ("--frames", {"default": 5}),
+            (f"--target {_RENDERING} --seed --size {_READING}", {}),
+            ("--output", {"default": "output/view.rrd", "metavar": "FILE", "help": "recording to write"}),
+        ],
+    ),
+}
 
 
-# --- benchmarks -------------------------------------------------------------------------------------------------------
-def bench() -> argparse.ArgumentParser:
-    parser = command_parser(
-        "bench",
-        "Speed against accuracy: every quality, geometry and decoded size, for one target rig.",
-        "--data FOLDER --target waymo",
-    )
-    add_options(parser, "--data", without="synthetic streets")
-    add_options(parser, "--target", "--output")
-    add_options(parser, "--size", default=SIZE, help="of every view")
-    add_options(parser, "--frames", help="frames for accuracy")
-    add = parser.add_argument
-    add("--quality", nargs="+", choices=get_args(Quality), default=[*get_args(Quality)], help="presets")
-    add("--geometry", nargs="+", choices=[*SCORED], help="(default: what the samples offer)")
-    text = "decode real images at 1/N of their size"
-    add_options(parser, "--downscale", nargs="+", default=[*get_args(Reduce)], help=text)
+def parser_of(name: str) -> argparse.ArgumentParser:
+    """Create the parser of a command."""
+    command = COMMANDS[name]
+    program = ("python -m arbiview_aug.train", "") if name == "train" else ("python -m arbiview_aug", name)
+    parser = command_parser(program[1], command.description, command.example, program[0])
+    for flags, changes in command.options:
+        add_options(parser, *flags.split(), **changes)
+    if name == "demo":
+        parser.set_defaults(reduce=1, clean_masks=False)
     return parser
 
 
 # --- options that exclude each other ----------------------------------------------------------------------------------
 def check_together(name: str, parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
     """Refuse options of a command that do not fit together, as argparse refuses others."""
-
-    def refuse(options: Iterable[str], why: str) -> None:
-        for option in options:
-            if getattr(arguments, option) != parser.get_default(option):
+    given = vars(arguments)
+    is_there = name == "check" and (given["data"] in shipped_rigs() or os.path.exists(given["data"]))
+    is_rig_there, is_generated = is_there and is_rig(given["data"]), "diffusion" in given.get("holes", ())
+    of_images = "detector segmenter size quality geometry holes"
+    for commands, holds, options_, why in (
+        ("depth", not given.get("model"), "batch reference", "expected it with --model alone"),
+        ("check", is_rig_there, "frames reduce clean_masks", "expected frames with it, got a rig"),
+        ("convert", given.get("size") is None, "fit", "expected --size with it, found none"),
+        ("convert evaluate", not is_generated, "generator steps", "expected it with --holes diffusion"),
+        ("evaluate", given.get("displaced"), "seed size target lidar", "expected it without --displaced"),
+        ("evaluate", given.get("lidar"), of_images, "it is of images; expected no --lidar"),
+        ("evaluate", given.get("data") is None, "displaced lidar", "expected --data FOLDER with it, found none"),
+    ):
+        for option in options_.split() if holds and name in commands.split() else ():
+            if given[option] != parser.get_default(option):
                 flag = "downscale" if option == "reduce" else option.replace("_", "-")
                 parser.error(f"argument --{flag}: {why}")
-
     if name == "convert" and arguments.shard_index >= arguments.num_shards:
         parser.error(f"argument --shard-index: expected less than {arguments.num_shards}, got {arguments.shard_index}")
     if name in ("convert", "demo", "evaluate", "view") and "paper" in arguments.quality:
         surfaces = arguments.geometry if isinstance(arguments.geometry, list) else [arguments.geometry]
         if {*surfaces} - {"auto", "infinity"}:
             parser.error(f"argument --geometry: quality paper knows infinity alone, got {', '.join(surfaces)}")
-    if name == "depth" and not arguments.model:
-        refuse(("batch", "reference"), "expected it with --model alone: depth from motion needs no network")
-    if name == "check" and is_rig(arguments.data):
-        if arguments.data in shipped_rigs() or os.path.exists(arguments.data):
-            refuse(("frames", "reduce", "clean_masks"), "expected frames with it, got a rig")
-    if name == "convert" and arguments.size is None:
-        refuse(("fit",), "expected --size with it, found none")
-    if name in ("convert", "evaluate") and "diffusion" not in arguments.holes:
-        refuse(("generator", "steps"), "expected it with --holes diffusion")
-    if name == "evaluate":
-        if arguments.displaced:
-            refuse(("seed", "size", "target", "lidar"), "expected it without --displaced, which has its own")
-        if arguments.lidar:
-            of_images = "detector", "segmenter", "size", "quality", "geometry", "holes"
-            refuse(of_images, "it is of images; expected no --lidar")
-        if arguments.segmenter and arguments.data is not None and not arguments.displaced:
-            parser.error("argument --segmenter: expected --displaced with --data: it compares with true images")
-        if arguments.data is None:
-            refuse(("displaced", "lidar"), "expected --data FOLDER with it, found none")
+    if name == "evaluate" and arguments.segmenter and arguments.data is not None and not arguments.displaced:
+        parser.error("argument --segmenter: expected --displaced with --data: it compares with true images")

@@ -17,7 +17,6 @@ from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.report.pictures import draw_rigs, save_picture
 from arbiview_aug.evaluate.report.tables import markdown_table
-from arbiview_aug.evaluate.rig_gap import rig_gap
 
 NOISE_DEG, NOISE_M = 0.2, 0.02
 """Errors of a calibration that is kept up. Rigs that differ by less are one rig."""
@@ -29,7 +28,7 @@ def run(arguments: argparse.Namespace) -> None:
     rigs, notes = zip(*(_load(name) for name in arguments.rigs), strict=True)
     print("\n\n".join(f"{rig!r}{note}" for rig, note in zip(rigs, notes, strict=True)))
     for other in rigs[1:]:
-        print(f"\n{differences(rigs[0], other)}\n\n{rig_gap(rigs[0], other)}")
+        print(f"\n{differences(rigs[0], other)}")
     print(f"\npicture: {save_picture(path, draw_rigs(rigs))}")
 
 
@@ -47,7 +46,10 @@ def differences(source: Rig, target: Rig) -> str:
         away_m = camera.center_m - nearest.center_m
         off = np.nan_to_num(_corners(camera)) - np.nan_to_num(_corners(nearest))  # outside a lens both may be NaN
         is_noise &= bool(np.linalg.norm(off, axis=1).max() < np.radians(NOISE_DEG) and np.linalg.norm(away_m) < NOISE_M)
-        density = [_pixels_per_deg(c) for c in (nearest, camera)]
+        density = []
+        for seen in (nearest, camera):  # columns a degree on the optical axis
+            aside, ahead = seen.project_cam(np.array([[np.radians(1e-3), 0, 1], [0, 0, 1]])).uv[:, 0]
+            density.append(float(1e3 * (aside - ahead)))
         rows.append(
             [
                 *(camera.name, nearest.name, f"{turned:.1f} deg"),
@@ -66,12 +68,6 @@ def _corners(camera: Camera) -> FloatArray:
     """(4, 3) directions of the image's corners in the ego frame: other lenses, K and rotations have others."""
     w, h = camera.width_px - 0.5, camera.height_px - 0.5
     return camera.unproject([[-0.5, -0.5], [w, -0.5], [-0.5, h], [w, h]]).directions
-
-
-def _pixels_per_deg(camera: Camera) -> float:
-    """Columns a degree on the optical axis."""
-    beside, ahead = camera.project_cam(np.array([[np.radians(1e-3), 0, 1], [0, 0, 1]])).uv[:, 0]
-    return float(1e3 * (beside - ahead))
 
 
 def _load(name: str) -> tuple[Rig, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from arbiview_aug.datasets.image_io import encoded_image
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
+from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import views_of
 from arbiview_aug.evaluate.report.pictures import BOX, HOLE, RIG_COLOURS, box_lines, coloured, left_to_right
 from arbiview_aug.scene.scene import GEOMETRIES
@@ -82,14 +82,13 @@ def _frames(arguments: argparse.Namespace) -> Iterator[Mapping[str, Any]]:
     frames = [sample, *sample.pop("neighbours")]
     needs_others = GEOMETRIES[arguments.geometry].needs == "motion"
     for frame in frames[: arguments.frames]:
-        yield {**frame, "neighbours": [one for one in frames if one is not frame]} if needs_others else frame
+        yield {**frame, "neighbours": [other for other in frames if other is not frame]} if needs_others else frame
 
 
 class SampleRecording:
     """A recording of samples and their views by a target rig, written to an .rrd file frame by frame.
 
-    Everything of a frame is below ``ego``: points, boxes, and the cameras of ``source`` and ``target``. With
-    ``ego2world`` in the samples, ``ego`` drives through the first one's ego frame.
+    A frame's points, boxes and cameras are below ``ego``, which drives through the first one's ego frame.
     """
 
     def __init__(self, path: Path, source: Rig, target: Rig) -> None:
@@ -100,14 +99,8 @@ class SampleRecording:
         self._first: dict[str, Any] = {}  # time and pose of the first frame
         self._log("/", self._rr.ViewCoordinates.FLU, static=True)
         self._log("/", self._rr.AnnotationContext(list(_LEGEND)), static=True)
-        self._lay_out({"source": source, "target": target})
-
-    def close(self) -> None:
-        """Write what is not on the disk yet."""
-        self._stream.disconnect()
-
-    def _lay_out(self, rigs: Mapping[str, Rig]) -> None:
-        """Put the 3D scene next to the source's images and the target's views."""
+        # The 3D scene next to the source's images and the target's views.
+        rigs = {"source": source, "target": target}
         views = optional_package("rerun.blueprint", "viewer")
         cameras = [(self._path(side, camera), camera) for side, rig in rigs.items() for camera in rig]
         flat = [f"{path}/{name}" for path, _ in cameras for name in ("boxes", "coverage", "confidence")]
@@ -127,6 +120,10 @@ class SampleRecording:
         layout = views.Horizontal(scene, images, column_shares=[2, 3])
         self._stream.send_blueprint(views.Blueprint(layout, collapse_panels=True))
 
+    def close(self) -> None:
+        """Write what is not on the disk yet."""
+        self._stream.disconnect()
+
     def _path(self, side: str, camera: Camera) -> str:
         return f"/ego/{side}/{self._rr.escape_entity_path_part(camera.name)}"
 
@@ -141,7 +138,10 @@ class SampleRecording:
             self._add_pose("/ego", np.linalg.inv(self._first.setdefault("ego2world", ego2world)) @ ego2world)
         source: Rig = sample["rig"]
         boxes = np.zeros((0, 7)) if sample.get("boxes_3d") is None else sample["boxes_3d"].double().numpy()
-        self._add_boxes(boxes, sample.get("box_names"))
+        turns = np.zeros((len(boxes), 4))
+        turns[:, 2], turns[:, 3] = np.sin(boxes[:, 6] / 2), np.cos(boxes[:, 6] / 2)
+        shape = {"centers": boxes[:, :3], "sizes": boxes[:, 3:6], "quaternions": turns, "colors": BOX}
+        self._log("/ego/boxes", self._rr.Boxes3D(**shape, labels=sample.get("box_names"), show_labels=False))
         clouds = {"source": sample.get("points"), "target": out.get("points") if self._target.lidars else None}
         for side, points in clouds.items():
             positions = np.zeros((0, 3)) if points is None else points[:, :3].numpy()
@@ -155,23 +155,19 @@ class SampleRecording:
         for camera, view in zip(self._target.in_frame_of(source), views_of(out), strict=True):
             path = self._path("target", camera)
             self._add_camera(path, camera, view.image, boxes, RIG_COLOURS[1])
-            self._add_maps(path, view)
+            hole = _BLACK if view.generated is None else np.where(view.generated, _FILLED, _BLACK)
+            self._add_classes(path, np.where(view.coverage, _SEEN, hole))
+            if view.confidence is not None:
+                percent = np.rint(100 * view.confidence).astype(np.uint8)
+                picture = self._rr.DepthImage(percent, meter=100.0, depth_range=(0.0, 100.0), colormap="viridis")
+                self._log(f"{path}/confidence", picture)
         self._frames += 1
 
     def _add_pose(self, path: str, pose: FloatArray) -> None:
         self._log(path, self._rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
 
-    def _add_boxes(self, boxes: FloatArray, names: Sequence[str] | None) -> None:
-        turns = np.zeros((len(boxes), 4))
-        turns[:, 2], turns[:, 3] = np.sin(boxes[:, 6] / 2), np.cos(boxes[:, 6] / 2)
-        shape = {"centers": boxes[:, :3], "sizes": boxes[:, 3:6], "quaternions": turns, "colors": BOX}
-        self._log("/ego/boxes", self._rr.Boxes3D(**shape, labels=names, show_labels=False))
-
     def _add_camera(self, path: str, camera: Camera, image: Image, boxes: FloatArray, colour: str) -> None:
-        """Add a camera's pose and frustum, its image, and boxes bent as its lens bends them.
-
-        Rerun's cameras have no lenses: images of cameras with one are not shown in 3D.
-        """
+        """Add a camera's pose, image and boxes; Rerun's cameras know no lenses: images with one are not in 3D."""
         self._add_pose(path, camera.cam2ego)
         K = camera.K.copy()
         K[:2, 2] += _PIXEL_CENTER
@@ -184,14 +180,6 @@ class SampleRecording:
         strips = np.concatenate([np.zeros((0, 2, 2)), *(segments for segments, _ in lines)]) + _PIXEL_CENTER
         colours = [colour for segments, colour in lines for _ in segments]
         self._log(f"{path}/boxes", self._rr.LineStrips2D(strips, colors=colours, radii=_THIN))
-
-    def _add_maps(self, path: str, view: RenderedView) -> None:
-        hole = _BLACK if view.generated is None else np.where(view.generated, _FILLED, _BLACK)
-        self._add_classes(path, np.where(view.coverage, _SEEN, hole))
-        if view.confidence is not None:
-            percent = np.rint(100 * view.confidence).astype(np.uint8)
-            picture = self._rr.DepthImage(percent, meter=100.0, depth_range=(0.0, 100.0), colormap="viridis")
-            self._log(f"{path}/confidence", picture)
 
     def _add_classes(self, path: str, classes: Any) -> None:
         self._log(f"{path}/coverage", self._rr.SegmentationImage(classes.astype(np.uint8), opacity=0.5))

@@ -27,10 +27,9 @@ NOT_DISPLACED = (
 
 
 def displaced_frames(data: Any, indices: Iterable[int]) -> Iterator[tuple[str, ScoredFrame]]:
-    """Name and frame of those samples at ``indices`` that have photographs; methods get all that a sample has.
+    """Name and frame of those samples at ``indices`` that have photographs; DataError if none has.
 
-    The truth is a ``FrameFolder``'s ``truth`` camera, else the nearest neighbour recorded later. Samples without one
-    are left out; DataError if no sample has one.
+    The truth is a ``FrameFolder``'s ``truth`` camera, else the nearest neighbour recorded later.
     """
     problems, found = list[str](), False
     recorded = data.dataset if isinstance(data, WithDepth) else data
@@ -54,10 +53,9 @@ def displaced_frames(data: Any, indices: Iterable[int]) -> Iterator[tuple[str, S
 
 
 def later_neighbour(sample: Mapping[str, Any], problems: list[str]) -> tuple[Frame, Neighbour, list[Any]] | None:
-    """A sample's frame, the nearest neighbour recorded later, and the neighbours elsewhere.
+    """A sample's frame, the nearest neighbour recorded at most ``MOST_APART_S`` later, and the neighbours elsewhere.
 
-    None if there is no such frame, or the vehicle stands so long that it comes more than ``MOST_APART_S`` later. What
-    was wrong goes to ``problems``.
+    None if there is no such frame; what was wrong goes to ``problems``.
     """
     (frame,) = read_frames(sample, None, further=("neighbours",), warn=lambda _, message: problems.append(message))
     neighbours = frame.neighbours or ()

@@ -14,7 +14,6 @@ from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray
@@ -37,15 +36,11 @@ EXPOSURES: tuple[Exposure, ...] = ("raw", "even")  # exposures as recorded, and 
 
 
 class LidarReference(NamedTuple):
-    """A sample at one exposure, and the scoring points in its colours."""
-
-    sample: dict[str, Any]
-    points: ColouredPoints
+    sample: dict[str, Any]  # at one exposure
+    points: ColouredPoints  # the scoring ones, in its colours
 
 
 class Truth(NamedTuple):
-    """True images of a rig."""
-
     images: Sequence[Image]
     valid: Sequence[BoolArray]  # (h, w) pixels that score
     regions: Sequence[Mapping[str, BoolArray]] = ()  # (h, w) parts of each image that have a score by name, if known
@@ -117,15 +112,12 @@ def make_frame(
 
 
 def _street_truth(views: RenderedViews) -> Truth:
-    classes = [plane.numpy() for plane in views.classes]
-    valid = [plane != SceneClass.VOID for plane in classes]
-    return Truth(as_arrays(views.images), valid, [regions(plane) for plane in classes])
-
-
-def regions(classes: npt.NDArray[np.uint8]) -> dict[str, BoolArray]:
-    """Ground, object and sky of a synthetic view (h, w)."""
-    ground, sky = np.isin(classes, [int(c) for c in GROUND_CLASSES]), classes == SceneClass.SKY
-    return {"ground": ground, "sky": sky, "object": ~ground & ~sky & (classes != SceneClass.VOID)}
+    valid, regions = [], []
+    for classes in map(np.asarray, views.classes):
+        valid.append(classes != SceneClass.VOID)
+        ground, sky = np.isin(classes, [int(c) for c in GROUND_CLASSES]), classes == SceneClass.SKY
+        regions.append({"ground": ground, "sky": sky, "object": ~ground & ~sky & valid[-1]})
+    return Truth(as_arrays(views.images), valid, regions)
 
 
 def scores(
@@ -133,10 +125,9 @@ def scores(
 ) -> tuple[list[RenderedView], list[dict[str, float]]]:
     """Render a frame for a rig in its own ego frame, and score each view at the exposures that the frame has.
 
-    Returns:
-        The views at the first exposure, and one row of metrics each: ``seen``, the share of covered pixels;
-        ``true_...`` if the truth is known (``truth_metrics`` with the classes ground, object and sky); ``raw_...`` and
-        ``even_...`` if there are points (``sparse_metrics``).
+    Returns the views at the first exposure, and one row of metrics each: ``seen``, the share of covered pixels;
+    ``true_...`` if the truth is known (``truth_metrics``); ``raw_...`` and ``even_...`` if there are points
+    (``sparse_metrics``).
     """
     mounted = target.in_frame_of(frame.sample["rig"])
     references = [(exposure, frame.lidar[exposure]) for exposure in exposures if exposure in frame.lidar]
@@ -192,10 +183,9 @@ def evaluate(
     tick: Callable[[str, int], None] = lambda _, __: None,
     look: Look | None = None,
 ) -> Evaluation:
-    """Run every method on every named frame; DataError without frames.
+    """Run every method on every named frame, for its ``target`` or that of its rig; DataError without frames.
 
-    ``target`` maps a source rig to the rig to render, unless a frame has a ``target`` of its own. ``tick`` is called
-    before each step with its name and the frame's number of steps. ``look`` sees all views.
+    ``tick`` is called before each step with its name and the frame's number of steps. ``look`` sees all views.
     """
     done: Evaluation | None = None
     for name, frame in frames:

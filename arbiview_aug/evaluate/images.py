@@ -21,11 +21,6 @@ class RenderedView(NamedTuple):
     confidence: npt.NDArray[np.float32] | None = None  # (h, w) in [0, 1], if the renderer gives it
     generated: BoolArray | None = None  # (h, w) bool, inpainted or generated pixels, if any
 
-    @property
-    def shown(self) -> BoolArray:
-        """(h, w) bool, covered or generated pixels."""
-        return self.coverage if self.generated is None else self.coverage | self.generated
-
 
 def as_arrays(images: torch.Tensor | Sequence[torch.Tensor]) -> list[Image]:
     """Convert images (N, 3, h, w) or a list of (3, h, w), uint8 or float in [0, 1], to (h, w, 3) on the scale 0-255."""

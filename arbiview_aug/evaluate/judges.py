@@ -9,7 +9,8 @@ import importlib.util
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.errors import DataError, described, one_line, shown
+from arbiview_aug.errors import DataError, one_line, shown
 from arbiview_aug.evaluate.report.pictures import Picture
 
 
@@ -61,43 +62,38 @@ def is_road_user(name: str) -> bool:
 def load_detector(name: str) -> Detector:
     """Load the detector that ``--detector`` names.
 
-    It returns the detections from ``LEAST_SCORE`` on that count: vehicles and people by name, and all numbers.
+    It returns the detections from ``LEAST_SCORE`` on that count, cut at the image's border: vehicles and people by
+    name, and all numbers.
 
     Raises:
-        DataError: No such function; its calls raise it for outputs of other shapes.
+        DataError: No such function. Calls raise it for outputs that are not boxes (n, 4), scores (n,) and n labels, or
+            boxes that are not finite and ordered.
     """
     option = f"--detector {name}"
     detect = _function(option, name)
-    return lambda image: _called(option, lambda rgb: checked_detections(option, detect(rgb), image), image)
 
+    def detections_of(image: Picture) -> Detections:
+        output = _called(option, detect, image)
+        expected = f"{option}: expected boxes (n, 4) x0 y0 x1 y1, scores (n,) and n labels for an image {image.shape}"
+        try:
+            boxes, scores, labels = (np.asarray(_host(part)) for part in output)
+            boxes, scores, labels = boxes.astype(np.float64), scores.astype(np.float64), labels.reshape(-1)
+            texts = [str(int(label)) if np.issubdtype(labels.dtype, np.number) else str(label) for label in labels]
+        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise DataError(f"{expected}, got other values: {error}") from None
+        boxes = boxes.reshape(0, 4) if boxes.size == 0 else boxes
+        if boxes.ndim != 2 or boxes.shape[1] != 4 or scores.shape != (len(boxes),) or len(labels) != len(boxes):
+            raise DataError(f"{expected}, got {boxes.shape}, {scores.shape} and {len(labels)}")
+        wrong = ~np.isfinite(boxes).all(axis=1) | (boxes[:, :2] > boxes[:, 2:]).any(axis=1)
+        if wrong.any():
+            raise DataError(f"{expected}: finite, with x0 <= x1 and y0 <= y1, got {boxes[wrong][0].tolist()}")
+        if not ((scores >= 0) & (scores <= 1)).all():
+            raise DataError(f"{expected}: scores from 0 to 1, got {shown(scores.tolist())}")
+        counts = np.array([text.isdecimal() or is_road_user(text) for text in texts], bool)
+        h, w = image.shape[:2]
+        return Detections(boxes.clip(0, (w, h, w, h)), scores).subset(counts & (scores >= LEAST_SCORE))
 
-def checked_detections(option: str, output: Any, image: Picture) -> Detections:
-    """A detector's output for an image: the detections that count, cut at the image's border.
-
-    Raises:
-        DataError: Not boxes (n, 4), scores (n,) and n labels; or boxes that are not finite and ordered.
-    """
-    expected = f"{option}: expected boxes (n, 4) x0 y0 x1 y1, scores (n,) and n labels for an image {image.shape}"
-    if not isinstance(output, tuple | list) or len(output) != 3:
-        got = f"{len(output)} values" if isinstance(output, tuple | list) else type(output).__name__
-        raise DataError(f"{expected}, got {got}")
-    try:
-        boxes, scores = (np.asarray(_host(part), np.float64) for part in output[:2])
-        labels = np.asarray(_host(output[2])).reshape(-1)
-        texts = [str(int(label)) if np.issubdtype(labels.dtype, np.number) else str(label) for label in labels]
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise DataError(f"{expected}, got other values: {error}") from None
-    boxes = boxes.reshape(0, 4) if boxes.size == 0 else boxes
-    if boxes.ndim != 2 or boxes.shape[1] != 4 or scores.shape != (len(boxes),) or len(labels) != len(boxes):
-        raise DataError(f"{expected}, got {boxes.shape}, {scores.shape} and {len(labels)}")
-    wrong = ~np.isfinite(boxes).all(axis=1) | (boxes[:, :2] > boxes[:, 2:]).any(axis=1)
-    if wrong.any():
-        raise DataError(f"{expected}: finite, with x0 <= x1 and y0 <= y1, got {boxes[wrong][0].tolist()}")
-    if not ((scores >= 0) & (scores <= 1)).all():
-        raise DataError(f"{expected}: scores from 0 to 1, got {shown(scores.tolist())}")
-    counts = np.array([text.isdecimal() or is_road_user(text) for text in texts], bool)
-    h, w = image.shape[:2]
-    return Detections(boxes.clip(0, (w, h, w, h)), scores).subset(counts & (scores >= LEAST_SCORE))
+    return detections_of
 
 
 def load_segmenter(name: str) -> Segmenter:
@@ -110,7 +106,7 @@ def load_segmenter(name: str) -> Segmenter:
     segment = _function(option, name)
 
     def masks_of(image: Picture) -> BoolArray:
-        masks = segment(image)
+        masks = _called(option, segment, image)
         try:
             array = np.asarray(_host(masks))
         except (TypeError, ValueError, RuntimeError):
@@ -121,11 +117,22 @@ def load_segmenter(name: str) -> Segmenter:
             raise DataError(f"{option}: expected masks (n, {h}, {w}) of 0 and 1, got {got}")
         return array.astype(bool)
 
-    return lambda image: _called(option, masks_of, image)
+    return masks_of
 
 
 def _host(part: Any) -> Any:
     return part.detach().cpu() if isinstance(part, torch.Tensor) else part
+
+
+@contextmanager
+def _foreign(text: str) -> Iterator[None]:
+    """Turn what another's code raises into DataError with a text; SystemExit, too, which would end the command."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise DataError(f"{text} raised {type(error).__name__}: {one_line(error)}") from error
 
 
 def _function(option: str, name: str) -> Callable[[Picture], Any]:
@@ -138,25 +145,16 @@ def _function(option: str, name: str) -> Callable[[Picture], Any]:
     spec = importlib.util.spec_from_file_location(f"arbiview_aug_judge_{Path(file).stem}", file)
     assert spec is not None and spec.loader is not None
     module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
-    try:
+    with _foreign(f"{option}: importing {file}"):
         spec.loader.exec_module(module)
         function = getattr(module, wanted, None)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # SystemExit, too, which would end the command as if it was done
-        raise DataError(f"{option}: importing {file} raised {type(error).__name__}: {one_line(error)}") from error
     if not callable(function):
         there = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
         raise DataError(f"{option}: expected a function {wanted} in {file}, found {shown(there)}")
-    return function  # type: ignore[no-any-return]
+    return function
 
 
 def _called(option: str, function: Callable[[Picture], Any], image: Picture) -> Any:
     """Call a judge with a copy of an image: it may write into it, and raise anything."""
-    try:
+    with _foreign(f"{option}: for an image {image.shape} {image.dtype} it"):
         return function(image.copy())
-    except (DataError, KeyboardInterrupt):
-        raise
-    except BaseException as error:  # SystemExit, too, which would end the command as if it was done
-        text = one_line(described(error))
-        raise DataError(f"{option}: raised {text} for an image {image.shape} {image.dtype}") from error

@@ -35,11 +35,9 @@ _MIN_SHARED_POINTS = 20
 
 
 class VisiblePoints(NamedTuple):
-    """Visible points of a camera: indices (n,) into the cloud, pixels (n, 2) and depths (n,)."""
-
-    indices: npt.NDArray[np.intp]
-    uv: FloatArray
-    depth_m: FloatArray
+    indices: npt.NDArray[np.intp]  # (n,) into the cloud
+    uv: FloatArray  # (n, 2) pixels
+    depth_m: FloatArray  # (n,)
 
 
 @dataclass(frozen=True)
@@ -61,8 +59,7 @@ class ColouredPoints:
 def visible_points(camera: Camera, points: FloatArray) -> VisiblePoints:
     """Find the points (P, >=3) that a camera sees, with a coarse z-buffer; ignores its mask.
 
-    LiDAR is sparse, so points behind a surface show through its gaps. A point is occluded if another one within 5 x 3
-    cells is closer by more than 0.3 m and a tenth of its depth.
+    LiDAR is sparse: a point is occluded if another one within 5 x 3 cells is closer by 0.3 m and a tenth of its depth.
     """
     h, w = camera.size
     uv, depth, valid = camera.project(points[:, :3])
@@ -93,10 +90,7 @@ def colours_at(image: npt.NDArray[Any], uv: FloatArray) -> npt.NDArray[np.float3
 
 
 def coloured_points(rig: Rig, images: Sequence[Image], points: FloatArray) -> ColouredPoints:
-    """Colour LiDAR points (P, >=3) by the camera that sees each closest to its axis.
-
-    Drops returns of the own car and points that no camera sees outside its car-body mask.
-    """
+    """Colour LiDAR points (P, >=3) off the own car by the camera that sees each closest to its axis, unmasked."""
     points = points[~own_car(points), :3].astype(np.float64)
     colours, best_cosine = np.zeros((len(points), 3)), np.full(len(points), -1.0)
     for camera, image in zip(rig, images, strict=True):
@@ -111,8 +105,8 @@ def coloured_points(rig: Rig, images: Sequence[Image], points: FloatArray) -> Co
     return ColouredPoints(points[seen], colours[seen], on_ground[seen])
 
 
-def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray) -> FloatArray:
-    """Fit (N,) gains that give points seen by two cameras one brightness.
+def equalised(rig: Rig, images: Sequence[Image], points: FloatArray) -> list[npt.NDArray[np.uint8]]:
+    """Images with one gain each, by which points seen by two cameras have one brightness.
 
     Least squares on log-gains g: g_a - g_b = -median(log brightness_a - log brightness_b) for each pair of cameras with
     at least 20 shared points that are neither dark nor saturated, with weak priors g = 0 and sum g = 0.
@@ -132,11 +126,7 @@ def equalising_gains(rig: Rig, images: Sequence[Image], points: FloatArray) -> F
             targets.append(-np.median(brighter))
     A = np.vstack([*rows, _GAIN_PRIOR * np.eye(count), np.ones((1, count))])
     rhs = np.concatenate([targets, np.zeros(count + 1)])
-    return np.asarray(np.exp(np.linalg.lstsq(A, rhs, rcond=None)[0]))
-
-
-def equalised(rig: Rig, images: Sequence[Image], points: FloatArray) -> list[npt.NDArray[np.uint8]]:
-    gains = equalising_gains(rig, images, points)
+    gains = np.exp(np.linalg.lstsq(A, rhs, rcond=None)[0])
     return [np.clip(image * gain, 0, 255).astype(np.uint8) for image, gain in zip(images, gains, strict=True)]
 
 
@@ -150,15 +140,13 @@ def lidar_split(points: FloatArray) -> tuple[BoolArray, BoolArray]:
 def sparse_metrics(
     image: Image, camera: Camera, points: ColouredPoints, *, coverage: BoolArray | None = None
 ) -> dict[str, float] | None:
-    """Compare a target's image with the coloured points that fall into it.
-
-    ``coverage`` (h, w) bool is where some source saw the target; by default, pixels that are not black.
+    """Compare a target's image with the coloured points that fall into it; None if no point is visible.
 
     Returns:
-        ``psnr_db, mae, rmse`` over all points, the paper's figures; the same with the prefixes ``covered_``,
-        ``ground_`` and ``other_`` (off the road) where there are such points; ``ssim`` of two images that are black
-        but at the points; ``coverage``, the share of points on covered pixels; and ``points``, their number. None if
-        no point is visible.
+        ``psnr_db, mae, rmse`` over all points, the paper's figures; the same with the prefixes ``covered_`` by
+        ``coverage`` (h, w), by default pixels that are not black, ``ground_`` and ``other_`` where there are such
+        points; ``ssim`` of two images that are black but at the points; ``coverage``, the share of points on covered
+        pixels; and ``points``, their number.
     """
     h, w = camera.size
     index, uv, _ = visible_points(camera, points.points)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import cv2
@@ -28,13 +28,10 @@ _CACHED_TRANSFORMS = 8  # targets of a study; full-size plans take 50 MB each
 
 @dataclass(frozen=True)
 class Method:
-    """A row of a table.
-
-    ``render`` maps a sample with ``rig`` and a target rig (in its own ego frame) to one view per target camera.
-    """
+    """A row of a table."""
 
     name: str
-    render: Callable[[Sample, Rig], list[RenderedView]]
+    render: Callable[[Sample, Rig], list[RenderedView]]  # of a sample with ``rig``, for a rig in its own ego frame
     reads_points: bool = False  # may use the sample's ``points``, so that only a part of them can score it
 
 
@@ -46,29 +43,19 @@ def retargeting(
     holes: Holes | Inpainter = "black",
     **settings: Any,
 ) -> Method:
-    """Wrap ``RigRetarget`` as a method, with its arguments.
-
-    Exposures stay as recorded: metrics compare with them. The name is by default made of quality, geometry and what
-    fills holes.
-    """
+    """Wrap ``RigRetarget`` as a method, with its arguments; exposures stay as recorded: metrics compare with them."""
     inpainter = inpainter_of(holes)  # once, not for each target
     settings = dict[str, Any](cache=PlanCache(max_bytes=0)) | settings
     images_alone = replace(settings.get("keys", SampleKeys()), points="source")
     settings |= {"holes": inpainter, "match_exposure": False, "keys": images_alone}
 
-    @lru_cache(_CACHED_TRANSFORMS)
-    def transform(target: Rig) -> RigRetarget:
-        return RigRetarget(target, quality=quality, geometry=geometry, **settings)
-
-    def render(sample: Sample, target: Rig) -> list[RenderedView]:
-        return views_of(transform(target)(sample))
-
+    transform = lru_cache(_CACHED_TRANSFORMS)(partial(RigRetarget, quality=quality, geometry=geometry, **settings))
     label = name or ", ".join([quality if isinstance(quality, str) else type(quality).__name__, geometry])
     if not name and not isinstance(inpainter, Black):
         steps = getattr(inpainter, "steps", None)
         label += f", {holes if isinstance(holes, str) else type(holes).__name__}" + (f" {steps}" if steps else "")
     reads_points = isinstance(render_config(quality), RenderConfig) and "points" in GEOMETRIES[geometry].reads
-    return Method(label, render, reads_points)
+    return Method(label, lambda sample, target: views_of(transform(target)(sample)), reads_points)
 
 
 def _copy(sample: Sample, target: Rig) -> list[RenderedView]:

@@ -67,21 +67,13 @@ def truth_metrics(
     classes: Mapping[str, BoolArray] | None = None,
     valid: BoolArray | None = None,
 ) -> dict[str, float]:
-    """Compare a view with the true one: over all pixels, split by coverage and by class.
-
-    SSIM of a region is the mean of the SSIM map over its pixels.
-
-    Args:
-        image: (h, w, 3) the rendered view, scale 0-255.
-        truth: (h, w, 3) the true one.
-        coverage: (h, w) bool, where some source saw the view: splits into ``covered`` and ``hole``.
-        classes: (h, w) bool by name, for instance ``ground``, ``object``, ``sky``.
-        valid: (h, w) bool, where the truth is known (not on the target's own car body).
+    """Compare a view (h, w, 3) with the true one, scale 0-255, where that is ``valid`` (h, w), by default everywhere.
 
     Returns:
-        ``psnr_db, mae, rmse, ssim, share`` over all valid pixels, and the same with the prefixes ``covered_``,
-        ``hole_``, ``<class>_``, ``covered_<class>_``, ``hole_<class>_``. ``share`` is the
-        region's part of the valid pixels. A region without pixels has a share of 0 and no other entries.
+        ``psnr_db, mae, rmse, ssim, share`` over all valid pixels. The same with the prefixes ``covered_`` and ``hole_``
+        by ``coverage`` (h, w), where some source saw the view; ``<class>_`` by ``classes``, (h, w) bool by name; and
+        ``covered_<class>_``, ``hole_<class>_``. SSIM is the mean of the map over a region's pixels, ``share`` their
+        part of the valid ones. A region without pixels has a share of 0 and no other entries.
     """
     everywhere = np.ones(image.shape[:2], bool) if valid is None else valid
     regions = {"": everywhere}

@@ -6,6 +6,8 @@ the ego frame, metres.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -62,42 +64,35 @@ def scan_metrics(
     where: BoolArray | bool = True,
     boxes: FloatArray | None = None,
 ) -> dict[str, float]:
-    """Compare a cloud with a scanner's true one.
-
-    Args:
-        lidar: The scanner of the truth.
-        points: (P, >=3).
-        truth: (Q, >=3).
-        where: (beams, columns) rays that count for returns and ranges; by default all.
-        boxes: (B, 7) labelled objects.
+    """Compare points (P, >=3) with a scanner's true ones (Q, >=3), at rays ``where`` (beams, columns), by default all.
 
     Returns:
         ``recall``: share of the true returns that the cloud has, within ``TOLERANCE``. ``precision``: share of the
         cloud's returns that are true. ``range_error_m``: median error of range at rays where both return.
         ``chamfer_m``: mean distance to the other cloud's nearest point, over both directions. ``returns``: the cloud's
-        number of points over the true one. ``in_boxes``: sum over the boxes of how far the numbers of points are apart,
-        over the sum of the true ones. NaN where undefined.
+        number of points over the true one. ``in_boxes``: sum over ``boxes`` (B, 7) of how far the numbers of points are
+        apart, over the sum of the true ones. NaN where undefined.
     """
     ours, true = (np.where(where, range_image(lidar, cloud), 0) for cloud in (points, truth))
     both = (ours > 0) & (true > 0)
     error = np.abs(ours - true)
     right = np.count_nonzero(both & (error <= np.maximum(TOLERANCE_M, TOLERANCE * true)))
     met, met_true = (len(returns_of(lidar, cloud)[0]) for cloud in (points, truth))
-    nothing = float("nan")
-    return {
-        "recall": right / np.count_nonzero(true) if true.any() else nothing,
-        "precision": right / np.count_nonzero(ours) if ours.any() else nothing,
-        "range_error_m": float(np.median(error[both])) if both.any() else nothing,
-        "chamfer_m": chamfer_m(points, truth),
-        "returns": met / met_true if met_true else nothing,
-        "in_boxes": nothing if boxes is None else _counts_apart(points, truth, boxes),
-    }
-
-
-def _counts_apart(points: FloatArray, truth: FloatArray, boxes: FloatArray) -> float:
+    boxes = np.zeros((0, 7)) if boxes is None else boxes
     clouds = (np.ascontiguousarray(cloud[:, :3], np.float32) for cloud in (points, truth))
-    ours, true = (np.diff(points_by_box(boxes, cloud, 0.0)[1], prepend=0) for cloud in clouds)
-    return float(np.abs(ours - true).sum() / true.sum()) if true.any() else float("nan")
+    inside, truly = (np.diff(points_by_box(boxes, cloud, 0.0)[1], prepend=0) for cloud in clouds)
+
+    def ratio(part: Any, whole: Any) -> float:
+        return float(part / whole) if whole else float("nan")
+
+    return {
+        "recall": ratio(right, np.count_nonzero(true)),
+        "precision": ratio(right, np.count_nonzero(ours)),
+        "range_error_m": float(np.median(error[both])) if both.any() else float("nan"),
+        "chamfer_m": chamfer_m(points, truth),
+        "returns": ratio(met, met_true),
+        "in_boxes": ratio(np.abs(inside - truly).sum(), truly.sum()),
+    }
 
 
 def chamfer_m(one: FloatArray, two: FloatArray) -> float:

@@ -1,10 +1,10 @@
-"""A detector's and a segmenter's verdicts on views: AP, recall and IoU with bootstrap intervals."""
+"""A detector's and a segmenter's verdicts on views: hits, AP, recall and IoU with bootstrap intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,17 +12,21 @@ import numpy.typing as npt
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.detections import (
-    CONFIDENCE,
-    Matches,
-    Objects,
-    labelled_objects,
-    match,
-    precision_and_recall,
-)
 from arbiview_aug.evaluate.frames import ScoredFrame
 from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, to_bytes
-from arbiview_aug.evaluate.judges import Detections, Detector, Segmenter
+from arbiview_aug.evaluate.judges import Detections, Detector, Segmenter, is_road_user
+from arbiview_aug.sample.boxes_2d import project_boxes_3d
+
+CONFIDENCE = 0.5
+"""Least score of a sure detection: recall counts no others, and in true images they are the objects."""
+
+OVERLAP = 0.5
+"""Least IoU of a hit, as in PASCAL VOC."""
+
+VISIBLE = 0.5
+"""Least visible share of a labelled object that counts."""
+
+IntArray = npt.NDArray[np.int64]
 
 SOURCES = "sources"
 """Row of the source images."""
@@ -35,12 +39,74 @@ TOO_FEW = "rows of fewer than 100 objects or 10 images are too few to tell metho
 _DRAWS = 1000
 
 
-class Verdict(NamedTuple):
-    """Verdicts on one image."""
+class Objects(NamedTuple):
+    """Objects that the detections in an image are compared with."""
 
-    method: str  # or ``SOURCES``
-    matches: Matches | None = None
-    pixels: npt.NDArray[np.int64] | None = None  # (masks, 2) intersection and union with the true image's masks
+    boxes: FloatArray  # (n, 4) x0 y0 x1 y1 in pixels; pixel k reaches from k to k + 1
+    counts: BoolArray  # (n,); a detection of an object that does not count is neither a hit nor a miss
+
+
+class Matches(NamedTuple):
+    """Detections in an image that are hits or misses."""
+
+    scores: FloatArray  # (d,)
+    hits: BoolArray  # (d,); each object is hit once
+    num_true: int
+
+
+def labelled_objects(sample: Mapping[str, Any], rig: Rig) -> list[Objects] | None:
+    """A sample's labels in the cameras of a rig in its ego frame, whose masks hide them; None without ``boxes_3d``.
+
+    Vehicles and people count if others hide no more than half of them; without ``box_names`` all objects are such.
+    """
+    if sample.get("boxes_3d") is None:
+        return None
+    names, objects = sample.get("box_names"), []
+    for seen in project_boxes_3d(sample["boxes_3d"], rig):
+        users = [names is None or is_road_user(names[row]) for row in seen.rows]
+        edges = seen.boxes + 0.5  # those of 3D boxes refer to pixel centres
+        objects.append(Objects(edges, (seen.visibility >= VISIBLE) & np.array(users, bool)))
+    return objects
+
+
+def ious(one: FloatArray, two: FloatArray) -> FloatArray:
+    """(n, m) IoU of boxes (n, 4) and (m, 4); that of two empty ones is 0."""
+    # Not torchvision's: importing it takes seconds.
+    low, high = np.maximum(one[:, None, :2], two[:, :2]), np.minimum(one[:, None, 2:], two[:, 2:])
+    both = (high - low).clip(0).prod(axis=-1)
+    one_px, two_px = ((boxes[:, 2:] - boxes[:, :2]).prod(axis=1) for boxes in (one, two))
+    return np.asarray(both / np.maximum(one_px[:, None] + two_px - both, 1e-9))
+
+
+def match(detections: Detections, objects: Objects) -> Matches:
+    """Match detections, the surest first, each with the free object that it overlaps most."""
+    true, others = objects.boxes[objects.counts], objects.boxes[~objects.counts]
+    hits, free = np.zeros(len(detections.boxes), bool), np.ones(len(true), bool)
+    overlaps = ious(detections.boxes, true)
+    for k in np.argsort(-detections.scores, kind="stable") if len(true) else ():
+        best = np.where(free, overlaps[k], 0).argmax()
+        hits[k] = free[best] and overlaps[k, best] >= OVERLAP
+        free[best] &= not hits[k]
+    chosen = hits | (ious(detections.boxes, others).max(axis=1, initial=0) < OVERLAP)
+    return Matches(detections.scores[chosen], hits[chosen], len(true))
+
+
+def precision_and_recall(matches: Sequence[Matches], weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(R,) AP and recall of images (n) together, for R weightings (R, n) of these; NaN without true objects.
+
+    AP is the area under the envelope of precision over recall; recall is that of detections from ``CONFIDENCE`` on.
+    """
+    image = np.repeat(np.arange(len(matches)), [len(found.scores) for found in matches])
+    scores, hits = (np.concatenate(parts) for parts in zip(*(found[:2] for found in matches), strict=True))
+    order = np.argsort(-scores, kind="stable")
+    scores, hits, weights_of = scores[order], hits[order], weights[:, image[order]]
+    num_true = weights @ np.array([found.num_true for found in matches], float)
+    num_true[num_true == 0] = np.nan
+    recall = (weights_of * hits).cumsum(axis=1) / num_true[:, None]
+    precision = recall * num_true[:, None] / np.maximum(weights_of.cumsum(axis=1), 1)
+    precision = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
+    average = np.where(np.isnan(num_true), np.nan, (np.diff(recall, axis=1, prepend=0) * precision).sum(axis=1))
+    return average, (weights_of * (hits & (scores >= CONFIDENCE))).sum(axis=1) / num_true
 
 
 class Reference(NamedTuple):
@@ -53,15 +119,16 @@ class Reference(NamedTuple):
 
 @dataclass
 class Panel:
-    """Networks, and their verdicts on all images that they were shown; ``look`` is that of ``evaluate``.
+    """Networks, and their verdicts on all images that they were shown.
 
-    Views are compared with the true images, where there are some: sure detections there are the objects. Otherwise the
-    detector's views, and its source images, are compared with the labels.
+    Views are compared with the true images, where there are some: sure detections there are the objects. Otherwise
+    views and source images are compared with the labels.
     """
 
     detector: Detector | None = None
     segmenter: Segmenter | None = None
-    verdicts: list[Verdict] = field(default_factory=list)
+    matches: dict[str, list[Matches]] = field(default_factory=dict)  # by method, or ``SOURCES``
+    pixels: dict[str, list[IntArray]] = field(default_factory=dict)  # (masks, 2) intersection and union, likewise
     _frame: str = ""
     _references: list[Reference] = field(default_factory=list)  # of that frame, by camera
 
@@ -92,22 +159,22 @@ class Panel:
     def _judge(self, method: str, images: Sequence[Image], references: Sequence[Reference]) -> None:
         """Add the verdicts on images."""
         for image, reference in zip(map(to_bytes, images), references, strict=True):
-            matches = pixels = None
             if self.detector is not None and reference.objects is not None:
-                matches = match(valid_detections(self.detector(image), reference.valid), reference.objects)
+                found = valid_detections(self.detector(image), reference.valid)
+                self.matches.setdefault(method, []).append(match(found, reference.objects))
             if self.segmenter is not None and reference.masks is not None:
                 masks = self.segmenter(image)
                 if len(masks) != len(reference.masks):
                     expected = f"as many masks as in the true image, {len(reference.masks)}"
                     raise DataError(f"--segmenter: expected {expected}, got {len(masks)} in a view by {method}")
                 ours, true = masks & reference.valid, reference.masks & reference.valid
-                pixels = np.stack([(ours & true).sum(axis=(1, 2)), (ours | true).sum(axis=(1, 2))], axis=1)
-            if matches is not None or pixels is not None:
-                self.verdicts.append(Verdict(method, matches, pixels))
+                counts = np.stack([(ours & true).sum(axis=(1, 2)), (ours | true).sum(axis=(1, 2))], axis=1)
+                self.pixels.setdefault(method, []).append(counts)
 
     def rows(self, methods: Sequence[str]) -> dict[str, dict[str, float]]:
         """``figures`` of the sources and of each method."""
-        rows = {name: figures([v for v in self.verdicts if v.method == name]) for name in (SOURCES, *methods)}
+        names = (SOURCES, *methods)
+        rows = {name: figures(self.matches.get(name, ()), self.pixels.get(name, ())) for name in names}
         return {name: row for name, row in rows.items() if row}
 
 
@@ -117,24 +184,28 @@ def valid_detections(detections: Detections, valid: BoolArray) -> Detections:
     return detections.subset(valid[y.clip(max=valid.shape[0] - 1), x.clip(max=valid.shape[1] - 1)])
 
 
-def figures(verdicts: Sequence[Verdict]) -> dict[str, float]:
-    """Figures of a row of the tables, from the verdicts on its images.
+def figures(matches: Sequence[Matches], pixels: Sequence[IntArray] = ()) -> dict[str, float]:
+    """Figures of a row: ``ap``, ``recall`` and number of ``objects``; ``iou_1``, ... and number of ``images``.
 
-    ``ap`` and ``recall`` of ``objects``; ``iou_1``, ``iou_2``, ... of the masks, their pixels summed over ``images``.
-    Each has a 95 % interval, ``_low`` and ``_high``, by the bootstrap over images. The same seed and number of images
-    give the same draws.
+    Each has a 95 % interval, ``_low`` and ``_high``, by the bootstrap over images, from one seed.
     """
     row: dict[str, float] = {}
-    if matches := [verdict.matches for verdict in verdicts if verdict.matches is not None]:
+
+    def add(name: str, draws: FloatArray) -> None:
+        low, high = np.nanpercentile(draws[1:], (2.5, 97.5))  # a draw without objects has no figure
+        row.update({name: float(draws[0]), f"{name}_low": float(low), f"{name}_high": float(high)})
+
+    if matches:
         row["objects"] = sum(found.num_true for found in matches)
         if row["objects"]:
             average, recall = precision_and_recall(matches, draws_of(len(matches)))
-            row |= interval("ap", average) | interval("recall", recall)
-    if pixels := [verdict.pixels for verdict in verdicts if verdict.pixels is not None]:
+            add("ap", average)
+            add("recall", recall)
+    if pixels:
         row["images"] = len(pixels)
         sums = np.einsum("rv,vmk->mrk", draws_of(len(pixels)), np.stack(pixels))
         for k, mask in enumerate(sums, 1):
-            row |= interval(f"iou_{k}", mask[:, 0] / np.maximum(mask[:, 1], 1))
+            add(f"iou_{k}", mask[:, 0] / np.maximum(mask[:, 1], 1))
     return row
 
 
@@ -142,12 +213,6 @@ def draws_of(count: int) -> FloatArray:
     """(1 + draws, count) how often each of ``count`` things counts: once, and as drawn with replacement."""
     drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=_DRAWS)
     return np.concatenate([np.ones((1, count)), drawn])
-
-
-def interval(name: str, draws: FloatArray) -> dict[str, float]:
-    """A figure, the first of its draws, and its 95 % interval."""
-    low, high = np.nanpercentile(draws[1:], (2.5, 97.5))  # a draw without objects has no figure
-    return {name: float(draws[0]), f"{name}_low": float(low), f"{name}_high": float(high)}
 
 
 def too_few(rows: Iterable[Mapping[str, float]]) -> bool:

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property, wraps
 from pathlib import Path
 from typing import Any, get_args
 
+import cv2
 import torch
+from torch.utils.data import get_worker_info
 
 from arbiview_aug import favs, transforms
 from arbiview_aug.cameras.framing import Fit, framing
 from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.choices import GeometryName, Holes, Quality, choice
-from arbiview_aug.environment import eager_on_cpu, warn_about_cv2_wheels
+from arbiview_aug.environment import compilation_announced, warn_about_cv2_wheels
 from arbiview_aug.errors import GeometryWarning, SampleError, WarnOnce
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
 from arbiview_aug.inpaint.neighbours import Reach
@@ -48,6 +53,31 @@ from arbiview_aug.transforms.settings import (
     size_mistake,
     warn_of_target,
 )
+
+
+def _eager_on_cpu(method: Any) -> Any:
+    """Run a method outside ``torch.compile``, with new tensors on the CPU; say where kernels are compiled."""
+
+    def run_on_cpu(*args: Any, **options: Any) -> Any:
+        if get_worker_info() is not None:
+            _one_thread_of_opencv(os.getpid())
+        # Under another default device, numbers of plans would be made there, or nowhere (meta).
+        is_cpu = torch.empty(0).device.type == "cpu"  # get_default_device of torch 2.6 misses contexts
+        with nullcontext() if is_cpu else torch.device("cpu"), compilation_announced():
+            return method(*args, **options)
+
+    @wraps(method)
+    def run(*args: Any, **options: Any) -> Any:
+        is_imported = "torch._dynamo" in sys.modules  # importing it takes a second
+        return (torch.compiler.disable(run_on_cpu) if is_imported else run_on_cpu)(*args, **options)
+
+    return run
+
+
+@cache
+def _one_thread_of_opencv(process: int) -> None:
+    """Leave OpenCV one thread in a DataLoader's worker: more would fight for the cores."""
+    cv2.setNumThreads(0)
 
 
 class RigRetarget(torch.nn.Module):
@@ -186,7 +216,7 @@ class RigRetarget(torch.nn.Module):
         return f"target={target}, {settings}, {cache}{self.renderer.config}"
 
     # --- the transform --------------------------------------------------------------------------------------------
-    @eager_on_cpu
+    @_eager_on_cpu
     def forward(self, sample: Mapping[str, Any], params: Mapping[str, float] | None = None) -> dict[str, Any]:
         """Retarget one sample, or a batch with leading dimensions.
 

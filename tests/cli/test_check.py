@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from pathlib import Path
 
 import cv2
@@ -12,8 +11,7 @@ import pytest
 
 from arbiview_aug import save_rig
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli import check as command
-from arbiview_aug.datasets import FrameFolder, open_data
+from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.evaluate.report.pictures import draw_labels
 from tests.helpers import camera, street_sample
 
@@ -81,23 +79,6 @@ def test_a_rig_is_checked_alone(folder: Path, tmp_path: Path, capsys: pytest.Cap
     assert "argument --frames: expected frames with it, got a rig" in capsys.readouterr().err
     camera_file = next(ros.glob("front*.yaml")).rename(folder / "a" / "front.yaml")  # data are data all the same
     assert main(["check", str(folder / "a"), "--output", str(tmp_path / "out")]) == 0 and camera_file.exists()
-
-
-def test_a_picture_for_each_camera_and_no_finding_of_libraries(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for frame in ("a", "b"):
-        cameras = json.loads((folder / frame / "calib.json").read_text())["cameras"]
-        change(
-            folder / frame, cameras=[{**c, "name": f"cam{sign}1"} for c, sign in zip(cameras, "-./: _", strict=True)]
-        )
-    monkeypatch.setattr(
-        command,
-        "open_data",
-        lambda *a, **k: warnings.warn("old", DeprecationWarning, stacklevel=2) or open_data(*a, **k),
-    )
-    assert main(["check", str(folder), "--output", str(tmp_path / "out")]) == 0
-    assert "old" not in capsys.readouterr().out and len(list((tmp_path / "out").iterdir())) == 6
 
 
 @pytest.mark.parametrize("lens", ["pinhole", "fisheye"])

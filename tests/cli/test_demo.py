@@ -58,14 +58,6 @@ def test_synthetic_street(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert f"picture: {tmp_path / 'demo.png'}" in printed
 
 
-@pytest.mark.slow
-def test_holes_filled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["demo", "--size", "40x104", "--output", str(tmp_path), "--width", "600", "--holes", "telea"]) == 0
-    printed = capsys.readouterr().out
-    plain, filled = (numbers(printed, name)[-1] for name in ("auto", "auto, inpainted"))
-    assert filled > plain + 1, "whole views, holes and all"
-
-
 @pytest.mark.parametrize("reader", ["frame folder", pytest.param("tables", marks=pytest.mark.slow)])
 def test_real_keyframe(reader: str, nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = nuscenes_root
@@ -95,20 +87,3 @@ def test_the_published_method_beside_fast(nuscenes_root: Path, tmp_path: Path, c
     with pytest.raises(SystemExit, match="2"):
         main(["demo", *options, "--geometry", "street"])
     assert "quality paper knows infinity alone" in capsys.readouterr().err
-
-
-def test_lenses_without_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--target", "ddad", "--size", "120x200", "--output", str(tmp_path), "--geometry", "infinity"]
-    assert main(["demo", "--data", str(fisheye_root), *arguments]) == 0
-    printed = capsys.readouterr().out
-    assert "no truth and no LiDAR points" in printed
-    assert numbers(printed, "infinity")[0] > 80 and numbers(printed, "ground")[0] > 80
-
-
-@pytest.mark.slow
-def test_geometry_that_the_sample_has_and_one_that_it_lacks(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    options = ["--size", "16x44", "--output", str(tmp_path), "--geometry"]
-    assert main(["demo", *options, "lidar"]) == 0
-    assert numbers(capsys.readouterr().out, "lidar")[0] > 60
-    assert main(["demo", *options, "learned"]) == 2
-    assert "expected 'learned_depth_m' in the sample" in capsys.readouterr().err

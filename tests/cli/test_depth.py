@@ -155,26 +155,3 @@ def test_what_was_found_from_less_is_found_again(recorded: Path, tmp_path: Path,
     kept = capsys.readouterr().out.partition(" were there before")[0]
     assert int(kept.split()[-1]) < 3, "those that had lost their neighbour, and the one that could not be read"
     assert main(asked) == 0 and "4 were there before" in capsys.readouterr().out
-
-
-def test_a_broken_frame_is_no_neighbour(recorded: Path, tmp_path: Path) -> None:
-    shutil.copytree(recorded, tmp_path / "drive")
-    (tmp_path / "drive" / "002" / "calib.json").write_text("{")
-    with pytest.warns(UserWarning, match="002.*this frame is no neighbour"):
-        drive = FrameFolder(tmp_path / "drive", neighbours=Neighbours())
-    assert drive[1]["neighbours"] and all(frame["token"] != "002" for frame in drive[1]["neighbours"])
-    with pytest.raises(DataError, match="002"):
-        drive[2]
-
-
-@pytest.mark.parametrize(
-    "broken",
-    [{"format": [1, 2]}, {"kind": "dreamt"}, {"words": None}, {"format": None}, {"K": [1]}, {"depth_00": 3}],
-)
-def test_files_of_nonsense_are_named(depth_root: Path, recorded: Path, tmp_path: Path, broken: dict) -> None:
-    """Arrays that are missing or of other shapes."""
-    with np.load(depth_root / "000.npz") as file:
-        held = {name: file[name] for name in file.files} | {name: np.array(value) for name, value in broken.items()}
-    np.savez(tmp_path / "000.npz", **{name: value for name, value in held.items() if broken.get(name, 0) is not None})
-    with pytest.raises(DataError, match=r"000\.npz: expected depth"):
-        DepthFolder(tmp_path).read("000", FrameFolder(recorded)[0]["rig"])

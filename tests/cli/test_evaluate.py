@@ -14,16 +14,18 @@ import cv2
 import numpy as np
 import pytest
 
+from arbiview_aug import Lidar
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.cli import evaluate as command
 from arbiview_aug.cli.arguments import chosen_frames, gathered_warnings
-from arbiview_aug.datasets import FrameFolder
-from arbiview_aug.datasets.synthetic import demo_source_rig
+from arbiview_aug.datasets import FrameFolder, Neighbours
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.evaluate.images import RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.transforms.rig_retarget import RigRetarget
+from tests.helpers import write_drive
 
 AGREEMENT_DB = 0.01
 
@@ -99,32 +101,6 @@ def test_numbers_agree_with_the_protocol(
         assert mean[f"{exposure}_points"] == pytest.approx(want["n"])
 
 
-@pytest.mark.slow
-def test_points_that_methods_may_read_do_not_score(
-    nuscenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    common = ["--data", str(nuscenes_root), "--downscale", "4", "--target", "waymo", "--size", "80x144"]
-    whole = run([*common, "--geometry", "street"], tmp_path / "street")
-    held = run([*common, "--geometry", "auto"], tmp_path / "auto")
-    assert held["scored_on_other_points"] and not whole["scored_on_other_points"]
-    assert "Methods get the points of every other degree of azimuth" in capsys.readouterr().out
-    ratio = held["means"]["fast, auto"]["raw_points"] / whole["means"]["fast, street"]["raw_points"]
-    assert 0.4 < ratio < 0.7
-
-
-@pytest.mark.slow
-def test_lenses_that_a_method_cannot_take(
-    fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["--data", str(fisheye_root), "--target", "ddad", "--size", "60x100", "--geometry", "infinity"]
-    report = run([*arguments, "--quality", "fast", "paper"], tmp_path)
-    printed = capsys.readouterr().out
-    assert list(report["means"]) == ["fast, infinity"] and "note: paper, infinity: " in printed and "pinhole" in printed
-    assert "no truth and no LiDAR points" in printed
-    assert main(["evaluate", *arguments, "--quality", "paper", "--output", str(tmp_path)]) == 2
-    assert "pinhole" in capsys.readouterr().err
-
-
 # --- judges -----------------------------------------------------------------------------------------------------------
 JUDGES = """
 import numpy as np
@@ -190,13 +166,6 @@ def test_pictures_of_targets_with_long_names(tmp_path: Path) -> None:
     assert len([*tmp_path.glob("*.png")]) == 1
 
 
-def test_a_name_given_twice_is_one_row(tmp_path: Path) -> None:
-    (tmp_path / "own.py").write_text(JUDGES)
-    asked = ["--size", "24x66", "--detector", f"{tmp_path}/own.py:detect", "--geometry", "infinity"]
-    once, twice = (run([*asked, *more], tmp_path)["judges"] for more in ([], ["infinity"]))
-    assert once == twice
-
-
 @pytest.mark.slow
 def test_rows_do_not_depend_on_other_rows(tmp_path: Path) -> None:
     """Motion needs neighbours, which must not fill the holes of other rows."""
@@ -207,52 +176,43 @@ def test_rows_do_not_depend_on_other_rows(tmp_path: Path) -> None:
     assert list(beside) == ["fast, street", "fast, motion"] and beside["fast, street"] == alone["fast, street"]
 
 
-NANODET = """
-import sys
-sys.path.insert(0, {folder!r})
-import nanodet, numpy as np
-
-def detect(rgb):
-    boxes, scores, labels = nanodet.detect(rgb, score=0.05)
-    keep = np.isin(labels, (0, 1, 2, 3, 5, 7))
-    return boxes[keep], scores[keep], labels[keep]
-"""
-TWINLITENET = """
-import cv2, numpy as np, torch
-network = torch.jit.load({folder!r} + "/twinlitenet.ts").eval()
-
-def segment(rgb):
-    h, w = rgb.shape[:2]
-    wide, high = min(w, h * 16 // 9), min(h, max(1, w * 9 // 16))  # the 16:9 part that the network knows
-    part = slice(h - high, h), slice((w - wide) // 2, (w - wide) // 2 + wide)
-    small = cv2.resize(rgb[part], (640, 360), interpolation=cv2.INTER_AREA)
-    with torch.inference_mode():
-        out = network(torch.from_numpy(small).permute(2, 0, 1)[None].float() / 255)
-    masks = np.zeros((len(out), h, w), bool)
-    for mask, logits in zip(masks, out):
-        classes = logits[0].argmax(0).byte().numpy()
-        mask[part] = cv2.resize(classes, (wide, high), interpolation=cv2.INTER_NEAREST) > 0
-    return masks
-"""
+POSE = np.eye(4)
+POSE[:3, 3] = 0.9, 0.0, 2.2
+TOP = Lidar("top", POSE, np.linspace(-20, 5, 36).tolist(), 0.4, (1.0, 80.0))
+RIG = replace(demo_source_rig((16, 44)), lidars=[TOP])
 
 
-@pytest.mark.slow
-def test_real_judges_of_a_real_frame(judges_root: Path, nuscenes_root: Path, tmp_path: Path) -> None:
-    """They find as many of the labels in views turned by 11 degrees as in the photographs, or nearly."""
-    pytest.importorskip("ncnn", reason="pip install ncnn")
-    FrameFolder(nuscenes_root)[0]["rig"].turned(yaw_deg=11).save(tmp_path / "turned.yaml")
-    data = ["--data", f"nuscenes:{nuscenes_root}", "--target", str(tmp_path / "turned.yaml"), "--geometry", "boxes"]
-    (tmp_path / "own.py").write_text(NANODET.format(folder=str(judges_root)))
-    rows = run([*data, "--detector", f"{tmp_path}/own.py:detect"], tmp_path)["judges"]
-    assert rows["sources"]["objects"] > 10 and rows["sources"]["recall"] > 0.1
-    assert rows["fast, boxes"]["recall"] > rows["sources"]["recall"] - 0.1
+def run_scans(arguments: list[str], folder: Path) -> dict:
+    assert main(["evaluate", "--lidar", *arguments, "--output", str(folder)]) == 0
+    return json.loads((folder / "evaluate.json").read_text())
 
 
-@pytest.mark.slow
-def test_real_judges_of_photographs(judges_root: Path, kitti_root: Path, tmp_path: Path) -> None:
-    """Eleven frames of a suburb, 0.54 m aside: lane marks, the second mask, tell the surfaces apart."""
-    (tmp_path / "own.py").write_text(TWINLITENET.format(folder=str(judges_root)))
-    network = ["--segmenter", f"{tmp_path}/own.py:segment"]
-    rows = run(["--displaced", "--data", str(kitti_root), "--geometry", "street", *network], tmp_path)["judges"]
-    assert rows["copy"]["iou_2"] < 0.1 and rows["fast, street"]["iou_2"] == pytest.approx(0.27, abs=0.03)
-    assert rows["copy"]["iou_1"] < rows["fast, street"]["iou_1"] > 0.9
+def test_the_next_frame_of_a_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its scan is the truth, of all frames that have a next one; the scanner is that of calib.json."""
+    drive = SyntheticDrive(RIG, num_frames=1, neighbours=Neighbours(count=2, step_m=1.5, direction="future"))
+    sample = drive[0]
+    recorded = (sample, *sample["neighbours"])
+    frames = [{key: value for key, value in one.items() if key != "neighbours"} for one in recorded]
+    write_drive(tmp_path / "drive", frames)
+    report = run_scans(["--data", str(tmp_path / "drive")], tmp_path)
+    assert "Points of 2 frames against true scans by sedan" in capsys.readouterr().out
+    scans = report["scans"]
+    assert len({row["frame"] for row in report["rows"]}) == 2
+    assert list(scans) == ["as they are", "scanned"] and scans["scanned"]["recall"] > scans["as they are"]["recall"]
+    assert scans["scanned"]["precision"] > 0.7
+    lost = [{key: value for key, value in frame.items() if key != "ego2world"} for frame in frames]
+    write_drive(tmp_path / "lost", lost)
+    asked = ["evaluate", "--lidar", "--data", str(tmp_path / "lost"), "--output", str(tmp_path / "out")]
+    assert main(asked) == 2 and "expected a 'truth' camera in calib.json, or a later frame" in capsys.readouterr().err
+    bare = [{**one, "rig": replace(RIG, lidars=())} for one in frames]
+    write_drive(tmp_path / "bare", bare)
+    asked = ["evaluate", "--lidar", "--data", str(tmp_path / "bare"), "--output", str(tmp_path / "out")]
+    assert main(asked) == 2 and "expected lidars in calib.json, or --target" in capsys.readouterr().err
+    alike = run_scans([*asked[2:4], "--target", str(RIG.save(tmp_path / "rig.json"))], tmp_path / "out")["scans"]
+    assert alike["scanned"] == pytest.approx(scans["scanned"])
+
+
+def test_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["evaluate", "--lidar"])
+    assert "--lidar: expected --data FOLDER with it" in capsys.readouterr().err

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -16,8 +15,6 @@ from arbiview_aug.datasets import FrameFolder, WithDepth
 from arbiview_aug.datasets.depth_folder import LEARNED_FOLDER, DepthFolder
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.errors import SampleError
-from arbiview_aug.temporal.learned_depth import LearnedDepth
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from tests.helpers import saved_depth_model
 
@@ -120,18 +117,6 @@ def test_it_goes_on_and_other_origins_are_made_again(recorded: Path, knowing: Pa
     assert "1 were there before" in out and "front: 1 of 1 frames fitted to motion, residual" in out
     assert main([*asked, "--output", str(recorded / "motion_depth")]) == 1
     assert "000.npz: expected learned depth, got another kind; name another --output" in capsys.readouterr().err
-
-
-def test_samples_carry_both_kinds(recorded: Path) -> None:
-    rig = FrameFolder(recorded)[0]["rig"]
-    maps = tuple(np.full((64, 176), 7, np.float32) for _ in rig)
-    DepthFolder(recorded / "motion_depth").write("000", rig, MotionDepth(maps, "still"))
-    DepthFolder(recorded / LEARNED_FOLDER).write("000", rig, LearnedDepth(maps, "m"), ["m"])
-    sample = WithDepth(FrameFolder(recorded), recorded)[0]
-    assert {"motion_depth_m", "learned_depth_m"} < sample.keys()
-    assert sample["learned_depth_words"] == "learned depth: 100% of the pixels, m"
-    with pytest.raises(SampleError, match=r"geometry='learned': expected 'learned_depth_m' in the sample, got none"):
-        RigRetarget(TARGET, geometry="learned")(FrameFolder(recorded)[0])
 
 
 @pytest.mark.slow

@@ -9,9 +9,13 @@ import torch
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import LazyFrame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.frames import make_frame, regions, scores
+from arbiview_aug.evaluate.frames import make_frame, scores
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
 from arbiview_aug.evaluate.lidar import coloured_points, lidar_split
+from arbiview_aug.evaluate.methods import retargeting
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.transforms.rig_retarget import RigRetarget
+from tests.helpers import street_sample
 
 SIZE = (64, 176)
 
@@ -52,14 +56,6 @@ def test_methods_that_read_no_points_get_none_and_all_score(sample: dict) -> Non
     whole = coloured_points(sample["rig"], as_arrays(sample["images"]), sample["points"].numpy().astype(np.float64))
     np.testing.assert_array_equal(frame.lidar["raw"].points.points, whole.points)
     assert "points" in sample, "the sample itself stays"
-
-
-def test_where_points_do_not_score_they_are_handed_over_whole(sample: dict) -> None:
-    frame = make_frame(sample, exposures=(), hand_over_points=True)
-    assert frame.sample["points"] is sample["points"] and not frame.lidar and not frame.held_out
-    assert "points" not in make_frame(sample, exposures=()).sample
-    bare = {key: value for key, value in sample.items() if key != "points"}
-    assert not make_frame(bare).lidar
 
 
 def test_neighbours_bring_no_points_where_points_score(sample: dict) -> None:
@@ -105,23 +101,19 @@ def test_scores_of_the_source_itself(drive: SyntheticDrive, sample: dict) -> Non
     assert len(calls) == 1 and "even_psnr_db" in rows[0] and "raw_psnr_db" not in rows[0]
 
 
-def test_scores_without_any_reference(sample: dict) -> None:
-    bare = {key: value for key, value in sample.items() if key != "points"}
-    _, rows = scores(make_frame(bare), untouched, sample["rig"])
-    assert rows == [{"seen": 1.0}] * 6
+def test_retargeting_is_the_transform() -> None:
+    sample = street_sample((48, 132))
+    target = sample["rig"].turned(yaw_deg=10)
+    views = retargeting("fast", "street").render(sample, target)
+    out = RigRetarget(target, geometry="street", holes="black")(sample)
+    for view, image, coverage in zip(views, as_arrays(out["images"]), out["coverage"], strict=True):
+        np.testing.assert_array_equal(view.image, image)
+        np.testing.assert_array_equal(view.coverage, coverage)
+        assert not view.image[~view.coverage].any()
 
 
-def test_targets_of_another_road(sample: dict) -> None:
-    """LiDAR points are where the source's road is: a target in its own frame is mounted there first."""
-    rig: Rig = sample["rig"]
-    raised = Rig([c.shifted(z_m=0.4) for c in rig], ground_z_m=rig.ground_z_m + 0.4)
-    frame = make_frame(sample)
-    for raised_row, row in zip(scores(frame, untouched, raised)[1], scores(frame, untouched, rig)[1], strict=True):
-        assert raised_row == pytest.approx(row)
-
-
-def test_regions_are_apart(drive: SyntheticDrive) -> None:
-    for classes in drive.render(0).classes:
-        found = regions(classes.numpy())
-        assert np.array_equal(sum(mask.astype(int) for mask in found.values()), np.ones(SIZE, int))
-        assert not found["sky"][-1].any(), "no sky at the bottom"
+def test_names_and_points() -> None:
+    assert retargeting("draft", "ground").name == "draft, ground"
+    assert retargeting(PaperConfig(), name="mine").name == "mine"
+    assert retargeting("fast", "auto").reads_points and not retargeting("fast", "street").reads_points
+    assert not retargeting("paper", "auto").reads_points, "the published stages know rotations only"

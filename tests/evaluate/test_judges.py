@@ -13,7 +13,6 @@ from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.judges import is_road_user, load_detector, load_segmenter
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (90, 160, 3), np.uint8)
-EXITS = "type('Boxes', (), {'__array__': lambda *_, **__: exit(0)})()"
 
 
 @pytest.fixture
@@ -65,10 +64,9 @@ def test_detections_that_count(file: Callable[[str], str]) -> None:
         ("[[1, 2, 3, 4]], [0.5], [float('nan')]", "got other values"),
         ("[[1, 2, 3, 4]], [0.5], [float('inf')]", "got other values"),
         ("[torch.ones(4, requires_grad=True)], [0.5], [0]", "got other values"),
-        ("rgb.missing", "raised AttributeError: 'numpy.ndarray' object has no attribute 'missing' for an image"),
-        ("exit(0)", "raised SystemExit: 0 for an image"),
+        ("rgb.missing", "for an image (90, 160, 3) uint8 it raised AttributeError: 'numpy.ndarray' object has no attr"),
+        ("exit(0)", "it raised SystemExit: 0"),
         ("(_ for _ in ()).throw(GeneratorExit)", "raised GeneratorExit"),
-        (f"{EXITS}, [0.5], [0]", "raised SystemExit: 0 for an image"),
     ],
 )
 def test_detections_of_other_shapes(file: Callable[[str], str], expression: str, message: str) -> None:
@@ -101,9 +99,8 @@ def test_files_without_a_function(load: Callable[[str], object], file: Callable[
 def test_a_segmenter_of_a_file(file: Callable[[str], str]) -> None:
     masks = load_segmenter(file("np.stack([rgb[..., 0] > 9, rgb[..., 1] > 9])"))(IMAGE)
     assert masks.dtype == np.bool_ and np.array_equal(masks, IMAGE.transpose(2, 0, 1)[:2] > 9)
-    for exits in ("exit(0)", EXITS):
-        with pytest.raises(DataError, match=r"--segmenter .*: raised SystemExit: 0 for an image"):
-            load_segmenter(file(exits))(IMAGE)
+    with pytest.raises(DataError, match=r"--segmenter .*: for an image .* it raised SystemExit: 0"):
+        load_segmenter(file("exit(0)"))(IMAGE)
     wrong_ones = {"rgb[..., 0] > 9": "bool (90, 160)", "rgb.transpose(2, 0, 1)": "uint8", "None": "NoneType"}
     for wrong, got in wrong_ones.items():
         with pytest.raises(

@@ -11,9 +11,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.lidar import (
     ColouredPoints,
     coloured_points,
-    colours_at,
     equalised,
-    equalising_gains,
     lidar_split,
     sparse_metrics,
     visible_points,
@@ -70,17 +68,6 @@ def test_a_fisheye_sees_beside_itself() -> None:
     assert len(visible_points(camera(), beside).indices) == 0
 
 
-def test_colours_at_interpolates_and_takes_any_number() -> None:
-    image = np.zeros((81, 101, 3), np.float32)
-    image[..., 0], image[..., 1] = np.arange(101), np.arange(81)[:, None]
-    uv = np.random.default_rng(0).uniform([0, 0], [100, 80], (40000, 2))
-    got = colours_at(image, uv)
-    assert got.shape == (40000, 3)
-    np.testing.assert_allclose(got[:, :2], uv, atol=1 / 32)
-    assert colours_at(image, np.zeros((0, 2))).shape == (0, 3)
-    assert colours_at(image[..., 0], uv[:5]).shape == (5,)
-
-
 def test_the_camera_closest_to_its_axis_colours_a_point() -> None:
     rig = Rig([camera("a"), camera("b", 20.0)])
     points = np.array([[15.0, 0.5, 1.5], [15.0, 3.0, 1.5], [1.0, 0.0, 0.5], [-20.0, 0.0, 0.0]])
@@ -95,14 +82,6 @@ def test_points_on_the_car_body_get_no_colour() -> None:
     mask[:, :50] = False
     coloured = coloured_points(Rig([camera(mask=mask)]), [plain((9, 9, 9))], wall())
     assert len(coloured) and (coloured.points[:, 1] <= 0).all()
-
-
-def test_ground_is_the_rigs_road() -> None:
-    rig = Rig([camera(position_m=(5.0, 0.0, 1.2))], ground_z_m=-0.33)
-    points = np.array([[25.0, 0.0, -0.2], [25.0, 1.0, 1.0]])
-    coloured = coloured_points(rig, [plain((50, 50, 50))], points)
-    assert coloured.on_ground.tolist() == [True, False]
-    assert len(coloured.subset(coloured.on_ground)) == 1
 
 
 def test_hand_computed_errors() -> None:
@@ -150,17 +129,11 @@ def test_gains_bring_shared_points_together() -> None:
     texture = np.random.default_rng(0).uniform(90, 110, (81, 101, 1)) * np.ones(3)
     # No texture is shared between the views, so only the mean brightness counts: one image is twice as bright.
     images = [texture.astype(np.uint8), (1.9 * texture).astype(np.uint8)]
-    gains = equalising_gains(rig, images, wall())
-    assert gains[0] / gains[1] == pytest.approx(1.9, rel=0.03)
-    assert gains[0] * gains[1] == pytest.approx(1.0, rel=0.03), "the mean log-gain is zero"
     even = equalised(rig, images, wall())
     assert even[0].dtype == np.uint8
+    gains = [after.mean() / before.mean() for before, after in zip(images, even, strict=True)]
+    assert gains[0] * gains[1] == pytest.approx(1.0, rel=0.03), "the mean log-gain is zero"
     assert even[0].mean() / even[1].mean() == pytest.approx(1.0, rel=0.03)
-
-
-def test_cameras_without_shared_points_keep_their_exposure() -> None:
-    rig = Rig([camera("a"), camera("b", 180.0)])
-    np.testing.assert_allclose(equalising_gains(rig, [plain((50,) * 3), plain((200,) * 3)], wall()), 1.0)
 
 
 def test_lidar_split_alternates_by_azimuth() -> None:

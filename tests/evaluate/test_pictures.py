@@ -1,26 +1,31 @@
-"""Contact sheets, coverage outlines, rig pictures: sizes, places and colours; never golden images."""
+"""Contact sheets, outlines, rig pictures, tables, ``show``: sizes, places and colours; never golden images."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
 
+from arbiview_aug import RigRetarget, collate, project_boxes_3d, show
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.errors import DataError, OutputError
+from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.report.pictures import (
     HOLE,
     contact_sheet,
     draw_rigs,
+    frame_sheet,
+    hatched_view,
+    left_to_right,
     outline_coverage,
-    put_text,
     rig_figure,
-    save_picture,
 )
+from arbiview_aug.evaluate.report.tables import (
+    SEEN,
+    cell,
+    text_table,
+)
+from tests.helpers import camera, street_sample
 
 
 def plain(h: int, w: int, colour: tuple[int, int, int]) -> np.ndarray:
@@ -46,11 +51,6 @@ def test_contact_sheet_places_images_row_by_row() -> None:
     assert places["blue"][1] - places["blue"][0] < 0.31 * 600, "a lone portrait image does not fill the sheet"
 
 
-def test_contact_sheet_takes_floats() -> None:
-    sheet = contact_sheet([("", [np.full((20, 40, 3), 99.6)], [""])], width_px=100)
-    assert (sheet == 100).all(-1).any()
-
-
 def test_outline_marks_holes_and_nothing_else() -> None:
     image = plain(90, 160, (120, 130, 140))
     coverage = np.ones((90, 160), bool)
@@ -63,22 +63,6 @@ def test_outline_marks_holes_and_nothing_else() -> None:
     assert (picture == HOLE).all(-1)[:, :60].any() and (image == (120, 130, 140)).all(), "the input is not changed"
 
 
-def test_text_outside_ascii() -> None:
-    picture = plain(40, 300, (255, 255, 255))
-    put_text(picture, "yaw −11° café", (4, 25), 0.45)
-    assert (picture < 128).any()
-
-
-def test_save_picture(tmp_path: Path) -> None:
-    picture = plain(5, 6, (10, 20, 30))
-    path = save_picture(tmp_path / "new" / "sheet.png", picture)
-    np.testing.assert_array_equal(cv2.imread(str(path))[..., ::-1], picture)
-    with pytest.raises(DataError, match=r"expected a name ending in .png or .jpg"):
-        save_picture(tmp_path / "sheet.words", picture)
-    with pytest.raises(OutputError, match=r"sheet\.png: expected a file that can be written, got Not a directory"):
-        save_picture(path / "below_a_file" / "sheet.png", picture)
-
-
 def test_rig_figure_has_a_column_per_rig() -> None:
     one, two = (rig_figure([load_rig(name) for name in names]) for names in (["waymo"], ["waymo", "argoverse2"]))
     assert len(one.axes) == 2 and len(two.axes) == 4
@@ -88,10 +72,6 @@ def test_rig_figure_has_a_column_per_rig() -> None:
         assert {text.get_text().splitlines()[0] for text in axes.texts} == set(rig.names), "only its own names"
         assert len(axes.patches) == len(load_rig("waymo")) + len(load_rig("argoverse2")), "the other behind it"
         assert sum(patch.get_facecolor()[3] > 0 for patch in axes.patches) == len(rig), "its own wedges are filled"
-    heights = {line for text in two.axes[3].texts for line in text.get_text().splitlines()}
-    over_road = {f"{c.name} {c.center_m[2] - rig.ground_z_m:.2f} m" for c in rig}
-    beams = {f"{s.name} {s.center_m[2] - rig.ground_z_m:.2f} m, {len(s.elevations_deg)} beams" for s in rig.lidars}
-    assert heights == over_road | beams and len(beams) == 2, "over its own road"
     picture = draw_rigs([load_rig("waymo")])
     assert picture.shape == (1050, 800, 3) and picture.std() > 20
 
@@ -108,21 +88,6 @@ def test_rig_figure_forward_is_up_and_left_is_left() -> None:
         np.testing.assert_allclose(looks / np.linalg.norm(looks), direction, atol=1e-6)
 
 
-@pytest.mark.parametrize("fov_deg", [5.0, 200.0, 359.5])
-def test_rig_picture_of_extreme_lenses(fov_deg: float) -> None:
-    camera = Camera.looking(
-        name="a very long camera name " * 3,
-        azimuth_deg=170,
-        width_px=64,
-        height_px=48,
-        horizontal_fov_deg=fov_deg,
-        lens="fisheye",
-        distortion=(0.0,) * 4,
-        position_m=(300.0, -50.0, 80.0),
-    )
-    assert draw_rigs([Rig([camera]), load_rig("ddad")]).dtype == np.uint8
-
-
 def test_scanners_are_drawn_in_their_places() -> None:
     pose = np.eye(4)
     pose[:3, 3] = 1.0, 0.4, 1.7
@@ -131,3 +96,71 @@ def test_scanners_are_drawn_in_their_places() -> None:
     above, side = rig_figure([Rig([camera], lidars=[front], ground_z_m=-0.3)]).axes
     (dot,), (over_road, _) = above.lines, side.lines  # the last is the road
     assert np.allclose(dot.get_xydata(), [[0.4, 1.0]]) and np.allclose(over_road.get_xydata(), [[1.0, 2.0]])
+
+
+def test_cells() -> None:
+    row = {"seen": 0.5, "psnr": 20.126, "ssim": 0.98765}
+    assert cell(row, SEEN[1]) == "50.0%" and cell(row, "{psnr:.2f}") == "20.13" and cell(row, "{ssim:.4f}") == "0.9877"
+    assert cell(row, "{absent:.2f}") == "-", "what a row lacks is no zero"
+
+
+def test_layout() -> None:
+    rows = {"a method of some length": {"seen": 1.0}, "b": {"seen": 0.25, "x": 3.0}}
+    table = text_table("Title", rows, [SEEN, ("a wide heading", "{x:.2f}")], "a note")
+    title, _, head, rule, first, second, _, note = table.splitlines()
+    assert title == "Title:" and note == "a note"
+    assert len(head) == len(rule) == len(first) == len(second), "columns line up"
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in (first, second)]
+    assert cells == [["a method of some length", "100.0%", "-"], ["b", "25.0%", "3.00"]]
+    assert text_table("Nothing", {}, [SEEN]).count("\n") == 3
+
+
+def test_cameras_stand_as_in_a_panorama() -> None:
+    rig = Rig([camera(f"at {a}", a) for a in (0, -60, 60, 180)])
+    assert [rig.names[k] for k in left_to_right(rig)] == ["at 60", "at 0", "at -60", "at 180"]
+
+
+def test_sheets_hatch_only_what_is_unseen() -> None:
+    rig = Rig([camera(f"at {a}", a) for a in (0, 60)])
+    images = [np.full((40, 60, 3), 90, np.uint8)] * 2
+    seen, half = np.ones((40, 60), bool), np.ones((40, 60), bool)
+    half[:, :30] = False
+    whole = frame_sheet(rig, images, rig, [RenderedView(images[0], seen)] * 2, width_px=400)
+    holed = frame_sheet(
+        rig, images, rig, [RenderedView(images[0], seen), RenderedView(images[0], half)], images, width_px=400
+    )
+    assert not (whole == HOLE).all(-1).any() and (holed == HOLE).all(-1).any()
+    assert holed.shape[0] > 1.7 * whole.shape[0], "two rows more: hatched, and the truth"
+    hatched = (hatched_view(RenderedView(images[0], half), 40) == HOLE).all(-1)
+    assert hatched[:, :25].any() and not hatched[:, 35:].any()
+
+
+def pictures(sample: object) -> list[np.ndarray]:
+    return [np.asarray(axes.images[0].get_array()) for axes in show(sample).axes if axes.images]
+
+
+def test_images_are_drawn_with_boxes_under_their_cameras_names() -> None:
+    sample = street_sample()
+    figure = show(sample)
+    assert [axes.get_title() for axes in figure.axes] == sample["rig"].names
+    shown = zip(pictures(sample), sample["images"], strict=True)
+    drawn = [bool((picture != image.permute(1, 2, 0).numpy()).any()) for picture, image in shown]
+    labelled = [len(boxes.rows) > 0 for boxes in project_boxes_3d(sample["boxes_3d"], sample["rig"])]
+    assert drawn == labelled and any(labelled)
+    assert figure._repr_png_().startswith(b"\x89PNG")
+
+
+def test_what_no_camera_saw_is_dimmed() -> None:
+    sample = street_sample()
+    del sample["boxes_3d"]
+    views = RigRetarget(sample["rig"].turned(pitch_deg=-10), geometry="street")(sample)
+    for picture, image, seen in zip(pictures(views), views["images"], views["coverage"].numpy(), strict=True):
+        image = image.permute(1, 2, 0).numpy()
+        assert not seen.all() and (picture[seen] == image[seen]).all()
+        assert picture[~seen].mean() < 0.5 * image[~seen].mean()
+
+
+def test_batches_show_each_frame() -> None:
+    sample = {key: value for key, value in street_sample().items() if key in ("images", "K", "cam2ego", "boxes_3d")}
+    titles = [axes.get_title() for axes in show(collate([sample, sample])).axes]
+    assert titles == [f"frame {k}, camera {j}" for k in range(2) for j in range(6)]

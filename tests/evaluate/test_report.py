@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import shutil
-import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +13,6 @@ from arbiview_aug.evaluate.frames import Evaluation, evaluate, make_frame
 from arbiview_aug.evaluate.images import RenderedView
 from arbiview_aug.evaluate.methods import Method, retargeting
 from arbiview_aug.evaluate.report.html import html_report, layers
-from arbiview_aug.evaluate.report.pictures import overlay_confidence
 from arbiview_aug.evaluate.report.tables import TRUTH_COLUMNS
 
 SIZE = (48, 132)
@@ -64,54 +59,3 @@ def test_layers(done: Evaluation) -> None:
         expected += [name] if shown[name][0].coverage.all() else [name, f"{name}: unseen"]
     assert list(found) == [*expected, f"{NAMES[1]}: confidence", "truth"]
     np.testing.assert_array_equal(found[NAMES[0]], shown[NAMES[0]][0].image)
-
-
-def test_confidence_colours() -> None:
-    grey = np.full((1, 3, 3), 100, np.uint8)
-    red, yellow, green = overlay_confidence(grey, np.array([[0.0, 0.5, 1.0]]))[0].astype(int)
-    assert red.tolist() == [178, 50, 50] and green.tolist() == [50, 178, 50] and yellow.tolist() == [178, 178, 50]
-
-
-PROBE = """<script>
-const range = document.querySelector('input[type=range]'), slider = range.previousElementSibling;
-const look = side => slider.querySelectorAll('img.' + side + '[data-layer]');
-const before = [...look('before')].map(i => i.dataset.layer), after = [...look('after')].map(i => i.dataset.layer);
-const clip = getComputedStyle(look('before')[0]).clipPath, drawn = look('before')[0].naturalWidth;
-range.value = 20; range.dispatchEvent(new Event('input'));
-const moved = getComputedStyle(look('before')[0]).clipPath;
-const choice = document.querySelector('select[data-side=before]');
-choice.value = 'nearest source camera'; choice.dispatchEvent(new Event('change'));
-const chosen = [...look('before')].map(i => i.dataset.layer);
-document.title = 'PROBE ' + JSON.stringify([before, after, clip, moved, chosen, drawn]);
-</script>"""
-
-
-def browser() -> str:
-    for name in ("chromium", "chromium-browser", "google-chrome"):
-        if (path := shutil.which(name)) is not None:
-            return path
-    pytest.skip("no Chromium: Debian's package chromium has it")
-
-
-def test_sliders_and_choices(page: str, tmp_path: Path) -> None:
-    program = browser()
-    (tmp_path / "report.html").write_text(page.replace("</body>", f"{PROBE}</body>"), encoding="utf-8")
-    done = subprocess.run(
-        [
-            program,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            f"--user-data-dir={tmp_path / 'profile'}",
-            "--dump-dom",
-            (tmp_path / "report.html").as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=500,
-    )
-    (found,) = re.findall(r"<title>PROBE (.*?)</title>", done.stdout)
-    before, after, clip, moved, chosen, width = json.loads(found)
-    assert before == ["truth"] and after == [NAMES[0]], "one layer on each side"
-    assert "50%" in clip and "80%" in moved, "the slider at 20 hides the right four fifths of the left layer"
-    assert chosen == ["nearest source camera"] and width == SIZE[1]

@@ -1,4 +1,4 @@
-"""Verdicts of networks that know each image by its colour; rows of figures and their intervals."""
+"""Hits, AP and recall by hand; verdicts of networks that know each image by its colour; intervals."""
 
 from __future__ import annotations
 
@@ -12,12 +12,22 @@ import torch
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.detections import Matches, labelled_objects
 from arbiview_aug.evaluate.frames import ScoredFrame, Truth
 from arbiview_aug.evaluate.images import RenderedView, as_tensors
 from arbiview_aug.evaluate.judges import Detections, Detector
 from arbiview_aug.evaluate.report.pictures import Picture
-from arbiview_aug.evaluate.verdicts import SOURCES, Panel, Verdict, figures, too_few
+from arbiview_aug.evaluate.verdicts import (
+    SOURCES,
+    Matches,
+    Objects,
+    Panel,
+    figures,
+    labelled_objects,
+    match,
+    precision_and_recall,
+    too_few,
+)
+from arbiview_aug.sample.boxes_2d import project_boxes_3d
 from tests.helpers import camera
 
 RIG = Rig([camera("front", 0)])
@@ -68,22 +78,6 @@ def test_without_a_true_image_they_and_the_sources_are_compared_with_labels() ->
     assert looked(Panel(detector({VIEW: [LEFT]})), unlabelled) == {}
 
 
-def test_methods_share_the_truth() -> None:
-    calls: list[int] = []
-    seen = detector({VIEW: [LEFT], TRUE: [LEFT, RIGHT]})
-
-    def detect(image: Picture) -> Detections:
-        calls.append(int(image[0, 0, 0]))
-        return seen(image)
-
-    panel = Panel(detect)
-    for name in ("first", "second"):
-        for method in ("own", "other"):
-            panel.look(name, frame(), method, RIG, [RenderedView(plain(VIEW), ALL)])
-    assert [calls.count(colour) for colour in (TRUE, VIEW)] == [2, 4]
-    assert {name: row["objects"] for name, row in panel.rows(["own", "other"]).items()} == {"own": 4, "other": 4}
-
-
 def test_unsure_detections_in_the_true_image_do_not_count() -> None:
     sure, unsure = detector({VIEW: [LEFT]}), detector({TRUE: [LEFT, RIGHT]}, score=0.4)
     rows = looked(Panel(lambda image: (unsure if image[0, 0, 0] == TRUE else sure)(image)), frame())
@@ -113,9 +107,9 @@ def test_masks() -> None:
 
 
 # --- intervals --------------------------------------------------------------------------------------------------------
-def verdicts(found: Sequence[bool]) -> list[Verdict]:
+def verdicts(found: Sequence[bool]) -> list[Matches]:
     """Views of one object each, found or not."""
-    return [Verdict("own", Matches(np.array([0.9] * hit), np.ones(int(hit), bool), 1)) for hit in found]
+    return [Matches(np.array([0.9] * hit), np.ones(int(hit), bool), 1) for hit in found]
 
 
 def test_intervals_are_those_of_a_share() -> None:
@@ -129,3 +123,73 @@ def test_intervals_are_those_of_a_share() -> None:
 def test_too_few() -> None:
     assert not too_few([{"objects": 100, "images": 10}, {"objects": 100}]) and not too_few([])
     assert too_few([{"objects": 100}, {"objects": 99}]) and too_few([{"images": 9}])
+
+
+PAIR = np.array([[0.0, 0, 10, 10], [20, 0, 30, 10]])
+NONE = np.zeros((0, 4))
+
+
+def detections(boxes: np.ndarray, *scores: float) -> Detections:
+    return Detections(boxes, np.array(scores))
+
+
+# --- labels -----------------------------------------------------------------------------------------------------------
+def box(x: float, y: float) -> list[float]:
+    return [x, y, 1.5, 2.0, 2.0, 2.0, 0.0]
+
+
+def test_labels_that_others_hide_do_not_count() -> None:
+    boxes = torch.tensor([box(10, 0), box(20, 0), box(20, 8), box(-10, 0)])
+    (objects,) = labelled_objects({"boxes_3d": boxes}, RIG) or []
+    assert objects.counts.tolist() == [True, False, True], "the second is hidden, the last is behind the camera"
+    outline = project_boxes_3d(boxes, RIG)[0].boxes
+    np.testing.assert_array_equal(objects.boxes, outline + 0.5, "pixel 0 is centred at 0, and reaches from 0 to 1 here")
+
+
+def test_labels_that_are_no_road_users_hide_others_alone() -> None:
+    sample = {"boxes_3d": torch.tensor([box(10, 0), box(20, 0), box(20, 8)])}
+    names = ["movable_object.barrier", "vehicle.car", "vehicle.car"]
+    (objects,) = labelled_objects({**sample, "box_names": names}, RIG) or []
+    assert objects.counts.tolist() == [False, False, True]
+    assert labelled_objects({}, RIG) is None
+
+
+# --- average precision and recall -------------------------------------------------------------------------------------
+def scores(found: Detections, true: np.ndarray, others: np.ndarray = NONE) -> tuple[float, float]:
+    objects = Objects(np.concatenate([true, others]), np.arange(len(true) + len(others)) < len(true))
+    ap, recall = precision_and_recall([match(found, objects)], np.ones((1, 1)))
+    return float(ap[0]), float(recall[0])
+
+
+def test_average_precision_and_recall() -> None:
+    assert scores(detections(PAIR, 0.9, 0.8), PAIR) == (1, 1)
+    assert scores(detections(PAIR, 0.9, 0.4), PAIR) == (1, 0.5), "recall counts sure detections alone"
+    after_misses = detections(np.concatenate([PAIR + 100, PAIR]), 0.9, 0.85, 0.8, 0.7)
+    assert scores(after_misses, PAIR) == pytest.approx((0.5, 1))
+    for moved_px, hits in ((3, 1), (4, 0)):  # IoU 7 / 13 and 6 / 14
+        assert scores(detections(PAIR + np.array([moved_px, 0, moved_px, 0]), 0.9, 0.8), PAIR) == (hits, hits)
+    assert scores(detections(PAIR[[0, 0]], 0.9, 0.8), PAIR) == (0.5, 0.5), "each object is hit once"
+    assert scores(detections(NONE), PAIR) == (0, 0) and np.isnan(scores(detections(PAIR, 0.9, 0.8), NONE)).all()
+    false_between = detections(np.concatenate([PAIR[:1], PAIR + 100, PAIR[1:]]), 0.9, 0.8, 0.7, 0.6)
+    assert scores(false_between, PAIR) == pytest.approx((0.5 * 1 + 0.5 * 2 / 4, 1))
+
+
+def test_the_surest_takes_the_best_free_box() -> None:
+    both = np.array([[0.0, 0, 10, 10], [1, 0, 11, 10]])
+    found = match(detections(both[[0, 0, 0]], 0.5, 0.9, 0.4), Objects(both, np.ones(2, bool)))
+    assert found.hits.tolist() == [True, True, False] and found.num_true == 2
+
+
+def test_objects_that_do_not_count_are_neither_hits_nor_misses() -> None:
+    found = detections(np.concatenate([PAIR[1:], PAIR[:1]]), 0.9, 0.8)
+    assert scores(found, PAIR[:1]) == (0.5, 1) and scores(found, PAIR[:1], PAIR[1:]) == (1, 1)
+
+
+def test_weights_count_images_several_times() -> None:
+    one = Matches(np.array([0.9, 0.7]), np.array([True, False]), 2)
+    two = Matches(np.array([0.8, 0.6]), np.array([False, True]), 1)
+    weighted = precision_and_recall([one, two], np.array([[1.0, 1], [1, 2], [0, 0]]))
+    for k, images in enumerate(([one, two], [one, two, two])):
+        expected = precision_and_recall(images, np.ones((1, len(images))))
+        np.testing.assert_allclose([figure[k] for figure in weighted], np.concatenate(expected))
+    assert np.isnan([figure[2] for figure in weighted]).all()

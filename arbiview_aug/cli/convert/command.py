@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
+import pickle
 import sys
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,14 @@ import numpy as np
 
 from arbiview_aug.atomic_io import inside, remove_parts, write_whole
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.cli.arguments import gathered_warnings, told_once, writable_folder
+from arbiview_aug.cli.arguments import chosen_frames, gathered_warnings, told_once, writable_folder
 from arbiview_aug.cli.convert.job import Done, Jobs, State
-from arbiview_aug.cli.convert.ray_runner import ray_results
-from arbiview_aug.cli.convert.settings import FOLDER, READING, RETARGET_OPTIONS, Settings, check_output
-from arbiview_aug.cli.parallel import results
+from arbiview_aug.cli.convert.writer import FOLDER, READING, RETARGET_OPTIONS, Settings, check_output
+from arbiview_aug.cli.parallel import results, with_progress
 from arbiview_aug.datasets.depth_folder import FOLDERS, WithDepth
 from arbiview_aug.datasets.drive import Recording, is_converted
 from arbiview_aug.datasets.registry import kinds_of, open_data, split_kind
-from arbiview_aug.environment import one_thread, versions, working_s
+from arbiview_aug.environment import one_thread, optional_package, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
 from arbiview_aug.evaluate.frames import evaluate, make_frame
 from arbiview_aug.evaluate.images import RenderedView, as_arrays
@@ -41,41 +41,82 @@ def run(arguments: argparse.Namespace) -> int:
     """
     settings = _settings(arguments)
     check_output(settings)
-    jobs, facts = _begin(settings, arguments)
+    data, (shard, shards) = settings.open(), (arguments.shard_index, arguments.num_shards)
+    try:
+        settings.retarget()
+    except ArbiviewError:
+        raise
+    except ValueError as error:
+        raise DataError(str(error)) from None
+    jobs = Jobs(settings, data, range(shard, len(data), shards), skip=arguments.on_error == "skip")
+    facts = {"versions": versions(), "settings": settings.rendering(), "source": jobs.format.facts()}
+    _print_notes(jobs.format.notes())
+    if not is_converted(settings.output):
+        jobs.format.check()
+        writable_folder(settings.output, str(settings.output))
+    jobs.manifest.begin(facts)
+    remove_parts(settings.output, lambda owner: owner.isdecimal() and int(owner) % shards == shard)
     records: list[Done] = []
-    started_s = working_s()
     for done in _run(jobs, arguments):
         records.append(done)
-        if done.state == "stopped" or (done.state == "failed" and arguments.on_error == "fatal"):
+        if done.state == "stopped":
             break
-    for line in told_once(line for done in records if done.is_converted for line in done.messages):
-        print(f"note: {line}", file=sys.stderr)
-    print(_summary(settings.output, records, working_s() - started_s))
+    _print_notes(told_once(line for done in records if done.is_converted for line in done.messages))
+    states = Counter(done.state for done in records)
+    names: dict[State, str] = {"kept": "there before", "skipped": "skipped", "failed": "failed"}
+    counts = "".join(f", {states[state]} {name}" for state, name in names.items() if states[state])
+    coverage = np.mean([done.coverage for done in records if done.is_converted] or [0.0])
+    print(f"{settings.output}: {states['made']} samples converted{counts}; {coverage:.1%} of the pixels seen")
     for done in records:
         if not done.is_converted:
             print(f"  {done.token}: {done.state}: {'; '.join(done.messages)}", file=sys.stderr)
     if any(done.state in ("stopped", "failed") for done in records):
         return 1
-    converted = _finish(jobs, facts, arguments.num_shards)
-    if arguments.report and converted:
-        print(f"report: {write_report(settings, jobs.data, converted, arguments.report)}")
+    missing, converted, left_out = {*data.tokens}, list[str](), list[str]()  # of all shards
+    for record in jobs.manifest.records(data.tokens):
+        if "failed" not in record:
+            missing.remove(record["token"])
+            (left_out if "skipped" in record else converted).append(record["token"])
+    if missing and shards == 1:
+        got = f"found {len(missing)} missing; do all machines see this folder under this path?"
+        raise OutputError(f"{settings.output}: expected the records of all {len(data)} samples, {got}")
+    if missing:
+        print(f"{len(missing)} samples of other shards are missing so far; the last shard finishes the output")
+        return 0
+    if not converted:
+        raise DataError(f"{settings.output}: expected at least one sample that can be converted, got none")
+    written, notes = jobs.format.finish(jobs.manifest.records(converted), {*left_out})  # tables and provenance
+    _print_notes(notes)
+    jobs.manifest.write_provenance(facts, data.tokens, written)
+    print(f"look at it: python -m arbiview_aug check {settings.output}")
+    if arguments.report:
+        print(f"report: {write_report(settings, data, converted, arguments.report)}")
     return 0
+
+
+def _print_notes(notes: Iterable[str]) -> None:
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
 
 
 def _settings(arguments: argparse.Namespace) -> Settings:
     kind, root = split_kind(arguments.data)
-    root = root.absolute()  # Ray's actors have a working directory of their own
+    root = root.absolute()  # Ray's actors have another working directory
     generator, depth = arguments.generator and Path(arguments.generator), _depth_folder(arguments, root)
-    named = "version", *RETARGET_OPTIONS, "holes", "steps", *READING, "neighbours", "link", "points"
+    target, names = load_rig(arguments.target), dict(arguments.names)
+    if unknown := names.keys() - {*target.names}:
+        got = ", ".join(sorted(unknown))
+        raise DataError(f"--names: expected cameras of the target, {', '.join(target.names)}, got {got}")
+    options = "version", *RETARGET_OPTIONS, "holes", "steps", *READING, "neighbours", "points"
     return Settings(
         root=root,
         kind=kind,
-        target=_renamed(load_rig(arguments.target), arguments.names),
+        target=target.with_cameras([replace(camera, name=names.get(camera.name, camera.name)) for camera in target]),
         output=Path(arguments.output).absolute(),
         generator=generator.absolute() if generator and os.path.exists(generator) else generator,  # or a hub id
         motion_depth=None if depth is None else depth.absolute(),
         suffix=f".{arguments.images}",  # type: ignore[arg-type]
-        **{name: getattr(arguments, name) for name in named},
+        **{name: getattr(arguments, name) for name in options},
     )
 
 
@@ -106,117 +147,72 @@ def _depth_folder(arguments: argparse.Namespace, root: Path) -> Path | None:
     raise DataError(f"--geometry {arguments.geometry}: expected depth in {defaults[0]}, found none; {fix}")
 
 
-def _renamed(target: Rig, names: Sequence[tuple[str, str]]) -> Rig:
-    """The target with new names of cameras, given as pairs of an old and a new one."""
-    if unknown := {old for old, _ in names} - {*target.names}:
-        got = ", ".join(sorted(unknown))
-        raise DataError(f"--names: expected cameras of the target, {', '.join(target.names)}, got {got}")
-    new = dict(names)
-    return target.with_cameras([replace(camera, name=new.get(camera.name, camera.name)) for camera in target])
-
-
-def _begin(settings: Settings, arguments: argparse.Namespace) -> tuple[Jobs, Mapping[str, Any]]:
-    """Make this shard's jobs, and write the output's facts or check them."""
-    data = settings.open()
-    try:
-        settings.retarget()
-    except ArbiviewError:
-        raise
-    except ValueError as error:
-        raise DataError(str(error)) from None
-    shard, shards = arguments.shard_index, arguments.num_shards
-    jobs = Jobs(settings, data, range(shard, len(data), shards), arguments.on_error)
-    facts = {"versions": versions(), "settings": settings.rendering(), "source": jobs.format.facts()}
-    for note in jobs.format.notes():
-        print(f"note: {note}", file=sys.stderr)
-    if not is_converted(settings.output):
-        jobs.format.check()
-        writable_folder(settings.output, str(settings.output))
-    jobs.manifest.begin(facts)
-    remove_parts(settings.output, lambda owner: owner.isdecimal() and int(owner) % shards == shard)
-    return jobs, facts
-
-
 def _run(jobs: Jobs, arguments: argparse.Namespace) -> Iterator[Done]:
     def note(done: Done) -> str:
         return f"coverage {done.coverage:.1%}"
 
     if arguments.runner == "ray":
-        yield from ray_results(jobs, arguments.workers, "convert", note)
-    else:
-        with one_thread():
-            if min(arguments.workers, len(jobs)) > 1:
-                compile_kernels(matching=False)  # here, once, and not in every worker
-            yield from results(jobs, min(arguments.workers, len(jobs)), "convert", note)
+        yield from with_progress(ray_results(jobs, arguments.workers), len(jobs), "convert", note)
+        return
+    with one_thread():
+        if min(arguments.workers, len(jobs)) > 1:
+            compile_kernels(matching=False)  # here, once, and not in every worker
+        yield from results(jobs, min(arguments.workers, len(jobs)), "convert", note)
 
 
-def _summary(output: Path, records: Sequence[Done], wall_s: float) -> str:
-    """Counts, coverage and shares of the time."""
-    states = Counter(done.state for done in records)
-    words: dict[State, str] = {"kept": "there before", "skipped": "skipped", "failed": "failed"}
-    counts = "".join(f", {states[state]} {word}" for state, word in words.items() if states[state])
-    count, coverage = states["made"], np.mean([done.coverage for done in records if done.is_converted] or [0.0])
-    text = f"{output}: {count} samples converted{counts}; {coverage:.1%} of the pixels seen"
-    if not count:
-        return text
-    seconds = np.sum([done.seconds for done in records], axis=0)
-    read, retarget, write = seconds / seconds.sum()
-    return (
-        f"{text}\n{1e3 * seconds.sum() / count:.0f} ms a sample: read and decode {read:.0%}, retarget {retarget:.0%}, "
-        f"encode and write {write:.0%}; {count / wall_s:.2f} samples/s"
-    )
+class Actor:
+    """A Ray worker that has all jobs and the transform; each call runs one job."""
+
+    def __init__(self, jobs: Jobs) -> None:
+        self.jobs = jobs
+        self._threads = one_thread()
+        self._threads.__enter__()
+        if optional_package("ray", "distributed").get_gpu_ids():
+            jobs.retarget.to("cuda")
+
+    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
+        return {"done": pickle.dumps(self.jobs[int(row["id"])])}  # Arrow's strings cannot hold every file's name
 
 
-def _finish(jobs: Jobs, facts: Mapping[str, Any], shards: int) -> list[str]:
-    """Write tables and provenance once the samples of all shards are complete; return the converted ones, or none."""
-    output, tokens = jobs.settings.output, jobs.data.tokens
-    converted, left_out = [], set()
-    for record in jobs.manifest.records(tokens):
-        if "skipped" in record:
-            left_out.add(record["token"])
-        elif "failed" not in record:
-            converted.append(record["token"])
-    missing = len(tokens) - len(converted) - len(left_out)
-    if missing and shards == 1:
-        got = f"found {missing} missing; do all machines see this folder under this path?"
-        raise OutputError(f"{output}: expected the records of all {len(tokens)} samples, {got}")
-    if missing:
-        print(f"{missing} samples of other shards are missing so far; the last shard finishes the output")
-        return []
-    if not converted:
-        raise DataError(f"{output}: expected at least one sample that can be converted, got none")
-    written, notes = jobs.format.finish(jobs.manifest.records(converted), left_out)
-    for note in notes:
-        print(f"note: {note}", file=sys.stderr)
-    jobs.manifest.write_provenance(facts, tokens, written)
-    print(f"look at it: python -m arbiview_aug check {output}")
-    return converted
+def ray_results(jobs: Jobs, workers: int) -> Iterator[Done]:
+    """Yield results in any order, by actors of the Ray cluster at ``RAY_ADDRESS``, or of this machine.
+
+    All machines need the source and the output under the same paths. Bytes do not depend on the order of jobs. With
+    ``--holes diffusion``, actors share the cluster's GPUs; generated pixels differ from a CPU's in their last bits.
+    """
+    ray, data = (optional_package(name, "distributed") for name in ("ray", "ray.data"))
+    try:
+        ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False)
+    except (ValueError, ConnectionError) as error:
+        raise DataError(f"--runner ray: expected a cluster (RAY_ADDRESS) that can be reached, got {error}") from None
+    data.DataContext.get_current().enable_progress_bars = False
+    gpus = float(ray.cluster_resources().get("GPU", 0)) if jobs.settings.holes == "diffusion" else 0.0
+    rows = data.range(len(jobs), override_num_blocks=max(1, min(len(jobs), 4 * workers)))
+    share = {"num_cpus": 1, "num_gpus": min(1.0, gpus / workers)}
+    done = rows.map(Actor, fn_constructor_args=(jobs,), compute=data.ActorPoolStrategy(size=workers), **share)
+    return (pickle.loads(row["done"]) for row in done.iter_rows())
 
 
 def write_report(settings: Settings, data: Recording, tokens: Sequence[str], count: int) -> Path:
     """Score ``count`` converted frames, spread evenly over ``tokens``, as ``evaluate`` does; return the page's path."""
-    picked = [tokens[int(k)] for k in np.unique(np.linspace(0, len(tokens) - 1, min(count, len(tokens))).round())]
+    picked = [tokens[k] for k in chosen_frames(count, len(tokens))]
     kept = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
     kind = "nuscenes" if settings.version else kept  # its tables may have any name
     written = open_data(settings.output, kind=kind, version=settings.version, load_points=False)
 
     def read_views(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:
         stored = written.by_token(sample["token"])
-        images = dict(zip(stored["rig"].names, as_arrays(stored["images"]), strict=True))  # the reader's own order
-        seen = dict(zip(stored["rig"].names, stored["coverage"], strict=True))
-        return [RenderedView(images[name], seen[name].numpy()) for name in rig.names]
+        views = map(RenderedView, as_arrays(stored["images"]), map(np.asarray, stored["coverage"]))
+        by_name = dict(zip(stored["rig"].names, views, strict=True))  # the reader's own order
+        return [by_name[name] for name in rig.names]
 
     # The views were rendered at the recorded exposures.
     frames = ((token, make_frame(data.by_token(token), exposures=("raw",))) for token in picked)
     with gathered_warnings([]):  # each sample's were told when it was converted
-        done = evaluate(frames, lambda _: settings.sized_target, [Method(CONVERTED, read_views)])
+        done = evaluate(frames, lambda _: settings.sized_target, [Method("converted", read_views)])
     title = f"{data.root.resolve().name} as {settings.target.name or 'the target'} would have seen it"
     notes = [f"{len(picked)} of {len(tokens)} frames. LiDAR points also score views that were made with them."]
     path = settings.output / FOLDER / "report.html"
-    page = html_report(title, done, [CONVERTED], [evaluation_table(done, [CONVERTED])], notes)
+    page = html_report(title, done, ["converted"], [evaluation_table(done, ["converted"])], notes)
     write_whole({path: page.encode()})
     return path
-
-
-CONVERTED = "converted"
-"""The written views, as a row of tables."""

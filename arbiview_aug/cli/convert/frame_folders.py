@@ -5,17 +5,15 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from arbiview_aug.atomic_io import file_name, write_whole, writing
-from arbiview_aug.cli.convert.manifest import Record
-from arbiview_aug.cli.convert.settings import FOLDER, Settings
-from arbiview_aug.cli.convert.writer import Converted, Writer
+from arbiview_aug.atomic_io import file_name, remove, write_whole
+from arbiview_aug.cli.convert.writer import FOLDER, Converted, Record, Writer
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE, MOST_BYTES, POINTS_FILE, SEQUENCE_FILE, entry_name
 from arbiview_aug.datasets.image_io import VIEW_MASKS
 from arbiview_aug.datasets.py123d import NOT_SHARED
@@ -25,18 +23,13 @@ from arbiview_aug.sample.inputs import CALIBRATION_KEYS, CAMERA_KEYS, PIXEL_BOUN
 from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
 _BOX_COUNTS = "num_lidar_pts"
-_OF_SCAN = ("lidar2ego", _BOX_COUNTS)
-"""Keys of a calibration that speak of the source's scan."""
-
-_OF_VIEWS = ("name", "file", "mask", *VIEW_MASKS, "confidence", "width", "height", "K", "cam2ego", "distortion", "lens")
-"""Keys of a camera that the target's cameras have anew."""
+_OF_RIG = {"cameras", "ground_z_m", "lidars", "name", "lidar"}  # keys of a calibration that the target's rig replaces
+_OF_VIEWS = {"name", "file", "mask", *VIEW_MASKS, "confidence", "width", "height", "K", "cam2ego", "distortion", "lens"}
+"""Keys of a camera that the target's cameras replace."""
 
 
 class FrameFolders(Writer):
     """A folder for each frame of the source, by its name."""
-
-    def __init__(self, settings: Settings, data: Any) -> None:
-        self.output, self.data = settings.output, data
 
     def facts(self) -> dict[str, Any]:
         return {"kind": "frames", "root": self.data.root.resolve().name, "frames": self.data.tokens}
@@ -45,7 +38,7 @@ class FrameFolders(Writer):
         if FOLDER in self.data.tokens:
             raise DataError(f"{self.data.root}: expected frames of other names than {FOLDER!r}; rename that folder")
 
-    def stem(self, index: int, camera: int, name: str) -> str:
+    def stem(self, index: int, name: str) -> str:
         """``name`` without dots: no image has the name of another camera's mask."""
         return f"{self.data.tokens[index]}/{file_name(name).replace('.', '%2E')}"
 
@@ -56,22 +49,32 @@ class FrameFolders(Writer):
         calib = _calibration(converted)
         folder, points = calibration.parent.name, converted.out.get("points")
         is_scanned = RINGS_KEY in converted.out
-        file = POINTS_FILE if is_scanned or points is None else f"lidar{files[-1].suffix}"
-        left_out = {*_left_out(source, calibration.parent, is_scanned)}
-        kept = {key: value for key, value in source.items() if key not in (*calib, *left_out, "dataset", "lidar")}
-        if _BOX_COUNTS in left_out and COUNTS_KEY in converted.out:
+        stale = {*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *CAMERA_KEYS, "truth"}
+        stale |= {"lidar2ego", _BOX_COUNTS} if is_scanned else set()
+        for key, value in source.items():
+            if isinstance(value, str) and os.path.isfile(os.path.join(calibration.parent, value)):
+                stale.add(key)
+        entry = source["lidar"] if isinstance(source.get("lidar"), Mapping) else {}
+        columns = {key: entry[key] for key in ("columns",) if key in entry and not is_scanned}
+        kept = {key: value for key, value in source.items() if key not in stale | _OF_RIG | {*calib, "dataset"}}
+        if is_scanned and _BOX_COUNTS in source and COUNTS_KEY in converted.out:
             kept[_BOX_COUNTS] = converted.out[COUNTS_KEY].tolist()
-            left_out.remove(_BOX_COUNTS)
+        left_out = (source.keys() & stale) - _OF_RIG - kept.keys()
+        left_out |= {f"cameras.{key}" for camera in source["cameras"] for key in camera.keys() - _OF_VIEWS}
+        left_out |= {f"lidar.{key}" for key in entry.keys() - {"file", *columns}}
         if left_out:
-            words = "they speak of the source's pixels, cameras or points, or name files that are not copied"
-            warn(f"calib.json: left out {', '.join(sorted(left_out))}: {words}")
+            why = "they speak of the source's pixels, cameras or points, or name files that are not copied"
+            warn(f"calib.json: left out {', '.join(sorted(left_out))}: {why}")
+        made, links = dict[str, bytes](), dict[str, Path]()
         if points is not None:
-            entry = source["lidar"] if isinstance(source.get("lidar"), Mapping) and not is_scanned else {}
-            kept["lidar"] = {"file": file, **{key: entry[key] for key in ("columns",) if key in entry}}
-        text = json.dumps({**calib, **kept}, indent=1).encode()
-        scan = {f"{folder}/{file}": _npy(points)} if is_scanned else {}
-        links = {} if points is None or is_scanned else {f"{folder}/{file}": files[-1]}
-        return {**scan, f"{folder}/{CALIBRATION_FILE}": text}, links, {}
+            file = POINTS_FILE if is_scanned else f"lidar{files[-1].suffix}"
+            kept["lidar"] = {"file": file, **columns}
+            if is_scanned:
+                made[f"{folder}/{file}"] = _npy(points)
+            else:
+                links[f"{folder}/{file}"] = files[-1]
+        made[f"{folder}/{CALIBRATION_FILE}"] = json.dumps({**calib, **kept}, indent=1).encode()
+        return made, links, {}
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> tuple[list[str], list[str]]:
         """Write the frames' sequence, without those that were left out."""
@@ -85,9 +88,7 @@ class FrameFolders(Writer):
     def _finish(self, left_out: set[str], sequence: Mapping[str, Any] | None) -> tuple[list[str], list[str]]:
         """Write a sequence; remove the calibrations that make frames of folders: a killed run may have left them."""
         for token in left_out:
-            path = self.kept_path(f"{token}/{CALIBRATION_FILE}")
-            with writing(path):
-                path.unlink(missing_ok=True)
+            remove(self.kept_path(f"{token}/{CALIBRATION_FILE}"))
         if sequence is not None:
             write_whole({self.output / SEQUENCE_FILE: json.dumps(sequence, indent=1).encode()})
         return [] if sequence is None else [SEQUENCE_FILE], []
@@ -128,20 +129,6 @@ class LogFrames(FrameFolders):
         return self._finish(left_out, {"frames": [{"name": token, "time_s": self.data.time_s(k)} for k, token in kept]})
 
 
-def _left_out(source: Mapping[str, Any], folder: Path, is_scanned: bool) -> Iterator[str]:
-    """Names of a calibration's entries that would be stale beside the new cameras, or beside a new scan."""
-    rig = {"cameras", "ground_z_m", "lidars", "name", "lidar"}
-    stale = {*CALIBRATION_KEYS, *PIXEL_BOUND_KEYS, *CAMERA_KEYS, "truth", *(_OF_SCAN if is_scanned else ())}
-    for key, value in source.items():
-        names_file = isinstance(value, str) and os.path.isfile(os.path.join(folder, value))
-        if key not in rig and (key in stale or names_file):
-            yield key
-    of_cameras = {key for camera in source["cameras"] for key in camera if key not in _OF_VIEWS}
-    yield from (f"cameras.{key}" for key in of_cameras)
-    if isinstance(lidar := source.get("lidar"), Mapping):
-        yield from (f"lidar.{key}" for key in lidar if key not in ("file", *(() if is_scanned else ("columns",))))
-
-
 def _npy(points: Any) -> bytes:
     """A .npy file of points, a tensor."""
     file = BytesIO()
@@ -154,6 +141,5 @@ def _calibration(converted: Converted) -> dict[str, Any]:
     calib = converted.rig.to_dict()
     for entry, names in zip(calib["cameras"], converted.views, strict=True):
         for suffix, name in names.items():
-            key = {".jpg": "file", ".png": "file"}.get(suffix, suffix.split(".")[1])
-            entry[key] = Path(name).name
+            entry["file" if suffix in (".jpg", ".png") else suffix.split(".")[1]] = Path(name).name
     return calib

@@ -7,28 +7,32 @@ target's scanners are one ``LIDAR_TOP`` in the frame of the first.
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import torch
 
 from arbiview_aug.atomic_io import check_name, checksum, inside, link_whole, whole_file
-from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cli.convert.manifest import Record
-from arbiview_aug.cli.convert.nuscenes_rows import NewSensors, Remaining, kept_sensors, view_stem, visible_shares
-from arbiview_aug.cli.convert.settings import FOLDER, Settings
-from arbiview_aug.cli.convert.writer import Converted, Writer
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.rotations import quaternion_from_rotation
+from arbiview_aug.cli.convert.writer import FOLDER, Converted, Record, Settings, Writer
 from arbiview_aug.datasets.nuscenes import tables as kinds
 from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING, NuScenesDataset
-from arbiview_aug.datasets.nuscenes.recordings import IntArray
-from arbiview_aug.datasets.nuscenes.tables import Kind, Row, Tables, Tokens, on_circle
+from arbiview_aug.datasets.nuscenes.recordings import LIDAR
+from arbiview_aug.datasets.nuscenes.tables import Kind, Row, Tables, Tokens, is_camera, on_circle
 from arbiview_aug.errors import CalibrationError, DataError
+from arbiview_aug.sample.boxes_2d import project_boxes_3d
 from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
 _TABLES = (
@@ -76,27 +80,22 @@ class NuScenes(Writer):
     """Tables, images and masks of the new cameras; CalibrationError for lenses, and names of other sensors."""
 
     def __init__(self, settings: Settings, data: NuScenesDataset) -> None:
-        self.output, self.data, self.suffix, self.how = settings.output, data, settings.suffix, settings.link
-        self.target, self.scanned = settings.target, bool(settings.target.lidars) and settings.points == "target"
-        self.scanned &= data.lidar_channel is not None
+        super().__init__(settings, data)
+        self.suffix, self.target = settings.suffix, settings.target
+        is_scanned = bool(self.target.lidars) and settings.points == "target"
+        self.scanned = is_scanned and data.lidar_channel is not None
         self.tables = Tables(data.root, data.version)
         self.moment = data.lidar_channel or data.channels[0]
         self.there = [name for name in _TABLES if self.tables.path(name).is_file()]  # in writing order
-        labels = {"instance", "sample_annotation"}
-        if len(lacking := labels - {*self.there}) == 1:  # its rows name those of the other one
-            missing = self.tables.path(*lacking)
-            raise DataError(
-                f"nuScenes {data.root}: expected the tables {' and '.join(sorted(labels))} or neither, got no {missing}"
-            )
+        labels = ("instance", "sample_annotation")  # whose rows name each other's
+        if len(lacking := [name for name in labels if name not in self.there]) == 1:
+            got = f"no {self.tables.path(*lacking)}"
+            raise DataError(f"nuScenes {data.root}: expected the tables {' and '.join(labels)} or neither, got {got}")
         self.written = [name for name in self.there if not (self.scanned and name in _OF_POINTS)]
         if lenses := [f"{camera.name} ({camera.lens})" for camera in self.target if not camera.is_rectilinear]:
-            name = self.target.name or "the target"
-            raise CalibrationError(
-                f"rig {name!r}: expected pinhole cameras, since nuScenes tables know no lenses, got "
-                f'{", ".join(lenses)}; convert to Rig.undistorted(): python -c "from arbiview_aug import load_rig; '
-                f"load_rig('{name}').undistorted().save('pinhole.yaml')\" and --target pinhole.yaml; frame folders "
-                "carry lenses"
-            )
+            fix = "convert to Rig.undistorted(), saved as a file, or frame folders, which carry lenses"
+            expected = "pinhole cameras, since nuScenes tables know no lenses"
+            raise CalibrationError(f"rig {self.target.name!r}: expected {expected}, got {', '.join(lenses)}; {fix}")
         if taken := sorted(set(self.target.names) & set(data.other_channels)):
             expected, got = "cameras of other names than the sensors that are kept", ", ".join(taken)
             raise CalibrationError(f"rig {self.target.name!r}: expected {expected}, got {got}; rename them (--names)")
@@ -108,18 +107,11 @@ class NuScenes(Writer):
 
     def notes(self) -> list[str]:
         names, wanted = self.target.names, CAMERA_RING
-        if {*wanted} <= {*names}:
-            return []
-        fix = f"--names {names[0]}={wanted[0]} ... names them"
-        return [f"channels {', '.join(names)}: detectors' converters ask for {', '.join(wanted)} by name; {fix}"]
+        note = f"channels {', '.join(names)}: detectors' converters ask for {', '.join(wanted)} by name; --names "
+        return [] if {*wanted} <= {*names} else [f"{note}{names[0]}={wanted[0]} ... names them"]
 
     def check(self) -> None:
-        """Read all tables once.
-
-        Raises:
-            DataError: A malformed table; a dangling reference, a file outside the root or a missing column;
-                a duplicate token; a circle of ``next`` or ``prev``; image names that clash or no file can have.
-        """
+        """Read all tables once: no dangling references, duplicate tokens, circles, clashing or impossible names."""
         names = [PurePosixPath(self.data.moment_file(index)).name for index in range(len(self.data))]
         (stem, times), *_ = Counter(view_stem(name, "") for name in names).most_common(1)
         if times > 1:
@@ -170,7 +162,7 @@ class NuScenes(Writer):
             if parts and (parts[0] in own_folders or "/".join(parts[:2]) in own_folders):
                 raise DataError(f"{where}: expected a file outside of {', '.join(own_folders)}, got one in {folder}")
 
-    def stem(self, index: int, camera: int, name: str) -> str:
+    def stem(self, index: int, name: str) -> str:
         return view_stem(PurePosixPath(self.data.moment_file(index)).name, name)
 
     def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Path], dict[str, Any]]:
@@ -189,58 +181,42 @@ class NuScenes(Writer):
             if not len(out["points"]):
                 fix = "--points source keeps those that were measured"
                 raise DataError(f"{name}: expected returns of the target's scanners, got none; {fix}")
-            files[name] = _scan_file(out["points"].numpy(), out[RINGS_KEY].numpy(), lidar2ego)
+            points = out["points"].numpy()
+            xyz = (points[:, :3] - lidar2ego[:3, 3]) @ lidar2ego[:3, :3]
+            intensity = points[:, 3] if points.shape[1] > 3 else np.zeros(len(points))
+            files[name] = np.column_stack([xyz, intensity, out[RINGS_KEY].numpy()]).astype("<f4").tobytes()
             facts |= {"lidar2ego": lidar2ego.tolist()}
             facts["num_lidar_pts"] = dict(zip(tokens, out.get(COUNTS_KEY, torch.empty(0)).tolist(), strict=True))
         return files, {}, facts
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> tuple[list[str], list[str]]:
         """Write the tables and link the files of the remaining sensors."""
-        source = self.tables
-        remaining = Remaining(source, left_out, self.scanned, self.moment)
-        new = NewSensors(records, self.suffix, remaining.moment_sensor)
-        keyframes, poses = remaining.moments()
-        self._missing = 0
-        rows: dict[str, Callable[[], Iterable[Row]]] = {
-            "sensor": lambda: chain(remaining.sensor(), new.sensor()),
-            "calibrated_sensor": lambda: chain(remaining.calibrated_sensor(), new.calibrated_sensor()),
-            "ego_pose": lambda: remaining.ego_pose(poses),
-            "scene": remaining.scene,
-            "instance": remaining.instance,
-            "sample_annotation": lambda: remaining.sample_annotation(new.visible, new.num_lidar_pts),
-            "sample_data": lambda: chain(
-                self._linked("sample_data", remaining.sample_data()), new.sample_data(remaining.drives, keyframes)
-            ),
-            "lidarseg": lambda: self._linked("lidarseg", source.rows("lidarseg")),
-            "panoptic": lambda: self._linked("panoptic", source.rows("panoptic")),
-            "sample": remaining.sample,
-        }
+        tables = ConvertedTables(self.tables, records, left_out, self.scanned, self.moment, self.suffix)
+        missing = 0
         for path in self._maps():
-            link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"), how=self.how)
+            link_whole(*self._kept(path.relative_to(self.data.root).as_posix(), "maps"))
         for name in self.written:
-            of_table = rows.get(name, partial(source.rows, name))
+            rows: Iterable[Row] = getattr(tables, name, partial(self.tables.rows, name))()
             with whole_file(self.kept_path(f"{self.data.version}/{name}.json")) as file:
                 file.write(b"[")
-                for k, row in enumerate(of_table()):
+                for k, row in enumerate(rows):
+                    is_new = row.get("calibrated_sensor_token") in tables.calibrations
+                    if name in ("sample_data", *_OF_POINTS) and not is_new:
+                        try:
+                            link_whole(*self._kept(row["filename"], self._where(name, row)))
+                        except FileNotFoundError:
+                            missing += 1
                     file.write((b",\n" if k else b"\n") + json.dumps(row).encode())
                 file.write(b"\n]\n")
         notes = []
-        if self._missing:
-            notes.append(f"{self._missing} files that sample_data names are not in the source: were sweeps not copied?")
+        if missing:
+            notes.append(f"{missing} files that sample_data names are not in the source: were sweeps not copied?")
         if unfit := sorted({*self.there} - {*self.written}):
             notes.append(f"left out, since they label the points that were measured: tables {', '.join(unfit)}")
         unknown = sorted({path.stem for path in (self.data.root / self.data.version).glob("*.json")} - {*_TABLES})
         if unknown:
             notes.append(f"left out, since they may describe the source's images: tables {', '.join(unknown)}")
         return [f"{self.data.version}/{name}.json" for name in self.written], notes
-
-    def _linked(self, table: str, rows: Iterable[Row]) -> Iterator[Row]:
-        for row in rows:
-            try:
-                link_whole(*self._kept(row["filename"], self._where(table, row)), how=self.how)
-            except FileNotFoundError:
-                self._missing += 1
-            yield row
 
     def _kept(self, name: str, where: str) -> tuple[Path, Path]:
         """Paths of a kept file in the source and in the output; links must not leave either."""
@@ -253,8 +229,200 @@ class NuScenes(Writer):
         return f"nuScenes {self.data.root} {self.data.version}: table {table}: row {row.get('token')!r}: filename"
 
 
-def _scan_file(points: FloatArray, rings: IntArray, lidar2ego: FloatArray) -> bytes:
-    """A LiDAR file of points (P, >=3) in the ego frame: x y z in the scanner's frame, intensity, ring; float32."""
-    xyz = (points[:, :3] - lidar2ego[:3, 3]) @ lidar2ego[:3, :3]
-    intensity = points[:, 3] if points.shape[1] > 3 else np.zeros(len(points))
-    return np.column_stack([xyz, intensity, rings]).astype("<f4").tobytes()
+# --- rows of a converted root -----------------------------------------------------------------------------------------
+LEVELS = ("1", "2", "3", "4")  # tokens of nuScenes' table ``visibility``: 0 to 40, 40 to 60, 60 to 80 and 80 to 100 %
+
+_BOUNDS = (0.4, 0.6, 0.8)
+_SUFFIX = re.compile(r"(?:\.(?:pcd|npy|jpg|jpeg|png))?(?:\.bin)?$")  # of what was recorded at a sample's time
+
+
+def visible_shares(rig: Rig, coverage: Sequence[BoolArray], boxes: FloatArray) -> FloatArray:
+    """(B,) share of each box (B, >= 7) that the cameras show, each with its coverage (h, w): the sum over cameras."""
+    shares = np.zeros(len(boxes))
+    covered = [replace(camera, mask=seen) for camera, seen in zip(rig, coverage, strict=True)]
+    for seen in project_boxes_3d(boxes, rig.with_cameras(covered)):
+        shares[seen.rows] += (1 - seen.truncation) * seen.visibility
+    return np.minimum(shares, 1.0)
+
+
+def level(share: float, source: str) -> str:
+    """Visibility token from a visible share, at most the ``source``'s token; empty if that is unknown."""
+    return min(source, LEVELS[int(np.searchsorted(_BOUNDS, share, side="right"))]) if source in LEVELS else ""
+
+
+def kept_sensors(tables: Tables) -> tuple[set[str], set[str]]:
+    """Tokens of the sensors other than cameras, and of their calibrations."""
+    sensors = {row["token"] for row in tables.rows("sensor") if not is_camera(row)}
+    calibrated = tables.rows("calibrated_sensor")
+    return sensors, {row["token"] for row in calibrated if row["sensor_token"] in sensors}
+
+
+class ConvertedTables:
+    """Rows of a converted root: a method for each table that changes, named after it.
+
+    The source's rows stay, but for those of its cameras and of the samples ``left_out``; chains between rows are closed
+    again. A LiDAR keyframe of a sample that was left out becomes a sweep of the next sample of its scene. With
+    ``scanned`` the scans of the sensor ``moment``, whose keyframes time the samples, go as cameras do. Rows of the
+    target's cameras and scanners come from the ``records`` of the converted samples; ``suffix`` is that of images.
+
+    Attributes:
+        calibrations: New rows of ``calibrated_sensor`` by token.
+    """
+
+    def __init__(
+        self, tables: Tables, records: Iterable[Record], left_out: set[str], scanned: bool, moment: str, suffix: str
+    ) -> None:
+        self.tables, self.left_out, self.suffix = tables, left_out, suffix
+        self._drives: dict[str, list[str]] = {}  # tokens of samples by scene, in order of time
+        self._stand_in: dict[str, str] = {}
+        rows_of_scenes: dict[str, list[Row]] = {}
+        for row in tables.rows("sample"):
+            rows_of_scenes.setdefault(row["scene_token"], []).append(row)
+        for scene, rows in rows_of_scenes.items():
+            tokens = [row["token"] for row in sorted(rows, key=lambda row: int(row["timestamp"]))]
+            drive = self._drives[scene] = [token for token in tokens if token not in left_out]
+            later = drive[-1] if drive else ""
+            for token in reversed(tokens):
+                later = self._stand_in[token] = later if token in left_out else token
+        self._sensors, kept = kept_sensors(tables)
+        lidar = next(row["token"] for row in tables.rows("sensor") if row["channel"] == moment)
+        timing = {row["token"] for row in tables.rows("calibrated_sensor") if row["sensor_token"] == lidar}
+        self._kept = kept - timing if scanned else kept
+        self._keyframes: dict[str, Row] = {}  # row that times each sample
+        self._poses = set[str]()  # tokens of the ego poses in use
+        for row in self._rows("sample_data"):
+            sample, sensor = row["sample_token"], row["calibrated_sensor_token"]
+            if row["is_key_frame"] and sensor in timing and sample not in left_out:
+                self._keyframes[sample] = row
+                self._poses.add(row["ego_pose_token"])
+            elif sensor in self._kept and self._stand_in[sample]:
+                self._poses.add(row["ego_pose_token"])
+        annotations = self._rows("sample_annotation") if left_out else ()
+        self._annotations_left_out = {  # predecessor, successor and instance by token
+            row["token"]: (row.get("prev", ""), row.get("next", ""), row["instance_token"])
+            for row in annotations
+            if row["sample_token"] in left_out
+        }
+        self.calibrations: dict[str, Row] = {}
+        self._visible: dict[str, float] = {}  # visible share of each annotation's box
+        self._num_lidar_pts: dict[str, int] = {}  # points in it, where scans are the target's
+        self._views: dict[str, dict[str, Row]] = {}  # columns of ``sample_data`` by sample and camera
+        self._scans: dict[str, Row] = {}  # likewise of scans
+        for record in records:
+            self._visible |= record["visible"]
+            views = self._views[record["token"]] = {}
+            for camera in record["cameras"]:
+                name = camera["name"]
+                calibrated = self._calibrated(name, token_of("sensor", name), camera["cam2ego"], camera["K"])
+                size = {key: camera[key] for key in ("height", "width")}
+                views[name] = {"calibrated_sensor_token": calibrated, **size, "filename": camera["file"]}
+            if "lidar2ego" in record:
+                self._num_lidar_pts |= record["num_lidar_pts"]
+                calibrated = self._calibrated(LIDAR, lidar, record["lidar2ego"], [])
+                file = {"filename": record["lidar_file"], "fileformat": "bin"} if "lidar_file" in record else {}
+                self._scans[record["token"]] = {"calibrated_sensor_token": calibrated, **file}
+
+    def sensor(self) -> Iterator[Row]:
+        yield from (row for row in self.tables.rows("sensor") if row["token"] in self._sensors)
+        for name in dict.fromkeys(chain.from_iterable(self._views.values())):
+            yield {"token": token_of("sensor", name), "channel": name, "modality": "camera"}
+
+    def calibrated_sensor(self) -> Iterator[Row]:
+        yield from (row for row in self.tables.rows("calibrated_sensor") if row["token"] in self._kept)
+        yield from self.calibrations.values()
+
+    def ego_pose(self) -> Iterator[Row]:
+        return (row for row in self._rows("ego_pose") if row["token"] in self._poses)
+
+    def scene(self) -> Iterator[Row]:
+        for row in self.tables.rows("scene"):
+            drive = self._drives.get(row["token"], [])
+            if drive or not self.left_out:
+                ends = {"first_sample_token": drive[0], "last_sample_token": drive[-1]} if drive else {}
+                yield self._changed(row, {"nbr_samples": len(drive), **ends})
+
+    def instance(self) -> Iterator[Row]:
+        fewer = Counter(instance for _, _, instance in self._annotations_left_out.values())
+        for row in self.tables.rows("instance"):
+            first, last = (row.get(f"{end}_annotation_token", "") for end in ("first", "last"))
+            remaining_first = self._remaining(first, 1)
+            if remaining_first or not first:
+                values = {"first_annotation_token": remaining_first, "last_annotation_token": self._remaining(last, 0)}
+                count = (row.get("nbr_annotations") or 0) - fewer[row["token"]]
+                yield self._changed(row, {**values, "nbr_annotations": count})
+
+    def sample_annotation(self) -> Iterator[Row]:
+        for row in self._rows("sample_annotation"):
+            if row["token"] in self._annotations_left_out:
+                continue
+            around = {key: self._remaining(row.get(key, ""), k) for k, key in enumerate(("prev", "next"))}
+            row = self._changed(row, around)
+            if "visibility_token" in row:
+                share = self._visible.get(row["token"], 1.0)  # of a box that was not read, unknown
+                row = {**row, "visibility_token": level(share, row["visibility_token"])}
+            if row["token"] in self._num_lidar_pts:
+                row = {**row, "num_lidar_pts": self._num_lidar_pts[row["token"]]}
+            yield row
+
+    def sample_data(self) -> Iterator[Row]:
+        """The remaining rows; then new ones, at the time and ego pose of the samples' keyframes."""
+        for row in self._rows("sample_data"):
+            stand_in = self._stand_in[row["sample_token"]] if row["calibrated_sensor_token"] in self._kept else ""
+            if stand_in == row["sample_token"]:
+                yield row
+            elif stand_in:
+                yield {**row, "sample_token": stand_in, "is_key_frame": False}
+        for drive in self._drives.values():
+            for before, sample, after in zip(["", *drive], drive, [*drive[1:], ""], strict=False):
+                moment, around = self._keyframes[sample], {"prev": before, "next": after}
+                if sample in self._scans:
+                    ends = {key: token and self._keyframes[token]["token"] for key, token in around.items()}
+                    yield {**moment, **self._scans[sample], **ends}
+                for name, view in self._views[sample].items():
+                    yield {
+                        **{"token": token_of(sample, name), "sample_token": sample},
+                        **{key: moment[key] for key in ("ego_pose_token", "timestamp")},
+                        **{"fileformat": self.suffix.removeprefix("."), "is_key_frame": True, **view},
+                        **{key: token and token_of(token, name) for key, token in around.items()},
+                    }
+
+    def sample(self) -> Iterator[Row]:
+        place = {token: (drive, k) for drive in self._drives.values() for k, token in enumerate(drive)}
+        for row in self.tables.rows("sample"):
+            if row["token"] in place:
+                drive, k = place[row["token"]]
+                around = {"prev": drive[k - 1] if k else "", "next": drive[k + 1] if k + 1 < len(drive) else ""}
+                yield self._changed(row, around)
+
+    def _rows(self, table: str) -> Iterator[Row]:
+        return chain.from_iterable(self.tables.batches(table))
+
+    def _changed(self, row: Row, values: Mapping[str, Any]) -> Row:
+        """Set existing columns of a row; rows stay unchanged if nothing is left out."""
+        return {**row, **{key: value for key, value in values.items() if key in row}} if self.left_out else row
+
+    def _remaining(self, token: str, direction: int) -> str:
+        """Follow a chain (0 back, 1 forward) to its first annotation that is not left out."""
+        while token in self._annotations_left_out:
+            token = self._annotations_left_out[token][direction]
+        return token
+
+    def _calibrated(self, name: str, sensor: str, sensor2ego: list[list[float]], K: list[list[float]]) -> str:
+        """Token of a calibration, which is collected."""
+        token, pose = token_of("calibrated_sensor", name, json.dumps([K, sensor2ego])), np.array(sensor2ego)
+        self.calibrations[token] = {
+            **{"token": token, "sensor_token": sensor, "translation": pose[:3, 3].tolist()},
+            **{"rotation": quaternion_from_rotation(pose[:3, :3]).tolist(), "camera_intrinsic": K},
+        }
+        return token
+
+
+def view_stem(lidar: str, name: str) -> str:
+    """Path of a camera's image below the root, without suffix, after the file that times the same sample."""
+    channel, stem = quote(name, safe="", errors="surrogatepass"), _SUFFIX.sub("", lidar)
+    return f"samples/{channel}/{stem.replace(LIDAR, channel) if LIDAR in stem else f'{stem}__{channel}'}"
+
+
+def token_of(*parts: str) -> str:
+    """Hash texts to a token in nuScenes' form, 32 hexadecimal digits."""
+    return hashlib.md5("\n".join(parts).encode(errors="surrogatepass"), usedforsecurity=False).hexdigest()

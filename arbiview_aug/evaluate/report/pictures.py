@@ -1,8 +1,12 @@
-"""Contact sheets, also of a whole retargeted frame, overlays, and drawings of rigs, as (h, w, 3) uint8 RGB."""
+"""Contact sheets, also of a whole retargeted frame, overlays, and drawings of samples and rigs, (h, w, 3) uint8 RGB."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +20,13 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.image_io import encoded
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.images import Image, RenderedView, to_bytes
+from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, to_bytes
 from arbiview_aug.evaluate.lidar import visible_points
+from arbiview_aug.sample.batching import leading_shape
 from arbiview_aug.sample.boxes_2d import edge_points
+from arbiview_aug.sample.calibration import as_array
+from arbiview_aug.sample.inputs import read_frames
+from arbiview_aug.scene.boxes import checked_boxes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,7 +39,8 @@ _FARTHEST_M = 80.0  # points there, and beyond, are blue
 
 RIG_COLOURS = ("#1f64c8", "#d65414", "#1e8c3c", "#8c3caa", "#966e14")  # of rigs, in their order
 
-_SCANNER = "#00a0a0"  # colour of scanners
+_DOT = {"marker": "o", "linestyle": "", "color": "#00a0a0", "markersize": 7, "markeredgecolor": "white", "zorder": 3}
+"""Style of scanners."""
 
 _GAP_PX = 6
 _CAPTION_PX, _CAPTION_SCALE = 20, 0.42
@@ -47,10 +56,7 @@ def put_text(picture: Picture, text: str, xy: tuple[int, int], scale: float) -> 
 
 
 def contact_sheet(rows: Sequence[tuple[str, Sequence[Image], Sequence[str]]], *, width_px: int = 1800) -> Picture:
-    """Lay out rows (title, images (h, w, 3), scale 0-255, and their captions); a row's images share a height.
-
-    Rows fill the width; captions that are too long are cut.
-    """
+    """Lay out rows of a title, images (h, w, 3), scale 0-255, and captions, which are cut where too long."""
     strips = []
     for title, images, captions in rows:
         strips.append(np.full((_TITLE_PX, width_px, 3), PAPER, np.uint8))
@@ -102,13 +108,9 @@ def overlay_confidence(image: Image, confidence: npt.NDArray[np.floating[Any]]) 
 
 
 def draw_labels(camera: Camera, image: Image, points: FloatArray | None, boxes: FloatArray | None) -> Picture:
-    """Draw points by their depth, red to blue, and boxes with their headings into a camera's image (h, w, 3).
+    """Draw points (P, >=3) by depth, red to blue, and boxes (B, 7) with headings into an image (h, w, 3), 0-255.
 
-    Args:
-        camera: The camera; what its mask hides is hatched.
-        image: On the scale 0-255.
-        points: (P, >=3) in the ego frame.
-        boxes: (B, 7).
+    What the camera's mask hides is hatched.
     """
     picture = to_bytes(image).copy() if camera.mask is None else outline_coverage(image, camera.mask)
     h, w = camera.size
@@ -128,10 +130,7 @@ def draw_labels(camera: Camera, image: Image, points: FloatArray | None, boxes: 
 
 
 def box_lines(camera: Camera, box: FloatArray) -> list[tuple[FloatArray, tuple[int, int, int]]]:
-    """Segments (n, 2, 2) in a camera's image of a box's edges and of its heading, each with their colour.
-
-    A lens bends them. The box is (7,) in the ego frame.
-    """
+    """Segments (n, 2, 2) in a camera's image, bent by its lens, of a box's (7,) edges and heading, with colours."""
     ahead = np.array([np.cos(box[6]), np.sin(box[6]), 0.0]) * box[3]
     heading = box[:3] + np.linspace(0.5, 1.0, 9)[:, None, None] * ahead
     heading = (heading - camera.center_m) @ camera.cam2ego[:3, :3]
@@ -217,10 +216,64 @@ def left_to_right(rig: Rig) -> list[int]:
     return sorted(range(len(rig)), key=lambda k: -((rig[k].azimuth_deg + _RING_START_DEG) % 360))
 
 
+_COLUMNS, _WIDTH_IN = 3, 12.0
+_DIMMED = 0.35  # brightness of what is no evidence
+
+
+def show(sample: Mapping[str, Any]) -> Figure:
+    """Draw a sample's images in a grid, with its boxes and their headings; show the figure in notebooks.
+
+    What ``coverage`` or a mask leaves out is dimmed: no source camera saw it, or it is the own car.
+
+    Args:
+        sample: A sample that ``RigRetarget`` takes or returns; of a batch, each frame.
+
+    Returns:
+        A matplotlib figure; ``savefig(path)`` writes it.
+
+    Raises:
+        SampleError: As ``RigRetarget`` raises it.
+    """
+    drawn: list[tuple[str, Picture]] = []
+    frames = read_frames(sample, None, further=("boxes_3d",))
+    for number, frame in enumerate(frames):
+        boxes = None if frame.boxes is None else checked_boxes(as_array("boxes_3d", frame.boxes))
+        of_frame = f"frame {number}, " if leading_shape(sample["images"]) else ""
+        for camera, image in zip(frame.rig, as_arrays(frame.images), strict=True):
+            if camera.mask is not None:
+                image = image * (_DIMMED + (1 - _DIMMED) * camera.mask[..., None])
+            picture = draw_labels(replace(camera, mask=None), image, None, boxes)
+            drawn.append((of_frame + camera.name, picture))
+    columns = min(_COLUMNS, len(drawn))
+    rows = math.ceil(len(drawn) / columns)
+    aspect = max(picture.shape[0] / picture.shape[1] for _, picture in drawn)
+    height_in = rows * (_WIDTH_IN / columns * aspect + 0.35)
+    figure = _notebook_figure()(figsize=(_WIDTH_IN, height_in), layout="constrained")
+    for axes in figure.subplots(rows, columns, squeeze=False).flat:
+        axes.set_axis_off()
+    for axes, (title, picture) in zip(figure.axes, drawn, strict=False):
+        axes.imshow(picture)
+        axes.set_title(title, fontsize="medium")
+    return figure
+
+
+@cache
+def _notebook_figure() -> type[Figure]:
+    """A class of figures that notebooks show without pyplot and its global state."""
+    from matplotlib.figure import Figure
+
+    class NotebookFigure(Figure):
+        def _repr_png_(self) -> bytes:
+            png = BytesIO()
+            self.savefig(png, format="png")
+            return png.getvalue()
+
+    return NotebookFigure
+
+
 # --- rigs: fields of view from above, heights over the road from the side ---------------------------------------------
 def draw_rigs(rigs: Sequence[Rig]) -> Picture:
-    # Without pyplot: no global state and no display.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # without pyplot: no global state and no display
 
     canvas = FigureCanvasAgg(rig_figure(rigs))
     canvas.draw()
@@ -228,11 +281,9 @@ def draw_rigs(rigs: Sequence[Rig]) -> Picture:
 
 
 def rig_figure(rigs: Sequence[Rig]) -> Figure:
-    """Draw one column per rig: from above (forward is up) and from the side (forward is to the right).
+    """Draw one column per rig, from above and from the side, on one scale with the other rigs' outlines behind.
 
-    Wedges show horizontal fields of view above and vertical ones below. A telephoto camera's wedge is longer. All
-    columns share one scale, with the other rigs' outlines behind. Heights are over each rig's own road. Scanners are
-    dots.
+    Wedges are fields of view, longer for telephoto cameras; dots are scanners. Heights are over each rig's own road.
     """
     from matplotlib.figure import Figure
 
@@ -243,64 +294,35 @@ def rig_figure(rigs: Sequence[Rig]) -> Figure:
             colour, here = RIG_COLOURS[k % len(RIG_COLOURS)], k == column
             style = {"facecolor": (colour, 0.15 if here else 0), "edgecolor": (colour, 1 if here else 0.3)}
             for camera in rig:
-                above.fill(*_wedge_from_above(camera).T, **style)
-                side.fill(*_wedge_from_side(camera, rig).T, **style)
-        _label(above, side, rigs[column])
-        above.set_title(f"{rigs[column].name or 'rig'}: {len(rigs[column])} cameras", color=RIG_COLOURS[column % 5])
+                fov = min(camera.fov_deg[0], 359.0)
+                angle = np.radians(camera.azimuth_deg + np.linspace(-fov / 2, fov / 2, max(2, int(fov / 3))))
+                y, x = camera.center_m[1::-1, None] + _radius_m(camera) * np.stack([np.sin(angle), np.cos(angle)])
+                above.fill([camera.center_m[1], *y], [camera.center_m[0], *x], **style)
+                row = np.linspace(-0.5, camera.height_px - 0.5, 25)
+                rays = camera.unproject(np.stack([np.full_like(row, camera.K[0, 2]), row], -1)).directions
+                centre = camera.center_m - (0, 0, rig.ground_z_m)
+                x, _, z = np.concatenate([centre[None], centre + 1.1 * rays]).T
+                side.fill(x, z, **style)
+        own = rigs[column]
+        for camera in own:  # its name and field of view at the end of its wedge
+            forward, left = np.cos(np.radians(camera.azimuth_deg)), np.sin(np.radians(camera.azimuth_deg))
+            y, x = camera.center_m[1::-1] + (_radius_m(camera) + 0.2) * np.array([left, forward])
+            text = f"{camera.name}\n{camera.fov_deg[0]:.0f}° x {camera.fov_deg[1]:.0f}°"
+            aligned = {"ha": "right" if left > 0.3 else "left" if left < -0.3 else "center"}
+            above.text(y, x, text, fontsize=8, va="bottom" if forward > 0 else "top", **aligned)
+        for lidar in own.lidars:
+            x, y, z = lidar.center_m - (0, 0, own.ground_z_m)
+            above.plot(y, x, **_DOT)
+            side.plot(x, z, **_DOT)
+        above.set_title(f"{own.name or 'rig'}: {len(own)} cameras", color=RIG_COLOURS[column % len(RIG_COLOURS)])
         above.set(xlabel="left (m)", ylabel="forward (m)", aspect="equal")
         side.set(xlabel="forward (m)", ylabel="height over the road (m)", aspect="equal")
         side.axhline(0, color="grey", linewidth=3)
-        for axes, margins in ((above, (0.15, 0.15)), (side, (0.7, 0.05))):
+        for axes, margins in ((above, (0.15, 0.15)), (side, (0.15, 0.05))):
             axes.grid(alpha=0.3)
             axes.margins(*margins)
     above.invert_xaxis()
     return figure
-
-
-def _label(above: Any, side: Any, rig: Rig) -> None:
-    """Write each camera's name and field of view at the end of its wedge, and all heights next to the side's drawing.
-
-    Rear cameras are listed on the left, front ones on the right, scanners between them; scanners are drawn as dots.
-    """
-    for camera in rig:
-        forward, left = np.cos(np.radians(camera.azimuth_deg)), np.sin(np.radians(camera.azimuth_deg))
-        y, x = camera.center_m[1::-1] + (_radius_m(camera) + 0.2) * np.array([left, forward])
-        text = f"{camera.name}\n{camera.fov_deg[0]:.0f}° x {camera.fov_deg[1]:.0f}°"
-        aligned = {"ha": "right" if left > 0.3 else "left" if left < -0.3 else "center"}
-        above.text(y, x, text, fontsize=8, va="bottom" if forward > 0 else "top", **aligned)
-    order = sorted(rig, key=lambda camera: (camera.center_m[0], camera.azimuth_deg))
-    sensors: list[Any] = [*order, *rig.lidars]
-    heights = [f"{sensor.name} {sensor.center_m[2] - rig.ground_z_m:.2f} m" for sensor in sensors]
-    beams = [f"{text}, {len(s.elevations_deg)} beams" for text, s in zip(heights[len(rig) :], rig.lidars, strict=True)]
-    half = len(rig) // 2
-    for ha, at, lines in (
-        ("left", 0.01, heights[:half]),
-        ("right", 0.99, heights[half : len(rig)]),
-        ("center", 0.5, beams),
-    ):
-        colour = {"color": _SCANNER} if ha == "center" else {}
-        side.text(at, 0.96, "\n".join(lines), transform=side.transAxes, ha=ha, va="top", fontsize=8, **colour)
-    dot = {"marker": "o", "linestyle": "", "color": _SCANNER, "markersize": 7, "markeredgecolor": "white", "zorder": 3}
-    for lidar in rig.lidars:
-        x, y, z = lidar.center_m - (0, 0, rig.ground_z_m)
-        above.plot(y, x, **dot)
-        side.plot(x, z, **dot)
-
-
-def _wedge_from_above(camera: Camera) -> FloatArray:
-    """(n, 2) outline in ego y, x: the horizontal field of view about the optical axis."""
-    fov = min(camera.fov_deg[0], 359.0)
-    angle = np.radians(camera.azimuth_deg + np.linspace(-fov / 2, fov / 2, max(2, int(fov / 3))))
-    arc = camera.center_m[1::-1] + _radius_m(camera) * np.stack([np.sin(angle), np.cos(angle)], -1)
-    return np.concatenate([camera.center_m[None, 1::-1], arc])
-
-
-def _wedge_from_side(camera: Camera, rig: Rig) -> FloatArray:
-    """(n, 2) outline in ego x and height over the road: the vertical field of view."""
-    row = np.linspace(-0.5, camera.height_px - 0.5, 25)
-    rays = camera.unproject(np.stack([np.full_like(row, camera.K[0, 2]), row], -1)).directions
-    centre = camera.center_m - (0, 0, rig.ground_z_m)
-    return np.concatenate([centre[None], centre + 1.1 * rays])[:, [0, 2]]
 
 
 def _radius_m(camera: Camera) -> float:

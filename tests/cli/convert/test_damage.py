@@ -11,7 +11,6 @@ import io
 import json
 import os
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,7 +23,6 @@ from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import Neighbours, NuScenesDataset
 from arbiview_aug.errors import ArbiviewError
 from arbiview_aug.transforms.warm_up import compile_kernels
-from tests import mutations
 from tests.cli.convert.drives import SURROUND, command, read_tables, tree, write_nuscenes
 from tests.helpers import examples, sampled
 from tests.mutations import mutated_json, works, written
@@ -274,27 +272,6 @@ def test_tables_that_cannot_be_parsed(tried: Range, table: str, content: bytes) 
 def test_nothing_is_wrong_with_sound_tables(tried: Range) -> None:
     """Nor with maps that name no file, as those of cut-out data sets do."""
     assert tried.changed("map", put("filename", "")) == ("read", "")
-
-
-@pytest.mark.parametrize(
-    ("fault", "noticed"),
-    [
-        (lambda root: {}["x"], (KeyError, "x")),
-        (lambda root: (root / "beside" / "y").write_bytes(b""), (AssertionError, "beside/y")),
-        (lambda root: print("Traceback", file=sys.stderr), (AssertionError, "Traceback")),
-        (lambda root: next(iter(int, 1)) or [None for _ in iter(int, 1)], (AssertionError, "over 1.0 s of CPU")),
-    ],
-    ids=["an exception", "a file outside the output", "a traceback", "a hang"],
-)
-def test_faults_that_must_be_noticed(
-    tried: Range, fault: Callable[[Path], object], noticed: tuple[Any, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The tests here themselves."""
-    monkeypatch.setattr(mutations, "HANG_S", 1.0)
-    monkeypatch.setitem(globals(), "main", lambda argv: fault(tried.root) and 1)
-    with pytest.raises(noticed[0], match=noticed[1]):
-        tried.changed("scene", lambda rows: None)
-    (tried.root / "beside" / "y").unlink(missing_ok=True)
 
 
 # --- drawn ------------------------------------------------------------------------------------------------------------

@@ -13,9 +13,9 @@ import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.convert.nuscenes_rows import level, token_of, view_stem, visible_shares
+from arbiview_aug.cli.convert.nuscenes import level, token_of, visible_shares
 from arbiview_aug.datasets import NuScenesDataset
-from tests.cli.convert.drives import SURROUND, TARGET, chained, command, read_tables, tree, write_nuscenes
+from tests.cli.convert.drives import SURROUND, TARGET, chained, command, read_tables, write_nuscenes
 
 LEFT_OUT = "goes-sample-1"
 
@@ -160,12 +160,6 @@ def test_visibility_is_at_most_what_people_saw(source: Path, output: Path) -> No
     assert stripped == [{k: v for k, v in row.items() if k not in changed} for row in new]
 
 
-def test_names_that_are_no_file_names() -> None:
-    assert view_stem("a__LIDAR_TOP__12.pcd.bin", "CAM") == "samples/CAM/a__CAM__12"
-    assert view_stem("000012.bin", "/camera/front") == "samples/%2Fcamera%2Ffront/000012__%2Fcamera%2Ffront"
-    assert view_stem("1532402927.147951.bin", "CAM") == "samples/CAM/1532402927.147951__CAM"
-
-
 def test_lidar_files_of_one_name(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Samples would write over each other's images."""
     files = [path.relative_to(source) for path in (files[-1] for files in map(NuScenesDataset(source).files, (1, 4)))]
@@ -215,20 +209,6 @@ def test_a_sample_that_is_left_out_leaves_no_trace(
     assert NuScenesDataset(tmp_path / "new")[1]["token"] == "goes-sample-2"
     provenance = json.loads((tmp_path / "new" / "conversion" / "provenance.json").read_text())
     assert list(provenance["skipped"]) == [LEFT_OUT]
-
-
-def test_a_mended_sample_comes_back(source: Path, output: Path, tmp_path: Path) -> None:
-    shutil.copytree(source, tmp_path / "source")
-    (broken,) = [tmp_path / "source" / NuScenesDataset(source).files(1)[2].relative_to(source)]
-    sound = broken.read_bytes()
-    broken.write_bytes(b"")
-    assert main(command(tmp_path / "source", tmp_path / "new", "--images", "png", "--on-error", "skip")) == 0
-    broken.write_bytes(sound)
-    assert main(command(tmp_path / "source", tmp_path / "new", "--images", "png")) == 0
-    expected, mended = tree(output), tree(tmp_path / "new")
-    assert set(mended) == set(expected)
-    named = {"conversion/settings.json", "conversion/provenance.json"}  # the roots have other names
-    assert {name for name in mended if mended[name] != expected[name]} == named
 
 
 def test_lidar_files_that_are_missing(source: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -295,26 +275,11 @@ def test_only_what_some_source_saw_counts() -> None:
 
 def test_cut_by_the_image_and_continued_in_the_next() -> None:
     at_the_edge = [14.0, 14, 0, 2, 2, 2, np.pi / 4]  # 45 degrees: half in either camera of 90 degrees
-    assert shares([AHEAD], [at_the_edge]) == pytest.approx([0.5], abs=0.04)
-    assert shares([AHEAD, looking(90)], [at_the_edge]) == pytest.approx([1], abs=0.04)
+    (one,), (two,) = shares([AHEAD], [at_the_edge]), shares([AHEAD, looking(90)], [at_the_edge])
+    assert level(one, "4") == "2" and level(two, "4") == "4" and two == pytest.approx(2 * one)
 
 
-def test_no_boxes() -> None:
-    assert visible_shares(Rig([AHEAD]), [ALL], np.zeros((0, 9))).shape == (0,)
-
-
-@pytest.mark.parametrize(
-    ("share", "source", "expected"),
-    [
-        (0.0, "4", "1"),
-        (0.39, "4", "1"),
-        (0.4, "4", "2"),
-        (0.7, "4", "3"),
-        (0.9, "4", "4"),
-        (0.9, "2", "2"),
-        (0.9, "", ""),
-    ],
-)
-def test_levels(share: float, source: str, expected: str) -> None:
+def test_levels() -> None:
     """nuScenes' bins; what people saw less of is not seen more of; unknown stays unknown."""
-    assert level(share, source) == expected
+    assert [level(share, "4") for share in (0.0, 0.39, 0.4, 0.7, 0.9)] == ["1", "1", "2", "3", "4"]
+    assert (level(0.9, "2"), level(0.9, "")) == ("2", "")

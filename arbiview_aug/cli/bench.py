@@ -16,12 +16,12 @@ import json
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from time import process_time
 from timeit import timeit
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from tqdm import tqdm
@@ -53,8 +53,7 @@ _ROUNDS, _LEAST_ROUNDS = 9, 3  # a median of fewer is a single time
 _ENOUGH_MS = 1000.0  # keeps a sweep of 30 settings at two minutes
 
 
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     quality: Quality
     surface: GeometryName
     reduce: Reduce  # images are decoded at 1 / this
@@ -65,11 +64,6 @@ class Setting:
         depth = ["depth held"] if self.cached else []
         return ", ".join([self.quality, self.surface, *depth, f"1/{self.reduce}"])
 
-    def call(self, target: Rig) -> Callable[[Sample], dict[str, Any]]:
-        """Create a transform that caches the last plan alone."""
-        cache = PlanCache(share_overlap=self.cached, max_bytes=0)
-        return RigRetarget(target, quality=self.quality, geometry=self.surface, holes="black", cache=cache)
-
 
 def settings(
     surfaces: Sequence[GeometryName],
@@ -79,29 +73,11 @@ def settings(
     """List combinations that differ: ``paper`` has ``infinity`` alone; ``accurate`` needs depth from overlap."""
     rows = []
     for quality, reduce in itertools.product(qualities, reduces):
-        if quality == "paper":
-            rows.append(Setting(quality, "infinity", reduce))
-            continue
-        for surface in surfaces:
-            if quality != "accurate":
-                rows.append(Setting(quality, surface, reduce))
-            elif GEOMETRIES[surface].overlap_depth:
-                rows += [Setting(quality, surface, reduce, cached) for cached in (False, True)]
+        for surface in surfaces if quality != "paper" else ("infinity",):
+            if quality != "accurate" or GEOMETRIES[surface].overlap_depth:
+                caches = (False, True) if quality == "accurate" else (False,)
+                rows += [Setting(quality, surface, reduce, cached) for cached in caches]
     return rows
-
-
-def _frame(data: Any, sample: Mapping[str, Any], index: int, reference: Any) -> ScoredFrame:
-    """Frame scored by the true views, or by points in the colours of the ``reference``'s images.
-
-    On real frames methods get the points of every other degree; the others score, and DataError if there are none.
-    """
-    if isinstance(data, SyntheticDrive):
-        return make_frame(sample, truth=partial(data.render, index), exposures=(), hand_over_points=True)
-    if "points" not in sample:
-        raise DataError(f"data {data.root}: expected LiDAR points to score by, got none")
-    frame = make_frame(sample, exposures=("even",), hand_over_points=True)
-    points = make_frame(reference[index], exposures=("even",), hand_over_points=True).lidar["even"].points
-    return replace(frame, lidar={"even": LidarReference(frame.lidar["even"].sample, points)})
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -118,28 +94,39 @@ def run(arguments: argparse.Namespace) -> None:
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """Score and time all settings."""
     reduces: list[Reduce] = arguments.reduce if arguments.data else [1]  # streets are not decoded
-    opened: dict[int, Any] = {}
     if arguments.data is None:
-        opened[1] = SyntheticDrive(demo_source_rig(arguments.size), num_frames=arguments.frames)
-    for reduce in {*reduces, REFERENCE} if arguments.data else ():
-        opened[reduce] = open_data(arguments.data, reduce=reduce)
+        opened: dict[int, Any] = {1: SyntheticDrive(demo_source_rig(arguments.size), num_frames=arguments.frames)}
+    else:
+        opened = {reduce: open_data(arguments.data, reduce=reduce) for reduce in {*reduces, REFERENCE}}
 
     @cache
     def frame(index: int, reduce: Reduce) -> ScoredFrame:
-        return _frame(opened[reduce], opened[reduce][index], index, opened.get(REFERENCE, ()))
+        """Frame scored by the true views; or by half of the points, in the colours of the reference's images."""
+        sample = opened[reduce][index]
+        if arguments.data is None:
+            return make_frame(sample, truth=partial(opened[1].render, index), exposures=(), hand_over_points=True)
+        if "points" not in sample:
+            raise DataError(f"data {arguments.data}: expected LiDAR points to score by, got none")
+        scored, reference = (
+            make_frame(given, exposures=("even",), hand_over_points=True)
+            for given in (sample, opened[REFERENCE][index])
+        )
+        points = reference.lidar["even"].points
+        return replace(scored, lidar={"even": LidarReference(scored.lidar["even"].sample, points)})
 
     first = frame(0, reduces[0]).scored_sample
     source, target = first["rig"], demo_target_rig(arguments.size)
     if arguments.target is not None or arguments.data is not None:
         target = without_masks(load_rig(arguments.target or REAL_TARGET)).resized(arguments.size, "stretch")
     target = replace(target, lidars=())  # scans are no views
-    bent = next((camera for camera in source if not camera.is_rectilinear), None)
-    if "paper" in arguments.quality and bent is not None:
-        arguments.quality = [quality for quality in arguments.quality if quality != "paper"]
-        left_out = f"--quality paper: expected pinhole cameras, camera {bent.name!r} of the data has lens {bent.lens!r}"
-        if not arguments.quality:
+    if bent := [camera for camera in source if not camera.is_rectilinear]:
+        got = f"camera {bent[0].name!r} of the data has lens {bent[0].lens!r}"
+        left_out = f"--quality paper: expected pinhole cameras, {got}"
+        if arguments.quality == ["paper"]:
             raise DataError(left_out)
-        print(f"note: left out, {left_out}", file=sys.stderr)
+        if "paper" in arguments.quality:
+            print(f"note: left out, {left_out}", file=sys.stderr)
+        arguments.quality = [quality for quality in arguments.quality if quality != "paper"]
     if "paper" in arguments.quality:  # homographies know no lens; all settings share the target
         target = target.undistorted()
 
@@ -147,33 +134,43 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     offered: list[Any] = [name for name, key in SCORED.items() if key in first]
     surfaces = [name for name in offered if not arguments.geometry or name in arguments.geometry]
     chosen = settings(surfaces, arguments.quality, reduces)
-    if not chosen or not set(offered).issuperset(arguments.geometry or ()):
-        wanted = f"--geometry {' '.join(arguments.geometry or ['none'])} --quality {' '.join(arguments.quality)}"
+    if not chosen or not {*offered}.issuperset(arguments.geometry or ()):
         refined = [name for name in offered if GEOMETRIES[name].overlap_depth]
         expected = f"{', '.join(offered)}, which the samples offer (accurate: {', '.join(refined)})"
-        raise DataError(f"{wanted}: expected geometry of {expected}")
-    prefix, rows, calls = "even" if arguments.data else "true", [], {}
+        raise DataError(f"--geometry {' '.join(arguments.geometry or ['none'])}: expected geometry of {expected}")
+    prefix, rows, calls = "even" if arguments.data else "true", [], dict[str, Callable[[], Any]]()
     for setting in tqdm(chosen, desc="accuracy", unit="setting", leave=False):
-        call = setting.call(target)
+        plans = PlanCache(share_overlap=setting.cached, max_bytes=0)  # the last plan alone
+        retarget = RigRetarget(target, quality=setting.quality, geometry=setting.surface, holes="black", cache=plans)
         frames = [frame(index, setting.reduce) for index in range(num_frames)]
-        means = mean_of(row for each in frames for row in scores(each, partial(_render, call), target, ("even",))[1])
+
+        def render(sample: Sample, _: Rig, retarget: RigRetarget = retarget) -> list[RenderedView]:
+            return views_of(retarget(sample))
+
+        means = mean_of(row for each in frames for row in scores(each, render, target, ("even",))[1])
         if f"{prefix}_covered_psnr_db" not in means:
             expected = f"LiDAR points in views of {target.name or 'the target'} that source cameras see, too"
             raise DataError(f"data {arguments.data}: expected {expected}, found none to score {setting.name} by")
-        row: dict[str, Any] = {"name": setting.name, "quality": setting.quality, "surface": setting.surface}
-        row |= {"reduce": setting.reduce, "seen": means["seen"], "psnr_db": means[f"{prefix}_covered_psnr_db"]}
-        row |= {"whole_psnr_db": means[f"{prefix}_psnr_db"]}
+        row: dict[str, Any] = {"name": setting.name, **setting._asdict(), "seen": means["seen"]}
+        row |= {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
         rows.append(row | {"harm": static_harm(source, target, setting.surface, RenderConfig())})
-        calls[setting.name] = partial(call, frames[0].scored_sample)
+        calls[setting.name] = partial(retarget, frames[0].scored_sample)
     for reduce in reduces if arguments.data else ():
-        calls[f"decode 1/{reduce}"] = partial(
-            open_data(arguments.data, reduce=reduce, load_points=False).__getitem__, 0
-        )
-    times = _times(calls)
+        data = open_data(arguments.data, reduce=reduce, load_points=False)
+        calls[f"decode 1/{reduce}"] = partial(data.__getitem__, 0)
+    # CPU time leaves out waiting on a busy machine. Each round runs every call in turn, once to warm its caches and
+    # once measured, so that other load slows all alike.
+    taken: dict[str, list[float]] = {name: [] for name in calls}
+    for number in tqdm(range(_ROUNDS), desc="times", unit="round", leave=False):
+        for name, call in calls.items():
+            if number < _LEAST_ROUNDS or sum(taken[name]) < _ENOUGH_MS:
+                call()
+                taken[name].append(1e3 * timeit(call, timer=process_time, number=1))
     for row in rows:
-        row |= times[row["name"]]
-        if decoding := times.get(f"decode 1/{row['reduce']}"):
-            row |= {"decode_ms": decoding["median_ms"], "decode_ratio": row["median_ms"] / decoding["median_ms"]}
+        row["q1_ms"], row["median_ms"], row["q3_ms"] = np.quantile(taken[row["name"]], (0.25, 0.5, 0.75)).tolist()
+        if decoding := taken.get(f"decode 1/{row['reduce']}"):
+            decode_ms = float(np.median(decoding))
+            row |= {"decode_ms": decode_ms, "decode_ratio": row["median_ms"] / decode_ms}
     front = {row["name"] for row in pareto_front(rows)}
     return {
         "clock": "CPU time of the process, milliseconds, one thread",
@@ -185,26 +182,6 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         "against": "LiDAR points, exposures made even" if arguments.data else "true views",
         "settings": [{**row, "front": row["name"] in front} for row in rows],
     }
-
-
-def _render(call: Callable[[Sample], dict[str, Any]], sample: Sample, _: Rig) -> list[RenderedView]:
-    return views_of(call(sample))
-
-
-def _times(calls: Mapping[str, Callable[[], Any]]) -> dict[str, dict[str, float]]:
-    """Median and quartiles of each call's CPU milliseconds.
-
-    CPU time leaves out waiting on a busy machine. Each round runs every call in turn, once to warm its caches and once
-    measured, so that other load slows all alike.
-    """
-    taken: dict[str, list[float]] = {name: [] for name in calls}
-    for number in tqdm(range(_ROUNDS), desc="times", unit="round", leave=False):
-        for name, call in calls.items():
-            if number < _LEAST_ROUNDS or sum(taken[name]) < _ENOUGH_MS:
-                call()
-                taken[name].append(1e3 * timeit(call, timer=process_time, number=1))
-    quartiles = {name: np.quantile(times, (0.5, 0.25, 0.75)).tolist() for name, times in taken.items()}
-    return {name: dict(zip(("median_ms", "q1_ms", "q3_ms"), values, strict=True)) for name, values in quartiles.items()}
 
 
 def pareto_front(rows: Sequence[Row]) -> list[Row]:
@@ -237,15 +214,11 @@ def table(report: Mapping[str, Any]) -> str:
     Shows the front, and other settings at the decoded size of the fastest one.
     """
     h, w = report["size"]
-    rows = sorted(map(dict, report["settings"]), key=lambda row: row["median_ms"])
-    shown = [row for row in rows if row["front"] or row["reduce"] == rows[0]["reduce"]]
-    for row in shown:
-        row["mark"] = "front" if row["front"] else ""
-    lines = [
-        f"{report['data']} to {report['target']}, views of {h}x{w}, against {report['against']}. {NOTES}",
-        "",
-        metric_table(shown, COLUMNS, ("name", "mark")),
-    ]
+    rows = sorted(report["settings"], key=lambda row: row["median_ms"])
+    shown = [{**row, "mark": "front" if row["front"] else ""} for row in rows]
+    shown = [row for row in shown if row["front"] or row["reduce"] == rows[0]["reduce"]]
+    head = f"{report['data']} to {report['target']}, views of {h}x{w}, against {report['against']}. {NOTES}"
+    lines = [head, "", metric_table(shown, COLUMNS, ("name", "mark"))]
     if len(rows) > len(shown):
         lines += ["", f"{len(rows) - len(shown)} more settings, none of them on the front, are in the JSON."]
     if harm := next((row["harm"] for row in rows if row["harm"] is not None), None):

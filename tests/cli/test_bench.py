@@ -6,15 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rig import load_rig
-from arbiview_aug.cli.bench import pareto
-from arbiview_aug.cli.bench.pareto import Row, Setting, pareto_front, settings, table
-from arbiview_aug.datasets import open_data
+from arbiview_aug.cli.bench import Row, Setting, pareto_front, settings, table
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.render.requirements import STATIC_HARM
@@ -70,13 +67,6 @@ def test_the_sweep(tmp_path: Path) -> None:
     assert STATIC_HARM in printed and ". Better: 'points', 'depth_m' or" in printed
 
 
-def test_a_folder_may_have_fewer_frames_than_asked_for(nuscenes_root: Path, tmp_path: Path) -> None:
-    only = ["--quality", "draft", "--geometry", "street", "--downscale", "4", "--size", "32x88"]
-    assert main(["bench", *only, "--data", str(nuscenes_root), "--frames", "3", "--output", str(tmp_path)]) == 0
-    report = json.loads((tmp_path / "pareto.json").read_text())
-    assert report["frames"] == 1 and report["settings"][0]["decode_ratio"] > 0
-
-
 def test_real_frames_need_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "--data", str(fisheye_root), "--output", str(tmp_path)]) == 2
     assert "expected LiDAR points to score by, got none" in capsys.readouterr().err
@@ -106,14 +96,3 @@ def test_geometry_that_is_not_offered(tmp_path: Path, capsys: pytest.CaptureFixt
     chosen = ["--quality", "accurate", "--geometry", "infinity"]
     assert main(["bench", *chosen, "--size", "16x44", "--output", str(tmp_path)]) == 2
     assert "expected geometry of infinity, ground, street, boxes, lidar, which" in capsys.readouterr().err
-
-
-def test_real_frames_are_scored_by_points_that_nobody_read(nuscenes_root: Path) -> None:
-    """Whatever is decoded, the same points score, by the same colours."""
-    opened = {reduce: open_data(nuscenes_root, reduce=reduce) for reduce in (4, 2)}
-    frames = [pareto._frame(data, data[0], 0, opened[2]) for data in opened.values()]
-    score = [frame.lidar["even"].points for frame in frames]
-    assert np.array_equal(score[0].colours, score[1].colours) and frames[0].held_out
-    assert frames[1].sample["images"].shape[-1] == 2 * frames[0].sample["images"].shape[-1]
-    read = {tuple(p) for p in frames[0].sample["points"][:, :3].double().numpy().round(6)}
-    assert not read & {tuple(p) for p in score[0].points.round(6)}

@@ -1,1 +1,0 @@
-"""``python -m arbiview_aug bench [WHAT]``: repeatable measurements, one module each."""
