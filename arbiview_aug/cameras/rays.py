@@ -6,7 +6,7 @@ Directions lie plane by plane in memory, (3, ny, nx): three times faster.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -48,18 +48,20 @@ def project_rays(
     return uv, valid
 
 
-def look_apart(camera: Camera, others: Sequence[Camera], nearest: float) -> list[bool]:
-    """Whether the viewing cones of other cameras are disjoint from one's, for inverse distances up to ``nearest``.
+def cone_gaps(targets: Rig, sources: Rig) -> FloatArray:
+    """Angles (M, N) between the viewing cones of cameras; negative where directions are shared."""
+    axes, others = targets.cam2ego[:, :3, 2], sources.cam2ego[:, :3, 2]
+    spread, further = (np.array([camera.half_angle_rad for camera in rig]) for rig in (targets, sources))
+    return np.asarray(np.arccos(np.clip(axes @ others.T, -1, 1)) - spread[:, None] - further - 0.01)
+
+
+def look_apart(gaps: FloatArray, baselines_m: FloatArray, nearest: float) -> BoolArray:
+    """Whether two cameras, by their ``cone_gaps``, share no point of an inverse distance up to ``nearest``.
 
     By the law of sines, the directions to a point at 1 / q from two centres differ by at most asin(baseline * q).
     """
-    apart = []
-    for other in others:
-        sine = math.dist(camera.center_m, other.center_m) * nearest
-        angle = math.acos(min(max(float(camera.cam2ego[:3, 2] @ other.cam2ego[:3, 2]), -1), 1))
-        spread = camera.half_angle_rad + other.half_angle_rad
-        apart.append(sine < 1 and angle > spread + math.asin(sine) + 0.01)
-    return apart
+    sine = baselines_m * nearest
+    return np.asarray((sine < 1) & (gaps > np.arcsin(np.minimum(sine, 1))))
 
 
 VIEW_SIZE, TILE_PX = (450, 800), 32  # (h, w) of the half-way view, and side of the chessboard's tiles in it

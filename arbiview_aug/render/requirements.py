@@ -9,16 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.rays import look_apart
-from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.cameras.rays import cone_gaps, look_apart
+from arbiview_aug.cameras.rig import Rig, content_order
 from arbiview_aug.cameras.validation import pose_mistake
 from arbiview_aug.errors import GeometryWarning, UnreachableError, WarnOnce
+from arbiview_aug.image_ops import level_size
 from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.scene.surface import FAR_PARALLAX_PX, NEAREST_SCENE_M, worst_parallax_px
@@ -57,18 +60,83 @@ _SUSPICIOUS = 0.3  # a rig of which less is covered may have wrong poses
 
 @dataclass(frozen=True, eq=False)
 class RigPair:
-    """A source rig and a target rig, and what follows from their calibrations alone."""
+    """A source rig of N cameras and a target rig of M, and what follows from their calibrations alone.
 
-    key: tuple[bytes, bytes]  # of both, with names
+    Geometry ``auto`` ignores pairs of cameras whose worst-case parallax is below ``FAR_PARALLAX_PX``, and those without
+    common points beyond ``NEAREST_SCENE_M``.
+    """
+
     source: Rig
     target: Rig  # in the source's ego frame
     geometry: str  # a name in ``GEOMETRIES``
     config: RenderConfig
 
     @cached_property
+    def key(self) -> tuple[bytes, bytes]:
+        """Keys of both, with names."""
+        return self.source.named_key, self.target.named_key
+
+    @cached_property
+    def order(self) -> list[int]:
+        """Numbers of the sources in content order."""
+        return content_order(self.source.cameras)
+
+    @cached_property
+    def baselines_m(self) -> FloatArray:
+        """Distances (M, N) of the optical centres."""
+        offsets_m = self.target.cam2ego[:, None, :3, 3] - self.source.cam2ego[None, :, :3, 3]
+        return np.asarray(np.linalg.norm(offsets_m, axis=-1))
+
+    @cached_property
+    def gaps(self) -> FloatArray:
+        """``rays.cone_gaps`` (M, N)."""
+        return cone_gaps(self.target, self.source)
+
+    @cached_property
+    def is_exact(self) -> BoolArray:
+        """Whether centres coincide (M, N)."""
+        return self.baselines_m < SAME_CENTER_M
+
+    @cached_property
+    def is_far(self) -> BoolArray:
+        """Whether the scene counts as infinitely far away (M, N)."""
+        focal_px = self.target.K[:, :1, 0]
+        near = worst_parallax_px(self.baselines_m, focal_px) < FAR_PARALLAX_PX
+        return np.asarray(self.is_exact | near if self.geometry == "auto" else self.is_exact)
+
+    @cached_property
+    def is_served(self) -> list[bool]:
+        """Whether one source certainly wins every pixel of a target (M,)."""
+        return [
+            any(covers_target_exactly(self.source.cameras[k], camera, self.config) for k in np.flatnonzero(exact))
+            for camera, exact in zip(self.target, self.is_exact, strict=True)
+        ]
+
+    @cached_property
     def needs_geometry(self) -> bool:
         """Whether the source position of any target pixel depends on the distance of the scene."""
-        return needs_geometry(self.source, self.target, self.geometry, self.config)
+        depends = ~self.is_far
+        if self.geometry == "auto":
+            depends &= ~look_apart(self.gaps, self.baselines_m, 1 / NEAREST_SCENE_M)
+        return any(on.any() and not served for on, served in zip(depends, self.is_served, strict=True))
+
+    @cached_property
+    def poses(self) -> tuple[npt.NDArray[np.float32], ...]:
+        """Rotations (M, N, 3, 3) from targets to sources, and targets minus sources in the frames of both (M, N, 3)."""
+        of_target, of_source = self.target.cam2ego[:, None, :3, :3], self.source.cam2ego[None, :, :3, :3]
+        offsets_m = self.target.cam2ego[:, None, :3, 3:] - self.source.cam2ego[None, :, :3, 3:]
+        to_source = of_source.transpose(0, 1, 3, 2)
+        in_source, in_target = to_source @ offsets_m, of_target.transpose(0, 1, 3, 2) @ offsets_m
+        return tuple(part.astype(np.float32) for part in (to_source @ of_target, in_source[..., 0], in_target[..., 0]))
+
+    @cached_property
+    def lenses(self) -> tuple[npt.NDArray[Any], ...]:
+        """Lens codes (N,), ``Camera.parameters`` (N, 14), sizes (N, 2) and bounds (N, 6) of the sources."""
+        from arbiview_aug.cameras.kernels import LENS_CODES
+
+        codes = np.array([LENS_CODES.get(camera.lens, -1) for camera in self.source])
+        bounds = np.array([source_bounds(size, 0) for size in self.source.sizes], np.float32)
+        return codes, np.stack([camera.parameters for camera in self.source]), np.array(self.source.sizes), bounds
 
     @cached_property
     def harm(self) -> str | None:
@@ -76,31 +144,23 @@ class RigPair:
         return static_harm(self.source, self.target, "street", self.config)
 
 
-def baselines_m(source: Rig, target: Rig) -> FloatArray:
-    """(M, N) distances in metres between target and source optical centres, with coinciding roads and origins."""
-    target = target.in_frame_of(source)
-    return np.asarray(np.linalg.norm(target.cam2ego[:, None, :3, 3] - source.cam2ego[None, :, :3, 3], axis=-1))
+_SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
+
+
+@lru_cache(32)
+def source_bounds(full: tuple[int, int], level: int) -> tuple[float, ...]:
+    """Least and largest columns and rows of what an image (h, w) halved ``level`` times shows; its last ones, or -1."""
+    (h, w), scale = level_size(full, level), 0.5**level
+    slack_px = _SLACK_PX + _ROUNDING * max(full)
+    first, *last = ((side + 0.5) * scale - 0.5 for side in (-slack_px, full[1] - 1 + slack_px, full[0] - 1 + slack_px))
+    # Halving leaves out the last row or column of an odd size: nothing is known there.
+    right, bottom = min(last[0], w - 0.5), min(last[1], h - 0.5)
+    return first, first, right, bottom, *((w - 1, h - 1) if level else (-1, -1))
 
 
 def needs_geometry(source: Rig, target: Rig, geometry: str, config: RenderConfig) -> bool:
-    """Whether the source position of any target pixel depends on the distance of the scene.
-
-    The target is in its own ego frame. Geometry ``auto`` ignores pairs of cameras whose worst-case parallax is below
-    ``FAR_PARALLAX_PX``, and those without common points beyond ``NEAREST_SCENE_M``.
-    """
-    target = target.in_frame_of(source)
-    for camera, row in zip(target, baselines_m(source, target), strict=True):
-        if any(
-            covers_target_exactly(one, camera, config) for one, b in zip(source, row, strict=True) if b < SAME_CENTER_M
-        ):
-            continue
-        focal_px = float(camera.K[0, 0])
-        for apart, b in zip(look_apart(camera, source.cameras, 1 / NEAREST_SCENE_M), row.tolist(), strict=True):
-            if geometry == "auto" and (worst_parallax_px(b, focal_px) < FAR_PARALLAX_PX or apart):
-                continue
-            if b >= SAME_CENTER_M:
-                return True
-    return False
+    """``RigPair.needs_geometry`` of a target in its own ego frame."""
+    return RigPair(source, target.in_frame_of(source), geometry, config).needs_geometry
 
 
 def static_harm(source: Rig, target: Rig, geometry: str, config: RenderConfig) -> str | None:
@@ -111,8 +171,9 @@ def static_harm(source: Rig, target: Rig, geometry: str, config: RenderConfig) -
     """
     if not GEOMETRIES[geometry].is_static:
         return None
-    moved_m = float(baselines_m(source, target).min(axis=1).max())
-    if moved_m <= MOVED_M or not needs_geometry(source, target, "auto", config):
+    pair = RigPair(source, target.in_frame_of(source), "auto", config)
+    moved_m = float(pair.baselines_m.min(axis=1).max())
+    if moved_m <= MOVED_M or not pair.needs_geometry:
         return None
     return (
         f"target cameras stand up to {moved_m:.2f} m from the nearest source camera, and a static surface does not "

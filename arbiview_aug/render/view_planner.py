@@ -8,7 +8,7 @@ with every frame.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -34,7 +34,7 @@ from arbiview_aug.render.plan import (
     SourceUse,
     ViewPlan,
 )
-from arbiview_aug.render.requirements import SAME_CENTER_M, covers_target_exactly
+from arbiview_aug.render.requirements import SAME_CENTER_M, RigPair, source_bounds
 from arbiview_aug.scene.boxes import BOX_ERROR
 from arbiview_aug.scene.point_cloud import occlusion_level
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
@@ -50,50 +50,8 @@ MAGNIFIED = 0.8
 """A view is read by cubics where it has at most this many source pixels per pixel, and is mostly read at its own
 centre: docs/decisions.md."""
 
-_SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
 _STRIP_PX = 128  # height of strips in which bands along seams are rectangles
 _NO_IMAGE, _NO_FACES, _NO_PARTS = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32), np.zeros(0, np.int32)
-
-
-@dataclass(frozen=True, eq=False)
-class _Pair:
-    """A pair of rigs in one ego frame, the scene and settings; M target and N source cameras."""
-
-    source: Rig
-    target: Rig
-    geometry: str
-    scene: Scene
-    config: RenderConfig
-    maps: RayCache
-
-    @cached_property
-    def order(self) -> list[int]:
-        """Numbers of the sources in content order."""
-        return content_order(self.source.cameras)
-
-    @cached_property
-    def baselines_m(self) -> FloatArray:
-        """Distances (M, N) of the centres."""
-        offsets_m = self.target.cam2ego[:, None, :3, 3] - self.source.cam2ego[None, :, :3, 3]
-        return np.asarray(np.linalg.norm(offsets_m, axis=-1))
-
-    @cached_property
-    def poses(self) -> tuple[npt.NDArray[np.float32], ...]:
-        """Rotations (M, N, 3, 3) from targets to sources, and targets minus sources in the frames of both (M, N, 3)."""
-        of_target, of_source = self.target.cam2ego[:, None, :3, :3], self.source.cam2ego[None, :, :3, :3]
-        offsets_m = self.target.cam2ego[:, None, :3, 3:] - self.source.cam2ego[None, :, :3, 3:]
-        to_source = of_source.transpose(0, 1, 3, 2)
-        in_source, in_target = to_source @ offsets_m, of_target.transpose(0, 1, 3, 2) @ offsets_m
-        return tuple(part.astype(np.float32) for part in (to_source @ of_target, in_source[..., 0], in_target[..., 0]))
-
-    @cached_property
-    def lenses(self) -> tuple[npt.NDArray[Any], ...]:
-        """Lens codes (N,), ``Camera.parameters`` (N, 14), sizes (N, 2) and bounds (N, 6) of the sources."""
-        from arbiview_aug.cameras.kernels import LENS_CODES
-
-        codes = np.array([LENS_CODES.get(camera.lens, -1) for camera in self.source])
-        bounds = np.array([source_bounds(size, 0) for size in self.source.sizes], np.float32)
-        return codes, np.stack([camera.parameters for camera in self.source]), np.array(self.source.sizes), bounds
 
 
 class ViewPlanner:
@@ -103,12 +61,14 @@ class ViewPlanner:
     ``GRID_STEP_PX`` apart, which lie on pixel centres, and interpolated between.
     """
 
-    def __init__(self, pair: _Pair, index: int, wanted: BoolArray | None = None) -> None:
+    def __init__(
+        self, pair: RigPair, index: int, scene: Scene, maps: RayCache, wanted: BoolArray | None = None
+    ) -> None:
         from arbiview_aug.render.kernels import View
 
         self.pair, self.index, self.camera = pair, index, pair.target.cameras[index]
-        self.config, self.scene, self.maps = pair.config, pair.scene, pair.maps
-        self.name = pair.scene.best if pair.geometry == "auto" else pair.geometry
+        self.config, self.scene, self.maps = pair.config, scene, maps
+        self.name = scene.best if pair.geometry == "auto" else pair.geometry
         # From outside, the far wall is a narrow strip with edges, which cells could step over.
         coarse = min(self.camera.size) >= SMALL_SIDE_PX
         coarse &= is_within_wall(self.camera.center_m) or not GEOMETRIES[pair.geometry].has_wall
@@ -197,62 +157,62 @@ class ViewPlanner:
         """Choose the sources that may see the view, and weigh them on its nodes."""
         from arbiview_aug.render.kernels import Nodes, measure_nodes
 
-        pair, baselines_m = self.pair, self.pair.baselines_m[self.index]
-        is_exact = baselines_m < SAME_CENTER_M
-        parallax_px = worst_parallax_px(baselines_m, float(self.camera.K[0, 0]))
-        self.is_far = is_exact | (pair.geometry == "auto") & (parallax_px < FAR_PARALLAX_PX)
-        exact = np.flatnonzero(is_exact).tolist()
-        is_served = any(covers_target_exactly(pair.source.cameras[k], self.camera, self.config) for k in exact)
-        asked = is_exact if is_served else np.ones(len(is_exact), bool)
-        self.seen_name = "infinity" if self.is_far[asked].all() else self.name
-        self.is_far |= self.seen_name == "infinity"
+        pair, m = self.pair, self.index
+        asked = pair.is_exact[m] if pair.is_served[m] else np.ones(len(pair.source), bool)
+        self.seen_name = "infinity" if pair.is_far[m][asked].all() else self.name
+        self.is_far = pair.is_far[m] | (self.seen_name == "infinity")
         surfaces = self._seen(self.seen_name)
-        apart = look_apart(self.camera, pair.source.cameras, float(surfaces.q.max()))
+        asked = asked & ~look_apart(pair.gaps[m], pair.baselines_m[m], float(surfaces.q.max()))
         # In content order, so that ties never depend on the order of the source list.
-        sources = [k for k in pair.order if asked[k] and not apart[k]]
-        read = self._read(sources)
-        shape = len(sources), *surfaces.behind.shape
-        uv = np.empty((len(sources), 2, *surfaces.behind.shape), np.float32)
-        for i in np.flatnonzero(read.kind < 0):
-            behind = surfaces.behind * np.float32(not self.is_far[sources[i]])
-            uv[i] = source_pixels(self.camera, self.view.rays, behind, pair.source.cameras[sources[i]])
-        score, border, parallax, resolution = np.empty((4, *shape), np.float32)
-        places = np.empty(shape, bool), uv, np.empty(len(sources), np.int64)
-        nodes = Nodes(score, border, parallax, resolution, *places)
-        measure_nodes(self.view, read, surfaces, self.config.antialias, nodes)
-        seen = np.flatnonzero(nodes.halvings >= 0)
-        self.nodes = nodes if len(seen) == len(sources) else Nodes(*(part[seen] for part in nodes))
-        self.sources, self.levels = [sources[i] for i in seen], self.nodes.halvings.tolist()
+        self.sources = [k for k in pair.order if asked[k]]
+        self._read = self._read_sources()
+        shape = len(self.sources), *surfaces.behind.shape
+        uv = np.empty((shape[0], 2, *shape[1:]), np.float32)
+        for i in np.flatnonzero(self._read.kind < 0):
+            behind = surfaces.behind * np.float32(not self.is_far[self.sources[i]])
+            uv[i] = source_pixels(self.camera, self.view.rays, behind, pair.source.cameras[self.sources[i]])
+        measured = np.empty((4, *shape), np.float32), np.empty(shape, bool), uv, np.empty(shape[0], np.int64)
+        self.nodes = Nodes(*measured[0], *measured[1:])
+        measure_nodes(self.view, self._read, surfaces, self.config.antialias, self.nodes)
+        seen = np.flatnonzero(self.nodes.halvings >= 0)
+        if len(seen) < len(self.sources):
+            self.nodes, self._read = _at(self.nodes, seen), _at(self._read, seen)
+            self.sources = [self.sources[i] for i in seen]
+        self.levels = self.nodes.halvings.tolist()
 
     @property
     def used(self) -> list[tuple[int, int]]:
         """Numbers of the sources that may see the view, in content order, and halvings of their images."""
         return list(zip(self.sources, self.levels, strict=True))
 
-    def _read(self, sources: list[int], layout: AtlasLayout | None = None) -> Any:
-        """Sources at full size, or halved and with their places in an atlas, as ``kernels.Sources``."""
-        from arbiview_aug.render.kernels import Sources
+    def _read_sources(self) -> Any:
+        """The sources at full size as ``kernels.Sources``, without places in an atlas."""
+        from arbiview_aug.render.kernels import Images, Sources
 
-        pair, k = self.pair, np.array(sources, np.int64)
-        A, o, offset_m = (part[self.index, k] for part in pair.poses)
-        kind, parameters, size, bounds = (part[k] for part in pair.lenses)
+        pair, m, k = self.pair, self.index, np.array(self.sources, np.int64)
+        A, o, offset_m = (part[m, k] for part in pair.poses)
         o *= ~self.is_far[k][:, None]
-        bonus = np.where(pair.baselines_m[self.index, k] < SAME_CENTER_M, PRIMARY_BONUS, 1).astype(np.float32)
-        slots, positions = np.zeros((len(k), 3), np.int32), [_NO_IMAGE] * len(k)
-        clean: list[npt.NDArray[Any]] = [_NO_IMAGE] * len(k)
-        for i, level in enumerate(self.levels if layout else []):
-            assert layout is not None
-            camera, slot = pair.source.cameras[sources[i]], layout.slot(sources[i], level)
-            slots[i], clean[i] = (slot.source, slot.x, slot.y), self.maps.clean_pixels(camera, level)
+        bonus = np.where(pair.is_exact[m, k], PRIMARY_BONUS, 1).astype(np.float32)
+        none = Images(np.zeros(len(k), np.int64), np.zeros((len(k), 2), np.int64))
+        to_mask = self._images([self.maps.to_mask(pair.source.cameras[i]) for i in self.sources])
+        lenses, slots = [part[k] for part in pair.lenses], np.zeros((len(k), 3), np.int32)
+        return Sources(A, o, *lenses, offset_m, bonus, slots, none, to_mask, none)
+
+    def _placed_sources(self, layout: AtlasLayout) -> Any:
+        """The sources as they are read: some halved, and with their places in an atlas."""
+        read, positions, clean = self._read, list[npt.NDArray[Any]](), list[npt.NDArray[Any]]()
+        for i, (k, level) in enumerate(self.used):
+            camera, slot = self.pair.source.cameras[k], layout.slot(k, level)
+            read.slot[i] = slot.source, slot.x, slot.y
+            clean.append(self.maps.clean_pixels(camera, level))
             if level:
-                parameters[i], bounds[i] = camera.parameters_at(0.5**level), source_bounds(camera.size, level)
-            if kind[i] < 0:
-                q = self._seen("infinity" if self.is_far[sources[i]] else self.seen_name).q
+                read.P[i], read.bounds[i] = camera.parameters_at(0.5**level), source_bounds(camera.size, level)
+            positions.append(_NO_IMAGE)
+            if read.kind[i] < 0:
+                q = self._seen("infinity" if self.is_far[k] else self.seen_name).q
                 uv = source_pixels(self.camera, self.rays.at(*map(np.arange, self.camera.size)), q, camera)
                 positions[i] = at_level(np.concatenate(uv), level).astype(np.float32)
-        to_mask = [self.maps.to_mask(pair.source.cameras[i]) for i in sources]
-        images = (self._images(arrays) for arrays in (positions, to_mask, clean))
-        return Sources(A, o, kind, parameters, size, bounds, offset_m, bonus, slots, *images)
+        return read._replace(positions=self._images(positions), clean=self._images(clean))
 
     # --- who wins -----------------------------------------------------------------------------------------------------
     def finish(self, layout: AtlasLayout) -> ViewPlan:
@@ -261,7 +221,7 @@ class ViewPlanner:
         from arbiview_aug.render.paint_kernels import find_paint
 
         size, memory, view, surfaces = self.camera.size, self.maps.memory, self.view, self._seen(self.seen_name)
-        sources, occluders = self._read(self.sources, layout), self._occluders()
+        sources, occluders = self._placed_sources(layout), self._occluders()
         most = max(size[1], view.step * BLOCK_PX, len(view.x))
         scratch = np.empty((FLOAT_ROWS, most), np.float32), np.empty((INT_ROWS, most), np.int32)
         hides = bool(sources.clean.size.any() or occluders.beyond.size.any())
@@ -359,7 +319,7 @@ class ViewPlanner:
             return self.config.interpolation
         won, total = 0, 0.0
         for i, k in enumerate(self.sources):
-            if self.pair.baselines_m[self.index, k] < SAME_CENTER_M and won_px[k]:
+            if self.pair.is_exact[self.index, k] and won_px[k]:
                 resolution = np.sort(self.nodes.resolution[i][self.nodes.border[i] > 0])
                 fineness = resolution[len(resolution) // 2] / 2 ** self.levels[i] if len(resolution) else 1.0
                 won, total = won + won_px[k], total + fineness * won_px[k]
@@ -426,22 +386,16 @@ def nodes_of(size: tuple[int, int], step: int) -> tuple[npt.NDArray[np.int64], n
     return y, x
 
 
-@lru_cache(32)
-def source_bounds(full: tuple[int, int], level: int) -> tuple[float, ...]:
-    """Least and largest columns and rows of what an image (h, w) halved ``level`` times shows; its last ones, or -1."""
-    (h, w), scale = level_size(full, level), 0.5**level
-    slack_px = _SLACK_PX + _ROUNDING * max(full)
-    first, *last = ((side + 0.5) * scale - 0.5 for side in (-slack_px, full[1] - 1 + slack_px, full[0] - 1 + slack_px))
-    # Halving leaves out the last row or column of an odd size: nothing is known there.
-    right, bottom = min(last[0], w - 0.5), min(last[1], h - 0.5)
-    return first, first, right, bottom, *((w - 1, h - 1) if level else (-1, -1))
-
-
 @lru_cache(32)  # all targets ask for the same ones
 def halved_camera(camera: Camera, level: int) -> Camera:
     """The camera of an image that was halved ``level`` times, at least once."""
     h, w = level_size(camera.size, level)
     return camera.crop(0, 0, (h << level, w << level)).resize((h, w))
+
+
+def _at(rows: Any, k: npt.NDArray[np.int64]) -> Any:
+    """Rows k of all arrays in a structure of arrays."""
+    return type(rows)(*(_at(part, k) if isinstance(part, tuple) else part[k] for part in rows))
 
 
 def _is_measured(surface: Any) -> bool:
@@ -485,11 +439,11 @@ def build_plan(
         The plan. Targets that no source sees have zero coverage.
     """
     with compilation_announced():
-        settings = geometry, scene or Scene(), config or RenderConfig(), maps or RayCache()
-        pair = _Pair(source, target.in_frame_of(source), *settings)
+        scene, maps = scene or Scene(), maps or RayCache()
+        pair = RigPair(source, target.in_frame_of(source), geometry, config or RenderConfig())
         # Cameras at one centre share panoramas: the order of targets must not tell which of them makes one.
         order = content_order(pair.target.cameras)
-        planners = {k: ViewPlanner(pair, k, None if wanted is None else wanted[k]) for k in order}
+        planners = {k: ViewPlanner(pair, k, scene, maps, None if wanted is None else wanted[k]) for k in order}
         layout = AtlasLayout.for_sources(source.sizes, [used for planner in planners.values() for used in planner.used])
         views = {k: planner.finish(layout) for k, planner in planners.items()}
         # The same places for what is read: images that win no pixel are not copied.

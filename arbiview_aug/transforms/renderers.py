@@ -110,9 +110,7 @@ class PlannedRenderer:
     def _pair(self, source: Rig, target: Rig) -> RigPair:
         """The pair of a source and a target rig; cached."""
         key = source.named_key, target.named_key
-        return self._pairs.get(
-            key, lambda: RigPair(key, source, target.in_frame_of(source), self.geometry, self.config)
-        )
+        return self._pairs.get(key, lambda: RigPair(source, target.in_frame_of(source), self.geometry, self.config))
 
     def plan(self, frame: Frame, target: Rig) -> FramePlan:
         """Choose a frame's scene, and plan how it is rendered over it."""
