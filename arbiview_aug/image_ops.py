@@ -158,6 +158,12 @@ class Memory:
         weakref.finalize(array, self._take_back, block).atexit = False
         return array.reshape(shape)
 
+    def empties(self, shape: tuple[int, ...], *dtypes: npt.DTypeLike) -> list[Any]:
+        """Arrays of one shape in one block, those of large items first."""
+        bytes_of, n = [np.dtype(dtype).itemsize for dtype in dtypes], math.prod(shape)
+        block, at = self.empty((n * sum(bytes_of),), np.uint8), [n * sum(bytes_of[:k]) for k in range(len(dtypes) + 1)]
+        return [block[a:b].view(kind).reshape(shape) for a, b, kind in zip(at, at[1:], dtypes, strict=False)]
+
     def full(self, shape: tuple[int, ...], value: float, dtype: npt.DTypeLike) -> Any:
         """An array of one value."""
         array = self.empty(shape, dtype)

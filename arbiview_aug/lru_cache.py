@@ -34,10 +34,11 @@ class LRUCache(Generic[K, V]):
         new = make()
         with self._lock:
             value = self._values.setdefault(key, new)
-            self._total += self._size(value)
             if self.misses >= self._next_count:
                 self._total = sum(map(self._size, self._values.values()))
                 self._next_count = self.misses + len(self._values) // 8
+            else:
+                self._total += self._size(value)
             while self._total > self.limit and len(self._values) > 1:
                 self._total -= self._size(self._values.popitem(last=False)[1])
         return value

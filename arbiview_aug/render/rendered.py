@@ -86,12 +86,12 @@ def render_opencv(
         # Tone the views, not the sources: these have more pixels, and would have to be copied.
         if curves is not None:
             tone(buffer.reshape(-1), target.runs, tones, *scale)
-        for band, runs in zip(target.bands, target.band_runs, strict=True):
+        for k, band in enumerate(target.bands):
             bh, bw = band.weight.shape
             rows, columns = slice(band.y, band.y + bh), slice(band.x, band.x + bw)
             second = _remap(atlas, band.at.xy, band.at.frac, target.seam_interpolation)
             if curves is not None:
-                tone(second.reshape(-1), runs, tones, *scale)
+                tone(second.reshape(-1), target.band_runs[k], tones, *scale)
             if change is not None:
                 difference = np.abs(buffer[rows, columns].astype(np.float32) - second).mean(-1)
                 change[rows, columns] += difference * band.weight

@@ -227,13 +227,14 @@ class ViewPlanner:
         hides = bool(sources.clean.size.any() or occluders.beyond.size.any())
         if hides:
             see_nodes(view, sources, surfaces, occluders, self.nodes, *scratch)
-        at = FixedMap(memory.empty((*size, 2), np.int16), memory.empty(size, np.uint16))
+        xy, frac, winner = memory.empties(size, np.int32, np.uint16, np.int8)
+        at = FixedMap(xy.view(np.int16).reshape(*size, 2), frac)
         blended = size if self.config.seam_width and len(self.sources) > 1 else (0, 0)
-        winner, shared = memory.empty(size, np.int8), np.empty((len(view.y) - 1, len(view.x) - 1), bool)
-        in_image, won_px = memory.empty(size if hides else (0, 0), np.uint8), np.zeros(128, np.int64)
-        second, xy = memory.full(blended, -1, np.int8), memory.empty(blended, np.int32)
-        seconds = second, xy, memory.empty(blended, np.uint16), memory.empty(blended, np.float32), shared
-        pixels = Pixels(winner, at.packed, at.frac, *seconds, in_image, won_px)
+        second_xy, share, second_frac, second = memory.empties(blended, np.int32, np.float32, np.uint16, np.int8)
+        second.fill(-1)
+        shared, won_px = np.empty((len(view.y) - 1, len(view.x) - 1), bool), np.zeros(128, np.int64)
+        in_image, seconds = memory.empty(size if hides else (0, 0), np.uint8), (second, second_xy, second_frac, share)
+        pixels = Pixels(winner, xy, frac, *seconds, shared, in_image, won_px)
         sets = np.empty((2, shared.shape[1]), np.int64)
         weights = self._weights(), self.nodes.near
         plan_pixels(view, sources, surfaces, occluders, *weights, self.wanted, pixels, *scratch, sets)
@@ -438,18 +439,25 @@ def build_plan(
     Returns:
         The plan. Targets that no source sees have zero coverage.
     """
+    pair = RigPair(source, target.in_frame_of(source), geometry, config or RenderConfig())
+    return plan_pair(pair, scene or Scene(), maps or RayCache(), wanted)
+
+
+def plan_pair(
+    pair: RigPair, scene: Scene, maps: RayCache, wanted: Sequence[BoolArray | None] | None = None
+) -> RenderPlan:
+    """As ``build_plan``, for a pair of rigs in one ego frame."""
     with compilation_announced():
-        scene, maps = scene or Scene(), maps or RayCache()
-        pair = RigPair(source, target.in_frame_of(source), geometry, config or RenderConfig())
         # Cameras at one centre share panoramas: the order of targets must not tell which of them makes one.
         order = content_order(pair.target.cameras)
         planners = {k: ViewPlanner(pair, k, scene, maps, None if wanted is None else wanted[k]) for k in order}
-        layout = AtlasLayout.for_sources(source.sizes, [used for planner in planners.values() for used in planner.used])
+        used = {(k, source) for k, planner in planners.items() for source in planner.used}
+        layout = AtlasLayout.for_sources(pair.source.sizes, [source for _, source in used])
         views = {k: planner.finish(layout) for k, planner in planners.items()}
         # The same places for what is read: images that win no pixel are not copied.
-        read = {used for k, view in views.items() for used in planners[k].used if used[0] in view.sources}
+        read = {source for k, source in used if source[0] in views[k].sources}
         layout = AtlasLayout(tuple(slot for slot in layout.slots if (slot.source, slot.level) in read))
-        return RenderPlan(source, pair.target, layout, tuple(views[k] for k in range(len(views))), pair.config)
+        return RenderPlan(pair.source, pair.target, layout, tuple(views[k] for k in range(len(views))), pair.config)
 
 
 def warm_up() -> None:

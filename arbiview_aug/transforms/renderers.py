@@ -26,7 +26,7 @@ from arbiview_aug.render.overlap_depth import OverlapDepth, estimate_overlap, ov
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, Renderer, Views
 from arbiview_aug.render.requirements import RigPair, boxes_harm, check_reach, harm_remedies, pose_mistakes
-from arbiview_aug.render.view_planner import build_plan
+from arbiview_aug.render.view_planner import plan_pair
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY, read_scene
 from arbiview_aug.sample.neighbours import points_of_neighbours
@@ -167,13 +167,12 @@ class PlannedRenderer:
         return self._build(pair, scene)
 
     def _build(self, pair: RigPair, scene: Scene) -> RenderPlan:
-        source, target = pair.source, pair.target
-        plan = build_plan(source, target, geometry=self.geometry, config=self.config, scene=scene, maps=self._maps)
+        plan = plan_pair(pair, scene, self._maps)
         coverage = plan.coverage
         # Objects may hide all of a frame's target, if its cameras are where they should be.
-        if not scene.is_empty and not any(map(np.any, coverage)) and not pose_mistakes(source, target):
-            coverage = build_plan(source, target, geometry="street", config=self.config, maps=self._maps).coverage
-        check_reach(source, target, coverage, self._unseen, self.warn)
+        if not scene.is_empty and not any(map(np.any, coverage)) and not pose_mistakes(pair.source, pair.target):
+            coverage = plan_pair(replace(pair, geometry="street"), Scene(), self._maps).coverage
+        check_reach(pair.source, pair.target, coverage, self._unseen, self.warn)
         return plan
 
     def render(self, plans: Sequence[FramePlan]) -> list[Views]:
