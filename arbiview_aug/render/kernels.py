@@ -23,7 +23,7 @@ from arbiview_aug.cameras.kernels import FAR_AWAY_PX, edge_distance_row, project
 from arbiview_aug.cameras.rays import CELL_PX
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.environment import borrowing, compiled, inlined
-from arbiview_aug.render.plan import OUTSIDE
+from arbiview_aug.render.plan import GRID_STEP_PX, OUTSIDE
 from arbiview_aug.scene.boxes import PIECES
 from arbiview_aug.scene.kernels import upsampled_row
 
@@ -557,8 +557,12 @@ def _weigh_row(weights: Any, step: int, y: int, x0: int, out: Any) -> None:
         first = weights[j, i] + (weights[j + 1, i] - weights[j, i]) * t
         slope = (weights[j, i + 1] + (weights[j + 1, i + 1] - weights[j, i + 1]) * t - first) * per
         cell = out[i * step - x0 : min(i * step + step - x0, n)]
-        for m in range(cell.shape[0]):
-            cell[m] = first + slope * np.float32(m)
+        if cell.shape[0] == GRID_STEP_PX:  # a number of pixels that the compiler knows is one vector
+            for m in range(GRID_STEP_PX):
+                cell[m] = first + slope * np.float32(m)
+        else:
+            for m in range(cell.shape[0]):
+                cell[m] = first + slope * np.float32(m)
 
 
 @inlined
@@ -767,10 +771,11 @@ def plan_pixels(
                     end += 1
                 if some:
                     x0, x1 = i * step, min(end * step, w)
-                    for y in range(y0, y1, y1 - y0 if in_blocks else 1):
+                    rows = y1 - y0 if in_blocks else max(w // (x1 - x0), 1)
+                    for y in range(y0, y1, rows):
                         unseen += _plan_block(
                             view, sources, surfaces, occluders, weights, pixels, floats, ints, y,
-                            y1 if in_blocks else y + 1, x0, x1, some, fills == 1,
+                            min(y + rows, y1), x0, x1, some, fills == 1,
                         )  # fmt: skip
                 i = end
 
