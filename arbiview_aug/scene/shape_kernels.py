@@ -67,6 +67,20 @@ def beside(planes: Any, point: Any) -> float:
     return nearest
 
 
+@called
+def _all_beside(planes: Any, at: Any, off: Any, farthest: Any) -> None:
+    """Write ``beside`` of points (3, m) into ``off`` (m,); ``farthest`` (m,) is scratch."""
+    x, y, z = at[0], at[1], at[2]
+    for piece in range(planes.shape[0]):
+        for face in range(6):
+            a, b, c, d = planes[piece, face]
+            for i in range(off.shape[0]):
+                away = a * x[i] + b * y[i] + c * z[i] - d
+                farthest[i] = away if face == 0 else max(farthest[i], away)
+        for i in range(off.shape[0]):
+            off[i] = farthest[i] if piece == 0 else min(off[i], farthest[i])
+
+
 @compiled
 def fit_profiles(
     boxes: Any, profiles: Any, fitting: Any, points: Any, within: Any, ends: Any, least: int, air: float, scanner: Any,
@@ -91,16 +105,20 @@ def fit_profiles(
         is_own: (P,) set for the points of objects.
         displaced: (B, 5, rows, columns) metres along the normals of the rear, front, right, left and top; 0 before.
     """
-    some = np.empty(planes.shape[1:])
+    some, scratch = np.empty(planes.shape[1:]), np.empty((5, within.shape[0]))
     for k in range(boxes.shape[0]):
         own = within[ends[k - 1] if k else 0 : ends[k]]
+        at, off, farthest = scratch[:3, : own.shape[0]], scratch[3, : own.shape[0]], scratch[4, : own.shape[0]]
+        for i in range(own.shape[0]):
+            at[0, i], at[1, i], at[2, i] = points[own[i], 0], points[own[i], 1], points[own[i], 2]
         best, chosen, is_measured = np.inf, fitting[k, 0], own.shape[0] >= least
         if fitting[k, -1] > chosen and is_measured:
             for number in range(chosen, fitting[k, -1] + 1):
                 planes_of(boxes[k], profiles[number], some)
+                _all_beside(some, at, off, farthest)
                 total = 0.0
-                for i in own:
-                    total += min(abs(beside(some, points[i])), 1.5 * air)
+                for i in range(off.shape[0]):
+                    total += min(abs(off[i]), 1.5 * air)
                 if total < best - 1e-9:
                     best, chosen = total, number
         floor, n, profile = boxes[k, 2] - boxes[k, 5] / 2 + air, 0, profiles[chosen].copy()

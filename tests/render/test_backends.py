@@ -10,6 +10,7 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.image_ops import Scratch
 from arbiview_aug.render.kernels import read_ahead
@@ -63,17 +64,7 @@ def test_target_equal_to_source_gives_the_source_back(name: str, surface: str) -
 @pytest.mark.parametrize("name", ["nuscenes", "ddad", "argoverse2"])
 def test_pinhole_on_the_far_surface_equals_a_warp_by_h_geom(name: str) -> None:
     rig = load_rig(name).resized(0.5)
-    check_warp(rig, noise_images(rig, grain_px=32))
-
-
-def test_a_warp_by_h_geom_on_real_images(nuscenes_root) -> None:
-    from arbiview_aug.datasets import FrameFolder
-
-    sample = FrameFolder(nuscenes_root)[0]
-    check_warp(sample["rig"], list(sample["images"]))
-
-
-def check_warp(rig: Rig, images: list[torch.Tensor]) -> None:
+    images = noise_images(rig, grain_px=32)
     target = rig.turned(yaw_deg=14, pitch_deg=-3, roll_deg=2)
     for k in range(len(rig)):
         one = rig.with_cameras([rig[k]])
@@ -89,9 +80,6 @@ def check_warp(rig: Rig, images: list[torch.Tensor]) -> None:
 @pytest.mark.parametrize("reduce", [4, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("quality", ["draft", "fast"])
 def test_executions_agree_on_real_images(nuscenes_root, ddad_root, quality: str, reduce: int) -> None:
-    from arbiview_aug.datasets import FrameFolder
-    from arbiview_aug.transforms.settings import render_config
-
     for root in (nuscenes_root, ddad_root):
         sample = FrameFolder(root, reduce=reduce)[0]
         rig, images = sample["rig"], list(sample["images"])
@@ -152,10 +140,9 @@ def test_views_of_any_sizes_share_one_buffer() -> None:
     rig, scratch = load_rig("nuscenes").resized(0.1), Scratch()
     for size in ((40, 60), (90, 160), (20, 90), (41, 60)):
         plan = build_plan(rig, rig.resized(size))
-        assert (
-            differences(render_opencv(plan, noise_images(rig)), render_opencv(plan, noise_images(rig), scratch)).max()
-            == 0
-        )
+        alone, views = render_opencv(plan, noise_images(rig)), render_opencv(plan, noise_images(rig), scratch)
+        render_opencv(plan, noise_images(rig, 1), scratch)
+        assert differences(alone, views).max() == 0  # views share no memory with the buffer
     held = vars(scratch._local)
     assert set(held) == {"atlas", "view"} and held["view"].size == 3 * 90 * 160
 
@@ -178,34 +165,6 @@ def test_no_view_depends_on_memory_that_no_image_fills(monkeypatch: pytest.Monke
     monkeypatch.setattr(np, "empty", lambda shape, dtype: np.full(shape, np.nan, dtype))  # what it may hold
     views = render_opencv(plan, images)
     assert all(view.isfinite().all() for view in views)
-
-
-def test_results_do_not_share_memory_with_buffers() -> None:
-    rig = load_rig("nuscenes").resized(0.1)
-    plan, scratch = build_plan(rig, rig.turned(yaw_deg=5)), Scratch()
-    first = render_opencv(plan, noise_images(rig, 0), scratch)
-    kept = [view.clone() for view in first]
-    render_opencv(plan, noise_images(rig, 1), scratch)
-    assert all(torch.equal(a, b) for a, b in zip(first, kept, strict=True))
-
-
-def test_torch_execution_is_differentiable_in_the_images() -> None:
-    rig = load_rig("nuscenes").resized(0.05)
-    plan = build_plan(rig, rig.turned(yaw_deg=20))
-    images = [torch.rand(1, 3, *c.size, dtype=torch.float32, requires_grad=True) for c in rig]
-    views = render_torch(plan, images)
-    sum(view.sum() for view in views).backward()
-    assert all(image.grad is not None and image.grad.abs().sum() > 0 for image in images)
-
-
-def test_batches_equal_single_frames() -> None:
-    rig = load_rig("nuscenes").resized(0.1)
-    plan = build_plan(rig, rig.turned(yaw_deg=20))
-    frames = [noise_images(rig, seed) for seed in (0, 1)]
-    batch = render_torch(plan, [torch.stack(pair) for pair in zip(*frames, strict=True)])
-    for b, images in enumerate(frames):
-        single = render_torch(plan, [image[None] for image in images])
-        assert all(torch.equal(x[b], y[0]) for x, y in zip(batch, single, strict=True))
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
@@ -342,10 +301,3 @@ def test_atlas_spills_into_columns_where_rows_run_out() -> None:
     for i, a in enumerate(boxes):
         for b in boxes[:i]:
             assert a[1] <= b[0] or b[1] <= a[0] or a[3] <= b[2] or b[3] <= a[2]
-
-
-def test_fixed_maps_keep_32nds_of_a_pixel() -> None:
-    uv = np.array([[[0.0, 10.0], [1599.5, 899.25], [3.3, 5399.71]]], np.float32)
-    fixed = FixedMap(*cv2.convertMaps(uv, None, cv2.CV_16SC2))
-    assert np.abs(fixed.to_float() - uv).max() <= 1 / 64 + 1e-4
-    assert np.array_equal(fixed.rounded().to_float(), [[[0, 10], [1600, 899], [3, 5400]]])

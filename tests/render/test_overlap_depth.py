@@ -17,7 +17,6 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 from arbiview_aug.render.overlap_depth import (
     LIMITS,
-    MIN_RISE_DB,
     OverlapDepth,
     estimate_overlap,
     overlap_cache,
@@ -320,7 +319,3 @@ def test_the_plan_knows_its_corrections(nearer: tuple[torch.Tensor, OverlapDepth
     plan = retarget.plan(RIG, TARGET, Scene(corrections=depth.corrections))
     assert retarget.plan(RIG, TARGET, Scene(corrections=depth.corrections)) is plan
     assert retarget.plan(RIG, TARGET) is not plan
-
-
-def test_the_preset() -> None:
-    assert render_config("accurate").overlap_depth and MIN_RISE_DB > 0

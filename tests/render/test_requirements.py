@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
-from arbiview_aug.render.requirements import MOVED_M, baselines_m, covers_target_exactly, needs_geometry, static_harm
+from arbiview_aug.render.requirements import MOVED_M, RigPair, covers_target_exactly, needs_geometry, static_harm
 from arbiview_aug.render.view_planner import ViewPlanner, build_plan
 from arbiview_aug.transforms.settings import render_config
 
@@ -34,7 +34,7 @@ def zoomed(camera: Camera, factor: float, size: tuple[int, int] | None = None) -
 def built_without(source: Rig, target: Rig, config: RenderConfig, monkeypatch: pytest.MonkeyPatch) -> RenderPlan:
     """The plan for which every source was looked at."""
     with monkeypatch.context() as patch:
-        patch.setattr("arbiview_aug.render.view_planner.covers_target_exactly", lambda *_: False)
+        patch.setattr("arbiview_aug.render.requirements.covers_target_exactly", lambda *_: False)
         return build_plan(source, target, config=config)
 
 
@@ -179,7 +179,7 @@ def moved_to_origin(camera: Camera) -> np.ndarray:
 def test_baselines_align_the_roads() -> None:
     rig = nuscenes()
     lifted = Rig([c.shifted(z_m=-0.4) for c in rig], ground_z_m=-0.4)
-    assert np.allclose(np.diag(baselines_m(rig, lifted)), 0, atol=1e-9)
+    assert np.allclose(np.diag(RigPair(rig, lifted.in_frame_of(rig), "auto", FAST).baselines_m), 0, atol=1e-9)
 
 
 def test_a_static_surface_harms_where_cameras_move_and_pixels_depend_on_the_street() -> None:
