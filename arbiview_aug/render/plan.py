@@ -276,8 +276,9 @@ class ViewPlan:
     @cached_property
     def runs(self) -> npt.NDArray[np.int64]:
         """(n, 3) runs of pixels of one source in a row of h: first one in the flattened view, end, source · h + row."""
-        winner = self.source_camera
-        start = np.flatnonzero(np.diff(winner, prepend=np.int8(-2)) != 0)  # of int8 it takes ten times as long
+        winner, is_first = self.source_camera, np.ones(self.source_camera.shape, bool)
+        np.not_equal(winner[:, 1:], winner[:, :-1], out=is_first[:, 1:])
+        start = np.flatnonzero(is_first)
         source, row = winner.ravel()[start].astype(np.int64), start // winner.shape[1]
         runs = np.stack([start, np.append(start[1:], winner.size), source * len(winner) + row], 1)
         return runs[runs[:, 2] >= 0]

@@ -151,7 +151,8 @@ def points_by_box(
     from arbiview_aug.scene.kernels import points_in
 
     box, point = points_in(np.ascontiguousarray(boxes), np.ascontiguousarray(points, np.float32), air_m)
-    return point[np.argsort(box, kind="stable")], np.cumsum(np.bincount(box, minlength=len(boxes)))
+    few = box.astype(np.min_scalar_type(len(boxes)))  # small numbers are sorted by radix
+    return point[np.argsort(few, kind="stable")], np.cumsum(np.bincount(box, minlength=len(boxes)))
 
 
 def whole(boxes: FloatArray) -> FloatArray:

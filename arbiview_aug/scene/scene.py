@@ -48,7 +48,7 @@ class Scene:
 
     @cached_property
     def best(self) -> GeometryName:
-        """The surface that ``auto`` uses: made of the most accurate geometry."""
+        """What ``auto`` is in this scene, the one rule that all ask: the surface made of the most accurate geometry."""
         motion = self.motion is not None and len(self.motion) > 0
         if any(array is not None and len(array) for array in (self.points, self.further.get("depth_m"))):
             return "fused" if motion else "lidar"

@@ -121,7 +121,7 @@ class PlannedRenderer:
     def choose_scene(
         self, frame: Frame, pair: RigPair
     ) -> tuple[Scene, GeometryName, OverlapDepth | None, temporal.MotionDepth | None]:
-        """Read a frame's scene, decide what ``auto`` is, and estimate the depth that the geometry asks for.
+        """Read a frame's scene, ask it what ``auto`` is, and estimate the depth that the geometry asks for.
 
         Returns the scene, the geometry's name, and depth from overlap and from motion as far as they were estimated,
         which they are only where a pixel depends on distances.
