@@ -117,14 +117,6 @@ def test_auto_takes_far_where_parallax_cannot_be_seen() -> None:
     assert {p.surface for p in nearest} == {"infinity"} and all("parallax" in p.reason for p in nearest)
 
 
-def test_only_what_the_scene_requires_is_evaluated() -> None:
-    source = half_size("nuscenes")
-    one_center = source.with_cameras([source[0]])
-    plan = build_plan(one_center, one_center.turned(yaw_deg=10))
-    (view,) = plan.targets
-    assert [pair.surface for pair in view.pairs] == ["infinity"] and not view.bands
-
-
 def test_exact_source_wins_wherever_it_sees() -> None:
     source = half_size("nuscenes")
     plan = build_plan(source, source.turned(yaw_deg=22), geometry="street")
