@@ -153,7 +153,7 @@ class _HoleSurface(DenseSurface):
                 before = full.occlusion_map(camera, rays, memory).beyond.copy()
             if self.objects is not None:
                 before[self.objects.occlusion_map(camera, rays, memory).solid >= 0] = np.inf
-            self._shadows[key] = OcclusionMap(before, np.zeros(before.shape, np.int32))
+            self._shadows[key] = OcclusionMap(before)
         return self._shadows[key]
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:

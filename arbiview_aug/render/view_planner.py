@@ -126,7 +126,7 @@ class ViewPlanner:
         surface = self._surface(self.seen_name)
         found, scales = [], []
         for k, level in self.used:
-            hiding, coarser, source = OcclusionMap(_NO_IMAGE, _NO_FACES), level, self.pair.source.cameras[k]
+            hiding, coarser, source = OcclusionMap(_NO_IMAGE), level, self.pair.source.cameras[k]
             if _is_measured(surface) and not self.is_far[k]:
                 # Points hide by cells: a pixel for each is enough. Silhouettes of objects are sharper.
                 coarser = level if surface.is_layered else max(level, occlusion_level(source))

@@ -254,8 +254,7 @@ class PointCloudSurface(DenseSurface):
         """
         key = camera.content_key
         if key not in self._shadows:
-            solid = memory.full(camera.size, -1, np.int32)
-            self._shadows[key] = OcclusionMap(self.hidden(camera, rays, memory), solid)
+            self._shadows[key] = OcclusionMap(self.hidden(camera, rays, memory))
         return self._shadows[key]
 
     def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, coarse: bool = True) -> Layer:

@@ -102,7 +102,8 @@ def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: 
     boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
     sweeps = None if points is None else scene.sweeps
     parts = [np.zeros((0, 3), np.float32) if part is None else part[:, :3] for part in (points, sweeps)]
-    together = np.concatenate([part[~own_car(part)] for part in parts], dtype=np.float32)
+    together = np.concatenate(parts, dtype=np.float32)
+    together = together[: close_gaps(together, np.concatenate([own_car(part) for part in parts]))]
     known, pixels = [], np.zeros(0, np.int32)
     if of_kinds := [part for part in maps if isinstance(part, tuple) and part]:
         known = joined(chain.from_iterable(of_kinds))

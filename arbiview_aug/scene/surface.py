@@ -65,7 +65,9 @@ class OcclusionMap(NamedTuple):
     # (h, w) float32, 1/m: points with a smaller inverse distance are occluded, and so is a background with
     # ``is_guess``; 0 without an occluder
     beyond: Layer
-    solid: npt.NDArray[np.int32]  # (h, w) int32 index of the occluder, -1 for none
+    solid: npt.NDArray[np.int32] = np.zeros(
+        (0, 0), np.int32
+    )  # (h, w) of occluders, -1: none; (0, 0) without objects
     # (F,) metres by which the camera lies before the planes of all faces; (0,) without objects
     before_m: Layer = np.zeros(0, np.float32)
 
