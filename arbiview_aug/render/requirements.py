@@ -108,7 +108,7 @@ class RigPair:
     def is_served(self) -> list[bool]:
         """Whether one source certainly wins every pixel of a target (M,)."""
         return [
-            any(covers_target_exactly(self.source.cameras[k], camera, self.config) for k in np.flatnonzero(exact))
+            any(covers_target_exactly(self.source[k], camera, self.config) for k in np.flatnonzero(exact).tolist())
             for camera, exact in zip(self.target, self.is_exact, strict=True)
         ]
 

@@ -171,8 +171,9 @@ class ViewPlanner:
         for i in np.flatnonzero(self._read.kind < 0):
             behind = surfaces.behind * np.float32(not self.is_far[self.sources[i]])
             uv[i] = source_pixels(self.camera, self.view.rays, behind, pair.source.cameras[self.sources[i]])
-        measured = np.empty((4, *shape), np.float32), np.empty(shape, bool), uv, np.empty(shape[0], np.int64)
-        self.nodes = Nodes(*measured[0], *measured[1:])
+        score, border, parallax, resolution = np.empty((4, *shape), np.float32)
+        places = np.empty(shape, bool), uv, np.empty(shape[0], np.int64)
+        self.nodes = Nodes(score, border, parallax, resolution, *places)
         measure_nodes(self.view, self._read, surfaces, self.config.antialias, self.nodes)
         seen = np.flatnonzero(self.nodes.halvings >= 0)
         if len(seen) < len(self.sources):
@@ -195,8 +196,8 @@ class ViewPlanner:
         bonus = np.where(pair.is_exact[m, k], PRIMARY_BONUS, 1).astype(np.float32)
         none = Images(np.zeros(len(k), np.int64), np.zeros((len(k), 2), np.int64))
         to_mask = self._images([self.maps.to_mask(pair.source.cameras[i]) for i in self.sources])
-        lenses, slots = [part[k] for part in pair.lenses], np.zeros((len(k), 3), np.int32)
-        return Sources(A, o, *lenses, offset_m, bonus, slots, none, to_mask, none)
+        (kind, parameters, size, bounds), slots = (part[k] for part in pair.lenses), np.zeros((len(k), 3), np.int32)
+        return Sources(A, o, kind, parameters, size, bounds, offset_m, bonus, slots, none, to_mask, none)
 
     def _placed_sources(self, layout: AtlasLayout) -> Any:
         """The sources as they are read: some halved, and with their places in an atlas."""
