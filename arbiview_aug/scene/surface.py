@@ -65,9 +65,7 @@ class OcclusionMap(NamedTuple):
     # (h, w) float32, 1/m: points with a smaller inverse distance are occluded, and so is a background with
     # ``is_guess``; 0 without an occluder
     beyond: Layer
-    solid: npt.NDArray[np.int32] = np.zeros(
-        (0, 0), np.int32
-    )  # (h, w) of occluders, -1: none; (0, 0) without objects
+    solid: npt.NDArray[np.int32] = np.zeros((0, 0), np.int32)  # (h, w) of occluders, -1: none; (0, 0) without objects
     # (F,) metres by which the camera lies before the planes of all faces; (0,) without objects
     before_m: Layer = np.zeros(0, np.float32)
 
@@ -238,7 +236,7 @@ FAR_PARALLAX_PX = 0.5
 """Worst-case parallax below which ``auto`` takes a pair of cameras as far."""
 
 
-def worst_parallax_px(baseline_m: Any, focal_px: float) -> Any:
+def worst_parallax_px(baseline_m: Any, focal_px: Any) -> Any:
     """Largest pixel shift between two centres if the scene is anywhere from ``NEAREST_SCENE_M`` to infinity."""
     return focal_px * baseline_m / NEAREST_SCENE_M
 
