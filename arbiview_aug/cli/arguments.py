@@ -10,7 +10,6 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -127,7 +126,6 @@ def pair(text: str) -> tuple[str, str]:
     return old, new
 
 
-@cache
 def options() -> dict[str, dict[str, Any]]:
     """Options of the commands, as argparse takes them: type or choices, metavar, default, text."""
     default_target = f"(default: a higher five-camera rig; of real frames, {REAL_TARGET})"
