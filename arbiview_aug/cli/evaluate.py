@@ -1,8 +1,9 @@
 """``python -m arbiview_aug evaluate``: the quality of rendered views, in numbers and pictures.
 
 Real frames are scored by sparse LiDAR metrics, synthetic streets by the true views. ``--displaced`` scores real frames
-by photographs that another camera took, or the next frame's cameras; ``--detector`` and ``--segmenter`` let networks
-judge the views; ``--lidar`` scores points instead of images.
+by photographs that another camera took, or the next frame's cameras, and ``--held-out`` by the photographs of cameras
+that are rendered from the others. ``--detector`` and ``--segmenter`` let networks judge the views; ``--lidar`` scores
+points instead of images.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, dem
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.displaced import NOT_DISPLACED, displaced_frames, later_neighbour, surfaces_for
 from arbiview_aug.evaluate.frames import EXPOSURES, Evaluation, Look, ScoredFrame, evaluate, make_frame
+from arbiview_aug.evaluate.held_out import CommonPixels, held_out_frames
 from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.evaluate.judges import load_detector, load_segmenter
 from arbiview_aug.evaluate.methods import COPY, Method, retargeting
@@ -76,18 +78,26 @@ def run(arguments: argparse.Namespace) -> None:
         load_segmenter(arguments.segmenter) if arguments.segmenter else None,
     )
     look = panel.look if arguments.detector or arguments.segmenter else None
-    if arguments.displaced:
-        # A copy and the surfaces, on photographs; holes are not read from neighbours.
+    common = CommonPixels(look) if arguments.held_out else None
+    if common is not None or arguments.displaced:
+        # The surfaces, and a copy of displaced cameras, on photographs; holes are not read from neighbours.
         everything: GeometryName = "fused" if arguments.geometry == ["auto"] else "motion"
         data = open_frames(arguments, [everything, *arguments.geometry])
-        chosen = chosen_frames(arguments.frames or len(data), len(data))
-        with named_steps(notes, len(chosen)) as tick:
-            frames = displaced_frames(data, chosen)
+        chosen, asked = chosen_frames(arguments.frames or len(data), len(data)), arguments.held_out or ("",)
+        each = len(data[chosen[0]]["rig"]) if "all" in asked else len(asked)  # views a frame and method
+        with named_steps(notes, len(chosen) * each) as tick:
+            if common is None:
+                frames = displaced_frames(data, chosen)
+            else:
+                frames = held_out_frames(data, chosen, asked, panel.segmenter)
             first = next(frames)
             if arguments.geometry == ["auto"]:
                 arguments.geometry = surfaces_for(first[1].sample)
-            methods = [COPY, *_methods(arguments, neighbours=None)]
-            done = evaluate(chain([first], frames), lambda rig: rig, methods, tick, look)
+            methods = [*([COPY] if common is None else []), *_methods(arguments, neighbours=None)]
+            looks = look if common is None else common.look
+            done = evaluate(chain([first], frames), lambda rig: rig, methods, tick, looks)
+        if common is not None:
+            common.finish()
     else:
         methods, data = _methods(arguments), open_frames(arguments, arguments.geometry)
         done = measured(arguments, data, methods, notes, look)
@@ -96,19 +106,21 @@ def run(arguments: argparse.Namespace) -> None:
         raise DataError("; ".join(done.declined.values()))
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
     scored = evaluation_table(done, names)
+    tables = [scored] if common is None else common.tables([name for name in names if name not in done.declined])
     verdicts = panel.rows([name for name in names if name not in done.declined])  # others were judged on fewer frames
-    tables = [scored, *verdict_tables(verdicts)]
+    tables += verdict_tables(verdicts)
     if too_few(verdicts.values()):
         notes.append(TOO_FEW)
     if arguments.detector and not any("objects" in row for row in verdicts.values()):
         notes.append("--detector: no labels (boxes_3d) and no true images: nothing to compare its detections with")
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
-    title = f"{source}: {frames_text(len({view['frame'] for view in done.views}))}"
+    title = f"{source}: {frames_text(len({view['frame'].split(': ')[0] for view in done.views}))}"
     for note in notes:
         print(f"note: {note}\n")
     print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
     report: dict[str, Any] = {"arguments": vars(arguments), "scored_on_other_points": done.first.held_out}
-    report |= {"means": scored[1], "views": done.views} | ({"judges": verdicts} if verdicts else {})
+    report |= {"means": tables[0][1], "views": common.rows if common else done.views}
+    report |= {"judges": verdicts} if verdicts else {}
     (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
     for method, views in done.pictures.items():
         file = re.sub(r"[^\w+-]+", "-", f"{done.label}-{method}")

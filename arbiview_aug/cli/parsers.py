@@ -38,6 +38,9 @@ _RIGS = (
 )
 
 
+_INSPECTED = "the picture (default: inspect.png), or with --common the rig (default: common.yaml)"
+
+
 class Command(NamedTuple):
     """A command: its module has ``run``, a function of the parsed arguments."""
 
@@ -139,10 +142,11 @@ COMMANDS = {
             *((flag, {"nargs": "+", "default": [name]}) for flag, name in zip(RENDERING, _EVALUATED, strict=True)),
             (
                 "--frames",
-                {"default": None, "help": "spread over the data (default: 1; --displaced, --lidar: all)"},
+                {"default": None, "help": "spread over the data (default: 1; --displaced, --held-out, --lidar: all)"},
             ),
             (f"--generator --steps --seed --size {_READING} --output", {}),
             ("--displaced --lidar --detector --segmenter", {}),
+            ("--held-out", {"nargs": "+"}),
         ],
     ),
     "inspect": Command(
@@ -152,7 +156,8 @@ COMMANDS = {
         "nuscenes waymo",
         [
             ("rigs", {"type": path, "nargs": "+", "metavar": "RIG", "help": _RIGS}),
-            ("--output", {"default": "inspect.png", "metavar": "FILE", "help": "the picture"}),
+            ("--common", {}),
+            ("--output", {"default": None, "metavar": "FILE", "help": _INSPECTED}),
         ],
     ),
     "train": Command(
@@ -210,9 +215,15 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
         ("check", is_rig_there, "frames reduce clean_masks", "expected frames with it, got a rig"),
         ("convert", given.get("size") is None, "fit", "expected --size with it, found none"),
         ("convert evaluate", not is_generated, "generator steps", "expected it with --holes diffusion"),
-        ("evaluate", given.get("displaced"), "seed size target lidar", "expected it without --displaced"),
+        ("evaluate", given.get("displaced"), "seed size target lidar held_out", "expected it without --displaced"),
+        ("evaluate", given.get("held_out"), "seed size target lidar", "expected it without --held-out"),
         ("evaluate", given.get("lidar"), of_images, "it is of images; expected no --lidar"),
-        ("evaluate", given.get("data") is None, "displaced lidar", "expected --data FOLDER with it, found none"),
+        (
+            "evaluate",
+            given.get("data") is None,
+            "displaced held_out lidar",
+            "expected --data FOLDER with it, found none",
+        ),
     ):
         for option in options_.split() if holds and name in commands.split() else ():
             if given[option] != parser.get_default(option):
@@ -224,5 +235,7 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
         surfaces = arguments.geometry if isinstance(arguments.geometry, list) else [arguments.geometry]
         if {*surfaces} - {"auto", "infinity"}:
             parser.error(f"argument --geometry: quality paper knows infinity alone, got {', '.join(surfaces)}")
-    if name == "evaluate" and arguments.segmenter and arguments.data is not None and not arguments.displaced:
-        parser.error("argument --segmenter: expected --displaced with --data: it compares with true images")
+    photographs = "displaced", "held_out"
+    if name == "evaluate" and arguments.segmenter and arguments.data and not any(given[key] for key in photographs):
+        expected = "expected --displaced or --held-out with --data"
+        parser.error(f"argument --segmenter: {expected}: it compares with true images")

@@ -15,20 +15,31 @@ from arbiview_aug.cli.arguments import PICTURES, data, output_file
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.common_rig import common_rig, seen_shares
 from arbiview_aug.evaluate.report.pictures import draw_rigs, save_picture
 from arbiview_aug.evaluate.report.tables import markdown_table
+
+RIG_FILES = ".yaml", ".yml", ".json"
 
 NOISE_DEG, NOISE_M = 0.2, 0.02
 """Errors of a calibration that is kept up. Rigs that differ by less are one rig."""
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Print the rigs and the differences of the others from the first; write the picture."""
-    path = output_file(arguments.output, PICTURES)
+    """Print the rigs and the differences of the others from the first; write the picture, or the common rig."""
+    default, endings = ("common.yaml", RIG_FILES) if arguments.common else ("inspect.png", PICTURES)
+    path = output_file(arguments.output or default, endings)
     rigs, notes = zip(*(_load(name) for name in arguments.rigs), strict=True)
     print("\n\n".join(f"{rig!r}{note}" for rig, note in zip(rigs, notes, strict=True)))
     for other in rigs[1:]:
         print(f"\n{differences(rigs[0], other)}")
+    if arguments.common:
+        common = common_rig(rigs)
+        shares = [[f"{share:.0%}" for share in seen_shares(rig, common)] for rig in rigs]
+        rows = [[rig.name or f"rig {k}", *cells] for k, (rig, cells) in enumerate(zip(rigs, shares, strict=True), 1)]
+        table = markdown_table(["seen by", *common.names], rows)
+        print(f"\n{common!r}\n\n{table}\n\nrig: {common.save(path)}")
+        return
     print(f"\npicture: {save_picture(path, draw_rigs(rigs))}")
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from arbiview_aug.atomic_io import check_name, inside
@@ -53,7 +54,7 @@ from arbiview_aug.sample.masks import image_circle, without_specks
 from arbiview_aug.scene.boxes import checked_boxes
 
 SEQUENCE_FILE = "sequence.json"
-POINTS_FILE = "lidar.npy"
+POINTS_FILE, CLASSES_FILE = "lidar.npy", "class.npy"
 MOST_BYTES = 1 << 26  # of a frame's or a sequence's JSON: 64 MiB, 200,000 boxes
 
 _COLUMNS = 'say them in calib.json: "lidar": {"file": NAME, "columns": ["x", "y", "z", "intensity"]}'
@@ -304,6 +305,18 @@ class FrameFolder(WritableRecording):
         size = {key: frame.cameras[0].get(key) for key in ("width", "height")} if frame.cameras else {}
         frame = replace(frame, calib={**frame.calib, "cameras": [size | entry]})
         return camera_fields(self._rig(frame), frame.images(self.reduce), frame.name)
+
+    def point_classes(self, index: int) -> tuple[torch.Tensor, npt.NDArray[np.int64]] | None:
+        """LiDAR points (P, >=3) of a frame and the class of each (P,), if ``class.npy`` lies next to ``calib.json``."""
+        frame = self._frames[checked_index(index, len(self))].read()
+        path, points = frame.file(CLASSES_FILE), frame.points()
+        if points is None or not os.path.lexists(path):
+            return None
+        classes = read_cloud(path, None, _COLUMNS)
+        if classes.shape != (len(points),) or classes.dtype.kind not in "iu":
+            expected = f"a whole number for each of {len(points)} points"
+            raise DataError(f"classes {path}: expected {expected}, got {classes.dtype} {classes.shape}")
+        return points, classes.astype(np.int64)
 
     def _boxes_pose_time(self, frame: _Frame) -> dict[str, Any]:
         values = {"boxes_3d": frame.boxes(), "ego2world": frame.pose(), "time_s": self._times_s.get(frame.name)}

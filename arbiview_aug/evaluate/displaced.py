@@ -12,6 +12,7 @@ from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.errors import DataError, warn
 from arbiview_aug.evaluate.frames import ScoredFrame, photographed
+from arbiview_aug.evaluate.images import as_arrays
 from arbiview_aug.sample.frame import Frame, Neighbour
 from arbiview_aug.sample.inputs import LEARNED_KEY, read_frames
 from arbiview_aug.sample.neighbours import STILL_M
@@ -37,13 +38,13 @@ def displaced_frames(data: Any, indices: Iterable[int]) -> Iterator[tuple[str, S
         sample = data[index]
         truth = recorded.truth(index) if isinstance(recorded, FrameFolder) else None
         if truth is not None:
-            frame = photographed(sample, truth["rig"], truth["images"])
+            frame = photographed(sample, truth["rig"], as_arrays(truth["images"]))
         elif found_later := later_neighbour(sample, problems):
             given, later, others = found_later
             moved = later.labelled if later.moved is None else later.moved
             rig = later.rig.with_cameras([without_objects(camera, moved) for camera in later.rig])
             sample = {**sample, **({"neighbours": others} if others else {})}
-            frame = photographed(sample, rig, later.images(given.images))
+            frame = photographed(sample, rig, as_arrays(later.images(given.images)))
         else:
             continue
         found = True

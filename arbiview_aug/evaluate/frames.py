@@ -36,7 +36,7 @@ EXPOSURES: tuple[Exposure, ...] = ("raw", "even")  # exposures as recorded, and 
 
 
 class LidarReference(NamedTuple):
-    sample: dict[str, Any]  # at one exposure
+    sample: Mapping[str, Any]  # at one exposure
     points: ColouredPoints  # the scoring ones, in its colours
 
 
@@ -48,14 +48,14 @@ class Truth(NamedTuple):
 
 @dataclass(frozen=True)
 class ScoredFrame:
-    sample: dict[str, Any]  # ``rig``, ``images`` and other keys that methods may use
+    sample: Mapping[str, Any]  # ``rig``, ``images`` and other keys that methods may use
     lidar: Mapping[Exposure, LidarReference] = field(default_factory=dict)  # by exposure; empty without points
     held_out: bool = False  # whether ``sample`` has points, and others score
     truth: Callable[[Rig], Truth] | None = None  # the truth of a rig; None if unknown
     target: Rig | None = None  # the rig that alone has a truth, that of photographs; None for any rig
 
     @property
-    def scored_sample(self) -> dict[str, Any]:
+    def scored_sample(self) -> Mapping[str, Any]:
         """Sample that methods get for scoring, with even exposures if points score at those."""
         return self.lidar["even"].sample if "even" in self.lidar else self.sample
 
@@ -64,10 +64,15 @@ class ScoredFrame:
         return None if self.truth is None else self.truth(target).images
 
 
-def photographed(sample: dict[str, Any], rig: Rig, images: Sequence[torch.Tensor] | torch.Tensor) -> ScoredFrame:
+def photographed(
+    sample: Mapping[str, Any],
+    rig: Rig,
+    images: Sequence[Image],
+    regions: Sequence[Mapping[str, BoolArray]] = (),
+) -> ScoredFrame:
     """Frame whose truth is what the cameras of ``rig``, in its ego frame, photographed outside of their masks."""
     valid = [np.ones(camera.size, bool) if camera.mask is None else camera.mask for camera in rig]
-    truth = Truth(as_arrays(images), valid)
+    truth = Truth(images, valid, regions)
     return ScoredFrame(sample, truth=lambda _: truth, target=without_masks(rig))
 
 

@@ -190,23 +190,23 @@ def figures(matches: Sequence[Matches], pixels: Sequence[IntArray] = ()) -> dict
     Each has a 95 % interval, ``_low`` and ``_high``, by the bootstrap over images, from one seed.
     """
     row: dict[str, float] = {}
-
-    def add(name: str, draws: FloatArray) -> None:
-        low, high = np.nanpercentile(draws[1:], (2.5, 97.5))  # a draw without objects has no figure
-        row.update({name: float(draws[0]), f"{name}_low": float(low), f"{name}_high": float(high)})
-
     if matches:
         row["objects"] = sum(found.num_true for found in matches)
         if row["objects"]:
             average, recall = precision_and_recall(matches, draws_of(len(matches)))
-            add("ap", average)
-            add("recall", recall)
+            row |= interval("ap", average) | interval("recall", recall)
     if pixels:
         row["images"] = len(pixels)
         sums = np.einsum("rv,vmk->mrk", draws_of(len(pixels)), np.stack(pixels))
         for k, mask in enumerate(sums, 1):
-            add(f"iou_{k}", mask[:, 0] / np.maximum(mask[:, 1], 1))
+            row |= interval(f"iou_{k}", mask[:, 0] / np.maximum(mask[:, 1], 1))
     return row
+
+
+def interval(name: str, draws: FloatArray) -> dict[str, float]:
+    """A figure, the first of its draws, and its 95 % interval."""
+    low, high = np.nanpercentile(draws[1:], (2.5, 97.5))  # a draw without objects has no figure
+    return {name: float(draws[0]), f"{name}_low": float(low), f"{name}_high": float(high)}
 
 
 def draws_of(count: int) -> FloatArray:

@@ -1,0 +1,189 @@
+"""Held-out cameras: each is rendered from the frame's other cameras and compared with its own photograph."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.lens import BoolArray
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.depth_folder import WithDepth
+from arbiview_aug.datasets.frame_folder import FrameFolder
+from arbiview_aug.errors import DataError
+from arbiview_aug.evaluate.frames import Look, ScoredFrame, Truth, photographed
+from arbiview_aug.evaluate.images import RenderedView, as_arrays, to_bytes
+from arbiview_aug.evaluate.judges import Segmenter
+from arbiview_aug.evaluate.lidar import visible_points
+from arbiview_aug.evaluate.metrics import errors, mean_of, ssim_map
+from arbiview_aug.evaluate.report.tables import Table
+from arbiview_aug.evaluate.verdicts import draws_of, interval
+from arbiview_aug.sample.boxes_2d import rig_of
+from arbiview_aug.sample.inputs import DEPTH_KEYS
+
+_BY_CAMERA = ("images", "K", "cam2ego", "distortion", "lens", "coverage", "generated", "ego_mask", *DEPTH_KEYS)
+_WINDOW_PX = 9  # side of the square around a point that belongs to its class
+
+NOTES = (
+    "Each camera is rendered from the others and compared with its own photograph. seen: share of its pixels that the "
+    "method covers. PSNR and SSIM: of the pixels that all methods cover ({common:.0%}), means over cameras and frames; "
+    "one gain: each view times the number that fits it best. difference: to the first row, with a 95 % interval, "
+    "bootstrap over frames. Frames of one drive are alike: the interval says little about other drives. Tone curves "
+    "and calibration of the cameras limit all PSNR here: read the differences."
+)
+_COLUMNS = (
+    ("seen", "{seen:.1%}"),
+    ("PSNR dB", "{psnr_db:.2f}"),
+    ("one gain", "{gain_psnr_db:.2f}"),
+    ("difference", "{difference_db:+.2f} [{difference_db_low:+.2f}, {difference_db_high:+.2f}]"),
+    ("SSIM", "{ssim:.4f}"),
+)
+
+
+class WithoutCamera(Mapping[str, Any]):
+    """A sample without one of its cameras, also in its neighbours; entries are read on access."""
+
+    def __init__(self, sample: Mapping[str, Any], place: int) -> None:
+        self._sample, self._place = sample, place
+
+    def __getitem__(self, key: str) -> Any:
+        value, place = self._sample[key], self._place
+        if key == "rig":
+            return value.with_cameras([camera for k, camera in enumerate(value) if k != place])
+        if key == "neighbours":
+            return [WithoutCamera(frame, place) for frame in value]
+        if key not in _BY_CAMERA:
+            return value
+        others = [entry for k, entry in enumerate(value) if k != place]
+        return torch.stack(others) if isinstance(value, torch.Tensor) else others
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._sample  # the images need not be decoded
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._sample)
+
+    def __len__(self) -> int:
+        return len(self._sample)
+
+
+def held_out_frames(
+    data: Any, indices: Iterable[int], cameras: Sequence[str], segmenter: Segmenter | None = None
+) -> Iterator[tuple[str, ScoredFrame]]:
+    """Name and frame of each held-out camera (``all``: of every camera) of the samples at ``indices``.
+
+    Regions of the truth are the classes of LiDAR points in it (``FrameFolder.point_classes``), and the segmenter's
+    masks. DataError for a camera that a sample lacks, or that is its only one.
+    """
+    recorded = data.dataset if isinstance(data, WithDepth) else data
+    for index in indices:
+        sample = data[index]
+        rig, frame = rig_of(sample), str(sample.get("token", index))
+        if unknown := {*cameras} - {*rig.names, "all"}:
+            expected = f"all, or cameras of frame {frame}, {', '.join(rig.names)}"
+            raise DataError(f"--held-out: expected {expected}, got {', '.join(sorted(unknown))}")
+        if len(rig) < 2:
+            raise DataError(f"--held-out: expected frames of several cameras, frame {frame} has one")
+        classed = recorded.point_classes(index) if isinstance(recorded, FrameFolder) else None
+        for place, camera in enumerate(rig):
+            if camera.name not in cameras and "all" not in cameras:
+                continue
+            image = as_arrays([sample["images"][place]])
+            masks = () if segmenter is None else segmenter(to_bytes(image[0]))
+            regions = {f"mask {k}": mask for k, mask in enumerate(masks, 1)}
+            regions |= {} if classed is None else _windows(camera, *classed)
+            target = Rig([camera], name=camera.name, ground_z_m=rig.ground_z_m)
+            yield f"{frame}: {camera.name}", photographed(WithoutCamera(sample, place), target, image, [regions])
+
+
+def _windows(camera: Camera, points: torch.Tensor, classes: npt.NDArray[np.int64]) -> dict[str, BoolArray]:
+    """(h, w) pixels around the points (P, >=3) of each class (P,) that a camera sees."""
+    seen, regions = visible_points(camera, points.numpy().astype(np.float64)), dict[str, BoolArray]()
+    column, row = np.round(seen.uv).astype(int).T
+    for number in np.unique(classes[seen.indices]):
+        at = classes[seen.indices] == number
+        around = np.zeros(camera.size, np.uint8)
+        around[row[at], column[at]] = 1
+        regions[f"class {number}"] = np.asarray(cv2.dilate(around, np.ones((_WINDOW_PX,) * 2, np.uint8)) > 0)
+    return regions
+
+
+def _in_order(name: str) -> tuple[str, int]:
+    kind, number = name.split()
+    return kind, int(number)
+
+
+@dataclass
+class CommonPixels:
+    """Scores of held-out cameras on the pixels that all methods cover; ``look`` is that of ``evaluate``."""
+
+    then: Look | None = None  # looks after it
+    rows: list[dict[str, Any]] = field(default_factory=list)  # metrics by frame, camera and method
+    _name: str = ""
+    _truth: Truth | None = None
+    _views: dict[str, RenderedView] = field(default_factory=dict)  # of that camera, by method
+
+    def look(self, name: str, frame: ScoredFrame, method: str, rig: Rig, views: Sequence[RenderedView]) -> None:
+        """Collect a method's view of a held-out camera, and score the views of the one before."""
+        if name != self._name:
+            self.finish()
+            self._name, self._truth = name, None if frame.truth is None else frame.truth(rig)
+        self._views[method] = views[0]
+        if self.then is not None:
+            self.then(name, frame, method, rig, views)
+
+    def finish(self) -> None:
+        """Score the last views."""
+        views, truth = self._views, self._truth
+        if truth is None or not views:
+            return
+        true, (valid,), (regions,) = truth.images[0], truth.valid, truth.regions
+        common = valid & np.all([view.coverage for view in views.values()], axis=0)
+        frame, camera = self._name.rsplit(": ", 1)
+        for method, view in views.items():
+            row = {"frame": frame, "camera": camera, "method": method, "seen": float(view.coverage[valid].mean())}
+            row["common"] = float(common[valid].mean())
+            if common.any():
+                shown, wanted = view.image[common].astype(np.float64), true[common].astype(np.float64)
+                gain = (shown * wanted).sum() / max((shown**2).sum(), 1.0)
+                row |= {"psnr_db": errors(shown, wanted)["psnr_db"]}
+                row |= {"gain_psnr_db": errors(gain * shown, wanted)["psnr_db"]}
+                row["ssim"] = float(ssim_map(view.image, true).mean(-1)[common].mean())
+                for region, mask in regions.items():
+                    found = errors(gain * view.image[common & mask], true[common & mask])
+                    row |= {region: found["psnr_db"]} if found else {}
+            self.rows.append(row)
+        self._views = {}
+
+    def tables(self, methods: Sequence[str]) -> list[Table]:
+        """Scores by method, and one-gain PSNR by class."""
+        frames = list(dict.fromkeys(row["frame"] for row in self.rows))
+        means, by_frame = {}, {}
+        for method in methods:
+            own = [row for row in self.rows if row["method"] == method]
+            means[method] = mean_of(own)
+            of_frames = [mean_of(row for row in own if row["frame"] == frame) for frame in frames]
+            by_frame[method] = np.array([row.get("gain_psnr_db", np.nan) for row in of_frames])
+        drawn = draws_of(len(frames))
+        for method in methods[1:]:
+            difference = by_frame[method] - by_frame[methods[0]]
+            known = np.isfinite(difference)
+            draws = drawn[:, known] @ difference[known] / np.maximum(drawn[:, known].sum(1), 1)
+            means[method] |= interval("difference_db", draws)
+        notes = NOTES.format(common=mean_of(self.rows).get("common", 0.0))
+        tables: list[Table] = [("Against the photographs of held-out cameras", means, _COLUMNS, notes)]
+        if names := sorted(
+            {key for row in self.rows for key in row if key.startswith(("class ", "mask "))}, key=_in_order
+        ):
+            columns = [(name, f"{{{name}:.2f}}") for name in names]
+            notes = (
+                "PSNR after one gain, of common pixels, by class of LiDAR points around them or mask of the segmenter."
+            )
+            tables.append(("The same by class", means, columns, notes))
+        return tables
