@@ -26,7 +26,7 @@ Reduce = Literal[1, 2, 4]
 Reference = Literal["LiDAR", "motion", "road"]
 """References that a network's depth is fitted to, the best first."""
 
-TRAINING_PRESETS = ("paper", "inpaint", "small", "compact", "tiny")
+TRAINING_PRESETS = ("compact", "small", "inpaint", "paper")
 """Presets of all settings of a training."""
 
 

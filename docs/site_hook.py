@@ -20,7 +20,6 @@ BESIDE_CODE = (
     "README.md",
     "CHANGELOG.md",
     "integrations/*/*.md",
-    "arbiview_aug/generator/weights/*.md",
 )
 """Files outside ``docs`` that are pages or pictures of the site."""
 

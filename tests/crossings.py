@@ -58,7 +58,6 @@ def traced_calls() -> dict[str, Tracer]:
     calls = {
         "street, plan cached": (RigRetarget(target), bare),
         "LiDAR + boxes": (RigRetarget(target), sample),
-        "generated": (RigRetarget(target, holes="diffusion"), bare),
         "motion": (RigRetarget(target, geometry="motion"), unmeasured),
         "paper": (RigRetarget(target, quality="paper"), bare),
     }

@@ -57,7 +57,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "torch": {"backend": "torch", "keys": SampleKeys(extra=ALL)},
     "inpaint": {"holes": "telea"},
     "inpaint doubtful": {"holes": Telea(min_confidence=0.4)},
-    "diffusion": {"holes": "diffusion"},
     "all neighbours": {"neighbours": "all", "keys": SampleKeys(extra=ALL)},
     "no neighbours": {"neighbours": None, "keys": SampleKeys(extra=ALL)},
     "target frame": {"keys": SampleKeys(frame="target")},

@@ -25,7 +25,7 @@ from arbiview_aug.choices import GeometryName, Quality
 from arbiview_aug.cli import bench
 from arbiview_aug.datasets import registry
 from arbiview_aug.errors import MissingPackageError
-from arbiview_aug.generator.training import command as train_command
+from arbiview_aug.generator.training import trainer as train_command
 from arbiview_aug.render.requirements import HELPFUL_DATA, STATIC_HARM
 from tests.generator.training.small import frames as drawn_frames
 from tests.generator.training.test_command import SMALLER
@@ -63,7 +63,7 @@ TINY = {
     "depth --model ID_OR_PATH --data FOLDER": ["--output", "depth"],
     "depth --model ID_OR_PATH --data FOLDER --reference motion road": ["--output", "depth"],
     "evaluate --data FOLDER --target waymo --geometry learned street": ["--downscale", "4", "--geometry", "street"],
-    "train --output output/tiny": ["--quiet", *SMALLER],
+    "train --output output/compact": ["--quiet", *SMALLER],
     "view FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
     "view --seed 2 --output view.rrd": ["--size", "40x104", "--frames", "1"],
 }

@@ -184,7 +184,7 @@ def options() -> dict[str, dict[str, Any]]:
         ("--lidar", None, None, False, "score scanned points by the next frame's scan (docs/lidar.md)"),
         ("--detector", path, "MODEL", None, "FILE.py:function (docs/benchmarks.md): AP and recall of its boxes"),
         ("--segmenter", path, "MODEL", None, "FILE.py:function (docs/benchmarks.md): IoU of its masks"),
-        ("--config", TRAINING_PRESETS, None, "tiny", "preset of all settings"),
+        ("--config", TRAINING_PRESETS, None, "compact", "preset of all settings"),
         ("--set", str, "KEY=VALUE", [], "a setting, such as steps=100 or loss.geo=0"),
         ("--weights", path, "DIR", None, "config paper or inpaint: Stable Diffusion 1.5, or its inpainting model"),
         ("--vgg-weights", path, "FILE", None, "torchvision's vgg16 weights (default: cache or download)"),

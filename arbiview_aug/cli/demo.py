@@ -48,11 +48,11 @@ def run(arguments: argparse.Namespace) -> None:
         sample = data[0]
         read_frames(sample, None, arguments.geometry)  # refuses what the sample lacks before any work
     quality, geometry, holes = arguments.quality, arguments.geometry, arguments.holes
-    is_paper, filled = quality == "paper", {"telea": "inpainted", "diffusion": "generated"}.get(holes)
+    is_paper = quality == "paper"
     chosen = "paper" if is_paper else geometry
     others = [retargeting("fast" if is_paper else quality, name, name) for name in _COMPARED if name != chosen]
     methods = [retargeting(quality, geometry, chosen), *others]
-    methods += [] if filled is None else [retargeting(quality, geometry, f"{chosen}, {filled}", holes=holes)]
+    methods += [retargeting(quality, geometry, f"{chosen}, inpainted", holes=holes)] if holes == "telea" else []
     notes: list[str] = []
     done = measured(arguments, data, methods, notes)
     target = done.target

@@ -161,12 +161,12 @@ COMMANDS = {
         ],
     ),
     "train": Command(
-        "generator.training.command",
+        "generator.training.trainer",
         "train the generator that completes what no camera saw",
         "CVC-SSL: train a generator to reconstruct real views from pseudo views around them. The same command with the "
         "same --output goes on where it stopped. Several GPUs: accelerate launch -m arbiview_aug.train …, or torchrun "
         "--nproc_per_node N -m arbiview_aug.train …",
-        "--data nuscenes:ROOT --output output/tiny --set steps=100",
+        "--data nuscenes:ROOT --output output/compact --set steps=100",
         [
             ("--config", {}),
             ("--data", {"type": path, "metavar": "DATA", "help": _TRAINED}),
@@ -235,6 +235,9 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
         surfaces = arguments.geometry if isinstance(arguments.geometry, list) else [arguments.geometry]
         if {*surfaces} - {"auto", "infinity"}:
             parser.error(f"argument --geometry: quality paper knows infinity alone, got {', '.join(surfaces)}")
+    if is_generated and given.get("generator") is None:
+        fix = "python -m arbiview_aug.train makes one, which convert and evaluate read"
+        parser.error(f"argument --holes: diffusion needs --generator PATH: {fix}")
     photographs = "displaced", "held_out"
     if name == "evaluate" and arguments.segmenter and arguments.data and not any(given[key] for key in photographs):
         expected = "expected --displaced or --held-out with --data"

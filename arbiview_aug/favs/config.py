@@ -43,12 +43,10 @@ class PaperConfig:
     use_gradient_weight: bool = True
     use_quality_weight: bool = True
     use_primary_weight: bool = True
-    # --- stage 2 ----
     ratio: float = 0.75
     min_matches: int = 10
     consistent_px: float = 6.0
     inconsistent_px: float = 24.0
-    # --- stage 3 ----
     type_weights: tuple[tuple[str, float], ...] = (
         ("upright", 1.0),
         ("far", 1.0),
@@ -57,7 +55,6 @@ class PaperConfig:
         ("pedestrian", 1.0),
     )
     beta: float = 0.5
-    # --- stage 4 ----
     distance_gamma: float = 1.0
     gradient_sigma: float = 16.0
     unmatched_quality: float = 0.5
@@ -70,22 +67,17 @@ class PaperConfig:
                 f"PaperConfig.consistent_px: expected less than inconsistent_px={self.inconsistent_px!r}, "
                 f"got {self.consistent_px!r}"
             )
-        try:
-            weights = dict(self.type_weights)
-        except (TypeError, ValueError):
-            message = "PaperConfig.type_weights: expected pairs of a type and its weight"
-            raise ValueError(f"{message}, got {self.type_weights!r}") from None
-        for kind, weight in weights.items():
-            if not isinstance(weight, Real) or not 0 <= weight <= 1e6:
-                raise ValueError(f"PaperConfig.type_weights: {kind}: expected a number from 0 to 1e+06, got {weight!r}")
+        given = self.type_weights if isinstance(self.type_weights, tuple | list) else (None,)
+        pairs = [pair for pair in given if isinstance(pair, tuple | list) and len(pair) == 2]
+        if len(pairs) < len(given) or not all(isinstance(w, Real) and 0 <= w <= 1e6 for _, w in pairs):
+            expected = "expected pairs of a type and its weight, a number from 0 to 1e+06"
+            raise ValueError(f"PaperConfig.type_weights: {expected}, got {self.type_weights!r}")
 
     def type_weight(self, kind: str) -> float:
         """Look up type_weight_j of a type, or of the first known part of a dotted name such as ``vehicle.car``."""
         weights = dict(self.type_weights)
-        return next((weights[name] for name in (kind, *kind.split(".")) if name in weights), _OTHER_TYPE_WEIGHT)
+        return next((weights[name] for name in (kind, *kind.split(".")) if name in weights), 0.5)  # any other type
 
-
-_OTHER_TYPE_WEIGHT = 0.5  # type_weight_j of any other type of a detector
 
 _PAPER_RANGES: dict[str, tuple[float, float]] = {
     "ratio": (0.0, 1.0),

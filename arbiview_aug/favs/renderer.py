@@ -108,25 +108,24 @@ def render_paper(
 
 def render_frame(frame: Frame, target: Rig, config: PaperConfig) -> PaperRendering:
     """Render a frame, with its detections where the settings use them; the target is in its ego frame."""
-    detections = read_detections(frame) if config.use_detections else {}
-    return render_paper(frame.rig, target, frame.images, config, detections)
+    found = read_detections(frame) if config.use_detections else {}
+    return render_paper(frame.rig, target, frame.images, config, found)
 
 
 def check_settings(
     target: Rig, geometry: str, backend: str, outputs: Collection[str], min_confidence: float, harmoniser: Harmoniser
 ) -> None:
     """Refuse settings of ``RigRetarget`` that the published stages do not have."""
-    if "confidence" in outputs:
-        raise ValueError("SampleKeys.extra: quality='paper' has no 'confidence': it moves pixels by what it matches")
-    if min_confidence:
-        raise ValueError("holes: quality='paper' has no confidence: expected min_confidence=0")
     check_pinhole(target)
-    if geometry not in ("auto", "infinity"):
-        raise ValueError(f"geometry: quality='paper' has none: expected auto or infinity, got {geometry!r}")
-    if backend == "torch":
-        raise ValueError("backend: quality='paper' runs in OpenCV: expected auto or opencv, got 'torch'")
-    if harmoniser.is_on:
-        raise ValueError(f"match_exposure: quality='paper' is as published: expected True or False, got {harmoniser!r}")
+    for is_wrong, message in (
+        ("confidence" in outputs, "SampleKeys.extra: quality='paper' has no 'confidence': it moves pixels by matches"),
+        (min_confidence, "holes: quality='paper' has no confidence: expected min_confidence=0"),
+        (geometry not in ("auto", "infinity"), "geometry: quality='paper' has none: expected auto or infinity"),
+        (backend == "torch", "backend: quality='paper' runs in OpenCV: expected auto or opencv, got 'torch'"),
+        (harmoniser.is_on, "match_exposure: quality='paper' is as published: expected True or False, got gains"),
+    ):
+        if is_wrong:
+            raise ValueError(message)
 
 
 def primary_camera(sources: Sequence[Camera], target: Camera, candidates: Sequence[int]) -> int:
@@ -151,8 +150,9 @@ def _render_view(
     size, cameras = target.size, source.cameras
     # Stage 1.
     homographies = h_geom_of_visible(cameras, target)
-    visible = [k for k in order if k in homographies]
-    warped = {k: warp_perspective(arrays[k], homographies[k], size, cameras[k].mask) for k in visible}
+    warped = {
+        k: warp_perspective(arrays[k], homographies[k], size, cameras[k].mask) for k in order if k in homographies
+    }
     warps = {k: warp for k, warp in warped.items() if warp.coverage.any()}
     if not warps:
         nothing = np.full(size, -1, np.int8)
@@ -171,8 +171,10 @@ def _render_view(
         matches = NO_MATCHES
         if config.use_feature_matching or config.use_object_alignment:
             coverages, focal_ratio = (warp.coverage, reference.coverage), cameras[k].K[0, 0] / target.K[0, 0]
+            uv = warp.uv[warp.coverage]  # source pixels that the target shows
+            visible = Region(*map(int, (*np.floor(uv.min(0)), *np.ceil(uv.max(0)))))
             features = optimise_transformation(
-                H, _grey(warp.image), reference_grey, coverages, _visible(warp), focal_ratio, config
+                H, _grey(warp.image), reference_grey, coverages, visible, focal_ratio, config
             )
             matches = features.matches
         if not config.use_feature_matching:
@@ -193,7 +195,10 @@ def _render_view(
         SourceReport(k, k == primary, objects.H_aligned, features, objects, float((winners == k).mean()))
         for k, (features, objects) in results.items()
     )
-    return PaperView(_as_tensor(fused, dtype), winners, reports, _occluded(warped | warps, winners))
+    planes = torch.from_numpy(np.ascontiguousarray(fused.transpose(2, 0, 1), np.float32))
+    is_bytes = dtype == torch.uint8
+    image = (planes.round().clamp(0, 255) if is_bytes else (planes / 255).clamp(0, 1)).to(dtype)
+    return PaperView(image, winners, reports, _occluded(warped | warps, winners))
 
 
 def _occluded(warps: Mapping[int, Warp], winners: npt.NDArray[np.int8]) -> BoolArray | None:
@@ -222,12 +227,6 @@ def paper_labels(rendering: PaperRendering, labels: Sequence[torch.Tensor], fill
     return rendered
 
 
-def _visible(warp: Warp) -> Region:
-    """Bounding box, in source pixels, of the part of a source that the target shows."""
-    uv = warp.uv[warp.coverage]
-    return Region(*map(int, (*np.floor(uv.min(0)), *np.ceil(uv.max(0)))))
-
-
 def _masked(camera: Camera, image: torch.Tensor) -> Float32Image:
     """(H, W, 3) in 0..255, black on the own car's body."""
     copied = image.permute(1, 2, 0).to(torch.float32, copy=True, memory_format=torch.contiguous_format)
@@ -241,11 +240,6 @@ def _masked(camera: Camera, image: torch.Tensor) -> Float32Image:
 
 def _grey(image: Float32Image) -> npt.NDArray[np.uint8]:
     return np.clip(np.round(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)), 0, 255).astype(np.uint8)
-
-
-def _as_tensor(image: FloatArray, dtype: torch.dtype) -> torch.Tensor:
-    planes = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1), np.float32))
-    return planes.round().clamp(0, 255).to(dtype) if dtype == torch.uint8 else (planes / 255).clamp(0, 1).to(dtype)
 
 
 def as_rendered(rendering: PaperRendering, outputs: Collection[str] = ()) -> Views:

@@ -4,7 +4,7 @@ Equations of the paper's section "Feature-Aware Adaptive View Synthesis (FAVS) A
 Transformation Foundation":
 
 - H_geom = K2 R2 R1⁻¹ K1⁻¹: ``h_geom``.
-- H_planar = K2 (R − t nᵀ / d) K1⁻¹: ``h_planar``.
+- H_planar = K2 (R − t nᵀ / d) K1⁻¹ has no part in the other stages; the generator reads it (``correspondence``).
 - validity = check_homography(H_geom, corners): ``check_homography``.
 - K and R = R_z(θ) R_x(φ): ``Camera.K`` and ``Camera.looking``.
 
@@ -44,21 +44,6 @@ def h_geom_of_visible(sources: Sequence[Camera], target: Camera) -> dict[int, Fl
         if angle_rad <= source.half_angle_rad + target.half_angle_rad:
             homographies[k] = h_geom(source, target)
     return homographies
-
-
-def h_planar(source: Camera, target: Camera, normal: FloatArray, distance_m: float) -> FloatArray:
-    """Compute the (3, 3) homography of a scene plane, H_planar = K2 (R − t nᵀ / d) K1⁻¹.
-
-    R = R2 R1⁻¹ and t, the source's centre in the target's frame, take source to target: X2 = R X1 + t. The minus sign
-    means the plane n·X1 = −d: ``normal`` (3,) points from it towards the source, at ``distance_m`` > 0.
-    CalibrationError for other distances, and cameras that are not pinhole cameras.
-    """
-    check_pinhole((source, target))
-    if not distance_m > 0:
-        raise CalibrationError(f"h_planar: distance_m: expected a positive distance, got {distance_m!r}")
-    t = target.cam2ego[:3, :3].T @ (source.center_m - target.center_m)
-    R = target.cam2ego[:3, :3].T @ source.cam2ego[:3, :3]
-    return target.K @ (R - np.outer(t, normal) / distance_m) @ np.linalg.inv(source.K)
 
 
 def check_homography(H: FloatArray, size: tuple[int, int]) -> bool:

@@ -7,7 +7,7 @@ Optimization":
 - H_feature = RANSAC(good_matches): ``estimate_homography``.
 - |good_matches| >= min_matches, check_homography(H_feature), consistency(H_geometric, H_feature) < threshold:
   ``accept``, ``is_valid``, ``consistency``.
-- H_base by the three cases, and α: ``h_base``, ``blend_weight``.
+- H_base = α H_geometric + (1 − α) H_feature, with α = 0, α = 1 or between: ``accept``.
 
 The reference is the primary camera's warp, so both images are in target pixels: RANSAC's M takes the warp to the
 reference, and H_feature = M · H_geometric. Homographies map source pixels to target pixels. Grey images are uint8.
@@ -101,16 +101,6 @@ def consistency(H_geometric: FloatArray, H_feature: FloatArray, corners: FloatAr
     if moved[:, 2].min() <= 0:
         return float("inf")
     return float(np.linalg.norm(moved[:, :2] / moved[:, 2:] - corners, axis=1).max())
-
-
-def blend_weight(consistency_px: float, consistent_px: float, inconsistent_px: float) -> float:
-    """α from the consistency: 0 up to ``consistent_px``, 1 from ``inconsistent_px``, linear in between."""
-    return float(np.clip((consistency_px - consistent_px) / (inconsistent_px - consistent_px), 0.0, 1.0))
-
-
-def h_base(H_geometric: FloatArray, H_feature: FloatArray, alpha: float) -> FloatArray:
-    """H_base = α H_geometric + (1 − α) H_feature, both normalised; the other two cases are α = 0 and α = 1."""
-    return alpha * normalised(H_geometric) + (1 - alpha) * normalised(H_feature)
 
 
 # --- matching ---------------------------------------------------------------------------------------------------------
@@ -243,7 +233,7 @@ def accept(
         return FeatureReport(normalised(H_geometric), "geometric", 1.0, count, inliers, None, reason, agreeing)
     consistency_px = consistency(H_geometric, H_feature, shown.corners)
     consistent_px, inconsistent_px = config.consistent_px * scale, config.inconsistent_px * scale
-    alpha = blend_weight(consistency_px, consistent_px, inconsistent_px)
+    alpha = float(np.clip((consistency_px - consistent_px) / (inconsistent_px - consistent_px), 0.0, 1.0))
     evidence = f"{inliers} of {count} matches move the corners by {consistency_px:.1f} px"
     case: Case
     if alpha == 0:
@@ -252,7 +242,7 @@ def accept(
         case, reason = "blended", f"partially consistent: {evidence}, alpha {alpha:.2f}"
     else:
         case, reason = "geometric", f"inconsistent: {evidence}, not below {inconsistent_px:.1f}"
-    base = h_base(H_geometric, H_feature, alpha)
+    base = alpha * normalised(H_geometric) + (1 - alpha) * normalised(H_feature)
     return FeatureReport(base, case, alpha, count, inliers, consistency_px, reason, agreeing)
 
 

@@ -7,7 +7,7 @@ Fine-tuning":
 - object_j = {center_j, bbox_j, confidence_j, type_j}, with centroids c1_j and c2_j: ``SceneObject``, ``find_objects``.
 - w_j = confidence_j × type_weight_j × density_factor_j: ``SceneObject.weight``, ``confidence``, ``density_factor``.
 - ΔT = argmin Σ w_j ‖c2_j − (H_base c1_j + ΔT)‖²: ``mean_offset``.
-- H_aligned = T(β ΔT) · H_base: ``aligned``.
+- H_aligned = T(β ΔT) · H_base: ``align_objects``.
 """
 
 from __future__ import annotations
@@ -66,13 +66,6 @@ def mean_offset(c1: FloatArray, c2: FloatArray, weights: FloatArray, H_base: Flo
     c1 and c2 (m, 2) are object centres in source and target; weights (m,) >= 0 are not all 0.
     """
     return weights @ (c2 - apply(H_base, c1)) / weights.sum()
-
-
-def aligned(H_base: FloatArray, shift_px: FloatArray, beta: float) -> FloatArray:
-    """H_aligned = T(β ΔT) · H_base, a translation in target pixels."""
-    T = np.eye(3)
-    T[:2, 2] = beta * np.asarray(shift_px)
-    return T @ H_base
 
 
 def confidence(offsets: FloatArray, spread_px: float) -> float:
@@ -145,24 +138,21 @@ def find_objects(
         p2: FloatArray = matches.reference[cluster == k]
         x0, y0, x1, y1 = (float(v) for v in (*p2.min(0), *p2.max(0)))
         c1: FloatArray = p1.mean(0)
+        around = [d for d in detections if d.box[0] <= c1[0] <= d.box[2] and d.box[1] <= c1[1] <= d.box[3]]
+        areas = [(d.box[2] - d.box[0]) * (d.box[3] - d.box[1]) for d in around]
+        detected = around[int(np.argmin(areas))].type if around else ""
         objects.append(
             SceneObject(
                 center_source=c1,
                 center_target=p2.mean(0),
                 bbox=(x0, y0, x1, y1),
                 confidence=confidence(p2 - apply(H_base, p1), _CLUSTER_SPREAD_PX * scale),
-                type=_detected_type(c1, detections)
-                or geometric_type((x0, y0, x1, y1), target, ground_z_m, _GROUND_REACH_M),
+                type=detected or geometric_type((x0, y0, x1, y1), target, ground_z_m, _GROUND_REACH_M),
                 density_factor=density_factor(p2, radius_px, MIN_SAMPLES),
                 points=len(p1),
             )
         )
     return objects
-
-
-def _detected_type(center: FloatArray, detections: Sequence[Detection]) -> str:
-    around = [d for d in detections if d.box[0] <= center[0] <= d.box[2] and d.box[1] <= center[1] <= d.box[3]]
-    return min(around, key=lambda d: (d.box[2] - d.box[0]) * (d.box[3] - d.box[1])).type if around else ""
 
 
 # --- the stage --------------------------------------------------------------------------------------------------------
@@ -182,7 +172,9 @@ def align_objects(
         return declined(H_base, f"{len(objects)} objects ask for {length:.1f} px, more than {limit:.1f}", objects)
     kinds = ", ".join(sorted({o.type for o in objects}))
     reason = f"{len(objects)} objects ({kinds}) shift it by {config.beta:g} x ({shift[0]:+.1f}, {shift[1]:+.1f}) px"
-    return AlignmentReport(aligned(H_base, shift, config.beta), shift, tuple(objects), reason)
+    T = np.eye(3)
+    T[:2, 2] = config.beta * shift
+    return AlignmentReport(T @ H_base, shift, tuple(objects), reason)
 
 
 def declined(H_base: FloatArray, reason: str, objects: Sequence[SceneObject] = ()) -> AlignmentReport:

@@ -6,8 +6,6 @@ Generation":
 - I_warped⁽ⁱ⁾ = warp_perspective(I_source⁽ⁱ⁾, H_final⁽ⁱ⁾): ``warp_perspective``.
 - w⁽ⁱ⁾ = w_distance⁽ⁱ⁾ · w_gradient⁽ⁱ⁾ · w_quality⁽ⁱ⁾ · w_primary⁽ⁱ⁾: ``fusion_weight``.
 - I_target = Σ w⁽ⁱ⁾ I_warped⁽ⁱ⁾ / Σ w⁽ⁱ⁾: ``fuse``.
-
-w_distance is that of render plans, too (``arbiview_aug.render.kernels.measure_nodes``).
 """
 
 from __future__ import annotations
@@ -76,35 +74,23 @@ def source_pixels(
 
 
 # --- weights ----------------------------------------------------------------------------------------------------------
-def distance_weight(distance_px: FloatArray, d_max_px: float) -> FloatArray:
-    """w_distance(x, y) = d(x, y) / d_max, with γ = 1: 0 at the border of a source's coverage, 1 at its middle.
-
-    d (...,) is the distance to the border, negative outside; d_max > 0.
-    """
-    return np.clip(distance_px / d_max_px, 0.0, 1.0)
-
-
-def gradient_weight(gradient_magnitude: FloatArray, sigma: float) -> FloatArray:
-    """w_gradient(x, y) = 1 / (1 + ‖∇I(x, y)‖ / σ), with ‖∇I‖ (...,) and σ > 0 in grey levels per pixel."""
-    return 1.0 / (1.0 + gradient_magnitude / sigma)
-
-
 def fusion_weight(
     image: Float32Image, coverage: BoolArray, quality: float, primary: bool, config: PaperConfig
 ) -> npt.NDArray[np.float32]:
     """w = w_distance · w_gradient · w_quality · w_primary, (h, w), 0 outside the coverage, of a warped source.
 
+    w_distance = (d / d_max)^γ with the distance d to the border of the coverage, w_gradient = 1 / (1 + ‖∇I‖ / σ).
     ``quality`` in [0, 1] is that of matching, unused for the primary camera, to which the others are matched.
     """
     weight = coverage.astype(np.float64)
     if config.use_distance_weight and not coverage.all():  # without a border there is no distance to it
         distance = cv2.distanceTransform(coverage.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         d_max_px = max(float(distance.max()), 1.0)  # 1 is that of one covered pixel
-        weight = weight * distance_weight(distance.astype(np.float64), d_max_px) ** config.distance_gamma
+        weight = weight * (distance.astype(np.float64) / d_max_px) ** config.distance_gamma
     if config.use_gradient_weight:
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         gradient = [cv2.Sobel(grey, cv2.CV_32F, dx, dy, scale=1 / 8) for dx, dy in ((1, 0), (0, 1))]
-        weight = weight * gradient_weight(np.asarray(cv2.magnitude(*gradient), np.float64), config.gradient_sigma)
+        weight = weight / (1 + np.asarray(cv2.magnitude(*gradient), np.float64) / config.gradient_sigma)
     if config.use_quality_weight and not primary:
         weight = weight * (config.unmatched_quality + (1 - config.unmatched_quality) * quality)
     if config.use_primary_weight and primary:

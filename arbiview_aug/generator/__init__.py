@@ -3,7 +3,7 @@
 Needs diffusers and safetensors, imported where they are used: ``pip install arbiview_aug[generator]``.
 
 - ``correspondence``, ``attention``: geometry-guided cross-view attention; ``conditioning``: conditions and cameras;
-- ``denoiser``: the networks; ``sampler``: the reverse process; ``completion``: views from their conditions;
+- ``denoiser``: the networks; ``completion``: views from their conditions by the reverse process;
 - ``generator``: ``Generator``, which loads and saves them; ``inpainter``: ``Diffusion``, which fills frames by one.
 """
 
@@ -12,12 +12,8 @@ from typing import TYPE_CHECKING
 from arbiview_aug.environment import lazy_names
 
 if TYPE_CHECKING:
+    from arbiview_aug.generator.config import PRESETS as PRESETS
     from arbiview_aug.generator.config import GeneratorConfig as GeneratorConfig
-    from arbiview_aug.generator.config import compact as compact
-    from arbiview_aug.generator.config import inpaint as inpaint
-    from arbiview_aug.generator.config import paper as paper
-    from arbiview_aug.generator.config import small as small
-    from arbiview_aug.generator.config import tiny as tiny
     from arbiview_aug.generator.generator import Generator as Generator
     from arbiview_aug.generator.inpainter import Diffusion as Diffusion
     from arbiview_aug.generator.inpainter import load_inpainter as load_inpainter

@@ -25,7 +25,7 @@ FORMAT = 1
 CONFIG_FILE = "config.json"
 _DIGITS = 12
 _NAME = re.compile(rf"weights-[0-9a-f]{{{_DIGITS}}}\.safetensors")
-_MOST_CONFIG_BYTES = 1 << 20  # shipped: 2 kB
+_MOST_CONFIG_BYTES = 1 << 20  # 2 kB are usual
 _MAX_MESSAGE = 500  # characters of torch's message, which names every tensor
 
 

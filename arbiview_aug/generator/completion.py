@@ -1,8 +1,14 @@
-"""Sampling of target views from their conditions (Sec. CVC-SSL; appendix: The Multi-Branch U-Net)."""
+"""Sampling of target views from their conditions (Sec. CVC-SSL; appendix: The Multi-Branch U-Net).
+
+The reverse process is DPM-Solver++ (2M) (Lu et al. 2022), diffusers' ``DPMSolverMultistepScheduler`` of order 2, from
+noised pre-filled latents. Time steps are spaced "trailing", t_k = round(T s (1 − k / steps)) − 1 with strength s: the
+first is the noise added to the pre-filled latent, and the last step ends without noise. "Leading" spacing with one step
+would be t = 0.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -11,11 +17,12 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator.conditioning import FrameGeometry, ViewInputs
-from arbiview_aug.generator.config import GeneratorConfig
+from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
 from arbiview_aug.generator.correspondence import TokenWindow
-from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder
+from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, noise_schedule
 from arbiview_aug.generator.generator import Generator
-from arbiview_aug.generator.sampler import guided, sample
+
+Predict = Callable[[torch.Tensor, int], torch.Tensor]  # maps (x_t, t) to the prediction, or to x0 at ``REGRESSION``
 
 
 class Conditions(NamedTuple):
@@ -97,3 +104,42 @@ def unit(image: torch.Tensor) -> torch.Tensor:
 def valid_pixels(camera: Camera) -> torch.Tensor:
     """(H, W) bool: True on the scene, False on the camera's own car."""
     return torch.ones(camera.size, dtype=torch.bool) if camera.mask is None else torch.tensor(camera.mask)
+
+
+# --- the reverse process ----------------------------------------------------------------------------------------------
+def timesteps(steps: int, strength: float) -> list[int]:
+    """At most ``steps`` times from T · strength − 1 down, with trailing spacing; no time twice."""
+    spaced = [round(TIMESTEPS * strength * (1 - k / steps)) - 1 for k in range(steps)]
+    return sorted({t for t in spaced if t >= 0}, reverse=True) or [0]
+
+
+def sample(predict: Predict, prefilled: torch.Tensor, noise: torch.Tensor, config: GeneratorConfig) -> torch.Tensor:
+    """Sample x0 (B, N, C, h, w) float32 from pre-filled latents and standard normal noise of that shape.
+
+    ``predict``, the denoiser with its conditions, is called once per step. A single step is the one-step regression,
+    without noise. A ``residual`` generator's first step is the regression too, whose result is then noised.
+    """
+    prefilled = prefilled.float()
+    if config.steps == 1 or config.residual:
+        prefilled = predict(prefilled, REGRESSION).float()
+    if config.steps == 1:
+        return prefilled
+    schedule = noise_schedule(config)
+    schedule.set_timesteps(timesteps=timesteps(config.steps - config.residual, config.strength))
+    schedule.set_begin_index(0)
+    times = schedule.timesteps.tolist()
+    x = schedule.add_noise(prefilled, config.temperature * noise.float(), torch.tensor(times[:1]))
+    for t in times:
+        x = schedule.step(predict(x, t).float(), t, x, return_dict=False)[0]
+    return x
+
+
+def guided(conditional: torch.Tensor, unconditional: torch.Tensor, guidance: float, rescale: float) -> torch.Tensor:
+    """Classifier-free guidance u + g (c − u) of (B, N, C, h, w), rescaled to the deviation of c by φ = ``rescale``.
+
+    Lin et al. 2023, Sec. 3.4: φ = 0.7 keeps strong guidance from overexposing.
+    """
+    mixed = unconditional + guidance * (conditional - unconditional)
+    deviation, mixed_deviation = (x.std((2, 3, 4), keepdim=True) for x in (conditional, mixed))
+    scaled = mixed * (deviation / mixed_deviation.clamp(min=1e-6))
+    return rescale * scaled + (1 - rescale) * mixed

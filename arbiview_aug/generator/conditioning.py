@@ -147,11 +147,13 @@ class FrameGeometry(NamedTuple):
 
     def target_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> ViewInputs:
         """The targets' conditions: latents (B, N, C, h, w), coverage and confidence (B, N, H, W) at any resolution."""
-        return _views(latent, mask, confidence, self.target_rays, self.target_pose)
+        size = (latent.shape[-2], latent.shape[-1])
+        known, trust = pooled(mask, size)[:, :, None], pooled(confidence, size)[:, :, None]
+        return ViewInputs(latent, known, trust, self.target_rays, self.target_pose)
 
     def source_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> ViewInputs:
         """The sources' conditions; the latents are those of their images."""
-        return _views(latent, mask, confidence, self.source_rays, self.source_pose)
+        return self.target_views(latent, mask, confidence)._replace(rays=self.source_rays, pose=self.source_pose)
 
     def target_windows(self, dropped: torch.Tensor | None = None) -> list[TokenWindow]:
         """Windows of the targets, without sources in the frames ``dropped`` (B,) bool (classifier-free guidance)."""
@@ -191,10 +193,3 @@ def batched(frames: Sequence[FrameGeometry]) -> FrameGeometry:
     *tensors, target_reads, source_reads = zip(*frames, strict=True)
     reads = ([stacked(grid) for grid in zip(*grids, strict=True)] for grids in (target_reads, source_reads))
     return FrameGeometry._make([*map(torch.cat, tensors), *reads])
-
-
-def _views(
-    latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor, rays: torch.Tensor, pose: torch.Tensor
-) -> ViewInputs:
-    size = (latent.shape[-2], latent.shape[-1])
-    return ViewInputs(latent, pooled(mask, size)[:, :, None], pooled(confidence, size)[:, :, None], rays, pose)

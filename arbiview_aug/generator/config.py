@@ -1,11 +1,10 @@
-"""Settings of a generator: frozen dataclasses, and the configurations as functions."""
+"""Settings of a generator: frozen dataclasses, and presets."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, is_dataclass, replace
-from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
@@ -20,11 +19,7 @@ Prediction = Literal["epsilon", "v_prediction"]
 
 # --- checks and plain data --------------------------------------------------------------------------------------------
 def check_fields(
-    config: Any,
-    expected: str,
-    valid: Callable[[Any], bool],
-    *names: str,
-    error: type[ArbiviewError] = GeneratorError,
+    config: Any, expected: str, valid: Callable[[Any], bool], *names: str, error: type[ArbiviewError] = GeneratorError
 ) -> None:
     """Raise ``error`` for the first of these fields of a dataclass whose value is not valid."""
     for name in names:
@@ -198,12 +193,6 @@ class GeneratorConfig:
         check_fields(self, "a finite number", lambda x: -math.inf < x < math.inf, "guidance", "guidance_rescale")
 
     @property
-    def unet_channels(self) -> int:
-        """Input channels of the pretrained U-Net: the noisy latent, and an inpainting one's mask and masked latent."""
-        latent = self.autoencoder.latent_channels
-        return 2 * latent + 1 if self.inpainting else latent
-
-    @property
     def latent_size(self) -> tuple[int, int]:
         """(h, w) of the latents."""
         h, w = self.image_size
@@ -218,78 +207,49 @@ class TrainedOn:
     seed: int  # of the streets, and of the split
     held_out: tuple[int, ...]  # frames that it never saw
 
-    def unseen(self, data: str | Path | None) -> tuple[int, ...] | None:
-        """The held-out frames of a folder, or of streets (None); None for data that it was not trained on."""
-        trained = None if self.data == "synthetic" else Path(self.data.partition(":")[2])
-        asked = None if data is None else Path(str(data).partition(":")[2] or data).resolve()
-        return self.held_out if asked == trained else None
 
+# --- presets ----------------------------------------------------------------------------------------------------------
+_PAPER = GeneratorConfig(
+    name="paper",
+    image_size=(224, 400),
+    unet=UNetConfig(
+        widths=(320, 640, 1280, 1280), transformers=(True, True, True, False), context_width=768, heads=(8, 8, 8, 8)
+    ),
+    autoencoder=AutoencoderConfig(widths=(128, 256, 512, 512), latent_channels=4, norm_groups=32, scale=0.18215),
+    prediction="epsilon",
+    zero_snr=False,
+    residual=False,
+    prefilled=False,
+    one_step=False,
+    strength=0.6,
+    temperature=1.0,
+    frozen_unet=True,
+    prompt_tokens=77,
+    steps=50,
+    guidance=7.5,
+)
 
-# --- configurations ---------------------------------------------------------------------------------------------------
-def paper() -> GeneratorConfig:
-    """Stable Diffusion 1.5, frozen, with 147.5 M parameters of cross-view attention, as published."""
-    return GeneratorConfig(
-        name="paper",
-        image_size=(224, 400),
-        unet=UNetConfig(
-            widths=(320, 640, 1280, 1280),
-            transformers=(True, True, True, False),
-            context_width=768,
-            heads=(8, 8, 8, 8),
-        ),
-        autoencoder=AutoencoderConfig(widths=(128, 256, 512, 512), latent_channels=4, norm_groups=32, scale=0.18215),
-        prediction="epsilon",
-        zero_snr=False,
-        residual=False,
-        prefilled=False,
-        one_step=False,
-        strength=0.6,
-        temperature=1.0,
-        frozen_unet=True,
-        prompt_tokens=77,
-        steps=50,
-        guidance=7.5,
-    )
+_COARSE, _ON_PIXELS = (False, True, True), AutoencoderConfig(patch=4, latent_channels=48)
 
-
-def inpaint() -> GeneratorConfig:
-    """Stable Diffusion 1.5's inpainting U-Net of 9 channels, frozen, with cross-view attention and LoRA."""
-    return replace(paper(), name="inpaint", inpainting=True, lora_rank=16, strength=1.0, steps=20, guidance=1.0)
-
-
-def small() -> GeneratorConfig:
-    """Minutes on a GPU: a U-Net of 63 M and 10 M of cross-view attention; 4 x 4 pixels of 128 x 224 images."""
-    return GeneratorConfig(
-        name="small",
-        image_size=(128, 224),
-        unet=UNetConfig(widths=(128, 256, 384), transformers=(False, True, True)),
-        autoencoder=AutoencoderConfig(patch=4, latent_channels=48),
-    )
-
-
-def compact() -> GeneratorConfig:
-    """The shipped generator: at most 7 M parameters, 16 MB in half precision; 4 x 4 pixels of 64 x 112 images."""
-    return GeneratorConfig(
+PRESETS = {
+    # A CPU, an hour: at most 7 M parameters; 4 x 4 pixels of 64 x 112 images.
+    "compact": GeneratorConfig(
         name="compact",
         image_size=(64, 112),
-        unet=_light_unet((64, 96, 128), norm_groups=32),
-        autoencoder=AutoencoderConfig(patch=4, latent_channels=48),
+        unet=UNetConfig(widths=(64, 96, 128), transformers=_COARSE, cross_view=_COARSE, layers=1, context_width=64),
+        autoencoder=_ON_PIXELS,
         steps=1,  # after an hour of training, samples of more steps are speckled
-    )
-
-
-def tiny() -> GeneratorConfig:
-    """Minutes on a CPU: 2 x 2 pixels of 32 x 56 images."""
-    return GeneratorConfig(
-        name="tiny",
-        image_size=(32, 56),
-        unet=_light_unet((32, 64, 64), norm_groups=8),
-        autoencoder=AutoencoderConfig(patch=2, latent_channels=12),
-    )
-
-
-def _light_unet(widths: tuple[int, int, int], norm_groups: int) -> UNetConfig:
-    coarse = (False, True, True)
-    return UNetConfig(
-        widths=widths, transformers=coarse, cross_view=coarse, layers=1, context_width=64, norm_groups=norm_groups
-    )
+    ),
+    # A GPU: a U-Net of 63 M and 10 M of cross-view attention; 4 x 4 pixels of 128 x 224 images.
+    "small": GeneratorConfig(
+        name="small",
+        image_size=(128, 224),
+        unet=UNetConfig(widths=(128, 256, 384), transformers=_COARSE),
+        autoencoder=_ON_PIXELS,
+    ),
+    # Stable Diffusion 1.5's inpainting U-Net of 9 channels, frozen, with cross-view attention and LoRA.
+    "inpaint": replace(_PAPER, name="inpaint", inpainting=True, lora_rank=16, strength=1.0, steps=20, guidance=1.0),
+    # Stable Diffusion 1.5, frozen, with 147.5 M parameters of cross-view attention, as published.
+    "paper": _PAPER,
+}
+"""Generators by name."""

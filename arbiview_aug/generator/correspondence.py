@@ -16,7 +16,7 @@ Grids are computed in float64 and stored in float32; half precision would cost 0
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -65,12 +65,6 @@ def between(query: Camera, key: Camera) -> tuple[FloatArray, FloatArray]:
     return to_key @ query.cam2ego[:3, :3], to_key @ (query.center_m - key.center_m)
 
 
-def ray_map(query: Camera, key: Camera, plane: FloatArray) -> FloatArray:
-    """(3, 3) R + t nᵀ/d: rays of ``query`` to rays of ``key`` over a plane (3,) n/d of ``query``'s frame."""
-    R, t = between(query, key)
-    return R + np.outer(t, plane)
-
-
 def correspond(query: Camera, rays: Rays, key: Camera, planes: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Map the tokens (h, w) of view i, ``query``, with their rays in its own frame, to view j, ``key``, over planes.
 
@@ -78,8 +72,9 @@ def correspond(query: Camera, rays: Rays, key: Camera, planes: FloatArray) -> tu
     p_j^(l) (L, h, w, 2), 0 where not valid, and M_j^(l) (L, h, w).
     """
     directions = np.where(rays.valid[..., None], rays.directions, 0.0)
+    R, t = between(query, key)
     with np.errstate(over="ignore", invalid="ignore"):  # calibrations of 1e300 m
-        mapped = np.stack([directions @ ray_map(query, key, plane).T for plane in planes])
+        mapped = np.stack([directions @ (R + np.outer(t, plane)).T for plane in planes])
         inverse_depth = np.stack([directions @ plane for plane in planes])
         valid = rays.valid & np.isfinite(mapped).all(-1)
         valid[1:] &= inverse_depth[1:] > 0  # the plane lies in front of the camera
@@ -114,10 +109,17 @@ def correspondences(
     the finest first. All cameras and the road lie in one ego frame.
     """
     small = [[camera.resize(size) for size in sizes] for camera in keys]
-    by_query = []
+    by_query: list[list[tuple[int, list[tuple[FloatArray, BoolArray]]]]] = []
     for query, self_index in zip(queries, own_index, strict=True):
-        others = {j: grids for j, grids in enumerate(small) if j != self_index}
-        by_query.append(_neighbours(query, others, sizes, plane_vectors(query, ground_z_m, facing_m)))
+        planes = plane_vectors(query, ground_z_m, facing_m)
+        rays = [camera.unproject_cam(camera.pixel_grid()) for camera in map(query.resize, sizes)]
+        by_query.append([])  # views j that overlap the query, with ``correspond`` for each token grid
+        for j, of_sizes in enumerate(small):
+            same_centre = float(np.abs(query.center_m - of_sizes[0].center_m).max()) < SAME_CENTER_M
+            used = planes[:1] if same_centre else planes
+            if j != self_index and (first := correspond(query, rays[0], of_sizes[0], used))[1].any():
+                rest = [correspond(query, ray, key, used) for ray, key in zip(rays[1:], of_sizes[1:], strict=True)]
+                by_query[-1].append((j, [first, *rest]))
     slots = max(1, *(len(of_query) for of_query in by_query))
     levels = max((len(grids[0][0]) for of_query in by_query for _, grids in of_query), default=1)
     shapes = [(1, len(queries), slots, levels, h, w) for h, w in sizes]
@@ -132,22 +134,6 @@ def correspondences(
                 of_grid.centre[0, q, slot, : len(centre)] = torch.from_numpy(centre.astype(np.float32))
                 of_grid.valid[0, q, slot, : len(valid)] = torch.from_numpy(valid)
     return reads
-
-
-def _neighbours(
-    query: Camera, others: Mapping[int, Sequence[Camera]], sizes: Sequence[tuple[int, int]], planes: FloatArray
-) -> list[tuple[int, list[tuple[FloatArray, BoolArray]]]]:
-    """The views j that overlap a query, with ``correspond`` for each token grid; ``others`` are at these sizes."""
-    rays = [camera.unproject_cam(camera.pixel_grid()) for camera in map(query.resize, sizes)]
-    neighbours = []
-    for j, grids in others.items():
-        same_centre = float(np.abs(query.center_m - grids[0].center_m).max()) < SAME_CENTER_M
-        used = planes[:1] if same_centre else planes
-        first = correspond(query, rays[0], grids[0], used)
-        if first[1].any():
-            rest = [correspond(query, ray, camera, used) for ray, camera in zip(rays[1:], grids[1:], strict=True)]
-            neighbours.append((j, [first, *rest]))
-    return neighbours
 
 
 def stacked(frames: Sequence[Correspondence]) -> Correspondence:

@@ -266,6 +266,22 @@ def widen(unet: Any, channels: int) -> None:
     unet.register_to_config(in_channels=channels)
 
 
+def noise_schedule(config: GeneratorConfig) -> Any:
+    """Stable Diffusion's schedule (scaled linear, β from 0.00085 to 0.012, 1000 steps).
+
+    ``zero_snr`` rescales it to zero terminal SNR (Lin et al. 2023).
+    """
+    return optional_package("diffusers", "generator").DPMSolverMultistepScheduler(
+        num_train_timesteps=TIMESTEPS,
+        beta_start=0.00085,
+        beta_end=0.012,
+        beta_schedule="scaled_linear",
+        prediction_type=config.prediction,
+        rescale_betas_zero_snr=config.zero_snr,
+        timestep_spacing="trailing",
+    )
+
+
 class Autoencoder(nn.Module):
     """diffusers' ``AutoencoderKL`` with images in [0, 1] and latents of unit variance, or squares of pixels.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,9 @@ from arbiview_aug.errors import GeneratorError, one_line, shown
 from arbiview_aug.files import check_regular
 from arbiview_aug.generator.checkpoint import load_weights, read_checkpoint, write_checkpoint
 from arbiview_aug.generator.conditioning import input_channels
-from arbiview_aug.generator.config import GeneratorConfig, TrainedOn, from_plain, paper
-from arbiview_aug.generator.denoiser import Autoencoder, Denoiser
-from arbiview_aug.generator.sampler import noise_schedule
+from arbiview_aug.generator.config import PRESETS, GeneratorConfig, TrainedOn, from_plain
+from arbiview_aug.generator.denoiser import Autoencoder, Denoiser, noise_schedule
 
-_SHIPPED = Path(__file__).with_name("weights")
 _EMPTY_PROMPT = [49406, *[49407] * 76]  # CLIP's tokens of "": start of text, then end of text up to 77
 _FREE = ("sample_size", "upcast_attention", "force_upcast", "scaling_factor")  # not compared: they change no layer
 
@@ -82,20 +81,28 @@ class Generator(nn.Module):
 
         Args:
             where: A folder or hub id in diffusers' layout.
-            config: Settings, ``paper()`` by default, ``inpaint()`` for an inpainting model; the weights must fit.
+            config: Settings, ``PRESETS["paper"]`` by default; the weights must fit.
             empty_prompt: (prompt tokens, width) the text encoder's last hidden state for ""; by default computed by the
                 folder's text encoder, which needs transformers.
 
         Raises:
             GeneratorError: Weights that are missing, extra, of another architecture, or trained for another prediction.
         """
-        config = config or paper()
+        config = config or PRESETS["paper"]
         latent = config.autoencoder.latent_channels
         if not config.autoencoder.widths:
             raise GeneratorError("from_stable_diffusion: expected a config with an autoencoder, got one on pixels")
-        unet = load_part("UNet2DConditionModel", where, "unet", config.unet.arguments(config.unet_channels, latent))
+        unet = load_part(
+            "UNet2DConditionModel",
+            where,
+            "unet",
+            config.unet.arguments(2 * latent + 1 if config.inpainting else latent, latent),
+        )
         vae = load_part("AutoencoderKL", where, "vae", config.autoencoder.arguments())
-        scale, prediction = vae.config.scaling_factor, trained_prediction(where)
+        scale, prediction = vae.config.scaling_factor, None
+        with suppress(OSError, ValueError):  # no scheduler says what the U-Net was trained for
+            scheduler = optional_package("diffusers", "generator").DPMSolverMultistepScheduler
+            prediction = scheduler.load_config(where, subfolder="scheduler").get("prediction_type", "epsilon")
         if not is_number(scale):
             raise GeneratorError(f"{where}/vae: expected a number as scaling_factor, got {shown(scale)}")
         if prediction not in (None, config.prediction):
@@ -134,15 +141,6 @@ class Generator(nn.Module):
         # Inside a user's module its parameters must not be found by the optimiser or DDP.
         return generator.eval().requires_grad_(False)
 
-    @classmethod
-    def shipped(cls) -> Generator:
-        """Load the ``compact`` generator that comes with the package, see ``weights/README.md``.
-
-        Raises:
-            GeneratorError: The package was installed without its data.
-        """
-        return cls.from_pretrained(_SHIPPED)
-
     def save_pretrained(self, folder: str | Path) -> None:
         """Write the generator to a folder of its own, atomically; in float16 (``half()``) the file is half as large.
 
@@ -172,7 +170,9 @@ def load_part(kind: str, where: str | Path, subfolder: str, arguments: Mapping[s
     levels = len(arguments["block_out_channels"])
     for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:  # without self
         expected, got = arguments.get(name, parameter.default), config.get(name, parameter.default)
-        if name not in _FREE and _by_level(got, levels) != _by_level(expected, levels):
+        # diffusers takes a value for each level, or one for all
+        of_levels = [list(v) if isinstance(v, list | tuple) else [v] * levels for v in (got, expected)]
+        if name not in _FREE and of_levels[0] != of_levels[1]:
             raise GeneratorError(f"{label}: expected {name} {expected}, got {shown(got)}")
     return _complete_model(cls, where, subfolder, low_cpu_mem_usage=False)
 
@@ -205,17 +205,3 @@ def embedded_empty_prompt(where: str | Path) -> torch.Tensor:
     except (IndexError, RuntimeError, ValueError) as error:
         expected = "CLIP's, which reads 77 of 49408 tokens"
         raise GeneratorError(f"{where}/text_encoder: expected {expected}: {one_line(error)}") from None
-
-
-def trained_prediction(where: str | Path) -> Any:
-    """The prediction that the U-Net of a folder or hub id was trained for; None without a scheduler that says so."""
-    scheduler = optional_package("diffusers", "generator").DPMSolverMultistepScheduler
-    try:
-        return scheduler.load_config(where, subfolder="scheduler").get("prediction_type", "epsilon")
-    except (OSError, ValueError):
-        return None
-
-
-def _by_level(value: Any, levels: int) -> list[Any]:
-    """A value of each level: diffusers takes one for all."""
-    return list(value) if isinstance(value, list | tuple) else [value] * levels

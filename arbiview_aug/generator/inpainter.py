@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -15,6 +16,7 @@ from arbiview_aug.generator.completion import Conditions, denoised, unit, valid_
 from arbiview_aug.generator.conditioning import FrameGeometry, batched, frame_geometry, nearest_sources
 from arbiview_aug.generator.generator import Generator
 from arbiview_aug.image_ops import resized
+from arbiview_aug.inpaint.continued import Continue
 from arbiview_aug.inpaint.inpainter import (
     Inpainter,
     Tensors,
@@ -26,7 +28,6 @@ from arbiview_aug.inpaint.inpainter import (
     seeded,
 )
 from arbiview_aug.inpaint.networks import NetworkInpainter, PipelineInpainter, TorchScriptInpainter
-from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.frame import Frame
 
@@ -44,22 +45,23 @@ class Diffusion(Inpainter, torch.nn.Module):
     On a GPU it needs ``num_workers=0``, or ``complete_batch`` after collating.
 
     Args:
-        generator: ``Generator.from_pretrained(DIR)``; None loads the shipped weights, trained on synthetic streets.
+        generator: A generator, or the folder of one, which ``python -m arbiview_aug.train`` makes.
         steps: Denoising steps, from 1 (regression) on; the generator's default if None.
         guidance: Classifier-free guidance, 1 for none; the generator's default if None.
         min_confidence: As for every ``Inpainter``, like ``seed``.
 
     Raises:
         ValueError: Impossible settings.
-        GeneratorError: Steps or guidance that the generator cannot sample with.
+        GeneratorError: No generator; steps or guidance that it cannot sample with.
     """
 
     outcome = "made up by the generator"
     is_random = True
+    needs_layers = True
 
     def __init__(
         self,
-        generator: Generator | None = None,
+        generator: Generator | str | Path | None = None,
         *,
         steps: int | None = None,
         guidance: float | None = None,
@@ -68,9 +70,12 @@ class Diffusion(Inpainter, torch.nn.Module):
     ) -> None:
         super().__init__()
         self.min_confidence, self.seed = checked_settings(min_confidence, seed, steps, guidance)
-        if generator is not None and not isinstance(generator, Generator):
-            raise ValueError(f"generator: expected a Generator, got {type(generator).__name__}")
-        self.generator = Generator.shipped() if generator is None else generator
+        if generator is None:
+            fix = "python -m arbiview_aug.train trains one on your frames (docs/holes.md); holes='continue' needs none"
+            raise GeneratorError(f"Diffusion: expected a generator or its folder, got none: {fix}")
+        if not isinstance(generator, Generator | str | Path):
+            raise ValueError(f"generator: expected a Generator or its folder, got {type(generator).__name__}")
+        self.generator = generator if isinstance(generator, Generator) else Generator.from_pretrained(generator)
         self.steps, self.guidance = steps, guidance
         config = self.generator.config
         with_sampling(config, steps, guidance)
@@ -94,9 +99,9 @@ class Diffusion(Inpainter, torch.nn.Module):
     def fill(self, rendered: Sequence[Views], frames: Sequence[Frame]) -> list[Views]:
         """Fill rendered frames; ``frames`` hold their source images.
 
-        Views that are almost complete are inpainted by Telea's method. A frame's others are denoised together, so that
-        they agree. Frames with as many views and sources share the denoiser's calls. GeneratorError for generated
-        pixels that are not finite.
+        All are filled as by default (``Continue``); views that are almost complete stay so. A frame's others are
+        denoised together, so that they agree. Frames with as many views and sources share the denoiser's calls.
+        GeneratorError for generated pixels that are not finite.
         """
         images, holes = self._completed(rendered, frames)
         return [put(*frame) for frame in zip(rendered, images, holes, strict=True)]
@@ -107,39 +112,48 @@ class Diffusion(Inpainter, torch.nn.Module):
     ) -> tuple[list[list[torch.Tensor]], list[list[torch.Tensor]]]:
         """Images of each frame that are right in the holes, and the holes."""
         check_device(self.generator)
-        names, images, holes = frame_names(frames), [list(frame.images) for frame in rendered], []
+        names, images, holes = frame_names(frames), [list[torch.Tensor]() for _ in frames], []
         alike: dict[tuple[int, int], list[tuple[int, list[int], _Inputs]]] = {}
         for n, (frame, source) in enumerate(zip(rendered, frames, strict=True)):
             known, of_frame = holes_of(frame, self.min_confidence)
             holes.append(of_frame)
+            copied = [image.clone() for image in frame.images]
+            images[n] = Continue().fill([replace(frame, images=copied, coverage=known)], [source])[0].images
             left = [m for m, hole in enumerate(of_frame) if float(hole.float().mean()) > 1 - ALMOST_COMPLETE]
-            for m, hole in enumerate(of_frame):
-                if m not in left and bool(hole.any()):
-                    images[n][m] = telea(images[n][m], ~known[m])
             if left:
-                inputs = self._inputs(frame, source, known, left, names[n])
+                inputs = self._inputs(frame, source, images[n], known, left, names[n])
                 alike.setdefault((len(left), inputs[0].sources.shape[1]), []).append((n, left, inputs))
+        config, device = with_sampling(self.generator.config, self.steps, self.guidance), self.generator.device
         for (count, _), group in alike.items():
             size = max(1, VIEWS_AT_ONCE // count)
             for together in (group[start : start + size] for start in range(0, len(group), size)):
-                done = self._denoised([inputs for _, _, inputs in together])
-                for (n, left, _), generated in zip(together, done, strict=True):
-                    for m, image in zip(left, generated, strict=True):
+                conditions, geometries, noise = zip(*(inputs for _, _, inputs in together), strict=True)
+                batch = Conditions(*(torch.cat(part).to(device) for part in zip(*conditions, strict=True)))
+                geometry = batched(geometries).to(device)
+                done = denoised(self.generator, config, geometry, batch, torch.cat(noise).to(device)).cpu()
+                for (n, left, (before, *_)), generated in zip(together, done, strict=True):
+                    for m, image in zip(left, generated - before.prefilled[0], strict=True):
                         if not bool(image.isfinite().all()):
                             where = f"frame {names[n]:.40}, camera {rendered[n].rig[m].name!r}"
                             expected = f"finite pixels from generator {self.generator.config.name!r}"
                             fix = "pass finite images, no float16, less guidance"
                             raise GeneratorError(f"{where}: expected {expected}, got NaN or infinity: {fix}")
-                        images[n][m] = _like(image, images[n][m])
+                        images[n][m] = _changed(images[n][m], image)
         return images, holes
 
-    def _inputs(self, rendered: Views, source: Frame, known: Tensors, left: list[int], name: str) -> _Inputs:
-        """Conditions, cameras and noise of a frame's views ``left``, on the CPU."""
+    def _inputs(
+        self, rendered: Views, source: Frame, filled: Tensors, known: Tensors, left: list[int], name: str
+    ) -> _Inputs:
+        """Conditions, cameras and noise of a frame's views ``left``, ``filled`` as by default, on the CPU."""
         config = self.generator.config
         rig, size = rendered.rig.in_frame_of(source.rig), config.image_size
         branches = sorted({k for m in left for k in nearest_sources(rig[m], source.rig.cameras)})
         trust = rendered.coverage if rendered.confidence is None else rendered.confidence
-        views = [_prefilled(rendered.images[m], known[m], trust[m], size) for m in left]
+        views = []
+        for m in left:
+            maps = torch.stack([known[m].float(), trust[m].float() * known[m]])[None].cpu()
+            shares = functional.interpolate(maps, size, mode="bilinear", antialias=True)[0].clamp(0, 1)
+            views.append((unit(resized(filled[m].cpu(), size)), *shares))
         images = [unit(resized(source.images[k], size)) for k in branches]
         cameras = [source.rig[k] for k in branches]
         seen = [valid_pixels(camera.resize(size)).float() for camera in cameras]
@@ -150,52 +164,27 @@ class Diffusion(Inpainter, torch.nn.Module):
         geometry = frame_geometry([rig[m] for m in left], cameras, source.rig.ground_z_m, config)
         return conditions, geometry, torch.stack(noise)[None]
 
-    def _denoised(self, inputs: Sequence[_Inputs]) -> torch.Tensor:
-        """(B, N, 3, H, W) images of frames with as many views and sources, on the generator's device."""
-        generator, device = self.generator, self.generator.device
-        conditions, geometries, noise = zip(*inputs, strict=True)
-        together = Conditions(*(torch.cat(part).to(device) for part in zip(*conditions, strict=True)))
-        config = with_sampling(generator.config, self.steps, self.guidance)
-        return denoised(generator, config, batched(geometries).to(device), together, torch.cat(noise).to(device))
+
+def _changed(view: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
+    """A view (3, h, w) changed as the generator changed it at its size, (3, H, W): a larger view keeps its details."""
+    if change.shape != view.shape:
+        change = functional.interpolate(change[None], view.shape[-2:], mode="bicubic", antialias=True)[0]
+    changed = (unit(view) + change.to(view.device)).clamp(0, 1)
+    return ((changed * 255).round() if view.dtype == torch.uint8 else changed).to(view.dtype)
 
 
-def _prefilled(
-    image: torch.Tensor, known: torch.Tensor, trust: torch.Tensor, size: tuple[int, int]
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A view at the generator's size with holes inpainted (3, H, W), its known share and its confidence (H, W).
-
-    Colours are averaged over known pixels alone.
-    """
-    weight = known.float()[None]
-    planes = torch.cat([unit(image) * weight, weight, (trust.float() * known)[None]])[None]
-    if tuple(image.shape[-2:]) != size:
-        planes = functional.interpolate(planes, size, mode="bilinear", antialias=True)
-    colour, share, confidence = planes[0].split([3, 1, 1])
-    filled = telea((colour / share.clamp(min=1e-3)).clamp(0, 1), share[0] < 0.5)
-    return filled, share[0].clamp(0, 1), confidence[0].clamp(0, 1)
-
-
-def _like(generated: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
-    """A generated image (3, H, W) with the size, type and device of a view."""
-    generated = generated.clamp(0, 1).to(view.device)
-    if generated.shape != view.shape:
-        generated = functional.interpolate(generated[None], view.shape[-2:], mode="bicubic", antialias=True)[0]
-    generated = generated.clamp(0, 1)
-    return ((generated * 255).round() if view.dtype == torch.uint8 else generated).to(view.dtype)
-
-
-def load_inpainter(where: str | Path | None = None, *, steps: int | None = None) -> Diffusion | NetworkInpainter:
+def load_inpainter(where: str | Path | None, *, steps: int | None = None) -> Diffusion | NetworkInpainter:
     """Load what fills holes: a generator's folder, a TorchScript file, or an inpainting pipeline of diffusers.
 
     Args:
-        where: The folder, file or hub id; None loads the shipped generator.
+        where: The folder, file or hub id.
         steps: As for ``Diffusion``; TorchScript files have none.
 
     Raises:
         GeneratorError: None of these.
     """
     if where is None:
-        return Diffusion(steps=steps)
+        return Diffusion(None)  # refuses
     if os.path.isfile(where):
         return TorchScriptInpainter(where)
     is_there = os.path.isdir(where)
@@ -204,4 +193,4 @@ def load_inpainter(where: str | Path | None = None, *, steps: int | None = None)
         raise GeneratorError(f"generator {where}: expected {expected}, found none")
     if not is_there or (Path(where) / "model_index.json").is_file():
         return PipelineInpainter.from_pretrained(where, steps=steps)
-    return Diffusion(Generator.from_pretrained(where), steps=steps)
+    return Diffusion(where, steps=steps)

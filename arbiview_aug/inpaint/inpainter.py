@@ -88,8 +88,8 @@ class Inpainter(ABC):
         """Fill collated samples, on the device of a network: DataLoader workers cannot use a GPU.
 
         The pixels are those of ``RigRetarget(holes=self)``, but for rounding: frames are computed together. Those of
-        ``Continue`` are not: batches do not say what holes lie behind. Nor do they say which keys are label maps: with
-        ``min_confidence``, ignore labels where ``generated`` is True.
+        ``Continue``, and of a generator, which corrects it, are not: batches do not say what holes lie behind. Nor do
+        they say which keys are label maps: with ``min_confidence``, ignore labels where ``generated`` is True.
 
         Args:
             batch: From ``RigRetarget(..., keys=SampleKeys(extra=("sources", "confidence")))``: a sample or a batch.

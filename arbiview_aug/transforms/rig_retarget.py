@@ -98,8 +98,8 @@ class RigRetarget(torch.nn.Module):
             ``boxes``: ``boxes_3d`` on the street. ``lidar``: ``points`` or ``depth_m``, with boxes. ``motion``: depth
             from ``neighbours``. ``learned``: ``learned_depth_m``. ``fused``: all of these. See ``docs/surfaces.md``.
         holes: Filler of pixels that no camera saw, marked in ``generated``: ``continue``, the background continued
-            behind objects; ``telea``; ``mean``; ``diffusion``, the shipped generator; or an ``Inpainter``. ``black``
-            leaves them. See ``docs/holes.md``.
+            behind objects; ``telea``; ``mean``; or an ``Inpainter``, for example ``Diffusion``. ``black`` leaves them.
+            See ``docs/holes.md``.
         quality: ``draft``, ``fast``, ``accurate`` or a ``RenderConfig``; ``paper`` or a ``PaperConfig``: stages 1 to 4
             as published.
         neighbours: Holes that other frames of the drive (``neighbours`` in the sample) may fill: ``road``, those of the

@@ -12,7 +12,6 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -41,8 +40,8 @@ from integrations.benchmarks.study import run_study, stored, study_parser
 
 OURS: tuple[Quality, ...] = ("draft", "fast", "accurate")  # presets other than the published method
 
-INPAINTED, GENERATED = "fast, inpainted", "generator"
-"""Rows of ``fast`` with holes filled by Telea's inpainting, and by the shipped weights."""
+INPAINTED = "fast, inpainted"
+"""Row of ``fast`` with holes filled by Telea's inpainting."""
 
 SETS = ("paper", "yaw", "vehicles", "truck")
 """Target rigs, made from the source rig and without its car-body masks."""
@@ -73,7 +72,7 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         ("crop and slide", "DriveSuprim, Table 1", 9.5647, 0.8542, 72.4672, 87.5129),
         ("own camera", "Geometric, Table 2", 9.3167, 0.8339, 74.1309, 88.7707),
         ("paper", "FAVS, Table 2", 11.8707, 0.8813, 42.4985, 55.1446),
-        (GENERATED, "ArbiViewGen, Tables 1 and 2", 14.2335, 0.9691, 38.2820, 49.5294),
+        ("generator", "ArbiViewGen, Tables 1 and 2", 14.2335, 0.9691, 38.2820, 49.5294),
     )
 }
 """The paper's numbers at LiDAR pixels, by our name of the method: PSNR in dB, SSIM, MAE, RMSE."""
@@ -185,11 +184,6 @@ def named_targets(kind: str, rig: Rig) -> dict[str, Rig]:
 _FOUR = (("PSNR", "{psnr_db:.2f}"), ("SSIM", "{ssim:.4f}"), ("MAE", "{mae:.2f}"), ("RMSE", "{rmse:.2f}"))
 _HEADINGS = {"paper": "six", "yaw": "turned", "vehicles": "vehicles", "truck": "truck"}
 _TURNS = ", ".join(f"{yaw:g}" for yaw in YAWS_DEG)
-_GENERATOR = (
-    f"*{GENERATED}*: `fast`, its holes by the weights in the package, which were trained on synthetic streets alone, "
-    "those of the synthetic columns among them, "
-    "for an hour on two CPU cores; the paper's were trained on nuScenes from Stable Diffusion's."
-)
 _SIX = (
     "The paper's measure at its six configurations, exposures as recorded: its own numbers, and those of its methods "
     "and ours here."
@@ -205,8 +199,7 @@ _OTHERS = (
 def paper_report(study: Study) -> str:
     """Markdown tables: the paper's measure, PSNR on all targets, losses, and differences in protocol."""
     parts = [] if not study.means else [_SIX, _six(study), _OTHERS, _others(study)]
-    caption = [_GENERATOR] if GENERATED in _methods(study) else []
-    return "\n\n".join([*parts, *caption, *(f"{where}: {why}" for where, why in study.declined.items()), PROTOCOL])
+    return "\n\n".join([*parts, *(f"{where}: {why}" for where, why in study.declined.items()), PROTOCOL])
 
 
 def _six(study: Study) -> str:
@@ -264,13 +257,12 @@ def paper_stages() -> dict[str, PaperConfig]:
 
 
 def study_methods() -> list[Method]:
-    """Rows of the paper's tables and ours, from images and poses alone; the generator's only with diffusers."""
+    """Rows of the paper's tables and ours, from images and poses alone."""
     return [
         *map(baseline, BASELINES),
         *(retargeting(config, "auto", name) for name, config in paper_stages().items()),
         *(retargeting(quality, "street", quality) for quality in OURS),
         retargeting("fast", "street", INPAINTED, holes="telea"),
-        *([retargeting("fast", "street", GENERATED, holes="diffusion")] if find_spec("diffusers") else []),
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import sys
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -13,13 +14,15 @@ import pytest
 import torch
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator import Diffusion, Generator
-from arbiview_aug.generator.config import AutoencoderConfig
+from arbiview_aug.generator import Diffusion, Generator, load_inpainter
+from arbiview_aug.generator.completion import guided, sample, timesteps
+from arbiview_aug.generator.denoiser import REGRESSION, noise_schedule
 from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.frame import Frame
-from tests.generator.small import ring, small_config, stirred
+from arbiview_aug.transforms.rig_retarget import RigRetarget
+from tests.generator.small import ring, small_config
 from tests.helpers import assert_same_to_a_level
 
 SOURCES = ring(4, horizontal_fov_deg=100)
@@ -106,18 +109,6 @@ def test_the_result_depends_on_seed_frame_and_camera_alone(generator: Generator)
     assert_same_to_a_level(torch.stack(found.images), torch.stack(base.images))
 
 
-def test_confidence_decides_what_is_known(generator: Generator) -> None:
-    frame, source = rendered()
-    confidence = [torch.ones(seen.shape) for seen in frame.coverage]
-    for trust in confidence:
-        trust[10:20, 10:30] = 0.2
-    expected = ~torch.stack(list(frame.coverage))
-    for least in (0.0, 0.5):
-        out = filled(generator, replace(frame, confidence=confidence), source, min_confidence=least, steps=1)
-        expected[:, 10:20, 10:30] |= least > 0.2
-        assert torch.equal(out.generated, expected)
-
-
 def test_the_own_cars_are_neither_generated_nor_read(generator: Generator) -> None:
     """Training has them black."""
     mask = np.ones((48, 80), bool)
@@ -156,14 +147,6 @@ def test_an_inpainter_refuses_what_its_generator_cannot_do(made: Any, settings: 
     Diffusion(generator, guidance=made.get("guidance"))
 
 
-def test_views_of_other_sizes_and_lenses(generator: Generator) -> None:
-    waymo = load_rig("waymo").resized(0.08)
-    frame, source = rendered(waymo, load_rig("nuscenes").resized(0.1))
-    out = filled(generator, frame, source)
-    for image, view, seen, made in zip(out.images, frame.images, frame.coverage, out.generated, strict=True):
-        assert torch.equal(image[:, seen], view[:, seen]) and torch.equal(made, ~seen)
-
-
 def test_extremes_are_finite_in_bfloat16(generator: Generator) -> None:
     """One and twelve cameras, nothing covered at all, no source that looks there."""
     low = copy.deepcopy(generator).to(torch.bfloat16)
@@ -177,16 +160,6 @@ def test_extremes_are_finite_in_bfloat16(generator: Generator) -> None:
     assert completed(low, ring(1, horizontal_fov_deg=40, name="t"), behind).images[0].float().isfinite().all()
 
 
-def test_with_an_autoencoder() -> None:
-    vae = AutoencoderConfig(widths=(16, 16), layers=1, latent_channels=4, norm_groups=8)
-    torch.manual_seed(0)
-    made = Generator.from_config(small_config(autoencoder=vae, image_size=(12, 20))).eval()
-    stirred(made.denoiser)
-    assert completed(made).images[2].shape == (3, 48, 80)
-    with pytest.raises(GeneratorError, match="float16"):
-        completed(made.half())
-
-
 def test_without_diffusers_the_install_command_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
     for package, needed in (("diffusers", lambda: Generator.from_config(small_config())),
                             ("safetensors", lambda: Generator.from_pretrained("anywhere"))):  # fmt: skip
@@ -194,3 +167,85 @@ def test_without_diffusers_the_install_command_is_given(monkeypatch: pytest.Monk
         monkeypatch.delitem(sys.modules, f"{package}.torch", raising=False)
         with pytest.raises(ImportError, match=rf"{package} is not installed: pip install 'arbiview_aug\[generator\]'"):
             needed()
+
+
+def test_more_steps_than_one_are_warned_of_once() -> None:
+    generator = Generator.from_config(small_config(steps=1, name="warned of"))
+    with pytest.warns(UserWarning, match=r"steps=4: generator 'warned of' was trained for one step; more add noise"):
+        Diffusion(generator, steps=4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Diffusion(generator, steps=10)
+
+
+def test_a_generator_is_asked_for() -> None:
+    for make in (Diffusion, lambda: RigRetarget("waymo", holes="diffusion"), lambda: load_inpainter(None)):
+        with pytest.raises(GeneratorError, match="expected a generator or its folder, got none: python -m"):
+            make()
+
+
+def randn(seed: int) -> torch.Tensor:
+    return torch.randn(1, 2, 4, 5, 6, generator=torch.Generator().manual_seed(seed))
+
+
+def config(prediction: str = "v_prediction", residual: bool = False, **settings: Any) -> Any:
+    is_v = prediction == "v_prediction"
+    return small_config(prediction=prediction, zero_snr=is_v, residual=residual, **{"temperature": 1.0, **settings})
+
+
+def test_time_steps_are_trailing() -> None:
+    assert timesteps(4, 1.0) == [999, 749, 499, 249]
+    assert timesteps(4, 0.6) == [599, 449, 299, 149]
+    assert timesteps(1, 1.0) == [999]  # "leading" would be 0
+    assert timesteps(50, 0.6)[:2] == [599, 587] and len(timesteps(50, 0.6)) == 50
+    assert timesteps(50, 0.01) == list(range(9, -1, -1))  # no time twice
+    assert timesteps(4, 1e-9) == [0]
+
+
+@pytest.mark.parametrize("prediction", ["v_prediction", "epsilon"])
+@pytest.mark.parametrize(("steps", "strength"), [(2, 1.0), (4, 0.6), (50, 0.6), (4, 0.001)])
+def test_a_perfect_denoiser_gives_the_image_back(prediction: str, steps: int, strength: float) -> None:
+    """x0 comes out exactly, whatever the start; also from t = 999, where nothing of it is left in v's schedule."""
+    x0, noise, settings = randn(0), randn(1), config(prediction, steps=steps, strength=strength)
+    alphas = noise_schedule(settings).alphas_cumprod.double()
+    seen: list[int] = []
+
+    def predict(x: torch.Tensor, t: int) -> torch.Tensor:
+        seen.append(t)
+        a, s = alphas[t].sqrt(), (1 - alphas[t]).sqrt()
+        eps = (x.double() - a * x0) / s
+        return (eps if prediction == "epsilon" else a * eps - s * x0).float()
+
+    got = sample(predict, x0 + 0.3 * randn(2), noise, settings)
+    assert torch.allclose(got, x0, atol=5e-3)
+    assert seen == timesteps(steps, strength)
+
+
+@pytest.mark.parametrize("residual", [False, True])
+@pytest.mark.parametrize("steps", [1, 4])
+def test_the_start_is_the_prefilled_latent_or_the_regressions_result_with_noise(residual: bool, steps: int) -> None:
+    calls: list[tuple[int, torch.Tensor]] = []
+
+    def predict(x: torch.Tensor, t: int) -> torch.Tensor:
+        calls.append((t, x))
+        return x + 1 if t == REGRESSION else torch.zeros_like(x)
+
+    settings = config(residual=residual, steps=steps, strength=0.6, temperature=0.5)
+    out = sample(predict, randn(0), randn(1), settings)
+    is_regression = residual or steps == 1
+    assert [t for t, _ in calls] == [REGRESSION] * is_regression + (timesteps(4 - residual, 0.6) if steps > 1 else [])
+    start = randn(0) + is_regression
+    if steps == 1:
+        assert torch.equal(out, start)
+    else:
+        a = noise_schedule(settings).alphas_cumprod[599]
+        assert torch.allclose(calls[int(residual)][1], a.sqrt() * start + 0.5 * (1 - a).sqrt() * randn(1), atol=1e-5)
+
+
+def test_guidance() -> None:
+    c, u = randn(0), randn(1)
+    assert torch.allclose(guided(c, u, 1.0, 0.0), c)
+    assert torch.allclose(guided(c, u, 3.0, 0.0), u + 3 * (c - u))
+    strong = guided(c, u, 7.5, 1.0)  # each view has its conditional's deviation
+    assert torch.allclose(strong.std((2, 3, 4)), c.std((2, 3, 4)), rtol=1e-4)
+    assert torch.isfinite(guided(torch.zeros_like(c), torch.zeros_like(c), 7.5, 0.7)).all()

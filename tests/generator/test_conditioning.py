@@ -15,7 +15,6 @@ from arbiview_aug.generator.conditioning import (
     frame_geometry,
     nearest_sources,
     plucker_rays,
-    pooled,
     pose_vector,
 )
 from tests.generator.small import ring, small_config
@@ -36,13 +35,6 @@ def test_rays_are_directions_and_moments_in_the_references_frame() -> None:
     assert torch.allclose(moment[1, 2], torch.tensor([0.0, 0.5, 0.0]), atol=1e-6)
     own = plucker_rays(left, left, (3, 5))
     assert torch.allclose(own[:3], rays[:3], atol=1e-6) and not own[3:].any()
-
-
-def test_rays_of_a_latent_pixel_are_those_of_its_middle() -> None:
-    """Outer edges coincide: the first of 5 columns of 100 pixels has its centre at x = 9.5."""
-    direction = plucker_rays(ONE, ONE, (3, 5))[:3, 0, 0].numpy()
-    expected = ONE.unproject_cam(np.array([9.5, 9.5])).directions
-    assert np.abs(direction - expected).max() < 1e-6
 
 
 def test_poses_are_relative_and_bounded() -> None:
@@ -66,15 +58,6 @@ def test_the_reference_is_the_source_that_looks_most_alike() -> None:
     twins = [replace(ONE, name="a"), ONE.shifted(z_m=0.1)]
     (first, second), (first_of_reversed, _) = nearest_sources(ONE, twins), nearest_sources(ONE, twins[::-1])
     assert {first, second} == {0, 1} and twins[first] == twins[::-1][first_of_reversed]
-
-
-def test_masks_are_means_over_latent_pixels() -> None:
-    mask = torch.zeros(2, 4, 6, dtype=torch.bool)
-    mask[0, :2, :3] = True
-    mask[1, 0, 0] = True
-    expected = torch.tensor([[[1, 0], [0, 0]], [[1 / 6, 0], [0, 0]]])
-    assert torch.allclose(pooled(mask, (2, 2)), expected)
-    assert pooled(mask, (3, 5)).shape == (2, 3, 5)  # odd sizes
 
 
 def test_the_pose_token_follows_the_prompt() -> None:

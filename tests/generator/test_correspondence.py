@@ -10,13 +10,11 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.favs.stage1_geometry import h_geom, h_planar
 from arbiview_aug.generator.correspondence import (
     FACING_M,
     correspond,
     correspondences,
     plane_vectors,
-    ray_map,
     window,
 )
 
@@ -35,11 +33,6 @@ def found(query: Camera, key: Camera, ground_z_m: float = 0.0, grid: tuple[int, 
     small = query.resize(grid)
     planes = plane_vectors(query, ground_z_m)
     return correspond(query, small.unproject_cam(small.pixel_grid()), key.resize(grid), planes)
-
-
-def homography(query: Camera, key: Camera, plane: np.ndarray) -> np.ndarray:
-    """H_ij = K_j (R + t nᵀ/d) K_i⁻¹ of two pinhole cameras."""
-    return key.K @ ray_map(query, key, plane) @ np.linalg.inv(query.K)
 
 
 def points_on_planes(query: Camera, ground_z_m: float, grid: tuple[int, int]) -> np.ndarray:
@@ -64,40 +57,6 @@ def test_tokens_lie_where_the_3d_points_of_their_planes_project(key: Camera) -> 
     inside[1] &= (below_horizon - LEFT.center_m) @ LEFT.cam2ego[:3, 2] > 0
     assert np.array_equal(valid, inside)
     assert (centre[~valid] == 0).all()
-
-
-def test_pinholes_are_mapped_by_the_papers_homographies() -> None:
-    planes = plane_vectors(LEFT, 0.0)
-    small, key = LEFT.resize(GRID), RIGHT.resize(GRID)
-    centre, valid = found(LEFT, RIGHT)
-    pixel = np.concatenate([small.pixel_grid(), np.ones((*GRID, 1))], -1)
-    for level in range(3):
-        p = pixel @ homography(small, key, planes[level]).T
-        assert np.abs(p[..., :2] / p[..., 2:] - centre[level])[valid[level]].max() <= 1e-9
-
-
-def test_homographies_are_those_of_stage_1() -> None:
-    """h_planar has the paper's minus sign: its normal points from the plane to the camera."""
-    infinity, road, _ = plane_vectors(LEFT, 0.0)
-    H = homography(LEFT, RIGHT, infinity)
-    assert np.allclose(H, h_geom(LEFT, RIGHT), atol=1e-9)
-    up = LEFT.cam2ego[:3, :3].T @ np.array([0.0, 0.0, 1.0])
-    assert np.allclose(homography(LEFT, RIGHT, road), h_planar(LEFT, RIGHT, up, LEFT.center_m[2]), atol=1e-9)
-
-
-def test_a_token_is_a_pixel_of_the_resized_camera() -> None:
-    """Convention: outer edges coincide. With twice the pixels, a token has its centre between four."""
-    twice = LEFT.resize((448, 800))
-    centre, valid = found(LEFT, twice)
-    assert valid[0].all()
-    assert np.abs(centre[0] - LEFT.resize(GRID).pixel_grid()).max() <= 1e-9
-    fine = correspond(
-        LEFT,
-        LEFT.resize(GRID).unproject_cam(LEFT.resize(GRID).pixel_grid()),
-        LEFT.resize((28, 50)),
-        plane_vectors(LEFT, 0.0)[:1],
-    )[0][0]
-    assert np.abs(fine[0, 0] - [0.5, 0.5]).max() <= 1e-9  # between the four fine tokens that a coarse one covers
 
 
 def test_masks() -> None:
@@ -139,15 +98,6 @@ def test_neighbours_come_from_overlap_not_from_the_list() -> None:
     assert read["CAM_BACK"] == {"CAM_BACK_LEFT", "CAM_BACK_RIGHT"}
     for one, others in read.items():
         assert all(one in read[other] for other in others)
-
-
-def test_bilinear_rows_interpolate() -> None:
-    at = window(correspondences([LEFT], [LEFT, RIGHT], [0], [GRID], 0.0)[0], 2)
-    rows = at.bilinear()
-    assert torch.allclose(rows.sum(1), torch.ones(len(rows)), atol=1e-6)
-    whole = at.inside.all(1)
-    assert (rows[whole][..., None] * at.delta()[whole]).sum(1).abs().max() < 1e-5  # their mean is p_j itself
-    assert (rows > 0).sum(1).max() == 4
 
 
 def test_far_away_and_huge_calibrations_stay_finite() -> None:

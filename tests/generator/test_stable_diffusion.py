@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import torch
 from diffusers import AutoencoderKL, UNet2DConditionModel
 
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator import Generator, GeneratorConfig, paper
+from arbiview_aug.generator import PRESETS, Generator, GeneratorConfig
 from arbiview_aug.generator.conditioning import frame_geometry
 from arbiview_aug.generator.config import AutoencoderConfig, UNetConfig
 from arbiview_aug.generator.denoiser import Denoiser
@@ -42,23 +41,6 @@ UNET_15 = {
 }
 """unet/config.json of Stable Diffusion 1.5 as published, without its version entries."""
 
-LATER_15 = {
-    "class_embed_type": None,
-    "conv_in_kernel": 3,
-    "cross_attention_norm": None,
-    "dual_cross_attention": False,
-    "mid_block_only_cross_attention": None,
-    "mid_block_type": "UNetMidBlock2DCrossAttn",
-    "num_class_embeds": None,
-    "only_cross_attention": False,
-    "resnet_time_scale_shift": "default",
-    "time_embedding_type": "positional",
-    "transformer_layers_per_block": 1,
-    "upcast_attention": None,
-    "use_linear_projection": False,
-}
-"""Entries that later versions of diffusers write for the same U-Net."""
-
 VAE_15 = {
     "act_fn": "silu",
     "block_out_channels": [128, 256, 512, 512],
@@ -82,8 +64,8 @@ def test_the_paper_configuration_has_stable_diffusions_layout() -> None:
     """Key by key; 859,520,964 and 83,653,863 parameters, as published, and only ``conv_in`` is wider."""
     with torch.device("meta"):
         unet, vae = UNet2DConditionModel.from_config(UNET_15), AutoencoderKL.from_config(VAE_15)
-        plain, made = shapes(unet), Generator.from_config(paper())
-        attached = Denoiser(unet, paper())
+        plain, made = shapes(unet), Generator.from_config(PRESETS["paper"])
+        attached = Denoiser(unet, PRESETS["paper"])
     assert sum(torch.Size(s).numel() for s in plain.values()) == 859_520_964 and len(plain) == 686
     assert sum(torch.Size(s).numel() for s in shapes(vae).values()) == 83_653_863
     wide = {**plain, "conv_in.weight": (320, 16, 3, 3)}
@@ -112,7 +94,7 @@ def config() -> GeneratorConfig:
 def saved(folder: Path, settings: GeneratorConfig) -> Path:
     """A folder of diffusers with random weights for these settings."""
     torch.manual_seed(0)
-    UNet2DConditionModel(**settings.unet.arguments(settings.unet_channels, 4)).save_pretrained(folder / "unet")
+    UNet2DConditionModel(**settings.unet.arguments(9 if settings.inpainting else 4, 4)).save_pretrained(folder / "unet")
     vae = {**settings.autoencoder.arguments(), "scaling_factor": 0.18215}
     AutoencoderKL(**vae).save_pretrained(folder / "vae")
     return folder
@@ -207,19 +189,10 @@ def test_weights_that_do_not_fit_are_named(folder: Path) -> None:
         ("unet", "block_out_channels", [32, 32], r"expected block_out_channels \(32, 32, 64, 64\), got \[32, 32\]"),
         ("unet", "down_block_types", ["AttnDownBlock2D"] * 4, r"expected down_block_types \(.*got \['AttnDownBlock2D"),
         ("unet", "use_linear_projection", True, "unet: expected use_linear_projection False, got True"),
-        ("unet", "transformer_layers_per_block", 2, "expected transformer_layers_per_block 1, got 2"),
         ("unet", "only_cross_attention", [False, False, False, True], "expected only_cross_attention False, got"),
-        ("unet", "resnet_time_scale_shift", "scale_shift", "expected resnet_time_scale_shift default, got 'scale_"),
-        ("unet", "num_class_embeds", 3, "expected num_class_embeds None, got 3"),
-        ("unet", "flip_sin_to_cos", False, "expected flip_sin_to_cos True, got False"),
-        ("unet", "act_fn", "gelu", "unet: expected act_fn silu, got 'gelu'"),
-        ("vae", "act_fn", "gelu", "vae: expected act_fn silu, got 'gelu'"),
         ("vae", "use_quant_conv", False, "vae: expected use_quant_conv True, got False"),
-        ("vae", "block_out_channels", [16, 16, 16], r"\(16, 16, 16, 16\), got \[16, 16, 16\]"),
-        ("vae", "block_out_channels", [[16], [16]], r"expected block_out_channels .*, got \[\[16\], \[16\]\]"),
         ("vae", "block_out_channels", 16, "vae: expected the weights of this AutoencoderKL as safetensors"),
         ("vae", "scaling_factor", None, "vae: expected a number as scaling_factor, got None"),
-        ("unet", "class_embed_type", "timestep", "unet: expected class_embed_type None, got 'timestep'"),
         ("vae", "latent_channels", 16, "vae: expected latent_channels 4, got 16"),
     ],
 )
@@ -236,10 +209,9 @@ def test_a_prediction_that_the_unet_was_not_trained_for_is_named(folder: Path) -
     refused(folder, "scheduler: expected prediction_type 'epsilon', as of config 'test', got 'v_prediction'")
 
 
-@pytest.mark.parametrize("more", [{}, LATER_15])
-def test_folders_as_they_were_published_are_read(folder: Path, tmp_path: Path, more: dict[str, Any]) -> None:
-    """The entries of diffusers 0.2 alone, of later versions too, and unknown ones; schedulers without a prediction."""
-    own, unet = config(), UNET_15 | more
+def test_folders_as_they_were_published_are_read(folder: Path) -> None:
+    """The entries of diffusers 0.2, and unknown ones; schedulers without a prediction."""
+    own, unet = config(), UNET_15
     arguments = own.unet.arguments(4, 4) | {"attention_head_dim": 2}
     for part, published, sizes in (("unet", unet, arguments), ("vae", VAE_15, own.autoencoder.arguments())):
         given = {key: sizes.get(key, value) for key, value in published.items()}
@@ -257,7 +229,7 @@ def test_missing_folders_and_prompts_are_named(folder: Path, tmp_path: Path) -> 
         Generator.from_stable_diffusion(folder, config(), empty_prompt=torch.zeros(77, 24))
 
 
-def test_the_text_encoder_is_loaded_completely_or_not_at_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_text_encoder_is_loaded_completely_or_not_at_all(folder: Path) -> None:
     transformers = pytest.importorskip("transformers")
     size = {"hidden_size": 24, "intermediate_size": 32, "num_attention_heads": 2, "num_hidden_layers": 2}
 
@@ -288,9 +260,6 @@ def test_the_text_encoder_is_loaded_completely_or_not_at_all(folder: Path, monke
         saved_encoder(**other)
         with pytest.raises(GeneratorError, match="text_encoder: expected CLIP's, which reads 77 of 49408 tokens"):
             embedded_empty_prompt(folder)
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ImportError, match=r"^transformers is not installed: pip install 'arbiview_aug\[generator\]'$"):
-        embedded_empty_prompt(folder)
 
 
 def test_half_precision_is_refused_by_the_autoencoder(folder: Path) -> None:

@@ -19,12 +19,13 @@ from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator import Diffusion, load_inpainter
+from arbiview_aug.generator import Diffusion, Generator, load_inpainter
 from arbiview_aug.inpaint import Black, CompletedLoader, PipelineInpainter, TorchScriptInpainter
 from arbiview_aug.inpaint.telea import telea
 from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.inputs import read_frames
 from integrations.benchmarks.study import peak_mib
+from tests.generator.small import small_config
 from tests.helpers import ring
 from tests.inpaint.tiny_pipeline import save_tiny_pipeline
 
@@ -150,7 +151,9 @@ def test_cracks_cost_no_call(lama: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["script", "diffusion"])
 def test_a_network_stays_in_evaluation_mode(lama: Path, kind: str) -> None:
-    filler = TorchScriptInpainter(lama, size=64) if kind == "script" else Diffusion()
+    filler = (
+        TorchScriptInpainter(lama, size=64) if kind == "script" else Diffusion(Generator.from_config(small_config()))
+    )
     model = nn.ModuleList([RigRetarget("waymo", holes=filler)]).train()
     assert model[0].training
     network = filler.network if kind == "script" else filler.generator
@@ -273,7 +276,7 @@ def test_what_is_no_network_is_refused(lama: Path, tmp_path: Path) -> None:
     with pytest.raises(GeneratorError, match="expected a generator's folder"):
         load_inpainter(tmp_path / "empty")
     assert isinstance(load_inpainter(lama), TorchScriptInpainter)
-    with pytest.raises(ValueError, match=r"generator: expected a Generator, got Identity"):
+    with pytest.raises(ValueError, match=r"generator: expected a Generator or its folder, got Identity"):
         RigRetarget("waymo", holes=Diffusion(nn.Identity()))  # type: ignore[arg-type]
 
 

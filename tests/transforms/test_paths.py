@@ -94,13 +94,15 @@ class _Retargeted(torch.utils.data.Dataset[Any]):
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_batches_are_completed_as_samples_are(generator: Generator, workers: int) -> None:
-    completed = CompletedLoader(loader(workers), Diffusion(generator, steps=2))
+    """As each alone by ``complete_batch``; what holes lie behind, which ``RigRetarget`` knows, no batch says."""
+    inpainter = Diffusion(generator, steps=2)
+    completed = CompletedLoader(loader(workers), inpainter)
     assert len(completed) == 2
-    alone = RigRetarget(TARGET, holes=Diffusion(generator, steps=2), keys=SampleKeys(extra=("confidence",)))
+    alone = RigRetarget(TARGET, keys=SampleKeys(extra=("sources", "confidence")))
     for b, batch in enumerate(completed):
         assert "sources" not in batch and batch["images"].dtype == torch.uint8
         for k in range(2):
-            one = alone(a_sample(f"frame {2 * b + k}", 2 * b + k))
+            one = inpainter.complete_batch(alone(a_sample(f"frame {2 * b + k}", 2 * b + k)))
             for key in ("generated", "coverage", "confidence"):
                 assert torch.equal(batch[key][k], one[key]), key
             known = on(~one["generated"], one["images"])
@@ -198,7 +200,7 @@ def test_a_generator_on_the_cpu_works_in_workers(generator: Generator) -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Diffusion("weights"), "generator: expected a Generator, got str"),  # type: ignore[arg-type]
+        (lambda: Diffusion(3), "generator: expected a Generator or its folder, got int"),  # type: ignore[arg-type]
         (lambda: Diffusion(steps=0), "steps: expected a whole number from 1, got 0"),
         (lambda: Diffusion(guidance="x"), "guidance: expected a number"),  # type: ignore[arg-type]
         (lambda: Diffusion(seed=0.5), "seed: expected a whole number"),  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import signal
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,15 +22,12 @@ from arbiview_aug.generator.checkpoint import CONFIG_FILE, read_checkpoint, writ
 
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 _MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")  # in a resumed run
-_NO_SETTINGS = ("data", "frozen weights", "number of processes")  # what else a state knows of its run
-_MOST_NAMED = 6  # settings in one message
 
 
 @contextmanager
 def averaged(average: Any, parameters: Iterable[nn.Parameter]) -> Iterator[None]:
     """Put the weights of diffusers' ``EMAModel`` into the parameters for a while."""
-    parameters = list(parameters)
-    average.store(parameters)
+    average.store(parameters := list(parameters))
     average.copy_to(parameters)
     try:
         yield
@@ -49,9 +46,8 @@ def save_state(
 ) -> None:
     """Write the state after ``step`` steps; OutputError if it fails, and the last state is unchanged.
 
-    ``run`` is plain data: the settings, and all else that must be the same in a resumed run.
-
-    Not accelerate's ``save_state``: it pickles, and writes into the folder in place.
+    ``run`` is plain data that must be the same in a resumed run. Accelerate's ``save_state`` pickles, and writes into
+    the folder in place.
     """
     tensors = {f"weights.{name}": parameter.detach() for name, parameter in parameters.items()}
     tensors |= {f"buffers.{name}": value for name, value in buffers.items()}
@@ -77,11 +73,6 @@ def has_state(output: Path) -> bool:
     return False
 
 
-def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Check settings against those of a saved state, before any work. TrainingError for others, or a broken state."""
-    _read_state(folder, settings, (*_MAY_DIFFER, *_NO_SETTINGS))
-
-
 def load_state(
     folder: Path,
     run: Mapping[str, Any],
@@ -91,8 +82,21 @@ def load_state(
     optimiser: torch.optim.Optimizer,
 ) -> int:
     """Load a saved state into a run; returns its steps. TrainingError for another ``run``, or a broken state."""
-    step, tensors = _read_state(folder, run, _MAY_DIFFER)
     with _broken(folder):
+        data, tensors = read_checkpoint(folder)
+        before, step = _named(dict(data["training"])), data["step"]
+    now = _named(json.loads(json.dumps(run)))
+    changed = [
+        name if name == "frozen weights" else f"{name} ({now.get(name)!r} instead of {before.get(name)!r:.99})"
+        for name in now | before
+        if name.partition(".")[0] not in _MAY_DIFFER and before.get(name) != now.get(name)
+    ]
+    if changed:
+        fix = "resume with the same ones, or give another --output"
+        raise TrainingError(f"{folder}: a run with other {', '.join(changed)}; {fix}")
+    with _broken(folder):
+        if type(step) is not int or not 0 <= step <= now["steps"]:
+            raise ValueError(f"step: expected 0 to {now['steps']}, got {shown(step)}")
         for (name, parameter), shadow in zip(parameters.items(), average.shadow_params, strict=True):
             parameter.data.copy_(tensors[f"weights.{name}"])
             shadow.copy_(tensors[f"average.{name}"])
@@ -108,41 +112,12 @@ def load_state(
     return step
 
 
-def _read_state(folder: Path, run: Mapping[str, Any], ignored: Sequence[str]) -> tuple[int, dict[str, torch.Tensor]]:
-    """Steps and tensors of the saved state of a ``run``, which may differ in what is ``ignored``."""
-    with _broken(folder):
-        data, tensors = read_checkpoint(folder)
-        before, step = _named(dict(data["training"])), data["step"]
-    now = _named(json.loads(json.dumps(run)))
-    changed = {
-        name: "" if name == "frozen weights" else f" ({_text(now, name)} instead of {_text(before, name)})"
-        for name in now | before
-        if name.partition(".")[0] not in ignored and before.get(name) != now.get(name)
-    }
-    if changed:
-        named = [f"{name}{values}" for name, values in changed.items()]
-        if len(named) > _MOST_NAMED:
-            named[_MOST_NAMED:] = [f"and {len(named) - _MOST_NAMED} more"]
-        why = "; steps cannot change, since the learning rate falls to 0 at the last one" if "steps" in changed else ""
-        raise TrainingError(
-            f"{folder}: a run with other {', '.join(named)}; resume with the same ones, or give another --output{why}"
-        )
-    with _broken(folder):
-        if type(step) is not int or not 0 <= step <= now["steps"]:
-            raise ValueError(f"step: expected 0 to {now['steps']}, got {shown(step)}")
-    return step, tensors
-
-
 def _named(settings: Mapping[str, Any], group: str = "") -> dict[str, Any]:
     """Settings under the names that ``--set`` gives them."""
     named: dict[str, Any] = {}
     for name, value in settings.items():
         named |= _named(value, f"{group}{name}.") if isinstance(value, dict) else {f"{group}{name}": value}
     return named
-
-
-def _text(settings: Mapping[str, Any], name: str) -> str:
-    return shown(settings[name]) if name in settings else "nothing"
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Settings of a training run: frozen dataclasses, the configurations as functions, overrides by name."""
+"""Settings of a training run: frozen dataclasses, presets, overrides by name."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from functools import partial
 from typing import Any, Literal
 
 from arbiview_aug.errors import TrainingError
-from arbiview_aug.generator import config as generators
-from arbiview_aug.generator.config import GeneratorConfig, check_fields, from_plain
+from arbiview_aug.generator.config import PRESETS, GeneratorConfig, check_fields, from_plain
 
 GeoMode = Literal["normalised", "frobenius_sum"]
 PseudoQuality = Literal["fast", "paper"]
@@ -21,27 +20,31 @@ _check = partial(check_fields, error=TrainingError)
 
 @dataclass(frozen=True, kw_only=True)
 class PseudoViewConfig:
-    """Pseudo views (Algorithm 1) and what is added to them; probabilities are per training item."""
+    """Pseudo views (Algorithm 1). Ranges are ``RandomRig``'s, of one draw for each training item."""
 
-    quality: PseudoQuality = "fast"  # how FAVS renders them: as this package does, or by the published stages 1 to 4
+    quality: PseudoQuality = "fast"  # rendered over the frame's geometry, or by the published stages 1 to 4
     targets: int = 1  # real views to reconstruct together, of neighbouring cameras: each reads the others
-    yaw_deg: tuple[float, float] = (5.0, 35.0)  # range of a pseudo pose's turn to its side
-    pitch_deg: float = 8.0  # half-widths of the other turns and moves
-    lateral_m: float = 1.0
-    vertical_m: float = 0.3
-    p_translate: float = 0.5  # probability that pseudo poses are translated; otherwise infinity is the only depth level
-    focal: tuple[float, float] = (0.7, 1.3)  # range of the factor of the focal length
-    p_mask_transfer: float = 0.8  # probability of a target's coverage mask; Algorithm 1 leaves next to no holes
-    hidden: float = 0.5  # share of these masks that hide the pixels from the source branches too, as at inference
-    mask_bank: int = 128  # coverage masks drawn from the retarget distribution before training
+    yaw_deg: tuple[float, float] = (-20.0, 20.0)  # paper: to the left for one pose, to the right for the other
+    pitch_deg: tuple[float, float] = (-8.0, 8.0)
+    height_m: tuple[float, float] = (-0.7, 0.7)
+    forward_m: tuple[float, float] = (-1.0, 1.0)
+    lateral_m: tuple[float, float] = (-1.0, 1.0)
+    focal_scale: tuple[float, float] = (0.7, 1.3)
 
     def __post_init__(self) -> None:
-        _check(self, "a probability", lambda p: 0 <= p <= 1, "p_translate", "p_mask_transfer", "hidden")
         _check(self, "fast or paper", lambda q: q in ("fast", "paper"), "quality")
-        _check(self, "at least 1", lambda n: n >= 1, "targets", "mask_bank")
-        _check(self, "a finite number from 0", lambda x: 0 <= x < math.inf, "pitch_deg", "lateral_m", "vertical_m")
-        _check(self, "0 <= low <= high <= 90", lambda yaw: len(yaw) == 2 and 0 <= yaw[0] <= yaw[1] <= 90, "yaw_deg")
-        _check(self, "0 < low <= high, both finite", lambda f: len(f) == 2 and 0 < f[0] <= f[1] < math.inf, "focal")
+        _check(self, "at least 1", lambda n: n >= 1, "targets")
+        _check(self, "1 with quality='paper'", lambda n: n == 1 or self.quality == "fast", "targets")
+        _check(self, "finite low <= high", lambda r: len(r) == 2 and -math.inf < r[0] <= r[1] < math.inf, *_RANGES)
+        _check(self, "0 < low <= high", lambda r: r[0] > 0, "focal_scale")
+
+    @property
+    def ranges(self) -> dict[str, Any]:
+        """Arguments of ``RandomRig``."""
+        return {name: getattr(self, name) for name in _RANGES}
+
+
+_RANGES = ("yaw_deg", "pitch_deg", "height_m", "forward_m", "lateral_m", "focal_scale")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,47 +130,52 @@ def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
     return from_plain(TrainConfig, data, "config", TrainingError)
 
 
-# --- configurations ---------------------------------------------------------------------------------------------------
-def paper() -> TrainConfig:
-    """Algorithm 1 as published, on Stable Diffusion's frozen weights and the published stages' pseudo views.
+# --- presets ----------------------------------------------------------------------------------------------------------
+_STILL = (0.0, 0.0)
+_PAPER = TrainConfig(
+    generator=PRESETS["paper"],
+    pseudo_views=PseudoViewConfig(
+        quality="paper", yaw_deg=(5.0, 35.0), height_m=_STILL, forward_m=_STILL, lateral_m=_STILL
+    ),
+    loss=LossConfig(snr_limit=0.0, known_weight=1.0, regression=0.0),
+    steps=100_000,
+    batch=8,
+    lr=1e-4,
+    precision="bf16",
+    checkpointing=True,
+    workers=12,
+    save_every=2000,
+    validate_every=2000,
+)
+"""Algorithm 1 as published, on Stable Diffusion's frozen weights and the published stages' pseudo views.
 
-    See Sec. Training Parameters. Deviations: x0 is the real view's latent (``training.losses``). Pseudo poses are
-    turned but not moved: the published stages know rotations alone. L_geo is normalised, since as printed it outgrows
-    L_main (``loss.geo_mode="frobenius_sum"``). L_perceptual compares crops at early times, in every 4th step. The
-    learning rate is warmed up for 100 steps, and guidance is rescaled.
-    """
-    return TrainConfig(
-        generator=generators.paper(),
-        pseudo_views=PseudoViewConfig(quality="paper", p_translate=0.0, p_mask_transfer=0.0),
-        loss=LossConfig(snr_limit=0.0, known_weight=1.0, regression=0.0),
-        steps=100_000,
-        batch=8,
-        lr=1e-4,
+See Sec. Training Parameters. Deviations: x0 is the real view's latent (``training.losses``). Pseudo poses are turned
+but not moved: the published stages know rotations alone. L_geo is normalised, since as printed it outgrows L_main
+(``loss.geo_mode="frobenius_sum"``). L_perceptual compares crops at early times, in every 4th step. The learning rate is
+warmed up for 100 steps, and guidance is rescaled.
+"""
+
+CONFIGS = {
+    # An hour of a CPU, without VGG, which would take most of it.
+    "compact": TrainConfig(
+        generator=PRESETS["compact"],
+        pseudo_views=PseudoViewConfig(targets=3),
+        loss=LossConfig(perceptual=0.0, regression=0.9),
+        steps=2400,
+        batch=6,
+        lr=1e-3,
+        warmup=50,
+        ema=0.995,
         precision="bf16",
-        checkpointing=True,
-        workers=12,
-        save_every=2000,
-        validate_every=2000,
-    )
-
-
-def inpaint() -> TrainConfig:
-    """Cross-view attention and LoRA on Stable Diffusion's frozen inpainting U-Net, two neighbouring targets an item."""
-    return replace(
-        paper(),
-        generator=generators.inpaint(),
-        pseudo_views=PseudoViewConfig(targets=2),
-        loss=LossConfig(regression=0.0),
-        steps=20_000,
-        batch=4,
-        checkpointing=False,
-    )
-
-
-def small() -> TrainConfig:
-    """Minutes on a GPU."""
-    return TrainConfig(
-        generator=generators.small(),
+        scenes=400,
+        workers=1,
+        save_every=200,
+        validate_every=200,
+        validation_items=32,
+    ),
+    # A GPU.
+    "small": TrainConfig(
+        generator=PRESETS["small"],
         steps=20_000,
         batch=16,
         lr=3e-4,
@@ -176,41 +184,17 @@ def small() -> TrainConfig:
         workers=12,
         save_every=1000,
         validate_every=1000,
-    )
-
-
-def compact() -> TrainConfig:
-    """The run of the shipped weights: an hour or two on a CPU."""
-    return replace(
-        tiny(),
-        generator=generators.compact(),
-        steps=2400,
-        lr=1e-3,
-        warmup=50,
-        ema=0.995,
-        precision="bf16",
-        scenes=400,
-        save_every=200,
-        validate_every=200,
-    )
-
-
-def tiny() -> TrainConfig:
-    """Minutes on a CPU, without VGG, which would take most of them."""
-    return TrainConfig(
-        generator=generators.tiny(),
-        loss=LossConfig(perceptual=0.0, regression=0.5),
-        steps=500,
-        batch=16,
-        lr=1.5e-3,
-        warmup=30,
-        ema=0.99,
-        scenes=160,
-        workers=1,
-        save_every=200,
-        validate_every=200,
-        validation_items=32,
-    )
-
-
-CONFIGS = {"paper": paper, "inpaint": inpaint, "small": small, "compact": compact, "tiny": tiny}
+    ),
+    # Cross-view attention and LoRA on Stable Diffusion's frozen inpainting U-Net, two neighbouring targets an item.
+    "inpaint": replace(
+        _PAPER,
+        generator=PRESETS["inpaint"],
+        pseudo_views=PseudoViewConfig(targets=2),
+        loss=LossConfig(regression=0.0),
+        steps=20_000,
+        batch=4,
+        checkpointing=False,
+    ),
+    "paper": _PAPER,
+}
+"""Training runs by name."""

@@ -18,8 +18,7 @@ from arbiview_aug.errors import TrainingError
 from arbiview_aug.files import open_regular
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
-from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, Denoiser, Rows
-from arbiview_aug.generator.sampler import noise_schedule
+from arbiview_aug.generator.denoiser import REGRESSION, Autoencoder, Denoiser, Rows, noise_schedule
 from arbiview_aug.generator.training.config import GeoMode, TrainConfig
 from arbiview_aug.generator.training.pseudo_views import Batch
 

@@ -1,10 +1,15 @@
-"""The training loop: steps, averaging, logs, validation and checkpoints (Algorithm 1, Sec. Training Parameters)."""
+"""The training loop and its command: steps, averaging, logs, validation and checkpoints (Algorithm 1)."""
 
 from __future__ import annotations
 
+import argparse
+import json
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, replace
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +18,7 @@ import torch
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
+from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError, OutputError, TrainingError, one_line
 from arbiview_aug.evaluate.report.pictures import contact_sheet, save_picture
@@ -20,24 +26,31 @@ from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import denoised, shown_condition
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.generator.config import TrainedOn
-from arbiview_aug.generator.training.checkpointing import averaged, has_state, load_state, save_state, stop_requests
-from arbiview_aug.generator.training.config import TrainConfig
-from arbiview_aug.generator.training.data import Frames, item_workers
-from arbiview_aug.generator.training.losses import Perceptual, Step, draw
-from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate, mask_bank
+from arbiview_aug.generator.training.checkpointing import (
+    averaged,
+    has_state,
+    load_state,
+    save_state,
+    stop_requests,
+)
+from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
+from arbiview_aug.generator.training.data import Frames, item_workers, open_frames
+from arbiview_aug.generator.training.losses import Perceptual, Step, draw, load_perceptual
+from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.inpaint.inpainter import digest_of
 
 _LOG_EVERY = 10
 _DEVIATION_ITEMS = 32
 _MIN_DEVIATION = 0.02  # lower bound of the residual's deviation, 2.5 grey levels: the error of rendering twice
-_SEEDS = {"items": 1, "validation": 2, "masks": 3, "draws": 4}  # offsets: no stream sees another's draws
+_TIMEOUT = timedelta(hours=3)  # of a process that waits for the others: they prepare frames, validate and save
+_SEEDS = {"items": 1, "validation": 2, "draws": 4}  # offsets: no stream sees another's draws
 
 
 class Trainer:
     """Training of a generator's denoiser (Algorithm 1), on one process or many.
 
     The output folder gets ``generator/`` (averaged weights, for ``Generator.from_pretrained``), ``state/`` (to resume
-    from), ``logs/`` (TensorBoard) and ``validation/`` (PNG).
+    from), ``log.jsonl`` (losses and scores by step) and ``validation/`` (PNG).
 
     Args:
         generator: Trained in place on the ``frames``; its autoencoder is frozen.
@@ -50,7 +63,7 @@ class Trainer:
         TrainingError: The output holds a run with other settings, data, frozen weights or number of processes, or a
             generator without a state; the generator is frozen or has another configuration; VGG16 is missing; the
             process has another precision.
-        ImportError: accelerate or tensorboard is not installed.
+        ImportError: accelerate is not installed.
     """
 
     def __init__(
@@ -73,7 +86,7 @@ class Trainer:
             fix = "a process keeps its first precision; start another one"
             raise TrainingError(f"Trainer: precision={config.precision}: {one_line(error)}; {fix}") from None
         self.is_main: bool = self.accelerator.is_main_process
-        self.show, self.say = show and self.is_main, say if self.is_main else silent
+        self.show, self.say = show and self.is_main, say if self.is_main else lambda _: None
         self.device = self.accelerator.device
         scaled = replace(config.generator.autoencoder, scale=generator.config.autoencoder.scale)
         if generator.config != replace(config.generator, autoencoder=scaled, one_step=generator.config.one_step):
@@ -107,7 +120,6 @@ class Trainer:
         }
         self._buffers = {"deviation": generator.denoiser.deviation} if config.generator.residual else {}
         self.done, state = 0, self.output / "state"
-        self._writer: Any = None  # TensorBoard's, in the main process
         is_resumed = has_state(self.output)
         if is_resumed:
             self.done = load_state(state, self._run, self.trained, self._buffers, self.average, self.optimiser)
@@ -116,9 +128,7 @@ class Trainer:
         self.model, self._optimiser = self.accelerator.prepare(
             self.step, self.optimiser, device_placement=[True, False]
         )
-        rig, first = frames[self.split.training[0]].rig, 10 * config.seed
-        masks = mask_bank(rig, config.pseudo_views.mask_bank, config.seed + _SEEDS["masks"])
-        shared = config.pseudo_views, config.generator, masks
+        shared, first = (config.pseudo_views, config.generator), 10 * config.seed
         maker = "cpu" if config.workers else self.device
         self.items = PseudoViews(frames, self.split.training, *shared, first + _SEEDS["items"], maker)
         validation = self.split.validation or self.split.training
@@ -150,10 +160,6 @@ class Trainer:
         TrainingError if a loss or gradient is not finite, OutputError if the last state could not be saved.
         """
         config = self.config
-        if self.is_main:
-            tensorboard = optional_package("torch.utils.tensorboard", "generator")
-            purged = self.done + 1 if self.done else None
-            self._writer = tensorboard.SummaryWriter(str(self.output / "logs"), purge_step=purged)
         bar = tqdm(total=config.steps, initial=self.done, desc="train", unit="step", disable=not self.show)
         try:
             with stop_requests() as asked:
@@ -163,8 +169,7 @@ class Trainer:
                     bar.update()
                     last = self.done == config.steps
                     if self.done % _LOG_EVERY == 0 or last:
-                        rate = {"lr": learning_rate(config, self.done - 1)}
-                        self._log({f"loss/{name}": value for name, value in terms.items()} | rate)
+                        self._log({**terms, "lr": learning_rate(config, self.done - 1)})
                         bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()})
                     if self.done % config.validate_every == 0 or last:
                         self._validate()
@@ -172,11 +177,13 @@ class Trainer:
                     if self.accelerator.reduce(stops, "sum") > 0:  # all processes stop after the same step
                         break
                     if self.done % config.save_every == 0 and not last:
-                        self._save_or_warn()
+                        try:
+                            self.save()
+                        except OutputError as error:
+                            self.say(f"step {self.done}: not saved, continuing with the last good state: {error}")
                 self.save()
         finally:
             bar.close()
-            self._log({}, closing=True)
         if self.done < config.steps:
             self.say(f"stopped after step {self.done} of {config.steps}; saved: the same command goes on from there")
         return self.done == config.steps
@@ -217,20 +224,11 @@ class Trainer:
         numbers: Any = [range(n * config.batch, (n + 1) * config.batch) for n in first]
         return iter(DataLoader(self.items, batch_sampler=numbers, collate_fn=collate, **item_workers(config.workers)))
 
-    def _log(self, values: Mapping[str, float], validation: Any = None, *, closing: bool = False) -> None:
-        """Write to TensorBoard; a full disk ends the log, not the run."""
-        if self._writer is None:
-            return
-        try:
-            for name, value in values.items():
-                self._writer.add_scalar(name, value, self.done)
-            if validation is not None:
-                self._writer.add_image("validation", validation, self.done, dataformats="HWC")
-            if closing:
-                self._writer.close()
-        except OSError as error:
-            self._writer = None
-            self.say(f"step {self.done}: logs of TensorBoard end here, the run goes on: {error}")
+    def _log(self, values: Mapping[str, float]) -> None:
+        """Append a line to the log; a full disk costs the line, not the run."""
+        if self.is_main:
+            with suppress(OSError), (self.output / "log.jsonl").open("a") as log:
+                log.write(json.dumps({"step": self.done, **values}) + "\n")
 
     # --- saving -------------------------------------------------------------------------------------------------------
     def save(self) -> None:
@@ -244,12 +242,6 @@ class Trainer:
         finally:  # the other processes wait in any case
             self.accelerator.wait_for_everyone()
 
-    def _save_or_warn(self) -> None:
-        try:
-            self.save()
-        except OutputError as error:
-            self.say(f"step {self.done}: not saved, going on with the last good state: {error}")
-
     def _validate(self) -> None:
         """Log samples of fixed items by the averaged weights, and their mean PSNR inside the holes, in dB by method."""
         config, steps = self.config, max(2, self.config.generator.steps)
@@ -262,7 +254,7 @@ class Trainer:
                 methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)
             inside = {name: hole_psnr(made, batch.truth, batch.holes) for name, made in methods.items()}
             scores, image = {name: float(psnr.nanmean()) for name, psnr in inside.items()}, picture(batch, samples)
-            self._log({f"hole_psnr/{name}": value for name, value in scores.items()}, image)
+            self._log({f"hole_psnr/{name}": value for name, value in scores.items()})
             try:
                 save_picture(self.output / "validation" / f"{self.done:06d}.png", image)
             except DataError as error:
@@ -270,10 +262,6 @@ class Trainer:
             numbers = ", ".join(f"{name} {value:.2f}" for name, value in scores.items())
             self.say(f"step {self.done}: PSNR inside the holes, dB: {numbers}")
         self.accelerator.wait_for_everyone()
-
-
-def silent(message: str) -> None:
-    """Say nothing: the main process alone prints."""
 
 
 def learning_rate(config: TrainConfig, step: int) -> float:
@@ -302,16 +290,49 @@ def hole_psnr(images: torch.Tensor, truth: torch.Tensor, holes: torch.Tensor) ->
     return -10 * torch.log10(mse.clamp(min=1e-10))
 
 
-COLUMNS = ("source", "source", "FAVS", "mask", "filled", "sample", "truth")
-_COLUMN_PX = 120  # smaller views are enlarged
+COLUMNS = ("source", "FAVS", "mask", "filled", "sample", "truth")
 
 
 def picture(batch: Batch, samples: torch.Tensor) -> np.ndarray:
     """(height, width, 3) uint8: a row for each item of a batch with samples (B, N, 3, H, W), a column for each view."""
-    mask = batch.known[:, :1, None].float().expand_as(batch.favs[:, :1])
-    firsts = (batch.favs, mask, batch.condition, samples, batch.truth)
-    views = torch.cat([batch.sources[:, :2], *(views[:, :1] for views in firsts)], 1).cpu().clamp(0, 1) * 255
+    mask = batch.known[:, :, None].float().expand_as(batch.favs)
+    columns = (batch.sources, batch.favs, mask, batch.condition, samples, batch.truth)
+    views = torch.cat([views[:, :1] for views in columns], 1).cpu().clamp(0, 1) * 255
     rows = views.permute(0, 1, 3, 4, 2).numpy()  # [B, columns, h, w, 3]
-    width = len(COLUMNS) * max(_COLUMN_PX, rows.shape[3])
+    width = len(COLUMNS) * max(120, rows.shape[3])  # smaller views are enlarged
     titled = [(token, list(row), COLUMNS) for token, row in zip(batch.tokens, rows, strict=True)]
     return contact_sheet(titled, width_px=width)
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> int:
+    config = overridden(CONFIGS[arguments.config], arguments.set)
+    output = Path(arguments.output)
+    writable_folder(output, arguments.output)
+    accelerate = optional_package("accelerate", "generator")
+    processes = accelerate.PartialState(cpu=not torch.cuda.is_available(), timeout=_TIMEOUT)
+    options: dict[str, Any] = {"show": processes.is_main_process and not arguments.quiet, "say": say}
+    has_state(output)  # refuses a generator without one
+    settings, weights = config.generator, arguments.weights
+    where = f"--config {settings.name}"
+    if settings.frozen_unet and weights is None:
+        model = f"Stable Diffusion 1.5{' inpainting' if settings.inpainting else ''} in diffusers' layout"
+        raise TrainingError(f"{where}: expected --weights, a folder or hub id of {model}, for its frozen U-Net")
+    if not settings.frozen_unet and weights is not None:
+        raise TrainingError(f"--weights: expected none for {where}, which is trained from scratch")
+    if not settings.frozen_unet and settings.autoencoder.widths:
+        fix = "generator.autoencoder.widths=[] (squares of pixels), or a --config of --weights"
+        raise TrainingError(f"{where}: an autoencoder is not trained: expected {fix}")
+    options["perceptual"] = load_perceptual(arguments.vgg_weights) if config.loss.perceptual else None
+    data = arguments.data or "synthetic"
+    frames = open_frames(data, settings.image_size, scenes=config.scenes, seed=config.seed)
+    if data == "synthetic":
+        split = frames.split(config.seed)
+        used = [*split.training, *split.validation]
+        # Each process takes a second to start, a street half a second to render.
+        readers = min(8, os.cpu_count() or 1) if len(used) >= 16 else 0
+        frames.prepare(used, workers=readers, show=options["show"])
+    torch.manual_seed(config.seed)
+    made = Generator.from_config(settings) if weights is None else Generator.from_stable_diffusion(weights, settings)
+    Trainer(config, frames, made.to(processes.device), output, **options).train()
+    return 0

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch.utils.data import Dataset
 
-from arbiview_aug.generator.training.config import LossConfig, PseudoViewConfig, TrainConfig
+from arbiview_aug.generator.training.config import LossConfig, TrainConfig
 from arbiview_aug.generator.training.data import Frames
 from tests.generator.small import ring, small_config
 
@@ -38,7 +38,6 @@ def frames(count: int = 5) -> Frames:
 def config(**changes: Any) -> TrainConfig:
     made = TrainConfig(
         generator=small_config(image_size=SIZE),
-        pseudo_views=PseudoViewConfig(mask_bank=4),
         loss=LossConfig(perceptual=0.0),
         steps=4,
         batch=2,

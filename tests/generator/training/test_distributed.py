@@ -44,15 +44,8 @@ def test_two_processes_train_one_model(tmp_path: Path) -> None:
     # accelerate picks gloo on the CPU
     variables = {**os.environ, "PYTHONPATH": str(ROOT), "ACCELERATE_USE_CPU": "true", "OMP_NUM_THREADS": "1"}
     launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
-    done = subprocess.run(
-        [*launch, str(program), str(tmp_path / "run"), str(tmp_path)],
-        capture_output=True,
-        text=True,
-        timeout=500,
-        env=variables,
-        cwd=ROOT,
-        check=False,
-    )
+    command = [*launch, str(program), str(tmp_path / "run"), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, env=variables, cwd=ROOT)
     assert done.returncode == 0, done.stderr[-3000:]
     # Files, not standard output: the two processes share that, and their lines may run into one another.
     first, second = (json.loads((tmp_path / f"process-{rank}.json").read_text()) for rank in range(2))

@@ -1,49 +1,38 @@
-"""The loss terms: values at known points, finite gradients where norms vanish."""
+"""The loss terms of a step: values at known points, each item at its own time, finite gradients."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
 from arbiview_aug.errors import TrainingError
-from arbiview_aug.generator.denoiser import Rows
-from arbiview_aug.generator.sampler import noise_schedule
+from arbiview_aug.generator import Generator
+from arbiview_aug.generator.completion import shown_condition
+from arbiview_aug.generator.denoiser import REGRESSION, Rows, noise_schedule
+from arbiview_aug.generator.training.config import LossConfig, PseudoViewConfig, TrainConfig
 from arbiview_aug.generator.training.losses import (
+    Draws,
     ForwardProcess,
     Perceptual,
+    Step,
+    draw,
     geometric_loss,
     load_perceptual,
     masked_mse,
 )
+from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
+from arbiview_aug.generator.training.trainer import hole_psnr
 from tests.generator.small import small_config
+from tests.generator.training.small import config, frames
 
 
 def diffusion(prediction: str = "v_prediction", zero_snr: bool = True) -> ForwardProcess:
     return ForwardProcess(small_config(prediction=prediction, zero_snr=zero_snr, residual=zero_snr))
-
-
-@pytest.mark.parametrize("prediction", ["epsilon", "v_prediction"])
-def test_the_target_gives_x0_back(prediction: str) -> None:
-    process = diffusion(prediction, zero_snr=False)
-    x0, eps = torch.randn(2, 3, 1, 3, 4, 5).unbind(0)
-    t = torch.tensor([0, 400, 900])
-    x = process.noisy(x0, eps, t)
-    back = process.x0(x, process.target(x0, eps, t), t)
-    assert torch.allclose(back, x0, atol=1e-4)
-
-
-def test_the_forward_process_is_the_samplers() -> None:
-    schedule = noise_schedule(small_config())
-    process = diffusion()
-    x0, eps = torch.randn(2, 2, 1, 3, 4, 5).unbind(0)
-    for t in (10, 600, 999):
-        schedule.set_timesteps(timesteps=[t])  # without, diffusers' own add_noise reads its table backwards
-        schedule.set_begin_index(0)
-        at = torch.tensor([t])
-        assert torch.allclose(process.noisy(x0, eps, at), schedule.add_noise(x0, eps, at), atol=1e-3)
 
 
 def test_min_snr_weights_have_a_floor() -> None:
@@ -100,18 +89,6 @@ def features() -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def test_perceptual_is_zero_for_the_same_and_has_finite_gradients_there() -> None:
-    torch.manual_seed(0)
-    vgg = Perceptual(features())
-    image = torch.rand(2, 3, 16, 16, requires_grad=True)
-    distance = vgg(image, image.detach())
-    assert distance.tolist() == [0.0, 0.0]
-    distance.sum().backward()
-    assert image.grad is not None and bool(torch.isfinite(image.grad).all())
-    assert float(vgg(image.detach(), torch.rand(2, 3, 16, 16)).min()) > 0
-    assert not any(parameter.requires_grad for parameter in vgg.parameters())
-
-
 def test_perceptual_reads_four_layers() -> None:
     """The mean over relu1_2, 2_2, 3_3 and 4_3 of the features' RMS difference, by VGG16 itself."""
     torch.manual_seed(0)
@@ -137,3 +114,75 @@ def test_vgg_weights_that_are_none(tmp_path: Path) -> None:
     torch.save({"a": torch.ones(1)}, tmp_path / "other.pth")
     with pytest.raises(TrainingError, match="expected weights of torchvision"):
         load_perceptual(tmp_path / "other.pth")
+
+
+def step_of(settings: TrainConfig, times: list[int], vgg: Perceptual | None = None) -> tuple[Step, Batch, Draws]:
+    """A step of an untrained generator, a batch of as many items as ``times``, and its draws at these times."""
+    torch.manual_seed(0)
+    generator = Generator.from_config(settings.generator)
+    items = PseudoViews(frames(), [0, 1], settings.pseudo_views, settings.generator, seed=0)
+    batch = collate([items[k] for k in range(len(times))])
+    draws = draw(settings, batch, torch.Generator().manual_seed(0))
+    draws = draws._replace(t=torch.tensor(times), drop=torch.zeros(len(times), dtype=torch.bool))
+    return Step(settings, generator.denoiser, generator.autoencoder, vgg), batch, draws
+
+
+def test_each_item_is_noised_at_its_own_time_and_compared_with_its_own_truth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A denoiser that answers exactly, from the schedule's own formula, has no error at any time."""
+    times = [3, 400, 950, REGRESSION]
+    step, batch, draws = step_of(config(loss=LossConfig(geo=0.0, perceptual=0.0)), times)
+    x0 = batch.truth * 2 - 1
+    share = noise_schedule(config().generator).alphas_cumprod
+    signal, noise = ([float(part[min(t, 999)]) ** 0.5 for t in times] for part in (share, 1 - share))
+    noisy, answer = [], []
+    for b in range(3):
+        noisy.append(signal[b] * x0[b] + noise[b] * draws.eps[b])
+        answer.append(signal[b] * draws.eps[b] - noise[b] * x0[b])
+
+    def exact(x: torch.Tensor, t: torch.Tensor, *_: Any) -> torch.Tensor:
+        assert t.tolist() == times
+        assert torch.allclose(x[:3], torch.stack(noisy), atol=1e-4)
+        return torch.stack([*answer, x0[3]])
+
+    monkeypatch.setattr(step.denoiser, "forward", exact)
+    terms = step(batch, draws)
+    assert float(terms["main"]) == pytest.approx(0, abs=1e-5)
+    assert float(terms["regression"]) == pytest.approx(0, abs=1e-5)
+
+
+def test_the_perceptual_term_compares_the_prediction_with_the_truth() -> None:
+    settings = config(loss=LossConfig(perceptual=1.0, perceptual_below_t=1000, regression=0.0))
+    torch.manual_seed(0)
+    step, batch, draws = step_of(settings, [300, 600], Perceptual(features()))
+    term = step(batch, draws, perceptual=True)["perceptual"]
+    term.backward()
+    head = step.denoiser.unet.conv_out.weight.grad
+    assert float(term.detach()) > 0.01 and head is not None and float(head.abs().max()) > 0
+
+
+def test_the_perceptual_term_is_a_mean_over_targets() -> None:
+    """As the other terms are."""
+    loss = LossConfig(perceptual=1.0, perceptual_below_t=1000, regression=0.0)
+    settings = config(loss=loss, pseudo_views=PseudoViewConfig(targets=2))
+    step, batch, draws = step_of(settings, [300, 600])
+    step._frozen = step._frozen[0], lambda predicted, _: torch.ones(len(predicted))  # type: ignore[assignment]
+    assert batch.truth.shape[:2] == (2, 2) and float(step(batch, draws, perceptual=True)["perceptual"]) == 1
+
+
+def test_only_holes_count_in_validation() -> None:
+    truth = torch.rand(2, 1, 3, 4, 6)
+    made = truth.clone()
+    holes = torch.zeros(2, 1, 4, 6, dtype=torch.bool)
+    holes[0, :, :, :3] = True
+    made[:, :, :, :, :3] += 0.1
+    made[:, :, :, :, 3:] += 0.7
+    psnr = hole_psnr(made, truth, holes)
+    assert float(psnr[0]) == pytest.approx(20.0, abs=1e-3) and bool(psnr[1].isnan())
+
+
+def test_holes_of_the_condition_are_grey_as_published_or_filled() -> None:
+    _, batch, _ = step_of(config(), [3, 400])
+    settings, known = config().generator, batch.known[:, :, None].expand_as(batch.condition)
+    grey = shown_condition(replace(settings, prefilled=False), batch.condition, batch.known)
+    assert bool((grey[~known] == 0.5).all()) and torch.equal(grey[known], batch.condition[known])
+    assert shown_condition(settings, batch.condition, batch.known) is batch.condition
