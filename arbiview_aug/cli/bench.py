@@ -4,8 +4,8 @@ Sweeps quality, geometry, decoded size and cached depth from overlap, and marks 
 static surfaces should not be chosen, since cameras move: PSNR does not show what a detector learns from them.
 
 Times are CPU time of a ``RigRetarget`` call on one thread, with the plan where every frame needs its own. Accuracy is
-the mean PSNR of pixels that some source sees, against LiDAR points or the true views, in the colours of images decoded
-at 1 / ``REFERENCE``.
+the mean PSNR of pixels that some source sees, in the colours of images decoded at 1 / ``REFERENCE``: against the true
+views, LiDAR points, or without points the photographs of cameras that are rendered from the frame's others.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 from tqdm import tqdm
 
 from arbiview_aug import PlanCache
-from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.choices import GeometryName, Quality, Reduce
 from arbiview_aug.cli.arguments import REAL_TARGET, writable_folder
 from arbiview_aug.cli.parsers import SCORED
@@ -37,8 +37,8 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, dem
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import LidarReference, ScoredFrame, make_frame, scores, without_masks
-from arbiview_aug.evaluate.images import RenderedView
-from arbiview_aug.evaluate.methods import Sample, views_of
+from arbiview_aug.evaluate.held_out import held_out
+from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.render.plan import RenderConfig
@@ -100,21 +100,23 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         opened = {reduce: open_data(arguments.data, reduce=reduce) for reduce in {*reduces, REFERENCE}}
 
     @cache
-    def frame(index: int, reduce: Reduce) -> ScoredFrame:
-        """Frame scored by the true views; or by half of the points, in the colours of the reference's images."""
+    def scored(index: int, reduce: Reduce) -> list[ScoredFrame]:
+        """A frame scored by the true views, by half of its points, or by its cameras' photographs, in turn."""
         sample = opened[reduce][index]
         if arguments.data is None:
-            return make_frame(sample, truth=partial(opened[1].render, index), exposures=(), hand_over_points=True)
+            return [make_frame(sample, truth=partial(opened[1].render, index), exposures=(), hand_over_points=True)]
+        reference = opened[REFERENCE][index]  # its colours score
         if "points" not in sample:
-            raise DataError(f"data {arguments.data}: expected LiDAR points to score by, got none")
-        scored, reference = (
-            make_frame(given, exposures=("even",), hand_over_points=True)
-            for given in (sample, opened[REFERENCE][index])
+            if len(sample["rig"]) < 2:
+                raise DataError(f"data {arguments.data}: expected LiDAR points or several cameras, to score by")
+            return [held_out(sample, place, reference) for place in range(len(sample["rig"]))]
+        frame, points = (
+            make_frame(given, exposures=("even",), hand_over_points=True).lidar["even"] for given in (sample, reference)
         )
-        points = reference.lidar["even"].points
-        return replace(scored, lidar={"even": LidarReference(scored.lidar["even"].sample, points)})
+        return [ScoredFrame(frame.sample, {"even": LidarReference(frame.sample, points.points)}, True)]
 
-    first = frame(0, reduces[0]).scored_sample
+    first = opened[reduces[0]][0]
+    by_points = arguments.data is not None and "points" in first
     source, target = first["rig"], demo_target_rig(arguments.size)
     if arguments.target is not None or arguments.data is not None:
         target = without_masks(load_rig(arguments.target or REAL_TARGET)).resized(arguments.size, "stretch")
@@ -138,23 +140,23 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         refined = [name for name in offered if GEOMETRIES[name].overlap_depth]
         expected = f"{', '.join(offered)}, which the samples offer (accurate: {', '.join(refined)})"
         raise DataError(f"--geometry {' '.join(arguments.geometry or ['none'])}: expected geometry of {expected}")
-    prefix, rows, calls = "even" if arguments.data else "true", [], dict[str, Callable[[], Any]]()
+    prefix, rows, calls = "even" if by_points else "true", [], dict[str, Callable[[], Any]]()
     for setting in tqdm(chosen, desc="accuracy", unit="setting", leave=False):
         plans = PlanCache(share_overlap=setting.cached, max_bytes=0)  # the last plan alone
-        retarget = RigRetarget(target, quality=setting.quality, geometry=setting.surface, holes="black", cache=plans)
-        frames = [frame(index, setting.reduce) for index in range(num_frames)]
-
-        def render(sample: Sample, _: Rig, retarget: RigRetarget = retarget) -> list[RenderedView]:
-            return views_of(retarget(sample))
-
-        means = mean_of(row for each in frames for row in scores(each, render, target, ("even",))[1])
+        method = retargeting(setting.quality, setting.surface, cache=plans)
+        frames = [frame for index in range(num_frames) for frame in scored(index, setting.reduce)]
+        means = mean_of(
+            row for frame in frames for row in scores(frame, method.render, frame.target or target, ("even",))[1]
+        )
         if f"{prefix}_covered_psnr_db" not in means:
-            expected = f"LiDAR points in views of {target.name or 'the target'} that source cameras see, too"
+            what = "LiDAR points in views of" if by_points else "pixels of"
+            expected = f"{what} {target.name or 'the target'} that source cameras see, too"
             raise DataError(f"data {arguments.data}: expected {expected}, found none to score {setting.name} by")
         row: dict[str, Any] = {"name": setting.name, **setting._asdict(), "seen": means["seen"]}
         row |= {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
         rows.append(row | {"harm": static_harm(source, target, setting.surface, RenderConfig())})
-        calls[setting.name] = partial(retarget, frames[0].scored_sample)
+        retarget = RigRetarget(target, quality=setting.quality, geometry=setting.surface, holes="black", cache=plans)
+        calls[setting.name] = partial(retarget, first if frames[0].target else frames[0].scored_sample)
     for reduce in reduces if arguments.data else ():
         data = open_data(arguments.data, reduce=reduce, load_points=False)
         calls[f"decode 1/{reduce}"] = partial(data.__getitem__, 0)
@@ -172,6 +174,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
             decode_ms = float(np.median(decoding))
             row |= {"decode_ms": decode_ms, "decode_ratio": row["median_ms"] / decode_ms}
     front = {row["name"] for row in pareto_front(rows)}
+    against = "true views" if arguments.data is None else "photographs of cameras rendered from the others"
     return {
         "clock": "CPU time of the process, milliseconds, one thread",
         "versions": versions(),
@@ -179,7 +182,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         "target": target.name or "target",
         "size": list(target.sizes[0]),
         "frames": num_frames,
-        "against": "LiDAR points, exposures made even" if arguments.data else "true views",
+        "against": "LiDAR points, exposures made even" if by_points else against,
         "settings": [{**row, "front": row["name"] in front} for row in rows],
     }
 

@@ -94,12 +94,20 @@ def held_out_frames(
         for place, camera in enumerate(rig):
             if camera.name not in cameras and "all" not in cameras:
                 continue
-            image = as_arrays([sample["images"][place]])
-            masks = () if segmenter is None else segmenter(to_bytes(image[0]))
+            masks = () if segmenter is None else segmenter(to_bytes(as_arrays([sample["images"][place]])[0]))
             regions = {f"mask {k}": mask for k, mask in enumerate(masks, 1)}
             regions |= {} if classed is None else _windows(camera, *classed)
-            target = Rig([camera], name=camera.name, ground_z_m=rig.ground_z_m)
-            yield f"{frame}: {camera.name}", photographed(WithoutCamera(sample, place), target, image, [regions])
+            yield f"{frame}: {camera.name}", held_out(sample, place, sample, regions)
+
+
+def held_out(
+    sample: Mapping[str, Any], place: int, reference: Mapping[str, Any], regions: Mapping[str, BoolArray] | None = None
+) -> ScoredFrame:
+    """A sample without one of its cameras, whose photograph in ``reference``, perhaps of another size, is the truth."""
+    camera: Camera = reference["rig"][place]
+    target = Rig([camera], name=camera.name, ground_z_m=reference["rig"].ground_z_m)
+    image = as_arrays([reference["images"][place]])
+    return photographed(WithoutCamera(sample, place), target, image, [regions or {}])
 
 
 def _windows(camera: Camera, points: torch.Tensor, classes: npt.NDArray[np.int64]) -> dict[str, BoolArray]:

@@ -67,9 +67,19 @@ def test_the_sweep(tmp_path: Path) -> None:
     assert STATIC_HARM in printed and ". Better: 'points', 'depth_m' or" in printed
 
 
-def test_real_frames_need_points(fisheye_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "--data", str(fisheye_root), "--output", str(tmp_path)]) == 2
-    assert "expected LiDAR points to score by, got none" in capsys.readouterr().err
+def test_frames_without_points_are_scored_by_held_out_cameras(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for count, code in ((3, 0), (1, 2)):
+        rig = demo_source_rig((64, 176))
+        rig = rig.with_cameras(list(rig)[:count])
+        sample = SyntheticDrive(rig, num_frames=1)[0]
+        write_frame(tmp_path / f"{count}", {key: value for key, value in sample.items() if key != "points"})
+        data = ["--data", str(tmp_path / f"{count}"), "--quality", "draft", "--output", str(tmp_path)]
+        assert main(["bench", *data, *SMALLEST]) == code
+    said = capsys.readouterr()
+    assert "against photographs of cameras rendered from the others" in said.out
+    assert "expected LiDAR points or several cameras, to score by" in said.err
 
 
 def test_points_that_no_camera_sees(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
