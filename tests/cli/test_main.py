@@ -123,7 +123,9 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             for option in ("displaced", "lidar")
         ),
         ("evaluate --displaced --target waymo --data frame", "argument --target: expected it without --displaced"),
-        ("evaluate --segmenter road.py:f --data frame", "argument --segmenter: expected --displaced with --data"),
+        ("evaluate --segmenter road.py:f --data frame", "argument --segmenter: expected --displaced or --held-out"),
+        ("evaluate --held-out front --displaced --data frame", "argument --held-out: expected it without --displaced"),
+        ("evaluate --held-out front", "argument --held-out: expected --data FOLDER with it, found none"),
         *(
             (f"demo --{option}", f"argument --{option.split()[0]}: ")
             for option in ("size 704", "size 0x3", "seed -1", "frames 0", "geometry flat")
