@@ -22,7 +22,7 @@ STEP, JUMP = np.uint16(PER_CORRELATION // 10), np.uint16(PER_CORRELATION * 6 // 
 PEAK, CLEAR = 2, np.float32(1.3)
 """Uniqueness test: the best cost must be ``CLEAR`` times below every cost more than ``PEAK`` steps away."""
 
-SCALES = 64  # steps of the scale of things that hang above the road
+SCALES = 256  # steps of the scale of things that hang above the road: a fortieth of the least
 _FARTHEST_SCALE = 0.1  # of a road that can be told from infinity
 _ABOVE_FOOT = 2 / 3  # of the foot's scale, down to which a thing must match better than the road
 
@@ -339,7 +339,7 @@ def find_feet(
     are made by ``plane_sweep.stand_on_road``, whose other arguments these are.
     """
     horizontal, road, slope = surfaces
-    least_scale, evidence, standing, least_gap_px, height_m, tallest_m = limits
+    least_scale, evidence, standing, least_gap_px, height_m, tallest_m, slenderest = limits
     h, w = labels.shape
     walls, tops, gains = np.empty(w, np.float64), np.empty(w, np.int64), np.empty(SCALES, np.float64)
     for thing in range(1, boxes.shape[0]):
@@ -366,7 +366,7 @@ def find_feet(
                 most, scaled = below, k / SCALES
         if most < evidence or scaled < least_scale:
             continue
-        sum_above, hanging, stands, gap_px, sharp, tall = 0.0, 0.0, 0.0, 0, 0.0, 0
+        sum_above, hanging, stands, gap_px, sharp, tall, sum_px = 0.0, 0.0, 0.0, 0, 0.0, 0, 0
         for x in range(x0, x0 + n):
             above, below, foot = 0.0, 0.0, h - 1
             for y in range(h - 1, y0 - 1, -1):
@@ -381,11 +381,14 @@ def find_feet(
                         above -= gain
             foot = max(foot - RADIUS_PX, y0)  # windows that touch an outline are matched by it
             sharp += road[foot, x] / (horizontal[foot, x] * walls[x])
+            sum_px += foot - tops[x]
             sum_above += above
             hanging += max(below, 0.0)
             stands -= min(below, 0.0)
             tall += height_m + slope[tops[x], x] / (scaled * walls[x]) > tallest_m
         if sum_above < evidence or gap_px < least_gap_px * n or stands > standing * hanging or 2 * tall > n:
+            continue
+        if sum_px > slenderest * n * n and 0 < x0 and x0 + n < w:  # a cut-off vehicle is slender, too
             continue
         scaled = max(sharp / n, least_scale)
         for x in range(x0, x0 + n):

@@ -177,8 +177,8 @@ UPRIGHT = 1.05
 LOWEST_M, TALLEST_M = 1.4, 4.5
 """Heights of the lowest vehicles and of the tallest."""
 
-LEAST_SCALE = 0.3
-"""Scale of a thing that comes at twice the vehicle's speed."""
+LEAST_SCALE = 0.1
+"""Scale of a thing that comes at nine times the vehicle's speed: a slow vehicle meets fast traffic."""
 
 EVIDENCE = 5.0
 """Least gain in correlation, summed over pixels, on both sides of a foot: a tenth over the 49 pixels of a window."""
@@ -196,7 +196,7 @@ _LEAST_DIS_PX = 16  # two patches; OpenCV fails on smaller images
 
 _LEAST_CORRELATION, _AS_GOOD = 0.5, 0.1  # of a match, and the difference of two that tell nothing
 
-_MOST_SLENDER = 1.5  # height over width: a truck from behind
+_MOST_SLENDER, _SLENDEREST = 1.5, 3.0  # height over width: a truck from behind, and a person
 
 
 def stand_on_road(
@@ -222,7 +222,7 @@ def stand_on_road(
     upright = (valid & (q > UPRIGHT * image.road)).astype(np.uint8)
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(upright, connectivity=4)
     least_gap_px = RADIUS_PX + math.tan(math.radians(SLOPE_DEG)) * float(image.camera.K[1, 1])
-    limits = LEAST_SCALE, EVIDENCE, STANDING, least_gap_px, image.height_m, TALLEST_M
+    limits = LEAST_SCALE, EVIDENCE, STANDING, least_gap_px, image.height_m, TALLEST_M, _SLENDEREST
     find_feet(labels, boxes[:count], (image.horizontal, image.road, image.slope), costs, spacing, limits, q, valid)
     _stand_off_road(image, others, chosen_costs, costs[..., 0], q, valid)
     return q, valid

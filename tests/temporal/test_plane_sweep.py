@@ -157,8 +157,10 @@ def painted(along_m: Any, aside_m: Any) -> Any:
     return cv2.remap(texture(), *at, cv2.INTER_LINEAR)
 
 
-def photograph(ahead_m: float, board_m: float, aside_m: float, legs: bool = False) -> SweptImage:
-    """An image of a road from a camera so far ahead, and of an upright board, 2 m wide and 1.5 m high, on the road.
+def photograph(
+    ahead_m: float, board_m: float, aside_m: float, legs: bool = False, size_m: tuple[float, float] = (2.0, 1.5)
+) -> SweptImage:
+    """An image of a road from a camera so far ahead, and of an upright board, so wide and high, on the road.
 
     With ``legs``, its lower 0.6 m are two legs.
     """
@@ -170,17 +172,19 @@ def photograph(ahead_m: float, board_m: float, aside_m: float, legs: bool = Fals
     y, z = board[..., 1] - aside_m, board[..., 2]
     asphalt, wall = 70 + painted(road[..., 0], road[..., 1]) / 5, painted(far[..., 2] / 4, far[..., 1] / 4)
     grey = np.where(road[..., 0] < 60, asphalt, wall)
-    on = (np.abs(y) < 1) & (z > 0) & (z < 1.5) & ((z > 0.6) | (np.abs(y) > 0.6) | (not legs))
+    on = (np.abs(y) < size_m[0] / 2) & (z > 0) & (z < size_m[1]) & ((z > 0.6) | (np.abs(y) > 0.6) | (not legs))
     return SweptImage(camera, np.where(on, painted(z + 7, y + 11), grey).astype(np.float32), 0.0)
 
 
-def distances(stands: bool, by_m: tuple[float, float], legs: bool = False) -> tuple[float, float]:
+def distances(
+    stands: bool, by_m: tuple[float, float], legs: bool = False, size_m: tuple[float, float] = (2.0, 1.5)
+) -> tuple[float, float]:
     """Median distance of the board's middle, and the largest relative error of the road's before it.
 
     The board moves by so much, along and aside, while the camera travels ``TRAVEL_M``.
     """
     before, now, after = (
-        photograph(k * TRAVEL_M, BOARD_M + k * by_m[0], ASIDE_M + k * by_m[1], legs) for k in (-1, 0, 1)
+        photograph(k * TRAVEL_M, BOARD_M + k * by_m[0], ASIDE_M + k * by_m[1], legs, size_m) for k in (-1, 0, 1)
     )
     q, valid = _match(now, [before, after], WALLS, stands=stands)
     upper, lower = (CAMERA.project(np.array([[BOARD_M, ASIDE_M + y, z]])).uv[0] for y, z in ((0.6, 1.2), (-0.6, 0.8)))
@@ -196,11 +200,22 @@ def test_what_stands_stays() -> None:
         assert distances(True, (0, 0), legs=legs)[0] == pytest.approx(BOARD_M, rel=0.05)
 
 
-@pytest.mark.parametrize("by_m", [(-1.2, 0.0), (1.2, 0.0), (0.0, -0.8)], ids=["comes", "drives along", "crosses"])
+@pytest.mark.parametrize(
+    "by_m",
+    [(-1.2, 0.0), (-4.0, 0.0), (1.2, 0.0), (0.0, -0.8)],
+    ids=["comes", "comes fast", "drives along", "crosses"],
+)
 def test_what_moves_stands_where_its_foot_is(by_m: tuple[float, float]) -> None:
     assert distances(False, by_m)[0] != pytest.approx(BOARD_M, rel=0.25)
     found_m, road_error = distances(True, by_m)
     assert found_m == pytest.approx(BOARD_M, rel=0.15) and road_error < 0.05
+
+
+def test_what_is_too_slender_for_a_person_stays() -> None:
+    """Wires, trunks and parts of the sky that hang above the road."""
+    for size_m, is_right in (((0.6, 1.7), True), ((0.6, 4.0), False)):
+        found_m, _ = distances(True, (-1.2, 0.0), size_m=size_m)
+        assert (abs(found_m - BOARD_M) < 0.15 * BOARD_M) == is_right
 
 
 @pytest.mark.parametrize("rows", [2, 3])
