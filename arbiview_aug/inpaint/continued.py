@@ -1,8 +1,9 @@
-"""Default filling of holes: the background continued along lines of the scene and by a pyramid of cells.
+"""Default filling of holes: the background continued along lines of the scene, by a pyramid of cells, and by pixels.
 
 A hole pixel knows whether its ray would meet the road next. The road continues along the ego's heading, in its plane;
 upright things continue along the heading, too, at equal height, and up and down. Each pixel mixes what its lines meet
-first with a blurred completion of its surroundings. Unseen parts of objects are painted.
+first with a blurred completion of its surroundings, and this with the nearest known pixels of its row and column:
+holes have the detail of their border near it. Unseen parts of objects are painted.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ view's shorter side: nothing; upright things and road outside the sources' image
 
 SIDE_REACH = 1 / 4
 """The same of seen pixels of a body or cabin in the row and column of its unseen ones, against its colour."""
+
+PIXEL_REACH = 1 / 128
+"""The same of the nearest known pixels in a hole's row and column, against all of the above (docs/decisions.md)."""
 
 _LENS_NODES = 17  # directions of lines are interpolated between N nodes along each side; a pinhole's are linear
 _MOVE = 1e-4  # by which rays are moved along a line, as a share of their length
@@ -181,7 +185,8 @@ def _fill(
     mark_cells(sums[3], seen, layers, road, cell, kinds)
     reach = REACH * np.float32(min(seen.shape) / cell)
     continue_lines(sums, around, complete, kinds, _line_directions(camera), reach)
-    put_cells(sums, cell, seen, 0.5 if view.dtype == np.uint8 else 0.0, view)
+    rounding = 0.5 if view.dtype == np.uint8 else 0.0
+    put_cells(sums, cell, seen, layers, below, PIXEL_REACH * min(seen.shape), rounding, view)
 
 
 def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:

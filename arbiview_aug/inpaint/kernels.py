@@ -325,32 +325,73 @@ def _mix_lines(sums: Any, complete: Any, kinds: Any, reach: Any, number: Any, me
 
 
 @compiled
-def put_cells(cells: Any, cell: int, seen: Any, rounding: float, view: Any) -> None:
-    """Interpolate cells (4, ny, nx) into the pixels of a view (3, h, w) that are not seen (h, w); add ``rounding``."""
-    (h, w), (ny, nx) = seen.shape, cells.shape[1:]
+def put_cells(
+    cells: Any, cell: int, seen: Any, layers: Any, below: int, reach: float, rounding: float, view: Any
+) -> None:
+    """Fill the pixels of a view that are not seen: cells, mixed with the nearest known pixels of the row and column.
+
+    Args:
+        cells: (4, ny, nx) colours of all cells.
+        cell: Side of a cell, pixels.
+        seen: (h, w) bool.
+        layers: (h, w) uint8; seen pixels of layers ``below`` this one are known, others hide what is behind them.
+        below: First layer that is not known.
+        reach: Distance in pixels at which a known pixel weighs as much as the cells.
+        rounding: Added to what is written.
+        view: (3, h, w), filled.
+    """
+    (h, w), (ny, nx), first_unknown = seen.shape, cells.shape[1:], np.uint8(below)
     rows, left, share = np.empty((3, nx + 1), np.float32), np.empty(w, np.int32), np.empty(w, np.float32)
     for x in range(w):
         at = min(max((np.float32(x) + _HALF) / np.float32(cell) - _HALF, _ZERO), np.float32(nx - 1))
         left[x], share[x] = np.int32(at), at - np.float32(np.int32(at))
+    lower, upper, after = np.empty((h + 1, w), np.int32), np.full(w, -1, np.int32), np.empty(w, np.int32)
+    mixed = np.empty(3, np.float32)
+    lower[h] = -1  # the known pixel that a hole meets first below it, -1 for none; likewise above and on both sides
+    for y in range(h - 1, -1, -1):
+        for x in range(w):
+            met = y if layers[y, x] < first_unknown else -1
+            lower[y, x] = met if seen[y, x] else lower[y + 1, x]
     for y in range(h):
         all_seen = True
         for x in range(w):
             all_seen &= seen[y, x]
+            met = y if layers[y, x] < first_unknown else -1
+            upper[x] = met if seen[y, x] else upper[x]
         if all_seen:
             continue
+        met = -1
+        for x in range(w - 1, -1, -1):
+            if seen[y, x]:
+                met = x if layers[y, x] < first_unknown else -1
+            after[x] = met
         at = min(max((np.float32(y) + _HALF) / np.float32(cell) - _HALF, _ZERO), np.float32(ny - 1))
         j0 = int(at)
         j1, s = min(j0 + 1, ny - 1), at - np.float32(j0)
         for c in range(3):
-            row, above, below = rows[c], cells[c, j0], cells[c, j1]
+            row, one, two = rows[c], cells[c, j0], cells[c, j1]
             for i in range(nx):
-                row[i] = above[i] + s * (below[i] - above[i]) + np.float32(rounding)
+                row[i] = one[i] + s * (two[i] - one[i])
             row[nx] = row[nx - 1]
+        met = -1
         for x in range(w):
-            if not seen[y, x]:
-                i, t = left[x], share[x]
-                for c in range(3):
-                    view[c, y, x] = rows[c, i] + t * (rows[c, i + 1] - rows[c, i])
+            if seen[y, x]:
+                met = x if layers[y, x] < first_unknown else -1
+                continue
+            i, t = left[x], share[x]
+            for c in range(3):
+                mixed[c] = rows[c, i] + t * (rows[c, i + 1] - rows[c, i])
+            total = _ONE
+            for side in range(4):
+                yy = y if side < 2 else upper[x] if side == 2 else lower[y, x]
+                xx = x if side > 1 else after[x] if side else met
+                if yy >= 0 and xx >= 0:
+                    weight = np.float32(reach) / np.float32(abs(yy - y) + abs(xx - x))
+                    total += weight
+                    for c in range(3):
+                        mixed[c] += weight * np.float32(view[c, yy, xx])
+            for c in range(3):
+                view[c, y, x] = mixed[c] / total + np.float32(rounding)
 
 
 @borrowing
@@ -545,5 +586,5 @@ def warm_up() -> None:
     colour_objects(colours, pixel, 1.0, np.empty((PARTS, 3), np.float32))
     for view in (np.zeros((3, 2, 2), np.uint8), np.zeros((3, 2, 2), np.float32)):
         sum_cells(view, seen, layers, 2, 1, cells[0])
-        put_cells(cells[0], 1, seen, 0.5, view)
+        put_cells(cells[0], 1, seen, layers, 2, 1.0, 0.5, view)
         paint(pixel, pixel, np.zeros((4, 1), np.int32), colours, seen, 1.0, 0.5, view.reshape(3, 4))

@@ -92,6 +92,19 @@ def test_filled_holes_are_nearer_to_the_truth_than_black_ones() -> None:
     assert errors["continue"] < 0.6 * errors["mean"] < 0.6 * errors["black"]
 
 
+def test_holes_have_the_detail_of_their_border_but_not_that_of_objects() -> None:
+    """Rows alternate in brightness, at a tenth of a cell's side; an object to the right of a hole is black."""
+    view = torch.full((3, 640, 640), 40, dtype=torch.uint8)
+    view[:, ::2] = 200
+    seen, layers = torch.ones(640, 640, dtype=torch.bool), np.zeros((640, 640), np.uint8)
+    seen[:, 300:310], layers[:, 310:340] = False, OBJECT
+    view[:, :, 310:340] = 0
+    (out,) = fill_holes([view * seen], [seen], [layers])
+    contrast = out[0, ::2].float().mean(0) - out[0, 1::2].float().mean(0)
+    assert contrast[300] > 100 and contrast[309] > 30 and (contrast[301:310] < contrast[300:309]).all()
+    assert out[0, :, 300:310].float().mean(0).sub(120).abs().max() < 2 and torch.equal(out[:, seen], view[:, seen])
+
+
 def test_beyond_the_sources_views_columns_go_on_and_fade() -> None:
     source = Rig([camera(size=(64, 64))])
     upwards = source.turned(pitch_deg=40)
