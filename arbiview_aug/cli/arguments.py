@@ -178,7 +178,8 @@ def options() -> dict[str, dict[str, Any]]:
             str,
             "CAMERA",
             None,
-            "score by these cameras' photographs (all: each), rendered from the others",
+            "score by these cameras' photographs (all: each), rendered from the others; holes: score --holes in holes "
+            "that --target's place would leave in them",
         ),
         ("--common", None, None, False, "propose one rig for all: pinhole cameras whose views each of the rigs sees"),
         ("--lidar", None, None, False, "score scanned points by the next frame's scan (docs/lidar.md)"),

@@ -78,20 +78,22 @@ def run(arguments: argparse.Namespace) -> None:
         load_segmenter(arguments.segmenter) if arguments.segmenter else None,
     )
     look = panel.look if arguments.detector or arguments.segmenter else None
-    common = CommonPixels(look) if arguments.held_out else None
+    common = CommonPixels(look, arguments.held_out == ["holes"]) if arguments.held_out else None
     if common is not None or arguments.displaced:
         # The surfaces, and a copy of displaced cameras, on photographs; holes are not read from neighbours.
         everything: GeometryName = "fused" if arguments.geometry == ["auto"] else "motion"
-        data = open_frames(arguments, [everything, *arguments.geometry])
+        place_of = load_rig(arguments.target or REAL_TARGET) if arguments.held_out == ["holes"] else None
+        data = open_frames(arguments, arguments.geometry if place_of else [everything, *arguments.geometry])
         chosen, asked = chosen_frames(arguments.frames or len(data), len(data)), arguments.held_out or ("",)
-        each = len(data[chosen[0]]["rig"]) if "all" in asked else len(asked)  # views a frame and method
+        each = len(data[chosen[0]]["rig"]) if {"all", "holes"} & {*asked} else len(asked)  # views a frame and method
         with named_steps(notes, len(chosen) * each) as tick:
             if common is None:
                 frames = displaced_frames(data, chosen)
             else:
-                frames = held_out_frames(data, chosen, asked, panel.segmenter)
-            first = next(frames)
-            if arguments.geometry == ["auto"]:
+                frames = held_out_frames(data, chosen, asked, panel.segmenter, place_of)
+            if (first := next(frames, None)) is None:
+                raise DataError("--held-out holes: expected a --target whose place leaves holes, found none")
+            if arguments.geometry == ["auto"] and place_of is None:
                 arguments.geometry = surfaces_for(first[1].sample)
             methods = [*([COPY] if common is None else []), *_methods(arguments, neighbours=None)]
             looks = look if common is None else common.look

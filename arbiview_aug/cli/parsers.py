@@ -216,7 +216,8 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
         ("convert", given.get("size") is None, "fit", "expected --size with it, found none"),
         ("convert evaluate", not is_generated, "generator steps", "expected it with --holes diffusion"),
         ("evaluate", given.get("displaced"), "seed size target lidar held_out", "expected it without --displaced"),
-        ("evaluate", given.get("held_out"), "seed size target lidar", "expected it without --held-out"),
+        ("evaluate", given.get("held_out"), "seed size lidar", "expected it without --held-out"),
+        ("evaluate", given.get("held_out", ["holes"]) not in (None, ["holes"]), "target", "expected --held-out holes"),
         ("evaluate", given.get("lidar"), of_images, "it is of images; expected no --lidar"),
         (
             "evaluate",

@@ -1,9 +1,9 @@
-"""Held-out cameras: each is rendered from the frame's other cameras and compared with its own photograph."""
+"""Photographs as truth for held-out cameras, rendered from the others, and for holes that are cut into them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -17,7 +17,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.frames import Look, ScoredFrame, Truth, photographed
+from arbiview_aug.evaluate.frames import Look, ScoredFrame, Truth, photographed, without_masks
 from arbiview_aug.evaluate.images import RenderedView, as_arrays, to_bytes
 from arbiview_aug.evaluate.judges import Segmenter
 from arbiview_aug.evaluate.lidar import visible_points
@@ -26,6 +26,7 @@ from arbiview_aug.evaluate.report.tables import Table
 from arbiview_aug.evaluate.verdicts import draws_of, interval
 from arbiview_aug.sample.boxes_2d import rig_of
 from arbiview_aug.sample.inputs import DEPTH_KEYS
+from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 _BY_CAMERA = ("images", "K", "cam2ego", "distortion", "lens", "coverage", "generated", "ego_mask", *DEPTH_KEYS)
 _WINDOW_PX = 9  # side of the square around a point that belongs to its class
@@ -37,6 +38,11 @@ NOTES = (
     "bootstrap over frames. Frames of one drive are alike: the interval says little about other drives. Tone curves "
     "and calibration of the cameras limit all PSNR here: read the differences."
 )
+HOLE_NOTES = (
+    "Fills of the holes that the target's place would leave in the photographs, which are the truth. Means over "
+    "cameras and frames; gradients: as a share of the photographs'. difference: PSNR to the first row, with a 95 % "
+    "interval, bootstrap over frames. Frames of one drive are alike."
+)
 _COLUMNS = (
     ("seen", "{seen:.1%}"),
     ("PSNR dB", "{psnr_db:.2f}"),
@@ -44,6 +50,7 @@ _COLUMNS = (
     ("difference", "{difference_db:+.2f} [{difference_db_low:+.2f}, {difference_db_high:+.2f}]"),
     ("SSIM", "{ssim:.4f}"),
 )
+_HOLE_COLUMNS = (_COLUMNS[1], *_COLUMNS[3:], ("gradients", "{gradients:.0%}"))
 
 
 class WithoutCamera(Mapping[str, Any]):
@@ -74,10 +81,15 @@ class WithoutCamera(Mapping[str, Any]):
 
 
 def held_out_frames(
-    data: Any, indices: Iterable[int], cameras: Sequence[str], segmenter: Segmenter | None = None
+    data: Any,
+    indices: Iterable[int],
+    cameras: Sequence[str],
+    segmenter: Segmenter | None = None,
+    place_of: Rig | None = None,
 ) -> Iterator[tuple[str, ScoredFrame]]:
     """Name and frame of each held-out camera (``all``: of every camera) of the samples at ``indices``.
 
+    With ``place_of`` they are all cameras that have holes from the places of that rig's cameras, as sources too.
     Regions of the truth are the classes of LiDAR points in it (``FrameFolder.point_classes``), and the segmenter's
     masks. DataError for a camera that a sample lacks, or that is its only one.
     """
@@ -85,19 +97,26 @@ def held_out_frames(
     for index in indices:
         sample = data[index]
         rig, frame = rig_of(sample), str(sample.get("token", index))
-        if unknown := {*cameras} - {*rig.names, "all"}:
+        if place_of is not None:
+            sample, holes = _with_holes(sample, rig, place_of)
+        elif unknown := {*cameras} - {*rig.names, "all"}:
             expected = f"all, or cameras of frame {frame}, {', '.join(rig.names)}"
             raise DataError(f"--held-out: expected {expected}, got {', '.join(sorted(unknown))}")
-        if len(rig) < 2:
+        elif len(rig) < 2:
             raise DataError(f"--held-out: expected frames of several cameras, frame {frame} has one")
         classed = recorded.point_classes(index) if isinstance(recorded, FrameFolder) else None
         for place, camera in enumerate(rig):
-            if camera.name not in cameras and "all" not in cameras:
+            if not holes[place].any() if place_of is not None else not {camera.name, "all"} & {*cameras}:
                 continue
             masks = () if segmenter is None else segmenter(to_bytes(as_arrays([sample["images"][place]])[0]))
             regions = {f"mask {k}": mask for k, mask in enumerate(masks, 1)}
             regions |= {} if classed is None else _windows(camera, *classed)
-            yield f"{frame}: {camera.name}", held_out(sample, place, sample, regions)
+            if place_of is None:
+                held = held_out(sample, place, sample, regions)
+            else:
+                own = rig.with_cameras([replace(camera, mask=holes[place])])
+                held = photographed(sample, own, as_arrays([sample["images"][place]]), [regions])
+            yield f"{frame}: {camera.name}", held
 
 
 def held_out(
@@ -108,6 +127,23 @@ def held_out(
     target = Rig([camera], name=camera.name, ground_z_m=reference["rig"].ground_z_m)
     image = as_arrays([reference["images"][place]])
     return photographed(WithoutCamera(sample, place), target, image, [regions or {}])
+
+
+def _with_holes(sample: Mapping[str, Any], rig: Rig, target: Rig) -> tuple[dict[str, Any], list[BoolArray]]:
+    """Sample whose cameras do not see the holes (h, w) that they would have at the centres of the target's nearest."""
+    centres = [camera.center_m for camera in target.in_frame_of(rig)]
+    moved = [camera.shifted(*min(centres - camera.center_m, key=np.linalg.norm)) for camera in rig]
+    there = RigRetarget(without_masks(rig.with_cameras(moved)), holes="black", match_exposure=False, neighbours=None)
+    seen = [covered.numpy() for covered in there(sample)["coverage"]]
+    own = [np.ones(camera.size, bool) if camera.mask is None else camera.mask for camera in rig]
+    coverage = [torch.from_numpy(covered & mask) for covered, mask in zip(seen, own, strict=True)]
+    return {**sample, "coverage": coverage}, [mask & ~covered for covered, mask in zip(seen, own, strict=True)]
+
+
+def _gradients(image: npt.NDArray[Any], pixels: BoolArray) -> float:
+    """Sum of the differences of those pixels (h, w) and their right and lower neighbours, if they are of these, too."""
+    steps = [np.abs(np.diff(image.astype(np.float64), axis=axis)).sum(-1) for axis in (0, 1)]
+    return float(steps[0][pixels[1:] & pixels[:-1]].sum() + steps[1][pixels[:, 1:] & pixels[:, :-1]].sum())
 
 
 def _windows(camera: Camera, points: torch.Tensor, classes: npt.NDArray[np.int64]) -> dict[str, BoolArray]:
@@ -132,6 +168,7 @@ class CommonPixels:
     """Scores of held-out cameras on the pixels that all methods cover; ``look`` is that of ``evaluate``."""
 
     then: Look | None = None  # looks after it
+    in_holes: bool = False  # score the pixels that no method covers, at their own exposure
     rows: list[dict[str, Any]] = field(default_factory=list)  # metrics by frame, camera and method
     _name: str = ""
     _truth: Truth | None = None
@@ -152,17 +189,18 @@ class CommonPixels:
         if truth is None or not views:
             return
         true, (valid,), (regions,) = truth.images[0], truth.valid, truth.regions
-        common = valid & np.all([view.coverage for view in views.values()], axis=0)
+        common = valid & np.all([view.coverage != self.in_holes for view in views.values()], axis=0)
         frame, camera = self._name.rsplit(": ", 1)
         for method, view in views.items():
             row = {"frame": frame, "camera": camera, "method": method, "seen": float(view.coverage[valid].mean())}
             row["common"] = float(common[valid].mean())
             if common.any():
                 shown, wanted = view.image[common].astype(np.float64), true[common].astype(np.float64)
-                gain = (shown * wanted).sum() / max((shown**2).sum(), 1.0)
+                gain = 1.0 if self.in_holes else (shown * wanted).sum() / max((shown**2).sum(), 1.0)
                 row |= {"psnr_db": errors(shown, wanted)["psnr_db"]}
                 row |= {"gain_psnr_db": errors(gain * shown, wanted)["psnr_db"]}
                 row["ssim"] = float(ssim_map(view.image, true).mean(-1)[common].mean())
+                row["gradients"] = _gradients(view.image, common) / max(_gradients(true, common), 1.0)
                 for region, mask in regions.items():
                     found = errors(gain * view.image[common & mask], true[common & mask])
                     row |= {region: found["psnr_db"]} if found else {}
@@ -186,12 +224,15 @@ class CommonPixels:
             means[method] |= interval("difference_db", draws)
         notes = NOTES.format(common=mean_of(self.rows).get("common", 0.0))
         tables: list[Table] = [("Against the photographs of held-out cameras", means, _COLUMNS, notes)]
+        if self.in_holes:
+            tables = [("Against the photographs in held-out holes", means, _HOLE_COLUMNS, HOLE_NOTES)]
         if names := sorted(
             {key for row in self.rows for key in row if key.startswith(("class ", "mask "))}, key=_in_order
         ):
             columns = [(name, f"{{{name}:.2f}}") for name in names]
             notes = (
-                "PSNR after one gain, of common pixels, by class of LiDAR points around them or mask of the segmenter."
+                "PSNR of these pixels (held-out cameras: after one gain), by class of LiDAR points around them or mask "
+                "of the segmenter."
             )
             tables.append(("The same by class", means, columns, notes))
         return tables

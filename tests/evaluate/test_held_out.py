@@ -53,6 +53,28 @@ def test_scores_on_common_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert [row["psnr_db"] for row in found["views"][:2]] == pytest.approx(10 * np.log10(255**2 / np.array(squares)))
 
 
+def test_held_out_holes_are_those_of_the_targets_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, raised = folder_of_streets(tmp_path / "data", count=1), RIG.shifted(z_m=0.7)
+    raised.save(tmp_path / "raised.yaml")
+    options = ["--data", str(data), "--output", str(tmp_path / "out"), "--target", str(tmp_path / "raised.yaml")]
+    assert main(["evaluate", "--held-out", "holes", *options, "--holes", "mean", "continue"]) == 0
+    found = json.loads((tmp_path / "out" / "evaluate.json").read_text())
+    assert "held-out holes" in capsys.readouterr().out
+    assert [*found["means"]] == ["fast, auto, mean", "fast, auto, continue"]
+    RIG.save(tmp_path / "raised.yaml")  # the same place
+    assert main(["evaluate", "--held-out", "holes", *options]) == 2 and "found none" in capsys.readouterr().err
+    mean, filled = found["means"].values()
+    assert mean["gradients"] < filled["gradients"] < 1 and filled["psnr_db"] > mean["psnr_db"]
+
+    sample = FrameFolder(data)[0]
+    seen = RigRetarget(raised, holes="black", match_exposure=False)(sample)["coverage"]
+    out = RigRetarget(RIG, holes="continue", match_exposure=False)({**sample, "coverage": seen})
+    hole = (~out["coverage"] & ~seen)[1].numpy()
+    (row,) = (row for row in found["views"] if row["camera"] == "front" and "continue" in row["method"])
+    away = as_arrays(out["images"])[1][hole] - as_arrays(sample["images"])[1][hole].astype(float)
+    assert hole.sum() > 100 and row["psnr_db"] == pytest.approx(10 * np.log10(255**2 / np.mean(away**2)), abs=0.02)
+
+
 def test_a_copy_of_the_camera_gives_back_its_photograph(tmp_path: Path) -> None:
     twins = Rig([camera("left", 40), camera("front", 0), camera("twin", 0)])
     data = folder_of_streets(tmp_path / "data", twins, 1)
