@@ -45,6 +45,11 @@ _TOP_M = np.float32(2.0)
 _JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
 """... and by an upright surface: maximum difference of their distances, metres, and as a multiple of their distance
 across the ray."""
+_MISSING_LINE = np.float32(1.5)
+"""Spacings of scan lines, of at least two cells, between two points above which a line is missing: glass and dark paint
+return nothing. Of lines that are closer together, some share a cell."""
+_ASIDE, _ASIDE_CELLS = np.float32(0.6), np.float32(0.55)
+"""Half the spacing of points along a scan line, and half a cell, each with a tenth for jitter."""
 
 Numbers = npt.NDArray[np.int32]
 
@@ -164,7 +169,9 @@ def meet_points(
     """Find where rays meet the surfaces between points: the next point above each ray, and the next one below.
 
     Points of one surface are joined by a line. Elsewhere a ray meets the surface of the nearer point, which continues
-    level or upright for half the spacing of the scan lines around that point.
+    level or upright for half the spacing of the scan lines around that point, for a quarter above it if the next line
+    passed over it, and aside for half the spacing along its line. Points between which a line is missing are not
+    joined: the measuring scanner's rays met glass or dark paint there.
 
     Args:
         rows: (ny, nx) rows of the rays in a panorama.
@@ -184,8 +191,9 @@ def meet_points(
     far = 2 * reach
     aside = int(side) + 1
     above, below = _next_points(index)
-    spoken, is_level = np.empty(seeds.shape[1], np.float32), np.zeros((2, seeds.shape[1]), np.bool_)
-    _describe(above, below, index, seeds, ground, reach, spoken, is_level)
+    gaps, is_level = np.full((2, seeds.shape[1]), np.inf, np.float32), np.zeros((2, seeds.shape[1]), np.bool_)
+    spoken, steps = np.empty(seeds.shape[1], np.float32), np.empty(seeds.shape[1], np.float32)
+    _describe(above, below, index, seeds, ground, reach, side, gaps, spoken, steps, is_level)
     for y in range(rows.shape[0]):
         for x in range(rows.shape[1]):
             if nearest[y, x] >= 0:
@@ -212,11 +220,14 @@ def meet_points(
             to_over = seeds[0, over] - rows[y, x] if over >= 0 else np.float32(np.inf)
             to_under = rows[y, x] - seeds[0, under] if under >= 0 else np.float32(np.inf)
             one = over if to_over <= to_under else under
-            inverse, met = _ZERO, one
-            if over >= 0 and under >= 0 and to_over + to_under <= far:
-                apart = (to_over + to_under) * rad
-                inverse, met = _between_points(seeds, is_level, over, under, slope, apart, ground)
-            if inverse <= _ZERO and min(to_over, to_under) <= spoken[one]:
+            inverse, met, gap = _ZERO, one, to_over + to_under
+            if over >= 0 and under >= 0 and gap <= min(far, _MISSING_LINE * max(gaps[0, over], gaps[1, under], _TWO)):
+                inverse, met = _between_points(seeds, is_level, over, under, slope, gap * rad, ground)
+            if inverse <= _ZERO and abs(seeds[1, one] - columns[y, x]) <= steps[one]:
+                is_outline = one == under and gap <= far and seeds[2, over] < seeds[2, under]
+                is_outline = is_outline and not _is_road(seeds, one, ground)
+                if min(to_over, to_under) > (spoken[one] / _TWO if is_outline else spoken[one]):
+                    continue
                 is_flat = is_level[0, one] if one == over else is_level[1, one]
                 inverse, met = slope / seeds[3, one] if is_flat else seeds[2, one], one
             if inverse > _ZERO:
@@ -276,9 +287,11 @@ def _cost(seeds: Any, i: int, row: float, column: float, far: float, side: float
 
 @inlined
 def _describe(
-    above: Any, below: Any, index: Any, seeds: Any, ground: float, reach: float, spoken: Any, is_level: Any
-) -> None:
-    """Write for how many cells above and below points (n,) speak, and which lie on level surfaces (2, n).
+    above: Any, below: Any, index: Any, seeds: Any, ground: float, reach: float, side: float, gaps: Any, spoken: Any,
+    steps: Any, is_level: Any,
+) -> None:  # fmt: skip
+    """Write the cells to the next points above and below (2, n), for how many cells up and down and aside (n,) points
+    speak, and which lie on level surfaces (2, n).
 
     A point speaks for half the spacing of points there, at most ``reach``. Rows say how its surface goes on below and
     above it: as it lies on its other side where it stands upright on this one, so that a top ends in a level edge.
@@ -289,8 +302,13 @@ def _describe(
             i = index[row, column]
             if i < 0:
                 continue
-            least, is_flat = 2 * reach, _is_road(seeds, i, ground)
-            for j in (above[row + 1, column], below[row - 1, column]):
+            least, is_flat, steps[i] = 2 * reach, _is_road(seeds, i, ground), side
+            for c in (column - 1, column + 1, column - 2, column + 2):
+                if steps[i] == side and 0 <= c < w and index[row, c] >= 0:
+                    steps[i] = min(side, max(_ASIDE * abs(seeds[1, index[row, c]] - seeds[1, i]), _ASIDE_CELLS))
+            for k, j in enumerate((above[row + 1, column], below[row - 1, column])):
+                if j >= 0:
+                    gaps[k, i] = abs(seeds[0, j] - seeds[0, i])
                 if j >= 0 and abs(seeds[0, j] - seeds[0, i]) <= 2 * reach:
                     least = min(least, abs(seeds[0, j] - seeds[0, i]))
                     # Is the line to a point under the origin, too, nearer to a level one than to an upright one?

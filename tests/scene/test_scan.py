@@ -63,7 +63,7 @@ def ranges(lidar: Lidar, result: Scan) -> np.ndarray:
     return image
 
 
-@pytest.mark.parametrize(("beams", "new_beams", "up"), [(32, 64, 0.0), (64, 32, 0.0), (32, 64, 0.7)])
+@pytest.mark.parametrize(("beams", "new_beams", "up"), [(32, 64, 0.0), (64, 32, 0.0), (32, 64, 0.7), (200, 200, 0.0)])
 def test_wall_and_road_are_where_they_are(beams: int, new_beams: int, up: float) -> None:
     a, b = scanner(beams, at()), scanner(new_beams, at(z=1.9 + up))
     result = scan([b], measured(a), 0.0)
@@ -133,6 +133,37 @@ def test_edges_and_feet(column: list[tuple[float, float]], z_m: float, expected_
     deg = float(np.degrees(np.arctan2(z_m - 1.9, expected_m if z_m < 0 else column[1][0])))
     ray = replace(scanner(1, at()), elevations_deg=(deg,), azimuth_step_deg=0.25)
     np.testing.assert_allclose(scan([ray], points, 0.0).points[:, 0], expected_m, atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "deg", "azimuth_deg", "returns"),
+    [
+        ("glass", -1.0, 0.0, False),  # a line between two others is missing
+        ("glass", -1.4, 0.0, True),
+        ("dropout", -1.0, 0.0, False),  # the only line there misses one point
+        ("dropout", -1.0, 0.1, True),
+        ("outline", 0.2, 0.0, False),  # the next line passed over the car, and met the wall
+        ("outline", 0.1, 0.0, True),
+    ],
+)
+def test_a_ray_has_no_return_where_the_measuring_rays_had_none(
+    name: str, deg: float, azimuth_deg: float, returns: bool
+) -> None:
+    columns = np.arange(-2, 2.1, 0.2)
+    without = columns[np.abs(columns) > 0.1]
+    lines = {  # elevation, columns, distance
+        "glass": [(up, columns, 10.0) for up in (-2.0, -1.5, -0.5, 0.0)],
+        "dropout": [(-1.0, without, 10.0)],
+        "outline": [(up, columns, 10.0) for up in (-1.0, -0.5, 0.0)] + [(0.5, columns, 30.0)],
+    }[name]
+    parts = []
+    for up_deg, along_deg, away_m in lines:
+        up, along = np.radians(up_deg), np.radians(along_deg)
+        rays = np.stack([np.cos(up) * np.cos(along), np.cos(up) * np.sin(along), np.full(along.shape, np.sin(up))], 1)
+        parts.append([0, 0, 1.9] + away_m * rays)
+    ray = scanner(1, at(), azimuth_step_deg=0.1, azimuth_deg=(azimuth_deg, azimuth_deg + 0.1))
+    ray = replace(ray, elevations_deg=(deg,))
+    assert len(scan([ray], np.concatenate(parts).astype(np.float32), 0.0).points) == returns
 
 
 def test_other_frames_fill_what_the_own_scan_does_not_support() -> None:
