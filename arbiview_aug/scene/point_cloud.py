@@ -322,11 +322,9 @@ class PointCloudSurface(DenseSurface):
         if key not in self._nodes:
             R = camera.cam2ego[:3, :3]
             step = max(1, int(min(NODES_RAD * float(rays.parameters[0]), max(rays.size))))  # two nodes span any image
-            local = rays.nodes(step)
-            panorama, is_smooth = self.panorama(camera.center_m, local, R, cells, memory)
-            if not is_smooth and step > 1:
-                step, local = 1, rays.nodes(1)
-            local = rays.planes if step == 1 and rays.planes.size else local
+            panorama, is_smooth = self.panorama(camera.center_m, rays.nodes(step), R, cells, memory)
+            step = step if is_smooth else 1
+            local = rays.planes if step == 1 and rays.planes.size else rays.nodes(step)
             rows, columns = np.empty((2, *local.shape[1:]), np.float32)
             cells_of(local, R.astype(np.float32), panorama.window, rows, columns)
             self._nodes[key] = panorama, rows, columns, step
