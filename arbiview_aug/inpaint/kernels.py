@@ -490,16 +490,19 @@ def colour_objects(sample: Any, part: Any, white: float, colours: Any) -> None:
     objects = colours.shape[0] // PARTS
     tops, sure = np.empty((objects, 3, 3)), np.empty(objects)  # paint, body and seen top of each, linear
     weight, x_sum, y_sum, xx, xy = 2.0, 1.0, 1.0, 1.0, 1.0  # of a black and a white top
-    windows, body, rim, top = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    panes, is_glazed = np.empty((objects, 3)), np.empty(objects, np.bool_)
+    body, rim, top = np.empty(3), np.empty(3), np.empty(3)
     shades, known = np.empty(objects, np.float32), 0
     for n in range(objects):
-        if _quantile(ordered, ends[PARTS * n], ends[PARTS * n + 1], _MEDIAN, 0, values, windows):
-            shades[known] = windows.sum()
+        first = PARTS * n
+        is_glazed[n] = _quantile(ordered, ends[first], ends[first + 1], _MEDIAN, 0, values, panes[n])
+        if is_glazed[n]:
+            shades[known] = panes[n].sum()
             known += 1
     glass = np.float64(_select(shades, known, _MEDIAN)) if known else 0.0
     for n in range(objects):
         first, seen = PARTS * n, ends[PARTS * n + RIM_PART] - ends[PARTS * n + TOP_PART]
-        has_windows = _quantile(ordered, ends[first], ends[first + 1], _MEDIAN, 0, values, windows)
+        windows, has_windows = panes[n], is_glazed[n]
         has_body = _quantile(ordered, ends[first + 1], ends[first + TOP_PART], _MEDIAN, 0, values, body)
         _quantile(ordered, ends[first + TOP_PART], ends[first + RIM_PART], _TOP_SHARE, 0, values, top)
         has_rim = _quantile(ordered, ends[first + RIM_PART], ends[first + PARTS], _RIM_SHARE, 0, values, rim)
