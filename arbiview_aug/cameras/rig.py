@@ -37,6 +37,7 @@ from arbiview_aug.errors import CalibrationError, calibration_of, shown, warn
 from arbiview_aug.files import read_bytes
 
 MOST_CAMERAS, MOST_LIDARS = 128, 32  # largest rig: winning sources are int8
+RIG_SUFFIXES = ".yaml", ".yml", ".json"  # of rig files
 _CAMERA_KEYS = {"name", "width", "height", "K", "cam2ego", "distortion", "mask"}
 _NOTES = ("source", "notes", "ego_frame", "ground_source", "dataset", "kind", "license")
 _MOST_MASK_BYTES = 1 << 28
@@ -240,7 +241,7 @@ class Rig:
         The folder is created. CalibrationError for another suffix, OutputError for a file that cannot be written.
         """
         path = Path(path)
-        if path.suffix not in (".json", ".yaml", ".yml"):
+        if path.suffix not in RIG_SUFFIXES:
             raise CalibrationError(f"rig file {path}: expected the suffix .yaml, .yml or .json, got {path.suffix!r}")
         data, files = self.to_dict(), dict[Path, bytes]()
         for k, (entry, camera) in enumerate(zip(data["cameras"], self.cameras, strict=True)):

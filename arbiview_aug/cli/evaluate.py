@@ -39,9 +39,9 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, dem
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.displaced import NOT_DISPLACED, displaced_frames, later_neighbour, surfaces_for
 from arbiview_aug.evaluate.frames import EXPOSURES, Evaluation, Look, ScoredFrame, evaluate, make_frame
-from arbiview_aug.evaluate.held_out import CommonPixels, held_out_frames
+from arbiview_aug.evaluate.held_out import CommonPixels, held_out_frames, render_alone
 from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.judges import load_detector, load_segmenter
+from arbiview_aug.evaluate.judges import Segmenter, load_detector, load_segmenter
 from arbiview_aug.evaluate.methods import COPY, Method, retargeting
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.html import html_report
@@ -79,27 +79,10 @@ def run(arguments: argparse.Namespace) -> None:
     )
     look = panel.look if arguments.detector or arguments.segmenter else None
     common = CommonPixels(look, arguments.held_out == ["holes"]) if arguments.held_out else None
-    if common is not None or arguments.displaced:
-        # The surfaces, and a copy of displaced cameras, on photographs; holes are not read from neighbours.
-        everything: GeometryName = "fused" if arguments.geometry == ["auto"] else "motion"
-        place_of = load_rig(arguments.target or REAL_TARGET) if arguments.held_out == ["holes"] else None
-        data = open_frames(arguments, arguments.geometry if place_of else [everything, *arguments.geometry])
-        chosen, asked = chosen_frames(arguments.frames or len(data), len(data)), arguments.held_out or ("",)
-        each = len(data[chosen[0]]["rig"]) if {"all", "holes"} & {*asked} else len(asked)  # views a frame and method
-        with named_steps(notes, len(chosen) * each) as tick:
-            if common is None:
-                frames = displaced_frames(data, chosen)
-            else:
-                frames = held_out_frames(data, chosen, asked, panel.segmenter, place_of)
-            if (first := next(frames, None)) is None:
-                raise DataError("--held-out holes: expected a --target whose place leaves holes, found none")
-            if arguments.geometry == ["auto"] and place_of is None:
-                arguments.geometry = surfaces_for(first[1].sample)
-            methods = [*([COPY] if common is None else []), *_methods(arguments, neighbours=None)]
-            looks = look if common is None else common.look
-            done = evaluate(chain([first], frames), lambda rig: rig, methods, tick, looks)
-        if common is not None:
-            common.finish()
+    if common is not None:
+        methods, done = _held_out(arguments, notes, common, panel.segmenter)
+    elif arguments.displaced:
+        methods, done = _displaced(arguments, notes, look)
     else:
         methods, data = _methods(arguments), open_frames(arguments, arguments.geometry)
         done = measured(arguments, data, methods, notes, look)
@@ -107,22 +90,21 @@ def run(arguments: argparse.Namespace) -> None:
     if done.declined.keys() >= {*names}:
         raise DataError("; ".join(done.declined.values()))
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
-    scored = evaluation_table(done, names)
-    tables = [scored] if common is None else common.tables([name for name in names if name not in done.declined])
-    verdicts = panel.rows([name for name in names if name not in done.declined])  # others were judged on fewer frames
+    whole = [name for name in names if name not in done.declined]  # others were judged on fewer frames
+    verdicts, rows = panel.rows(whole), done.views if common is None else common.rows
+    tables = [evaluation_table(done, names)] if common is None else common.tables(whole)
     tables += verdict_tables(verdicts)
     if too_few(verdicts.values()):
         notes.append(TOO_FEW)
     if arguments.detector and not any("objects" in row for row in verdicts.values()):
         notes.append("--detector: no labels (boxes_3d) and no true images: nothing to compare its detections with")
     source = arguments.data or f"Synthetic streets, seed {arguments.seed}"
-    title = f"{source}: {frames_text(len({view['frame'].split(': ')[0] for view in done.views}))}"
+    title = f"{source}: {frames_text(len({row['frame'] for row in rows}))}"
     for note in notes:
         print(f"note: {note}\n")
     print(title, *(text_table(*table) for table in tables), sep="\n\n", end="\n\n")
     report: dict[str, Any] = {"arguments": vars(arguments), "scored_on_other_points": done.first.held_out}
-    report |= {"means": tables[0][1], "views": common.rows if common else done.views}
-    report |= {"judges": verdicts} if verdicts else {}
+    report |= {"means": tables[0][1], "views": rows} | ({"judges": verdicts} if verdicts else {})
     (folder / "evaluate.json").write_text(json.dumps(report, indent=1) + "\n")
     for method, views in done.pictures.items():
         file = re.sub(r"[^\w+-]+", "-", f"{done.label}-{method}")
@@ -154,6 +136,45 @@ def measured(
     frames = map(frame, indices)
     with named_steps(notes, len(indices)) as tick:
         return evaluate(frames, partial(target_rig, arguments, chosen), methods, tick, look)
+
+
+def _displaced(arguments: argparse.Namespace, notes: list[str], look: Look | None) -> tuple[list[Method], Evaluation]:
+    """Evaluate a copy and the surfaces on photographs; holes are not read from neighbours."""
+    data = _with_all_surfaces(arguments)
+    chosen = chosen_frames(arguments.frames or len(data), len(data))
+    with named_steps(notes, len(chosen)) as tick:
+        frames = displaced_frames(data, chosen)
+        first = next(frames)
+        if arguments.geometry == ["auto"]:
+            arguments.geometry = surfaces_for(first[1].sample)
+        methods = [COPY, *_methods(arguments, neighbours=None)]
+        return methods, evaluate(chain([first], frames), lambda rig: rig, methods, tick, look)
+
+
+def _held_out(
+    arguments: argparse.Namespace, notes: list[str], common: CommonPixels, segmenter: Segmenter | None
+) -> tuple[list[Method], Evaluation]:
+    """Evaluate the surfaces on held-out cameras, or what fills held-out holes; none is read from neighbours."""
+    place_of = load_rig(arguments.target or REAL_TARGET) if common.in_holes else None
+    data = _with_all_surfaces(arguments) if place_of is None else open_frames(arguments, arguments.geometry)
+    chosen, asked = chosen_frames(arguments.frames or len(data), len(data)), arguments.held_out
+    each = len(data[chosen[0]]["rig"]) if {"all", "holes"} & {*asked} else len(asked)  # views a frame and method
+    with named_steps(notes, len(chosen) * each) as tick:
+        frames = held_out_frames(data, chosen, asked, segmenter, place_of)
+        if (first := next(frames, None)) is None:
+            raise DataError("--held-out holes: expected a --target whose place leaves holes, found none")
+        if arguments.geometry == ["auto"] and place_of is None:
+            arguments.geometry = surfaces_for(first[1].sample)
+        methods = _methods(arguments, neighbours=None)
+        done = evaluate(chain([first], frames), lambda rig: rig, methods, tick, common.look, render_alone)
+    common.finish()
+    return methods, done
+
+
+def _with_all_surfaces(arguments: argparse.Namespace) -> Any:
+    """Open the data with what every surface reads that photographs may score."""
+    everything: GeometryName = "fused" if arguments.geometry == ["auto"] else "motion"
+    return open_frames(arguments, [everything, *arguments.geometry])
 
 
 def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:

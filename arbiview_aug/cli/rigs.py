@@ -10,7 +10,7 @@ import numpy as np
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.formats.calibration import recognised
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.rig import Rig, load_rig, read_rig, shipped_rigs
+from arbiview_aug.cameras.rig import RIG_SUFFIXES, Rig, load_rig, read_rig, shipped_rigs
 from arbiview_aug.cli.arguments import PICTURES, data, output_file
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
@@ -19,15 +19,13 @@ from arbiview_aug.evaluate.common_rig import common_rig, seen_shares
 from arbiview_aug.evaluate.report.pictures import draw_rigs, save_picture
 from arbiview_aug.evaluate.report.tables import markdown_table
 
-RIG_FILES = ".yaml", ".yml", ".json"
-
 NOISE_DEG, NOISE_M = 0.2, 0.02
 """Errors of a calibration that is kept up. Rigs that differ by less are one rig."""
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Print the rigs and the differences of the others from the first; write the picture, or the common rig."""
-    default, endings = ("common.yaml", RIG_FILES) if arguments.common else ("inspect.png", PICTURES)
+    default, endings = ("common.yaml", RIG_SUFFIXES) if arguments.common else ("inspect.png", PICTURES)
     path = output_file(arguments.output or default, endings)
     rigs, notes = zip(*(_load(name) for name in arguments.rigs), strict=True)
     print("\n\n".join(f"{rig!r}{note}" for rig, note in zip(rigs, notes, strict=True)))

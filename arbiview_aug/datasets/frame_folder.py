@@ -306,17 +306,16 @@ class FrameFolder(WritableRecording):
         frame = replace(frame, calib={**frame.calib, "cameras": [size | entry]})
         return camera_fields(self._rig(frame), frame.images(self.reduce), frame.name)
 
-    def point_classes(self, index: int) -> tuple[torch.Tensor, npt.NDArray[np.int64]] | None:
-        """LiDAR points (P, >=3) of a frame and the class of each (P,), if ``class.npy`` lies next to ``calib.json``."""
-        frame = self._frames[checked_index(index, len(self))].read()
-        path, points = frame.file(CLASSES_FILE), frame.points()
-        if points is None or not os.path.lexists(path):
+    def point_classes(self, index: int, count: int) -> npt.NDArray[np.int64] | None:
+        """Class of each of a frame's ``count`` LiDAR points, if ``class.npy`` lies next to ``calib.json``."""
+        path = self._frames[checked_index(index, len(self))].file(CLASSES_FILE)
+        if not os.path.lexists(path):
             return None
         classes = read_cloud(path, None, _COLUMNS)
-        if classes.shape != (len(points),) or classes.dtype.kind not in "iu":
-            expected = f"a whole number for each of {len(points)} points"
+        if classes.shape != (count,) or classes.dtype.kind not in "iu":
+            expected = f"a whole number for each of {count} points"
             raise DataError(f"classes {path}: expected {expected}, got {classes.dtype} {classes.shape}")
-        return points, classes.astype(np.int64)
+        return classes.astype(np.int64)
 
     def _boxes_pose_time(self, frame: _Frame) -> dict[str, Any]:
         values = {"boxes_3d": frame.boxes(), "ego2world": frame.pose(), "time_s": self._times_s.get(frame.name)}

@@ -34,8 +34,8 @@ def common_rig(rigs: Sequence[Rig]) -> Rig:
     """
     if len(rigs) < 2:
         raise CalibrationError(f"common rig: expected two or more rigs, got {len(rigs)}")
-    placed = [replace(rig, name=rig.name or f"rig {k}").shifted(z_m=-rig.ground_z_m) for k, rig in enumerate(rigs, 1)]
-    placed = [replace(rig, ground_z_m=0.0) for rig in placed]
+    level = replace(rigs[0], ground_z_m=0.0)
+    placed = [replace(rig, name=rig.name or f"rig {k}").in_frame_of(level) for k, rig in enumerate(rigs, 1)]
     height_m = np.mean([rig.cam2ego[:, 2, 3].mean() for rig in placed])
     best, most = list[Camera](), 0
     for rig in placed:

@@ -71,9 +71,13 @@ def photographed(
     regions: Sequence[Mapping[str, BoolArray]] = (),
 ) -> ScoredFrame:
     """Frame whose truth is what the cameras of ``rig``, in its ego frame, photographed outside of their masks."""
-    valid = [np.ones(camera.size, bool) if camera.mask is None else camera.mask for camera in rig]
-    truth = Truth(images, valid, regions)
+    truth = Truth(images, scene_masks(rig), regions)
     return ScoredFrame(sample, truth=lambda _: truth, target=without_masks(rig))
+
+
+def scene_masks(rig: Rig) -> list[BoolArray]:
+    """(h, w) pixels of each camera that show no car body."""
+    return [np.ones(camera.size, bool) if camera.mask is None else camera.mask for camera in rig]
 
 
 def without_masks(rig: Rig) -> Rig:
@@ -187,6 +191,7 @@ def evaluate(
     methods: Sequence[Method],
     tick: Callable[[str, int], None] = lambda _, __: None,
     look: Look | None = None,
+    score: Callable[[ScoredFrame, Render, Rig], tuple[list[RenderedView], list[dict[str, float]]]] = scores,
 ) -> Evaluation:
     """Run every method on every named frame, for its ``target`` or that of its rig; DataError without frames.
 
@@ -200,7 +205,7 @@ def evaluate(
         for method in methods:
             tick(f"{name}: {method.name}", len(methods))
             try:
-                views, rows = scores(frame, method.render, rig)
+                views, rows = score(frame, method.render, rig)
             except (CalibrationError, SampleError) as error:  # lenses, for a method of pinhole cameras
                 done.declined[method.name] = f"frame {name}: {error}"
                 continue

@@ -17,7 +17,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.frame_folder import FrameFolder
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.frames import Look, ScoredFrame, Truth, photographed, without_masks
+from arbiview_aug.evaluate.frames import Look, Render, ScoredFrame, Truth, photographed, scene_masks, without_masks
 from arbiview_aug.evaluate.images import RenderedView, as_arrays, to_bytes
 from arbiview_aug.evaluate.judges import Segmenter
 from arbiview_aug.evaluate.lidar import visible_points
@@ -104,13 +104,15 @@ def held_out_frames(
             raise DataError(f"--held-out: expected {expected}, got {', '.join(sorted(unknown))}")
         elif len(rig) < 2:
             raise DataError(f"--held-out: expected frames of several cameras, frame {frame} has one")
-        classed = recorded.point_classes(index) if isinstance(recorded, FrameFolder) else None
+        points, classes = sample.get("points"), None
+        if points is not None and isinstance(recorded, FrameFolder):
+            classes = recorded.point_classes(index, len(points))
         for place, camera in enumerate(rig):
             if not holes[place].any() if place_of is not None else not {camera.name, "all"} & {*cameras}:
                 continue
             masks = () if segmenter is None else segmenter(to_bytes(as_arrays([sample["images"][place]])[0]))
             regions = {f"mask {k}": mask for k, mask in enumerate(masks, 1)}
-            regions |= {} if classed is None else _windows(camera, *classed)
+            regions |= {} if points is None or classes is None else _windows(camera, points, classes)
             if place_of is None:
                 held = held_out(sample, place, sample, regions)
             else:
@@ -129,13 +131,18 @@ def held_out(
     return photographed(WithoutCamera(sample, place), target, image, [regions or {}])
 
 
+def render_alone(frame: ScoredFrame, render: Render, target: Rig) -> tuple[list[RenderedView], list[dict[str, float]]]:
+    """Views without scores, for ``evaluate``: ``CommonPixels`` scores them once all methods' are there."""
+    return render(frame.sample, target), [{} for _ in target]
+
+
 def _with_holes(sample: Mapping[str, Any], rig: Rig, target: Rig) -> tuple[dict[str, Any], list[BoolArray]]:
     """Sample whose cameras do not see the holes (h, w) that they would have at the centres of the target's nearest."""
     centres = [camera.center_m for camera in target.in_frame_of(rig)]
     moved = [camera.shifted(*min(centres - camera.center_m, key=np.linalg.norm)) for camera in rig]
     there = RigRetarget(without_masks(rig.with_cameras(moved)), holes="black", match_exposure=False, neighbours=None)
     seen = [covered.numpy() for covered in there(sample)["coverage"]]
-    own = [np.ones(camera.size, bool) if camera.mask is None else camera.mask for camera in rig]
+    own = scene_masks(rig)
     coverage = [torch.from_numpy(covered & mask) for covered, mask in zip(seen, own, strict=True)]
     return {**sample, "coverage": coverage}, [mask & ~covered for covered, mask in zip(seen, own, strict=True)]
 
@@ -170,7 +177,8 @@ class CommonPixels:
     then: Look | None = None  # looks after it
     in_holes: bool = False  # score the pixels that no method covers, at their own exposure
     rows: list[dict[str, Any]] = field(default_factory=list)  # metrics by frame, camera and method
-    _name: str = ""
+    _name: str = ""  # of the held-out camera in its frame
+    _place: tuple[str, str] = "", ""  # its frame, and its own name
     _truth: Truth | None = None
     _views: dict[str, RenderedView] = field(default_factory=dict)  # of that camera, by method
 
@@ -179,6 +187,7 @@ class CommonPixels:
         if name != self._name:
             self.finish()
             self._name, self._truth = name, None if frame.truth is None else frame.truth(rig)
+            self._place = name.removesuffix(f": {rig[0].name}"), rig[0].name
         self._views[method] = views[0]
         if self.then is not None:
             self.then(name, frame, method, rig, views)
@@ -190,7 +199,7 @@ class CommonPixels:
             return
         true, (valid,), (regions,) = truth.images[0], truth.valid, truth.regions
         common = valid & np.all([view.coverage != self.in_holes for view in views.values()], axis=0)
-        frame, camera = self._name.rsplit(": ", 1)
+        frame, camera = self._place
         for method, view in views.items():
             row = {"frame": frame, "camera": camera, "method": method, "seen": float(view.coverage[valid].mean())}
             row["common"] = float(common[valid].mean())
