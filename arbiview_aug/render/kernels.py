@@ -373,10 +373,10 @@ def soften(winner: Any, border_px: Any, radius: int, width_px: float, weights: A
 
 # --- pixels -----------------------------------------------------------------------------------------------------------
 @inlined
-def _block(floats: Any, ints: Any, q: Any, n: int) -> Block:
+def _block(floats: Any, ints: Any, q: Any, n: int, has_held: bool) -> Block:
     """A block of n pixels with scratch memory, of which ``_look`` uses rows 6 to 10 of ``floats`` and 3 of ``ints``."""
     x, y, z, u, v = floats[0, :n], floats[1, :n], floats[2, :n], floats[4, :n], floats[5, :n]
-    return Block(x, y, z, q, ints[0, :n], u, v, ints[1, :n], ints[2, :n])
+    return Block(x, y, z, q, ints[0, :n], u, v, ints[1, :n], ints[2, : n if has_held else 0])
 
 
 @inlined
@@ -474,8 +474,8 @@ def _hide(
 
 @borrowing
 def _look(
-    sources: Sources, k: int, occluders: Occluders, block: Block, has_faces: bool, has_held: bool, floats: Any,
-    ints: Any, xy: Any, tag: Any,
+    sources: Sources, k: int, occluders: Occluders, block: Block, has_faces: bool, floats: Any, ints: Any,
+    xy: Any, tag: Any,
 ) -> None:  # fmt: skip
     """Find where source k sees the pixels of a block.
 
@@ -493,7 +493,7 @@ def _look(
     low_u, low_v, high_u, high_v, right, bottom = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4], bounds[5]
     for i in range(n):
         seen[i] = (u[i] >= low_u) & (u[i] <= high_u) & (v[i] >= low_v) & (v[i] <= high_v)
-    for i in range(n if has_held else 0):
+    for i in range(block.held.shape[0]):
         block.held[i] |= seen[i]
     if occluders.beyond.size[k, 0]:
         _hide(sources, k, occluders, block, has_faces, floats, place)
@@ -528,7 +528,7 @@ def see_nodes(
 ) -> None:
     """Clear the scores of nodes that a source does not see; ``floats`` and ``ints`` are as in ``plan_pixels``."""
     K, ny, nx = nodes.score.shape
-    block, has_faces = _block(floats, ints, floats[3, :nx], nx), surfaces.face.shape[0] > 0
+    block, has_faces = _block(floats, ints, floats[3, :nx], nx, False), surfaces.face.shape[0] > 0
     xy, tag = ints[6, :nx], ints[7, :nx]
     for j in range(ny):
         for i in range(nx):
@@ -542,7 +542,7 @@ def see_nodes(
                 for i in range(nx):
                     block.u[i] = positions[view.y[j], view.x[i]]
                     block.v[i] = positions[h // 2 + view.y[j], view.x[i]]
-            _look(sources, k, occluders, block, has_faces, False, floats, ints, xy, tag)
+            _look(sources, k, occluders, block, has_faces, floats, ints, xy, tag)
             score = nodes.score[k, j]
             for i in range(nx):
                 score[i] = score[i] if tag[i] >= 0 else _ZERO
@@ -581,9 +581,8 @@ def _plan_block(
     With ``fills`` the first one that sees a pixel wins it, if none has won it before.
     """
     n, total = x1 - x0, (x1 - x0) * (y1 - y0)
-    block = _block(floats, ints, floats[3, :total] if y1 - y0 > 1 else surfaces.q[y0, x0:x1], total)
-    in_image = pixels.in_image.shape[0] > 0
-    has_faces: Any = False
+    in_image, face_most = pixels.in_image.shape[0] > 0, np.int32(-1)
+    block = _block(floats, ints, floats[3, :total] if y1 - y0 > 1 else surfaces.q[y0, x0:x1], total, in_image)
     weight_1, weight_2, weight, mixed = floats[11, :total], floats[12, :total], floats[13, :total], floats[14, :total]
     xy_1, tag_1, xy, tag = ints[4, :total], ints[5, :total], ints[6, :total], ints[7, :total]
     xy_2, tag_2, work = ints[8, :total], ints[9, :total], ints[10, :total]
@@ -594,12 +593,11 @@ def _plan_block(
         for x in range(n if y1 - y0 > 1 else 0):
             to_q[x] = q[x]
         if surfaces.face.shape[0]:
-            face, to_face, most = surfaces.face[y, x0:x1], block.face[row], np.int32(-1)
+            face, to_face = surfaces.face[y, x0:x1], block.face[row]
             for x in range(n):
                 to_face[x] = face[x]
             for x in range(n):
-                most = max(most, to_face[x])
-            has_faces = has_faces or most >= 0
+                face_most = max(face_most, to_face[x])
     for x in range(total if in_image else 0):
         block.held[x] = 0
     several, is_first = some & (some - 1) != 0, True
@@ -614,7 +612,7 @@ def _plan_block(
                     block.u[(y - y0) * n + x] = positions[y, x0 + x]
                     block.v[(y - y0) * n + x] = positions[rows // 2 + y, x0 + x]
         to_xy, to_tag = (xy_1, tag_1) if is_first else (xy, tag)
-        _look(sources, k, occluders, block, has_faces, in_image, floats, ints, to_xy, to_tag)
+        _look(sources, k, occluders, block, face_most >= 0, floats, ints, to_xy, to_tag)
         if several:
             for y in range(y0, y1):
                 _weigh_row(weights[k], view.step, y, x0, mixed[(y - y0) * n : (y - y0) * n + n])
