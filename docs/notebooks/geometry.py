@@ -21,27 +21,30 @@ GEOMETRIES = "infinity", "ground", "street", "boxes", "lidar"
 
 
 def compare(target, geometries=GEOMETRIES):
-    """Print PSNR and coverage of a target's views by geometry; return the views of each, and the truth."""
+    """Print PSNR and coverage by geometry; return the views, and the truth."""
     truth, outs = drive.render(0, target).images, {}
     for geometry in geometries:
-        views = outs[geometry] = RigRetarget(target, geometry=geometry, holes="black")(sample)
+        retarget = RigRetarget(target, geometry=geometry, holes="black")
+        views = outs[geometry] = retarget(sample)
         seen = views["coverage"][:, None].expand_as(truth)
-        mse = (views["images"].float() - truth.float())[seen].square().mean().item()
-        print(f"{geometry:9} {10 * math.log10(255**2 / mse):5.1f} dB  {seen.float().mean():6.1%} covered")
+        errors = (views["images"].float() - truth.float())[seen]
+        psnr = 10 * math.log10(255**2 / errors.square().mean().item())
+        covered = seen.float().mean()
+        print(f"{geometry:9} {psnr:5.1f} dB  {covered:6.1%} covered")
     return outs, truth
 
 
 # %% [markdown]
 # ## Cameras that turn
 #
-# Each camera tilts by 3 degrees where it stands. Rays keep their starts, so distances hardly matter.
+# Each camera tilts by 3 degrees in its place. Rays keep their starts, so distances hardly matter.
 
 # %%
 outs, truth = compare(source.turned(pitch_deg=3.0))
 
 # %% [markdown]
-# Turned to the left by 10 degrees, a view also shows what only the next camera saw. That one stands elsewhere, so this
-# strip needs distances.
+# Turned to the left by 10 degrees, a view also shows what only the next camera saw. That one is in another place, so
+# this strip needs distances.
 
 # %%
 outs, truth = compare(source.turned(yaw_deg=10.0))
@@ -49,7 +52,7 @@ outs, truth = compare(source.turned(yaw_deg=10.0))
 # %% [markdown]
 # ## Cameras that rise
 #
-# Now all cameras stand 0.7 m higher, as on a van. Distances matter.
+# Now all cameras are 0.7 m higher, as on a van. Distances matter.
 
 # %%
 raised = source.with_cameras([camera.shifted(z_m=0.7) for camera in source])
@@ -61,7 +64,8 @@ outs, truth = compare(raised)
 # was measured. Black is what no camera saw. `infinity` covers everything, and is wrong.
 
 # %%
-pictures = {name: views["images"][0] for name, views in outs.items()} | {"the truth": truth[0]}
+pictures = {name: views["images"][0] for name, views in outs.items()}
+pictures["the truth"] = truth[0]
 figure, grid = plt.subplots(2, 3, figsize=(12, 4), layout="constrained")
 for axes, (name, picture) in zip(grid.flat, pictures.items(), strict=True):
     axes.imshow(picture.permute(1, 2, 0).numpy())
@@ -77,8 +81,8 @@ for axes, (name, picture) in zip(grid.flat, pictures.items(), strict=True):
 # %%
 for keys in (("points", "boxes_3d"), ("boxes_3d",), ()):
     offered = {key: sample[key] for key in ("images", "rig", *keys)}
-    explained = str(RigRetarget(raised).explain(offered))
-    print(f"{' and '.join(keys) or 'images alone'}:\n  {explained.splitlines()[2].strip()}")
+    explained = str(RigRetarget(raised).explain(offered)).splitlines()
+    print(" and ".join(keys) or "images alone", explained[2], sep="\n")
 
 # %% [markdown]
 # ## The rule
@@ -87,10 +91,10 @@ for keys in (("points", "boxes_3d"), ("boxes_3d",), ()):
 # | --- | --- | --- |
 # | turn, zoom | anything | `auto`, which takes `infinity` |
 # | move | LiDAR | `auto`, which takes `lidar`, with boxes if there are any |
-# | move | boxes alone | `auto`, which takes `boxes`; leave half of the samples untouched |
+# | move | boxes alone | `auto`, which takes `boxes` |
 # | move | images of a drive with poses | the `depth` command, then `motion` |
-# | move | images alone | depth of a network and `learned`, or do not retarget |
+# | move | images alone | `auto`, with half of the samples untouched; or depth of a network and `learned` |
 #
 # [When to retarget](../when.md) says how much of a detector's gap each closes, and
-# [surfaces and qualities](../surfaces.md) says how each works. Your own drive has no truth to compare with: there,
+# [depth source and quality](../surfaces.md) says how each works. Your own drive has no truth to compare with: there,
 # `evaluate --displaced` takes the photographs of the next frame instead.

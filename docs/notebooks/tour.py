@@ -2,14 +2,21 @@
 # # A tour
 #
 # One sample, from your own data to a training loader: check it, ask what retargeting would do, retarget, load, and
-# measure. A synthetic street stands in for your data, so everything runs anywhere in under a minute.
+# measure. A synthetic street takes the place of your data, so everything runs anywhere in under a minute.
 
 # %%
 import math
 
 from torch.utils.data import DataLoader
 
-from arbiview_aug import RetargetedDataset, RigRetarget, check, collate, load_rig, show
+from arbiview_aug import (
+    RetargetedDataset,
+    RigRetarget,
+    check,
+    collate,
+    load_rig,
+    show,
+)
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 
@@ -20,9 +27,11 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 # metres) make the views better. [Formats](../formats.md) lists every key.
 
 # %%
-dataset = SyntheticDrive(demo_source_rig((128, 352)), num_frames=4, seed=2, lidar=True)
+rig = demo_source_rig((128, 352))
+dataset = SyntheticDrive(rig, num_frames=4, seed=2, lidar=True)
 recorded = dataset[0]
-sample = {key: recorded[key] for key in ("images", "K", "cam2ego", "boxes_3d", "points")}
+keys = "images", "K", "cam2ego", "boxes_3d", "points"
+sample = {key: recorded[key] for key in keys}
 for key, value in sample.items():
     print(f"{key:9} {tuple(value.shape)} {value.dtype}")
 
@@ -73,16 +82,23 @@ for key in ("images", "K", "cam2ego", "coverage", "generated", "points"):
 show(views)
 
 # %% [markdown]
+# The same views without boxes, holes filled, as a network gets them:
+
+# %%
+show({key: views[key] for key in ("images", "K", "cam2ego")})
+
+# %% [markdown]
 # ## Load
 #
 # `RetargetedDataset` retargets in the DataLoader's workers, if `num_workers` asks for any. `collate` stacks what has
 # one shape, and lists the rest.
 
 # %%
-loader = DataLoader(RetargetedDataset(dataset, retarget), batch_size=2, collate_fn=collate)
-for batch in loader:
+retargeted = RetargetedDataset(dataset, retarget)
+for batch in DataLoader(retargeted, batch_size=2, collate_fn=collate):
     covered = batch["coverage"].float().mean()
-    print(tuple(batch["images"].shape), f"{covered:.1%} covered,", [len(boxes) for boxes in batch["boxes_3d"]], "boxes")
+    print(tuple(batch["images"].shape), f"{covered:.1%} covered")
+    print([len(boxes) for boxes in batch["boxes_3d"]], "boxes")
 
 # %% [markdown]
 # ## Evaluate
@@ -91,7 +107,8 @@ for batch in loader:
 # (`--data FOLDER`) the scores come from LiDAR points, overlaps, and photographs of other cameras.
 
 # %%
-status = main(["evaluate", "--size", "128x352", "--geometry", "auto", "street", "--output", "tour"])
+command = "evaluate --size 128x352 --geometry auto street --output tour"
+status = main(command.split())
 
 # %% [markdown]
 # Next: [choosing the geometry](geometry.py), [when to retarget, and when not to](../when.md), and

@@ -63,7 +63,7 @@ MISSED: Mapping[tuple[int, int], Mapping[str, tuple[float, float]]] = {
 }
 """Bounds of calls that miss those of ``BOUNDS``, which are goals here: on pinhole and radtan targets, and on fisheye.
 
-About 1.15 times the ratios in docs/benchmarks.md, of pinhole and radtan the larger.
+About 1.15 times the measured ratios, of pinhole and radtan the larger.
 """
 
 

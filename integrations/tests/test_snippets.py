@@ -47,10 +47,10 @@ def test_kornia() -> None:
 @pytest.mark.slow
 def test_nuscenes(tmp_path: Path) -> None:
     root = fake_root(tmp_path / "root")
-    (code,) = snippets("nuscenes", {"data/nuscenes": str(root), "v1.0-trainval": VERSION, "num_workers=8": ""})
-    names: dict[str, Any] = {"train_scenes": None}
+    (code,) = snippets("nuscenes", {"data/nuscenes": str(root), "v1.0-mini": VERSION, "num_workers=8": ""})
+    names: dict[str, Any] = {}
     exec(code, names)
-    assert names["views"].shape == (5, 3, 256, 704)
+    assert names["images"].shape == (5, 3, 256, 704)
     assert len(names["labels_2d"]) == 5
 
 

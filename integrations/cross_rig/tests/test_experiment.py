@@ -1,7 +1,6 @@
 """A whole run, tiny: killed, it continues, and ends with the numbers of an uninterrupted one; its views and streets."""
 
 import json
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -102,13 +101,6 @@ def test_labels_and_draws_are_paired(done):
     np.testing.assert_array_equal(first, second)
     from_raw = [bool(np.isclose(mixed.batch(1).K[0, 0, 0], raw.frames.K[0, 0, 0, 0])) for _ in range(200)]
     assert 75 < sum(from_raw) < 125
-
-
-def test_tables_of_the_page_are_the_reports():
-    page = (Path(__file__).parents[3] / "docs" / "benchmarks.md").read_text()
-    tables = dict(re.findall(r"<!-- cross_rig: (\w+) -->\n(.*?)<!-- /cross_rig -->", page, re.DOTALL))
-    results = (Path(__file__).parents[1] / "results").glob("*.json")
-    assert tables == {path.stem: summary(json.loads(path.read_text())) for path in results} != {}
 
 
 def test_settings_of_the_command(tmp_path):
