@@ -234,7 +234,7 @@ def _within(outer: slice, inner: slice) -> slice:
 
 
 def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neighbour: Neighbour) -> Candidate:
-    from arbiview_aug.render.kernels import upsample_where
+    from arbiview_aug.scene.kernels import upsample_where
 
     usable = view.coverage & hole.wanted
     blur, risk = np.zeros(usable.shape, np.uint8), np.full(usable.shape, ChangeRisk.UNLABELLED, np.uint8)

@@ -1,8 +1,7 @@
-"""Compiled inner loops of planning: where each source sees a view's pixels, and which source wins them.
+"""Compiled loops over the pixels of a view: where each source sees them, which source wins, and bands along seams.
 
-A view takes two steps. ``measure_nodes`` projects nodes 8 px apart into all sources and weighs these there.
 ``plan_pixels`` evaluates all pixels: by rows where one source has weight, else in small blocks, of which the best two
-sources are kept. Sources without weight fill what those do not see.
+sources are kept. Sources without weight fill what those do not see. ``node_kernels`` has the weights.
 
 Every loop over pixels writes one array, so that it becomes vector instructions. None writes the array whose elements it
 keeps under a condition: ``x[i] = a if c else x[i]`` becomes a masked store, which takes AMD's processors ten cycles.
@@ -14,18 +13,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
-from numba.np.arrayobj import populate_array
 
-from arbiview_aug.cameras.kernels import FAR_AWAY_PX, edge_distance_row, project_row, rays_row, turn_row
-from arbiview_aug.cameras.rays import CELL_PX
+from arbiview_aug.cameras.kernels import FAR_AWAY_PX, project_row, rays_row, turn_row
 from arbiview_aug.cameras.validation import MAX_SIZE_PX
 from arbiview_aug.environment import borrowing, compiled, inlined
+from arbiview_aug.render.node_kernels import array_at
 from arbiview_aug.render.plan import GRID_STEP_PX, OUTSIDE
+from arbiview_aug.render.structures import Nodes, Occluders, Pixels, Sources, Surfaces, View
 from arbiview_aug.scene.boxes import PIECES
-from arbiview_aug.scene.kernels import upsampled_row
 
 _ZERO, _ONE, _HALF = np.float32(0), np.float32(1), np.float32(0.5)
 _TINY, _MOST = np.float32(1e-30), np.float32(1e30)
@@ -35,108 +30,15 @@ LEAST_INCIDENCE = np.float32(0.05)
 SAME_OBJECT_M = np.float32(0.15)
 """A piece of an object must be nearer by this share to hide another: they touch, and are drawn half a pixel wider."""
 
-LEAST_BORDER_PX = np.float32(0.499)
-"""Distance to the border from which a source sees a point: the outermost pixel centres, and a rounding."""
-
-WHOLE = 0.97
-"""Share of an object's nodes, among those of the source that sees most, from which a source sees it whole."""
-
 LEAST_SHARE = np.float32(1 / 256)
 """Share of a pixel below which a second source cannot change a grey level."""
 
 BLOCK_PX, FLOAT_ROWS, INT_ROWS = 56, 15, 11
 """Most columns of a block that several sources share: its scratch stays in the first-level cache. Scratch arrays."""
 
-_MOST_HALVINGS, _MOST_BITS = 14, 62
-_COARSEST = np.float32(0.05)  # source pixels per target pixel below which weights fall no further
+_MOST_BITS = 62
 _OUTSIDE = np.int32((OUTSIDE << 16) | (OUTSIDE & 0xFFFF))  # both coordinates of a packed position
-_MAX_SIDE_PX = 32767
 _MAP_LIMIT_PX = np.float32(MAX_SIZE_PX)
-_AHEAD_COLUMNS, _MOST_AHEAD = 176, 32  # of a strip at a time; at most so many pixels are read for each of its own
-
-
-class Images(NamedTuple):
-    """An array for each of K sources, of different sizes, by its address: the caller keeps them alive, C-contiguous."""
-
-    address: Any  # (K,) int64
-    size: Any  # (K, 2) int64 rows and columns, 0 for none
-
-
-class View(NamedTuple):
-    """A target view (h, w) with nodes (ny, nx)."""
-
-    planes: Any  # (3, h, w) float32 unit rays of the pixels; (3, 0, 0) for a pinhole
-    P: Any  # (14,) float32 ``Camera.parameters``
-    R: Any  # (3, 3) float64 rotation to the ego frame
-    center_m: Any  # (3,) float64 in the ego frame
-    cone: Any  # (4,) float64 middle of a cone around the rays, camera frame, and its half angle
-    y: Any  # (ny,) int64 rows of the nodes
-    x: Any  # (nx,) int64 columns of the nodes
-    rays: Any  # (3, ny, nx) float32 unit rays of the nodes
-    step: int  # side of a cell, pixels
-
-
-class Sources(NamedTuple):
-    """The K source cameras that may see a view, as they are read: some are halved."""
-
-    A: Any  # (K, 3, 3) float32 rotation from the target's frame
-    o: Any  # (K, 3) float32 the target's centre in the source's frame; 0 where the scene counts as infinitely far
-    kind: Any  # (K,) int64 lens; -1 for one that kernels do not know
-    P: Any  # (K, 14) float32 ``Camera.parameters``
-    size: Any  # (K, 2) int64 height and width, not halved
-    bounds: Any  # (K, 6) float32 least columns and rows of the image, largest ones; last pixel of a halved one, or -1
-    offset_m: Any  # (K, 3) float32 the target's centre minus the source's, target's frame
-    bonus: Any  # (K,) float32 factor of the weight
-    slot: Any  # (K, 3) int32 number of the source; column and row of its image in the atlas
-    positions: Images  # (2 h, w) float32 columns, then rows, for lenses that kernels do not know
-    to_mask: Images  # float32 distance of each cell of ``CELL_PX`` to the own car, pixels
-    clean: Images  # uint8, 0 where the image shows the own car
-
-
-class Surfaces(NamedTuple):
-    """The scene as a view sees it."""
-
-    q: Any  # (h, w) float32 inverse distances along the pixels' rays, 1/m
-    face: Any  # (h, w) int32 faces of objects, -1 elsewhere; (0, 0) without any
-    behind: Any  # (ny, nx) float32 inverse distances of the background on the nodes
-    uncertainty: Any  # (ny, nx) float32 expected error of the inverse distance on the nodes, 1/m
-
-
-class Occluders(NamedTuple):
-    """What hides points from K sources; ``surface.OcclusionMap`` for each."""
-
-    beyond: Images  # float32 inverse distances beyond which points are hidden, 1/m
-    solid: Images  # int32 number of the solid that hides them, -1 for none
-    scale: Any  # (K,) float32 size of these images over that of the image that is read
-    before_m: Any  # (K, F) float32 metres that the source lies before the plane of each face; (K, 0) without objects
-    is_guess: bool  # the background was not measured: all that stands before it hides it
-
-
-class Nodes(NamedTuple):
-    """What weights depend on, for K sources on the nodes of a view; written by ``measure_nodes``."""
-
-    score: Any  # (K, ny, nx) float32 weight, 0 where the source sees nothing
-    border: Any  # (K, ny, nx) float32 distance to the border of what the source sees, target pixels; 0 if not ``near``
-    parallax: Any  # (K, ny, nx) float32 expected displacement, target pixels
-    resolution: Any  # (K, ny, nx) float32 source pixels per target pixel along the worse axis
-    near: Any  # (K, ny, nx) bool, whether the source's image may contain pixels of the cells around
-    uv: Any  # (K, 2, ny, nx) float32 columns and rows in the source; given where the lens is unknown
-    halvings: Any  # (K,) int64 of the source's image before it is read; -1 where no pixel can lie in it
-
-
-class Pixels(NamedTuple):
-    """The plan of a view's pixels; written by ``plan_pixels``."""
-
-    winner: Any  # (h, w) int8 number of the winning source, -1 for none
-    xy: Any  # (h, w) int32, two int16: whole pixels in the atlas
-    frac: Any  # (h, w) uint16 32nds of a pixel
-    second: Any  # (h, w) int8 number of the source that is blended in, -1 for none; given as -1; (0, 0) without seams
-    second_xy: Any  # (h, w) int32 its ``xy``, where ``shared``, as all that follow
-    second_frac: Any  # (h, w) uint16
-    share: Any  # (h, w) float32 its share
-    shared: Any  # (ny - 1, nx - 1) bool cells in which several sources have weight
-    in_image: Any  # (h, w) uint8, not 0 where some source's image contains the pixel; (0, 0) where nothing hides
-    won: Any  # (128,) int64 pixels that each source wins; given as 0
 
 
 class Block(NamedTuple):
@@ -153,225 +55,6 @@ class Block(NamedTuple):
     held: Any  # int32, updated: whether the image of some source contains them
 
 
-def _array_at(typing: Any, address: Any, shape: Any, dtype: Any) -> Any:
-    """The C-contiguous array of a shape and type that lies at an address; compiled code alone can call it."""
-    kind = types.Array(dtype.dtype, len(shape), "C")
-
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        item = context.get_data_type(kind.dtype)
-        size = stride = context.get_constant(types.intp, context.get_abi_sizeof(item))
-        sides, strides = cgutils.unpack_tuple(builder, arguments[1]), list[Any]()
-        for side in reversed(sides):
-            strides.insert(0, stride)
-            stride = builder.mul(stride, side)
-        array = context.make_array(kind)(context, builder)
-        data = builder.inttoptr(arguments[0], item.as_pointer())
-        populate_array(array, data=data, shape=sides, strides=strides, itemsize=size, meminfo=None)
-        return array._getvalue()
-
-    return kind(types.int64, shape, dtype), codegen
-
-
-array_at: Any = intrinsic(_array_at)
-
-
-# --- nodes ------------------------------------------------------------------------------------------------------------
-@compiled
-def measure_nodes(view: View, sources: Sources, surfaces: Surfaces, antialias: bool, nodes: Nodes) -> None:
-    """Project the nodes of a view into all sources, and weigh these by distance to the border and quality."""
-    K, ny, nx = nodes.score.shape
-    work, edge, focal_px, step2 = np.empty((5, nx), np.float32), np.empty(nx), view.P[0], np.float32(view.step**2)
-    # The last nodes may coincide: their difference says nothing.
-    last_y = max(ny - 2 - (ny > 2 and view.y[ny - 1] == view.y[ny - 2]), 0)
-    last_x = max(nx - 2 - (nx > 2 and view.x[nx - 1] == view.x[nx - 2]), 0)
-    is_line = view.y[ny - 1] == view.y[0] or view.x[nx - 1] == view.x[0]
-    rays, q, near_q = view.rays, surfaces.behind, np.empty(nx, np.float32)
-    for k in range(K):
-        u, v, offset_m, size = nodes.uv[k, 0], nodes.uv[k, 1], sources.offset_m[k], sources.size[k]
-        for j in range(ny if sources.kind[k] >= 0 else 0):
-            turn_row(rays[0, j], rays[1, j], rays[2, j], q[j], sources.A[k], sources.o[k], work[0], work[1], work[2])
-            project_row(work[0], work[1], work[2], sources.kind[k], sources.P[k], work[3], work[4], u[j], v[j])
-        shape = sources.to_mask.size[k, 0], sources.to_mask.size[k, 1]
-        to_mask, least = array_at(sources.to_mask.address[k], shape, np.float32), np.float32(min(size[0], size[1]))
-        right, bottom = np.float32(size[1] - 1), np.float32(size[0] - 1)
-        ox, oy, oz = offset_m[0], offset_m[1], offset_m[2]
-        length2, is_near = ox * ox + oy * oy + oz * oz, False
-        inside: Any = 0
-        for j in range(ny):
-            jj = min(j, last_y)
-            per_y = _ONE / np.float32(max(view.y[jj + 1] - view.y[jj], 1))
-            edge_distance_row(u[j], v[j], (size[0], size[1]), to_mask, CELL_PX, edge)
-            for i in range(nx):
-                ii = min(i, last_x)
-                per_x = _ONE / np.float32(max(view.x[ii + 1] - view.x[ii], 1))
-                # The resolution along the worse axis is the smaller singular value of the Jacobian ((a, b), (c, d)).
-                a, c = (u[j, ii + 1] - u[j, ii]) * per_x, (v[j, ii + 1] - v[j, ii]) * per_x
-                b, d = (u[jj + 1, i] - u[jj, i]) * per_y, (v[jj + 1, i] - v[jj, i]) * per_y
-                half_sum, determinant, border = (
-                    (a * a + b * b + c * c + d * d) * _HALF,
-                    a * d - b * c,
-                    np.float32(edge[i]),
-                )
-                # Pixels of the cells around a node lie in the source at most so far from it.
-                room2 = min((_ONE + half_sum + half_sum) * step2, least * least)
-                outside = max(max(-u[j, i], u[j, i] - right), max(-v[j, i], v[j, i] - bottom))
-                nodes.near[k, j, i] = outside < _ZERO or outside * outside < room2
-                is_near = is_near or nodes.near[k, j, i]
-                if not nodes.near[k, j, i]:
-                    nodes.score[k, j, i], nodes.border[k, j, i] = _ZERO, _ZERO
-                    nodes.parallax[k, j, i], nodes.resolution[k, j, i] = _ZERO, _ZERO
-                    continue
-                root = np.sqrt(max(half_sum * half_sum - determinant * determinant, _ZERO))
-                fine = _ONE if is_line else abs(determinant) / max(np.sqrt(half_sum + root), _TINY)
-                along = rays[0, j, i] * ox + rays[1, j, i] * oy + rays[2, j, i] * oz
-                off = focal_px * np.float32(np.sqrt(max(length2 - along * along, _ZERO))) * surfaces.uncertainty[j, i]
-                is_seen, distance_weight = border >= LEAST_BORDER_PX, min((border + border) / least, _ONE)
-                weight = distance_weight * min(max(fine, _COARSEST), _ONE) / (_ONE + off) * sources.bonus[k]
-                nodes.score[k, j, i] = weight if is_seen else _ZERO
-                nodes.border[k, j, i] = border / max(fine, np.float32(1e-3))
-                nodes.parallax[k, j, i], nodes.resolution[k, j, i] = off, fine
-                inside += is_seen
-        if not is_near and surfaces.face.shape[0] and sources.kind[k] >= 0:  # it may see objects before the background
-            for j in range(ny):
-                for i in range(nx):
-                    near_q[i] = surfaces.q[view.y[j], view.x[i]]
-                turn_row(
-                    rays[0, j], rays[1, j], rays[2, j], near_q, sources.A[k], sources.o[k], work[0], work[1], work[2]
-                )
-                project_row(work[0], work[1], work[2], sources.kind[k], sources.P[k], work[3], work[4], u[j], v[j])
-                for i in range(nx):
-                    is_near = is_near or (u[j, i] >= 0 and u[j, i] <= right and v[j, i] >= 0 and v[j, i] <= bottom)
-        nodes.halvings[k] = 0 if is_near else -1
-        for level in range(1, 1 + _MOST_HALVINGS if antialias and inside else 1):
-            # Four fifths of the nodes are minified by 2^level; 2 %: a target of half size must read the halved source.
-            count, limit = 0, np.float32(2.0**level / 1.02)
-            for j in range(ny):
-                for i in range(nx):
-                    count += (nodes.resolution[k, j, i] >= limit) & (nodes.score[k, j, i] > _ZERO)
-            if 5 * count < 4 * inside or min(size[0], size[1]) >> level < 2:
-                break
-            nodes.halvings[k] = level
-
-
-@compiled
-def win_nodes(view: View, nodes: Nodes, boxes: Any, winner: Any) -> None:
-    """Let the source of the largest weight win each node, but one source all that it sees of a labelled object.
-
-    A seam repeats or cuts what it crosses. An object that one would cross is read from the source of the least parallax
-    among those that see it whole. Nearer objects decide last. Objects that a source shows exactly, from the target's
-    own centre, stay as they are.
-
-    ``boxes`` (B, 7) float64 are centre, length, width, height and yaw in the ego frame, the nearest last; ``winner``
-    (ny, nx) int8 is written, -1 for none.
-    """
-    K, ny, nx = nodes.score.shape
-    n, center, R, axis, node_rad = ny * nx, view.center_m, view.R, view.cone, view.step / np.float64(view.P[0])
-    score, error = nodes.score.reshape(K, n), nodes.parallax.reshape(K, n)
-    ray, chosen = view.rays.reshape(3, n), winner.reshape(n)
-    x, y, z = ray[0], ray[1], ray[2]
-    first, near, inside = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
-    along, vectors, count, total = np.empty(n, np.float32), np.empty((7, 3)), np.empty(K), np.empty(K)
-    axes, to_box, across, away, half = vectors[:3], vectors[3], vectors[4], vectors[5], vectors[6]
-    for i in range(n):
-        first[i] = 0 if score[0, i] > _ZERO else -1
-    for k in range(1, K):
-        for i in range(n):
-            better = score[k, i] > (score[first[i], i] if first[i] >= 0 else _ZERO)
-            first[i] = k if better else first[i]
-    for i in range(n):
-        chosen[i] = first[i]
-    for b in range(boxes.shape[0]):
-        c, s = np.cos(boxes[b, 6]), np.sin(boxes[b, 6])
-        for i in range(3):
-            away[i], half[i] = boxes[b, i] - center[i], boxes[b, 3 + i] / 2
-        far = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2)
-        margin = node_rad * far
-        reach = np.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2) + 2 * margin
-        for i in range(3):
-            axes[0, i], axes[1, i], axes[2, i] = c * R[0, i] + s * R[1, i], c * R[1, i] - s * R[0, i], R[2, i]
-            to_box[i] = R[0, i] * away[0] + R[1, i] * away[1] + R[2, i] * away[2]
-        for i in range(3):
-            across[i] = axes[i, 0] * to_box[0] + axes[i, 1] * to_box[1] + axes[i, 2] * to_box[2]
-        outside = far > reach
-        off_axis = to_box[0] * axis[0] + to_box[1] * axis[1] + to_box[2] * axis[2]
-        if outside and off_axis < far * np.cos(min(axis[3] + np.arcsin(reach / far), np.pi)):
-            continue
-        ax, ay, az = np.float32(to_box[0]), np.float32(to_box[1]), np.float32(to_box[2])
-        bound = np.float32(np.sqrt(far**2 - reach**2)) if outside else -_MOST
-        for i in range(n):
-            along[i] = ax * x[i] + ay * y[i] + az * z[i]
-        around, within, low, high, exact = 0, 0, K, -1, False
-        for i in range(n):
-            if along[i] <= bound:
-                continue
-            enter, leave, enter_wide, leave_wide = -1e9, 1e9, -1e9, 1e9
-            for k in range(3):
-                d = axes[k, 0] * x[i] + axes[k, 1] * y[i] + axes[k, 2] * z[i]
-                inverse = 1 / d if abs(d) > 1e-12 else 1e12
-                middle, less, more = across[k] * inverse, half[k] * abs(inverse), (half[k] + margin) * abs(inverse)
-                enter, leave = max(enter, middle - less), min(leave, middle + less)
-                enter_wide, leave_wide = max(enter_wide, middle - more), min(leave_wide, middle + more)
-            best = first[i]
-            if leave_wide >= enter_wide and enter_wide > 0:
-                near[around] = i
-                around += 1
-                low, high = min(low, best if best >= 0 else K), max(high, best)
-            if leave >= enter and enter > 0:
-                inside[within] = i
-                within += 1
-                exact = exact or (best >= 0 and score[best, i] > _ONE)
-        if exact or low >= high:
-            continue
-        most = 0.0
-        for k in range(K):
-            count[k], total[k] = 0.0, 0.0
-            for j in range(within):
-                count[k] += score[k, inside[j]] > _ZERO
-                total[k] += error[k, inside[j]]
-            most = max(most, count[k])
-        one = -1
-        for k in range(K):
-            if count[k] > 0 and count[k] >= WHOLE * most and (one < 0 or total[k] < total[one]):
-                one = k
-        for j in range(around if one >= 0 else 0):
-            if score[one, near[j]] > _ZERO:
-                chosen[near[j]] = one
-
-
-@compiled
-def soften(winner: Any, border_px: Any, radius: int, width_px: float, weights: Any) -> None:
-    """Write ``weights.seam_weights`` (K, ny, nx) float32, by the borders (K, ny, nx) of what the sources see."""
-    K, ny, nx = border_px.shape
-    side, width = 2 * radius + 1, np.float32(width_px)
-    row, across, total = np.empty(nx + 2 * radius, np.float32), np.empty((ny, nx)), np.empty(nx)
-    for k in range(K):
-        soft = weights[k]
-        for j in range(ny):
-            for i in range(nx):
-                soft[j, i] = _ONE if winner[j, i] == k else _ZERO
-        for _ in range(2):  # two passes of a box make a smooth ramp
-            for j in range(ny):
-                for i in range(row.shape[0]):
-                    row[i] = soft[j, min(max(i - radius, 0), nx - 1)]
-                across[j] = 0.0
-                for shift in range(side):
-                    part = row[shift : shift + nx]
-                    for i in range(nx):
-                        across[j, i] += part[i]
-            for j in range(ny):
-                total[:] = 0.0
-                for shift in range(side):
-                    part = across[min(max(j + shift - radius, 0), ny - 1)]
-                    for i in range(nx):
-                        total[i] += part[i]
-                for i in range(nx):
-                    soft[j, i] = total[i] * (1.0 / (side * side))
-        for j in range(ny):
-            for i in range(nx):
-                soft[j, i] *= min(max(border_px[k, j, i] / width, _ZERO), _ONE)
-
-
-# --- pixels -----------------------------------------------------------------------------------------------------------
 @inlined
 def _block(floats: Any, ints: Any, q: Any, n: int, has_held: bool) -> Block:
     """A block of n pixels with scratch memory, of which ``_look`` uses rows 6 to 10 of ``floats`` and 3 of ``ints``."""
@@ -839,48 +522,3 @@ def cut_bands(pixels: Pixels, bands: Any, band_xy: Any, band_frac: Any, weight: 
             for x in range(out.shape[0]):
                 out_frac[x] = frac[x] if out[x] > _ZERO else np.uint16(0)
             at += x1 - x0
-
-
-@compiled
-def upsample_where(nodes: Any, step: int, winner: Any, number: int, out: Any) -> None:
-    """Put node values (ny + 1, nx + 1), interpolated and rounded, into (h, w) uint8 where a source wins."""
-    h, w = winner.shape
-    row, values = np.empty(nodes.shape[1], np.float32), np.empty(w, np.float32)
-    for y in range(h):
-        upsampled_row(nodes, step, y, np.int64(0), row, values)
-        for x in range(w):
-            if winner[y, x] == number:
-                out[y, x] = np.uint8(np.rint(values[x]))
-
-
-@compiled
-def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
-    """Read what a strip of a view is about to read from an atlas, so that it lies in the cache; the result is no use.
-
-    The view itself reads along slanted lines with gaps, which no cache foresees: it would take up to twice as long.
-
-    Args:
-        atlas: (rows, bytes) uint8.
-        pixel: Bytes of one of its pixels.
-        packed: (h, w) ``FixedMap.packed``.
-        winner: (h, w) int8 source, -1 where none is read.
-    """
-    (h, w), total = winner.shape, 0
-    ends = np.empty((4, 128), np.int32)  # first and last row and column of each source
-    for x0 in range(0, w, _AHEAD_COLUMNS):
-        ends[0::2] = _MAX_SIDE_PX
-        ends[1::2] = -1
-        for j in range(0, h + 3, 4):
-            for i in range(x0, min(x0 + _AHEAD_COLUMNS, w) + 7, 8):
-                y, x = min(j, h - 1), min(i, w - 1)
-                k, row, column = winner[y, x], packed[y, x] >> 16, packed[y, x] & 0xFFFF
-                if k >= 0:
-                    ends[0, k], ends[1, k] = min(ends[0, k], row), max(ends[1, k], row)
-                    ends[2, k], ends[3, k] = min(ends[2, k], column), max(ends[3, k], column)
-        for k in range(128):
-            top, bottom, left, right = ends[0, k], ends[1, k], ends[2, k], ends[3, k]
-            if (bottom - top) * (right - left) <= _MOST_AHEAD * h * _AHEAD_COLUMNS:
-                for row in range(top, min(bottom + 2, atlas.shape[0])):
-                    for at in range(left * pixel, min((right + 2) * pixel, atlas.shape[1]), 64):
-                        total ^= atlas[row, at]
-    return total  # else nothing would be read

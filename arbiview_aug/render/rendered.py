@@ -51,8 +51,7 @@ def render_opencv(
     Returns:
         M views (3, h, w) of the images' type, black where no source sees; slices of one block where sizes agree.
     """
-    from arbiview_aug.render.kernels import read_ahead
-    from arbiview_aug.render.photometry_kernels import blend, tone
+    from arbiview_aug.render.photometry_kernels import blend, read_ahead, tone
 
     scratch = scratch or Scratch()
     dtype = images[0].dtype

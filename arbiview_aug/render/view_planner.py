@@ -1,7 +1,7 @@
 """How a rig is rendered: which sources see each target view, over which surface, and who wins each pixel.
 
 The scene becomes images first: inverse distances of each view, and what hides it from each source. Compiled code
-(``arbiview_aug.render.kernels``) then evaluates nodes and pixels, fast enough for calibrations or geometry that change
+(``node_kernels``, ``kernels``) then evaluates nodes and pixels, fast enough for calibrations or geometry that change
 with every frame.
 """
 
@@ -35,6 +35,7 @@ from arbiview_aug.render.plan import (
     ViewPlan,
 )
 from arbiview_aug.render.requirements import SAME_CENTER_M, RigPair, source_bounds
+from arbiview_aug.render.structures import Images, Nodes, Occluders, Pixels, Sources, Surfaces, View
 from arbiview_aug.scene.boxes import BOX_ERROR
 from arbiview_aug.scene.point_cloud import occlusion_level
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
@@ -64,8 +65,6 @@ class ViewPlanner:
     def __init__(
         self, pair: RigPair, index: int, scene: Scene, maps: RayCache, wanted: BoolArray | None = None
     ) -> None:
-        from arbiview_aug.render.kernels import View
-
         self.pair, self.index, self.camera = pair, index, pair.target.cameras[index]
         self.config, self.scene, self.maps = pair.config, scene, maps
         self.name = scene.best if pair.geometry == "auto" else pair.geometry
@@ -79,7 +78,7 @@ class ViewPlanner:
         pose = self.camera.cam2ego[:3, :3].copy(), self.camera.center_m.copy()
         self.view = View(self.rays.planes, self.rays.parameters, *pose, self.rays.cone, y, x, rays, step)
         self.wanted = np.zeros((0, 0), bool) if wanted is None else some_of_cells(wanted, step)
-        self._surfaces: dict[str, Any] = {}
+        self._surfaces: dict[str, Surfaces] = {}
         self._alive = list[Any]()  # arrays that kernels read by their addresses
         self._measure()
 
@@ -94,10 +93,8 @@ class ViewPlanner:
         """The scene's surface of a name."""
         return self.scene.surface(name, self.pair.source.ground_z_m)
 
-    def _seen(self, name: str) -> Any:
-        """A surface as the view sees it: ``kernels.Surfaces``."""
-        from arbiview_aug.render.kernels import Surfaces
-
+    def _seen(self, name: str) -> Surfaces:
+        """A surface as the view sees it: ``Surfaces``."""
         if name in self._surfaces:
             return self._surfaces[name]
         surface = self._surface(name)
@@ -119,10 +116,8 @@ class ViewPlanner:
         self._surfaces[name] = Surfaces(q, face, behind, uncertainty.astype(np.float32))
         return self._surfaces[name]
 
-    def _occluders(self) -> Any:
-        """What hides the scene from the sources: ``kernels.Occluders``."""
-        from arbiview_aug.render.kernels import Occluders
-
+    def _occluders(self) -> Occluders:
+        """What hides the scene from the sources: ``Occluders``."""
         surface = self._surface(self.seen_name)
         found, scales = [], []
         for k, level in self.used:
@@ -140,10 +135,8 @@ class ViewPlanner:
         images = self._images([one.beyond for one in found]), self._images([one.solid for one in found])
         return Occluders(*images, np.array(scales, np.float32), before_m, bool(surface.background.is_guess))
 
-    def _images(self, arrays: Sequence[npt.NDArray[Any]]) -> Any:
-        """Arrays as ``kernels.Images``."""
-        from arbiview_aug.render.kernels import Images
-
+    def _images(self, arrays: Sequence[npt.NDArray[Any]]) -> Images:
+        """Arrays as ``Images``."""
         address, size = np.zeros(len(arrays), np.int64), np.zeros((len(arrays), 2), np.int64)
         for k, array in enumerate(arrays):
             if array.size:
@@ -155,7 +148,7 @@ class ViewPlanner:
     # --- what sources see ---------------------------------------------------------------------------------------------
     def _measure(self) -> None:
         """Choose the sources that may see the view, and weigh them on its nodes."""
-        from arbiview_aug.render.kernels import Nodes, measure_nodes
+        from arbiview_aug.render.node_kernels import measure_nodes
 
         pair, m = self.pair, self.index
         asked = pair.is_exact[m] if pair.is_served[m] else np.ones(len(pair.source), bool)
@@ -186,10 +179,8 @@ class ViewPlanner:
         """Numbers of the sources that may see the view, in content order, and halvings of their images."""
         return list(zip(self.sources, self.levels, strict=True))
 
-    def _read_sources(self) -> Any:
-        """The sources at full size as ``kernels.Sources``, without places in an atlas."""
-        from arbiview_aug.render.kernels import Images, Sources
-
+    def _read_sources(self) -> Sources:
+        """The sources at full size as ``Sources``, without places in an atlas."""
         pair, m, k = self.pair, self.index, np.array(self.sources, np.int64)
         A, o, offset_m = (part[m, k] for part in pair.poses)
         o *= ~self.is_far[k][:, None]
@@ -199,7 +190,7 @@ class ViewPlanner:
         (kind, parameters, size, bounds), slots = (part[k] for part in pair.lenses), np.zeros((len(k), 3), np.int32)
         return Sources(A, o, kind, parameters, size, bounds, offset_m, bonus, slots, none, to_mask, none)
 
-    def _placed_sources(self, layout: AtlasLayout) -> Any:
+    def _placed_sources(self, layout: AtlasLayout) -> Sources:
         """The sources as they are read: some halved, and with their places in an atlas."""
         read, positions, clean = self._read, list[npt.NDArray[Any]](), list[npt.NDArray[Any]]()
         for i, (k, level) in enumerate(self.used):
@@ -218,7 +209,7 @@ class ViewPlanner:
     # --- who wins -----------------------------------------------------------------------------------------------------
     def finish(self, layout: AtlasLayout) -> ViewPlan:
         """Winners, maps into the atlas, and blended bands."""
-        from arbiview_aug.render.kernels import BLOCK_PX, FLOAT_ROWS, INT_ROWS, Pixels, plan_pixels, see_nodes
+        from arbiview_aug.render.kernels import BLOCK_PX, FLOAT_ROWS, INT_ROWS, plan_pixels, see_nodes
         from arbiview_aug.render.paint_kernels import find_paint
 
         size, memory, view, surfaces = self.camera.size, self.maps.memory, self.view, self._seen(self.seen_name)
@@ -269,7 +260,7 @@ class ViewPlanner:
 
         A seam blends each source over its weight around the area that it wins, which fades at its own border.
         """
-        from arbiview_aug.render.kernels import soften, win_nodes
+        from arbiview_aug.render.node_kernels import soften, win_nodes
 
         width_px, view, nodes = self.config.seam_width * self.camera.width_px, self.view, self.nodes
         if width_px == 0 or len(self.sources) < 2:
@@ -282,7 +273,7 @@ class ViewPlanner:
         soften(winner, nodes.border, max(1, round(width_px / view.step / 2)), width_px, weights)
         return weights
 
-    def _bands(self, pixels: Any) -> tuple[BlendRegion, ...]:
+    def _bands(self, pixels: Pixels) -> tuple[BlendRegion, ...]:
         """Rectangles around the pixels that a second source adds to, in content order: they overlap."""
         from arbiview_aug.render.kernels import cut_bands, find_bands
 
@@ -301,7 +292,7 @@ class ViewPlanner:
 
     def _certainty(self, winner: npt.NDArray[np.int8]) -> npt.NDArray[np.uint8]:
         """``confidence.certainty`` (h, w) of the winning sources in 255ths."""
-        from arbiview_aug.render.kernels import upsample_where
+        from arbiview_aug.scene.kernels import upsample_where
 
         certain, nodes = self.maps.memory.full(winner.shape, 0, np.uint8), self.nodes
         share = 255 * certainty(nodes.parallax / float(self.camera.K[0, 0]), nodes.resolution)
@@ -463,7 +454,7 @@ def plan_pair(
 
 def warm_up() -> None:
     """Compile the kernels of cameras and of plans over objects, or load them from numba's cache."""
-    from arbiview_aug.render.kernels import read_ahead
+    from arbiview_aug.render.photometry_kernels import read_ahead
 
     # A lens without and one with an array of rays: kernels are compiled once for all lenses.
     lenses: tuple[tuple[LensName, tuple[float, ...]], ...] = ("pinhole", ()), ("fisheye", (0.0,) * 4)

@@ -294,6 +294,18 @@ def upsampled_row(nodes: Any, step: int, y: int, x0: int, row: Any, out: Any) ->
             out[at + k] = first + slope * np.float32(k)
 
 
+@compiled
+def upsample_where(nodes: Any, step: int, winner: Any, number: int, out: Any) -> None:
+    """Put node values (ny + 1, nx + 1), interpolated and rounded, into (h, w) uint8 where a source wins."""
+    h, w = winner.shape
+    row, values = np.empty(nodes.shape[1], np.float32), np.empty(w, np.float32)
+    for y in range(h):
+        upsampled_row(nodes, step, y, np.int64(0), row, values)
+        for x in range(w):
+            if winner[y, x] == number:
+                out[y, x] = np.uint8(np.rint(values[x]))
+
+
 _NEAR_M, _NEAR_CELLS = 1.0, 256  # a grid around all boxes, over which it repeats
 
 

@@ -23,7 +23,7 @@ GROUPS = {
         "transforms.warm_up:warm_up_boxes inpaint.kernels:warm_up render.photometry_kernels:warm_up",
         "scene.kernels:draw_solids inpaint.kernels:paint render.photometry_kernels:blend",
     ),
-    "plans": ("render.view_planner:warm_up", "render.kernels:read_ahead"),
+    "plans": ("render.view_planner:warm_up", "render.photometry_kernels:read_ahead"),
     "points": (
         "transforms.warm_up:warm_up_points scene.scan:warm_up",
         "scene.completion:hidden_depths scene.scan:continue_road",

@@ -14,7 +14,7 @@ from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.image_ops import Scratch
-from arbiview_aug.render.kernels import read_ahead
+from arbiview_aug.render.photometry_kernels import read_ahead
 from arbiview_aug.render.plan import AtlasLayout, FixedMap, RenderConfig, RenderPlan, Slot
 from arbiview_aug.render.rendered import render_labels, render_opencv
 from arbiview_aug.render.torch_backend import (

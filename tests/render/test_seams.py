@@ -11,8 +11,10 @@ from numba import njit
 from arbiview_aug.cameras import kernels as camera_kernels
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.render import kernels
-from arbiview_aug.render.kernels import Pixels, cut_bands, find_bands, soften
+from arbiview_aug.render.kernels import cut_bands, find_bands
+from arbiview_aug.render.node_kernels import soften
 from arbiview_aug.render.plan import RenderConfig
+from arbiview_aug.render.structures import Pixels
 from arbiview_aug.render.view_planner import PRIMARY_BONUS, ViewPlanner, build_plan
 from tests.extremes import reference
 from tests.helpers import demo_source_rig
