@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from arbiview_aug.cameras.random_rig import RandomRig as RandomRig
     from arbiview_aug.cameras.rig import Rig as Rig
     from arbiview_aug.cameras.rig import load_rig as load_rig
-    from arbiview_aug.cameras.rig import save_rig as save_rig
     from arbiview_aug.cameras.shipped import shipped_rigs as shipped_rigs
     from arbiview_aug.cameras.validation import Finding as Finding
     from arbiview_aug.datasets.wrappers import MixedDataset as MixedDataset

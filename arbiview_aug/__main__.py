@@ -7,13 +7,13 @@ import sys
 from collections.abc import Sequence
 
 from arbiview_aug.cli.parsers import COMMANDS, Command, check_together, parser_of
-from arbiview_aug.environment import imported, installed_version, warn_about_cv2_wheels
+from arbiview_aug.environment import imported, installed_version
 from arbiview_aug.errors import exit_status
 
 
 def usage() -> str:
     """The commands with their one-line help."""
-    listed = "\n".join(f"  {name:<9} {command.summary}" for name, command in COMMANDS.items())
+    listed = "\n".join(f"  {name:<9} {command.description.partition(':')[0]}" for name, command in COMMANDS.items())
     head, tail = "usage: python -m arbiview_aug [--version] COMMAND ...", "python -m arbiview_aug COMMAND --help"
     return f"{head}\n\ncommands:\n{listed}\n\n{tail} explains each."
 
@@ -36,7 +36,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"python -m arbiview_aug: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
         return 2
-    warn_about_cv2_wheels()
     return run(f"python -m arbiview_aug {name}", name, COMMANDS[name], rest)
 
 

@@ -32,13 +32,9 @@ def installed_version(name: str) -> str | None:
         return None
 
 
-def cv2_wheels() -> dict[str, str]:
-    """Installed distributions that provide ``cv2``, with their versions."""
-    return {name: version for name in _CV2_WHEELS if (version := installed_version(name)) is not None}
-
-
-def cv2_conflict(wheels: dict[str, str]) -> str | None:
-    """Warning that several wheels provide ``cv2``, and the fix; None for one."""
+def cv2_conflict() -> str | None:
+    """Warning that several installed wheels provide ``cv2``, and the fix; None for one."""
+    wheels = {name: version for name in _CV2_WHEELS if (version := installed_version(name)) is not None}
     if len(wheels) < 2:
         return None
     versions = " and ".join(f"{name} {version}" for name, version in wheels.items())
@@ -51,7 +47,7 @@ def cv2_conflict(wheels: dict[str, str]) -> str | None:
 @cache
 def warn_about_cv2_wheels() -> None:
     """Warn once per process if several wheels provide ``cv2``."""
-    if (conflict := cv2_conflict(cv2_wheels())) is not None:
+    if (conflict := cv2_conflict()) is not None:
         warn(conflict, RuntimeWarning)
 
 

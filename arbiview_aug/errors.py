@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from multiprocessing import parent_process
 from types import FrameType
 
-INTERRUPTED = 130  # 128 + SIGINT, as shells report Ctrl-C
-
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxstring, _SHORT.maxother, _SHORT.maxlong = 4, 100, 100, 100
 _SHORT.maxlist = _SHORT.maxtuple = _SHORT.maxdict = 12
@@ -51,7 +49,7 @@ def exit_status(program: str, command: Callable[[], int | None], *, resumable: b
         return int(command() or 0)
     except KeyboardInterrupt:
         print(f"{program}: interrupted{'; run it again to go on' if resumable else ''}", file=sys.stderr)
-        return INTERRUPTED
+        return 130  # 128 + SIGINT, as shells report Ctrl-C
     except (ArbiviewError, OSError) as error:
         print(f"{program}: {' '.join(str(error).splitlines())}", file=sys.stderr)
         return 2

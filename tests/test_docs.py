@@ -47,8 +47,7 @@ TINY = {
     "demo --target truck.yaml": TINY_DEMO,
     "demo --data FOLDER --target waymo": ["--size", "64x112"],
     "evaluate --data FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
-    "evaluate --displaced --data FOLDER": ["--geometry", "street", "--downscale", "4", "--frames", "1"],
-    "evaluate --displaced --data FOLDER --detector own.py:detect --segmenter own.py:segment": [
+    "evaluate --held-out next --data FOLDER --detector own.py:detect --segmenter own.py:segment": [
         *("--geometry", "street", "--downscale", "4", "--frames", "1")
     ],
     "check FOLDER": ["--downscale", "4"],
@@ -68,7 +67,7 @@ TINY = {
     "evaluate --data FOLDER --target waymo --geometry learned street": ["--downscale", "4", "--geometry", "street"],
     "train --output output/compact": ["--quiet", *SMALLER],
     "view FOLDER --target waymo": ["--downscale", "4", "--size", "40x72"],
-    "view --seed 2 --output view.rrd": ["--size", "40x104", "--frames", "1"],
+    "view FOLDER --output view.rrd": ["--downscale", "4", "--size", "40x72"],
 }
 """Every command of the README and the pages, and options that make it quick."""
 
@@ -207,7 +206,7 @@ def test_the_commands_run(
     if arguments[0] == "view":
         pytest.importorskip("rerun")
     if "FOLDER" in arguments:
-        root = request.getfixturevalue("kitti_root" if "--displaced" in arguments else "nuscenes_root")
+        root = request.getfixturevalue("kitti_root" if "next" in arguments else "nuscenes_root")
         arguments[arguments.index("FOLDER")] = str(root)
     if "ID_OR_PATH" in arguments:
         arguments[arguments.index("ID_OR_PATH")] = str(saved_depth_model(tmp_path / "model"))
@@ -215,7 +214,7 @@ def test_the_commands_run(
     monkeypatch.chdir(tmp_path)
     if "own.py:detect" in arguments:
         Path("own.py").write_text(
-            "def detect(rgb):\n    return [[0, 0, 9, 9]], [0.9], ['car']\n\n\n"
+            "def detect(rgb):\n    return [[0, 0, 9, 9]], [0.9]\n\n\n"
             "def segment(rgb):\n    return rgb.transpose(2, 0, 1)[:2] > 100\n"
         )
     if "truck.yaml" in arguments:

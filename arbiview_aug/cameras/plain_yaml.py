@@ -79,11 +79,6 @@ def dump_yaml(data: Any) -> str:
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
 
 
-def file_stem(name: str, index: int) -> str:
-    """A camera's name for files; names such as /camera/front are none, and no camera has the space of theirs."""
-    return name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", name) else f"camera {index}"
-
-
 def parse_json(text: str | bytes) -> Any:
     """Data of a JSON document; ValueError for a key that stands twice, of which ``json`` alone takes the last."""
     return json.loads(text, object_pairs_hook=_without_repeats)

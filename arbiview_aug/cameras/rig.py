@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,7 +30,7 @@ from arbiview_aug.cameras.framing import Fit
 from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, lens_called, misnamed, unknown_key
 from arbiview_aug.cameras.lens import FloatArray, canonical_name
 from arbiview_aug.cameras.lidar import Lidar
-from arbiview_aug.cameras.plain_yaml import dump_yaml, file_stem, parse_yaml
+from arbiview_aug.cameras.plain_yaml import dump_yaml, parse_yaml
 from arbiview_aug.cameras.shipped import shipped_rigs
 from arbiview_aug.cameras.validation import MAX_SIZE_PX, MOST_M, doubts
 from arbiview_aug.errors import CalibrationError, calibration_of, shown, warn
@@ -246,7 +246,8 @@ class Rig:
         data, files = self.to_dict(), dict[Path, bytes]()
         for k, (entry, camera) in enumerate(zip(data["cameras"], self.cameras, strict=True)):
             if camera.mask is not None:
-                file = path.with_name(f"{path.name}.{file_stem(camera.name, k)}.mask.png")
+                stem = camera.name if re.fullmatch(r"[A-Za-z0-9_.-]{1,64}", camera.name) else f"camera {k}"
+                file = path.with_name(f"{path.name}.{stem}.mask.png")
                 files[file] = cv2.imencode(".png", camera.mask.astype(np.uint8) * 255)[1].tobytes()
                 entry["mask"] = file.name
         text = json.dumps(data, indent=1) if path.suffix == ".json" else dump_yaml(data)
@@ -300,32 +301,6 @@ def read_rig(path: Path) -> tuple[Rig, str]:
         more = f"; and {len(found) - 4} more" if len(found) > 4 else ""
         warn(f"{where}: {'; '.join(map(str, found[:4]))}{more}. If this is meant so, ignore the warning (docs/rigs.md)")
     return rig, data.get("notes", "")
-
-
-def save_rig(
-    rig: Rig | str | Path, path: str | Path, *, format: Literal["rig", "ros", "kalibr", "colmap"] = "rig"
-) -> Path:
-    """Write a rig for another tool, or as a rig file. Returns the path.
-
-    Args:
-        rig: A rig, or what ``load_rig`` reads; masks of cameras and the rig's scanners are in rig files alone.
-        path: A file for ``rig``, a folder for the others, which ``load_rig`` reads.
-        format: ``rig``: see ``Rig.save``. ``ros``: a CameraInfo YAML for each camera, and ``tf_static.yaml``.
-            ``kalibr``: ``camchain.yaml``, whose cameras are cam0, cam1 and so on. ``colmap``: ``cameras.txt`` and
-            ``images.txt``. ``mounting.yaml`` beside them has the road, the ego frame, names and order.
-
-    Raises:
-        CalibrationError: A lens or a skew that the format has not, or a folder with files of another calibration.
-    """
-    rig = load_rig(rig)
-    is_long = max(map(len, os.fspath(path).split(os.sep))) > 255
-    if not str(path).strip() or is_long or re.search("[\0\ud800-\udbff]", str(path)):
-        raise CalibrationError(f"save_rig: path: expected a file's or folder's name, got {shown(str(path))}")
-    if format == "rig":
-        return rig.save(path)
-    from arbiview_aug.cameras.formats.calibration import write_calibration
-
-    return write_calibration(rig.to_dict(), Path(path), format)
 
 
 def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -> Camera:

@@ -1,11 +1,11 @@
-"""``python -m arbiview_aug bench``: speed against accuracy of all settings, on the user's data or synthetic streets.
+"""``python -m arbiview_aug bench``: speed against accuracy of all settings, on the user's data.
 
 Sweeps quality, geometry, decoded size and cached depth from overlap, and marks the Pareto front. A note says where
 static surfaces should not be chosen, since cameras move: PSNR does not show what a detector learns from them.
 
 Times are CPU time of a ``RigRetarget`` call on one thread, with the plan where every frame needs its own. Accuracy is
-the mean PSNR of pixels that some source sees, in the colours of images decoded at 1 / ``REFERENCE``: against the true
-views, LiDAR points, or without points the photographs of cameras that are rendered from the frame's others.
+the mean PSNR of pixels that some source sees, in the colours of images decoded at 1 / ``REFERENCE``: against LiDAR
+points, or without any the photographs of cameras that are rendered from the frame's others.
 """
 
 from __future__ import annotations
@@ -33,12 +33,10 @@ from arbiview_aug.cli.arguments import REAL_TARGET, writable_folder
 from arbiview_aug.cli.parsers import SCORED
 from arbiview_aug.datasets import open_data
 from arbiview_aug.datasets.registry import data_name
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
 from arbiview_aug.environment import one_thread, versions
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.frames import LidarReference, ScoredFrame, make_frame, scores, without_masks
+from arbiview_aug.evaluate.frames import LidarReference, ScoredFrame, make_frame, retargeting, scores, without_masks
 from arbiview_aug.evaluate.held_out import held_out
-from arbiview_aug.evaluate.methods import retargeting
 from arbiview_aug.evaluate.metrics import mean_of
 from arbiview_aug.evaluate.report.tables import metric_table
 from arbiview_aug.render.plan import RenderConfig
@@ -93,19 +91,13 @@ def run(arguments: argparse.Namespace) -> None:
 
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """Score and time all settings."""
-    reduces: list[Reduce] = arguments.reduce if arguments.data else [1]  # streets are not decoded
-    if arguments.data is None:
-        opened: dict[int, Any] = {1: SyntheticDrive(demo_source_rig(arguments.size), num_frames=arguments.frames)}
-    else:
-        opened = {reduce: open_data(arguments.data, reduce=reduce) for reduce in {*reduces, REFERENCE}}
+    reduces: list[Reduce] = arguments.reduce
+    opened: dict[int, Any] = {reduce: open_data(arguments.data, reduce=reduce) for reduce in {*reduces, REFERENCE}}
 
     @cache
     def scored(index: int, reduce: Reduce) -> list[ScoredFrame]:
-        """A frame scored by the true views, by half of its points, or by its cameras' photographs, in turn."""
-        sample = opened[reduce][index]
-        if arguments.data is None:
-            return [make_frame(sample, truth=partial(opened[1].render, index), exposures=(), hand_over_points=True)]
-        reference = opened[REFERENCE][index]  # its colours score
+        """A frame scored by half of its points, or by its cameras' photographs, in turn."""
+        sample, reference = opened[reduce][index], opened[REFERENCE][index]  # whose colours score
         if "points" not in sample:
             if len(sample["rig"]) < 2:
                 raise DataError(f"data {arguments.data}: expected LiDAR points or several cameras, to score by")
@@ -116,10 +108,8 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         return [ScoredFrame(frame.sample, {"even": LidarReference(frame.sample, points.points)}, True)]
 
     first = opened[reduces[0]][0]
-    by_points = arguments.data is not None and "points" in first
-    source, target = first["rig"], demo_target_rig(arguments.size)
-    if arguments.target is not None or arguments.data is not None:
-        target = without_masks(load_rig(arguments.target or REAL_TARGET)).resized(arguments.size, "stretch")
+    by_points, source = "points" in first, first["rig"]
+    target = without_masks(load_rig(arguments.target or REAL_TARGET)).resized(arguments.size, "stretch")
     target = replace(target, lidars=())  # scans are no views
     if bent := [camera for camera in source if not camera.is_rectilinear]:
         got = f"camera {bent[0].name!r} of the data has lens {bent[0].lens!r}"
@@ -156,8 +146,8 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         row |= {"psnr_db": means[f"{prefix}_covered_psnr_db"], "whole_psnr_db": means[f"{prefix}_psnr_db"]}
         rows.append(row | {"harm": static_harm(source, target, setting.surface, RenderConfig())})
         retarget = RigRetarget(target, quality=setting.quality, geometry=setting.surface, holes="black", cache=plans)
-        calls[setting.name] = partial(retarget, first if frames[0].target else frames[0].scored_sample)
-    for reduce in reduces if arguments.data else ():
+        calls[setting.name] = partial(retarget, frames[0].lidar["even"].sample if by_points else first)
+    for reduce in reduces:
         data = open_data(arguments.data, reduce=reduce, load_points=False)
         calls[f"decode 1/{reduce}"] = partial(data.__getitem__, 0)
     # CPU time leaves out waiting on a busy machine. Each round runs every call in turn, once to warm its caches and
@@ -170,15 +160,14 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
                 taken[name].append(1e3 * timeit(call, timer=process_time, number=1))
     for row in rows:
         row["q1_ms"], row["median_ms"], row["q3_ms"] = np.quantile(taken[row["name"]], (0.25, 0.5, 0.75)).tolist()
-        if decoding := taken.get(f"decode 1/{row['reduce']}"):
-            decode_ms = float(np.median(decoding))
-            row |= {"decode_ms": decode_ms, "decode_ratio": row["median_ms"] / decode_ms}
+        decode_ms = float(np.median(taken[f"decode 1/{row['reduce']}"]))
+        row |= {"decode_ms": decode_ms, "decode_ratio": row["median_ms"] / decode_ms}
     front = {row["name"] for row in pareto_front(rows)}
-    against = "true views" if arguments.data is None else "photographs of cameras rendered from the others"
+    against = "photographs of cameras rendered from the others"
     return {
         "clock": "CPU time of the process, milliseconds, one thread",
         "versions": versions(),
-        "data": "synthetic streets" if arguments.data is None else data_name(arguments.data),
+        "data": data_name(arguments.data),
         "target": target.name or "target",
         "size": list(target.sizes[0]),
         "frames": num_frames,

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +12,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import load_rig
 from arbiview_aug.cli.arguments import chosen_frames, data, gathered_warnings, is_rig, reading, writable_folder
 from arbiview_aug.datasets.registry import open_data
-from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.evaluate.metrics import as_arrays
 from arbiview_aug.evaluate.report.pictures import draw_labels, save_picture
 from arbiview_aug.sample.camera_mistakes import neighbour_errors
 from arbiview_aug.sample.frame import Frame
@@ -47,7 +45,11 @@ def run(arguments: argparse.Namespace) -> int:
             for pair, found in neighbour_errors(sample["rig"], sample["images"]).items():
                 errors.setdefault(pair, []).append(found)
             if index == chosen[0]:
-                pictures = _draw(sample, folder)
+                given = sample.get("points"), sample.get("boxes_3d")
+                points, boxes = (None if value is None else value.numpy() for value in given)
+                for camera, image in zip(sample["rig"], as_arrays(sample["images"]), strict=True):
+                    picture = draw_labels(camera, image, points, boxes)
+                    save_picture(folder / f"check-{file_name(camera.name)}.png", picture)
         for finding in check_own_car(frames):
             lines[finding.where, finding.fix] = [str(finding)] * len(chosen)
     for note in notes:
@@ -58,15 +60,6 @@ def run(arguments: argparse.Namespace) -> int:
         angles = [f"{one}, {two} {np.median(np.concatenate(found)):.2f}" for (one, two), found in errors.items()]
         print(f"degrees between matches of neighbouring cameras, median: {'; '.join(angles)}")
     count = len(notes) + len(lines)
-    print(
-        f"{count or 'no'} finding{'s' * (count != 1)} in {len(chosen)} of {len(samples)} frames; pictures: {pictures}"
-    )
+    told = f"{count or 'no'} finding{'s' * (count != 1)} in {len(chosen)} of {len(samples)} frames"
+    print(f"{told}; pictures: {folder}/check-*.png")
     return int(count > 0)
-
-
-def _draw(sample: Mapping[str, Any], folder: Path) -> str:
-    """Write a picture for each camera of a reader's sample; return what they are called."""
-    points, boxes = (None if sample.get(key) is None else sample[key].numpy() for key in ("points", "boxes_3d"))
-    for camera, image in zip(sample["rig"], as_arrays(sample["images"]), strict=True):
-        save_picture(folder / f"check-{file_name(camera.name)}.png", draw_labels(camera, image, points, boxes))
-    return f"{folder}/check-*.png"

@@ -18,8 +18,8 @@ from arbiview_aug.cli.arguments import PICTURES, frames_text, gathered_warnings,
 from arbiview_aug.cli.evaluate import measured, open_frames
 from arbiview_aug.cli.parsers import SIZE
 from arbiview_aug.environment import working_s
-from arbiview_aug.evaluate.images import as_arrays
-from arbiview_aug.evaluate.methods import retargeting, views_of
+from arbiview_aug.evaluate.frames import retargeting, views_of
+from arbiview_aug.evaluate.metrics import as_arrays
 from arbiview_aug.evaluate.report.pictures import frame_sheet, save_picture
 from arbiview_aug.evaluate.report.tables import evaluation_table, text_table
 from arbiview_aug.sample.inputs import read_frames
@@ -29,8 +29,7 @@ from arbiview_aug.transforms.warm_up import compiling
 PICTURE_FILE = "demo.png"
 _COMPARED: tuple[GeometryName, ...] = ("street", "ground", "infinity")
 _TIMED_CALLS = 3
-_OTHER_M = 1e-4
-"""Shift of cameras and boxes that makes them others, and nothing else."""
+_OTHER_M = 1e-4  # shift of cameras and boxes that makes them others, and nothing else
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -52,7 +51,6 @@ def run(arguments: argparse.Namespace) -> None:
     chosen = "paper" if is_paper else geometry
     others = [retargeting("fast" if is_paper else quality, name, name) for name in _COMPARED if name != chosen]
     methods = [retargeting(quality, geometry, chosen), *others]
-    methods += [retargeting(quality, geometry, f"{chosen}, inpainted", holes=holes)] if holes == "telea" else []
     notes: list[str] = []
     done = measured(arguments, data, methods, notes)
     target = done.target
@@ -69,11 +67,8 @@ def run(arguments: argparse.Namespace) -> None:
     print(text_table(f"{title} ({len(target)} cameras, {count_of})", rows, columns, table_notes))
     planned = f"{other_ms:.1f} ms with another calibration or other boxes, whose plan is new."
     planned = "nothing can be planned ahead." if is_paper else planned
-    print(
-        f"\n{same_ms:.1f} ms a frame: {len(source)} source images to {len(target)} views of "
-        f"{target[0].height_px}x{target[0].width_px}, quality {quality}, {cv2.getNumThreads()} threads; "
-        f"{planned}"
-    )
+    sizes = f"{len(source)} source images to {len(target)} views of {target[0].height_px}x{target[0].width_px}"
+    print(f"\n{same_ms:.1f} ms a frame: {sizes}, quality {quality}, {cv2.getNumThreads()} threads; {planned}")
     images, truth = as_arrays(sample["images"]), done.first.true_images(target)
     sheet = frame_sheet(source, images, target, views, truth, width_px=arguments.width)
     print(f"picture: {save_picture(path, sheet)}")

@@ -5,12 +5,9 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import re
-import shutil
 import statistics
 from collections.abc import Iterator
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from timeit import timeit
 
@@ -21,23 +18,11 @@ import torch
 from arbiview_aug.cameras.kernels import project_image
 from arbiview_aug.cli.arguments import gathered_warnings
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.environment import (
-    cv2_conflict,
-    cv2_wheels,
-    installed_version,
-    is_intact,
-    one_thread,
-    versions,
-    working_s,
-)
+from arbiview_aug.environment import cv2_conflict, installed_version, is_intact, one_thread, versions, working_s
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.warm_up import compiling
 
 _CALLS = 5
-_FRAME_MB = 0.6
-"""A converted frame of five views of 256 x 704, JPEG at quality 96, on synthetic and real streets."""
-
-_LIMITS = "OMP_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"
 
 Line = tuple[bool, str]  # whether all is well, and what was found
 
@@ -54,28 +39,12 @@ def run(arguments: argparse.Namespace) -> int:
 def _lines(size: tuple[int, int]) -> Iterator[Line]:
     found = {**versions(), "numba": installed_version("numba") or "not installed"}
     yield True, f"{', '.join(f'{name} {version}' for name, version in found.items())}; {platform.platform()}"
-    conflict, wheels = (
-        cv2_conflict(cv2_wheels()),
-        [f"{name} {version}, alone" for name, version in cv2_wheels().items()],
-    )
-    alone = wheels[0] if wheels else f"{cv2.__version__}, not from a wheel: {cv2.__file__}"
-    yield conflict is None, f"OpenCV: {conflict or alone}"
-    variables = [f"{name}={value}" for name in _LIMITS if (value := os.environ.get(name)) is not None]
-    threads = f"OpenCV {cv2.getNumThreads()}, torch {torch.get_num_threads()}; {', '.join(variables) or 'no limit set'}"
-    yield True, f"threads: {os.cpu_count()} cores; {threads}"
+    if (conflict := cv2_conflict()) is not None:
+        yield False, f"OpenCV: {conflict}"
+    threads = f"OpenCV {cv2.getNumThreads()}, torch {torch.get_num_threads()} of {os.cpu_count()} cores"
     gpus = [torch.cuda.get_device_name(k) for k in range(torch.cuda.device_count())]
-    yield True, f"GPUs: {', '.join(gpus) or 'none that torch can use'}"
+    yield True, f"threads: {threads}; GPUs: {', '.join(gpus) or 'none that torch can use'}"
     yield _kernels(project_image._cache.cache_path)
-    free_mb = shutil.disk_usage(".").free / 1e6
-    frames = f"about {free_mb / _FRAME_MB:,.0f} converted frames of five views of 704x256"
-    yield free_mb > 1000, f"free disk here: {free_mb / 1000:.1f} GB, {frames}"
-    lacking: dict[str, set[str]] = {}
-    for requirement in (installed_version("arbiview_aug") and metadata.requires("arbiview_aug")) or []:
-        name, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"]([\w-]+)['\"]", requirement)
-        if name and extra and extra[1] not in ("dev", "docs"):
-            lacking.setdefault(extra[1], set()).update({name[0]} if installed_version(name[0]) is None else ())
-    extras = [f"{extra} {'lacks ' + ', '.join(sorted(names)) if names else 'yes'}" for extra, names in lacking.items()]
-    yield True, f"extras: {'; '.join(extras) or 'unknown, since arbiview_aug is not installed'}"
     yield _frame(size)
 
 

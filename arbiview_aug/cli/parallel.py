@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, TypeVar
 
 from torch.utils.data import DataLoader, Dataset
@@ -18,10 +18,8 @@ from arbiview_aug.errors import OutputError
 Result = TypeVar("Result")
 
 
-def results(
-    jobs: Dataset[Result], workers: int, label: str, note: Callable[[Result], str] | None = None
-) -> Iterator[Result]:
-    """Yield the items of ``jobs``, each of which does some work, in order; ``note`` is the text beside the bar.
+def results(jobs: Dataset[Result], workers: int, label: str) -> Iterator[Result]:
+    """Yield the items of ``jobs``, each of which does some work, in order, behind a progress bar.
 
     Several workers are one-thread processes, started by a fork server so that no thread or CUDA context is forked; the
     jobs are pickled. 1 works in this process, on its own threads. OutputError if a worker is killed.
@@ -39,7 +37,7 @@ def results(
         worker_init_fn=_begin,
     )
     try:
-        yield from with_progress(loader, len(jobs), label, note)  # type: ignore[arg-type]
+        yield from with_progress(loader, len(jobs), label)  # type: ignore[arg-type]
     except RuntimeError as error:
         if not str(error).startswith("DataLoader worker (pid"):
             raise
@@ -47,18 +45,14 @@ def results(
         raise OutputError(f"{label}: expected worker processes that live, got one that was killed, {fix}") from None
 
 
-def with_progress(
-    done: Iterable[Result], count: int, label: str, note: Callable[[Result], str] | None = None
-) -> Iterator[Result]:
+def with_progress(done: Iterable[Result], count: int, label: str) -> Iterator[Result]:
     """Yield ``count`` results as they come, behind a progress bar with frames/s and the remaining time."""
     with tqdm(total=count, unit="frame", desc=label) as bar:
         bar._time = working_s
         bar.reset()
-        for one in done:
-            if note is not None:
-                bar.set_postfix_str(note(one), refresh=False)
+        for result in done:
             bar.update()
-            yield one
+            yield result
 
 
 def unchanged(value: Any) -> Any:

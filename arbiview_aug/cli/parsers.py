@@ -36,8 +36,6 @@ _RIGS = (
     f"a shipped rig ({', '.join(shipped_rigs())}), a rig file (YAML or JSON), another tool's calibration "
     "(docs/rigs.md), or data as other commands' --data takes it: the rig of its first frame"
 )
-
-
 _INSPECTED = "the picture (default: inspect.png), or with --common the rig (default: common.yaml)"
 
 
@@ -45,8 +43,7 @@ class Command(NamedTuple):
     """A command: its module has ``run``, a function of the parsed arguments."""
 
     module: str
-    summary: str
-    description: str
+    description: str  # up to its first colon it is the command's summary
     example: str
     options: Sequence[tuple[str, dict[str, Any]]]  # flags, and what differs from ``arguments.options``
     resumable: bool = False
@@ -55,11 +52,10 @@ class Command(NamedTuple):
 COMMANDS = {
     "bench": Command(
         "cli.bench",
-        "measure speed against accuracy, on your own data too",
-        "Speed against accuracy: every quality, geometry and decoded size, for one target rig.",
+        "Measure speed against accuracy: every quality, geometry and decoded size, for one target rig.",
         "--data FOLDER --target waymo",
         [
-            ("--data", {"without": "synthetic streets"}),
+            ("--data", {"required": True}),
             ("--target --output", {}),
             ("--size", {"default": SIZE, "help": "of every view"}),
             ("--frames", {"help": "frames for accuracy"}),
@@ -70,7 +66,6 @@ COMMANDS = {
     ),
     "check": Command(
         "cli.check",
-        "find silent mistakes in a data set, and draw its labels into its images",
         "Look for silent mistakes: other columns, axes, frames and units, a wrong road, cameras that disagree, "
         "the own car, K of another resolution, specks in masks, unread keys. Draws boxes and points into the images.",
         "/data/frames --frames 5",
@@ -83,14 +78,13 @@ COMMANDS = {
     ),
     "convert": Command(
         "cli.convert.command",
-        "write a data set as another vehicle's cameras would have seen it",
         "Write a data set as another vehicle's cameras would have recorded it, in the source's format: nuScenes "
         "tables, or frame folders. Files that are there are left unchanged: run it again to go on.",
         "--data nuscenes:ROOT --target argoverse2 --output converted --size 256x704",
         [
             ("--data --target", {"required": True}),
             ("--output", {"required": True, "default": None}),
-            (f"--version --names {_RENDERING} --generator --steps", {}),
+            (f"--version --names {_RENDERING} --generator", {}),
             ("--size", {"help": "height and width of every view (default: the target's own)"}),
             (f"--fit --points {_READING} --neighbours --depth --images --shard-index --num-shards", {}),
             ("--runner --workers --on-error --report", {}),
@@ -99,7 +93,6 @@ COMMANDS = {
     ),
     "demo": Command(
         "cli.demo",
-        "retarget a synthetic street or real frames, with numbers and a picture",
         "Retarget a synthetic street, or real frames, to another vehicle's cameras: the plan in words, metrics, time, "
         "and one contact sheet.",
         "--data FOLDER --target waymo",
@@ -111,7 +104,6 @@ COMMANDS = {
     ),
     "depth": Command(
         "cli.depth",
-        "compute the depth of a drive's frames, from motion or by a network",
         "Compute the depth of every frame of a drive: from motion, for --geometry motion, or with --model by a "
         "network, for --geometry learned. Frames whose depth is there, of the same origin, stay.",
         "--data nuscenes:ROOT --workers 4",
@@ -125,33 +117,28 @@ COMMANDS = {
     ),
     "doctor": Command(
         "cli.doctor",
-        "check this installation, and time one frame",
-        "Check this installation: versions, OpenCV's wheels, threads, compiled kernels, disk, extras; time one frame.",
+        "Check this installation: versions, OpenCV's wheels, threads, compiled kernels; time one frame.",
         "--size 256x704",
         [("--size", {"default": SIZE, "help": "of the views"})],
     ),
     "evaluate": Command(
         "cli.evaluate",
-        "measure the quality of rendered views: metrics, pictures, a report",
         "Measure the quality of rendered views: LiDAR points or photographs as truth on real frames, true views on "
-        "synthetic streets. Writes tables, evaluate.json, pictures, and a self-contained report.html.",
+        "synthetic streets. Writes tables, evaluate.json, and a self-contained report.html.",
         "--data FOLDER --target waymo --geometry auto street",
         [
             ("--data", {"without": "synthetic streets"}),
             ("--target", {}),
             *((flag, {"nargs": "+", "default": [name]}) for flag, name in zip(RENDERING, _EVALUATED, strict=True)),
-            (
-                "--frames",
-                {"default": None, "help": "spread over the data (default: 1; --displaced, --held-out, --lidar: all)"},
-            ),
-            (f"--generator --steps --seed --size {_READING} --output", {}),
-            ("--displaced --lidar --detector --segmenter", {}),
+            ("--frames", {"default": None, "help": "spread over the data (default: 1; --held-out: all)"}),
+            (f"--generator --seed --size {_READING} --output", {}),
+            ("--detector --segmenter", {}),
             ("--held-out", {"nargs": "+"}),
+            ("--displaced", {"dest": "held_out", "action": "store_const", "const": ["next"], "help": "as next"}),
         ],
     ),
     "inspect": Command(
         "cli.rigs",
-        "show rigs: tables, differences, a picture",
         "Show rigs: tables, differences, a picture.",
         "nuscenes waymo",
         [
@@ -162,10 +149,9 @@ COMMANDS = {
     ),
     "train": Command(
         "generator.training.trainer",
-        "train the generator that completes what no camera saw",
-        "CVC-SSL: train a generator to reconstruct real views from pseudo views around them. The same command with the "
-        "same --output goes on where it stopped. Several GPUs: accelerate launch -m arbiview_aug.train …, or torchrun "
-        "--nproc_per_node N -m arbiview_aug.train …",
+        "Train the generator that fills holes: CVC-SSL, to reconstruct real views from pseudo views. The same command "
+        "with the same --output goes on where it stopped. Several GPUs: accelerate launch -m arbiview_aug.train …, or "
+        "torchrun --nproc_per_node N -m arbiview_aug.train …",
         "--data nuscenes:ROOT --output output/compact --set steps=100",
         [
             ("--config", {}),
@@ -177,14 +163,13 @@ COMMANDS = {
     ),
     "view": Command(
         "cli.view",
-        "write a recording of frames and their views for Rerun's viewer",
         "Write a recording for Rerun's viewer: frames along a time line, with cameras, points and boxes in 3D, and "
         "source images next to the target's views, their coverage and confidence. Needs the extra viewer.",
         "/data/frames --target waymo --frames 10",
         [
-            ("data", {**_DATA, "nargs": "?", "without": "a synthetic street"}),
+            ("data", _DATA),
             ("--frames", {"default": 5}),
-            (f"--target {_RENDERING} --seed --size {_READING}", {}),
+            (f"--target {_RENDERING} --size {_READING}", {}),
             ("--output", {"default": "output/view.rrd", "metavar": "FILE", "help": "recording to write"}),
         ],
     ),
@@ -209,22 +194,16 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
     given = vars(arguments)
     is_there = name == "check" and (given["data"] in shipped_rigs() or os.path.exists(given["data"]))
     is_rig_there, is_generated = is_there and is_rig(given["data"]), "diffusion" in given.get("holes", ())
-    of_images = "detector segmenter size quality geometry holes"
+    no_photographs = not given.get("held_out")
     for commands, holds, options_, why in (
         ("depth", not given.get("model"), "batch reference", "expected it with --model alone"),
         ("check", is_rig_there, "frames reduce clean_masks", "expected frames with it, got a rig"),
         ("convert", given.get("size") is None, "fit", "expected --size with it, found none"),
-        ("convert evaluate", not is_generated, "generator steps", "expected it with --holes diffusion"),
-        ("evaluate", given.get("displaced"), "seed size target lidar held_out", "expected it without --displaced"),
-        ("evaluate", given.get("held_out"), "seed size lidar", "expected it without --held-out"),
+        ("convert evaluate", not is_generated, "generator", "expected it with --holes diffusion"),
+        ("evaluate", given.get("held_out"), "seed size", "expected it without --held-out"),
         ("evaluate", given.get("held_out", ["holes"]) not in (None, ["holes"]), "target", "expected --held-out holes"),
-        ("evaluate", given.get("lidar"), of_images, "it is of images; expected no --lidar"),
-        (
-            "evaluate",
-            given.get("data") is None,
-            "displaced held_out lidar",
-            "expected --data FOLDER with it, found none",
-        ),
+        ("evaluate", given.get("data") and no_photographs, "detector segmenter", "expected --held-out with it"),
+        ("evaluate", given.get("data") is None, "held_out", "expected --data FOLDER with it, found none"),
     ):
         for option in options_.split() if holds and name in commands.split() else ():
             if given[option] != parser.get_default(option):
@@ -239,7 +218,3 @@ def check_together(name: str, parser: argparse.ArgumentParser, arguments: argpar
     if is_generated and given.get("generator") is None:
         fix = "python -m arbiview_aug.train makes one, which convert and evaluate read"
         parser.error(f"argument --holes: diffusion needs --generator PATH: {fix}")
-    photographs = "displaced", "held_out"
-    if name == "evaluate" and arguments.segmenter and arguments.data and not any(given[key] for key in photographs):
-        expected = "expected --displaced or --held-out with --data"
-        parser.error(f"argument --segmenter: {expected}: it compares with true images")

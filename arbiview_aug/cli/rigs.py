@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import os
+from pathlib import Path
 
 import numpy as np
 
 from arbiview_aug.cameras.camera import Camera
-from arbiview_aug.cameras.formats.calibration import recognised
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import RIG_SUFFIXES, Rig, load_rig, read_rig, shipped_rigs
-from arbiview_aug.cli.arguments import PICTURES, data, output_file
+from arbiview_aug.cli.arguments import PICTURES, data, is_rig, output_file
 from arbiview_aug.datasets.frame_folder import CALIBRATION_FILE
 from arbiview_aug.datasets.registry import open_data, split_kind
 from arbiview_aug.errors import DataError
@@ -19,8 +19,7 @@ from arbiview_aug.evaluate.common_rig import common_rig, seen_shares
 from arbiview_aug.evaluate.report.pictures import draw_rigs, save_picture
 from arbiview_aug.evaluate.report.tables import markdown_table
 
-NOISE_DEG, NOISE_M = 0.2, 0.02
-"""Errors of a calibration that is kept up. Rigs that differ by less are one rig."""
+NOISE_DEG, NOISE_M = 0.2, 0.02  # errors of a calibration that is kept up: rigs that differ by less are one
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -81,17 +80,14 @@ def _corners(camera: Camera) -> FloatArray:
 
 def _load(name: str) -> tuple[Rig, str]:
     """A rig, and a line on what another tool's calibration was read as."""
-    kind, root = split_kind(name)
-    if not name:  # which would be the current folder
+    if not name or name in shipped_rigs():  # an empty name would be the current folder
         return load_rig(name), ""
+    if is_rig(name):
+        rig, notes = read_rig(Path(name))
+        return rig, f"\n  {notes}" if notes else ""
+    kind, root = split_kind(name)
     if kind is None and os.path.isfile(root / CALIBRATION_FILE):  # its images need not be there
         return load_rig(root / CALIBRATION_FILE), ""
-    is_rig = os.path.isfile(root) or (os.path.isdir(root) and recognised(root))
-    if kind is None and name not in shipped_rigs() and is_rig:
-        rig, notes = read_rig(root)
-        return rig, f"\n  {notes}" if notes else ""
-    if kind is None and not os.path.isdir(root):
-        return load_rig(name), ""
     try:
         recording = open_data(data(name), load_points=False)
     except DataError as error:

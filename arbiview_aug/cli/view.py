@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterator, Mapping
-from itertools import chain
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +16,15 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.arguments import frames_text, named_steps, output_file
 from arbiview_aug.cli.evaluate import open_frames, target_rig
-from arbiview_aug.cli.parsers import SIZE
-from arbiview_aug.datasets.drive import Neighbours
 from arbiview_aug.datasets.image_io import encoded_image
-from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
-from arbiview_aug.evaluate.methods import views_of
+from arbiview_aug.evaluate.frames import views_of
+from arbiview_aug.evaluate.metrics import Image, as_arrays, as_tensors
 from arbiview_aug.evaluate.report.pictures import BOX, HOLE, RIG_COLOURS, box_lines, coloured, left_to_right
-from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import SampleKeys
 
-_STEP_M = 1.2  # between frames of the synthetic street
 _FRUSTUM_M = 0.8  # from a camera to its image in 3D
 _PIXEL_CENTER = 0.5  # Rerun counts pixels from the image's corner
 _LOW_M, _HIGH_M = -0.5, 3.5  # heights of points over the road, blue to red
@@ -53,36 +47,23 @@ def run(arguments: argparse.Namespace) -> None:
     chosen = None if arguments.target is None else load_rig(arguments.target)
     notes: list[str] = []
     with named_steps(notes, arguments.frames) as tick, whole_file(path) as file:
-        frames = _frames(arguments)
-        first = next(frames)
+        data = open_frames(arguments, [arguments.geometry])
+        first = data[0]
         target = target_rig(arguments, chosen, first["rig"])
         keys = SampleKeys(extra=() if arguments.quality == "paper" else ("confidence",))
         given = {name: getattr(arguments, name) for name in ("quality", "geometry", "holes")}
         retarget = RigRetarget(target, keys=keys, **given)
         recording = SampleRecording(Path(file.name), first["rig"], target)
-        for number, sample in enumerate(chain([first], frames)):
+        count = min(arguments.frames, len(data))
+        for number in range(count):
+            sample = data[number] if number else first
             tick(str(sample.get("token", number)), 1)
             recording.add(sample, retarget(sample))
         recording.close()
     for note in notes:
         print(f"note: {note}\n")
-    print(f"recording: {path} ({frames_text(number + 1)}, {path.stat().st_size / 1e6:.1f} MB)")
+    print(f"recording: {path} ({frames_text(count)}, {path.stat().st_size / 1e6:.1f} MB)")
     print(f"open it: python -m rerun {path}")
-
-
-def _frames(arguments: argparse.Namespace) -> Iterator[Mapping[str, Any]]:
-    """The first frames of the data, or of a drive along one synthetic street."""
-    if arguments.data is not None:
-        data = open_frames(arguments, [arguments.geometry])
-        yield from (data[k] for k in range(min(arguments.frames, len(data))))
-        return
-    rig = demo_source_rig(arguments.size or SIZE)
-    ahead = Neighbours(count=max(1, arguments.frames - 1), step_m=_STEP_M, direction="future")
-    sample = SyntheticDrive(rig, num_frames=1, seed=arguments.seed, lidar=True, neighbours=ahead)[0]
-    frames = [sample, *sample.pop("neighbours")]
-    needs_others = GEOMETRIES[arguments.geometry].needs == "motion"
-    for frame in frames[: arguments.frames]:
-        yield {**frame, "neighbours": [other for other in frames if other is not frame]} if needs_others else frame
 
 
 class SampleRecording:

@@ -6,7 +6,6 @@ from arbiview_aug.environment import lazy_names
 
 if TYPE_CHECKING:
     from arbiview_aug.datasets.depth_folder import WithDepth as WithDepth
-    from arbiview_aug.datasets.depth_folder import WithMotionDepth as WithMotionDepth
     from arbiview_aug.datasets.drive import LazyFrame as LazyFrame
     from arbiview_aug.datasets.drive import Neighbours as Neighbours
     from arbiview_aug.datasets.frame_folder import FrameFolder as FrameFolder

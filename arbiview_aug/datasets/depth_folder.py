@@ -34,8 +34,7 @@ WANTED = Neighbours(count=2, step_m=BEST_TRAVEL_M / 2)
 
 _FORMAT, _MOST_BYTES = 2, 1 << 29
 _KINDS: dict[str, type[MotionDepth]] = {"motion": MotionDepth, "learned": LearnedDepth}
-_SAME_PX, _SAME_POSE = 0.05, 1e-3
-"""Tolerances of equal calibrations, wide enough for images decoded at half size."""
+_SAME_PX, _SAME_POSE = 0.05, 1e-3  # tolerances of equal calibrations, also of images decoded at half size
 
 
 class DepthFolder:
@@ -139,9 +138,6 @@ class WithDepth(Dataset[dict[str, Any]]):
             key, words = learned if isinstance(depth, LearnedDepth) else motion
             out |= {key: stacked([*map(torch.from_numpy, depth.depth_m)]), words: str(depth)}
         return out
-
-
-WithMotionDepth = WithDepth  # deprecated: the former name
 
 
 def _calibration(rig: Rig) -> dict[str, Any]:

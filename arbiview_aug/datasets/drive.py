@@ -237,6 +237,3 @@ class LazyFrame(Mapping[str, Any]):
 
     def __len__(self) -> int:
         return len({**self._fields, **self._loads})
-
-    def __repr__(self) -> str:
-        return f"LazyFrame({', '.join(self)})"

@@ -137,7 +137,7 @@ class Py123dDataset(WritableRecording):
             self._logs.append(log)
         if unknown := {*(cameras or ())} - {camera.name for log in self._logs for camera in log.cameras.values()}:
             raise DataError(f"py123d {root}: cameras: expected names of its cameras, got {', '.join(sorted(unknown))}")
-        self._frames = frames
+        self._frames, self.is_one_drive = frames, len(folders) == 1
         self.tokens = [f"{self._logs[n].folder.parent.name}-{self._logs[n].folder.name}-{us}" for n, _, us in frames]
         self._drive = None if neighbours is None else self._find_drive()
 
@@ -145,10 +145,6 @@ class Py123dDataset(WritableRecording):
     def licences(self) -> dict[str, str]:
         """Licences by the names of the data sets that the logs were made of."""
         return {name: LICENCES.get(name, "unknown") for name in sorted({log.dataset for log in self._logs})}
-
-    @property
-    def is_one_drive(self) -> bool:
-        return len(self._logs) == 1
 
     def time_s(self, index: int) -> float:
         return 1e-6 * self._frames[index][2]

@@ -1,4 +1,4 @@
-"""Evaluation of methods on frames: the sample that a method gets, and the references that score its views.
+"""Evaluation of methods on frames: what renders, the sample that it gets, and the references that score its views.
 
 References are true images (of synthetic streets, or photographs), or LiDAR points in the source cameras' colours, as
 recorded and with even exposures. If a method may read points, all methods get those of alternate azimuth sectors
@@ -10,21 +10,31 @@ from __future__ import annotations
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import GeometryName, Holes, Quality
 from arbiview_aug.datasets.synthetic import GROUND_CLASSES, RenderedViews, SceneClass
 from arbiview_aug.errors import CalibrationError, DataError, SampleError
-from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors
 from arbiview_aug.evaluate.lidar import ColouredPoints, coloured_points, equalised, lidar_split, sparse_metrics
-from arbiview_aug.evaluate.methods import Method
-from arbiview_aug.evaluate.metrics import mean_of, truth_metrics
+from arbiview_aug.evaluate.metrics import Image, RenderedView, as_arrays, as_tensors, mean_of, truth_metrics
+from arbiview_aug.favs.config import PaperConfig
+from arbiview_aug.inpaint.inpainter import Black, Inpainter
+from arbiview_aug.render.plan import RenderConfig
 from arbiview_aug.sample.boxes_2d import rig_of
+from arbiview_aug.scene.scene import GEOMETRIES
+from arbiview_aug.transforms.rig_retarget import RigRetarget
+from arbiview_aug.transforms.settings import PlanCache, SampleKeys, inpainter_of, render_config
+
+Sample = Mapping[str, Any]
+
+_CACHED_TRANSFORMS = 8  # targets of a study; full-size plans take 50 MB each
 
 Render = Callable[[Mapping[str, Any], Rig], list[RenderedView]]  # a view for each of the target rig
 
@@ -35,6 +45,52 @@ Exposure = Literal["raw", "even"]
 EXPOSURES: tuple[Exposure, ...] = ("raw", "even")  # exposures as recorded, and made even
 
 
+@dataclass(frozen=True)
+class Method:
+    """A row of a table."""
+
+    name: str
+    render: Callable[[Sample, Rig], list[RenderedView]]  # of a sample with ``rig``, for a rig in its own ego frame
+    reads_points: bool = False  # may use the sample's ``points``, so that only a part of them can score it
+
+
+def retargeting(
+    quality: Quality | RenderConfig | PaperConfig,
+    geometry: GeometryName = "auto",
+    name: str = "",
+    *,
+    holes: Holes | Inpainter = "black",
+    **settings: Any,
+) -> Method:
+    """Wrap ``RigRetarget`` as a method, with its arguments; exposures stay as recorded: metrics compare with them."""
+    inpainter = inpainter_of(holes)  # once, not for each target
+    settings = dict[str, Any](cache=PlanCache(max_bytes=0)) | settings
+    images_alone = replace(settings.get("keys", SampleKeys()), points="source")
+    settings |= {"holes": inpainter, "match_exposure": False, "keys": images_alone}
+
+    transform = lru_cache(_CACHED_TRANSFORMS)(partial(RigRetarget, quality=quality, geometry=geometry, **settings))
+    label = name or ", ".join([quality if isinstance(quality, str) else type(quality).__name__, geometry])
+    if not name and not isinstance(inpainter, Black):
+        steps = getattr(inpainter, "steps", None)
+        label += f", {holes if isinstance(holes, str) else type(holes).__name__}" + (f" {steps}" if steps else "")
+    reads_points = isinstance(render_config(quality), RenderConfig) and "points" in GEOMETRIES[geometry].reads
+    return Method(label, lambda sample, target: views_of(transform(target)(sample)), reads_points)
+
+
+def own_index(source: Rig, camera: Camera) -> int:
+    """Index of the source camera of the same name, or else of the nearest direction."""
+    nearest = int(np.argmax(source.cam2ego[:, :3, 2] @ camera.cam2ego[:3, 2]))
+    return source.names.index(camera.name) if camera.name in source.names else nearest
+
+
+def views_of(out: Sample) -> list[RenderedView]:
+    images, coverage = as_arrays(out["images"]), [mask.cpu().numpy() for mask in out["coverage"]]
+    confidence = [c.float().cpu().numpy() for c in out["confidence"]] if "confidence" in out else [None] * len(images)
+    generated = [g.cpu().numpy() for g in out["generated"]] if "generated" in out else [None] * len(images)
+    return [RenderedView(*parts) for parts in zip(images, coverage, confidence, generated, strict=True)]
+
+
+# --- frames and what scores them --------------------------------------------------------------------------------------
 class LidarReference(NamedTuple):
     sample: Mapping[str, Any]  # at one exposure
     points: ColouredPoints  # the scoring ones, in its colours
@@ -54,21 +110,13 @@ class ScoredFrame:
     truth: Callable[[Rig], Truth] | None = None  # the truth of a rig; None if unknown
     target: Rig | None = None  # the rig that alone has a truth, that of photographs; None for any rig
 
-    @property
-    def scored_sample(self) -> Mapping[str, Any]:
-        """Sample that methods get for scoring, with even exposures if points score at those."""
-        return self.lidar["even"].sample if "even" in self.lidar else self.sample
-
     def true_images(self, target: Rig) -> Sequence[Image] | None:
         """The true views (h, w, 3) of a rig, if the truth is known."""
         return None if self.truth is None else self.truth(target).images
 
 
 def photographed(
-    sample: Mapping[str, Any],
-    rig: Rig,
-    images: Sequence[Image],
-    regions: Sequence[Mapping[str, BoolArray]] = (),
+    sample: Mapping[str, Any], rig: Rig, images: Sequence[Image], regions: Sequence[Mapping[str, BoolArray]] = ()
 ) -> ScoredFrame:
     """Frame whose truth is what the cameras of ``rig``, in its ego frame, photographed outside of their masks."""
     truth = Truth(images, scene_masks(rig), regions)
@@ -157,10 +205,6 @@ def scores(
 
 
 # --- evaluation of methods --------------------------------------------------------------------------------------------
-PHOTOGRAPHS = "photographs"
-"""Name of the target whose photographs are the truth."""
-
-
 @dataclass
 class Evaluation:
     """Measurements as plain data, and the views of the first frame."""
@@ -175,14 +219,6 @@ class Evaluation:
     def means(self, method: str) -> dict[str, float]:
         """Mean the per-image values over cameras and frames."""
         return mean_of(row for row in self.views if row["method"] == method)
-
-    def spread(self, method: str, metric: str) -> float:
-        """Standard deviation over the frames of a metric's mean."""
-        frames: dict[str, list[float]] = {}
-        for row in self.views:
-            if row["method"] == method and metric in row:
-                frames.setdefault(row["frame"], []).append(row[metric])
-        return float(np.std([np.mean(values) for values in frames.values()])) if frames else 0.0
 
 
 def evaluate(
@@ -201,7 +237,7 @@ def evaluate(
     for name, frame in frames:
         rig = frame.target or target(frame.sample["rig"])
         if done is None:
-            done = Evaluation(frame, rig, rig.name or "target" if frame.target is None else PHOTOGRAPHS)
+            done = Evaluation(frame, rig, rig.name or "target" if frame.target is None else "photographs")
         for method in methods:
             tick(f"{name}: {method.name}", len(methods))
             try:

@@ -1,4 +1,4 @@
-"""Photographs as truth for held-out cameras, rendered from the others, and for holes that are cut into them."""
+"""Photographs as truth: of held-out cameras, rendered from the others, or of the next frame; of holes cut into them."""
 
 from __future__ import annotations
 
@@ -14,29 +14,38 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import GeometryName
 from arbiview_aug.datasets.depth_folder import WithDepth
 from arbiview_aug.datasets.frame_folder import FrameFolder
-from arbiview_aug.errors import DataError
+from arbiview_aug.errors import DataError, warn
 from arbiview_aug.evaluate.frames import Look, Render, ScoredFrame, Truth, photographed, scene_masks, without_masks
-from arbiview_aug.evaluate.images import RenderedView, as_arrays, to_bytes
-from arbiview_aug.evaluate.judges import Segmenter
+from arbiview_aug.evaluate.judges import Segmenter, draws_of, interval
 from arbiview_aug.evaluate.lidar import visible_points
-from arbiview_aug.evaluate.metrics import errors, mean_of, ssim_map
+from arbiview_aug.evaluate.metrics import RenderedView, as_arrays, errors, mean_of, ssim_map, to_bytes
 from arbiview_aug.evaluate.report.tables import Table
-from arbiview_aug.evaluate.verdicts import draws_of, interval
 from arbiview_aug.sample.boxes_2d import rig_of
-from arbiview_aug.sample.inputs import DEPTH_KEYS
+from arbiview_aug.sample.frame import Frame, Neighbour
+from arbiview_aug.sample.inputs import DEPTH_KEYS, LEARNED_KEY, read_frames
+from arbiview_aug.sample.neighbours import STILL_M
+from arbiview_aug.temporal.motion_depth import without_objects
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 
 _BY_CAMERA = ("images", "K", "cam2ego", "distortion", "lens", "coverage", "generated", "ego_mask", *DEPTH_KEYS)
 _WINDOW_PX = 9  # side of the square around a point that belongs to its class
 
+MOST_APART_S = 2.0
+"""Longest time to the photograph that is the truth: a vehicle that stands waits longer, and traffic has gone on."""
+
+NO_PHOTOGRAPH = (
+    "--held-out next: expected a 'truth' camera in calib.json, or a later frame of the drive (sequence.json and "
+    "ego2world), found none; see docs/formats.md"
+)
 NOTES = (
-    "Each camera is rendered from the others and compared with its own photograph. seen: share of its pixels that the "
-    "method covers. PSNR and SSIM: of the pixels that all methods cover ({common:.0%}), means over cameras and frames; "
-    "one gain: each view times the number that fits it best. difference: to the first row, with a 95 % interval, "
-    "bootstrap over frames. Frames of one drive are alike: the interval says little about other drives. Tone curves "
-    "and calibration of the cameras limit all PSNR here: read the differences."
+    "Each camera is rendered from the others (next: from the frame before) and compared with its photograph. seen: "
+    "share of its pixels that the method covers. PSNR and SSIM: of the pixels that all methods cover ({common:.0%}), "
+    "means over cameras and frames; one gain: each view times the number that fits it best. difference: to the first "
+    "row, with a 95 % interval, bootstrap over frames. Frames of one drive are alike: the interval says little about "
+    "other drives. Tone curves and calibration of the cameras limit all PSNR here: read the differences."
 )
 HOLE_NOTES = (
     "Fills of the holes that the target's place would leave in the photographs, which are the truth. Means over "
@@ -89,46 +98,97 @@ def held_out_frames(
 ) -> Iterator[tuple[str, ScoredFrame]]:
     """Name and frame of each held-out camera (``all``: of every camera) of the samples at ``indices``.
 
-    With ``place_of`` they are all cameras that have holes from the places of that rig's cameras, as sources too.
+    ``["next"]`` holds out a ``FrameFolder``'s ``truth`` camera, else the cameras of the nearest neighbour recorded
+    later. With ``place_of`` they are all cameras that have holes from the places of that rig's cameras, as sources too.
     Regions of the truth are the classes of LiDAR points in it (``FrameFolder.point_classes``), and the segmenter's
-    masks. DataError for a camera that a sample lacks, or that is its only one.
+    masks. DataError for a camera that a sample lacks, or that is its only one, and if no sample has a photograph.
     """
     recorded = data.dataset if isinstance(data, WithDepth) else data
+    problems, count = list[str](), 0
     for index in indices:
         sample = data[index]
         rig, frame = rig_of(sample), str(sample.get("token", index))
+        held: list[tuple[Camera, torch.Tensor, Mapping[str, Any]]] = []  # camera, photograph, and what methods get
         if place_of is not None:
             sample, holes = _with_holes(sample, rig, place_of)
+            for camera, image, hole in zip(rig, sample["images"], holes, strict=True):
+                held += [(replace(camera, mask=hole), image, sample)] if hole.any() else []
+        elif cameras == ["next"]:
+            held = _displaced(sample, recorded.truth(index) if isinstance(recorded, FrameFolder) else None, problems)
         elif unknown := {*cameras} - {*rig.names, "all"}:
-            expected = f"all, or cameras of frame {frame}, {', '.join(rig.names)}"
+            expected = f"all, next, or cameras of frame {frame}, {', '.join(rig.names)}"
             raise DataError(f"--held-out: expected {expected}, got {', '.join(sorted(unknown))}")
         elif len(rig) < 2:
             raise DataError(f"--held-out: expected frames of several cameras, frame {frame} has one")
+        else:
+            for place, (camera, image) in enumerate(zip(rig, sample["images"], strict=True)):
+                held += [(camera, image, WithoutCamera(sample, place))] if {camera.name, "all"} & {*cameras} else []
         points, classes = sample.get("points"), None
-        if points is not None and isinstance(recorded, FrameFolder):
+        if points is not None and isinstance(recorded, FrameFolder) and cameras != ["next"]:
             classes = recorded.point_classes(index, len(points))
-        for place, camera in enumerate(rig):
-            if not holes[place].any() if place_of is not None else not {camera.name, "all"} & {*cameras}:
-                continue
-            masks = () if segmenter is None else segmenter(to_bytes(as_arrays([sample["images"][place]])[0]))
+        for camera, image, given in held:
+            (photograph,) = as_arrays([image])
+            masks = () if segmenter is None else segmenter(to_bytes(photograph))
             regions = {f"mask {k}": mask for k, mask in enumerate(masks, 1)}
             regions |= {} if points is None or classes is None else _windows(camera, points, classes)
-            if place_of is None:
-                held = held_out(sample, place, sample, regions)
-            else:
-                own = rig.with_cameras([replace(camera, mask=holes[place])])
-                held = photographed(sample, own, as_arrays([sample["images"][place]]), [regions])
-            yield f"{frame}: {camera.name}", held
+            target = Rig([camera], name=camera.name, ground_z_m=rig.ground_z_m)
+            yield f"{frame}: {camera.name}", photographed(given, target, [photograph], [regions])
+        count += len(held)
+    if cameras == ["next"] and not count:
+        raise DataError(problems[0] if problems else NO_PHOTOGRAPH)
 
 
-def held_out(
-    sample: Mapping[str, Any], place: int, reference: Mapping[str, Any], regions: Mapping[str, BoolArray] | None = None
-) -> ScoredFrame:
+def _displaced(
+    sample: Mapping[str, Any], truth: Mapping[str, Any] | None, problems: list[str]
+) -> list[tuple[Camera, torch.Tensor, Mapping[str, Any]]]:
+    """Cameras and photographs of ``truth``, or of the next frame, where what moved is masked; the other entries."""
+    if truth is not None:
+        return [(camera, image, sample) for camera, image in zip(truth["rig"], truth["images"], strict=True)]
+    if (found := later_neighbour(sample, problems)) is None:
+        return []
+    frame, later, others = found
+    moved = later.labelled if later.moved is None else later.moved
+    sample = {**sample, **({"neighbours": others} if others else {})}
+    photographs = zip(later.rig, later.images(frame.images), strict=True)
+    return [(without_objects(camera, moved), image, sample) for camera, image in photographs]
+
+
+def later_neighbour(sample: Mapping[str, Any], problems: list[str]) -> tuple[Frame, Neighbour, list[Any]] | None:
+    """A sample's frame, the nearest neighbour recorded at most ``MOST_APART_S`` later, and the neighbours elsewhere.
+
+    None if there is no such frame; what was wrong goes to ``problems``.
+    """
+    (frame,) = read_frames(sample, None, further=("neighbours",), warn=lambda _, message: problems.append(message))
+    neighbours = frame.neighbours or ()
+    later = next((neighbour for neighbour in neighbours if neighbour.is_later), None)
+    if later is None:
+        return None
+    if (later.seconds or 0.0) > MOST_APART_S:
+        problems.append(
+            f"frame {str(sample.get('token', ''))!r} is left out, since its vehicle stands: the next frame from "
+            f"elsewhere is {later.seconds:.1f} s later"
+        )
+        warn(problems[-1])
+        return None
+    apart_m = {one.number: np.linalg.norm((one.ego2ego - later.ego2ego)[:3, 3]) for one in neighbours}
+    others = [entry for k, entry in enumerate(sample["neighbours"]) if apart_m.get(k, np.inf) > STILL_M]
+    return frame, later, others
+
+
+def surfaces_for(sample: Mapping[str, Any]) -> list[GeometryName]:
+    """Surfaces that a sample has the geometry for, from the least to the most."""
+    names: list[GeometryName] = ["ground", "street"]
+    names += ["boxes"] if sample.get("boxes_3d") is not None else []
+    names += ["learned"] if sample.get(LEARNED_KEY) is not None else []
+    measured: list[GeometryName] = ["lidar"] if sample.get("points") is not None else []
+    return names + measured + ((["motion", "fused"] if measured else ["motion"]) if sample.get("neighbours") else [])
+
+
+def held_out(sample: Mapping[str, Any], place: int, reference: Mapping[str, Any]) -> ScoredFrame:
     """A sample without one of its cameras, whose photograph in ``reference``, perhaps of another size, is the truth."""
     camera: Camera = reference["rig"][place]
     target = Rig([camera], name=camera.name, ground_z_m=reference["rig"].ground_z_m)
-    image = as_arrays([reference["images"][place]])
-    return photographed(WithoutCamera(sample, place), target, image, [regions or {}])
+    return photographed(WithoutCamera(sample, place), target, as_arrays([reference["images"][place]]))
 
 
 def render_alone(frame: ScoredFrame, render: Render, target: Rig) -> tuple[list[RenderedView], list[dict[str, float]]]:
@@ -163,11 +223,6 @@ def _windows(camera: Camera, points: torch.Tensor, classes: npt.NDArray[np.int64
         around[row[at], column[at]] = 1
         regions[f"class {number}"] = np.asarray(cv2.dilate(around, np.ones((_WINDOW_PX,) * 2, np.uint8)) > 0)
     return regions
-
-
-def _in_order(name: str) -> tuple[str, int]:
-    kind, number = name.split()
-    return kind, int(number)
 
 
 @dataclass
@@ -235,13 +290,9 @@ class CommonPixels:
         tables: list[Table] = [("Against the photographs of held-out cameras", means, _COLUMNS, notes)]
         if self.in_holes:
             tables = [("Against the photographs in held-out holes", means, _HOLE_COLUMNS, HOLE_NOTES)]
-        if names := sorted(
-            {key for row in self.rows for key in row if key.startswith(("class ", "mask "))}, key=_in_order
-        ):
+        found = {key for row in self.rows for key in row if key.startswith(("class ", "mask "))}
+        if names := sorted(found, key=lambda name: (name.split()[0], int(name.split()[1]))):
             columns = [(name, f"{{{name}:.2f}}") for name in names]
-            notes = (
-                "PSNR of these pixels (held-out cameras: after one gain), by class of LiDAR points around them or mask "
-                "of the segmenter."
-            )
+            notes = "PSNR of these pixels (cameras: after one gain), by class of points around or segmenter's mask."
             tables.append(("The same by class", means, columns, notes))
         return tables

@@ -1,37 +1,37 @@
-"""Networks that judge views: detectors and segmenters that were trained on photographs, as ``FILE.py:function``.
+"""Networks that judge views, and their verdicts: hits, AP, recall and IoU with bootstrap intervals.
 
-Detectors take an RGB image (H, W, 3) uint8 and return ``Detections``; segmenters return masks (n, H, W).
+Networks were trained on photographs and are named as ``FILE.py:function``. Detectors take an RGB image (H, W, 3) uint8
+and return boxes, scores, and what else they like, which is not read; segmenters return masks (n, H, W).
 """
 
 from __future__ import annotations
 
 import importlib.util
 import os
-import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import DataError, one_line, shown
+from arbiview_aug.evaluate.frames import ScoredFrame
+from arbiview_aug.evaluate.metrics import RenderedView, to_bytes
 from arbiview_aug.evaluate.report.pictures import Picture
 
 
 class Detections(NamedTuple):
-    """Objects that a detector sees in an image.
+    """Objects that a detector sees in an image."""
 
-    Attributes:
-        boxes: (n, 4) float64 x0 y0 x1 y1 in pixels, within the image.
-        scores: (n,) float64 in [0, 1].
-    """
-
-    boxes: FloatArray
-    scores: FloatArray
+    boxes: FloatArray  # (n, 4) x0 y0 x1 y1 in pixels, within the image
+    scores: FloatArray  # (n,) in [0, 1]
 
     def subset(self, chosen: BoolArray) -> Detections:
         """The detections that a mask (n,) chooses."""
@@ -44,54 +44,36 @@ Segmenter = Callable[[Picture], BoolArray]
 LEAST_SCORE = 0.05
 """Detections below it are left out: torchvision's default of Faster R-CNN, whatever the detector's."""
 
-_WORDS = (
-    *("person", "people", "pedestrian", "human", "rider", "cyclist", "bicyclist", "motorcyclist"),
-    *("bicycle", "bike", "motorcycle", "motorbike", "vehicle", "car", "van", "truck", "lorry", "bus", "trailer"),
-    *("wheelchair", "stroller", "signaler"),
-)
-_NO_ROAD_USERS = "static", "sign", "rack", "stop", "ego"
-"""Words of names such as ``static_object.bicycle_rack``, ``bus stop`` and ``vehicle.ego``."""
-
-
-def is_road_user(name: str) -> bool:
-    """Whether a class name is of vehicles or people: COCO's ``car``, nuScenes' ``vehicle.car``, ``BOX_TRUCK``."""
-    words = re.split(r"[^a-z]+", name.lower())
-    return {*words}.isdisjoint(_NO_ROAD_USERS) and not {*words}.isdisjoint(_WORDS)
-
 
 def load_detector(name: str) -> Detector:
     """Load the detector that ``--detector`` names.
 
-    It returns the detections from ``LEAST_SCORE`` on that count, cut at the image's border: vehicles and people by
-    name, and all numbers.
+    It returns the detections from ``LEAST_SCORE`` on, cut at the image's border.
 
     Raises:
-        DataError: No such function. Calls raise it for outputs that are not boxes (n, 4), scores (n,) and n labels, or
-            boxes that are not finite and ordered.
+        DataError: No such function. Calls raise it for outputs that are not boxes (n, 4) and scores (n,), or boxes that
+            are not finite and ordered.
     """
     option = f"--detector {name}"
     detect = _function(option, name)
 
     def detections_of(image: Picture) -> Detections:
         output = _called(option, detect, image)
-        expected = f"{option}: expected boxes (n, 4) x0 y0 x1 y1, scores (n,) and n labels for an image {image.shape}"
+        expected = f"{option}: expected boxes (n, 4) x0 y0 x1 y1 and scores (n,) for an image {image.shape}"
         try:
-            boxes, scores, labels = (np.asarray(_host(part)) for part in output)
-            boxes, scores, labels = boxes.astype(np.float64), scores.astype(np.float64), labels.reshape(-1)
-            texts = [str(int(label)) if np.issubdtype(labels.dtype, np.number) else str(label) for label in labels]
-        except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+            boxes, scores = (np.asarray(_host(part)).astype(np.float64) for part in output[:2])
+        except (TypeError, ValueError, RuntimeError) as error:
             raise DataError(f"{expected}, got other values: {error}") from None
         boxes = boxes.reshape(0, 4) if boxes.size == 0 else boxes
-        if boxes.ndim != 2 or boxes.shape[1] != 4 or scores.shape != (len(boxes),) or len(labels) != len(boxes):
-            raise DataError(f"{expected}, got {boxes.shape}, {scores.shape} and {len(labels)}")
+        if boxes.ndim != 2 or boxes.shape[1] != 4 or scores.shape != (len(boxes),):
+            raise DataError(f"{expected}, got {boxes.shape} and {scores.shape}")
         wrong = ~np.isfinite(boxes).all(axis=1) | (boxes[:, :2] > boxes[:, 2:]).any(axis=1)
         if wrong.any():
             raise DataError(f"{expected}: finite, with x0 <= x1 and y0 <= y1, got {boxes[wrong][0].tolist()}")
         if not ((scores >= 0) & (scores <= 1)).all():
             raise DataError(f"{expected}: scores from 0 to 1, got {shown(scores.tolist())}")
-        counts = np.array([text.isdecimal() or is_road_user(text) for text in texts], bool)
         h, w = image.shape[:2]
-        return Detections(boxes.clip(0, (w, h, w, h)), scores).subset(counts & (scores >= LEAST_SCORE))
+        return Detections(boxes.clip(0, (w, h, w, h)), scores).subset(scores >= LEAST_SCORE)
 
     return detections_of
 
@@ -158,3 +140,171 @@ def _called(option: str, function: Callable[[Picture], Any], image: Picture) -> 
     """Call a judge with a copy of an image: it may write into it, and raise anything."""
     with _foreign(f"{option}: for an image {image.shape} {image.dtype} it"):
         return function(image.copy())
+
+
+# --- verdicts ---------------------------------------------------------------------------------------------------------
+CONFIDENCE = 0.5
+"""Least score of a sure detection: recall counts no others, and in true images they are the objects."""
+
+OVERLAP = 0.5  # least IoU of a hit, as in PASCAL VOC
+
+IntArray = npt.NDArray[np.int64]
+
+FEWEST = {"objects": 100, "images": 10}
+"""95 % intervals of a share of 100 objects are 0.2 wide at most. Of fewer than 10 images a bootstrap says little."""
+
+TOO_FEW = "rows of fewer than 100 objects or 10 images are too few to tell methods apart; add frames"
+
+_DRAWS = 1000
+
+
+class Objects(NamedTuple):
+    """Objects that the detections in an image are compared with."""
+
+    boxes: FloatArray  # (n, 4) x0 y0 x1 y1 in pixels; pixel k reaches from k to k + 1
+    counts: BoolArray  # (n,); a detection of an object that does not count is neither a hit nor a miss
+
+
+class Matches(NamedTuple):
+    """Detections in an image that are hits or misses."""
+
+    scores: FloatArray  # (d,)
+    hits: BoolArray  # (d,); each object is hit once
+    num_true: int
+
+
+def ious(one: FloatArray, two: FloatArray) -> FloatArray:
+    """(n, m) IoU of boxes (n, 4) and (m, 4); that of two empty ones is 0."""
+    # Not torchvision's: importing it takes seconds.
+    low, high = np.maximum(one[:, None, :2], two[:, :2]), np.minimum(one[:, None, 2:], two[:, 2:])
+    both = (high - low).clip(0).prod(axis=-1)
+    one_px, two_px = ((boxes[:, 2:] - boxes[:, :2]).prod(axis=1) for boxes in (one, two))
+    return np.asarray(both / np.maximum(one_px[:, None] + two_px - both, 1e-9))
+
+
+def match(detections: Detections, objects: Objects) -> Matches:
+    """Match detections, the surest first, each with the free object that it overlaps most."""
+    true, others = objects.boxes[objects.counts], objects.boxes[~objects.counts]
+    hits, free = np.zeros(len(detections.boxes), bool), np.ones(len(true), bool)
+    overlaps = ious(detections.boxes, true)
+    for k in np.argsort(-detections.scores, kind="stable") if len(true) else ():
+        best = np.where(free, overlaps[k], 0).argmax()
+        hits[k] = free[best] and overlaps[k, best] >= OVERLAP
+        free[best] &= not hits[k]
+    chosen = hits | (ious(detections.boxes, others).max(axis=1, initial=0) < OVERLAP)
+    return Matches(detections.scores[chosen], hits[chosen], len(true))
+
+
+def precision_and_recall(matches: Sequence[Matches], weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(R,) AP and recall of images (n) together, for R weightings (R, n) of these; NaN without true objects.
+
+    AP is the area under the envelope of precision over recall; recall is that of detections from ``CONFIDENCE`` on.
+    """
+    image = np.repeat(np.arange(len(matches)), [len(found.scores) for found in matches])
+    scores, hits = (np.concatenate(parts) for parts in zip(*(found[:2] for found in matches), strict=True))
+    order = np.argsort(-scores, kind="stable")
+    scores, hits, weights_of = scores[order], hits[order], weights[:, image[order]]
+    num_true = weights @ np.array([found.num_true for found in matches], float)
+    num_true[num_true == 0] = np.nan
+    recall = (weights_of * hits).cumsum(axis=1) / num_true[:, None]
+    precision = recall * num_true[:, None] / np.maximum(weights_of.cumsum(axis=1), 1)
+    precision = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
+    average = np.where(np.isnan(num_true), np.nan, (np.diff(recall, axis=1, prepend=0) * precision).sum(axis=1))
+    return average, (weights_of * (hits & (scores >= CONFIDENCE))).sum(axis=1) / num_true
+
+
+class Reference(NamedTuple):
+    """A true image that a view is compared with."""
+
+    valid: BoolArray  # (h, w) pixels that count
+    objects: Objects | None = None
+    masks: BoolArray | None = None
+
+
+@dataclass
+class Panel:
+    """Networks, and their verdicts on all views that they were shown: true images say what is there.
+
+    Sure detections in the true images are the objects. Frames without a truth are not judged.
+    """
+
+    detector: Detector | None = None
+    segmenter: Segmenter | None = None
+    matches: dict[str, list[Matches]] = field(default_factory=dict)  # by method
+    pixels: dict[str, list[IntArray]] = field(default_factory=dict)  # (masks, 2) intersection and union, likewise
+    _frame: str = ""
+    _references: list[Reference] = field(default_factory=list)  # of that frame, by camera
+
+    def look(self, name: str, frame: ScoredFrame, method: str, rig: Rig, views: Sequence[RenderedView]) -> None:
+        """Judge a method's views for a rig; before the first ones, the true images."""
+        if frame.truth is None:
+            return
+        if name != self._frame:
+            self._frame, self._references, truth = name, [], frame.truth(rig)
+            for image, valid in zip(map(to_bytes, truth.images), truth.valid, strict=True):
+                objects = None
+                if self.detector is not None:
+                    found = valid_detections(self.detector(image), valid)
+                    objects = Objects(found.boxes, found.scores >= CONFIDENCE)
+                masks = None if self.segmenter is None else self.segmenter(image)
+                self._references.append(Reference(valid, objects, masks))
+        for view, reference in zip(views, self._references, strict=True):
+            image = to_bytes(view.image)
+            if self.detector is not None and reference.objects is not None:
+                found = valid_detections(self.detector(image), reference.valid)
+                self.matches.setdefault(method, []).append(match(found, reference.objects))
+            if self.segmenter is not None and reference.masks is not None:
+                masks = self.segmenter(image)
+                if len(masks) != len(reference.masks):
+                    expected = f"as many masks as in the true image, {len(reference.masks)}"
+                    raise DataError(f"--segmenter: expected {expected}, got {len(masks)} in a view by {method}")
+                ours, true = masks & reference.valid, reference.masks & reference.valid
+                counts = np.stack([(ours & true).sum(axis=(1, 2)), (ours | true).sum(axis=(1, 2))], axis=1)
+                self.pixels.setdefault(method, []).append(counts)
+
+    def rows(self, methods: Sequence[str]) -> dict[str, dict[str, float]]:
+        """``figures`` of each method."""
+        rows = {name: figures(self.matches.get(name, ()), self.pixels.get(name, ())) for name in methods}
+        return {name: row for name, row in rows.items() if row}
+
+
+def valid_detections(detections: Detections, valid: BoolArray) -> Detections:
+    """The detections whose centres are on valid pixels (h, w)."""
+    x, y = ((detections.boxes[:, :2] + detections.boxes[:, 2:]) / 2).astype(int).T
+    return detections.subset(valid[y.clip(max=valid.shape[0] - 1), x.clip(max=valid.shape[1] - 1)])
+
+
+def figures(matches: Sequence[Matches], pixels: Sequence[IntArray] = ()) -> dict[str, float]:
+    """Figures of a row: ``ap``, ``recall`` and number of ``objects``; ``iou_1``, ... and number of ``images``.
+
+    Each has a 95 % interval, ``_low`` and ``_high``, by the bootstrap over images, from one seed.
+    """
+    row: dict[str, float] = {}
+    if matches:
+        row["objects"] = sum(found.num_true for found in matches)
+        if row["objects"]:
+            average, recall = precision_and_recall(matches, draws_of(len(matches)))
+            row |= interval("ap", average) | interval("recall", recall)
+    if pixels:
+        row["images"] = len(pixels)
+        sums = np.einsum("rv,vmk->mrk", draws_of(len(pixels)), np.stack(pixels))
+        for k, mask in enumerate(sums, 1):
+            row |= interval(f"iou_{k}", mask[:, 0] / np.maximum(mask[:, 1], 1))
+    return row
+
+
+def interval(name: str, draws: FloatArray) -> dict[str, float]:
+    """A figure, the first of its draws, and its 95 % interval."""
+    low, high = np.nanpercentile(draws[1:], (2.5, 97.5))  # a draw without objects has no figure
+    return {name: float(draws[0]), f"{name}_low": float(low), f"{name}_high": float(high)}
+
+
+def draws_of(count: int) -> FloatArray:
+    """(1 + draws, count) how often each of ``count`` things counts: once, and as drawn with replacement."""
+    drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=_DRAWS)
+    return np.concatenate([np.ones((1, count)), drawn])
+
+
+def too_few(rows: Iterable[Mapping[str, float]]) -> bool:
+    """Whether some row has fewer objects or images than ``FEWEST``."""
+    return any(row.get(unit, fewest) < fewest for row in rows for unit, fewest in FEWEST.items())

@@ -20,8 +20,7 @@ import numpy.typing as npt
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.evaluate.images import Image
-from arbiview_aug.evaluate.metrics import errors, ssim_map
+from arbiview_aug.evaluate.metrics import Image, errors, ssim_map
 from arbiview_aug.scene.point_cloud import own_car
 
 NEAREST_M = 1.0  # closer points lie on the own car

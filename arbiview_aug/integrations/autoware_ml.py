@@ -65,6 +65,3 @@ class RigRetargetMultiViewImages:
             skipped = out.get("retarget_params", {}).get("skipped")
             changed["camera_names"] = list(input_dict["camera_names"] if skipped else self.step.names)
         return changed
-
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.step.retarget.extra_repr()})"

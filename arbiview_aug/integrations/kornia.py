@@ -16,8 +16,7 @@ _MOVING = (
 )
 """Modules whose classes move pixels, or draw from some that do."""
 
-_FAR_SHARE = 0.01
-"""Largest share of values far outside [0, 1]: more are normalised, and would be cut."""
+_FAR_SHARE = 0.01  # largest share of values far outside [0, 1]: more are normalised, and would be cut
 
 
 class OnImages(torch.nn.Module):

@@ -6,7 +6,7 @@ both in the LiDAR's frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from arbiview_aug.cameras.random_rig import RandomRig
 from arbiview_aug.cameras.validation import checked_pose, refusal
 from arbiview_aug.choices import is_number
 from arbiview_aug.errors import SampleError
-from arbiview_aug.integrations.mmdet3d.matrices import entry, like_array, padded
+from arbiview_aug.integrations.mmdet3d.matrices import entry, like_array
 from arbiview_aug.integrations.mmdet3d.results import check_as_recorded, geometry, moved_points
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
 from arbiview_aug.scene.boxes import checked_boxes, moved_by, points_by_box
@@ -79,12 +79,12 @@ class RigRetargetDataDict:
         self.p, self.min_points_in_gt = checked_probability(p), int(min_points_in_gt)
 
     def __call__(self, data_dict: Mapping[str, Any]) -> DataDict:
-        """A new ``data_dict``; ``calib`` is the given object, which becomes that of the new camera and frame.
+        """A new ``data_dict``; ``calib`` is the given object, which becomes that of the new frame.
 
         ``DatasetTemplate.prepare_data`` puts the object that it was given back after all augmentors.
 
         Raises:
-            SampleError: A scene that is turned already, images without matrices, nothing to retarget.
+            SampleError: A scene that is turned already, images without matrices or of KITTI, nothing to retarget.
             CalibrationError: Images, and a target with lenses.
         """
         if self.p < 1 and torch.rand((), generator=self.step.rng(data_dict, "p")).item() >= self.p:
@@ -96,12 +96,13 @@ class RigRetargetDataDict:
         if "camera_imgs" in data_dict:
             out = self._with_cameras(data_dict)
         elif "images" in data_dict:
-            out = self._with_kitti_image(data_dict)
+            fix = "leave 'images' out of GET_ITEM_LIST, or use nuScenes' form (camera_imgs)"
+            raise SampleError(f"images: expected points alone, since KITTI's image is not retargeted; {fix}")
         else:
             out = {**data_dict, "points": self._points(data_dict)}
         return self._filtered(_moved(out, self.move))
 
-    # --- points alone, nuScenes' cameras, KITTI's camera --------------------------------------------------------------
+    # --- points alone, nuScenes' cameras ------------------------------------------------------------------------------
     def _points(self, data_dict: Mapping[str, Any]) -> Any:
         target = self.step.retarget.target
         rig = target.rig(self.step.draw(data_dict)) if isinstance(target, RandomRig) else target
@@ -138,30 +139,6 @@ class RigRetargetDataDict:
             out["img_process_infos"] = [[1.0, (0, 0, w, h), False, 0] for _ in images]
         return out | {"ori_shape": (w, h)}
 
-    def _with_kitti_image(self, data_dict: Mapping[str, Any]) -> DataDict:
-        """``KittiDataset`` with ``images`` in ``GET_ITEM_LIST``: (H, W, 3) in [0, 1], and ``calib``."""
-        calib, image = data_dict.get("calib"), np.asarray(data_dict["images"])
-        if calib is None or image.ndim != 3:
-            got = "no calib" if calib is None else f"images of shape {image.shape}"
-            raise SampleError(f"images: expected one (H, W, 3) with its calib, as KittiDataset loads it, got {got}")
-        P2, R0, V2C = (padded(np.asarray(matrix, np.float64)[None])[0] for matrix in (calib.P2, calib.R0, calib.V2C))
-        levels = np.rint(image * 255).astype(np.uint8)
-        results = self.step({"img": [levels], "cam2img": [P2], "lidar2cam": [R0 @ V2C], **self._labels(data_dict)})
-        images = results["img"]
-        if len(images) != 1 or images[0].shape != image.shape:
-            got = f"{len(images)} of {images[0].shape}; pass size=(h, w)"
-            raise SampleError(f"target: expected one image of {image.shape}, as KITTI's is, got {got}")
-        K, lidar2cam = (np.asarray(results[key][0])[:3] for key in ("cam2img", "lidar2cam"))
-        _write_calib(calib, K.astype(calib.P2.dtype), lidar2cam.astype(calib.V2C.dtype))
-        out = {**data_dict, "images": (images[0] / 255).astype(image.dtype), "points": results["points"]}
-        if "road_plane" in out:  # in the rectified camera's frame
-            plane = np.asarray(out["road_plane"], np.float64) @ R0 @ V2C @ np.linalg.inv(padded(lidar2cam[None])[0])
-            out["road_plane"] = plane.astype(np.asarray(out["road_plane"]).dtype)
-        for key in ("depth_maps", "gt_boxes2d"):
-            out.pop(key, None)  # of the source's pixels
-        matrices = {"trans_lidar_to_cam": padded(lidar2cam[None])[0], "trans_cam_to_img": K}
-        return out | {key: value.astype(out[key].dtype) for key, value in matrices.items() if key in out}
-
     def _labels(self, data_dict: Mapping[str, Any]) -> DataDict:
         """All that the step reads besides cameras: the points, the boxes, and the name of the drive."""
         named = {key: value for key, value in data_dict.items() if key == self.step.sequence_key}
@@ -187,9 +164,6 @@ class RigRetargetDataDict:
                     kept[key] = out[key][enough]
         return out | kept
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.step.retarget.extra_repr()}, p={self.p:g})"
-
 
 def register(augmentor: Any) -> None:
     """Make the step known to OpenPCDet's ``DataAugmentor`` class as ``rig_retarget``; twice is allowed.
@@ -212,13 +186,6 @@ def _crop(resize: float, crop: Any, flip: bool, rotate: float) -> FloatArray:
     return moved
 
 
-def _write_calib(calib: Any, K: FloatArray, lidar2cam: FloatArray) -> None:
-    """Set OpenPCDet's ``Calibration`` to a camera of K (3, 4), in the place ``lidar2cam`` (3, 4), rectified."""
-    calib.P2, calib.R0, calib.V2C = K, np.eye(3, dtype=K.dtype), lidar2cam
-    calib.cu, calib.cv, calib.fu, calib.fv = K[0, 2], K[1, 2], K[0, 0], K[1, 1]
-    calib.tx = calib.ty = 0.0
-
-
 def _moved(out: DataDict, move: FloatArray) -> DataDict:
     """A ``data_dict`` in another frame: ``move`` (4, 4) leads from the old one to it."""
     if np.array_equal(move, np.eye(4)):
@@ -227,21 +194,16 @@ def _moved(out: DataDict, move: FloatArray) -> DataDict:
     changed: DataDict = {"points": moved_points(out["points"], move).numpy().astype(out["points"].dtype)}
     if (boxes := out.get("gt_boxes")) is not None:
         changed["gt_boxes"] = moved_by(boxes, move)
-    for key in ("lidar2camera", "lidar2image", "trans_lidar_to_cam"):
+    for key in ("lidar2camera", "lidar2image"):
         if key in out:
-            changed[key] = _each(out[key], lambda matrix: matrix @ back)
+            changed[key] = [(matrix @ back).astype(matrix.dtype) for matrix in out[key]]
+    if "trans_lidar_to_cam" in out:  # KITTI's
+        changed["trans_lidar_to_cam"] = (out["trans_lidar_to_cam"] @ back).astype(out["trans_lidar_to_cam"].dtype)
     if "camera2lidar" in out:
-        changed["camera2lidar"] = _each(out["camera2lidar"], lambda matrix: move @ matrix)
+        changed["camera2lidar"] = [(move @ matrix).astype(matrix.dtype) for matrix in out["camera2lidar"]]
     if (calib := out.get("calib")) is not None:
         calib.V2C = (np.asarray(calib.V2C, np.float64) @ back).astype(calib.V2C.dtype)
     return out | changed
-
-
-def _each(matrices: Any, change: Callable[[FloatArray], FloatArray]) -> Any:
-    """A matrix or a list of them, changed, in its type."""
-    if isinstance(matrices, list):
-        return [change(matrix).astype(matrix.dtype) for matrix in matrices]
-    return change(matrices).astype(matrices.dtype)
 
 
 def _upright_pose(name: str, value: Any) -> FloatArray:

@@ -97,4 +97,4 @@ for keys in (("points", "boxes_3d"), ("boxes_3d",), ()):
 #
 # [When to retarget](../when.md) says how much of a detector's gap each closes, and
 # [depth source and quality](../surfaces.md) says how each works. Your own drive has no truth to compare with: there,
-# `evaluate --displaced` takes the photographs of the next frame instead.
+# `evaluate --held-out next` takes the photographs of the next frame instead.

@@ -1,8 +1,8 @@
 """``python -m integrations.benchmarks.lidar``: scans as another scanner would have measured them, against true ones.
 
-Synthetic streets scanned by both scanners, which err as real ones do (``ERRORS``), but for rays of B that would be lost
-by chance; and DDAD's next scan, 1.26 m ahead, where ARBIVIEW_DATA names the real frames. Returns and ranges count at
-rays within half a line spacing of which A measured something; ``recall of all`` counts at all rays. Baselines: A's
+Synthetic streets scanned by both scanners, which err as real ones do (``ErringDrive``), but for rays of B that would be
+lost by chance; and DDAD's next scan, 1.26 m ahead, where ARBIVIEW_DATA names the real frames. Returns and ranges count
+at rays within half a line spacing of which A measured something; ``recall of all`` counts at all rays. Baselines: A's
 points as they are, and those of its rings that are next to one of B's (LiDAR-Distillation's way to fewer beams).
 """
 
@@ -22,22 +22,106 @@ from arbiview_aug import Lidar, Rig, RigRetarget, retarget_points
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cli.arguments import count, seed
 from arbiview_aug.datasets import FrameFolder, Neighbours
-from arbiview_aug.datasets.synthetic import ScanErrors, SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from arbiview_aug.datasets.synthetic.dataset import NOISE_M, Rays, albedo, cast_rays
+from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, IntArray, Scene
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.lidar import lidar_split
 from arbiview_aug.evaluate.report.tables import markdown_table
-from arbiview_aug.evaluate.scans import chamfer_m, polar, scan_metrics
 from arbiview_aug.inpaint.neighbours import Reach
 from arbiview_aug.scene.point_cloud import own_car
+from integrations.benchmarks.scans import chamfer_m, polar, scan_metrics
 from integrations.benchmarks.study import run_study, stored, study_parser
 
 COLUMNS = ("recall", "precision", "range_error_m", "chamfer_m", "recall of all")
 HEIGHT_M, UP_M = 1.9, 0.7
 _GRID_DEG = 0.05  # of directions near which something was measured
 
-ERRORS = ScanErrors(divergence_deg=0.17, reach_m=150.0)
+PULSE_M = 0.5
+"""Surfaces of one beam within this distance return one echo from between them: pulses last 3 to 5 ns."""
+
+DIVERGENCE_DEG, REACH_M = 0.17, 150.0
 """An HDL-32E's divergence, 3 mrad. Among rays between others that return from one surface, 95, 94 and 84 % return at 20
 to 30, 30 to 50 and 50 to 100 m; in nuScenes' frame 92, 92 and 83 %."""
+
+
+class ErringDrive(SyntheticDrive):
+    """Streets whose scanners depart from exact rays.
+
+    A beam returns from what its middle and four rays at its edge, ``divergence_deg`` apart, meet first, mixed over
+    ``PULSE_M``. 63 % of the rays return from a white surface that faces the scanner at ``reach_m``, others with a
+    probability of 1 - exp(-albedo cos(incidence) (reach_m / distance)²).
+    """
+
+    divergence_deg, reach_m, noise_m = DIVERGENCE_DEG, REACH_M, NOISE_M
+
+    def _scan(
+        self, scene: Scene, position: FloatArray, rays: Rays, range_m: tuple[float, float], seed: tuple[int, ...]
+    ) -> FloatArray:
+        R = scene.ego2street[:3, :3]
+        origin = R @ position + scene.ego2street[:3, 3]
+        beam = _beam(rays.astype(np.float64), math.radians(self.divergence_deg / 2))  # [columns, beams, S, 3]
+        street = (beam @ R.T).astype(np.float32).reshape(len(rays), -1, 3)
+        t, row = _echoes(*cast_rays(scene, origin, street), beam.shape[2])
+        ego = beam[:, :, 0].reshape(-1, 3)
+        rng = np.random.default_rng(np.random.SeedSequence(seed))
+        noise_m, gain = rng.normal(0, self.noise_m, len(t)), rng.uniform(0.8, 1.2, len(t))
+        keep = (t > range_m[0]) & (t < range_m[1])
+        if self.reach_m < math.inf:
+            drawn = rng.random(len(t))
+            hits = origin + (ego[keep] @ R.T) * t[keep, None]
+            signal = albedo(scene, row[keep]) * _incidence(scene, hits, ego[keep] @ R.T, row[keep])
+            keep[keep] = drawn[keep] < 1 - np.exp(-signal * (self.reach_m / t[keep]) ** 2)
+        points = position + ego[keep] * (t + noise_m)[keep, None]
+        intensity = (albedo(scene, row[keep]) * gain[keep] * 90).clip(0, 255)
+        return np.concatenate([points, intensity[:, None]], 1)
+
+
+def _beam(rays: FloatArray, half_rad: float) -> FloatArray:
+    """(columns, beams, 1 or 5, 3) rays of beams: the middle, and four at the edge."""
+    if half_rad == 0:
+        return rays[:, :, None]
+    side = np.cross([0.0, 0.0, 1.0], rays)
+    side /= np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 1e-9)
+    up = np.cross(rays, side)
+    beam = np.stack([rays, *(rays + math.tan(half_rad) * edge for edge in (side, -side, up, -up))], 2)
+    return np.asarray(beam / np.linalg.norm(beam, axis=-1, keepdims=True))
+
+
+def _echoes(t: FloatArray, row: IntArray, rays: int) -> tuple[FloatArray, IntArray]:
+    """Distances and rows (n,) of the first echoes of beams of ``rays`` rays (n * rays,)."""
+    if rays == 1:
+        return t, row
+    t, row = t.reshape(-1, rays), row.reshape(-1, rays)
+    finite = np.isfinite(t)
+    # One surface has one echo, from its middle: at grazing incidence its part of the beam is longer than a pulse.
+    same = row[:, :, None] == row[:, None]
+    t = np.where(finite, (np.where(finite, t, 0)[:, None] * same).sum(2) / same.sum(2), np.inf)
+    n, order = np.arange(len(t)), t.argmin(1)
+    chosen = t[n, order]
+    with np.errstate(invalid="ignore"):  # of the sky
+        together = finite & (np.abs(t - chosen[:, None]) <= PULSE_M)
+    mean = np.where(together, t, 0).sum(1) / np.maximum(together.sum(1), 1)
+    return np.where(np.isfinite(chosen), mean, np.inf), row[n, order]
+
+
+def _incidence(scene: Scene, points: FloatArray, rays: FloatArray, row: IntArray) -> FloatArray:
+    """(n,) cosines between rays (n, 3) and the normals where they meet surfaces, at points (n, 3)."""
+    normal = np.tile([0.0, 0.0, 1.0], (len(row), 1))  # the road's
+    kind = np.where(row >= 0, scene.kind[row.clip(0)], -1)
+    flat, curved = np.flatnonzero(kind == BOX), np.flatnonzero((kind >= 0) & (kind != BOX))
+    planes = scene.planes[row[flat]]
+    before = np.einsum("nfi,ni->nf", planes[..., :3], points[flat]) - planes[..., 3]
+    normal[flat] = planes[np.arange(len(flat)), before.argmax(1), :3]
+    k = row[curved]
+    local = np.einsum("nji,nj->ni", scene.rotation[k], points[curved] - scene.center[k]) / scene.half[k]
+    gradient, is_cap = local / scene.half[k], np.abs(local[:, 2]) > 1 - 1e-3
+    is_cylinder = kind[curved] == CYLINDER
+    gradient[is_cylinder, 2] = 0
+    gradient[is_cylinder & is_cap] = 0, 0, 1
+    gradient /= np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-9)
+    normal[curved] = np.einsum("nij,nj->ni", scene.rotation[k], gradient)
+    return np.asarray(np.abs((normal * rays).sum(1)))
 
 
 def scanner(beams: int, height_m: float) -> Lidar:
@@ -78,8 +162,9 @@ def synthetic(frames: int, seed: int) -> Iterator[tuple[str, str, dict[str, floa
         rows: dict[str, list[dict[str, float]]] = {}
         rig = replace(demo_source_rig((8, 22)), lidars=[a])
         target, around = replace(rig, lidars=[b]), Neighbours(count=1)
-        drive = SyntheticDrive(rig, num_frames=frames, seed=seed, lidar=ERRORS, neighbours=around)
-        complete = SyntheticDrive(target, num_frames=frames, seed=seed, lidar=replace(ERRORS, reach_m=math.inf))
+        drive = ErringDrive(rig, num_frames=frames, seed=seed, neighbours=around)
+        complete = ErringDrive(target, num_frames=frames, seed=seed)
+        complete.reach_m = math.inf
         for k in range(frames):
             sample, truth = drive[k], complete.points(k).numpy()
             points = sample["points"].numpy()

@@ -28,10 +28,18 @@ from arbiview_aug.datasets.nuscenes.reader import CAMERA_RING
 from arbiview_aug.datasets.registry import data_name
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import CalibrationError, SampleError
-from arbiview_aug.evaluate.frames import Exposure, ScoredFrame, make_frame, scores, without_masks
-from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, as_tensors, to_bytes
-from arbiview_aug.evaluate.methods import Method, Sample, own_index, retargeting
-from arbiview_aug.evaluate.metrics import mean_of
+from arbiview_aug.evaluate.frames import (
+    Exposure,
+    Method,
+    Sample,
+    ScoredFrame,
+    make_frame,
+    own_index,
+    retargeting,
+    scores,
+    without_masks,
+)
+from arbiview_aug.evaluate.metrics import Image, RenderedView, as_arrays, as_tensors, mean_of, to_bytes
 from arbiview_aug.evaluate.report.tables import cell, markdown_table
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.render.rendered import render_opencv

@@ -14,7 +14,7 @@ import pytest
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.evaluate.methods import retargeting
+from arbiview_aug.evaluate.frames import retargeting
 from integrations.benchmarks import paper
 from integrations.benchmarks.paper import (
     PROTOCOL,

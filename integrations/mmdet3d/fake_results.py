@@ -13,7 +13,7 @@ from arbiview_aug import Rig
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rotations import rotation_z
 from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD
+from arbiview_aug.integrations.mmdet3d.transform import MEAN_STD
 
 SPEED_MPS = 9.0
 LIDAR2EGO = np.eye(4)

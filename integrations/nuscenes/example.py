@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 import torch
 from torch.utils.data import DataLoader
 
-from arbiview_aug import RigRetarget, load_rig
-from arbiview_aug.integrations.nuscenes import NuScenesDataset, RetargetedDataset, project_boxes_3d
+from arbiview_aug import RetargetedDataset, RigRetarget, load_rig, project_boxes_3d
+from arbiview_aug.datasets import NuScenesDataset
 from integrations.nuscenes.fake_root import fake_root
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug import Rig
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from integrations.mmdet3d.fake_results import LIDAR2EGO, Recording, recording, source_rig
@@ -54,8 +53,8 @@ def labelled(given: Recording, lidar2ego: FloatArray) -> dict[str, Any]:
     }
 
 
-def kitti(given: Recording, *, image: bool = False) -> dict[str, Any]:
-    """Before ``KittiDataset``'s ``prepare_data``; with ``images`` of ``GET_ITEM_LIST``."""
+def kitti(given: Recording) -> dict[str, Any]:
+    """Before ``KittiDataset``'s ``prepare_data``."""
     labels = labelled(given, KITTI_LIDAR2EGO)
     labels["gt_boxes"] = labels["gt_boxes"][:, :7]
     front = given.rig[given.rig.names.index("CAM_FRONT")]
@@ -63,11 +62,6 @@ def kitti(given: Recording, *, image: bool = False) -> dict[str, Any]:
     P2[:, :3], P2[0, 3] = front.K, 0.06 * front.K[0, 0]  # 6 cm beside the camera of the rectified frame
     V2C[0, 3] -= 0.06
     labels |= {"calib": Calibration(P2, np.eye(3), V2C), "road_plane": np.array([0.0, -1.0, 0.0, 1.65])}
-    if image:
-        pixels = given.sample["images"][given.rig.names.index("CAM_FRONT")].permute(1, 2, 0).numpy()
-        lidar2cam = np.vstack([V2C, [0, 0, 0, 1]]).astype(np.float32)
-        labels |= {"images": pixels.astype(np.float32) / 255, "trans_lidar_to_cam": lidar2cam}
-        labels |= {"trans_cam_to_img": P2.astype(np.float32), "depth_maps": np.zeros(pixels.shape[:2], np.float32)}
     return labels
 
 
@@ -93,8 +87,3 @@ def nuscenes(given: Recording) -> dict[str, Any]:
         "camera_imgs": [image.resize((round(w * resize), round(h * resize))).crop(crop) for image in images],
         "img_process_infos": [[resize, crop, False, 0] for _ in images],
     }
-
-
-def one_camera(rig: Rig) -> Rig:
-    """A rig's ``CAM_FRONT`` alone, with its scanners."""
-    return rig.with_cameras([rig["CAM_FRONT"]])

@@ -32,7 +32,7 @@ def test_frameworks_are_imported_where_they_are_used(tmp_path: Path) -> None:
     )
     code = (
         "import sys, arbiview_aug\n"
-        "from arbiview_aug.integrations import kornia, mmdet3d, nuscenes\n"
+        "from arbiview_aug.integrations import kornia, mmdet3d\n"
         "mmdet3d.RigRetargetMultiView, mmdet3d.register\n"
         "import importlib; sys.path.insert(0, sys.argv[1]); importlib.reload(mmdet3d)\n"
     )

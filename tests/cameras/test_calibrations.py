@@ -1,4 +1,4 @@
-"""Calibrations of other tools: files as they write them, questions where they leave something open, and back again."""
+"""Calibrations of other tools: files as they write them, and questions where they leave something open."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from arbiview_aug import Rig, load_rig, save_rig
+from arbiview_aug import Rig, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.rotations import quaternion_from_rotation
 from arbiview_aug.errors import CalibrationError
@@ -295,83 +295,7 @@ def test_waymo(tmp_path: Path, key: str | None, intrinsic: Any) -> None:
     np.testing.assert_allclose(uv, [939.657 - 2055.556 * y / x, 641.072 - 2055.556 * z / x])
 
 
-# --- recognition, writing, the command --------------------------------------------------------------------------------
-def lens_rig(*lenses: str) -> Rig:
-    coefficients: dict[str, tuple[float, ...]] = {
-        "pinhole": (), "radtan": (-0.1, 0.03, 0.001, -0.002), "fisheye": (0.02, -0.01, 0.002, 0.0),
-        "radtan8": (0.9, 0.12, 0.0004, -0.0003, 0.002, 1.25, 0.35, 0.02), "double_sphere": (-0.2, 0.6),
-        "eucm": (0.6, 1.1), "ftheta": (0.0, 0.1, 0.0, 0.0),
-    }  # fmt: skip
-    return Rig(
-        [
-            camera(
-                f"/camera/{lens}", 40.0 * k, lens=lens.removesuffix("8"), distortion=coefficients[lens],
-                elevation_deg=-5.0, position_m=(1.0, 0.3 * k, 1.5), horizontal_fov_deg=60.0,
-            )
-            for k, lens in enumerate(lenses)
-        ],
-        ground_z_m=-0.25,
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("name", "lenses"),
-    [
-        ("ros", ("pinhole", "radtan", "radtan8", "fisheye")),
-        ("kalibr", ("pinhole", "radtan", "fisheye", "double_sphere", "eucm")),
-        ("colmap", ("pinhole", "radtan", "radtan8", "fisheye")),
-    ],
-)
-def test_written_rigs_come_back(tmp_path: Path, name: Any, lenses: tuple[str, ...]) -> None:
-    rig = lens_rig(*lenses)
-    assert save_rig(rig, tmp_path / "new" / "rig", format=name) == tmp_path / "new" / "rig"
-    again = load_rig(tmp_path / "new" / "rig")
-    assert again.ground_z_m == rig.ground_z_m and again.sizes == rig.sizes
-    assert again.names == rig.names
-    points = np.random.default_rng(0).normal([8.0, 3.0, 1.0], 2.0, (50, 3))
-    for before, after in zip(rig, again, strict=True):
-        a, b = before.project(points), after.project(points)
-        np.testing.assert_array_equal(a.valid, b.valid)
-        np.testing.assert_allclose(b.uv[a.valid], a.uv[a.valid], atol=1e-9)
-    if name == "kalibr":
-        chain = yaml.safe_load((tmp_path / "new" / "rig" / "camchain.yaml").read_text())
-        assert chain["cam3"]["camera_model"] == "ds" and chain["cam3"]["intrinsics"][:2] == [-0.2, 0.6]
-
-
-@pytest.mark.parametrize("name", ["ros", "kalibr", "colmap"])
-def test_names_that_are_no_file_names_come_back(tmp_path: Path, name: Any) -> None:
-    """Nor words of a line; ``camchain`` is a name of Kalibr's files."""
-    names = [" x", "/a/b", "a/", "front\nleft", "camera5", "my_camchain", "08", "camera1", "tf_static", "mounting"]
-    rig = Rig([camera(text, 20.0 * k) for k, text in enumerate(names)])
-    again = load_rig(save_rig(rig, tmp_path, format=name))
-    assert again.names == rig.names and np.allclose(again.cam2ego, rig.cam2ego)
-
-
-SKEWED, BOTH = Rig([camera(K=[[50, 1, 47.5], [0, 50, 35.5], [0, 0, 1]])]), Rig([camera("a"), camera("b", 40.0)])
-UNWRITTEN: tuple[tuple[Rig, Any, str], ...] = (
-    (lens_rig("ftheta"), "ros", r"ftheta': expected a lens of ROS: pinhole, .*, got ftheta with 4"),
-    (lens_rig("radtan8"), "kalibr", r"expected a lens of Kalibr: .* got radtan with 8"),
-    (SKEWED, "colmap", r"camera 'front': expected K without skew for COLMAP, got 1.0"),
-    (SKEWED, "waymo", r"format: expected rig, colmap, kalibr, ros, got 'waymo'"),
-    (SKEWED, ["ros"], r"format: expected rig, colmap, kalibr, ros, got \['ros'\]"),
-    (Rig([camera("/a"), camera("a", 40.0)]), "ros", "'a': expected another .* frame .*, got a_optical_frame twice"),
-)
-
-
-@pytest.mark.parametrize(("rig", "name", "message"), UNWRITTEN)
-def test_what_a_format_has_not_is_refused(tmp_path: Path, rig: Rig, name: Any, message: str) -> None:
-    refused(lambda: save_rig(rig, tmp_path, format=name), message)
-    assert not list(tmp_path.iterdir()) and load_rig(save_rig(rig, tmp_path / "rig.yaml")) == rig
-
-
-@pytest.mark.parametrize(("earlier", "name"), [("b.yaml", "ros"), ("camchain.yaml", "ros"), ("images.bin", "colmap")])
-def test_an_earlier_calibration_is_not_mixed_with_a_new_one(tmp_path: Path, earlier: str, name: Any) -> None:
-    """It was read with the new one, or in its place."""
-    save_rig(BOTH, save_rig(BOTH, tmp_path, format="ros"), format="ros")
-    if earlier != "b.yaml":
-        (tmp_path / earlier).write_bytes(b"")
-    message = f"{tmp_path.name}: expected no other calibration, got .*{earlier}.*, which would be read"
-    refused(lambda: save_rig(Rig([camera("a")]), tmp_path, format=name), message)
+# --- recognition, the command -----------------------------------------------------------------------------------------
 
 
 def test_inspect_says_what_was_assumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -629,7 +553,6 @@ def test_names_that_no_file_has(tmp_path: Path, name: str, monkeypatch: pytest.M
     refused(name, "found neither")
     entry = {**Rig([camera()]).to_dict()["cameras"][0], "mask": name}
     refused(written(tmp_path, rig__json=json.dumps({"cameras": [entry]})) / "rig.json", "mask: expected an image file")
-    refused(lambda: save_rig("waymo", name, format="ros"), "path: expected a file's or folder's name")
     if len(name) < 300:
         with pytest.raises(CalibrationError, match="camera name: expected a non-empty string"):
             camera(name)

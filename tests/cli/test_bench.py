@@ -48,11 +48,13 @@ def test_settings_differ_and_leave_out_what_is_the_same() -> None:
 # --- the sweep --------------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 def test_the_sweep(tmp_path: Path) -> None:
-    only = ["--quality", "draft", "fast", "--geometry", "infinity", "street", "boxes"]
+    write_frame(tmp_path / "0", SyntheticDrive(demo_source_rig((128, 352)), num_frames=1)[0])
+    only = ["--quality", "draft", "fast", "--geometry", "infinity", "street", "boxes", "--downscale", "1"]
+    only += ["--data", str(tmp_path / "0")]
     assert main(["bench", *only, "--size", "64x176", "--output", str(tmp_path)]) == 0
     report = json.loads((tmp_path / "pareto.json").read_text())
     rows: dict[str, Any] = {row["name"]: row for row in report["settings"]}
-    assert len(rows) == 2 * 3 and report["against"] == "true views" and report["size"] == list(SIZE)
+    assert len(rows) == 2 * 3 and report["against"].startswith("LiDAR points") and report["size"] == list(SIZE)
     for row in rows.values():
         assert 0 < row["q1_ms"] <= row["median_ms"] <= row["q3_ms"]
         assert 0.5 < row["seen"] <= 1 and row["psnr_db"] >= row["whole_psnr_db"] > 10
@@ -101,8 +103,9 @@ def test_paper_is_left_out_of_other_lenses(tmp_path: Path, capsys: pytest.Captur
 
 def test_geometry_that_is_not_offered(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        main(["bench", "--geometry", "motion"])
+        main(["bench", "--data", ".", "--geometry", "motion"])
     assert "invalid choice: 'motion'" in capsys.readouterr().err
-    chosen = ["--quality", "accurate", "--geometry", "infinity"]
+    write_frame(tmp_path / "0", SyntheticDrive(demo_source_rig((16, 44)), num_frames=1)[0])
+    chosen = ["--data", str(tmp_path / "0"), "--quality", "accurate", "--geometry", "infinity"]
     assert main(["bench", *chosen, "--size", "16x44", "--output", str(tmp_path)]) == 2
     assert "expected geometry of infinity, ground, street, boxes, lidar, which" in capsys.readouterr().err

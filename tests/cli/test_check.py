@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from arbiview_aug import save_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.evaluate.report.pictures import draw_labels
+from tests.cameras.calibrations import CAMERA_INFO, mounted
 from tests.helpers import camera, street_sample
 
 
@@ -72,7 +72,8 @@ def test_a_rig_is_checked_alone(folder: Path, tmp_path: Path, capsys: pytest.Cap
         assert main(["check", str(tmp_path / "rig.json")]) == status
     assert capsys.readouterr().out.splitlines()[0] == "no findings"
     assert main(["check", str(tmp_path / "none.yaml")]) == 2
-    ros = save_rig(rig, tmp_path / "ros", format="ros")
+    (ros := tmp_path / "ros").mkdir()
+    mounted(ros, front__yaml=CAMERA_INFO)
     assert main(["check", str(ros)]) == 0
     with pytest.raises(SystemExit):
         main(["check", str(ros), "--frames", "2"])

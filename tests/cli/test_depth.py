@@ -11,7 +11,7 @@ import torch
 from arbiview_aug import DataError, RetargetedDataset, Rig, RigRetarget, SampleKeys
 from arbiview_aug.__main__ import main
 from arbiview_aug.atomic_io import _host
-from arbiview_aug.datasets import FrameFolder, Neighbours, WithDepth, WithMotionDepth
+from arbiview_aug.datasets import FrameFolder, Neighbours, WithDepth
 from arbiview_aug.datasets.depth_folder import FOLDER, DepthFolder
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
@@ -93,7 +93,6 @@ def test_a_full_disk_ends_it(recorded: Path, tmp_path: Path, monkeypatch: pytest
 
 def test_samples_carry_it(depth_root: Path, recorded: Path) -> None:
     data = WithDepth(FrameFolder(recorded), depth_root)
-    assert WithMotionDepth is WithDepth  # its former name
     sample = data[1]
     assert len(data) == 4 and sample["motion_depth_m"].shape == (2, 64, 176)
     assert sample["motion_depth_m"].dtype == torch.float32 and (sample["motion_depth_m"] > 0).float().mean() > 0.3

@@ -113,26 +113,16 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ("evaluate --holes diffusion --generator no/no/no", "generator no/no/no: expected a folder of a generator"),
         ("evaluate --quality paper fast --geometry street", "quality paper knows infinity alone, got street"),
         ("evaluate --generator /nope", "argument --generator: expected it with --holes diffusion"),
-        *(
-            (f"evaluate --lidar --{option}", f"argument --{option.split()[0]}: it is of images; expected no --lidar")
-            for option in ("size 8x8", "quality draft", "geometry street", "holes telea", "detector x.py:f")
-        ),
-        ("evaluate --displaced --data frame --size 8x8", "argument --size: expected it without --displaced"),
-        *(
-            (f"evaluate --{option}", f"argument --{option}: expected --data FOLDER")
-            for option in ("displaced", "lidar")
-        ),
-        ("evaluate --displaced --target waymo --data frame", "argument --target: expected it without --displaced"),
-        ("evaluate --segmenter road.py:f --data frame", "argument --segmenter: expected --displaced or --held-out"),
-        ("evaluate --held-out front --displaced --data frame", "argument --held-out: expected it without --displaced"),
+        ("evaluate --held-out next --data frame --size 8x8", "argument --size: expected it without --held-out"),
+        ("evaluate --held-out next --target waymo --data frame", "argument --target: expected --held-out holes"),
+        ("evaluate --segmenter road.py:f --data frame", "argument --segmenter: expected --held-out with it"),
         ("evaluate --held-out front", "argument --held-out: expected --data FOLDER with it, found none"),
         *(
             (f"demo --{option}", f"argument --{option.split()[0]}: ")
             for option in ("size 704", "size 0x3", "seed -1", "frames 0", "geometry flat")
         ),
-        ("evaluate --steps 3", "argument --steps: expected it with --holes diffusion"),
-        ("view --output d\udce9/a.rrd", "expected a name in UTF-8, which Rerun's writer needs"),
-        ("view --output a.mp4", r"expected a name ending in \.rrd, got 'a\.mp4'"),
+        ("view frame --output d\udce9/a.rrd", "expected a name in UTF-8, which Rerun's writer needs"),
+        ("view frame --output a.mp4", r"expected a name ending in \.rrd, got 'a\.mp4'"),
         *(
             (f"depth --data frame --{option}", f"argument --{option.split()[0]}: expected it with --model alone")
             for option in ("batch 4", "reference road")
@@ -142,7 +132,6 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             for option in ("frames 5", "downscale 2", "clean-masks")
         ),
         ("convert --data frame --target waymo --output o --fit pad", "argument --fit: expected --size with it"),
-        ("convert --data frame --target waymo --output o --steps 3", "argument --steps: expected it with --holes diff"),
         ("demo --seed 1000000000000000000000", r"expected a whole number from 0, at most 2\*\*60, got"),
     ],
 )
@@ -268,7 +257,7 @@ def test_an_interrupt_is_one_line_and_130(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(__main__, "imported", lambda _: interrupted)
-    needed = {"check": ["d"], "inspect": ["d"], "depth": ["--data", "d"]}
+    needed = {"check": ["d"], "inspect": ["d"], "view": ["d"], "depth": ["--data", "d"], "bench": ["--data", "d"]}
     needed["convert"] = ["--data", "d", "--target", "waymo", "--output", "o"]
     assert main([name, *needed.get(name, [])]) == 130
     fix = "; run it again to go on" if name in ("convert", "depth", "train") else ""

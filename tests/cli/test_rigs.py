@@ -13,8 +13,9 @@ import pytest
 from arbiview_aug.__main__ import main
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.formats import calibration
-from arbiview_aug.cameras.rig import Rig, load_rig, save_rig
+from arbiview_aug.cameras.rig import Rig, load_rig
 from arbiview_aug.cli.rigs import differences
+from tests.cameras.calibrations import CAMCHAIN, mounted
 
 
 def test_prints_tables_and_differences_and_writes_the_picture(
@@ -88,7 +89,8 @@ def test_unknown_rig_and_unwritable_picture(tmp_path: Path, capsys: pytest.Captu
 def test_other_tools_calibrations_are_read_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    save_rig(load_rig("nuscenes"), tmp_path / "kalibr", format="kalibr")
+    (tmp_path / "kalibr").mkdir()
+    mounted(tmp_path / "kalibr", camchain__yaml=CAMCHAIN)
     reads, read = [], calibration.read_calibration
     monkeypatch.setattr(calibration, "read_calibration", lambda *where: reads.append(where) or read(*where))
     assert main(["inspect", str(tmp_path / "kalibr"), "--output", str(tmp_path / "rig.png")]) == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +9,19 @@ from pathlib import Path
 import pytest
 
 from arbiview_aug.__main__ import main
-from arbiview_aug.cli.view import SampleRecording, _frames
+from arbiview_aug.cli.view import SampleRecording
+from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from tests.helpers import write_drive
 
-TINY = ["--size", "24x64", "--frames", "2"]
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A drive of three small frames."""
+    root, ahead = tmp_path_factory.mktemp("drive"), Neighbours(count=2, direction="future")
+    sample = SyntheticDrive(demo_source_rig((24, 64)), num_frames=1, neighbours=ahead)[0]
+    write_drive(root, [sample, *sample["neighbours"]])
+    return str(root)
 
 
 def rerun(*arguments: str | Path) -> str:
@@ -22,11 +31,11 @@ def rerun(*arguments: str | Path) -> str:
 
 
 @pytest.mark.slow
-def test_rerun_reads_the_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rerun_reads_the_recording(drive: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A drive whose target has lenses and scanners."""
     pytest.importorskip("rerun")
     path = tmp_path / "new" / "drive.rrd"
-    assert main(["view", *TINY, "--target", "waymo", "--output", str(path)]) == 0
+    assert main(["view", drive, "--frames", "2", "--target", "waymo", "--output", str(path)]) == 0
     assert f"recording: {path} (2 frames, " in capsys.readouterr().out
     rerun("rrd", "verify", path)
     printed = rerun("rrd", "print", path)
@@ -39,30 +48,22 @@ def test_rerun_reads_the_recording(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 def test_without_rerun_one_line_says_how_to_install_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    drive: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert main(["view", *TINY, "--output", str(tmp_path / "drive.rrd")]) == 2
+    assert main(["view", drive, "--frames", "2", "--output", str(tmp_path / "drive.rrd")]) == 2
     expected = "python -m arbiview_aug view: rerun is not installed: pip install 'arbiview_aug[viewer]'\n"
     assert capsys.readouterr().err == expected
 
 
-def test_an_older_recording_stays_where_a_new_one_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_older_recording_stays_where_a_new_one_fails(
+    drive: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("rerun")
-    asked = ["view", "--size", "8x22", "--frames", "1", "--output", str(tmp_path / "drive.rrd")]
+    asked = ["view", drive, "--size", "8x22", "--frames", "1", "--output", str(tmp_path / "drive.rrd")]
     assert main(asked) == 0
     before = (tmp_path / "drive.rrd").read_bytes()
     monkeypatch.setattr(SampleRecording, "add", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(asked)
     assert (tmp_path / "drive.rrd").read_bytes() == before and len(list(tmp_path.iterdir())) == 1
-
-
-@pytest.mark.parametrize("count", [1, 3])
-def test_frames_of_a_street_for_depth_from_motion(count: int) -> None:
-    """Each frame has the others, which depth from motion needs; for other geometries none."""
-    arguments = argparse.Namespace(data=None, size=(8, 22), seed=0, frames=count, geometry="motion")
-    frames = list(_frames(arguments))
-    assert [len(frame["neighbours"]) for frame in frames] == [max(1, count - 1)] * count
-    arguments.geometry = "auto"
-    assert not any("neighbours" in frame for frame in _frames(arguments))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +12,9 @@ import torch
 from arbiview_aug import Lidar
 from arbiview_aug.datasets import FrameFolder
 from arbiview_aug.datasets.frame_folder import write_frame
-from arbiview_aug.datasets.synthetic import ScanErrors, SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.scans import range_image
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from integrations.benchmarks.lidar import ErringDrive
+from integrations.benchmarks.scans import range_image
 from tests.helpers import ring
 
 POSE = np.array([[0.0, -1, 0, 0.5], [1, 0, 0, 0.2], [0, 0, 1, 2.0], [0, 0, 0, 1]])  # it looks to the left
@@ -47,9 +47,10 @@ def test_synthetic_scans_are_those_of_the_rigs_scanners() -> None:
     assert 0 < (one - two)[:, :3].abs().max() < 0.3  # each has its noise
 
 
-def _ranges(**errors: Any) -> np.ndarray:
+def _ranges(divergence_deg: float = 0.0, reach_m: float = np.inf) -> np.ndarray:
     """Ranges of the rays of a scanner's returns by ray, (beams, columns), 0 for none."""
-    drive = SyntheticDrive(RIG, num_frames=1, seed=2, lidar=ScanErrors(noise_m=0, **errors))
+    drive = ErringDrive(RIG, num_frames=1, seed=2)
+    drive.noise_m, drive.divergence_deg, drive.reach_m = 0.0, divergence_deg, reach_m
     return range_image(RIG.lidars[0], drive.points(0).numpy())
 
 
@@ -71,13 +72,6 @@ def test_rays_drop_far_away_and_at_grazing_incidence() -> None:
     assert returns[0] > returns[1] > returns[2] and returns[0] > 0.9 > returns[2]
     road, near = np.isclose(exact, 1.9 / np.sin(np.radians(4)), rtol=0.02), (exact > 24) & (exact < 30)
     assert (some > 0)[near & road].mean() < (some > 0)[near & ~road].mean()
-
-
-def test_scan_errors_are_checked() -> None:
-    wrong = {"noise_m": (-1, float("nan"), "0.02"), "divergence_deg": (9,), "reach_m": (0, None)}
-    for change in ({name: value} for name, values in wrong.items() for value in values):
-        with pytest.raises(ValueError, match=f"scan errors: {next(iter(change))}: expected"):
-            ScanErrors(**change)
 
 
 def test_frame_folders_carry_scanners(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:

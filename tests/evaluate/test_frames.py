@@ -9,10 +9,9 @@ import torch
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import LazyFrame
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.frames import make_frame, scores
-from arbiview_aug.evaluate.images import RenderedView, as_arrays
+from arbiview_aug.evaluate.frames import make_frame, retargeting, scores
 from arbiview_aug.evaluate.lidar import coloured_points, lidar_split
-from arbiview_aug.evaluate.methods import retargeting
+from arbiview_aug.evaluate.metrics import RenderedView, as_arrays
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import street_sample
@@ -64,7 +63,7 @@ def test_neighbours_bring_no_points_where_points_score(sample: dict) -> None:
     drive = {**sample, "neighbours": [near]}
     for given in (True, False):
         frame = make_frame(drive, hand_over_points=given)
-        for one in (frame.sample, frame.scored_sample):
+        for one in (frame.sample, *(reference.sample for reference in frame.lidar.values())):
             (kept,) = one["neighbours"]
             assert kept.get("points") is None and kept["time_s"] == 0.5 and "images" in list(kept)
     assert make_frame(drive, exposures=()).sample["neighbours"] == [near]

@@ -13,7 +13,7 @@ from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.datasets.synthetic import SyntheticDrive
 from arbiview_aug.evaluate.held_out import WithoutCamera, held_out_frames
-from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.evaluate.metrics import as_arrays
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import camera
 
@@ -98,7 +98,12 @@ def test_neighbours_lose_the_camera_too() -> None:
 @pytest.mark.parametrize(
     ("cameras", "num_cameras", "classes", "message"),
     [
-        (["rear", "front"], 3, None, "--held-out: expected all, or cameras of frame 000, left, front, right, got rear"),
+        (
+            ["rear", "front"],
+            3,
+            None,
+            "expected all, next, or cameras of frame 000, left, front, right, got rear",
+        ),
         (["all"], 1, None, "--held-out: expected frames of several cameras, frame 000 has one"),
         (
             ["all"],

@@ -7,29 +7,19 @@ import re
 import numpy as np
 import pytest
 
-from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, demo_target_rig
-from arbiview_aug.evaluate.frames import Evaluation, evaluate, make_frame
-from arbiview_aug.evaluate.images import RenderedView
-from arbiview_aug.evaluate.methods import Method, retargeting
-from arbiview_aug.evaluate.report.html import html_report, layers
-from arbiview_aug.evaluate.report.tables import TRUTH_COLUMNS
+from arbiview_aug.evaluate.frames import Evaluation, evaluate, make_frame, retargeting
+from arbiview_aug.evaluate.report.tables import TRUTH_COLUMNS, html_report, layers
 
 SIZE = (48, 132)
 NAMES = ["fast, street", "own & only"]
-
-
-def halfway_sure(sample: dict, target: Rig) -> list[RenderedView]:
-    """A renderer that tells a confidence."""
-    views = retargeting("draft", "infinity").render(sample, target)
-    return [RenderedView(v.image, v.coverage, np.full(v.coverage.shape, 0.5, np.float32)) for v in views]
 
 
 @pytest.fixture(scope="module")
 def done() -> Evaluation:
     drive, target = SyntheticDrive(demo_source_rig(SIZE), num_frames=1), demo_target_rig(SIZE)
     frame = make_frame(drive[0], truth=lambda rig: drive.render(0, rig), exposures=())
-    methods = [retargeting("fast", "street", NAMES[0]), Method(NAMES[1], halfway_sure)]
+    methods = [retargeting("fast", "street", NAMES[0]), retargeting("draft", "infinity", NAMES[1])]
     return evaluate([("only", frame)], lambda _: target, methods)
 
 
@@ -57,5 +47,5 @@ def test_layers(done: Evaluation) -> None:
     expected = ["nearest source camera"]
     for name in NAMES:
         expected += [name] if shown[name][0].coverage.all() else [name, f"{name}: unseen"]
-    assert list(found) == [*expected, f"{NAMES[1]}: confidence", "truth"]
+    assert list(found) == [*expected, "truth"]
     np.testing.assert_array_equal(found[NAMES[0]], shown[NAMES[0]][0].image)

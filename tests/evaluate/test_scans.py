@@ -1,14 +1,18 @@
-"""Metrics of scans, by hand."""
+"""Metrics of scans, by hand; scans of a drive."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from arbiview_aug import Lidar
-from arbiview_aug.evaluate.scans import chamfer_m, range_image, returns_of, scan_metrics
+from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
+from integrations.benchmarks.scans import chamfer_m, main, range_image, returns_of, scan_metrics
+from tests.helpers import write_drive
 
 LIDAR = Lidar("top", np.eye(4), (10.0, -10.0, 0.0), 90.0, (1.0, 50.0))
 
@@ -63,3 +67,38 @@ def test_numbers_of_points() -> None:
 def test_chamfer() -> None:
     one, two = np.array([[0.0, 0, 0], [1, 0, 0]]), np.array([[0.0, 0, 0]])
     assert chamfer_m(one, two) == pytest.approx((0.5 + 0) / 2)
+
+
+POSE = np.eye(4)
+POSE[:3, 3] = 0.9, 0.0, 2.2
+TOP = Lidar("top", POSE, np.linspace(-20, 5, 36).tolist(), 0.4, (1.0, 80.0))
+RIG = replace(demo_source_rig((16, 44)), lidars=[TOP])
+
+
+def printed(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, list[float]]:
+    """Rows of the command's table."""
+    assert main(arguments) == 0
+    lines = [line.split("|")[1:-1] for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    return {cells[0].strip(): [float(cell.strip(" %")) for cell in cells[1:]] for cells in lines[2:]}
+
+
+def test_the_next_frame_of_a_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its scan is the truth, of all frames that have a next one; the scanner is that of calib.json."""
+    drive = SyntheticDrive(RIG, num_frames=1, neighbours=Neighbours(count=2, step_m=1.5, direction="future"))
+    sample = drive[0]
+    recorded = (sample, *sample["neighbours"])
+    frames = [{key: value for key, value in one.items() if key != "neighbours"} for one in recorded]
+    write_drive(tmp_path / "drive", frames)
+    scans = printed(["--data", str(tmp_path / "drive")], capsys)
+    assert list(scans) == ["as they are", "scanned"] and scans["scanned"][0] > scans["as they are"][0]
+    assert scans["scanned"][1] > 70, "precision in %"
+    lost = [{key: value for key, value in frame.items() if key != "ego2world"} for frame in frames]
+    write_drive(tmp_path / "lost", lost)
+    assert main(["--data", str(tmp_path / "lost")]) == 2
+    assert "expected a 'truth' camera in calib.json, or a later frame" in capsys.readouterr().err
+    bare = [{**one, "rig": replace(RIG, lidars=())} for one in frames]
+    write_drive(tmp_path / "bare", bare)
+    assert main(["--data", str(tmp_path / "bare")]) == 2
+    assert "expected lidars in calib.json, or --target" in capsys.readouterr().err
+    asked = ["--data", str(tmp_path / "bare"), "--target", str(RIG.save(tmp_path / "rig.json"))]
+    assert printed(asked, capsys) == scans

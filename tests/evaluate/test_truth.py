@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from arbiview_aug.errors import SampleError
-from arbiview_aug.evaluate.images import as_arrays, as_tensors, to_bytes
-from arbiview_aug.evaluate.metrics import errors, psnr_db, ssim_map, truth_metrics
+from arbiview_aug.evaluate.metrics import as_arrays, as_tensors, errors, psnr_db, ssim_map, to_bytes, truth_metrics
 
 
 def test_regions() -> None:

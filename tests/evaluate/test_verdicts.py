@@ -7,35 +7,31 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import DataError
 from arbiview_aug.evaluate.frames import ScoredFrame, Truth
-from arbiview_aug.evaluate.images import RenderedView, as_tensors
-from arbiview_aug.evaluate.judges import Detections, Detector
-from arbiview_aug.evaluate.report.pictures import Picture
-from arbiview_aug.evaluate.verdicts import (
-    SOURCES,
+from arbiview_aug.evaluate.judges import (
+    Detections,
+    Detector,
     Matches,
     Objects,
     Panel,
     figures,
-    labelled_objects,
     match,
     precision_and_recall,
     too_few,
 )
-from arbiview_aug.sample.boxes_2d import project_boxes_3d
+from arbiview_aug.evaluate.metrics import RenderedView, as_tensors
+from arbiview_aug.evaluate.report.pictures import Picture
 from tests.helpers import camera
 
 RIG = Rig([camera("front", 0)])
 SIZE = RIG[0].size
 ALL = np.ones(SIZE, bool)
 SOURCE, VIEW, TRUE = 10, 20, 30
-BOXES = torch.tensor([[10.0, 2.0, 1.5, 2.0, 2.0, 2.0, 0.0], [10.0, -2.0, 1.5, 2.0, 2.0, 2.0, 0.0]])
-LEFT, RIGHT = sorted((labelled_objects({"boxes_3d": BOXES}, RIG) or [])[0].boxes.tolist())
+LEFT, RIGHT = [10.0, 20.0, 30.0, 40.0], [60.0, 20.0, 80.0, 40.0]
 
 
 def plain(colour: int) -> Picture:
@@ -43,9 +39,9 @@ def plain(colour: int) -> Picture:
 
 
 def frame(valid: BoolArray = ALL) -> ScoredFrame:
-    """A labelled frame with a photograph as truth."""
+    """A frame with a photograph as truth."""
     truth = Truth([plain(TRUE)], [valid])
-    sample = {"rig": RIG, "images": as_tensors([plain(SOURCE)]), "boxes_3d": BOXES}
+    sample = {"rig": RIG, "images": as_tensors([plain(SOURCE)])}
     return ScoredFrame(sample, truth=lambda _: truth, target=RIG)
 
 
@@ -70,12 +66,8 @@ def test_views_are_compared_with_the_true_image() -> None:
     assert list(rows) == ["own"] and (rows["own"]["objects"], rows["own"]["ap"], rows["own"]["recall"]) == (2, 0.5, 0.5)
 
 
-def test_without_a_true_image_they_and_the_sources_are_compared_with_labels() -> None:
-    unknown = replace(frame(), truth=None)
-    rows = looked(Panel(detector({SOURCE: [LEFT, RIGHT], VIEW: [LEFT]})), unknown)
-    assert {name: row["recall"] for name, row in rows.items()} == {SOURCES: 1, "own": 0.5}
-    unlabelled = replace(unknown, sample={**unknown.sample, "boxes_3d": None})
-    assert looked(Panel(detector({VIEW: [LEFT]})), unlabelled) == {}
+def test_frames_without_a_true_image_are_not_judged() -> None:
+    assert looked(Panel(detector({VIEW: [LEFT]})), replace(frame(), truth=None)) == {}
 
 
 def test_unsure_detections_in_the_true_image_do_not_count() -> None:
@@ -131,27 +123,6 @@ NONE = np.zeros((0, 4))
 
 def detections(boxes: np.ndarray, *scores: float) -> Detections:
     return Detections(boxes, np.array(scores))
-
-
-# --- labels -----------------------------------------------------------------------------------------------------------
-def box(x: float, y: float) -> list[float]:
-    return [x, y, 1.5, 2.0, 2.0, 2.0, 0.0]
-
-
-def test_labels_that_others_hide_do_not_count() -> None:
-    boxes = torch.tensor([box(10, 0), box(20, 0), box(20, 8), box(-10, 0)])
-    (objects,) = labelled_objects({"boxes_3d": boxes}, RIG) or []
-    assert objects.counts.tolist() == [True, False, True], "the second is hidden, the last is behind the camera"
-    outline = project_boxes_3d(boxes, RIG)[0].boxes
-    np.testing.assert_array_equal(objects.boxes, outline + 0.5, "pixel 0 is centred at 0, and reaches from 0 to 1 here")
-
-
-def test_labels_that_are_no_road_users_hide_others_alone() -> None:
-    sample = {"boxes_3d": torch.tensor([box(10, 0), box(20, 0), box(20, 8)])}
-    names = ["movable_object.barrier", "vehicle.car", "vehicle.car"]
-    (objects,) = labelled_objects({**sample, "box_names": names}, RIG) or []
-    assert objects.counts.tolist() == [False, False, True]
-    assert labelled_objects({}, RIG) is None
 
 
 # --- average precision and recall -------------------------------------------------------------------------------------

@@ -3,25 +3,252 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import re
 import struct
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 import numpy as np
 import yaml
 
-from arbiview_aug.atomic_io import write_whole
-from arbiview_aug.cameras.formats import camera_files, rig_files
-from arbiview_aug.cameras.formats.entries import MOUNTING, Mounting
-from arbiview_aug.cameras.key_names import hint
-from arbiview_aug.cameras.plain_yaml import MOST_BYTES, dump_yaml, read_calibration_text
-from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line, shown, warn
+from arbiview_aug.cameras.formats import rig_files
+from arbiview_aug.cameras.formats.entries import MOUNTING, Mounting, camera_entry, matrix, pose_of, refusal
+from arbiview_aug.cameras.formats.fields import has_camera, read_fields
+from arbiview_aug.cameras.key_names import hint, plain
+from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.plain_yaml import MOST_BYTES, read_calibration_text, read_documents
+from arbiview_aug.cameras.rotations import poses_from
+from arbiview_aug.cameras.validation import BODY_AXES
+from arbiview_aug.errors import ArbiviewError, CalibrationError, described, one_line, warn
 from arbiview_aug.files import read_bytes
 
+# --- a file a camera: ROS, Foxglove, OpenCV, WoodScape and what Python scripts write ----------------------------------
+TF = "tf_static.yaml"
+SUFFIXES = (".yaml", ".yml", ".xml", ".json")
+_EGO_FRAMES = ("base_link", "base_footprint")  # REP 105; REP 120: base_footprint is on the floor
+_BODY_UP_DEG = 60.0  # a camera that looks up more steeply is none of a car's: its frame is the body's
+_OPTICAL = ("_optical_frame", "_optical", "")  # suffixes of a camera's frame; REP 103
+_ROS_KEYS = {"distortionmodel", "p", "projectionmatrix", "binningx"}
+_WOODSCAPE_KEYS = set("aspect_ratio cx_offset cy_offset height width k1 k2 k3 k4 model poly_order".split())
+_DEFAULT_NAME = "narrow_stereo"  # of camera_calibration, for every camera
 
+_UNREAD = {
+    "KITTI's text": (r"(?m)^P(_rect_)?\d\d?:", "K is P's left 3x3, cam2ego inv(R0_rect @ Tr_velo_to_cam) to the LiDAR"),
+    "ORB-SLAM": (r"(?m)^\s*Camera1?[._](type|fx)", "PinHole has radtan k1 k2 p1 p2, KannalaBrandt8 fisheye k1 to k4"),
+    "basalt": ('"camera_type"', "kb4 is fisheye k1 to k4, ds is double_sphere"),
+    "nerfstudio": (r"\bfl_x\b", "K of fl_x fl_y cx cy; negate columns 2 and 3 of transform_matrix (OpenGL's axes)"),
+    "NVIDIA's rig": ("nominalSensor2Rig|bw-poly", "ftheta_backward of bw-poly (docs/formats.md, Lenses)"),
+    "A2D2": ("CamMatrix", "K is CamMatrix, pinhole, of undistorted images"),
+    "Argoverse 1": ("focal_length_x_px_", "K of focal_length and focal_center; vehicle_SE3_camera_ is cam2ego"),
+    "ONCE": ("cam_to_velo", "K is cam_intrinsic; cam_to_velo is cam2ego with the LiDAR as ego frame"),
+    "ZOD": (r"(?s)undistortion.*image_dimensions", "fisheye k1 to k4 of distortion"),
+    "Cityscapes": (r"(?s)baseline.*\bu0\b", "K of fx fy u0 v0, pinhole"),
+    "CARLA, LGSVL": (r"image_size_x|sensor\.camera", "y is to the right there: negate y and yaw for Camera.looking"),
+    "OpenCV's stereo": (r"(?m)^\s*\"?M1\b", "or a file a camera: M1 as camera_matrix, D1 as distortion_coefficients"),
+    "Autoware's sensors": (r"\bcamera_link:", "or these poses to mounting.yaml beside CameraInfo files"),
+}
+"""Formats that are not read: how their text is recognised, and what a rig file takes from them."""
+
+_INSTEAD = "which is not read: write a rig file (docs/formats.md)"
+
+# Words of which a file with a camera has one; YAML takes seconds a megabyte.
+_WORDS = re.compile(r"(?i)matrix|mat\b|\bmtx\b|intrinsic|\bcam_k\b|\bk\b|\bfx\b|\bmu\b|\bgamma1\b|radial_poly")
+
+
+def camera_files(folder: Path) -> list[Path]:
+    """A folder's files with a camera."""
+    files = (path for path in sorted(folder.glob("*.*")) if path.suffix in SUFFIXES and path.name not in (MOUNTING, TF))
+    return [path for path in files if not path.is_dir() and has_cameras(path)]
+
+
+def has_cameras(path: Path) -> bool:
+    """Whether a file has a camera that is read here; False if it cannot be read."""
+    try:
+        text = read_calibration_text(path, path.name)
+        return bool(_WORDS.search(text) and not unread_tool(text) and _cameras(path))
+    except CalibrationError:
+        return False
+
+
+def unread_tool(text: str) -> str:
+    """The tool of a file, if it is one that is not read, and what to do; else nothing."""
+    tools = (f"{tool}, {_INSTEAD}; {fix}" for tool, (words, fix) in _UNREAD.items() if re.search(words, text))
+    return next(tools, "")
+
+
+def documents(path: Path) -> list[Any]:
+    """Plain data of a file: XML of OpenCV's FileStorage, JSON, or YAML, of which a stream has several."""
+    if path.suffix != ".xml":
+        return read_documents(path, path.name)
+    text = read_calibration_text(path, path.name)  # cv2's own reader is not used: broken files corrupt its memory
+    if re.search("<!(?!--)", text):  # entities could name other files, or multiply
+        raise CalibrationError(f"{path.name}: expected XML as OpenCV writes it, without declarations, got <!")
+    try:
+        return [{node.tag: _node_data(node) for node in ElementTree.fromstring(text)}]
+    except ElementTree.ParseError as error:
+        raise CalibrationError(f"{path.name}: expected XML, got {error}") from None
+
+
+def tool_of(path: Path) -> str:
+    """Format of a file with cameras: ``ros``, ``woodscape``, or ``opencv`` for FileStorage's and Python's."""
+    data = next(iter(_cameras(path).values()))
+    return "woodscape" if _is_woodscape(data) else "ros" if _ROS_KEYS & set(map(plain, data)) else "opencv"
+
+
+def _cameras(path: Path) -> dict[str, Mapping[Any, Any]]:
+    """The cameras of a file, by the file's name; by their keys, names or frames where it has several."""
+    keyed, listed = dict[str, Mapping[Any, Any]](), dict[str, Mapping[Any, Any]]()
+    for data in documents(path):
+        if isinstance(data, Mapping) and not _is_camera(data) and not isinstance(data.get("cameras"), list):
+            keyed |= {str(key): part for key, part in data.items() if _is_camera(part)}
+        for part in filter(_is_camera, data if isinstance(data, list) else [data]):
+            key = _declared(part) or _frame_id(part).removesuffix("_frame").removesuffix("_optical") or path.stem
+            part = {name: value for name, value in part.items() if name not in ("timestamp", "time_offset")}
+            part["header"] = {"frame_id": _frame_id(part)}  # a stream has the same camera again, at other times
+            listed[key if listed.get(key, part) == part else f"{key} {len(listed)}"] = part
+    return keyed | (listed if len(listed) != 1 else dict(zip([path.stem], listed.values(), strict=True)))
+
+
+def _is_camera(data: Any) -> bool:
+    return _is_woodscape(data) or has_camera(data)
+
+
+def _frame_id(data: Mapping[Any, Any]) -> str:
+    header = data.get("header")
+    return str((header if isinstance(header, Mapping) else data).get("frame_id") or "").strip("/")
+
+
+def read_camera_files(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+    """Cameras of one file, or of all of a folder.
+
+    Sources: camera_calibration_parsers of ROS; CameraCalibration of Foxglove's schemas; the sample
+    calib3d/camera_calibration of OpenCV.
+    """
+    frames, files = _frames(path), camera_files(path) if path.is_dir() else [path]
+    cameras = [(file, key, data) for file in files for key, data in _cameras(file).items()]
+    names = Counter(_declared(data) for _, _, data in cameras)
+    found = []
+    for file, key, data in cameras:
+        name = _declared(data)
+        is_default = name.startswith(_DEFAULT_NAME) and name not in mounting.poses
+        name = key if not name or names[name] > 1 or is_default else name
+        if _is_woodscape(data):
+            found.append(_woodscape(name, data, mounting))
+            continue
+        lens, K, coefficients, size, is_shifted = read_fields(name, data)
+        pose = _pose(file, name, _frame_id(data), is_shifted, mounting, frames)
+        found.append(camera_entry(name, size or mounting.size(name), K, pose, lens, coefficients))
+    return found
+
+
+def _is_woodscape(data: Any) -> bool:
+    intrinsic = data.get("intrinsic") if isinstance(data, Mapping) else None
+    return isinstance(intrinsic, Mapping) and intrinsic.get("model") == "radial_poly"
+
+
+def _woodscape(name: str, data: Mapping[Any, Any], mounting: Mounting) -> dict[str, Any]:
+    """A camera of WoodScape: r = k1 θ + ... + k4 θ⁴ in pixels, quaternion x y z w, camera to vehicle.
+
+    Source: scripts/calibration/projection.py of valeoai/WoodScape.
+    """
+    lens, extrinsic = data["intrinsic"], data["extrinsic"]
+    if (unread := lens.keys() - _WOODSCAPE_KEYS) or lens.get("poly_order", 4) != 4:
+        got = ", ".join(unread) or "another poly_order"
+        raise refusal(name, f"intrinsic {', '.join(sorted(_WOODSCAPE_KEYS))} 4", got)
+    width, height, k1 = lens["width"], lens["height"], lens["k1"]
+    K = matrix(k1, k1 * lens["aspect_ratio"], width / 2 - 0.5 + lens["cx_offset"], height / 2 - 0.5 + lens["cy_offset"])
+    x, y, z, w = extrinsic["quaternion"]
+    pose = mounting.poses.get(name, poses_from([*extrinsic["translation"], w, x, y, z]))
+    coefficients = [*(lens[key] / k1 for key in ("k2", "k3", "k4")), 0.0]
+    return camera_entry(name, (width, height), K, pose, "ftheta", coefficients)
+
+
+def _declared(data: Mapping[Any, Any]) -> str:
+    return str(data.get("camera_name") or data.get("name") or "").strip('"')
+
+
+def _pose(
+    file: Path, name: str, frame_id: str, is_shifted: bool, mounting: Mounting, frames: Mapping[str, FloatArray]
+) -> FloatArray:
+    """A camera's pose by ``mounting.yaml``, or by its frame in tf; ``is_shifted``: P has a baseline."""
+    optical = [frame_id] if frame_id else [name.strip("/") + end for end in _OPTICAL]
+    frame = next((frame for frame in optical if frame in frames), None)
+    if frame is None or name in mounting.poses:
+        is_ros = tool_of(file) == "ros"
+        there = f", or a frame {optical[0]} to {TF} as `ros2 topic echo /tf_static` prints it" if is_ros else ""
+        return mounting.pose(name, there)
+    pose = frames[frame]
+    up_deg = math.degrees(math.atan2(pose[2, 2], math.hypot(*pose[:2, 2])))
+    if up_deg > _BODY_UP_DEG and "optical" not in frame.lower():
+        instead = f"{frame.removesuffix('_link')}_optical_frame"
+        fix = f"write frame_id: {instead} to {file.name}, and add that frame, if it is not there,"
+        fix = fix if frame_id else f"add a frame {optical[0]}"
+        got = f"{frame}, which seems to have {BODY_AXES}: the camera would look up by {up_deg:.0f} degrees"
+        fix += f" to {TF} below {frame}, with rotation {{x: -0.5, y: 0.5, z: -0.5, w: 0.5}}"
+        raise refusal(name, "an optical frame (x right, y down, z forward)", got, fix)
+    if is_shifted:
+        fix = f"its frame may be the left camera's: write its own pose to {MOUNTING}, poses: {{{name}: ...}}"
+        raise refusal(name, "a projection matrix without a baseline", "one with", fix)
+    return pose
+
+
+def ros_road_z_m(path: Path) -> float | None:
+    """Height of the road in the ego frame: that of base_footprint, which stands on it; None if tf has no such frame."""
+    foot = _frames(path).get(_EGO_FRAMES[1])
+    return None if foot is None else round(float(foot[2, 3]), 6) + 0.0  # not -0.0
+
+
+def _frames(path: Path) -> dict[str, FloatArray]:
+    """Poses (4, 4) of the frames of the tf in a file's folder; none without one.
+
+    They are in the ego frame: base_link, or base_footprint where there is none.
+    """
+    tf = (path if path.is_dir() else path.parent) / TF
+    if not tf.is_file():
+        return {}
+    links: dict[str, tuple[str, FloatArray]] = {}
+    for link in (link for message in read_documents(tf, TF) for link in message["transforms"]):
+        child, parent = (frame.strip("/") for frame in (link["child_frame_id"], link["header"]["frame_id"]))
+        links[child] = parent, pose_of(child, link["transform"])
+
+    def climbed(at: str, end: str) -> tuple[str, FloatArray]:
+        pose: FloatArray = np.eye(4)
+        for _ in links:  # no more steps than links, which may run in a circle
+            if at in links and at != end:
+                at, pose = links[at][0], links[at][1] @ pose
+        return at, pose
+
+    known = {*links, *(parent for parent, _ in links.values())}
+    ego = next((frame for frame in _EGO_FRAMES if frame in known), "")
+    root, ego2root = climbed(ego, "")
+    poses = {}
+    for frame in known & {*links, _EGO_FRAMES[1]}:
+        at, pose = climbed(frame, ego)
+        if at in (ego, root):
+            poses[frame] = pose if at == ego else np.asarray(np.linalg.solve(ego2root, pose), np.float64)
+    if not ego:
+        got = ", ".join(sorted({parent for parent, _ in links.values()})) or "no transforms"
+        expected = f"{' or '.join(_EGO_FRAMES)}: x forward, y left, z up"
+        raise CalibrationError(f"{TF}: which frame is the ego frame? Expected {expected}; got {got}: rename it there")
+    return poses
+
+
+def _node_data(node: ElementTree.Element) -> Any:
+    if not len(node):
+        return (node.text or "").strip()
+    numbers = node.findtext("data")
+    if numbers is None:
+        return {child.tag: _node_data(child) for child in node}
+    sides = {side: text for side in ("rows", "cols") if (text := node.findtext(side))}
+    return {**sides, "data": numbers.split()}
+
+
+# --- formats and folders ----------------------------------------------------------------------------------------------
 class Format(NamedTuple):
     """A tool's calibration."""
 
@@ -31,7 +258,6 @@ class Format(NamedTuple):
     convention: str  # assumed on reading, for ``inspect``
     read: Callable[[Path, Mounting], list[dict[str, Any]]]  # cameras as in a rig file
     ground_z_m: float = 0.0  # road in the ego frame, where mounting.yaml does not say otherwise
-    files_of: Callable[[Mapping[str, Any]], dict[str, Any]] | None = None
     road_z_m: Callable[[Path], float | None] = lambda path: None  # the same, where the files say it
 
 
@@ -40,7 +266,7 @@ FORMATS = {
         "COLMAP", ("images.bin", "images.txt"), "cameras and images, .bin or .txt",
         "images of one moment as cameras; COLMAP's first pixel centre is (0.5, 0.5), so principal points are moved by "
         f"half a pixel; scale and ego frame from {MOUNTING}",
-        rig_files.read_colmap, files_of=rig_files.colmap_files,
+        rig_files.read_colmap,
     ),
     "argoverse2": Format(
         "Argoverse 2", ("intrinsics.feather", "calibration/intrinsics.feather"), "intrinsics.feather",
@@ -56,23 +282,23 @@ FORMATS = {
         "Kalibr", rig_files.CAMCHAINS, "cam0, cam1 ... with camera_model and intrinsics",
         "T_cn_cnm1 takes points from the camera before to the camera, T_cam_imu from the IMU; "
         f"pose of one camera from {MOUNTING}",
-        rig_files.read_kalibr, files_of=rig_files.kalibr_files,
+        rig_files.read_kalibr,
     ),
     "opencv": Format(
         "OpenCV", (), "camera_matrix and distortion_coefficients, also mtx and dist, or K and D",
         f"coefficients k1 k2 p1 p2 ..., or k1 to k4 of a fisheye where the file says so; poses from {MOUNTING}",
-        camera_files.read_camera_files,
+        read_camera_files,
     ),
     "ros": Format(
         "ROS", (), "camera_matrix and distortion_model, or K, D and P; Foxglove's too",
         "K and D of the raw image, not P; optical frames (x right, y down, z forward) below base_link in "
-        f"{camera_files.TF}, the road at base_footprint if it is there, or poses from {MOUNTING}",
-        camera_files.read_camera_files, files_of=camera_files.ros_files, road_z_m=camera_files.ros_road_z_m,
+        f"{TF}, the road at base_footprint if it is there, or poses from {MOUNTING}",
+        read_camera_files, road_z_m=ros_road_z_m,
     ),
     "woodscape": Format(
         "WoodScape", (), "intrinsic with model radial_poly",
         "r = k1 θ + ... + k4 θ⁴; quaternions x y z w, camera to vehicle; vehicle origin on the road",
-        camera_files.read_camera_files,
+        read_camera_files,
     ),
     "waymo": Format(
         "Waymo", (), "camera_calibrations",
@@ -85,7 +311,7 @@ FORMATS = {
 
 _FIX = "convert them, write a rig file, or move them elsewhere"
 _CAMERA = re.compile(r"(?i)camera_?mat|intrinsic|distort|camera_?model|\bmtx\b|focal|\bf[lx]_?x?\b")
-_LIKE_CAMERAS = (*camera_files.SUFFIXES, ".npz", ".npy", ".mat", ".pkl", ".toml")
+_LIKE_CAMERAS = (*SUFFIXES, ".npz", ".npy", ".mat", ".pkl", ".toml")
 
 _BROKEN = (
     *(LookupError, TypeError, ValueError, AttributeError, ArithmeticError, OSError, SystemError, RecursionError),
@@ -102,7 +328,7 @@ def read_calibration(path: Path, where: str) -> Any:
     is_folder = os.path.isdir(path)
     try:
         name = recognised(path)
-        data = None if name or is_folder or path.suffix == ".txt" else next(iter(camera_files.documents(path)), None)
+        data = None if name or is_folder or path.suffix == ".txt" else next(iter(documents(path)), None)
     except ArbiviewError as error:
         raise CalibrationError(f"{where}: {str(error).removeprefix(f'{path.name}: ')}") from None
     except OSError as error:
@@ -147,19 +373,19 @@ def recognised(path: Path) -> str | None:
         for name, form in FORMATS.items():
             if any(any(path.glob(pattern)) for pattern in form.files):
                 return name
-        files = camera_files.camera_files(path)
-        return camera_files.tool_of(files[0]) if files else None
+        files = camera_files(path)
+        return tool_of(files[0]) if files else None
     if path.suffix == ".txt":
-        return None if camera_files.unread_tool(read_calibration_text(path, path.name, 1 << 28)) else "colmap"
+        return None if unread_tool(read_calibration_text(path, path.name, 1 << 28)) else "colmap"
     by_name = {".bin": "colmap", ".feather": "argoverse2", rig_files.CALIBRATED_SENSOR: "nuscenes"}
     if path.name in by_name or path.suffix in by_name:
         return by_name.get(path.name) or by_name[path.suffix]
-    data = next(iter(camera_files.documents(path)), None)
+    data = next(iter(documents(path)), None)
     if rig_files.waymo_entries(data):
         return "waymo"
     if rig_files.chain_entries(data):
         return "kalibr"
-    return camera_files.tool_of(path) if camera_files.has_cameras(path) else None
+    return tool_of(path) if has_cameras(path) else None
 
 
 def _unread(folder: Path, name: str | None) -> list[Path]:
@@ -167,9 +393,9 @@ def _unread(folder: Path, name: str | None) -> list[Path]:
     if name in ("nuscenes", "argoverse2"):
         return []
     patterns = FORMATS[name].files if name else ()
-    read = {MOUNTING, camera_files.TF, *(path.name for pattern in patterns for path in folder.glob(pattern))}
+    read = {MOUNTING, TF, *(path.name for pattern in patterns for path in folder.glob(pattern))}
     if name and not patterns:
-        read |= {path.name for path in camera_files.camera_files(folder)}
+        read |= {path.name for path in camera_files(folder)}
     stems = {Path(file).stem for file in read}  # ost.txt beside ost.yaml is the same camera
     files = (path for path in sorted(folder.glob("*.*")) if path.suffix in _LIKE_CAMERAS and path.stem not in stems)
     return [path for path in files if not path.is_dir()]
@@ -183,24 +409,8 @@ def _seems(path: Path) -> str:
         return "" if error.errno == errno.EFBIG else f"a file that cannot be read: {error.strerror}"
     seems = "a calibration that is not read" if _CAMERA.search(text) and "cam2ego" not in text else ""
     try:
-        if path.suffix in camera_files.SUFFIXES and (seems or "\ufffd" in text):  # the second is in another encoding
-            camera_files.documents(path)
+        if path.suffix in SUFFIXES and (seems or "\ufffd" in text):  # the second is in another encoding
+            documents(path)
     except CalibrationError as error:
         return str(error).removeprefix(f"{path.name}: ")
-    return camera_files.unread_tool(text) or seems
-
-
-def write_calibration(data: Mapping[str, Any], folder: Path, name: str) -> Path:
-    """Write the plain data of a rig file to a folder, in the format of another tool. Returns the folder."""
-    files_of = FORMATS[name].files_of if isinstance(name, str) and name in FORMATS else None
-    if files_of is None:
-        known = ", ".join(key for key, form in FORMATS.items() if form.files_of)
-        raise CalibrationError(f"save_rig: format: expected rig, {known}, got {shown(name)}")
-    files = files_of(data)
-    there = {path for form in FORMATS.values() for pattern in form.files for path in folder.glob(pattern)}
-    if others := {path.name for path in (*there, *camera_files.camera_files(folder))} - files.keys():
-        got = f"{', '.join(sorted(others))}, which would be read instead or too: remove them, or name another folder"
-        raise CalibrationError(f"save_rig: {folder}: expected no other calibration, got {got}")
-    texts = {file: content if isinstance(content, str) else dump_yaml(content) for file, content in files.items()}
-    write_whole({folder / file: text.encode() for file, text in texts.items()})
-    return folder
+    return unread_tool(text) or seems

@@ -1,4 +1,4 @@
-"""Cameras as in a rig file, made by readers and taken apart by writers; ``mounting.yaml``: what other tools lack."""
+"""Cameras as in a rig file, made by readers; ``mounting.yaml``: what other tools lack."""
 
 from __future__ import annotations
 
@@ -56,30 +56,6 @@ def camera_entry(
 def matrix(fx: float, fy: float, cx: float, cy: float) -> list[list[float]]:
     """(3, 3) intrinsics."""
     return [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]
-
-
-def focal_and_center(camera: Mapping[str, Any], tool: str) -> list[float]:
-    """fx, fy, cx and cy of a rig file's camera, for a tool that knows no skew."""
-    (fx, skew, cx), (_, fy, cy), _ = camera["K"]
-    if skew:
-        raise refusal(camera["name"], f"K without skew for {tool}", skew)
-    return [fx, fy, cx, cy]
-
-
-def lens_of(camera: Mapping[str, Any], tool: str, most: Mapping[str, int]) -> tuple[str, list[float]]:
-    """Lens and coefficients of a rig file's camera for a tool that has ``most`` coefficients of each of its lenses.
-
-    A pinhole is a polynomial of four zeros.
-    """
-    bent = camera["distortion"] or {"model": "radtan", "coeffs": [0.0] * 4}
-    lens, coefficients = bent["model"], list(bent["coeffs"])
-    if lens == "radtan" and not any(coefficients[4:]):
-        coefficients = coefficients[:4]
-    if len(coefficients) > most.get(lens, -1):
-        known = ", ".join(f"{name} ({count} coefficients at most)" for name, count in most.items())
-        got = f"{lens} with {len(coefficients)}"
-        raise refusal(camera["name"], f"a lens of {tool}: pinhole, {known}", got)
-    return lens, coefficients
 
 
 MOUNTING = "mounting.yaml"

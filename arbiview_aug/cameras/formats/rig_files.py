@@ -7,26 +7,16 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Mapping
-from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import (
-    MOUNTING,
-    WAY_OUT,
-    Mounting,
-    camera_entry,
-    focal_and_center,
-    lens_of,
-    matrix,
-    refusal,
-)
+from arbiview_aug.cameras.formats.entries import MOUNTING, WAY_OUT, Mounting, camera_entry, matrix, refusal
 from arbiview_aug.cameras.formats.fields import read_fields
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import read_calibration_text, read_plain
-from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, poses_from, quaternion_from_rotation
+from arbiview_aug.cameras.rotations import CAMERA_AXES_IN_EGO, poses_from
 from arbiview_aug.cameras.validation import checked_pose
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import CalibrationError, shown
@@ -159,42 +149,7 @@ def _image(name: str, camera: int, numbers: list[float]) -> _Image:
     return _Image(name, camera, np.linalg.inv(poses_from([*numbers[4:], *numbers[:4]])))  # type: ignore[arg-type]
 
 
-def colmap_files(data: Mapping[str, Any]) -> dict[str, Any]:
-    """``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``; the world is the ego frame, in metres."""
-    cameras, images, files, names = [], [], dict[str, Any](), dict[str, str]()
-    taken = {camera["name"] for camera in data["cameras"]}
-    for number, camera in enumerate(data["cameras"], 1):
-        lens, coefficients = lens_of(camera, "COLMAP", {"radtan": 8, "fisheye": 4})
-        if len(coefficients) == 5:
-            coefficients += [0.0] * 3
-        model = "OPENCV_FISHEYE" if lens == "fisheye" else "OPENCV" if len(coefficients) == 4 else "FULL_OPENCV"
-        fx, fy, cx, cy = focal_and_center(camera, "COLMAP")
-        cameras.append((number, model, camera["width"], camera["height"], fx, fy, cx + 0.5, cy + 0.5, *coefficients))
-        world2cam = np.linalg.inv(np.array(camera["cam2ego"]))
-        pose = *quaternion_from_rotation(world2cam[:3, :3]).tolist(), *world2cam[:3, 3].tolist()
-        free = next(name for k in count(number) if (name := f"camera{k}") not in taken)
-        name = camera["name"] if re.fullmatch(r"\S*[^\s/]", camera["name"]) else free
-        taken.add(name)
-        names[name] = camera["name"]
-        images.append((number, *pose, number, f"{name}/0.png\n"))  # and no points
-    for file, head, rows in (
-        ("cameras", "CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", cameras),
-        ("images", "IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)", images),
-        ("points3D", "POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)", []),
-    ):
-        lines = (" ".join(map(str, row)) for row in rows)
-        files[f"{file}.txt"] = "\n".join([f"# {head}", *lines, ""])
-    poses = {next(iter(names)): data["cameras"][0]["cam2ego"]}
-    mounting = {"metres_per_unit": 1.0, "poses": poses, "names": names}
-    return files | {MOUNTING: {"ground_z_m": data["ground_z_m"], **mounting}}
-
-
 # --- Kalibr
-# By our lens: camera_model, distortion_model, and how many coefficients lead ``intrinsics``.
-_KALIBR_LENSES = {
-    **{"radtan": ("pinhole", "radtan", 0), "fisheye": ("pinhole", "equidistant", 0)},
-    **{"double_sphere": ("ds", "none", 2), "eucm": ("eucm", "none", 2)},
-}
 CAMCHAINS = ("*camchain*.yaml", "*cam_chain*.yaml")
 
 
@@ -242,26 +197,6 @@ def _relative(chain: Mapping[str, Mapping[str, Any]]) -> dict[str, FloatArray]:
         pose = pose @ np.asarray(np.linalg.inv(checked_pose(f"camera {name!r}", before, "T_cn_cnm1")), np.float64)
         relative[name] = pose
     return relative
-
-
-def kalibr_files(data: Mapping[str, Any]) -> dict[str, Any]:
-    """``camchain.yaml``; its cameras are cam0, cam1 and so on, by their names in ``mounting.yaml``."""
-    chain: dict[str, Any] = {}
-    poses = [np.array(camera["cam2ego"]) for camera in data["cameras"]]
-    for k, camera in enumerate(data["cameras"]):
-        lens, coefficients = lens_of(camera, "Kalibr", {"radtan": 4, "fisheye": 4, "double_sphere": 2, "eucm": 2})
-        model, distortion_model, leading = _KALIBR_LENSES[lens]
-        chain[f"cam{k}"] = {
-            **{"camera_model": model, "intrinsics": coefficients[:leading] + focal_and_center(camera, "Kalibr")},
-            **{"distortion_model": distortion_model, "distortion_coeffs": coefficients[leading:]},
-            "resolution": [camera["width"], camera["height"]],
-            "rostopic": f"/{camera['name'].strip('/')}/image_raw",
-        }
-        if k:
-            chain[f"cam{k}"]["T_cn_cnm1"] = (np.linalg.inv(poses[k]) @ poses[k - 1]).tolist()
-    names = {f"cam{k}": camera["name"] for k, camera in enumerate(data["cameras"])}
-    mounting = {"ground_z_m": data["ground_z_m"], "poses": {"cam0": poses[0].tolist()}, "names": names}
-    return {"camchain.yaml": chain, MOUNTING: mounting}
 
 
 # --- data sets

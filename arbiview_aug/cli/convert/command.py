@@ -25,11 +25,9 @@ from arbiview_aug.datasets.drive import Recording, is_converted
 from arbiview_aug.datasets.registry import kinds_of, open_data, split_kind
 from arbiview_aug.environment import one_thread, optional_package, versions
 from arbiview_aug.errors import ArbiviewError, DataError, OutputError
-from arbiview_aug.evaluate.frames import evaluate, make_frame
-from arbiview_aug.evaluate.images import RenderedView, as_arrays
-from arbiview_aug.evaluate.methods import Method
-from arbiview_aug.evaluate.report.html import html_report
-from arbiview_aug.evaluate.report.tables import evaluation_table
+from arbiview_aug.evaluate.frames import Method, evaluate, make_frame
+from arbiview_aug.evaluate.metrics import RenderedView, as_arrays
+from arbiview_aug.evaluate.report.tables import evaluation_table, html_report
 from arbiview_aug.scene.scene import GEOMETRIES
 from arbiview_aug.transforms.warm_up import compile_kernels
 
@@ -107,7 +105,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
     if unknown := names.keys() - {*target.names}:
         got = ", ".join(sorted(unknown))
         raise DataError(f"--names: expected cameras of the target, {', '.join(target.names)}, got {got}")
-    options = "version", *RETARGET_OPTIONS, "holes", "steps", *READING, "neighbours", "points"
+    options = "version", *RETARGET_OPTIONS, "holes", *READING, "neighbours", "points"
     return Settings(
         root=root,
         kind=kind,
@@ -148,16 +146,13 @@ def _depth_folder(arguments: argparse.Namespace, root: Path) -> Path | None:
 
 
 def _run(jobs: Jobs, arguments: argparse.Namespace) -> Iterator[Done]:
-    def note(done: Done) -> str:
-        return f"coverage {done.coverage:.1%}"
-
     if arguments.runner == "ray":
-        yield from with_progress(ray_results(jobs, arguments.workers), len(jobs), "convert", note)
+        yield from with_progress(ray_results(jobs, arguments.workers), len(jobs), "convert")
         return
     with one_thread():
         if min(arguments.workers, len(jobs)) > 1:
             compile_kernels(matching=False)  # here, once, and not in every worker
-        yield from results(jobs, min(arguments.workers, len(jobs)), "convert", note)
+        yield from results(jobs, min(arguments.workers, len(jobs)), "convert")
 
 
 class Actor:
@@ -196,8 +191,8 @@ def ray_results(jobs: Jobs, workers: int) -> Iterator[Done]:
 def write_report(settings: Settings, data: Recording, tokens: Sequence[str], count: int) -> Path:
     """Score ``count`` converted frames, spread evenly over ``tokens``, as ``evaluate`` does; return the page's path."""
     picked = [tokens[k] for k in chosen_frames(count, len(tokens))]
-    kept = settings.kind if settings.kind in kinds_of(settings.output) else None  # logs become frame folders
-    kind = "nuscenes" if settings.version else kept  # its tables may have any name
+    is_kept = settings.kind in kinds_of(settings.output)  # logs become frame folders; tables may have any name
+    kind = "nuscenes" if settings.version else settings.kind if is_kept else None
     written = open_data(settings.output, kind=kind, version=settings.version, load_points=False)
 
     def read_views(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:
@@ -212,7 +207,6 @@ def write_report(settings: Settings, data: Recording, tokens: Sequence[str], cou
         done = evaluate(frames, lambda _: settings.sized_target, [Method("converted", read_views)])
     title = f"{data.root.resolve().name} as {settings.target.name or 'the target'} would have seen it"
     notes = [f"{len(picked)} of {len(tokens)} frames. LiDAR points also score views that were made with them."]
-    path = settings.output / FOLDER / "report.html"
     page = html_report(title, done, ["converted"], [evaluation_table(done, ["converted"])], notes)
-    write_whole({path: page.encode()})
+    write_whole({(path := settings.output / FOLDER / "report.html"): page.encode()})
     return path

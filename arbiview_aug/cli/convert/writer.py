@@ -46,7 +46,6 @@ class Settings:
     output: Path
     holes: Holes = "continue"
     generator: Path | None = None
-    steps: int | None = None
     quality: Quality = "fast"
     geometry: GeometryName = "auto"
     size: tuple[int, int] | None = None
@@ -74,7 +73,7 @@ class Settings:
         """The transform; each process or actor makes one."""
         return RigRetarget(
             self.target,
-            holes=load_inpainter(self.generator, steps=self.steps) if self.holes == "diffusion" else self.holes,
+            holes=load_inpainter(self.generator) if self.holes == "diffusion" else self.holes,
             keys=SampleKeys(extra=() if self.quality == "paper" else ("confidence",), points=self.points),
             **{name: getattr(self, name) for name in RETARGET_OPTIONS},
         )
@@ -84,7 +83,7 @@ class Settings:
         target = self.target.to_dict()
         for entry, camera in zip(target["cameras"], self.target, strict=True):
             entry["content"] = camera.content_key.hex()  # of its mask too
-        names = ("holes", "steps", "quality", "geometry", "size", "reduce", "neighbours", "suffix")
+        names = ("holes", "quality", "geometry", "size", "reduce", "neighbours", "suffix")
         sums = {}
         if (of := self.generator) is not None:
             for path in [of] if of.is_file() else sorted(filter(Path.is_file, of.rglob("*"))):

@@ -28,8 +28,7 @@ from arbiview_aug.datasets.drive import (
 )
 from arbiview_aug.datasets.image_io import VIEW_MASKS, decode_images, decode_view_masks, reduced_rig
 from arbiview_aug.datasets.lidar_files import NUSCENES_COLUMNS, checked_points, read_cloud, row_type
-from arbiview_aug.datasets.nuscenes.boxes import read_annotations
-from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_recordings
+from arbiview_aug.datasets.nuscenes.recordings import LIDAR, IntArray, read_annotations, read_recordings
 from arbiview_aug.datasets.nuscenes.tables import TEXTS, TOKENS, Row, Tables, is_camera
 from arbiview_aug.errors import DataError, calibration_of, warn
 
@@ -254,7 +253,8 @@ class NuScenesDataset(WritableRecording):
         if (boxes := self._annotations) is not None:
             there = boxes.at_sample(sample, global2ego) if is_keyframe else boxes.at_time(scene, time_s, global2ego)
             fields["boxes_3d"] = torch.from_numpy(there)
-        lidar = moment if is_keyframe else recordings.nearest_lidar(row) if self._has_lidar_sweeps else None
+        nearest = recordings.nearest(len(self.channels), row) if self._has_lidar_sweeps else None
+        lidar = moment if is_keyframe else nearest
         points = None
         if self.load_points and lidar is not None:
             points = self._points(lidar, global2ego @ recordings.ego2global(lidar))

@@ -3,7 +3,6 @@
 from arbiview_aug.datasets.synthetic.dataset import (
     GROUND_CLASSES,
     RenderedViews,
-    ScanErrors,
     SyntheticDrive,
     demo_source_rig,
     demo_target_rig,
@@ -15,7 +14,6 @@ __all__ = [
     "GROUND_CLASSES",
     "BoxClass",
     "RenderedViews",
-    "ScanErrors",
     "Scene",
     "SceneClass",
     "SyntheticDrive",

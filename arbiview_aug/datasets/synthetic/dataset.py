@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -17,11 +15,11 @@ from torch.utils.data import Dataset
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.choices import is_number, is_whole
+from arbiview_aug.choices import is_whole
 from arbiview_aug.datasets.drive import LazyFrame, Neighbours, camera_fields, check_neighbours, checked_index
 from arbiview_aug.datasets.synthetic.raycast import GROUND_ID, cast, find_candidates, scene_from
 from arbiview_aug.datasets.synthetic.render import Renderer, small_steps
-from arbiview_aug.datasets.synthetic.scene import BOX, CYLINDER, FloatArray, IntArray, Material, Scene, SceneClass
+from arbiview_aug.datasets.synthetic.scene import FloatArray, IntArray, Material, Scene, SceneClass
 from arbiview_aug.datasets.synthetic.street import make_scene
 from arbiview_aug.sample.batching import stacked
 
@@ -30,39 +28,11 @@ LIDAR_BEAMS_DEG = (-30.67, 10.67)  # elevations of the lowest and the highest of
 LIDAR_COLUMNS = 1088
 LIDAR_RANGE_M = (1.0, 90.0)
 _BEAMS = 32
-PULSE_M = 0.5
-"""Surfaces of one beam within this distance return one echo from between them: pulses last 3 to 5 ns."""
+NOISE_M = 0.02  # one sigma of the range
 
 Rays = npt.NDArray[np.float32] | FloatArray
 
 _street = lru_cache(maxsize=4)(make_scene)  # drives of several rigs look at the same streets
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScanErrors:
-    """How scanners of ``SyntheticDrive`` depart from exact rays.
-
-    Attributes:
-        noise_m: One sigma of the range, not negative.
-        divergence_deg: Angle between the edges of a beam, 0 to 5: it returns from what its middle and four rays at its
-            edge meet first, mixed over ``PULSE_M``. 0 for a single ray.
-        reach_m: Distance at which 63 % of the rays return from a white surface that faces the scanner. Others return
-            with a probability of 1 - exp(-albedo cos(incidence) (reach_m / distance)²). Infinite: all return.
-
-    Raises:
-        ValueError: A value out of range.
-    """
-
-    noise_m: float = 0.02
-    divergence_deg: float = 0.0
-    reach_m: float = math.inf
-
-    def __post_init__(self) -> None:
-        wanted = "metres from 0", "0 to 5 degrees", "metres above 0, or infinity"
-        bounds = (0, sys.float_info.max), (0, 5), (math.ulp(0.0), math.inf)
-        for (field, value), (low, high), expected in zip(vars(self).items(), bounds, wanted, strict=True):
-            if not is_number(value) or not low <= value <= high:
-                raise ValueError(f"scan errors: {field}: expected {expected}, got {value!r}")
 
 
 class RenderedViews(NamedTuple):
@@ -103,11 +73,11 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         num_frames: Length of the dataset.
         seed: Seed of the world, not negative.
         supersampling: Rays across a pixel at outlines; 1 for no antialiasing.
-        lidar: Whether samples carry ``points``; or how the scanners err.
+        lidar: Whether samples carry ``points``.
         neighbours: Which other frames of the drive come with a sample; None for none.
 
     Raises:
-        TypeError: A ``rig``, ``lidar`` or ``neighbours`` of another type.
+        TypeError: A ``rig`` or ``neighbours`` of another type.
         ValueError: A count or seed out of range.
     """
 
@@ -118,26 +88,19 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         num_frames: int,
         seed: int = 0,
         supersampling: int = 2,
-        lidar: bool | ScanErrors = True,
+        lidar: bool = True,
         neighbours: Neighbours | None = None,
     ) -> None:
         self.rig = _checked_rig(rig)
         self.num_frames = _checked_count("num_frames", num_frames, 1, 1 << 40)
         self.seed = _checked_count("seed", seed, 0, 1 << 60)
-        if not isinstance(lidar, bool | ScanErrors):
-            raise TypeError(f"SyntheticDrive lidar: expected True, False or ScanErrors(...), got {lidar!r}")
-        self.lidar = bool(lidar)
-        self._errors = lidar if isinstance(lidar, ScanErrors) else ScanErrors()
+        self.lidar = lidar
         check_neighbours(neighbours)
         self.neighbours = neighbours
         self._renderer = Renderer(supersampling=_checked_count("supersampling", supersampling, 1, 8))
 
     def __len__(self) -> int:
         return self.num_frames
-
-    def __repr__(self) -> str:
-        rig = f"rig {self.rig.name or '(unnamed)'}: {len(self.rig)} cameras"
-        return f"SyntheticDrive({len(self)} frames, seed {self.seed}, {rig})"
 
     def scene(self, index: int) -> Scene:
         """The street as plain data; IndexError past the end."""
@@ -209,55 +172,31 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
             rays = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], -1)
             scanners = [(np.array(LIDAR_POSITION_M), rays, LIDAR_RANGE_M)]
         seeds = [(*noise, k) if k else noise for k in range(len(scanners))]
-        scans = [scan_scene(scene, *one, self._errors, seed) for one, seed in zip(scanners, seeds, strict=True)]
+        scans = [self._scan(scene, *scanner, seed) for scanner, seed in zip(scanners, seeds, strict=True)]
         points = np.concatenate(scans)
         points[:, 2] += rig.ground_z_m
         return torch.from_numpy(points.astype(np.float32))
 
+    def _scan(
+        self, scene: Scene, position: FloatArray, rays: Rays, range_m: tuple[float, float], seed: tuple[int, ...]
+    ) -> FloatArray:
+        """(P, 4) x y z and intensity, 0 to 255, of rays (columns, beams, 3) in the ego frame, unit vectors.
 
-def scan_scene(
-    scene: Scene,
-    position: FloatArray,
-    rays: Rays,
-    range_m: tuple[float, float],
-    errors: ScanErrors,
-    seed: tuple[int, ...],
-) -> FloatArray:
-    """(P, 4) x y z and intensity, 0 to 255, of rays (columns, beams, 3) in the ego frame, unit vectors.
-
-    They leave ``position`` (3,), whose z is over the road, and return from distances between both of ``range_m``.
-    """
-    R = scene.ego2street[:3, :3]
-    origin = R @ position + scene.ego2street[:3, 3]
-    beam = _beam(rays.astype(np.float64), math.radians(errors.divergence_deg / 2))  # [columns, beams, S, 3]
-    street = (beam @ R.T).astype(np.float32).reshape(len(rays), -1, 3)
-    t, row = _echoes(*_cast(scene, origin, street), beam.shape[2])
-    ego = beam[:, :, 0].reshape(-1, 3)
-    rng = np.random.default_rng(np.random.SeedSequence(seed))
-    noise_m, gain = rng.normal(0, errors.noise_m, len(t)), rng.uniform(0.8, 1.2, len(t))
-    keep = (t > range_m[0]) & (t < range_m[1])
-    if errors.reach_m < math.inf:
-        drawn = rng.random(len(t))
-        hits = origin + (ego[keep] @ R.T) * t[keep, None]
-        signal = _albedo(scene, row[keep]) * _incidence(scene, hits, ego[keep] @ R.T, row[keep])
-        keep[keep] = drawn[keep] < 1 - np.exp(-signal * (errors.reach_m / t[keep]) ** 2)
-    points = position + ego[keep] * (t + noise_m)[keep, None]
-    intensity = (_albedo(scene, row[keep]) * gain[keep] * 90).clip(0, 255)
-    return np.concatenate([points, intensity[:, None]], 1)
+        They leave ``position`` (3,), whose z is over the road, and return from distances between both of ``range_m``.
+        """
+        R = scene.ego2street[:3, :3]
+        origin = R @ position + scene.ego2street[:3, 3]
+        ego = rays.astype(np.float64)[:, :, None]
+        t, row = cast_rays(scene, origin, (ego @ R.T).astype(np.float32).reshape(len(rays), -1, 3))
+        rng = np.random.default_rng(np.random.SeedSequence(seed))
+        noise_m, gain = rng.normal(0, NOISE_M, len(t)), rng.uniform(0.8, 1.2, len(t))
+        keep = (t > range_m[0]) & (t < range_m[1])
+        points = position + ego.reshape(-1, 3)[keep] * (t + noise_m)[keep, None]
+        intensity = (albedo(scene, row[keep]) * gain[keep] * 90).clip(0, 255)
+        return np.concatenate([points, intensity[:, None]], 1)
 
 
-def _beam(rays: FloatArray, half_rad: float) -> FloatArray:
-    """(columns, beams, 1 or 5, 3) rays of beams: the middle, and four at the edge."""
-    if half_rad == 0:
-        return rays[:, :, None]
-    side = np.cross([0.0, 0.0, 1.0], rays)
-    side /= np.maximum(np.linalg.norm(side, axis=-1, keepdims=True), 1e-9)
-    up = np.cross(rays, side)
-    beam = np.stack([rays, *(rays + math.tan(half_rad) * edge for edge in (side, -side, up, -up))], 2)
-    return np.asarray(beam / np.linalg.norm(beam, axis=-1, keepdims=True))
-
-
-def _cast(scene: Scene, origin: FloatArray, street: Rays) -> tuple[FloatArray, IntArray]:
+def cast_rays(scene: Scene, origin: FloatArray, street: Rays) -> tuple[FloatArray, IntArray]:
     """Distances and rows (n,) of what rays (columns, m, 3) of the street frame meet; columns are neighbours."""
     columns, m, _ = street.shape
     packets = np.pad(street, ((0, -columns % 8), (0, 0), (0, 0)), mode="edge").reshape(-1, 8 * m, 3)
@@ -270,49 +209,13 @@ def _cast(scene: Scene, origin: FloatArray, street: Rays) -> tuple[FloatArray, I
     return t, row
 
 
-def _echoes(t: FloatArray, row: IntArray, rays: int) -> tuple[FloatArray, IntArray]:
-    """Distances and rows (n,) of the first echoes of beams of ``rays`` rays (n * rays,)."""
-    if rays == 1:
-        return t, row
-    t, row = t.reshape(-1, rays), row.reshape(-1, rays)
-    finite = np.isfinite(t)
-    # One surface has one echo, from its middle: at grazing incidence its part of the beam is longer than a pulse.
-    same = row[:, :, None] == row[:, None]
-    t = np.where(finite, (np.where(finite, t, 0)[:, None] * same).sum(2) / same.sum(2), np.inf)
-    n, order = np.arange(len(t)), t.argmin(1)
-    chosen = t[n, order]
-    with np.errstate(invalid="ignore"):  # of the sky
-        together = finite & (np.abs(t - chosen[:, None]) <= PULSE_M)
-    mean = np.where(together, t, 0).sum(1) / np.maximum(together.sum(1), 1)
-    return np.where(np.isfinite(chosen), mean, np.inf), row[n, order]
-
-
-def _albedo(scene: Scene, row: IntArray) -> FloatArray:
+def albedo(scene: Scene, row: IntArray) -> FloatArray:
     """(n,) light that comes back: glass returns little, retro-reflective plates much."""
-    albedo = scene.color.mean(1)[row.clip(0)]
-    albedo = np.where(row == GROUND_ID, 0.5 * scene.street.asphalt, albedo)
+    share = scene.color.mean(1)[row.clip(0)]
+    share = np.where(row == GROUND_ID, 0.5 * scene.street.asphalt, share)
     material = np.where(row >= 0, scene.material[row.clip(0)], -1)
     factors = np.select([material == Material.GLASSHOUSE, material == Material.SIGN], [0.3, 3.0], 1.0)
-    return np.asarray(albedo * factors)
-
-
-def _incidence(scene: Scene, points: FloatArray, rays: FloatArray, row: IntArray) -> FloatArray:
-    """(n,) cosines between rays (n, 3) and the normals where they meet surfaces, at points (n, 3)."""
-    normal = np.tile([0.0, 0.0, 1.0], (len(row), 1))  # the road's
-    kind = np.where(row >= 0, scene.kind[row.clip(0)], -1)
-    flat, curved = np.flatnonzero(kind == BOX), np.flatnonzero((kind >= 0) & (kind != BOX))
-    planes = scene.planes[row[flat]]
-    before = np.einsum("nfi,ni->nf", planes[..., :3], points[flat]) - planes[..., 3]
-    normal[flat] = planes[np.arange(len(flat)), before.argmax(1), :3]
-    k = row[curved]
-    local = np.einsum("nji,nj->ni", scene.rotation[k], points[curved] - scene.center[k]) / scene.half[k]
-    gradient, is_cap = local / scene.half[k], np.abs(local[:, 2]) > 1 - 1e-3
-    is_cylinder = kind[curved] == CYLINDER
-    gradient[is_cylinder, 2] = 0
-    gradient[is_cylinder & is_cap] = 0, 0, 1
-    gradient /= np.maximum(np.linalg.norm(gradient, axis=1, keepdims=True), 1e-9)
-    normal[curved] = np.einsum("nij,nj->ni", scene.rotation[k], gradient)
-    return np.asarray(np.abs((normal * rays).sum(1)))
+    return np.asarray(share * factors)
 
 
 def _checked_rig(rig: Any) -> Rig:

@@ -104,11 +104,6 @@ def find_candidates(local: LocalScene, rays: Tensor) -> Candidates:
     return Candidates(*seen.nonzero(as_tuple=True))
 
 
-def ranks(group: Tensor, counts: Tensor) -> Tensor:
-    """(n,) rank of each entry within its group (n,), sorted, of which group k has ``counts[k]`` entries."""
-    return torch.arange(len(group)) - (counts.cumsum(0) - counts)[group]
-
-
 def _inside(sides: Tensor, corners: Tensor) -> Tensor:
     """(n, P): not all corners (P, 8, 3) lie outside one of the sides (n, 4, 3)."""
     n, p = len(sides), len(corners)

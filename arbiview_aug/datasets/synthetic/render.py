@@ -24,7 +24,6 @@ from arbiview_aug.datasets.synthetic.raycast import (
     LocalScene,
     cast,
     find_candidates,
-    ranks,
     scene_from,
 )
 from arbiview_aug.datasets.synthetic.scene import Scene, SceneClass
@@ -203,7 +202,9 @@ class Renderer:
             candidates.packet, minlength=len(outline)
         )  # a pixel is a packet with its tile's candidates
         packet = torch.repeat_interleave(torch.arange(len(tile)), found[tile])
-        at = (found.cumsum(0) - found)[tile[packet]] + ranks(packet, found[tile])
+        counts = found[tile]
+        rank = torch.arange(len(packet)) - (counts.cumsum(0) - counts)[packet]  # of a candidate in its packet
+        at = (found.cumsum(0) - found)[tile[packet]] + rank
         packets = _to_street(sub.transpose(1, 2).contiguous(), scene)
         t, hit = cast(first.local, first.start[tile], packets, Candidates(packet, candidates.primitive[at]))
         t, hit, direction = t.reshape(-1), hit.reshape(-1), packets.transpose(1, 2).reshape(-1, 3)

@@ -1,14 +1,11 @@
-"""Contact sheets, also of a whole retargeted frame, overlays, and drawings of samples and rigs, (h, w, 3) uint8 RGB."""
+"""Contact sheets, also of a whole retargeted frame, and drawings of samples and rigs, (h, w, 3) uint8 RGB."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache
-from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,16 +17,13 @@ from arbiview_aug.cameras.lens import BoolArray, FloatArray
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.image_io import encoded
 from arbiview_aug.errors import DataError
-from arbiview_aug.evaluate.images import Image, RenderedView, as_arrays, to_bytes
 from arbiview_aug.evaluate.lidar import visible_points
+from arbiview_aug.evaluate.metrics import Image, RenderedView, as_arrays, to_bytes
 from arbiview_aug.sample.batching import leading_shape
 from arbiview_aug.sample.boxes_2d import edge_points
 from arbiview_aug.sample.calibration import as_array
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.scene.boxes import checked_boxes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Picture = npt.NDArray[np.uint8]
 INK, PAPER = (40, 40, 40), (255, 255, 255)
@@ -59,8 +53,9 @@ def contact_sheet(rows: Sequence[tuple[str, Sequence[Image], Sequence[str]]], *,
     """Lay out rows of a title, images (h, w, 3), scale 0-255, and captions, which are cut where too long."""
     strips = []
     for title, images, captions in rows:
-        strips.append(np.full((_TITLE_PX, width_px, 3), PAPER, np.uint8))
-        put_text(strips[-1], title, (_GAP_PX, _TITLE_PX - 8), 0.6)
+        if title:
+            strips.append(np.full((_TITLE_PX, width_px, 3), PAPER, np.uint8))
+            put_text(strips[-1], title, (_GAP_PX, _TITLE_PX - 8), 0.6)
         strips.append(_row(images, captions, width_px))
     return np.concatenate([*strips, np.full((_GAP_PX, width_px, 3), PAPER, np.uint8)])
 
@@ -97,14 +92,6 @@ def outline_coverage(image: Image, coverage: BoolArray) -> Picture:
     contours = cv2.findContours(hole.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)[0]
     cv2.drawContours(picture, contours, -1, HOLE, max(1, h // 200), cv2.LINE_AA)
     return picture
-
-
-def overlay_confidence(image: Image, confidence: npt.NDArray[np.floating[Any]]) -> Picture:
-    """Overlay an image (h, w, 3), in grey, with confidence (h, w) from red (0) over yellow to green (1)."""
-    value = np.clip(confidence.astype(np.float32), 0, 1)[..., None]
-    colour = 255 * np.concatenate([np.minimum(1, 2 - 2 * value), np.minimum(1, 2 * value), 0 * value], axis=-1)
-    grey = to_bytes(image).mean(axis=-1, keepdims=True)
-    return to_bytes(0.5 * grey + 0.5 * colour)
 
 
 def draw_labels(camera: Camera, image: Image, points: FloatArray | None, boxes: FloatArray | None) -> Picture:
@@ -216,12 +203,12 @@ def left_to_right(rig: Rig) -> list[int]:
     return sorted(range(len(rig)), key=lambda k: -((rig[k].azimuth_deg + _RING_START_DEG) % 360))
 
 
-_COLUMNS, _WIDTH_IN = 3, 12.0
+_COLUMNS = 3
 _DIMMED = 0.35  # brightness of what is no evidence
 
 
-def show(sample: Mapping[str, Any]) -> Figure:
-    """Draw a sample's images in a grid, with its boxes and their headings; show the figure in notebooks.
+def show(sample: Mapping[str, Any]) -> Any:
+    """Draw a sample's images in rows, with its boxes and their headings; a notebook shows the result.
 
     What ``coverage`` or a mask leaves out is dimmed: no source camera saw it, or it is the own car.
 
@@ -229,46 +216,26 @@ def show(sample: Mapping[str, Any]) -> Figure:
         sample: A sample that ``RigRetarget`` takes or returns; of a batch, each frame.
 
     Returns:
-        A matplotlib figure; ``savefig(path)`` writes it.
+        An image of Pillow; ``save(path)`` writes it.
 
     Raises:
         SampleError: As ``RigRetarget`` raises it.
     """
-    drawn: list[tuple[str, Picture]] = []
-    frames = read_frames(sample, None, further=("boxes_3d",))
-    for number, frame in enumerate(frames):
+    from PIL import Image as pillow
+
+    rows: list[tuple[str, Sequence[Image], Sequence[str]]] = []
+    for number, frame in enumerate(read_frames(sample, None, further=("boxes_3d",))):
         boxes = None if frame.boxes is None else checked_boxes(as_array("boxes_3d", frame.boxes))
-        of_frame = f"frame {number}, " if leading_shape(sample["images"]) else ""
+        drawn = []
         for camera, image in zip(frame.rig, as_arrays(frame.images), strict=True):
             if camera.mask is not None:
                 image = image * (_DIMMED + (1 - _DIMMED) * camera.mask[..., None])
-            picture = draw_labels(replace(camera, mask=None), image, None, boxes)
-            drawn.append((of_frame + camera.name, picture))
-    columns = min(_COLUMNS, len(drawn))
-    rows = math.ceil(len(drawn) / columns)
-    aspect = max(picture.shape[0] / picture.shape[1] for _, picture in drawn)
-    height_in = rows * (_WIDTH_IN / columns * aspect + 0.35)
-    figure = _notebook_figure()(figsize=(_WIDTH_IN, height_in), layout="constrained")
-    for axes in figure.subplots(rows, columns, squeeze=False).flat:
-        axes.set_axis_off()
-    for axes, (title, picture) in zip(figure.axes, drawn, strict=False):
-        axes.imshow(picture)
-        axes.set_title(title, fontsize="medium")
-    return figure
-
-
-@cache
-def _notebook_figure() -> type[Figure]:
-    """A class of figures that notebooks show without pyplot and its global state."""
-    from matplotlib.figure import Figure
-
-    class NotebookFigure(Figure):
-        def _repr_png_(self) -> bytes:
-            png = BytesIO()
-            self.savefig(png, format="png")
-            return png.getvalue()
-
-    return NotebookFigure
+            drawn.append(draw_labels(replace(camera, mask=None), image, None, boxes))
+        title = f"frame {number}" if leading_shape(sample["images"]) else ""
+        for k in range(0, len(drawn), _COLUMNS):
+            rows.append((title, drawn[k : k + _COLUMNS], frame.rig.names[k : k + _COLUMNS]))
+    widths = [sum(image.shape[1] + _GAP_PX for image in images) + _GAP_PX for _, images, _ in rows]
+    return pillow.fromarray(contact_sheet(rows, width_px=min(1800, max(widths))))
 
 
 # --- rigs: fields of view from above, heights over the road from the side ---------------------------------------------
@@ -280,7 +247,7 @@ def draw_rigs(rigs: Sequence[Rig]) -> Picture:
     return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
-def rig_figure(rigs: Sequence[Rig]) -> Figure:
+def rig_figure(rigs: Sequence[Rig]) -> Any:
     """Draw one column per rig, from above and from the side, on one scale with the other rigs' outlines behind.
 
     Wedges are fields of view, longer for telephoto cameras; dots are scanners. Heights are over each rig's own road.

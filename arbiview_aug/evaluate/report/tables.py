@@ -1,13 +1,21 @@
-"""Metrics as text: the columns of each table, and Markdown tables."""
+"""Metrics as text: the columns of each table, Markdown tables, and ``report.html``: one self-contained page."""
 
 from __future__ import annotations
 
+import base64
 import re
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-if TYPE_CHECKING:
-    from arbiview_aug.evaluate.frames import Evaluation
+import jinja2
+import numpy as np
+
+from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.datasets.image_io import encoded
+from arbiview_aug.evaluate.frames import Evaluation, own_index
+from arbiview_aug.evaluate.metrics import RenderedView, as_arrays
+from arbiview_aug.evaluate.report.pictures import Picture, draw_rigs, hatched_view, left_to_right, shrunk
 
 Columns = Sequence[tuple[str, str]]  # headings, and the format of the cells below them: fields of a row
 Table = tuple[str, Mapping[str, Mapping[str, float]], Columns, str]  # title, metrics by row, columns and notes
@@ -28,20 +36,6 @@ TRUTH_COLUMNS = (
 TRUTH_NOTES = (
     "seen: share of the target's pixels. ground, objects, sky: PSNR there. MAE in grey levels of 255. holes, hole MAE: "
     "pixels that no source saw. whole view: PSNR of all pixels; holes are black unless they are filled."
-)
-PHOTOGRAPH_COLUMNS = (
-    SEEN,
-    ("PSNR dB", "{true_covered_psnr_db:.2f}"),
-    ("spread", "{spread_db:.2f}"),
-    ("MAE", "{true_covered_mae:.2f}"),
-    ("SSIM", "{true_covered_ssim:.4f}"),
-    ("whole view", "{true_psnr_db:.2f}"),
-)
-PHOTOGRAPH_NOTES = (
-    "seen: share of the pixels that the method covers. PSNR, MAE, SSIM: of those, means over all cameras and frames. "
-    "spread: standard deviation of the frames' PSNR. whole view: PSNR of all pixels; holes are black unless they are "
-    "filled. copy: the source image as it is. The photographed vehicle itself and labelled objects that moved do not "
-    "score."
 )
 SPARSE_COLUMNS = (
     SEEN,
@@ -66,24 +60,10 @@ DETECTION_COLUMNS = (
     ("recall", "{recall:.2f} [{recall_low:.2f}, {recall_high:.2f}]"),
 )
 DETECTION_NOTES = (
-    "objects: detections of score 0.5 or more in the true images; without true images, labelled vehicles and people "
-    "that others hide by no more than half. AP, recall: at IoU 0.5; recall: of detections of score 0.5 or more. "
+    "objects: detections of score 0.5 or more in the true images. AP, recall: at IoU 0.5; recall: of detections of "
+    "score 0.5 or more. "
 )
 INTERVAL_NOTES = "Intervals: 95 %, bootstrap over images."
-SCAN_COLUMNS = (
-    ("recall", "{recall:.1%}"),
-    ("precision", "{precision:.1%}"),
-    ("range m", "{range_error_m:.3f}"),
-    ("Chamfer m", "{chamfer_m:.3f}"),
-    ("returns", "{returns:.2f}"),
-    ("in boxes", "{in_boxes:.1%}"),
-)
-SCAN_NOTES = (
-    "recall: true returns that the points have at the scanner's rays, within 0.2 m or 2 % of the range. precision: the "
-    "points' returns that are true. range: median error at rays where both return. Chamfer: mean distance to the other "
-    "cloud's nearest point. returns: the number of points over the true one. in boxes: how far the numbers of points "
-    "in boxes are apart, over the true ones."
-)
 _HELD_OUT = "Methods get the points of every other degree of azimuth; the points between score (the count above)."
 
 
@@ -91,9 +71,6 @@ def evaluation_table(done: Evaluation, methods: Sequence[str]) -> Table:
     """Tabulate views against their reference, a row per method."""
     rows = {name: done.means(name) for name in methods if name not in done.declined}
     first = done.first
-    if first.target is not None:
-        rows = {name: row | {"spread_db": done.spread(name, "true_covered_psnr_db")} for name, row in rows.items()}
-        return "Against photographs", rows, PHOTOGRAPH_COLUMNS, PHOTOGRAPH_NOTES
     if first.truth is not None:
         return "Against the true views, where some source camera saw", rows, TRUTH_COLUMNS, TRUTH_NOTES
     if first.lidar:
@@ -145,3 +122,53 @@ def cell(row: Mapping[str, Any], form: str) -> str:
         return form.format_map(row)
     except (KeyError, TypeError):
         return "-"
+
+
+# --- report.html: sliders between views, and the tables, by ``report.html.jinja`` -------------------------------------
+_SOURCE, _TRUTH = "nearest source camera", "truth"  # layers
+_HEIGHT_PX = 300
+
+
+def html_report(
+    title: str, done: Evaluation, methods: Sequence[str], tables: Sequence[Table], notes: Sequence[str] = ()
+) -> str:
+    """Build the page: title, notes, tables, the first frame's views with a slider between two layers, and both rigs."""
+    rig, source = done.target, done.first.sample["rig"]
+    shown = {name: done.pictures[name] for name in methods if name in done.pictures}
+    by_camera = [layers(k, done, shown) for k in range(len(rig))] if shown else []
+    cameras = []
+    for k in left_to_right(rig) if shown else ():
+        seen = "; ".join(f"{method} {views[k].coverage.mean():.1%}" for method, views in shown.items())
+        pictures = {name: _data_url(picture) for name, picture in by_camera[k].items()}
+        cameras.append({"name": rig[k].name, "size": rig[k].size, "seen": seen, "pictures": pictures})
+    # Every camera offers the same layers: a view without holes stands for its holes.
+    names = [*dict.fromkeys(name for pictures in by_camera for name in pictures)]
+    sides = {"before": _TRUTH if _TRUTH in names else _SOURCE, "after": next(iter(shown), "")}
+    template = jinja2.Environment(autoescape=True, trim_blocks=True).from_string(
+        Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8")
+    )
+    plan = _data_url(draw_rigs([source, rig])) if shown else ""
+    views = {"label": done.label, "names": names, "sides": sides, "cameras": cameras, "plan": plan}
+    page = template.render(title=title, notes=notes, tables=tables, cell=cell, **views)
+    return page.encode(errors="backslashreplace").decode()  # names of files that are not UTF-8
+
+
+def layers(camera: int, done: Evaluation, shown: Mapping[str, Sequence[RenderedView]]) -> dict[str, Picture]:
+    """Pictures that the slider of one target camera can show, by name."""
+    source: Rig = done.first.sample["rig"]
+    nearest = own_index(source, done.target[camera])
+    pictures = {_SOURCE: shrunk(as_arrays([done.first.sample["images"][nearest]])[0], _HEIGHT_PX)}
+    for method, views in shown.items():
+        view = views[camera]
+        pictures[method] = shrunk(view.image, _HEIGHT_PX)
+        if not view.coverage.all():
+            pictures[f"{method}: unseen"] = hatched_view(view, _HEIGHT_PX)
+    true = done.first.true_images(done.target)
+    if true is not None:
+        pictures[_TRUTH] = shrunk(true[camera], _HEIGHT_PX)
+    return pictures
+
+
+def _data_url(picture: Picture) -> str:
+    jpeg = encoded(np.ascontiguousarray(picture[..., ::-1]), ".jpg")
+    return f"data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}"

@@ -28,8 +28,6 @@ from arbiview_aug.sample.calibration import as_array
 from arbiview_aug.scene.surface import Points
 from arbiview_aug.transforms.scans import COUNTS_KEY, RINGS_KEY
 
-Retarget = Callable[[dict[str, Any]], dict[str, Any]]
-
 STALE_KEYS = (
     *("cam_instances", "gt_bboxes", "gt_bboxes_labels", "bboxes", "bboxes_ignore", "bboxes2d", "labels2d"),
     *("centers_2d", "centers2d", "depths", "depth_map", "depth_maps", "gt_depth", "canvas"),
@@ -58,25 +56,18 @@ TARGET_OUTPUTS = ("coverage", "ego_mask", "confidence", "generated", "source_cam
 
 def retarget_results(
     results: Mapping[str, Any],
-    retarget: Retarget,
+    retarget: Callable[[dict[str, Any]], dict[str, Any]],
     *,
     names: Sequence[str],
     lidar2ego: Any = None,
     ground_z_m: float = 0.0,
 ) -> dict[str, Any]:
-    """Re-render the images of a ``results`` dict, and rewrite every key that describes them.
+    """Re-render the images of a ``results`` dict, as the loading transforms leave it, and rewrite what describes them.
 
     Whatever keys of ``MATRICES`` the dict has are rewritten in their container, type and shape, at the top and in
     ``images``: the form is never guessed. All target cameras stand where they are at the LiDAR's time. ``points``
     (LiDAR frame) and ``gt_bboxes_3d`` are read as geometry, where there are any. Boxes stay. Points become what the
     target's scanners would have measured, if it has any, in the frame of the LiDAR that recorded.
-
-    Args:
-        results: As the loading transforms leave it; it is not changed.
-        retarget: A ``RigRetarget``.
-        names: Names of the target's cameras.
-        lidar2ego: (4, 4), where the dict does not tell it.
-        ground_z_m: Height of the road in the source's ego frame.
 
     Raises:
         SampleTypeError: Images of another form.

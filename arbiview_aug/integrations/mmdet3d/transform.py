@@ -1,8 +1,11 @@
-"""``RigRetargetMultiView``: a pipeline step for mmdet3d and its relatives, of one frame or of several."""
+"""``RigRetargetMultiView``: a pipeline step for mmdet3d and its relatives, of one frame or of several; BEVDet's form.
+
+BEVDet's images in ``img_inputs`` are resized, cropped, perhaps flipped, turned, and normalised already.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,10 +14,28 @@ import numpy as np
 import torch
 
 from arbiview_aug import CalibrationError, RandomRig, Rig, RigRetarget, SampleError, SampleKeys
+from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.random_rig import Epochs, names_in, sequence_rng
+from arbiview_aug.cameras.rotations import poses_from, quaternion_from_rotation
 from arbiview_aug.choices import is_number
-from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD, Norm, checked_norm, retarget_img_inputs
-from arbiview_aug.integrations.mmdet3d.results import check_no_lenses, retarget_results
+from arbiview_aug.errors import shown
+from arbiview_aug.integrations.mmdet3d.matrices import ResultCameras, padded, upper_triangular
+from arbiview_aug.integrations.mmdet3d.results import (
+    check_no_lenses,
+    geometry,
+    retarget_results,
+    scanned,
+    source_rig,
+    target_outputs,
+    target_views,
+    without_stale,
+)
+
+Norm = tuple[Sequence[float], Sequence[float]]
+"""Three means and three standard deviations: normalised images are (grey level − mean) / std."""
+
+MEAN_STD: Norm = ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375))
+"""Mean and deviation of BEVDet's ``mmlabNormalize``, in the order of the channels it leaves."""
 
 
 class RigRetargetMultiView:
@@ -107,9 +128,6 @@ class RigRetargetMultiView:
         """``retarget_params`` of a frame; those of all frames of its sequence with ``sequence_key``."""
         return self.retarget.draw(self.rng(frame))
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.retarget.extra_repr()})"
-
 
 def register(registry: Any) -> None:
     """Make the step known to a registry: mmengine's ``TRANSFORMS``, or ``PIPELINES`` of mmdet 2.
@@ -117,3 +135,193 @@ def register(registry: Any) -> None:
     Registering twice, as when a config is loaded again, is allowed.
     """
     registry.register_module(name="RigRetargetMultiView", force=True, module=RigRetargetMultiView)
+
+
+# --- BEVDet's form ----------------------------------------------------------------------------------------------------
+_ROUNDING = 0.01
+"""Grey levels of 255 by which a pixel that was normalised in float32 may miss a whole number."""
+
+_KEY_CAMERA = "CAM_FRONT"
+_FORM = "(imgs, sensor2egos, ego2globals, intrins, post_rots, post_trans[, bda])"
+
+
+def retarget_img_inputs(
+    results: Mapping[str, Any],
+    retarget: Callable[[dict[str, Any], Mapping[str, float]], dict[str, Any]],
+    params: Mapping[str, float],
+    *,
+    names: Sequence[str],
+    ground_z_m: float = 0.0,
+    mean_std: Norm = MEAN_STD,
+) -> dict[str, Any]:
+    """Re-render ``img_inputs`` of one frame (BEVDet) or several (BEVDet4D, BEVStereo4D), and what belongs to it.
+
+    ``results`` are as ``PrepareImageInputs`` leaves them, the current frame first: images by camera, then by frame; all
+    else by frame, then by camera. The source cameras are those of the images as they are: their resizing, cropping,
+    flipping and turning is a part of their K and pose. The target's images are not augmented: ``post_rots`` are ones,
+    ``post_trans`` zeros. ``ann_infos`` are read as geometry and stay; ``points`` become those of the target's scanners.
+
+    All target cameras stand where they are at ``CAM_FRONT``'s time (the first camera's, without one of that name):
+    that is the ego frame of BEVDet's boxes, and what it then takes, ``ego2globals[0]``, for its key ego frame. With the
+    LiDAR's pose there the boxes would be 0.33 m off at 9 m/s.
+    """
+    inputs = results["img_inputs"]
+    tensors = _checked(inputs)
+    infos = [results.get("curr"), *(results.get("adjacent") or ())]
+    total = len(tensors[0])
+    in_source = list(results.get("cam_names") or [f"camera {k}" for k in range(total // len(infos))])
+    if not in_source or not total or total % len(in_source):
+        raise SampleError(f"img_inputs: expected {len(in_source)} images a frame, as 'cam_names' says, got {total}")
+    count = total // len(in_source)
+    size = tensors[0].shape[-2], tensors[0].shape[-1]
+    key = in_source.index(_KEY_CAMERA) if _KEY_CAMERA in in_source else 0
+    outputs: list[list[torch.Tensor]] = []
+    outs: list[Mapping[str, Any]] = []
+    changed = without_stale(results, silently="canvas")  # the images before they were normalised, for people
+    for t in range(count):
+        rows = slice(t * len(in_source), (t + 1) * len(in_source))
+        images, *frame = tensors[0][t::count], *(tensor[rows] for tensor in tensors[1:])
+        info = infos[t] if t < len(infos) else None
+        key2global = frame[1][key].double().numpy()
+        try:
+            mirrored, source = _as_recorded(frame, in_source, key2global, size[1])
+        except np.linalg.LinAlgError:
+            matrices = "sensor2egos, ego2globals, intrins and post_rots"
+            raise SampleError(f"img_inputs: expected {matrices} that can be inverted, got a singular one") from None
+        grey = levels(images, mean_std)
+        views = [image.flip(-1) if flip else image for image, flip in zip(grey, mirrored, strict=True)]
+        sample = {"images": torch.stack(views), "rig": source_rig(source, views, ground_z_m)}
+        lidar2key = _lidar2key(info, key2global) if t == 0 else None
+        points = {} if lidar2key is None else geometry({"points": results.get("points")}, lidar2key)
+        out = retarget(sample | points | _boxes(results if t == 0 else info), params)
+        target = target_views(out, source, names)
+        if lidar2key is not None:
+            changed |= scanned(changed, out, lidar2key)
+        outputs.append(_entries(out["images"], target, [images, *frame], mean_std))
+        outs.append(out)
+        if isinstance(info, Mapping) and "cams" in info:
+            infos[t] = {**info, "cams": _infos(target, key2global)}
+    images = torch.stack([entries[0] for entries in outputs], dim=1).flatten(0, 1)
+    rest = [torch.cat(of_frames) for of_frames in zip(*(entries[1:] for entries in outputs), strict=True)]
+    changed["img_inputs"] = type(inputs)([images, *rest, *inputs[6:]])
+    if "cam_names" in results:
+        changed["cam_names"] = list(target.names)
+    changed |= {key: info for key, info in (("curr", infos[0]), ("adjacent", infos[1:])) if key in results}
+    return changed | target_outputs(outs)
+
+
+def _entries(
+    images: torch.Tensor, target: ResultCameras, like: Sequence[torch.Tensor], mean_std: Norm
+) -> list[torch.Tensor]:
+    """The six entries of a frame of target cameras, in the types of the source's; nothing is augmented."""
+    count = len(target.names)
+    values = (
+        normalised(images, mean_std),
+        torch.from_numpy(target.cam2ego),
+        torch.from_numpy(target.ego2global).expand(count, -1, -1).clone(),
+        torch.from_numpy(target.K),
+        torch.eye(3).expand(count, -1, -1).clone(),
+        torch.zeros(count, 3),
+    )
+    return [value.to(source) for value, source in zip(values, like, strict=True)]
+
+
+def _checked(inputs: Any) -> list[torch.Tensor]:
+    if not isinstance(inputs, list | tuple) or len(inputs) not in (6, 7):
+        got = len(inputs) if isinstance(inputs, list | tuple) else type(inputs).__name__
+        raise SampleError(f"img_inputs: expected {_FORM}, got {got} entries")
+    tensors = list(inputs[:6])
+    count = len(tensors[0])
+    shapes = [tuple(tensor.shape[1:]) for tensor in tensors]
+    if shapes[1:] != [(4, 4), (4, 4), (3, 3), (3, 3), (3,)] or len(shapes[0]) != 3:
+        raise SampleError(f"img_inputs: expected {_FORM} for each camera, got shapes {shapes}")
+    if any(len(tensor) != count for tensor in tensors):
+        raise SampleError(f"img_inputs: expected {count} cameras in each entry, got {[len(t) for t in tensors]}")
+    return tensors
+
+
+def _as_recorded(
+    frame: Sequence[torch.Tensor], names: Sequence[str], key2global: FloatArray, width_px: int
+) -> tuple[list[bool], ResultCameras]:
+    """Which images are mirrored; the cameras of the others as they are, and of those when mirrored back."""
+    sensor2ego, ego2global, intrinsics, post_rots, post_trans = (entry.double().numpy() for entry in frame)
+    moved = np.tile(np.eye(3), (len(names), 1, 1))
+    moved[:, :2, :2], moved[:, :2, 2] = post_rots[:, :2, :2], post_trans[:, :2]
+    # They move pixels as PIL does, whose outer edges are 0 and w; those of ``Camera`` are -0.5 and w - 0.5.
+    half = np.eye(3)
+    half[:2, 2] = 0.5
+    moved = np.linalg.inv(half) @ moved @ half
+    mirrored = np.linalg.det(moved[:, :2, :2]) < 0
+    moved[mirrored] = np.array([[-1.0, 0, width_px - 1], [0, 1, 0], [0, 0, 1]]) @ moved[mirrored]
+    K, turned = upper_triangular(moved @ intrinsics)
+    cam2ego = (np.linalg.inv(key2global) @ ego2global) @ sensor2ego @ np.linalg.inv(padded(turned))
+    return mirrored.tolist(), ResultCameras(names, K / K[:, 2:, 2:], cam2ego, np.eye(4), key2global)
+
+
+def _boxes(info: Any) -> dict[str, torch.Tensor]:
+    """``boxes_3d`` of ``ann_infos``, (B, 9): gravity centre, length, width, height, yaw, in the key ego frame."""
+    annotated = info.get("ann_infos") if isinstance(info, Mapping) else None
+    if not isinstance(annotated, list | tuple) or len(annotated) != 2:
+        return {}
+    boxes = np.asarray(annotated[0], np.float64).reshape(len(annotated[0]), -1)[:, :7]
+    return {"boxes_3d": torch.from_numpy(boxes.reshape(-1, 7)).float()}
+
+
+def _lidar2key(info: Any, key2global: FloatArray) -> FloatArray | None:
+    """(4, 4) from the LiDAR's frame to the key ego frame; None where the frame's info does not pose it."""
+    poses = ("ego2global", "lidar2ego")
+    if not isinstance(info, Mapping) or not all(f"{name}_rotation" in info for name in poses):
+        return None
+    key2ego = np.linalg.inv(key2global)
+    ego2global, lidar2ego = (
+        poses_from(np.array([*info[f"{name}_translation"], *info[f"{name}_rotation"]], np.float64)) for name in poses
+    )
+    return np.asarray(key2ego @ ego2global @ lidar2ego)
+
+
+def _infos(target: ResultCameras, key2global: FloatArray) -> dict[str, dict[str, Any]]:
+    """``curr["cams"]``: what ``PointToMultiViewDepth`` reads."""
+
+    def pose(prefix: str, matrix: FloatArray) -> dict[str, Any]:
+        quaternion = quaternion_from_rotation(matrix[:3, :3])
+        return {f"{prefix}_rotation": quaternion.tolist(), f"{prefix}_translation": matrix[:3, 3].tolist()}
+
+    of_key = pose("ego2global", key2global)
+    return {
+        name: {"data_path": name, "cam_intrinsic": K, **pose("sensor2ego", cam2ego), **of_key}
+        for name, K, cam2ego in zip(target.names, target.K, target.cam2ego, strict=True)
+    }
+
+
+# --- grey levels ------------------------------------------------------------------------------------------------------
+def checked_norm(norm: Any) -> Norm:
+    """Three means and three standard deviations above 0; SampleError for anything else."""
+    try:
+        mean, std = (np.asarray(numbers, np.float64).ravel().tolist() for numbers in norm)
+        valid = len(mean) == len(std) == 3 and min(std) > 0
+    except (TypeError, ValueError):
+        valid = False
+    if not valid:
+        raise SampleError(f"img_norm: expected three means and three positive stds, got {shown(norm)}")
+    return mean, std
+
+
+def levels(images: torch.Tensor, norm: Norm) -> torch.Tensor:
+    """Normalised images (..., 3, h, w) as uint8; SampleError for what was not 8 bit images normalised so."""
+    mean, std = (torch.tensor(numbers, dtype=torch.float64)[:, None, None] for numbers in norm)
+    grey = images.double() * std + mean
+    whole = grey.round()
+    off = float((grey - whole).abs().max())
+    if not (off <= _ROUNDING and whole.min() >= 0 and whole.max() <= 255):  # NaN too
+        raise SampleError(
+            f"img_inputs: expected 8 bit images normalised by mean and std {norm}, got grey levels {off:.2g} off whole "
+            f"numbers, from {grey.min():.1f} to {grey.max():.1f}; pass img_norm=(mean, std), and retarget before "
+            "photometric distortion"
+        )
+    return whole.to(torch.uint8)
+
+
+def normalised(images: torch.Tensor, norm: Norm) -> torch.Tensor:
+    """Images (..., 3, h, w) uint8 as (grey level − mean) / std, float32."""
+    mean, std = (torch.tensor(numbers, dtype=torch.float32)[:, None, None] for numbers in norm)
+    return (images.float() - mean) / std

@@ -11,8 +11,7 @@ import pytest
 from arbiview_aug import Rig, RigRetarget, load_rig
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import open_data
-from arbiview_aug.evaluate.frames import make_frame, scores
-from arbiview_aug.evaluate.methods import views_of
+from arbiview_aug.evaluate.frames import make_frame, scores, views_of
 
 MOST_DB = 0.1
 

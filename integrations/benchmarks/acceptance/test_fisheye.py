@@ -11,7 +11,7 @@ import torch
 
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets import FrameFolder
-from arbiview_aug.evaluate.images import as_arrays
+from arbiview_aug.evaluate.metrics import as_arrays
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.helpers import camera
 

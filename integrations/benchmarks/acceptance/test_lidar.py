@@ -22,8 +22,7 @@ import torch
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
-from arbiview_aug.evaluate.images import Image, as_arrays, as_tensors
-from arbiview_aug.evaluate.metrics import psnr_db
+from arbiview_aug.evaluate.metrics import Image, as_arrays, as_tensors, psnr_db
 from arbiview_aug.render.plan import RenderPlan
 from arbiview_aug.render.rendered import render_labels, render_opencv
 from arbiview_aug.transforms.rig_retarget import RigRetarget

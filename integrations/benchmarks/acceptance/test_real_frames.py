@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from arbiview_aug.environment import one_thread
-from arbiview_aug.evaluate.images import as_arrays, as_tensors
 from arbiview_aug.evaluate.lidar import coloured_points, sparse_metrics
+from arbiview_aug.evaluate.metrics import as_arrays, as_tensors
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from integrations.benchmarks.acceptance.protocol import FRAMES, ProtocolFrame, frame_folder
 from integrations.benchmarks.paper import YAWS_DEG

@@ -25,10 +25,9 @@ from arbiview_aug import (
     load_rig,
 )
 from arbiview_aug.datasets.synthetic import SyntheticDrive
-from arbiview_aug.integrations.mmdet3d.bevdet import MEAN_STD
 from arbiview_aug.integrations.mmdet3d.matrices import MATRICES
 from arbiview_aug.integrations.mmdet3d.results import geometry
-from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
+from arbiview_aug.integrations.mmdet3d.transform import MEAN_STD, RigRetargetMultiView
 from integrations.mmdet3d.fake_results import (
     EGO2GLOBAL,
     FORMS,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 import re
 import sys
-from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
@@ -19,7 +18,7 @@ import yaml
 from arbiview_aug import CalibrationError, Lidar, RandomRig, RigRetarget, SampleError, load_rig, retarget_points
 from arbiview_aug.integrations.openpcdet import RigRetargetDataDict
 from integrations.mmdet3d.fake_results import LIDAR2EGO, Recording, source_rig
-from integrations.openpcdet.fake_data import CROP, KITTI_LIDAR2EGO, kitti, nuscenes, one_camera, street
+from integrations.openpcdet.fake_data import CROP, KITTI_LIDAR2EGO, kitti, nuscenes, street
 from integrations.snippets import snippets
 
 SIZE = (36, 132)
@@ -121,34 +120,6 @@ def test_cameras_of_nuscenes(given: Recording) -> None:
     assert off.mean() < 1  # as of cameras that exposed up to 0.36 m away
 
 
-@pytest.mark.filterwarnings("ignore:the target rig")
-@pytest.mark.parametrize("to", [KITTI_LIDAR2EGO, POSE], ids=["A's frame", "B's frame"])
-def test_the_camera_of_kitti(given: Recording, to: np.ndarray) -> None:
-    data, front = kitti(given, image=True), one_camera(replace(SOURCE.shifted(z_m=0.4), lidars=[TOP]))
-    DataAugmentor.in_frame = lambda _, config: step(front, target_lidar2ego=to)  # type: ignore[attr-defined]
-    before, out = deepcopy(data), prepare_data(DataAugmentor([{"NAME": "in_frame"}]), data)
-    data = before
-    assert out["images"].shape == data["images"].shape and 0 <= out["images"].min() <= out["images"].max() <= 1
-    assert "depth_maps" not in out and data["calib"].P2[0, 3] > 0
-    planes = [
-        one["road_plane"] @ np.vstack([one["calib"].V2C, [0, 0, 0, 1]]) @ np.linalg.inv(pose)
-        for one, pose in ((data, KITTI_LIDAR2EGO), (out, to))
-    ]
-    np.testing.assert_allclose(*planes, atol=1e-4)  # in the ego frame the same
-    points = out["points"][:, :3].astype(float)
-    uv, depth_m = out["calib"].lidar_to_img(points)
-    expected, true_m, valid = front[0].project(in_ego(out["points"], to))
-    seen = valid & (true_m > 1) & front[0].contains(expected)
-    assert seen.sum() > 50
-    np.testing.assert_allclose(uv[seen], expected[seen], atol=0.02)
-    np.testing.assert_allclose(depth_m[seen], true_m[seen], atol=1e-3)
-    matrix = out["trans_cam_to_img"] @ out["trans_lidar_to_cam"]
-    x = np.pad(points, [(0, 0), (0, 1)], constant_values=1) @ matrix.T
-    np.testing.assert_allclose(x[seen, :2] / x[seen, 2:3], expected[seen], atol=0.02)
-    with pytest.raises(SampleError, match=r"target: expected one image of \(64, 176, 3\).*size=\(h, w\)"):
-        step()(data)
-
-
 def test_in_the_augmentors_of_a_config(given: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The YAML of the README, after ``register``; twice is allowed, and workers get a copy."""
     monkeypatch.chdir(tmp_path)
@@ -226,6 +197,7 @@ def test_points_need_no_pinholes_and_stay_on_demand(given: Recording) -> None:
         (kitti, {"points": torch.ones(2, 4)}, r"^points: expected"),
         (kitti, {"points": np.ones((2, 2), np.float32)}, r"^points: expected"),
         (kitti, {"points": None}, r"^points: expected"),
+        (kitti, {"images": np.zeros((9, 9, 3))}, r"^images: expected points alone"),
         (nuscenes, {"lidar2image": None}, "lidar2image: expected beside camera_imgs, found none"),
         (nuscenes, {"img_process_infos": [[1, (0, 0, 9, 9), True, 0]] * 6}, "before imgaug"),
         (nuscenes, {"img_process_infos": [(1.0,)] * 6}, r"infos: expected \(resize, crop, flip, rotate\) of each"),
