@@ -31,10 +31,6 @@ if TYPE_CHECKING:
     from arbiview_aug.sample.mistakes import check as check
     from arbiview_aug.sample.training import collate as collate
     from arbiview_aug.sample.training import depth_maps as depth_maps
-    from arbiview_aug.sample.training import lift_mask as lift_mask
-    from arbiview_aug.sample.training import visible_boxes as visible_boxes
-    from arbiview_aug.transforms.resize import CropRig as CropRig
-    from arbiview_aug.transforms.resize import ResizeRig as ResizeRig
     from arbiview_aug.transforms.rig_retarget import RigRetarget as RigRetarget
     from arbiview_aug.transforms.scans import retarget_points as retarget_points
     from arbiview_aug.transforms.settings import PlanCache as PlanCache

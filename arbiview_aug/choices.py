@@ -26,7 +26,7 @@ Reduce = Literal[1, 2, 4]
 Reference = Literal["LiDAR", "motion", "road"]
 """References that a network's depth is fitted to, the best first."""
 
-TRAINING_PRESETS = ("compact", "small", "inpaint", "paper")
+TRAINING_PRESETS = ("compact", "small", "paper")
 """Presets of all settings of a training."""
 
 
@@ -46,10 +46,3 @@ def is_number(value: Any) -> bool:
 def is_whole(value: Any, low: float = -math.inf, high: float = math.inf) -> bool:
     """Whether it is a whole number within bounds, and not a bool."""
     return isinstance(value, Integral) and not isinstance(value, bool) and low <= int(value) <= high
-
-
-def checked_stride(name: str, value: Any) -> int:
-    """A whole number of pixels from 1; ValueError for anything else."""
-    if not is_whole(value, 1):
-        raise ValueError(f"{name}: expected a number of pixels from 1, got {reprlib.repr(value)}")
-    return int(value)

@@ -9,7 +9,7 @@ from arbiview_aug.__main__ import COMMANDS, run
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns 0 if done or stopped while training, 2 after an error, 130 after any other Ctrl-C."""
+    """Run the command; returns 0 if done, 2 after an error, 130 after Ctrl-C."""
     return run("python -m arbiview_aug.train", "train", COMMANDS["train"], argv)
 
 

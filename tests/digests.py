@@ -24,10 +24,8 @@ import numpy as np
 import torch
 
 from arbiview_aug import (
-    CropRig,
     PlanCache,
     RandomRig,
-    ResizeRig,
     RigRetarget,
     SampleKeys,
     load_rig,
@@ -140,9 +138,6 @@ def outputs(sample: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     if isinstance(sample["images"], torch.Tensor):
         floats = {**sample, "images": sample["images"].float() / 255}
         yield "float", RigRetarget(lifted, keys=SampleKeys(labels=labels))(floats)
-    small = {k: v for k, v in sample.items() if k != "neighbours"}
-    yield "resized", ResizeRig((45, 80), keys=SampleKeys(labels=labels))(small)
-    yield "windowed", CropRig(4, 8, (32, 64), keys=SampleKeys(labels=labels))(small)
     if "boxes_3d" in sample:
         boxes = project_boxes_3d(sample["boxes_3d"], RigRetarget(lifted, keys=SampleKeys(labels=labels))(sample))
         yield "boxes 2D", [vars(box) if hasattr(box, "__dict__") else box for box in boxes]

@@ -6,9 +6,8 @@ import pytest
 
 from arbiview_aug.errors import ArbiviewError, GeneratorError
 from arbiview_aug.files import read_bytes, read_text
-from arbiview_aug.generator.checkpoint import read_checkpoint
-from arbiview_aug.generator.generator import load_part
-from arbiview_aug.generator.inpainter import load_inpainter
+from arbiview_aug.generator.completion import load_inpainter
+from arbiview_aug.generator.generator import FILE, load_part, read_checkpoint
 from arbiview_aug.generator.training.losses import load_perceptual
 from arbiview_aug.inpaint import PipelineInpainter
 from arbiview_aug.inpaint.networks import load_torchscript
@@ -18,12 +17,6 @@ from arbiview_aug.temporal.learned_depth import TransformersDepth
 def test_a_byte_order_mark_is_dropped(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"\xef\xbb\xbf{}\r\n")
     assert read_text(tmp_path / "file", 100) == "{}\r\n"
-
-
-def missing_weights(folder: Path) -> Path:
-    (folder / "config.json").write_text('{"format": 1, "weights": "weights-0123456789ab.safetensors"}')
-    os.mkfifo(folder / "weights-0123456789ab.safetensors")
-    return folder
 
 
 def with_pipe(folder: Path, name: str = "config.json") -> Path:
@@ -37,7 +30,7 @@ def with_pipe(folder: Path, name: str = "config.json") -> Path:
     [
         lambda folder: load_inpainter(with_pipe(folder, "model_index.json")),
         lambda folder: PipelineInpainter.from_pretrained(with_pipe(folder)),
-        lambda folder: read_checkpoint(missing_weights(folder)),
+        lambda folder: read_checkpoint(with_pipe(folder, FILE)),
         lambda folder: load_torchscript(with_pipe(folder) / "config.json", "network", GeneratorError),
         lambda folder: TransformersDepth(str(with_pipe(folder))),
         lambda folder: load_part("AutoencoderKL", with_pipe(folder), "vae", {}),

@@ -53,5 +53,5 @@ class Watched(Dataset[dict[str, Any]]):
             "worker": -1 if worker is None else worker.id,
             "cv2_threads": cv2.getNumThreads(),
             "torch_threads": torch.get_num_threads(),
-            "plans_built": self.retarget.plans.misses,
+            "plans_built": self.retarget.renderer.plans.misses,
         }

@@ -156,22 +156,3 @@ class Lidar:
             raise CalibrationError(f"{where}: {unknown}")
         with calibration_of(where):
             return cls(**{key: entry[key] for key in (*_KEYS, "azimuth_deg") if key in entry})
-
-
-def hdl64e(lidar2ego: Any, name: str = "hdl64e") -> Lidar:
-    """Velodyne's HDL-64E S2 at 10 Hz, KITTI's scanner (there 1.73 m over the road).
-
-    Source: user's manual of the S2. Upper block: 32 beams from +2 degrees down by 1/3, lower block: 32 from -8.83 down
-    by 1/2; 1.333 million rays a second; 120 m.
-    """
-    upper, lower = 2 - np.arange(32) / 3, -8.83 - np.arange(32) / 2
-    return Lidar(name, lidar2ego, tuple(np.concatenate([upper, lower]).tolist()), 0.1728, (0.9, 120.0))
-
-
-def at128(lidar2ego: Any, name: str = "at128") -> Lidar:
-    """Hesai's AT128P, a front scanner: 128 fixed beams and a turning mirror, so that its rays are rows and columns.
-
-    Source: user manual of the AT128P. Elevations from +12.9 to -12.5 degrees by 0.2, azimuths from -60 to 60 by 0.1;
-    200 m on surfaces of 10 % reflectivity. The least distance, 1 m, is an assumption.
-    """
-    return Lidar(name, lidar2ego, tuple((12.9 - 0.2 * np.arange(128)).tolist()), 0.1, (1.0, 200.0), (-60.0, 60.0))

@@ -10,6 +10,6 @@ if TYPE_CHECKING:
     from arbiview_aug.favs.renderer import SourceReport as SourceReport
     from arbiview_aug.favs.renderer import as_rendered as as_rendered
     from arbiview_aug.favs.renderer import check_settings as check_settings
-    from arbiview_aug.favs.renderer import render_frame as render_frame
+    from arbiview_aug.favs.renderer import render_paper as render_paper
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -30,8 +30,6 @@ from arbiview_aug.favs.stage4_fusion import Float32Image, Warp, adaptive_fusion,
 from arbiview_aug.render.harmonise import Harmoniser
 from arbiview_aug.render.rendered import Views, from_winners
 from arbiview_aug.render.requirements import SAME_CENTER_M
-from arbiview_aug.sample.detections import Detection, read_detections
-from arbiview_aug.sample.frame import Frame
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class PaperView:
         return self.source_camera >= 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PaperRendering:
     """A frame rendered by the published stages."""
 
@@ -72,19 +70,29 @@ class PaperRendering:
         """(h, w) for each target camera."""
         return [view.coverage for view in self.targets]
 
+    def __str__(self) -> str:
+        """Coverage of each target camera, and what each stage made of its sources."""
+        names = f"{self.source.name or 'source'} -> {self.target.name or 'target'}"
+        lines = [f"{names}: {len(self.source)} cameras to {len(self.target)}, stages 1 to 4 as published, far surface"]
+        for camera, view in zip(self.target, self.targets, strict=True):
+            lines.append(f"  {camera.name}: {view.coverage.mean():.1%} covered")
+            for report in view.reports:
+                stages = f"features: {report.features.reason}; objects: {report.objects.reason}"
+                reason = "the primary camera, the reference of the others" if report.primary else stages
+                lines.append(f"    {report.share:6.1%} from {self.source[report.source].name}: {reason}")
+        return "\n".join(lines)
+
 
 def render_paper(
     source: Rig,
     target: Rig,
     images: Sequence[torch.Tensor],
     config: PaperConfig | None = None,
-    detections: Mapping[int, Sequence[Detection]] | None = None,
 ) -> PaperRendering:
     """Render a target rig, in the source's ego frame, by the published stages.
 
     The same images give the same bits in every process, for which OpenCV runs on one thread. N images (3, H, W) are on
-    the CPU: uint8, or float in [0, 1]; pixels that the sources' masks hide are never read. Objects take their types
-    from a detector's boxes by source camera.
+    the CPU: uint8, or float in [0, 1]; pixels that the sources' masks hide are never read.
 
     Raises:
         CalibrationError: A camera is not a pinhole camera.
@@ -100,16 +108,10 @@ def render_paper(
     order = content_order(source.cameras)
     with repeatable_opencv():
         views = [
-            _render_view(source, order, camera, arrays, images[0].dtype, config or PaperConfig(), detections or {})
+            _render_view(source, order, camera, arrays, images[0].dtype, config or PaperConfig())
             for camera in target.cameras
         ]
     return PaperRendering(source, target, tuple(views))
-
-
-def render_frame(frame: Frame, target: Rig, config: PaperConfig) -> PaperRendering:
-    """Render a frame, with its detections where the settings use them; the target is in its ego frame."""
-    found = read_detections(frame) if config.use_detections else {}
-    return render_paper(frame.rig, target, frame.images, config, found)
 
 
 def check_settings(
@@ -145,7 +147,6 @@ def _render_view(
     arrays: Sequence[Float32Image],
     dtype: torch.dtype,
     config: PaperConfig,
-    detections: Mapping[int, Sequence[Detection]],
 ) -> PaperView:
     size, cameras = target.size, source.cameras
     # Stage 1.
@@ -180,7 +181,7 @@ def _render_view(
         if not config.use_feature_matching:
             features = unmatched(H, "feature matching is switched off", matches)
         if config.use_object_alignment:
-            candidates = find_objects(matches, H, features.H_base, target, source.ground_z_m, detections.get(k, ()))
+            candidates = find_objects(matches, H, features.H_base, target, source.ground_z_m)
             objects = align_objects(candidates, features.H_base, size[1], config)
         else:
             objects = declined(features.H_base, "object alignment is switched off")

@@ -4,7 +4,7 @@ Equations of the paper's section "Feature-Aware Adaptive View Synthesis (FAVS) A
 Transformation Foundation":
 
 - H_geom = K2 R2 R1⁻¹ K1⁻¹: ``h_geom``.
-- H_planar = K2 (R − t nᵀ / d) K1⁻¹ has no part in the other stages; the generator reads it (``correspondence``).
+- H_planar = K2 (R − t nᵀ / d) K1⁻¹ has no part in the other stages; the generator reads it (``generator.attention``).
 - validity = check_homography(H_geom, corners): ``check_homography``.
 - K and R = R_z(θ) R_x(φ): ``Camera.K`` and ``Camera.looking``.
 

@@ -22,7 +22,6 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.favs.config import PaperConfig
 from arbiview_aug.favs.stage2_features import REFERENCE_WIDTH_PX, Matches
-from arbiview_aug.sample.detections import Detection
 
 # Lengths named _PX are target pixels at ``REFERENCE_WIDTH_PX``.
 CLUSTER_RADIUS_PX = 30.0  # DBSCAN's ε: a car's width, 1.8 m, at 40 m and 60 degrees of view
@@ -40,13 +39,14 @@ class SceneObject:
     center_target: FloatArray  # c2_j, (2,) centroid in the reference, target pixels
     bbox: tuple[float, float, float, float]  # (x0, y0, x1, y1) around its points in the reference
     confidence: float  # in (0, 1], 1 where all points have the same offset
-    type: str  # ``ground``, ``upright``, ``far``, or a detector's class
+    type: str  # ``ground``, ``upright`` or ``far``
     density_factor: float  # in (0, 1)
     points: int  # n_j
 
     def weight(self, config: PaperConfig) -> float:
         """w_j = confidence_j × type_weight_j × density_factor_j."""
-        return self.confidence * config.type_weight(self.type) * self.density_factor
+        weight: float = getattr(config, f"{self.type}_weight")
+        return self.confidence * weight * self.density_factor
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def clusters(points: FloatArray, radius_px: float, min_samples: int) -> npt.NDAr
 
 
 def geometric_type(bbox: tuple[float, float, float, float], target: Camera, ground_z_m: float, reach_m: float) -> str:
-    """Classify a cluster by the road plane, for want of a detector.
+    """Classify a cluster by the road plane: the paper names types, but not what tells them.
 
     ``far``: its bottom edge lies above the horizon. ``ground``: its top edge meets the road within ``reach_m``.
     ``upright``: all others, such as vehicles and pedestrians. ``bbox`` is (x0, y0, x1, y1) in target pixels; the road's
@@ -121,12 +121,10 @@ def find_objects(
     H_base: FloatArray,
     target: Camera,
     ground_z_m: float,
-    detections: Sequence[Detection] = (),
 ) -> list[SceneObject]:
     """Cluster one source's matches, for which it was warped by ``H_geometric``, into objects.
 
-    The road lies at ``ground_z_m`` in the target's ego frame. The smallest detection around an object's centre gives
-    its type.
+    The road lies at ``ground_z_m`` in the target's ego frame.
     """
     scale = target.width_px / REFERENCE_WIDTH_PX
     radius_px = CLUSTER_RADIUS_PX * scale
@@ -137,17 +135,13 @@ def find_objects(
         p1: FloatArray = in_source[cluster == k]
         p2: FloatArray = matches.reference[cluster == k]
         x0, y0, x1, y1 = (float(v) for v in (*p2.min(0), *p2.max(0)))
-        c1: FloatArray = p1.mean(0)
-        around = [d for d in detections if d.box[0] <= c1[0] <= d.box[2] and d.box[1] <= c1[1] <= d.box[3]]
-        areas = [(d.box[2] - d.box[0]) * (d.box[3] - d.box[1]) for d in around]
-        detected = around[int(np.argmin(areas))].type if around else ""
         objects.append(
             SceneObject(
-                center_source=c1,
+                center_source=p1.mean(0),
                 center_target=p2.mean(0),
                 bbox=(x0, y0, x1, y1),
                 confidence=confidence(p2 - apply(H_base, p1), _CLUSTER_SPREAD_PX * scale),
-                type=detected or geometric_type((x0, y0, x1, y1), target, ground_z_m, _GROUND_REACH_M),
+                type=geometric_type((x0, y0, x1, y1), target, ground_z_m, _GROUND_REACH_M),
                 density_factor=density_factor(p2, radius_px, MIN_SAMPLES),
                 points=len(p1),
             )

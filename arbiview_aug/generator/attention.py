@@ -1,4 +1,18 @@
-"""Geometry-guided cross-view attention (Sec. Geometry-Guided Cross-View Attention Mechanism; appendix: CAA).
+"""Geometry-guided cross-view attention (Sec. Cross-View Geometric Correspondences, Geometry-Guided Cross-View Attention
+Mechanism, Geometry-Guided Feature Alignment; appendix: CAA).
+
+A token of view i is mapped to view j over L planes, the paper's depth levels: infinity (its rotation-only model), the
+road, and a plane that faces the camera. With X_j = R X_i + t and the plane n_l·X_i = d_l (the paper's minus sign is the
+convention n·X = −d),
+
+    H_ij^(l) = K_j (R + t n_lᵀ / d_l) K_i⁻¹,    p_j^(l) = π(H_ij^(l) p_i).
+
+The matrix in brackets maps viewing rays to viewing rays for any lens: with pinholes, unprojecting, applying it and
+projecting is the homography. The mask M_j^(l) is true where p_j^(l) lies in front of both cameras, inside view j, off
+its own car, and is plausible for the plane (the road lies below the horizon).
+
+Tokens are pixels of a camera resized to their grid: outer edges coincide, centres are integers (``Camera.resize``).
+Grids are computed in float64 and stored in float32; half precision would cost 0.2 px.
 
 For a token p_i of view i and a view j that overlaps it, with queries, keys and values projected from the layer-normed
 features of the views (Sec. Multi-Level Attention Computation),
@@ -17,13 +31,203 @@ each Attention^(l) a softmax over the 3 x 3 tokens around p_j^(l), with PE(Δp) 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import nn
 from torch.nn import functional
 
-from arbiview_aug.generator.correspondence import MASKED, TAPS, TokenWindow, tap_offsets
+from arbiview_aug.cameras.camera import Camera, Rays
+from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.render.requirements import SAME_CENTER_M
 
+FACING_M = 10.0  # of the plane that faces the camera: at a baseline of 1 m a 3-token window spans 7 to 17 m
+LEVELS = ("infinity", "road", "facing")  # the depth levels; pairs whose centres coincide have the first alone
+
+
+class Correspondence(NamedTuple):
+    """Positions of the tokens of Q query views in the views that they may read, on one token grid."""
+
+    neighbour: torch.Tensor  # (B, Q, J) int64, the key view of each of J slots; 0 in unused slots
+    centre: torch.Tensor  # (B, Q, J, L, h, w, 2) float32, p_j^(l) as (x, y) in tokens; 0 where not valid
+    valid: torch.Tensor  # (B, Q, J, L, h, w) bool, M_j^(l)
+
+    def to(self, device: torch.device | str) -> Correspondence:
+        return Correspondence(*(value.to(device, non_blocking=True) for value in self))
+
+    def without(self, views: int, dropped: torch.Tensor) -> Correspondence:
+        """Mask the first ``views`` key views in the frames ``dropped`` (B,) bool."""
+        masked = dropped[:, None, None] & (self.neighbour < views)  # [B, Q, J]
+        return self._replace(valid=self.valid & ~masked[..., None, None, None])
+
+
+# --- one pair of cameras ----------------------------------------------------------------------------------------------
+def plane_vectors(camera: Camera, ground_z_m: float) -> FloatArray:
+    """(L, 3) n_l / d_l of ``LEVELS`` in a camera's frame, 1/m; 0 for infinity and for the road of a camera below it.
+
+    A ray r meets the plane at the inverse distance (n_l / d_l)·r, if that is positive.
+    """
+    height_m = float(camera.center_m[2]) - ground_z_m
+    down = camera.cam2ego[:3, :3].T @ np.array([0.0, 0.0, -1.0])
+    road = down / height_m if height_m > 0 else np.zeros(3)
+    return np.stack([np.zeros(3), road, np.array([0.0, 0.0, 1 / FACING_M])])
+
+
+def between(query: Camera, key: Camera) -> tuple[FloatArray, FloatArray]:
+    """R (3, 3) and t (3,), metres, from the frame of ``query`` to that of ``key``: X_j = R X_i + t."""
+    to_key = key.cam2ego[:3, :3].T
+    return to_key @ query.cam2ego[:3, :3], to_key @ (query.center_m - key.center_m)
+
+
+def correspond(query: Camera, rays: Rays, key: Camera, planes: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Map the tokens (h, w) of view i, ``query``, with their rays in its own frame, to view j, ``key``, over planes.
+
+    The planes (L, 3) n_l / d_l lie in the query's frame; the first is infinity. The key has the size of the grid. Gives
+    p_j^(l) (L, h, w, 2), 0 where not valid, and M_j^(l) (L, h, w).
+    """
+    directions = np.where(rays.valid[..., None], rays.directions, 0.0)
+    R, t = between(query, key)
+    with np.errstate(over="ignore", invalid="ignore"):  # calibrations of 1e300 m
+        mapped = np.stack([directions @ (R + np.outer(t, plane)).T for plane in planes])
+        inverse_depth = np.stack([directions @ plane for plane in planes])
+        valid = rays.valid & np.isfinite(mapped).all(-1)
+        valid[1:] &= inverse_depth[1:] > 0  # the plane lies in front of the camera
+        uv, _, in_front = key.project_cam(np.where(valid[..., None], mapped, 0.0))
+    h, w = key.size
+    u, v = uv[..., 0], uv[..., 1]
+    valid &= in_front & (u >= -0.5) & (u <= w - 0.5) & (v >= -0.5) & (v <= h - 0.5)
+    centre = np.where(valid[..., None], uv, 0.0)
+    if key.mask is not None:
+        x, y = (np.rint(centre[..., k]).astype(int).clip(0, n - 1) for k, n in ((0, w), (1, h)))
+        valid &= key.mask[y, x]
+        centre[~valid] = 0.0
+    return centre, valid
+
+
+# --- the views of a frame ---------------------------------------------------------------------------------------------
+def correspondences(
+    queries: Sequence[Camera],
+    keys: Sequence[Camera],
+    own_index: Sequence[int],
+    sizes: Sequence[tuple[int, int]],
+    ground_z_m: float,
+) -> list[Correspondence]:
+    """Correspondences of query views with the key views that overlap them, one for each token grid (B = 1).
+
+    A pair overlaps if some token of the first grid is valid on some plane; the order of the list does not matter. A
+    pair whose centres coincide has one level, infinity, which is then exact; the others have all of ``LEVELS``. J is
+    the largest number of neighbours, at least 1: attention is never skipped, which would hang distributed training.
+
+    ``own_index`` is each query's index among the keys: no view reads itself. ``sizes`` (h, w) of the token grids,
+    the finest first. All cameras and the road lie in one ego frame.
+    """
+    small = [[camera.resize(size) for size in sizes] for camera in keys]
+    by_query: list[list[tuple[int, list[tuple[FloatArray, BoolArray]]]]] = []
+    for query, self_index in zip(queries, own_index, strict=True):
+        planes = plane_vectors(query, ground_z_m)
+        rays = [camera.unproject_cam(camera.pixel_grid()) for camera in map(query.resize, sizes)]
+        by_query.append([])  # views j that overlap the query, with ``correspond`` for each token grid
+        for j, of_sizes in enumerate(small):
+            same_centre = float(np.abs(query.center_m - of_sizes[0].center_m).max()) < SAME_CENTER_M
+            used = planes[:1] if same_centre else planes
+            if j != self_index and (first := correspond(query, rays[0], of_sizes[0], used))[1].any():
+                rest = [correspond(query, ray, key, used) for ray, key in zip(rays[1:], of_sizes[1:], strict=True)]
+                by_query[-1].append((j, [first, *rest]))
+    slots = max(1, *(len(of_query) for of_query in by_query))
+    levels = max((len(grids[0][0]) for of_query in by_query for _, grids in of_query), default=1)
+    shapes = [(1, len(queries), slots, levels, h, w) for h, w in sizes]
+    neighbour = torch.zeros(shapes[0][:3], dtype=torch.int64)
+    reads = [
+        Correspondence(neighbour, torch.zeros((*shape, 2)), torch.zeros(shape, dtype=torch.bool)) for shape in shapes
+    ]
+    for q, of_query in enumerate(by_query):
+        for slot, (j, grids) in enumerate(of_query):
+            neighbour[0, q, slot] = j
+            for of_grid, (centre, valid) in zip(reads, grids, strict=True):
+                of_grid.centre[0, q, slot, : len(centre)] = torch.from_numpy(centre.astype(np.float32))
+                of_grid.valid[0, q, slot, : len(valid)] = torch.from_numpy(valid)
+    return reads
+
+
+def stacked(frames: Sequence[Correspondence]) -> Correspondence:
+    """One batch of frames with equal numbers of query views; slots and levels are padded with invalid ones."""
+    slots, levels = (max(frame.valid.shape[axis] for frame in frames) for axis in (2, 3))
+    padded = []
+    for neighbour, centre, valid in frames:
+        more = 0, slots - valid.shape[2]
+        grid = 0, 0, 0, 0, 0, levels - valid.shape[3], *more
+        padded.append(
+            (functional.pad(neighbour, more), functional.pad(centre, (0, 0, *grid)), functional.pad(valid, grid))
+        )
+    return Correspondence(*(torch.cat(values) for values in zip(*padded, strict=True)))
+
+
+# --- windows ----------------------------------------------------------------------------------------------------------
+TAPS = 9  # integer taps of the 3 x 3 window around p_j, row by row; the fifth is the token nearest to it
+MASKED = -1e4  # logit of masked taps: finite in every dtype, so that a fully masked row stays finite
+
+
+class TokenWindow(NamedTuple):
+    """The 3 x 3 integer taps that attention reads around each valid p_j^(l), on one grid of T = h w tokens.
+
+    A rig's views overlap by a fifth to a third, so the E valid places (a token, a neighbour, a level) are listed.
+    """
+
+    valid: torch.Tensor  # (B, Q, J, L, T) bool, with E entries that are true
+    place: torch.Tensor  # (E,) int64 their indices in the flattened ``valid``
+    token: torch.Tensor  # (E,) int64 the query's token among all B Q T
+    tap: torch.Tensor  # (E, 9) int64 the keys' tokens among all B V T, in view j even where masked
+    inside: torch.Tensor  # (E, 9) bool, the taps inside view j
+    fraction: torch.Tensor  # (E, 2) float32 H p_i from its nearest tap
+
+    @property
+    def read(self) -> torch.Tensor:
+        """(B, Q, T) bool, tokens that read any other view."""
+        return self.valid.any(3).any(2)
+
+    def delta(self) -> torch.Tensor:
+        """(E, 9, 2) Δp = p_j − H p_i in tokens, (x, y)."""
+        return tap_offsets(self.fraction.device) - self.fraction[:, None]
+
+    def bilinear(self) -> torch.Tensor:
+        """(E, 9) M_ij^target of L_geo: bilinear weights at H p_i over the taps inside view j, sum 1."""
+        weight = (1 - self.delta().abs()).clamp(min=0).prod(-1) * self.inside
+        return weight / weight.sum(-1, keepdim=True)
+
+
+def window(correspondence: Correspondence, views: int) -> TokenWindow:
+    """The 3 x 3 taps of a correspondence with ``views`` key views; on a GPU this synchronises."""
+    neighbour, centre, valid = correspondence
+    Q, (h, w) = valid.shape[1], valid.shape[-2:]
+    place = valid.flatten().nonzero().squeeze(1)
+    frame, query, slot, _, row, column = torch.unravel_index(place, valid.shape)
+    centre = centre.reshape(-1, 2)[place]
+    last = torch.tensor([w - 1, h - 1], device=centre.device)
+    nearest = torch.minimum(centre.round().long().clamp(min=0), last)  # w - 0.5 may round to w
+    taps = nearest[:, None] + tap_offsets(centre.device).long()  # [E, 9, 2]
+    inside = ((taps >= 0) & (taps <= last)).all(-1)
+    x, y = torch.minimum(taps.clamp(min=0), last).unbind(-1)
+    view = frame * views + neighbour[frame, query, slot]
+    tap = (view * h * w)[:, None] + y * w + x
+    token = ((frame * Q + query) * h + row) * w + column
+    return TokenWindow(valid.flatten(4), place, token, tap, inside, centre - nearest)
+
+
+def tap_offsets(device: torch.device) -> torch.Tensor:
+    """(9, 2) float32 taps relative to the window's middle, (x, y), row by row."""
+    step = torch.arange(-1, 2, device=device, dtype=torch.float32)
+    return torch.stack(torch.meshgrid(step, step, indexing="ij")[::-1], -1).reshape(TAPS, 2)
+
+
+def token_sizes(latent_size: tuple[int, int], levels: int) -> list[tuple[int, int]]:
+    """(h, w) of a U-Net's token grids, the finest first: strided 3 x 3 convolutions round up."""
+    h, w = latent_size
+    return [(-(-h // 2**k), -(-w // 2**k)) for k in range(levels)]
+
+
+# --- attention --------------------------------------------------------------------------------------------------------
 HEAD_WIDTH = 32
 
 _INFINITY_LOGIT = 2.0  # initial scalar of level infinity, 0 for the others: w = .79, .11, .11
@@ -76,8 +280,6 @@ class CrossViewAttention(nn.Module):
 
     def __init__(self, width: int, levels: int) -> None:
         super().__init__()
-        if width % HEAD_WIDTH:
-            raise ValueError(f"CrossViewAttention: expected a width that is a multiple of {HEAD_WIDTH}, got {width}")
         self.heads = width // HEAD_WIDTH
         self.norm = nn.LayerNorm(width)
         self.to_q, self.to_k, self.to_v = (nn.Linear(width, width, bias=False) for _ in range(3))

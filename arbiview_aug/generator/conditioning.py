@@ -23,8 +23,7 @@ from torch.nn import functional
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.generator.config import GeneratorConfig
-from arbiview_aug.generator.correspondence import (
+from arbiview_aug.generator.attention import (
     Correspondence,
     TokenWindow,
     between,
@@ -33,11 +32,11 @@ from arbiview_aug.generator.correspondence import (
     token_sizes,
     window,
 )
+from arbiview_aug.generator.config import GeneratorConfig
 
 RAY_CHANNELS = 6
 SOURCES_PER_TARGET = 2  # source branches of a target camera, as in training (Algorithm 1: left and right)
 POSE_WIDTH = 16  # numbers of a pose: R (9), t (3), K (4)
-_KNOWN_SHARE = 0.99  # known share of a latent pixel from which it is no hole
 _OCTAVES = 4  # number of Fourier frequencies π, 2π, 4π, 8π
 
 
@@ -54,15 +53,9 @@ class ViewInputs(NamedTuple):
         """Zero the conditions of the frames ``drop`` (B,) bool, for classifier-free guidance."""
         return ViewInputs(*(value * ~drop.view(-1, *(1,) * (value.dim() - 1)) for value in self))
 
-    def channels(self, noisy: torch.Tensor, inpainting: bool = False) -> torch.Tensor:
-        """(B, N, 2 C + 8, h, w) the U-Net's input: noisy latent, condition latent, mask, confidence, rays.
-
-        For ``inpainting`` it begins as Stable Diffusion's: noisy latent, binary mask of the holes, condition latent.
-        """
-        if not inpainting:
-            return torch.cat([noisy, self.latent, self.mask, self.confidence, self.rays], 2)
-        holes = (self.mask < _KNOWN_SHARE).to(self.mask.dtype)
-        return torch.cat([noisy, holes, self.latent, self.confidence, self.rays], 2)
+    def channels(self, noisy: torch.Tensor) -> torch.Tensor:
+        """(B, N, 2 C + 8, h, w) the U-Net's input: noisy latent, condition latent, mask, confidence, rays."""
+        return torch.cat([noisy, self.latent, self.mask, self.confidence, self.rays], 2)
 
 
 def input_channels(latent_channels: int) -> int:
@@ -177,7 +170,7 @@ def frame_geometry(
     rays = [torch.stack([plucker_rays(*pair, size) for pair in pairs])[None] for pairs in viewed]
     poses = [torch.stack([pose_vector(*pair) for pair in pairs])[None] for pairs in viewed]
     keys, count = [*sources, *targets], len(sources)
-    settings = token_sizes(size, len(config.unet.widths)), ground_z_m, config.facing_m
+    settings = token_sizes(size, len(config.unet.widths)), ground_z_m
     return FrameGeometry(
         rays[0],
         poses[0],

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from arbiview_aug.errors import ArbiviewError, GeneratorError, shown
-from arbiview_aug.generator.correspondence import FACING_M
 
 _MOST_LEVELS, _MOST_LAYERS, _MOST_CHANNELS, _MOST_PIXELS = 8, 16, 8192, 8192
 
@@ -164,19 +163,15 @@ class GeneratorConfig:
     residual: bool = True  # diffuse the difference between image and pre-filled condition; never with ε
     prefilled: bool = True  # inpaint the condition's holes by Telea's method; else mid-grey, as in Algorithm 1
     one_step: bool = True  # whether the one-step regression was trained
-    frozen_unet: bool = False  # train only attention, pose, LoRA, the one-step head and the widened conv_in
-    inpainting: bool = False  # the U-Net's input begins as Stable Diffusion's inpainting: noisy, hole, masked latent
-    lora_rank: int = 0  # rank of the changes to the U-Net's own attention (Hu et al. 2022); 0 for none
+    frozen_unet: bool = False  # train only attention, pose, the one-step head and the widened conv_in
     prompt_tokens: int = 0  # tokens of the empty prompt's embedding
-    facing_m: float = FACING_M  # distance of the depth level that faces the camera
     steps: int = 4  # denoising steps; 1 is the one-step regression
     guidance: float = 1.0  # classifier-free guidance; 1 is none and takes half the time
-    guidance_rescale: float = 0.7  # φ of the rescaled guidance (Lin et al. 2023)
     strength: float = 1.0  # share of the diffusion by which pre-filled latents are noised: 0.6 starts at t = 599
     temperature: float = 0.5  # deviation of the initial noise; at 1 a sample is 3 dB below the posterior's mean
 
     def __post_init__(self) -> None:
-        check_sizes(self, _MOST_PIXELS, "image_size", "prompt_tokens", "lora_rank")
+        check_sizes(self, _MOST_PIXELS, "image_size", "prompt_tokens")
         factor, epsilon = self.autoencoder.factor, self.prediction == "epsilon"
         expected = f"two multiples of {factor}"
         check_fields(self, expected, lambda size: isinstance(size, tuple) and len(size) == 2, "image_size")
@@ -186,11 +181,9 @@ class GeneratorConfig:
         check_fields(self, expected, lambda used: not (used and epsilon), "zero_snr", "residual")
         expected = f"a whole number from 1 to {TIMESTEPS}"
         check_fields(self, expected, lambda n: type(n) is int and 1 <= n <= TIMESTEPS, "steps")
-        check_fields(self, "0 without frozen_unet", lambda rank: self.frozen_unet or not rank, "lora_rank")
         check_fields(self, "a value in (0, 1]", lambda s: 0 < s <= 1, "strength")
         check_fields(self, "a value in [0, 1]", lambda t: 0 <= t <= 1, "temperature")
-        check_fields(self, "a finite number above 0", lambda x: 0 < x < math.inf, "facing_m")
-        check_fields(self, "a finite number", lambda x: -math.inf < x < math.inf, "guidance", "guidance_rescale")
+        check_fields(self, "a finite number", lambda x: -math.inf < x < math.inf, "guidance")
 
     @property
     def latent_size(self) -> tuple[int, int]:
@@ -247,8 +240,6 @@ PRESETS = {
         unet=UNetConfig(widths=(128, 256, 384), transformers=_COARSE),
         autoencoder=_ON_PIXELS,
     ),
-    # Stable Diffusion 1.5's inpainting U-Net of 9 channels, frozen, with cross-view attention and LoRA.
-    "inpaint": replace(_PAPER, name="inpaint", inpainting=True, lora_rank=16, strength=1.0, steps=20, guidance=1.0),
     # Stable Diffusion 1.5, frozen, with 147.5 M parameters of cross-view attention, as published.
     "paper": _PAPER,
 }

@@ -20,14 +20,11 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import GeneratorError
-from arbiview_aug.generator.attention import CrossViewAttention
+from arbiview_aug.generator.attention import LEVELS, CrossViewAttention, TokenWindow
 from arbiview_aug.generator.conditioning import PoseContext, ViewInputs, input_channels
 from arbiview_aug.generator.config import TIMESTEPS, GeneratorConfig
-from arbiview_aug.generator.correspondence import LEVELS, TokenWindow
 
 REGRESSION = TIMESTEPS  # predicts x0 in one step, from the pre-filled latent instead of a noisy one
-_LORA_LAYERS = ("to_q", "to_k", "to_v", "to_out.0")  # of the U-Net's self- and cross-attention
 
 KeysValues = tuple[torch.Tensor, torch.Tensor]
 Sources = list[KeysValues]  # (B, S, T, width) of S source branches, for each cross-view block in the order they run
@@ -46,7 +43,7 @@ class Denoiser(nn.Module):
 
     Args:
         unet: A diffusers ``UNet2DConditionModel`` as ``UNetConfig`` describes; ``conv_in`` is widened by zeros.
-        config: Its ``inpainting``, ``lora_rank`` (by peft), ``prompt_tokens`` and ``unet.cross_view`` are read.
+        config: Its ``prompt_tokens`` and ``unet.cross_view`` are read.
         signal: (T,) √ᾱ_t of the schedule: the network then predicts the residual between image and condition. None
             leaves its output as it is, for Stable Diffusion's weights.
     """
@@ -57,10 +54,7 @@ class Denoiser(nn.Module):
         super().__init__()
         self.latent_channels = int(unet.config.out_channels)
         widen(unet, input_channels(self.latent_channels))
-        if rank := config.lora_rank:
-            lora = optional_package("peft", "generator").LoraConfig
-            unet.add_adapter(lora(r=rank, lora_alpha=rank, target_modules=list(_LORA_LAYERS)))
-        self.unet, self.inpainting = unet, config.inpainting
+        self.unet = unet
         widths = tuple(unet.config.block_out_channels)
         used = config.unet.cross_view or (True,) * len(widths)
         of_blocks = zip((*widths, widths[-1], *widths[::-1]), (*used, used[-1], *used[::-1]), strict=True)
@@ -79,10 +73,9 @@ class Denoiser(nn.Module):
             nn.init.zeros_(unet.conv_out.bias)
 
     def own_parameters(self) -> list[nn.Parameter]:
-        """Parameters trained beside a frozen U-Net: attention, pose, one-step head, widened ``conv_in``, LoRA."""
+        """Parameters trained next to a frozen U-Net: attention, pose, one-step head, widened ``conv_in``."""
         parts = (self.cross_view, self.context, self.regression, self.unet.conv_in)
-        lora = [parameter for name, parameter in self.unet.named_parameters() if ".lora_" in name]
-        return [parameter for part in parts for parameter in part.parameters()] + lora
+        return [parameter for part in parts for parameter in part.parameters()]
 
     def read_sources(self, sources: ViewInputs, windows: Sequence[TokenWindow]) -> Sources:
         """Run the source branches, which read sources only; ``windows``: one for each token grid, the finest first."""
@@ -167,7 +160,7 @@ class Denoiser(nn.Module):
     ) -> torch.Tensor:
         """Run all blocks of the U-Net; a source run appends its keys and values to ``outputs``."""
         unet, count = self.unet, noisy.shape[:2]
-        x = views.channels(noisy, self.inpainting).flatten(0, 1).to(unet.dtype)
+        x = views.channels(noisy).flatten(0, 1).to(unet.dtype)
         emb = unet.time_embedding(unet.time_proj(t.repeat_interleave(count[1])).to(unet.dtype))
         context = self.context(views.pose.flatten(0, 1))
         blocks, attended = 0, 0  # blocks of the U-Net so far, and cross-view blocks
@@ -294,14 +287,10 @@ class Autoencoder(nn.Module):
         self.scale = float(scale)  # of the latents; no buffer, since half precision would round it
 
     def encode(self, images: torch.Tensor) -> torch.Tensor:
-        """Encode images (..., 3, H, W) in [0, 1] to latents (..., C, H / f, W / f), without sampling.
-
-        GeneratorError with weights in float16, as in ``decode``.
-        """
+        """Encode images (..., 3, H, W) in [0, 1] to latents (..., C, H / f, W / f), without sampling."""
         images = images * 2 - 1
         if self.vae is None:
             return functional.pixel_unshuffle(images, self.patch)
-        self._refuse_float16()
         flat = images.reshape(-1, *images.shape[-3:]).to(self.vae.dtype)
         latents = self.vae.encode(flat).latent_dist.mode() * self.scale
         return latents.reshape(*images.shape[:-3], *latents.shape[-3:])
@@ -311,18 +300,7 @@ class Autoencoder(nn.Module):
         if self.vae is None:
             images = functional.pixel_shuffle(latents, self.patch)
         else:
-            self._refuse_float16()
             flat = latents.reshape(-1, *latents.shape[-3:]).to(self.vae.dtype)
             images = self.vae.decode(flat / self.scale).sample
             images = images.reshape(*latents.shape[:-3], *images.shape[-3:])
         return images / 2 + 0.5
-
-    def _refuse_float16(self) -> None:
-        assert self.vae is not None
-        device = self.vae.device.type
-        autocast = torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device) == torch.float16
-        if autocast or self.vae.dtype == torch.float16:
-            raise GeneratorError(
-                "autoencoder: expected float32 or bfloat16, got float16, in which Stable Diffusion's overflows; use "
-                "generator.to(torch.bfloat16)"
-            )

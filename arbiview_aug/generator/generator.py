@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -12,11 +13,11 @@ from typing import Any
 import torch
 from torch import nn
 
+from arbiview_aug.atomic_io import remove_parts, write_whole
 from arbiview_aug.choices import is_number
 from arbiview_aug.environment import optional_package
 from arbiview_aug.errors import GeneratorError, one_line, shown
 from arbiview_aug.files import check_regular
-from arbiview_aug.generator.checkpoint import load_weights, read_checkpoint, write_checkpoint
 from arbiview_aug.generator.conditioning import input_channels
 from arbiview_aug.generator.config import PRESETS, GeneratorConfig, TrainedOn, from_plain
 from arbiview_aug.generator.denoiser import Autoencoder, Denoiser, noise_schedule
@@ -92,12 +93,7 @@ class Generator(nn.Module):
         latent = config.autoencoder.latent_channels
         if not config.autoencoder.widths:
             raise GeneratorError("from_stable_diffusion: expected a config with an autoencoder, got one on pixels")
-        unet = load_part(
-            "UNet2DConditionModel",
-            where,
-            "unet",
-            config.unet.arguments(2 * latent + 1 if config.inpainting else latent, latent),
-        )
+        unet = load_part("UNet2DConditionModel", where, "unet", config.unet.arguments(latent, latent))
         vae = load_part("AutoencoderKL", where, "vae", config.autoencoder.arguments())
         scale, prediction = vae.config.scaling_factor, None
         with suppress(OSError, ValueError):  # no scheduler says what the U-Net was trained for
@@ -130,19 +126,19 @@ class Generator(nn.Module):
         """
         folder = Path(folder)
         data, tensors = read_checkpoint(folder)
-        config = from_plain(GeneratorConfig, data.get("generator", {}), f"{folder}/config.json")
+        config = from_plain(GeneratorConfig, data.get("generator", {}), str(folder))
         _networks()
         with torch.device("meta"):
             generator = cls.from_config(config)
         weights = {name: t.float() if t.is_floating_point() else t for name, t in tensors.items()}
         load_weights(generator, weights, folder)
         if data.get("trained_on") is not None:
-            generator.trained_on = from_plain(TrainedOn, data["trained_on"], f"{folder}/config.json")
+            generator.trained_on = from_plain(TrainedOn, data["trained_on"], str(folder))
         # Inside a user's module its parameters must not be found by the optimiser or DDP.
         return generator.eval().requires_grad_(False)
 
     def save_pretrained(self, folder: str | Path) -> None:
-        """Write the generator to a folder of its own, atomically; in float16 (``half()``) the file is half as large.
+        """Write the generator to a folder, atomically: one safetensors file, half as large in float16 (``half()``).
 
         Raises:
             OutputError: The disk is full, or the folder cannot be written.
@@ -151,6 +147,60 @@ class Generator(nn.Module):
         if self.trained_on is not None:
             config["trained_on"] = asdict(self.trained_on)
         write_checkpoint(Path(folder), config, self.state_dict())
+
+
+# --- checkpoints ------------------------------------------------------------------------------------------------------
+FILE, _FORMAT = "checkpoint.safetensors", 2  # the settings are its metadata: one atomic write replaces all
+_MAX_MESSAGE = 500  # characters of torch's message, which names every tensor
+
+
+def write_checkpoint(folder: Path, config: Mapping[str, Any], tensors: Mapping[str, torch.Tensor]) -> None:
+    """Write a checkpoint to a folder, which is created if needed, or replace the one there.
+
+    OutputError if the disk is full, or the folder cannot be written; the former checkpoint is unchanged.
+    """
+    save = optional_package("safetensors.torch", "generator").save
+    kept = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    write_whole({folder / FILE: save(kept, {"config": json.dumps({"format": _FORMAT, **config})})})
+    remove_parts(folder, lambda owner: False)
+
+
+def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """Read a checkpoint's configuration, and its tensors on the CPU.
+
+    GeneratorError for no checkpoint, a broken one, or one of another format. Nothing is unpickled.
+    """
+    path, package = folder / FILE, optional_package("safetensors", "generator")
+    if not path.is_file():
+        raise GeneratorError(f"{folder}: expected a generator's folder with {FILE}, found none")
+    try:
+        with package.safe_open(path, "pt") as file:
+            config = json.loads(file.metadata()["config"])
+            version, names = config.pop("format"), file.keys()
+            tensors = {name: file.get_tensor(name) for name in names}
+    except Exception as error:  # safetensors has its own errors
+        raise GeneratorError(f"{path}: expected a readable checkpoint, got {one_line(repr(error))}") from None
+    if version != _FORMAT:
+        raise GeneratorError(f"{path}: expected format {_FORMAT}, got {shown(version)}")
+    return config, tensors
+
+
+def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder: Path) -> None:
+    """Replace the tensors of a module by exactly its weights.
+
+    GeneratorError for names that are missing, extra or of another shape, and for values that are no finite numbers.
+    """
+    for name, expected in module.state_dict().items():
+        tensor = tensors.get(name, expected.new_zeros(0, device="cpu"))  # missing names are torch's to report
+        if tensor.is_floating_point() != expected.is_floating_point():
+            raise GeneratorError(f"{folder}: {name}: expected {expected.dtype} or alike, got {tensor.dtype}")
+        if tensor.is_floating_point() and not bool(torch.isfinite(tensor).all()):
+            raise GeneratorError(f"{folder}: {name}: expected finite weights, got NaN or infinity: training diverged")
+    try:
+        module.load_state_dict(tensors, assign=True)
+    except RuntimeError as error:
+        text = one_line(error, _MAX_MESSAGE)
+        raise GeneratorError(f"{folder}: expected the weights of this configuration: {text}") from None
 
 
 # --- Stable Diffusion's weights ---------------------------------------------------------------------------------------

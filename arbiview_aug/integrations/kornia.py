@@ -83,8 +83,8 @@ def check_photometric(module: Callable[[torch.Tensor], torch.Tensor]) -> None:
             base = getattr(v2, base.__name__, base)
         if base.__module__.startswith(_MOVING):
             raise ValueError(
-                f"{name}: moves pixels and leaves K unchanged; resize and crop with ResizeRig and "
-                "CropRig, turn and shift cameras with RandomRig"
+                f"{name}: moves pixels and leaves K unchanged; resize and crop with RigRetarget's "
+                "size and fit, turn and shift cameras with RandomRig"
             )
 
 

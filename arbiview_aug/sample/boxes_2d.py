@@ -71,15 +71,11 @@ def rig_of(cameras: Rig | Mapping[str, Any]) -> Rig:
     return frames[0].rig
 
 
-class Outline(NamedTuple):
-    """Rectangles (4,) x0 y0 x1 y1 around the projection of one box: uncut, and inside the image."""
+def _outline(camera: Camera, box: FloatArray) -> FloatArray | None:
+    """Rectangles (2, 4) x0 y0 x1 y1 around the projection of a box (7,): uncut, and inside the image.
 
-    uncut: FloatArray
-    inside: FloatArray
-
-
-def outline(camera: Camera, box: FloatArray) -> Outline | None:
-    """The outline of a box (7,) in a camera's image; None if it is outside or holds the camera."""
+    None if it is outside or holds the camera.
+    """
     if is_over(box, camera.center_m) and abs(camera.center_m[2] - box[2]) <= box[5] / 2:
         return None
     points = edge_points(camera, box)
@@ -110,8 +106,8 @@ def outline(camera: Camera, box: FloatArray) -> Outline | None:
         # Past the lens's fold, the box is projected as by a pinhole.
         beyond = points[~valid & (points[..., 2] > 0)] @ camera.K.T
         around.append(beyond[:, :2] / beyond[:, 2:])
-    uncut, inside = (np.concatenate([p.min(axis=0), p.max(axis=0)]) for p in (np.concatenate(around), within))
-    return Outline(uncut, inside)
+    parts = np.concatenate(around), within
+    return np.stack([np.concatenate([part.min(axis=0), part.max(axis=0)]) for part in parts])
 
 
 def edge_points(camera: Camera, box: FloatArray) -> FloatArray:
@@ -134,7 +130,7 @@ def edge_points(camera: Camera, box: FloatArray) -> FloatArray:
 
 
 def _project(camera: Camera, boxes: FloatArray) -> ImageBoxes:
-    outlines = {k: polygon for k, box in enumerate(boxes) if (polygon := outline(camera, box)) is not None}
+    outlines = {k: rectangles for k, box in enumerate(boxes) if (rectangles := _outline(camera, box)) is not None}
     rows = np.array(list(outlines), np.int64)
     uncut, inside = np.array(list(outlines.values())).reshape(-1, 2, 4).swapaxes(0, 1)
     uncut_px, inside_px = (np.prod(rectangles[:, 2:] - rectangles[:, :2], axis=1) for rectangles in (uncut, inside))

@@ -10,7 +10,7 @@ import numpy as np
 
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.cameras.validation import Finding, doubts
+from arbiview_aug.cameras.validation import Finding, doubts, is_rigid
 from arbiview_aug.sample.calibration import as_array
 from arbiview_aug.sample.camera_mistakes import neighbour_errors, neighbour_findings, own_car_share
 from arbiview_aug.sample.frame import Frame
@@ -105,10 +105,10 @@ def check_own_car(frames: Sequence[Frame]) -> list[Finding]:
 
 
 def _pose(frame: Frame) -> FloatArray | None:
-    """The frame's ``ego2world`` (4, 4); None without one, or for other shapes, which only neighbours need refuse."""
+    """The frame's ``ego2world`` (4, 4); None without one, or if it is no pose, which only neighbours need refuse."""
     pose = frame.further.get("ego2world")
-    pose = None if pose is None else as_array("ego2world", pose)
-    return None if pose is None or pose.shape != (4, 4) else np.asarray(pose, np.float64)
+    pose = None if pose is None else np.asarray(as_array("ego2world", pose), np.float64)
+    return pose if pose is not None and is_rigid(pose) else None
 
 
 def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:

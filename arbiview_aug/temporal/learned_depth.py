@@ -56,16 +56,7 @@ class LearnedDepth(MotionDepth):
 
 
 Output = Literal["depth", "inverse"] | None
-
-
-class Prediction(NamedTuple):
-    """A network's output for one image."""
-
-    values: Layer  # (h, w) over the whole image, of any size; not finite where unknown
-    output: Output  # ``depth``, ``inverse`` depth, or None if only the fit tells which
-    # Focal length of the image that the network saw, in its pixels. Networks that learned metres from one focal length
-    # see things twice as near at twice the focal length. None for relative depth.
-    scale_px: float | None = None
+"""What a network gives: depth, inverse depth, or None if only the fit tells which."""
 
 
 class DepthInputs(NamedTuple):
@@ -91,9 +82,7 @@ class CameraFit(NamedTuple):
         to, error = f"{self.points} points of {self.reference}", f"residual {self.residual or 0:.1%}"
         if self.declined:
             return f"{self.camera}: declined, {self.declined}{'' if self.residual is None else f' ({error}, {to})'}"
-        fitted = f"fitted to {to}, {error}"
-        others = "scale of the other cameras, at its own focal length"
-        return f"{self.camera}: {others if self.residual is None else fitted}"
+        return f"{self.camera}: fitted to {to}, {error}"
 
 
 def learned_depth(
@@ -107,13 +96,14 @@ def learned_depth(
     A camera is fitted to the first reference of ``wanted`` that it has enough points of.
     """
     views = {(n, k): View.of(frame, k) for n, frame in enumerate(frames) for k in range(len(frame.rig))}
-    predictions: dict[tuple[int, int], Prediction] = {}
+    predictions: dict[tuple[int, int], Layer] = {}
     for shape in dict.fromkeys(view.image.shape for view in views.values()):
         keys = [key for key, view in views.items() if view.image.shape == shape]
         for part in (keys[start : start + batch] for start in range(0, len(keys), batch)):
             predictions |= zip(part, model.predict([views[key] for key in part]), strict=True)
     for n, frame in enumerate(frames):
-        depth_m, fits = _fitted(frame, [(views[n, k], predictions[n, k]) for k in range(len(frame.rig))], wanted)
+        predicted = [(views[n, k], predictions[n, k]) for k in range(len(frame.rig))]
+        depth_m, fits = _fitted(frame, predicted, model.output, wanted)
         words = [f"{model.name}, revision {model.revision}, licence {model.licence}", *map(str, fits)]
         yield LearnedDepth(tuple(depth_m), "\n  ".join(words)), fits
 
@@ -139,12 +129,8 @@ class View(NamedTuple):
             image = torch.from_numpy(pixels).permute(2, 0, 1)
         return View(motion_camera(camera), pinhole, frame.rig.ground_z_m, image)
 
-    def sampled(self, prediction: Prediction) -> tuple[Layer, BoolArray]:
-        """A prediction over the pinhole image at the pixels of the depth map, and where it is known.
-
-        Metric networks are read as if all cameras had one focal length.
-        """
-        values, output, scale_px = prediction
+    def sampled(self, values: Layer) -> tuple[Layer, BoolArray]:
+        """A prediction over the pinhole image at the pixels of the depth map, and where it is known."""
         rays, valid = self.camera.unproject_cam(self.camera.pixel_grid())
         uv, z, _ = self.pinhole.project_cam(np.where(valid[..., None], rays, [0.0, 0.0, 1.0]))
         seen = valid & (z > 0) & self.pinhole.contains(uv, 0.5)
@@ -153,8 +139,7 @@ class View(NamedTuple):
         scale = np.array(values.shape[::-1]) / self.pinhole.size[::-1]
         at = ((uv + 0.5) * scale - 0.5).astype(np.float32)
         layer: Any = cv2.remap(values, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
-        focal = np.float32(1 if scale_px is None else scale_px / 1000)  # any common one: the fit finds the network's
-        return (layer * focal if output == "depth" else layer / focal), seen & np.isfinite(layer)
+        return layer, seen & np.isfinite(layer)
 
 
 def measured_pixels(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray]:
@@ -214,34 +199,25 @@ def _feature(form: _Form, values: FloatArray) -> FloatArray:
 
 
 def _fitted(
-    frame: DepthInputs, predicted: Sequence[tuple[View, Prediction]], wanted: Sequence[Reference]
+    frame: DepthInputs, predicted: Sequence[tuple[View, Layer]], output: Output, wanted: Sequence[Reference]
 ) -> tuple[list[Layer], list[CameraFit]]:
     """The depth map and the fit of each camera."""
-    fits: list[CameraFit] = []
-    lines: list[_Line | None] = [None] * len(predicted)
-    ratios: list[float] = []  # true over predicted inverse depth, of metric networks
-    samples = [view.sampled(prediction) for view, prediction in predicted]
+    depth, fits = list[Layer](), list[CameraFit]()
     too_few = f"fewer than {LEAST_POINTS} points of {', '.join(wanted)}"
-    for k, ((view, prediction), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
+    for k, (view, prediction) in enumerate(predicted):
+        values, seen = view.sampled(prediction)
         known = (of for of in _references(frame, k, view, seen) if of[0] in wanted and len(of[2]) >= LEAST_POINTS)
         reference, pixels, depth_m = next(known, (None, (), np.zeros(0)))
+        metres = np.zeros(values.shape)
         if reference is None:
             fits.append(CameraFit(view.camera.name, declined=too_few))
-            continue
-        step = -(-len(depth_m) // _MOST_POINTS)
-        x, depth_m = values[pixels][::step].astype(float), depth_m[::step]
-        line, residual, declined = fit_depth(x, depth_m, prediction.output)
-        fits.append(CameraFit(view.camera.name, reference, len(depth_m), residual, declined))
-        if not declined:
-            lines[k] = line
-            if prediction.scale_px is not None and prediction.output is not None:
-                ratios.append(float(np.median(1 / depth_m / _feature(prediction.output, x))))
-    depth = []
-    for k, ((_, (_, output, scale_px)), (values, seen)) in enumerate(zip(predicted, samples, strict=True)):
-        if fits[k].reference is None and scale_px is not None and output is not None and ratios:
-            lines[k], fits[k] = _Line(output, float(np.median(ratios)), 0.0), CameraFit(fits[k].camera)
-        line = lines[k]
-        metres = np.zeros(values.shape) if line is None else line.depth(np.where(seen, values, 1.0).astype(float))
+        else:
+            step = -(-len(depth_m) // _MOST_POINTS)
+            x, depth_m = values[pixels][::step].astype(float), depth_m[::step]
+            line, residual, declined = fit_depth(x, depth_m, output)
+            fits.append(CameraFit(view.camera.name, reference, len(depth_m), residual, declined))
+            if line is not None and not declined:
+                metres = line.depth(np.where(seen, values, 1.0).astype(float))
         depth.append(np.where(seen & (metres > _NEAREST_M), metres.clip(max=FARTHEST_M), 0).astype(np.float32))
     return depth, fits
 
@@ -330,10 +306,10 @@ class TransformersDepth:
         except Exception:  # no card, no network, a card that cannot be read
             self.licence = "unknown"
         stated = getattr(config, "depth_estimation_type", "")
-        self._output: Output = {"metric": "depth", "relative": "inverse"}.get(stated)  # type: ignore[assignment]
+        self.output: Output = {"metric": "depth", "relative": "inverse"}.get(stated)  # type: ignore[assignment]
 
     @torch.inference_mode()
-    def predict(self, views: Sequence[View]) -> list[Prediction]:
+    def predict(self, views: Sequence[View]) -> list[Layer]:
         """Predict the depth of images of one size in one batch.
 
         Raises:
@@ -347,10 +323,7 @@ class TransformersDepth:
             raise DataError(f"--batch: {len(images)} images do not fit on {self.device}; halve it") from None
         size = tuple(images[0].shape[-2:])
         done = self._processor.post_process_depth_estimation(out, [size] * len(images))  # takes padding away
-        seen = inputs["pixel_values"].shape[-1] / size[1]  # pixels of the network's for one of the image's
-        depths = [entry["predicted_depth"].float().cpu().numpy() for entry in done]
-        focal_px = [float(view.pinhole.K[0, 0]) * seen if self._output == "depth" else None for view in views]
-        return [Prediction(depth, self._output, px) for depth, px in zip(depths, focal_px, strict=True)]
+        return [entry["predicted_depth"].float().cpu().numpy() for entry in done]
 
 
 def load_pretrained(kind: Any, option: str, name: str, expected: str) -> Any:

@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 from arbiview_aug.environment import lazy_names
 
 if TYPE_CHECKING:
-    from arbiview_aug.transforms.explain import Explanation as Explanation
-    from arbiview_aug.transforms.explain import PaperExplanation as PaperExplanation
     from arbiview_aug.transforms.scans import RetargetedPoints as RetargetedPoints
     from arbiview_aug.transforms.scans import describe_points as describe_points
     from arbiview_aug.transforms.scans import entries_of as entries_of

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from arbiview_aug import favs, temporal, transforms
+from arbiview_aug import favs, temporal
 from arbiview_aug.cameras.rays import RayCache
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.choices import GeometryName
@@ -21,14 +21,21 @@ from arbiview_aug.errors import GeometryWarning, WarnOnce
 from arbiview_aug.inpaint.inpainter import Inpainter
 from arbiview_aug.inpaint.neighbours import Fills, Reach, fill_from_neighbours, plan_fills
 from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.harmonise import Harmonise, Harmoniser
+from arbiview_aug.render.harmonise import Harmonise, Harmoniser, PhotometricReport
 from arbiview_aug.render.overlap_depth import OverlapDepth, estimate_overlap, overlap_cache
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, Renderer, Views
 from arbiview_aug.render.requirements import RigPair, boxes_harm, check_reach, harm_remedies, pose_mistakes
 from arbiview_aug.render.view_planner import plan_pair
 from arbiview_aug.sample.frame import Frame
-from arbiview_aug.sample.inputs import LEARNED_KEY, LEARNED_WORDS_KEY, MOTION_KEY, MOTION_WORDS_KEY, read_scene
+from arbiview_aug.sample.inputs import (
+    DEPTH_WORDS,
+    LEARNED_KEY,
+    LEARNED_WORDS_KEY,
+    MOTION_KEY,
+    MOTION_WORDS_KEY,
+    read_scene,
+)
 from arbiview_aug.sample.neighbours import points_of_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.transforms.settings import PlanCache, unseen_note
@@ -85,6 +92,64 @@ class FramePlan:
         if GEOMETRIES[self.geometry].is_static or self.pair.harm is None:
             return self.pair.harm
         return boxes_harm(self.pair, self.scene.boxes) if self.geometry == "boxes" else None
+
+
+@dataclass(frozen=True, repr=False)
+class Explanation:
+    """Why a frame is rendered as it is; ``str`` prints it."""
+
+    planned: FramePlan
+    outcome: str  # of pixels that no camera saw
+    harmonisation: PhotometricReport | None = None  # the sources' gains and why, if they are harmonised
+    fills: Fills | None = None  # how other frames of the drive fill holes, if there are any
+    points: str | None = None  # what the target's scanners measure, if it has any
+
+    @property
+    def plan(self) -> RenderPlan:
+        """The render plan."""
+        return self.planned.plan
+
+    def __str__(self) -> str:
+        source, target, scene = self.plan.source, self.plan.target, self.planned.scene
+        lines = [] if self.harmonisation is None else [self.harmonisation.of_cameras(source.names)]
+        if (harm := self.planned.harm) is not None:
+            lines += [harm, f"better: {harm_remedies(source, target)}"]
+        if self.planned.overlap is not None:
+            lines += str(self.planned.overlap).splitlines()
+        parts: dict[str, Any] = {"boxes": scene.boxes, "points": scene.points}
+        parts |= {"pixels of depth from motion": scene.motion, "points of neighbouring frames": scene.sweeps}
+        parts |= {f"pixels of {key}": maps for key, maps in scene.further.items() if isinstance(maps, tuple)}
+        known = [
+            f"{sum(np.count_nonzero(m.depth_m) for m in part) if isinstance(part, tuple) else len(part)} {name}"
+            for name, part in parts.items()
+            if part is not None and len(part)
+        ]
+        lines += [f"geometry: {', '.join(known)}; the street elsewhere"] if known else []
+        lines += [] if self.planned.motion is None else [str(self.planned.motion)]
+        for key in DEPTH_WORDS.values():
+            lines += self.planned.frame.further.get(key, "").splitlines()
+        lines += [] if self.fills is None else self.fills.lines(self.plan)
+        lines += [] if self.points is None else [self.points]
+        head = f"{source.name or 'source'} -> {target.name or 'target'}: {len(source)} cameras to {len(target)}"
+        lines = ["\n  ".join([head, *lines])]
+        shares = self.fills.shares(self.plan) if self.fills else [0.0] * len(target)
+        for camera, view, filled in zip(target, self.plan.targets, shares, strict=True):
+            covered = float(view.coverage.mean())
+            note = f", up to {filled:.1%} more by other frames of the drive" if filled else ""
+            note += f", {1 - covered:.1%} that no camera saw, {self.outcome}" if covered < 1 else ""
+            lines.append(f"  {camera.name}: {covered:.1%} covered{note}")
+            for pair in view.pairs:
+                why = [pair.reason]
+                if pair.parallax_px:
+                    why.append(f"about {pair.parallax_px:.1f} px of parallax where depth is unknown")
+                if pair.level:
+                    why.append(f"read at 1/{2**pair.level} size")
+                surface = f"over the {pair.surface} surface ({', '.join(why)})"
+                lines.append(f"    {pair.share:6.1%} from {source[pair.source].name} {surface}")
+            lines += [] if view.pairs else ["    no source camera looks there"]
+        return "\n".join(lines)
+
+    __repr__ = __str__
 
 
 class PlannedRenderer:
@@ -197,11 +262,11 @@ class PlannedRenderer:
             return None
         return plan_fills(planned.plan, neighbours, planned.scene, planned.geometry, self.config, reach, self._maps)
 
-    def explain(self, frame: Frame, target: Rig, outcome: str, points: str | None = None) -> transforms.Explanation:
+    def explain(self, frame: Frame, target: Rig, outcome: str, points: str | None = None) -> Explanation:
         """Explain how a frame is rendered; ``outcome`` is what becomes of holes, ``points`` what scanners measure."""
         planned = self.plan(frame, target)
         gains = self.harmoniser.report(frame.rig, frame.images) if self.harmoniser.is_on else None
-        return transforms.Explanation(planned, outcome, gains, self._plan_neighbours(planned), points)
+        return Explanation(planned, outcome, gains, self._plan_neighbours(planned), points)
 
 
 # --- by the paper -----------------------------------------------------------------------------------------------------
@@ -212,7 +277,6 @@ class PaperRenderer:
     """
 
     geometry: ClassVar[GeometryName] = "infinity"
-    overlaps: ClassVar[None] = None
 
     def __init__(self, config: favs.PaperConfig, settings: RendererSettings) -> None:
         self.config: Any = config
@@ -225,10 +289,7 @@ class PaperRenderer:
             settings.target, settings.geometry, settings.backend, settings.outputs, least, self.harmoniser
         )
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """Sample keys that are read."""
-        return ("detections", "box_names", "boxes_3d") if self.config.use_detections else ()
+    reads: ClassVar[tuple[str, ...]] = ()
 
     def plan_views(self, source: Rig, target: Rig, scene: Scene) -> RenderPlan:
         """Raises ValueError."""
@@ -239,7 +300,7 @@ class PaperRenderer:
         return frame, target.in_frame_of(frame.rig)
 
     def _render(self, frame: Frame, target: Rig) -> favs.PaperRendering:
-        rendering = favs.render_frame(frame, target, self.config)
+        rendering = favs.render_paper(frame.rig, target, frame.images, self.config)
         check_reach(frame.rig, target, rendering.coverage, unseen_note(self.settings.inpainter), self.settings.warn)
         return rendering
 
@@ -247,6 +308,6 @@ class PaperRenderer:
         """Render frames by the published stages."""
         return [favs.as_rendered(self._render(*planned), self.settings.outputs) for planned in plans]
 
-    def explain(self, frame: Frame, target: Rig, outcome: str, *_: str) -> transforms.PaperExplanation:
-        """Explain what the stages made of a frame; ``outcome`` is what becomes of holes."""
-        return transforms.PaperExplanation(self._render(*self.plan(frame, target)), outcome)
+    def explain(self, frame: Frame, target: Rig, *_: str) -> favs.PaperRendering:
+        """Say what the stages made of a frame."""
+        return self._render(*self.plan(frame, target))

@@ -24,8 +24,7 @@ from arbiview_aug.environment import compilation_announced, warn_about_cv2_wheel
 from arbiview_aug.errors import GeometryWarning, SampleError, WarnOnce
 from arbiview_aug.inpaint.inpainter import Black, Inpainter
 from arbiview_aug.inpaint.neighbours import Reach
-from arbiview_aug.lru_cache import LRUCache
-from arbiview_aug.render.harmonise import Harmonise, PhotometricReport
+from arbiview_aug.render.harmonise import Harmonise
 from arbiview_aug.render.plan import RenderConfig, RenderPlan
 from arbiview_aug.render.rendered import Backend, Resizer
 from arbiview_aug.render.requirements import needs_geometry
@@ -40,7 +39,13 @@ from arbiview_aug.sample.inputs import (
 )
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
 from arbiview_aug.transforms.outputs import SampleWriter
-from arbiview_aug.transforms.renderers import FrameRenderer, PaperRenderer, PlannedRenderer, RendererSettings
+from arbiview_aug.transforms.renderers import (
+    Explanation,
+    FrameRenderer,
+    PaperRenderer,
+    PlannedRenderer,
+    RendererSettings,
+)
 from arbiview_aug.transforms.settings import (
     PlanCache,
     SampleKeys,
@@ -314,11 +319,6 @@ class RigRetarget(torch.nn.Module):
         return target.with_cameras([c.resize(framing(c.name, c.size, self._bars, "pad").scaled) for c in target])
 
     # --- plans ------------------------------------------------------------------------------------------------------
-    @property
-    def plans(self) -> LRUCache[bytes, RenderPlan]:
-        """The cached plans."""
-        return self.renderer.plans
-
     def plan(self, source: Rig | str | Path, target: Rig | str | Path, scene: Scene | None = None) -> RenderPlan:
         """The cached render plan of a pair of rigs in a scene; ValueError with ``quality="paper"``."""
         return self.renderer.plan_views(load_rig(source), load_rig(target), scene or Scene())
@@ -343,7 +343,7 @@ class RigRetarget(torch.nn.Module):
         return self.renderer.plan_views(source, target, Scene())
 
     # --- reports ----------------------------------------------------------------------------------------------------
-    def explain(self, sample: Mapping[str, Any]) -> transforms.Explanation | transforms.PaperExplanation:
+    def explain(self, sample: Mapping[str, Any]) -> Explanation | favs.PaperRendering:
         """How a sample would be rendered: sources, surfaces and why, coverage, expected parallax; print it.
 
         With ``quality="paper"``: what each stage made of each source. A random target is explained for one draw. Like a
@@ -353,8 +353,3 @@ class RigRetarget(torch.nn.Module):
         target, _, _ = self._make_params(sample, [frame], None)
         points = [transforms.describe_points(part, frame, target) for part in self._scan_points([frame], target)]
         return self.renderer.explain(frame, target, self.inpainter.outcome, *points)
-
-    def harmonisation(self, sample: Mapping[str, Any]) -> PhotometricReport:
-        """The gains that a sample's source images would get, and why; for a batch, its first frame's."""
-        frame = read_frames(sample, self.source)[0]
-        return self.renderer.harmoniser.report(frame.rig, frame.images)

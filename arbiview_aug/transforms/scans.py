@@ -83,32 +83,22 @@ def retarget_points(
         ground_z_m = ground.item()
         up = ground_z_m - target.ground_z_m  # scanners keep their rays where nothing moves
         lidars = [lidar.shifted(z_m=up) for lidar in target.lidars] if up else target.lidars
-        own = len(measured)
         if not isinstance(sweeps, Sequence | np.ndarray | torch.Tensor) or getattr(sweeps, "ndim", 1) == 0:
             raise SampleTypeError(f"sweeps: expected a list of points (Q, C), got {type(sweeps).__name__}")
-        if len(sweeps):
-            arrays = [as_array(f"sweeps[{k}]", sweep) for k, sweep in enumerate(sweeps)]
-            for k, sweep in enumerate(arrays):
-                if points.ndim != 2 or sweep.ndim != 2 or sweep.shape[1] != points.shape[1]:
-                    expected = f"expected the columns of points {tuple(points.shape)}"
-                    raise SampleError(f"sweeps[{k}]: {expected}, got {sweep.shape}")
-            if isinstance(points, np.ndarray):
-                points = np.concatenate([points, *arrays], dtype=points.dtype)
-            else:
-                tensors = [torch.from_numpy(np.ascontiguousarray(sweep)).to(points) for sweep in arrays]
-                points = torch.cat([points.detach(), *tensors])
-            array = as_array("points", points)
-            measured = checked_points(array)
+        arrays = [array, *(as_array(f"sweeps[{k}]", sweep) for k, sweep in enumerate(sweeps))]
+        for k, sweep in enumerate(arrays[1:]):
+            if array.ndim != 2 or sweep.ndim != 2 or sweep.shape[1] != array.shape[1]:
+                expected = f"expected the columns of points {array.shape}"
+                raise SampleError(f"sweeps[{k}]: {expected}, got {sweep.shape}")
+        own = len(measured)
+        if len(arrays) > 1:
+            array = as_array("points", np.concatenate(arrays).astype(array.dtype))
+        measured = checked_points(array)
         hits, nearest, rings_of, unsupported = scan(lidars, measured, ground_z_m, len(measured) - own)
-        rows = np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest
-        places: Any = hits
-        if isinstance(points, np.ndarray):
-            points = points[rows]
-        else:
-            points = points.detach()[torch.from_numpy(rows).to(points.device, torch.int64)]
-            places = torch.from_numpy(hits).to(points)
-        if points.ndim == 2:  # an empty list is points too
-            points[:, :3] = places
+        found = array[np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest]
+        if found.ndim == 2:  # an empty list is points too
+            found[:, :3] = hits
+        points = found.astype(points.dtype) if isinstance(points, np.ndarray) else torch.from_numpy(found).to(points)
         measured, rings = hits, torch.from_numpy(rings_of)
     counts = None
     if boxes is not None:

@@ -120,7 +120,7 @@ _INPAINTERS = {
     "telea": "inpaint.telea:Telea",
     "mean": "inpaint.continued:Mean",
     "black": "inpaint.inpainter:Black",
-    "diffusion": "generator.inpainter:Diffusion",
+    "diffusion": "generator.completion:Diffusion",
 }
 
 
@@ -153,16 +153,16 @@ def checked_params(params: Any) -> dict[str, float]:
     raise SampleError(f"params: expected the 'retarget_params' of an output, names and numbers, got {shown(params)}")
 
 
-def checked_pixels(value: Any, name: str = "size", form: str = "(h, w)", least: int = 1) -> tuple[int, int]:
-    """Two whole numbers of pixels, such as a size (h, w); ValueError for others."""
+def checked_pixels(value: Any) -> tuple[int, int]:
+    """A size (h, w) in whole pixels; ValueError for others."""
     try:
-        one, two = (operator.index(number) for number in value)  # 10.5 is refused, not cut
+        h, w = (operator.index(number) for number in value)  # 10.5 is refused, not cut
     except (TypeError, ValueError):
-        one = two = -1
-    if not least <= min(one, two) <= max(one, two) <= MAX_SIZE_PX:
-        limits = f"whole numbers from {least} to {MAX_SIZE_PX}"
-        raise ValueError(f"{name}: expected {form} in pixels, got {shown(value)}; {limits}")
-    return one, two
+        h = w = -1
+    if not 1 <= min(h, w) <= max(h, w) <= MAX_SIZE_PX:
+        limits = f"whole numbers from 1 to {MAX_SIZE_PX}"
+        raise ValueError(f"size: expected (h, w) in pixels, got {shown(value)}; {limits}")
+    return h, w
 
 
 _LEAST_KEPT, _LEAST_ROWS = 0.5, 0.4

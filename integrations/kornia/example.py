@@ -7,7 +7,7 @@ import torch
 from torchvision import tv_tensors
 from torchvision.transforms import v2
 
-from arbiview_aug import CropRig, ResizeRig, RigRetarget, load_rig
+from arbiview_aug import RigRetarget, load_rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.integrations.kornia import OnImages
 
@@ -16,8 +16,7 @@ def torchvision_pipeline() -> v2.Compose:
     """Ours inside ``v2.Compose``: photometric transforms after it see a ``tv_tensors.Image``."""
     return v2.Compose(
         [
-            RigRetarget(load_rig("waymo").undistorted(), size=(160, 352), geometry="boxes"),
-            CropRig(32, 0, (128, 352)),  # the sky
+            RigRetarget(load_rig("waymo").undistorted(), size=(128, 352), geometry="boxes"),  # the sky is cropped
             v2.ColorJitter(brightness=0.3, contrast=0.3, saturation=0.3),
             v2.GaussianBlur(3, sigma=(0.1, 0.8)),
             v2.ToDtype({tv_tensors.Image: torch.float32, "others": None}, scale=True),
@@ -32,8 +31,7 @@ def kornia_pipeline() -> torch.nn.Sequential:
         K.RandomGaussianNoise(std=0.02, p=0.5),
     )
     return torch.nn.Sequential(
-        RigRetarget(load_rig("waymo").undistorted(), size=(256, 704), geometry="boxes"),
-        ResizeRig((128, 352)),
+        RigRetarget(load_rig("waymo").undistorted(), size=(128, 352), geometry="boxes"),
         OnImages(colours),
     )
 

@@ -15,7 +15,6 @@ import yaml
 
 import arbiview_aug
 from arbiview_aug import Camera, Lidar
-from arbiview_aug.cameras.lidar import at128, hdl64e
 from arbiview_aug.cameras.rig import Rig, content_order, load_rig, shipped_rigs
 from arbiview_aug.cameras.validation import doubts
 from arbiview_aug.errors import CalibrationError, OutputError
@@ -177,7 +176,7 @@ def test_rigs_carry_scanners() -> None:
 
 @pytest.mark.parametrize("suffix", ["yaml", "json"])
 def test_files_keep_scanners(tmp_path: Path, suffix: str) -> None:
-    rig = replace(ring(1), lidars=[scanner(), hdl64e(AT_2_M)])
+    rig = replace(ring(1), lidars=[scanner(), scanner(name="front", azimuth_deg=(-60, 60))])
     assert load_rig(rig.save(tmp_path / f"rig.{suffix}")) == rig
 
 
@@ -196,12 +195,6 @@ def test_shipped_scanners() -> None:
     assert down.lidar2ego[2, 2] < -0.9  # it hangs upside down
     spacing = np.diff(load_rig("waymo").lidars[0].elevations_deg)
     assert 0.1 < spacing.min() < spacing[-20:].mean() < spacing[:20].mean() / 2  # denser near the horizon
-    upper, lower = np.split(np.array(hdl64e(np.eye(4)).elevations_deg), 2)
-    np.testing.assert_allclose([upper[0], upper[-1], lower[0], lower[-1]], [2, -8.33, -8.83, -24.33], atol=0.01)
-    assert hdl64e(np.eye(4)).shape == (64, 2083)
-    front = at128(AT_2_M)
-    assert front.shape == (128, 1200) and (front.rays[0] > 0.4).all()
-    np.testing.assert_allclose([front.elevations_deg[0], front.elevations_deg[-1]], [12.9, -12.5], atol=1e-9)
 
 
 # --- likely mistakes, of which ``load_rig`` warns and which ``check`` finds

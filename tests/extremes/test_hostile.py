@@ -34,8 +34,9 @@ from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.depth_folder import DepthFolder
 from arbiview_aug.errors import CalibrationError
 from arbiview_aug.generator import Generator
-from arbiview_aug.generator.training.checkpointing import load_state
+from arbiview_aug.generator.generator import read_checkpoint, write_checkpoint
 from arbiview_aug.generator.training.config import TrainConfig
+from arbiview_aug.generator.training.trainer import load_state
 from arbiview_aug.image_ops import Memory
 from arbiview_aug.sample.batching import is_readable
 from arbiview_aug.temporal.motion_depth import MotionDepth
@@ -97,9 +98,9 @@ class Boundaries:
         self.depths.write("0000", rig, MotionDepth(tuple(np.ones(c.size, np.float32) for c in rig), "made"))
         Generator.from_config(small_config()).save_pretrained(self.generator)
         self.training = TrainConfig(generator=small_config(), steps=1, batch=1, lr=1e-3)
-        config = json.loads((self.generator / "config.json").read_text())
+        config, weights = read_checkpoint(self.generator)
         config |= {"training": asdict(self.training), "step": 1}  # as the state of a training run has it
-        (self.generator / "config.json").write_text(json.dumps(config))
+        write_checkpoint(self.generator, config, weights)
         self.optimiser = torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))])
         self.frame = root / "frame"
         self.frame.mkdir()
@@ -117,8 +118,7 @@ class Boundaries:
             "sequence": ([self.drive / "sequence.json"], self._read_drive),
             "depth": ([self.depths.path("0000")], lambda _: self.depths.read("0000", FRAMES)),
             "record": (records, lambda _: self._go_on()),
-            "config": ([self.generator / "config.json"], self._read_generator),
-            "weights": ([*self.generator.glob("*.safetensors")], self._read_generator),
+            "generator": ([*self.generator.glob("*.safetensors")], self._read_generator),
         }
         self.sound = tree(root)
 
@@ -173,7 +173,7 @@ class Boundaries:
 
 NAMES = (
     *("sample", "sample", "sample", "settings", "check", "frame", "rig file", "calibration", "calibration"),
-    *("sequence", "depth", "record", "verified record", "config", "weights"),
+    *("sequence", "depth", "record", "verified record", "generator"),
 )
 
 
@@ -200,7 +200,6 @@ def test_files_that_mutations_found(boundaries: Boundaries) -> None:
         np.savez(infinite, **{**file, "format": np.array(np.inf)})
     for file, content, read, message in (
         ("drive/sequence.json", json.dumps({"frames": frames}).encode(), FrameFolder, "expected .* got OverflowError"),
-        ("generator/config.json", b"[" * 3000, Generator.from_pretrained, "expected a generator's configuration"),
         ("depth/0000.npz", infinite.getvalue(), None, "expected depth of a frame, got OverflowError; delete it"),
     ):
         path = boundaries.root / file
@@ -241,7 +240,7 @@ REFUSED: tuple[tuple[Callable[[], object], str], ...] = (
     (lambda: RenderConfig(seam_width="a"), r"RenderConfig\.seam_width"),  # type: ignore[arg-type]
     (lambda: RenderConfig(seam_width=10**400), r"RenderConfig\.seam_width"),
     (lambda: RenderConfig(antialias="no"), r"RenderConfig\.antialias: expected True or False"),  # type: ignore[arg-type]
-    (lambda: PaperConfig(type_weights=None), r"PaperConfig\.type_weights: expected pairs"),  # type: ignore[arg-type]
+    (lambda: PaperConfig(far_weight=None), r"PaperConfig\.far_weight: expected 0"),  # type: ignore[arg-type]
     (lambda: PaperConfig(use_feature_matching="off"), "use_feature_matching: expected True or False, got 'off'"),  # type: ignore[arg-type]
     *((lambda p=params: RigRetarget(RandomRig(TARGET, yaw_deg=5.0))(sample(), p), "params")  # type: ignore[misc]
       for params in ({"yaw_deg": "x"}, {"skipped": None}, 3, ["yaw_deg"])),
@@ -307,5 +306,5 @@ def test_threads_do_not_disturb_each_other(settings: dict[str, Any]) -> None:
         rendered = list(threads.map(lambda k: retarget(moving(k % 35))["images"], range(count)))
     for k, images in enumerate(rendered):
         assert torch.equal(images, fresh(moving(k % 35))["images"])
-    assert retarget.plans.misses <= count
-    assert retarget.plans.size <= retarget.cache.max_bytes or len(retarget.plans) == 1
+    assert retarget.renderer.plans.misses <= count
+    assert retarget.renderer.plans.size <= retarget.cache.max_bytes or len(retarget.renderer.plans) == 1

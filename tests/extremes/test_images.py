@@ -47,7 +47,7 @@ def sample(kind: str) -> dict[str, torch.Tensor | Rig]:
 @pytest.mark.parametrize("kind", ["blank", "grey", "saturated", "repeating", "night", "noise"])
 def test_harmonise_declines_and_says_why(kind: str) -> None:
     harmonised = RigRetarget(TARGET, match_exposure=True, geometry="street")
-    report = harmonised.harmonisation(sample(kind))
+    report = harmonised.explain(sample(kind)).harmonisation
     assert not report.accepted and report.gains == (1.0,) * len(RIG)
     assert "colours as recorded" in str(harmonised.explain(sample(kind))) and report.reason
     plain = RigRetarget(TARGET, match_exposure=False, geometry="street")

@@ -13,7 +13,6 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.favs.renderer import PaperRendering, paper_labels, primary_camera, render_paper
 from arbiview_aug.favs.stage1_geometry import h_geom
 from arbiview_aug.render.view_planner import build_plan
-from arbiview_aug.transforms.explain import PaperExplanation
 from tests import helpers
 
 OFF = PaperConfig(**{f.name: False for f in fields(PaperConfig) if f.name.startswith("use_")})
@@ -193,7 +192,7 @@ def test_rig_retarget_renders_the_published_stages(pair_images) -> None:
     assert np.array_equal(out["source_camera"][0].numpy(), direct.source_camera)
     assert torch.equal(out["segmentation"][0].int() % 255, out["source_camera"][0].int().clamp(min=0))
     assert out["token"] == "a" and np.array_equal(out["K"][0], MIDDLE[0].K)
-    assert len(retarget.plans) == 0
+    assert len(retarget.renderer.plans) == 0
     batch = retarget(
         {
             **sample,
@@ -206,22 +205,11 @@ def test_rig_retarget_renders_the_published_stages(pair_images) -> None:
 
 def test_explain_reports_each_stage(pair_images) -> None:
     words = RigRetarget(MIDDLE, quality=PaperConfig(min_matches=5000)).explain({"images": pair_images, "rig": PAIR})
-    assert isinstance(words, PaperExplanation) and isinstance(words.rendering, PaperRendering)
+    assert isinstance(words, PaperRendering)
     assert "stages 1 to 4 as published" in str(words) and "fewer than 5000; objects:" in str(words)
     assert "from left: the primary camera" in str(words)
-    sources = words.as_dict()[0]["sources"]
-    assert sum(s["share"] for s in sources) == pytest.approx(words.as_dict()[0]["coverage"])
-
-
-def test_detections_in_the_sample_give_types(pair_images) -> None:
-    everywhere = {"boxes": torch.tensor([[0.0, 0, 399, 239]]), "labels": ["vehicle.car"]}
-    sample = {"images": pair_images, "rig": PAIR, "detections": [everywhere, everywhere]}
-    for on in (True, False):
-        retarget = RigRetarget(MIDDLE, quality=PaperConfig(use_detections=on))
-        types = {o.type for r in retarget.explain(sample).rendering.targets[0].reports for o in r.objects.objects}
-        assert types and (types == {"vehicle.car"}) == on
-    with pytest.warns(UserWarning, match="drops detections"):
-        assert "detections" not in retarget(sample)
+    (view,) = words.targets
+    assert sum(report.share for report in view.reports) == pytest.approx(view.coverage.mean())
 
 
 def test_messages(pair_images) -> None:

@@ -167,7 +167,7 @@ def test_config_messages() -> None:
         ({"beta": 1.5}, "PaperConfig.beta: expected 0 to 1, got 1.5"),
         ({"min_matches": 3}, "PaperConfig.min_matches: expected 4 to"),
         ({"consistent_px": 30.0}, "PaperConfig.consistent_px: expected less than inconsistent_px=24"),
-        ({"type_weights": (("car", -1.0),)}, "PaperConfig.type_weights: expected pairs .*car"),
+        ({"far_weight": -1.0}, "PaperConfig.far_weight: expected 0 to"),
     ]:
         with pytest.raises(ValueError, match=message):
             PaperConfig(**settings)
@@ -206,9 +206,9 @@ def cluster_at(x: float, y: float, count: int = 9, spacing: float = 10.0) -> np.
     return np.stack(np.meshgrid(x + side, y + side), -1).reshape(-1, 2)
 
 
-def objects_of(reference: np.ndarray, offset, detections=()):
+def objects_of(reference: np.ndarray, offset):
     matches = Matches(reference - np.asarray(offset, float), reference)
-    return find_objects(matches, EYE, EYE, CAMERA, 0.0, detections)
+    return find_objects(matches, EYE, EYE, CAMERA, 0.0)
 
 
 def test_delta_t_is_the_weighted_mean_of_residuals() -> None:
@@ -281,7 +281,7 @@ def test_long_shifts_and_worthless_types_decline() -> None:
     report = align_objects(objects, EYE, 800, CONFIG)
     assert report.reason == "1 objects ask for 12.7 px, more than 12.0" and np.array_equal(report.H_aligned, EYE)
     assert align_objects(objects, EYE, 1600, CONFIG).shift_px.any()  # lengths scale with the target's width
-    worthless = PaperConfig(type_weights=(("far", 0.0),))
+    worthless = PaperConfig(far_weight=0.0)
     assert align_objects(objects, EYE, 800, worthless).reason == "1 clusters, none with a positive type weight"
 
 

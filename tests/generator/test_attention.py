@@ -8,8 +8,15 @@ import pytest
 import torch
 
 from arbiview_aug.cameras.rig import Rig
-from arbiview_aug.generator.attention import HEAD_WIDTH, CrossViewAttention, PositionalEncoding
-from arbiview_aug.generator.correspondence import TokenWindow, correspondences, stacked, window
+from arbiview_aug.generator.attention import (
+    HEAD_WIDTH,
+    CrossViewAttention,
+    PositionalEncoding,
+    TokenWindow,
+    correspondences,
+    stacked,
+    window,
+)
 from tests.generator.small import ring, stirred
 
 WIDTH = 64

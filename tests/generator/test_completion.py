@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 import sys
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +16,7 @@ from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, Generator, load_inpainter
-from arbiview_aug.generator.completion import guided, sample, timesteps
+from arbiview_aug.generator.completion import sample, timesteps
 from arbiview_aug.generator.denoiser import REGRESSION, noise_schedule
 from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.frame import Frame
@@ -169,15 +168,6 @@ def test_without_diffusers_the_install_command_is_given(monkeypatch: pytest.Monk
             needed()
 
 
-def test_more_steps_than_one_are_warned_of_once() -> None:
-    generator = Generator.from_config(small_config(steps=1, name="warned of"))
-    with pytest.warns(UserWarning, match=r"steps=4: generator 'warned of' was trained for one step; more add noise"):
-        Diffusion(generator, steps=4)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        Diffusion(generator, steps=10)
-
-
 def test_a_generator_is_asked_for() -> None:
     for make in (Diffusion, lambda: RigRetarget("waymo", holes="diffusion"), lambda: load_inpainter(None)):
         with pytest.raises(GeneratorError, match="expected a generator or its folder, got none: python -m"):
@@ -240,12 +230,3 @@ def test_the_start_is_the_prefilled_latent_or_the_regressions_result_with_noise(
     else:
         a = noise_schedule(settings).alphas_cumprod[599]
         assert torch.allclose(calls[int(residual)][1], a.sqrt() * start + 0.5 * (1 - a).sqrt() * randn(1), atol=1e-5)
-
-
-def test_guidance() -> None:
-    c, u = randn(0), randn(1)
-    assert torch.allclose(guided(c, u, 1.0, 0.0), c)
-    assert torch.allclose(guided(c, u, 3.0, 0.0), u + 3 * (c - u))
-    strong = guided(c, u, 7.5, 1.0)  # each view has its conditional's deviation
-    assert torch.allclose(strong.std((2, 3, 4)), c.std((2, 3, 4)), rtol=1e-4)
-    assert torch.isfinite(guided(torch.zeros_like(c), torch.zeros_like(c), 7.5, 0.7)).all()

@@ -10,7 +10,7 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rig import Rig, load_rig
-from arbiview_aug.generator.correspondence import (
+from arbiview_aug.generator.attention import (
     FACING_M,
     correspond,
     correspondences,

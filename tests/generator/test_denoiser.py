@@ -9,8 +9,8 @@ import torch
 from diffusers import UNet2DConditionModel
 
 from arbiview_aug.generator import Generator
+from arbiview_aug.generator.attention import token_sizes
 from arbiview_aug.generator.conditioning import FrameGeometry, ViewInputs, frame_geometry
-from arbiview_aug.generator.correspondence import token_sizes
 from arbiview_aug.generator.denoiser import REGRESSION, Denoiser, Rows
 from tests.generator.small import ring, small_config
 

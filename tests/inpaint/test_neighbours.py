@@ -11,6 +11,7 @@ from arbiview_aug.datasets import Neighbours
 from arbiview_aug.datasets.synthetic import SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.inpaint.merging import Candidate, merged
 from arbiview_aug.sample.neighbours import ChangeRisk
+from arbiview_aug.transforms.renderers import Explanation
 
 RIG = demo_source_rig((96, 256))
 
@@ -99,11 +100,12 @@ def test_gradients_reach_the_current_images(sample: dict[str, Any]) -> None:
 
 def test_explain_lists_each_neighbour(sample: dict[str, Any], alone: dict[str, Any], filled: dict[str, Any]) -> None:
     explanation = RigRetarget(low()).explain(sample)
-    shares = [entry["filled"] for entry in explanation.as_dict()]
+    assert isinstance(explanation, Explanation) and explanation.fills is not None
+    shares = explanation.fills.shares(explanation.plan)
     gained = (filled["coverage"] & ~alone["coverage"]).double().mean((1, 2)).tolist()
     assert all(up_to >= share for up_to, share in zip(shares, gained, strict=True)) and sum(shares) < 1.3 * sum(gained)
     assert str(explanation).count("m of travel: ") == 4 and "more by other frames of the drive" in str(explanation)
-    assert "filled" not in RigRetarget(low(), neighbours=None).explain(sample).as_dict()[0]
+    assert "more by other frames" not in str(RigRetarget(low(), neighbours=None).explain(sample))
 
 
 @pytest.mark.slow

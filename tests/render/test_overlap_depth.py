@@ -275,7 +275,7 @@ def test_a_cache_computes_each_scene_once(nearer: tuple[torch.Tensor, OverlapDep
     assert cache is not None
     first = retarget({"images": images, "token": "a"})["images"]
     again = retarget({"images": images, "token": "a"})["images"]
-    assert (cache.misses, len(retarget.plans)) == (1, 1)
+    assert (cache.misses, len(retarget.renderer.plans)) == (1, 1)
     assert torch.equal(first, again)
     retarget({"images": images, "token": "b"})
     assert cache.misses == 2

@@ -134,7 +134,7 @@ def test_rendered_and_cropped_samples_of_shipped_rigs_are_read(size: tuple[int, 
         target = load_rig(name).resized(size, "crop")
         images = torch.zeros((len(target), 3, *size), dtype=torch.uint8)
         given = {"images": images, "K": target.K, "cam2ego": target.cam2ego}
-        assert read_frames(given, None)  # as CropRig leaves it
+        assert read_frames(given, None)
         moved = target.K + np.array([[0, 0, size[1]], [0, 0, size[0]], [0, 0, 0]])
         coverage = torch.ones((len(target), *size), dtype=torch.bool)
         assert read_frames(given | {"K": moved, "coverage": coverage}, None)  # a target that is really like this

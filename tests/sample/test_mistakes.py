@@ -466,3 +466,8 @@ def test_rendering_names_the_fix(mistake: str, street: Sample) -> None:
     else:
         with pytest.warns(UserWarning, **said):
             RigRetarget("waymo", size=(32, 64))(wrong)
+
+
+def test_a_pose_that_is_none_tells_nothing(street: Sample) -> None:
+    for pose in (torch.zeros(4, 4), torch.full((4, 4), float("nan")), torch.eye(3)):
+        assert check({**street, "ego2world": pose}).findings == check({**street, "ego2world": None}).findings

@@ -1,4 +1,4 @@
-"""What a training reads of samples: boxes that are seen, cells that saw something real, depth maps, and batches."""
+"""Depth maps of points, and batches of samples."""
 
 from __future__ import annotations
 
@@ -16,64 +16,11 @@ from arbiview_aug import (
     RigRetarget,
     SampleError,
     SampleKeys,
-    SampleTypeError,
     collate,
     depth_maps,
-    lift_mask,
-    project_boxes_3d,
-    visible_boxes,
 )
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from tests.helpers import camera, ring, sample_of
-
-
-def sample(**further: Any) -> dict[str, Any]:
-    rig = Rig([camera(size=(64, 96))])
-    boxes = torch.tensor([[10.0, 0, 1, 4, 2, 2, 0], [30, 0, 1, 1, 1, 1, 0], [-10, 0, 1, 4, 2, 2, 0]])
-    return {"images": torch.zeros((1, 3, 64, 96)), "rig": rig, "boxes_3d": boxes, **further}
-
-
-def test_boxes_are_seen_before_others_within_the_image_and_where_it_is_covered() -> None:
-    np.testing.assert_array_equal(visible_boxes(sample()), [True, False, False])
-    black = torch.zeros((1, 64, 96), dtype=torch.bool)
-    assert not visible_boxes(sample(coverage=black)).any()
-    out = RigRetarget(sample()["rig"].turned(yaw_deg=60), geometry="infinity")(sample())
-    assert not visible_boxes(out).any()
-    with pytest.raises(SampleError, match="expected a sample with 'boxes_3d'"):
-        visible_boxes({"images": None})
-    with pytest.raises(SampleError, match=r"expected one sample, got a batch \(2,\); pass its frames one by one"):
-        visible_boxes(collate([sample()] * 2))
-
-
-def test_of_a_near_box_few_pixels_suffice() -> None:
-    near = {"images": torch.zeros((1, 3, 640, 960)), "rig": Rig([camera(size=(640, 960))])}
-    near["boxes_3d"] = torch.tensor([[10.0, 0, 1, 4, 2, 2, 0]])
-    left, top, right, bottom = (int(end) for end in project_boxes_3d(near["boxes_3d"], near)[0].boxes[0])
-    assert (right - left) * (bottom - top) > 10 * 80  # a tenth of it is more
-    for seen_px, expected in ((40, True), (20, False)):
-        coverage = torch.zeros((1, 640, 960), dtype=torch.bool)
-        coverage[0, (top + bottom) // 2 :, (left + right) // 2] = True
-        coverage[0, (top + bottom) // 2 + seen_px :] = False
-        assert visible_boxes(near | {"coverage": coverage}).tolist() == [expected]
-
-
-def test_cells_are_lifted_that_are_covered_and_no_own_car() -> None:
-    coverage = torch.zeros((2, 1, 9, 8), dtype=torch.bool)
-    coverage[0, 0, :3, :4] = coverage[0, 0, 8, 4:] = True
-    expected = torch.tensor([[[[1, 0], [0, 0], [0, 1]]], [[[0, 0], [0, 0], [0, 0]]]], dtype=torch.bool)
-    assert torch.equal(lift_mask({"coverage": coverage}, 4), expected)  # type: ignore[arg-type]
-    assert not lift_mask({"coverage": coverage, "ego_mask": coverage}, 4).any()  # type: ignore[union-attr]
-    (one,) = lift_mask({"coverage": [coverage[0, 0]]}, 4)
-    assert torch.equal(one, expected[0, 0])
-    with pytest.raises(SampleError, match="'coverage'"):
-        lift_mask({}, 4)
-    for stride in (0, 4.0, True):
-        with pytest.raises(ValueError, match="stride: expected a number of pixels from 1, got"):
-            lift_mask({"coverage": coverage}, stride)  # type: ignore[arg-type]
-    assert torch.equal(lift_mask({"coverage": coverage}, np.int64(4)), expected)  # type: ignore[arg-type]
-    for function in (lambda value: lift_mask(value, 4), visible_boxes):
-        with pytest.raises(SampleTypeError, match="expected an output of RigRetarget, got list"):
-            function([1])  # type: ignore[arg-type]
 
 
 def test_retargeted_samples_of_differing_numbers_of_objects() -> None:

@@ -239,4 +239,4 @@ def test_auto_plans_once_where_objects_cannot_matter() -> None:
     for x in (6.0, 7.0, 8.0):
         boxes = torch.from_numpy(CAR + np.array([x, 0, 0, 0, 0, 0, 0]))
         turned({"images": torch.zeros((1, 3, 64, 176)), "rig": one, "boxes_3d": boxes})
-    assert turned.plans.misses == 1
+    assert turned.renderer.plans.misses == 1

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -12,7 +12,7 @@ import torch
 
 from arbiview_aug import Rig
 from arbiview_aug.datasets.synthetic import RenderedViews, SyntheticDrive, demo_source_rig
-from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, Prediction, View, fit_depth, learned_depth
+from arbiview_aug.temporal.learned_depth import CameraFit, DepthInputs, View, fit_depth, learned_depth
 from arbiview_aug.temporal.motion_depth import MotionDepth
 from tests.helpers import camera
 
@@ -35,7 +35,7 @@ class Oracle:
     revision = "1"
     licence = "mit"
 
-    def predict(self, views: Sequence[View]) -> list[Prediction]:
+    def predict(self, views: Sequence[View]) -> list[np.ndarray]:
         self.batches = [*getattr(self, "batches", []), len(views)]
         predictions = []
         for view in views:
@@ -44,8 +44,7 @@ class Oracle:
                 * (self.assumed_px or float(view.pinhole.K[0, 0]))
                 / float(view.pinhole.K[0, 0])
             )
-            scale_px = float(view.pinhole.K[0, 0]) if self.assumed_px is not None else None
-            predictions.append(Prediction(self.form(seen).astype(np.float32), self.output, scale_px))
+            predictions.append(self.form(seen).astype(np.float32))
             view.image.zero_()  # a copy: the truth knows the images by their bytes
         return predictions
 
@@ -146,33 +145,12 @@ def test_outliers_do_not_move_a_fit() -> None:
     assert line.scale == pytest.approx(1 / 5, rel=1e-3) and line.shift == pytest.approx(-0.14, rel=1e-3)
 
 
-def test_one_picture_with_two_focal_lengths() -> None:
-    """A metric network says the same of both; the one with twice the focal length shows things twice as far away.
-
-    The second camera looks up, where nothing is known: it takes the first one's scale.
-    """
-    wide = camera("wide", size=(96, 128), horizontal_fov_deg=80.0, position_m=(0, 0, 1.5))
-    K = wide.K.copy()
-    K[0, 0], K[1, 1] = 2 * K[0, 0], 2 * K[1, 1]
-    tele = replace(wide, name="tele", K=K).turned(pitch_deg=60)
-    rays, _ = wide.unproject(wide.pixel_grid())
-    with np.errstate(divide="ignore"):
-        true = np.where(rays[..., 2] < -0.02, -1.5 / rays[..., 2] * rays[..., 0], 30.0)
+def test_a_camera_of_which_nothing_is_known_is_declined() -> None:
+    up = camera("up", size=(96, 128), horizontal_fov_deg=40.0, position_m=(0, 0, 1.5)).turned(pitch_deg=60)
     image = torch.zeros(3, 96, 128, dtype=torch.uint8)
-
-    class OfOnePicture(Oracle):
-        def predict(self, views: Sequence[View]) -> list[Prediction]:
-            return [Prediction(np.float32(0.7 * true), "depth", float(view.pinhole.K[0, 0])) for view in views]
-
-    model = OfOnePicture({image.numpy().tobytes(): true}, lambda z: z)
-    depth, fits = depth_of(model, DepthInputs(Rig([wide, tele]), [image, image]))
-    assert fits[0].reference == "road" and str(fits[1]) == "tele: scale of the other cameras, at its own focal length"
-    one, two = depth.depth_m
-    both = (one > 0) & (two > 0)
-    assert both.mean() > 0.5 and np.allclose(two[both], 2 * one[both], rtol=0.02)
-    relative = Oracle(model.truth, lambda z: 9 / z + 1, "inverse")
-    _, fits = depth_of(relative, DepthInputs(Rig([wide, tele]), [image, image]))
-    assert fits[1].declined == "fewer than 50 points of LiDAR, motion, road"
+    model = Oracle({image.numpy().tobytes(): np.ones((96, 128))}, lambda z: z, "depth")
+    depth, (fit,) = depth_of(model, DepthInputs(Rig([up]), [image]))
+    assert fit.declined == "fewer than 50 points of LiDAR, motion, road" and not depth.density
 
 
 def test_fisheye_images_are_shown_as_pinhole_ones() -> None:
@@ -183,14 +161,14 @@ def test_fisheye_images_are_shown_as_pinhole_ones() -> None:
     seen: list[torch.Tensor] = []
 
     class Road(Oracle):
-        def predict(self, views: Sequence[View]) -> list[Prediction]:
+        def predict(self, views: Sequence[View]) -> list[np.ndarray]:
             seen.extend(view.image for view in views)
             rays, _ = lens.undistorted().unproject(lens.pixel_grid())
             inverse = np.maximum(-rays[..., 2] / 1.5 / rays[..., 0], 0.0)
-            return [Prediction(inverse.astype(np.float32), "inverse") for _ in views]
+            return [inverse.astype(np.float32) for _ in views]
 
     image = torch.rand(3, 96, 128)
-    depth, (fit,) = depth_of(Road({}, lambda z: z), DepthInputs(Rig([lens]), [image]))
+    depth, (fit,) = depth_of(Road({}, lambda z: z, "inverse"), DepthInputs(Rig([lens]), [image]))
     rays, _ = lens.unproject(lens.pixel_grid())
     true = np.where(rays[..., 2] < -0.1, -1.5 / np.minimum(rays[..., 2], -1e-3) * rays[..., 0], np.inf)
     known = (depth.depth_m[0] > 0) & np.isfinite(true)

@@ -490,7 +490,7 @@ def test_rigs_drawn_for_each_sample_do_not_fill_the_cache() -> None:
     retarget = RigRetarget(RandomRig(ring(), yaw_deg=15))
     for _ in range(3):
         retarget(sample_of(ring()))
-    assert len(retarget.plans) == 1
+    assert len(retarget.renderer.plans) == 1
 
 
 # --- frames of reference ----------------------------------------------------------------------------------------------
@@ -576,7 +576,7 @@ def test_copies_and_pickles() -> None:
     retarget.plan(ring(), ring())
     assert retarget.plan("nuscenes", "waymo") is retarget.plan(load_rig("nuscenes"), load_rig("waymo"))
     for other in (copy.deepcopy(retarget), pickle.loads(pickle.dumps(retarget))):
-        assert len(other.plans) == 0
+        assert len(other.renderer.plans) == 0
         torch.manual_seed(1)
         assert same(other(sample), expected)
     fixed = RigRetarget("waymo", size=SIZE)
@@ -600,7 +600,7 @@ def test_prepare_builds_the_plan_that_samples_use() -> None:
     retarget.prepare()
     retarget({"images": smooth_images(source)})
     retarget({"images": smooth_images(source), "rig": ring()})  # an equal rig
-    assert retarget.plans.misses == 1
+    assert retarget.renderer.plans.misses == 1
     assert RigRetarget("waymo", geometry="street").prepare("nuscenes").source.name == "nuscenes"
     for bad in (RigRetarget(ring()), RigRetarget(RandomRig(ring()), source=source)):
         with pytest.raises(ValueError, match=r"prepare: expected a source rig .*, got (no|a) source and a"):
@@ -793,7 +793,7 @@ def test_explain_changes_nothing_but_the_random_state() -> None:
     retarget, sample = RigRetarget(ring().turned(yaw_deg=5)), sample_of(source)
     expected = retarget(sample)
     retarget.explain(sample)
-    assert same(retarget(sample), expected) and retarget.plans.misses == 1
+    assert same(retarget(sample), expected) and retarget.renderer.plans.misses == 1
 
 
 # --- what surrounds a call --------------------------------------------------------------------------------------------

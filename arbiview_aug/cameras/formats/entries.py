@@ -72,7 +72,6 @@ class Mounting:
         images: Image of each camera (COLMAP).
         sizes: ``{width, height}`` of all cameras, or by camera.
         names: Names of the cameras by those in the files, in the rig's order; all others come after them.
-        tokens: Rows of calibrated_sensor.json to read, all by default (nuScenes).
     """
 
     poses: Mapping[str, FloatArray] = field(default_factory=dict)
@@ -81,7 +80,6 @@ class Mounting:
     images: Mapping[str, str] = field(default_factory=dict)
     sizes: Mapping[str, Any] = field(default_factory=dict)
     names: Mapping[str, str] = field(default_factory=dict)
-    tokens: Sequence[str] = ()
 
     @classmethod
     def read(cls, folder: Path) -> Mounting:
@@ -96,8 +94,6 @@ class Mounting:
             if not isinstance(data[key], Mapping):
                 raise CalibrationError(f"{MOUNTING}: {key}: expected values by camera, got {shown(data[key])}")
             data[key] = {str(name): value for name, value in data[key].items()}
-        if not isinstance(data.get("tokens", []), list):
-            raise CalibrationError(f"{MOUNTING}: tokens: expected a list, got {shown(data['tokens'])}")
         poses = {name: pose_of(name, value) for name, value in data.get("poses", {}).items()}
         scale = data.get("metres_per_unit")
         if scale is not None and not (type(scale) in (int, float) and 0 < scale < math.inf):

@@ -35,12 +35,14 @@ _MODELS = (
     (6, "FULL_OPENCV", 2, 8, "radtan"),
     (8, "SIMPLE_RADIAL_FISHEYE", 1, 1, "fisheye"),
     (9, "RADIAL_FISHEYE", 1, 2, "fisheye"),
-    (10, "THIN_PRISM_FISHEYE", 2, 8, "fisheye"),  # k1 k2 p1 p2 k3 k4 sx1 sy1
     (14, "SIMPLE_FISHEYE", 1, 0, "fisheye"),
     (15, "FISHEYE", 2, 0, "fisheye"),
     (16, "EUCM", 2, 2, "eucm"),
 )
-_NOT_READ = {7: "FOV", 11: "RAD_TAN_THIN_PRISM_FISHEYE", 12: "SIMPLE_DIVISION", 13: "DIVISION", 17: "EQUIRECTANGULAR"}
+_NOT_READ = {
+    **{7: "FOV", 10: "THIN_PRISM_FISHEYE", 11: "RAD_TAN_THIN_PRISM_FISHEYE"},
+    **{12: "SIMPLE_DIVISION", 13: "DIVISION", 17: "EQUIRECTANGULAR"},
+}
 _COLMAP_FILES, _MOST_MODEL_BYTES = ("cameras", "images"), 1 << 28  # images with their points
 
 
@@ -93,11 +95,6 @@ def _camera(name: str, camera: tuple[Any, ...], cam2ego: FloatArray) -> dict[str
     if len(numbers) != (expected := focals + 2 + bends):
         raise CalibrationError(f"camera {name!r}: expected {expected} parameters of {model}, got {len(numbers)}")
     cx, cy, *coefficients = numbers[focals:]
-    if model == "THIN_PRISM_FISHEYE":
-        k1, k2, p1, p2, k3, k4, *prism = coefficients
-        if any((p1, p2, *prism)):
-            raise refusal(name, f"{model} with p1, p2, sx1 and sy1 of 0", shown(coefficients), WAY_OUT)
-        coefficients = [k1, k2, k3, k4]
     if lens != "pinhole":
         coefficients += [0.0] * (4 - len(coefficients)) if lens != "eucm" else []
     K = matrix(numbers[0], numbers[focals - 1], cx - 0.5, cy - 0.5)
@@ -215,15 +212,12 @@ def read_nuscenes(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     folder = path if path.is_dir() else path.parent
     channels = {row["token"]: row["channel"] for row in _table(folder, "sensor") if row["modality"] == "camera"}
     rows = [row for row in _table(folder, "calibrated_sensor") if row["sensor_token"] in channels]
-    rows = [row for row in rows if not mounting.tokens or row["token"] in mounting.tokens]
     by_name: dict[str, Mapping[str, Any]] = {}
     for row in rows:
         name = channels[row["sensor_token"]]
         if {**by_name.setdefault(name, row), "token": row["token"]} != row:
-            raise CalibrationError(
-                f"{name} has several calibrations: of which log? Write the tokens of one vehicle's rows to {MOUNTING} "
-                f"beside the file, tokens: [{row['token']}, ...]; or NuScenesDataset(root)[i]['rig'].save(FILE)"
-            )
+            fix = "save one vehicle's by NuScenesDataset(root)[i]['rig'].save(FILE)"
+            raise CalibrationError(f"{name} has several calibrations, of several logs: {fix}")
     sizes, table, cameras = {}, folder / "sample_data.json", []
     if not mounting.sizes and table.is_file() and table.stat().st_size <= _MOST_TABLE_BYTES:
         images = (row for row in _table(folder, "sample_data") if row.get("width"))

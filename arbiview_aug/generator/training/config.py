@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any, Literal
 
@@ -57,16 +57,12 @@ class LossConfig:
     perceptual_below_t: int = 300  # the x0 error is 0.57 times the ε error at t = 200, 14.6 times at t = 999
     perceptual_every: int = 4  # steps between two L_perceptual, whose mean weight is β / 4: decoding is slow
     perceptual_crop: int = 64  # side in pixels of the square that is compared
-    snr_limit: float = 5.0  # γ of Min-SNR-γ (Hang et al. 2023); 0 as printed. Unused by residual generators
-    snr_floor: float = 0.1  # lower bound of the weight: Min-SNR is .0047 at t = 999, where few-step samplers start
     known_weight: float = 0.2  # weight of known pixels relative to holes: they are pasted back at inference
     regression: float = 0.3  # share of the items that train the one-step regression; 0 switches it off
 
     def __post_init__(self) -> None:
         _check(self, "normalised or frobenius_sum", lambda m: m in ("normalised", "frobenius_sum"), "geo_mode")
-        _check(
-            self, "a finite number from 0", lambda w: 0 <= w < math.inf, "geo", "perceptual", "snr_limit", "snr_floor"
-        )
+        _check(self, "a finite number from 0", lambda w: 0 <= w < math.inf, "geo", "perceptual")
         _check(self, "a value in [0, 1)", lambda p: 0 <= p < 1, "regression")
         _check(self, "a value in (0, 1]", lambda w: 0 < w <= 1, "known_weight")
         _check(self, "at least 1", lambda n: n >= 1, "perceptual_every")
@@ -137,7 +133,7 @@ _PAPER = TrainConfig(
     pseudo_views=PseudoViewConfig(
         quality="paper", yaw_deg=(5.0, 35.0), height_m=_STILL, forward_m=_STILL, lateral_m=_STILL
     ),
-    loss=LossConfig(snr_limit=0.0, known_weight=1.0, regression=0.0),
+    loss=LossConfig(known_weight=1.0, regression=0.0),
     steps=100_000,
     batch=8,
     lr=1e-4,
@@ -152,7 +148,7 @@ _PAPER = TrainConfig(
 See Sec. Training Parameters. Deviations: x0 is the real view's latent (``training.losses``). Pseudo poses are turned
 but not moved: the published stages know rotations alone. L_geo is normalised, since as printed it outgrows L_main
 (``loss.geo_mode="frobenius_sum"``). L_perceptual compares crops at early times, in every 4th step. The learning rate is
-warmed up for 100 steps, and guidance is rescaled.
+warmed up for 100 steps.
 """
 
 CONFIGS = {
@@ -184,16 +180,6 @@ CONFIGS = {
         workers=12,
         save_every=1000,
         validate_every=1000,
-    ),
-    # Cross-view attention and LoRA on Stable Diffusion's frozen inpainting U-Net, two neighbouring targets an item.
-    "inpaint": replace(
-        _PAPER,
-        generator=PRESETS["inpaint"],
-        pseudo_views=PseudoViewConfig(targets=2),
-        loss=LossConfig(regression=0.0),
-        steps=20_000,
-        batch=4,
-        checkpointing=False,
     ),
     "paper": _PAPER,
 }

@@ -53,15 +53,6 @@ class ForwardProcess:
         a, s = self._at(t)
         return (x - s * predicted) / a.clamp(min=1e-4) if self.prediction == "epsilon" else a * x - s * predicted
 
-    def weight(self, t: torch.Tensor, limit: float, floor: float) -> torch.Tensor:
-        """(B,) Min-SNR-γ weights, at least ``floor``; 1 where the limit is 0."""
-        if not limit:
-            return torch.ones(t.shape, device=t.device)
-        a, s = self.signal.to(t.device)[t], self.noise.to(t.device)[t]
-        snr = (a / s.clamp(min=1e-6)) ** 2
-        weight = snr.clamp(max=limit) / (snr if self.prediction == "epsilon" else snr + 1).clamp(min=1e-8)
-        return weight.clamp(min=floor)
-
 
 def masked_mse(predicted: torch.Tensor, target: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     """(B,) weighted mean squared error of (B, N, C, h, w) latents; ``weight`` (B, N, 1, h, w) >= 0."""
@@ -193,10 +184,7 @@ class Step(nn.Module):
         predicted = self.denoiser(start, draws.t, views, windows, sources, rows).float()
         unit = self.denoiser.output_scale(draws.t, views)
         error = masked_mse(predicted / unit, target / unit, pixel_weight)
-        weight = torch.ones_like(error)
-        if not config.generator.residual:  # its unit makes all times alike
-            weight = self.diffusion.weight(t, loss.snr_limit, loss.snr_floor)
-        terms = {"main": (error * weight)[~is_regression].sum() / len(t)}
+        terms = {"main": error[~is_regression].sum() / len(t)}
         if loss.regression:
             terms["regression"] = error[is_regression].sum() / len(t)
         if rows is not None:

@@ -1,56 +1,52 @@
-"""The training loop and its command: steps, averaging, logs, validation and checkpoints (Algorithm 1)."""
+"""The training loop and its command (Algorithm 1): steps, averaging, logs, validation, and the state to resume from.
+
+Learning rates are functions of the step, and every draw comes from (seed, step): the state is the weights, their
+averages, the deviation and the optimiser. A resumed run equals one that never stopped.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 import math
-import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+import cv2
 import torch
+from torch import nn
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
 from arbiview_aug.cli.arguments import writable_folder
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import DataError, OutputError, TrainingError, one_line
-from arbiview_aug.evaluate.report.pictures import contact_sheet, save_picture
-from arbiview_aug.generator import Generator
+from arbiview_aug.errors import GeneratorError, OutputError, TrainingError, one_line, shown
 from arbiview_aug.generator.completion import denoised, shown_condition
 from arbiview_aug.generator.conditioning import pooled
 from arbiview_aug.generator.config import TrainedOn
-from arbiview_aug.generator.training.checkpointing import (
-    averaged,
-    has_state,
-    load_state,
-    save_state,
-    stop_requests,
-)
+from arbiview_aug.generator.generator import FILE, Generator, read_checkpoint, write_checkpoint
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
-from arbiview_aug.generator.training.data import Frames, item_workers, open_frames
 from arbiview_aug.generator.training.losses import Perceptual, Step, draw, load_perceptual
-from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
+from arbiview_aug.generator.training.pseudo_views import Batch, Frames, PseudoViews, collate, open_frames
 from arbiview_aug.inpaint.inpainter import digest_of
 
 _LOG_EVERY = 10
 _DEVIATION_ITEMS = 32
 _MIN_DEVIATION = 0.02  # lower bound of the residual's deviation, 2.5 grey levels: the error of rendering twice
-_TIMEOUT = timedelta(hours=3)  # of a process that waits for the others: they prepare frames, validate and save
+_TIMEOUT = timedelta(hours=3)  # of a process that waits for the others: they validate and save
 _SEEDS = {"items": 1, "validation": 2, "draws": 4}  # offsets: no stream sees another's draws
+_MAY_DIFFER = ("workers", "save_every", "validate_every", "validation_items")  # in a resumed run
 
 
 class Trainer:
     """Training of a generator's denoiser (Algorithm 1), on one process or many.
 
     The output folder gets ``generator/`` (averaged weights, for ``Generator.from_pretrained``), ``state/`` (to resume
-    from), ``log.jsonl`` (losses and scores by step) and ``validation/`` (PNG).
+    from) and ``log.jsonl`` (losses and scores by step).
 
     Args:
         generator: Trained in place on the ``frames``; its autoencoder is frozen.
@@ -61,9 +57,9 @@ class Trainer:
 
     Raises:
         TrainingError: The output holds a run with other settings, data, frozen weights or number of processes, or a
-            generator without a state; the generator is frozen or has another configuration; VGG16 is missing; the
-            process has another precision.
+            generator without a state; the generator is frozen or has another configuration; VGG16 is missing.
         ImportError: accelerate is not installed.
+        ValueError: The process has trained in another precision.
     """
 
     def __init__(
@@ -79,12 +75,8 @@ class Trainer:
     ) -> None:
         accelerate = optional_package("accelerate", "generator")
         self.config, self.frames, self.output = config, frames, Path(output)
-        try:
-            options = {"mixed_precision": config.precision, "cpu": not torch.cuda.is_available()}
-            self.accelerator = accelerate.Accelerator(**options)
-        except ValueError as error:
-            fix = "a process keeps its first precision; start another one"
-            raise TrainingError(f"Trainer: precision={config.precision}: {one_line(error)}; {fix}") from None
+        options = {"mixed_precision": config.precision, "cpu": not torch.cuda.is_available()}
+        self.accelerator = accelerate.Accelerator(**options)
         self.is_main: bool = self.accelerator.is_main_process
         self.show, self.say = show and self.is_main, say if self.is_main else lambda _: None
         self.device = self.accelerator.device
@@ -154,39 +146,30 @@ class Trainer:
         self.generator.denoiser.deviation.copy_(deviation)
 
     # --- the loop -----------------------------------------------------------------------------------------------------
-    def train(self) -> bool:
-        """Train to the last step, or until SIGTERM or SIGINT, and save; returns whether all steps are done.
+    def train(self) -> None:
+        """Train to the last step, and save.
 
         TrainingError if a loss or gradient is not finite, OutputError if the last state could not be saved.
         """
         config = self.config
         bar = tqdm(total=config.steps, initial=self.done, desc="train", unit="step", disable=not self.show)
-        try:
-            with stop_requests() as asked:
-                for batch in self._batches():
-                    terms = self.train_step(batch)
-                    self.done += 1
-                    bar.update()
-                    last = self.done == config.steps
-                    if self.done % _LOG_EVERY == 0 or last:
-                        self._log({**terms, "lr": learning_rate(config, self.done - 1)})
-                        bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()})
-                    if self.done % config.validate_every == 0 or last:
-                        self._validate()
-                    stops = torch.tensor(float(len(asked)), device=self.device)
-                    if self.accelerator.reduce(stops, "sum") > 0:  # all processes stop after the same step
-                        break
-                    if self.done % config.save_every == 0 and not last:
-                        try:
-                            self.save()
-                        except OutputError as error:
-                            self.say(f"step {self.done}: not saved, continuing with the last good state: {error}")
-                self.save()
-        finally:
-            bar.close()
-        if self.done < config.steps:
-            self.say(f"stopped after step {self.done} of {config.steps}; saved: the same command goes on from there")
-        return self.done == config.steps
+        with bar:
+            for batch in self._batches():
+                terms = self.train_step(batch)
+                self.done += 1
+                bar.update()
+                last = self.done == config.steps
+                if self.done % _LOG_EVERY == 0 or last:
+                    self._log({**terms, "lr": learning_rate(config, self.done - 1)})
+                    bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()})
+                if self.done % config.validate_every == 0 or last:
+                    self._validate()
+                if self.done % config.save_every == 0 and not last:
+                    try:
+                        self.save()
+                    except OutputError as error:
+                        self.say(f"step {self.done}: not saved, continuing with the last good state: {error}")
+            self.save()
 
     def train_step(self, batch: Batch) -> dict[str, float]:
         """Update the weights once; returns the loss terms, TrainingError if one or the gradient is not finite."""
@@ -222,7 +205,10 @@ class Trainer:
         config, world = self.config, self.accelerator.num_processes
         first = range(self.done * world + self.accelerator.process_index, config.steps * world, world)
         numbers: Any = [range(n * config.batch, (n + 1) * config.batch) for n in first]
-        return iter(DataLoader(self.items, batch_sampler=numbers, collate_fn=collate, **item_workers(config.workers)))
+        workers: dict[str, Any] = {"num_workers": config.workers}
+        if config.workers:  # not the default from Python 3.14: workers share what was read
+            workers |= {"multiprocessing_context": "fork", "worker_init_fn": lambda worker: cv2.setNumThreads(0)}
+        return iter(DataLoader(self.items, batch_sampler=numbers, collate_fn=collate, **workers))
 
     def _log(self, values: Mapping[str, float]) -> None:
         """Append a line to the log; a full disk costs the line, not the run."""
@@ -243,7 +229,7 @@ class Trainer:
             self.accelerator.wait_for_everyone()
 
     def _validate(self) -> None:
-        """Log samples of fixed items by the averaged weights, and their mean PSNR inside the holes, in dB by method."""
+        """Log the mean PSNR inside the holes, in dB by method, of fixed items sampled by the averaged weights."""
         config, steps = self.config, max(2, self.config.generator.steps)
         if self.is_main:
             batch = collate([self.validation[k] for k in range(config.validation_items)]).to(self.device)
@@ -251,14 +237,10 @@ class Trainer:
             with averaged(self.average, self.trained.values()):
                 if config.loss.regression:
                     methods["one_step"] = sampled(self.generator, batch, steps=1, seed=0)
-                methods[f"{steps}_steps"] = samples = sampled(self.generator, batch, steps=steps, seed=0)
+                methods[f"{steps}_steps"] = sampled(self.generator, batch, steps=steps, seed=0)
             inside = {name: hole_psnr(made, batch.truth, batch.holes) for name, made in methods.items()}
-            scores, image = {name: float(psnr.nanmean()) for name, psnr in inside.items()}, picture(batch, samples)
+            scores = {name: float(psnr.nanmean()) for name, psnr in inside.items()}
             self._log({f"hole_psnr/{name}": value for name, value in scores.items()})
-            try:
-                save_picture(self.output / "validation" / f"{self.done:06d}.png", image)
-            except DataError as error:
-                self.say(str(error))
             numbers = ", ".join(f"{name} {value:.2f}" for name, value in scores.items())
             self.say(f"step {self.done}: PSNR inside the holes, dB: {numbers}")
         self.accelerator.wait_for_everyone()
@@ -290,18 +272,98 @@ def hole_psnr(images: torch.Tensor, truth: torch.Tensor, holes: torch.Tensor) ->
     return -10 * torch.log10(mse.clamp(min=1e-10))
 
 
-COLUMNS = ("source", "FAVS", "mask", "filled", "sample", "truth")
+# --- the state of a run ----------------------------------------------------------------------------------------------
+@contextmanager
+def averaged(average: Any, parameters: Iterable[nn.Parameter]) -> Iterator[None]:
+    """Put the weights of diffusers' ``EMAModel`` into the parameters for a while."""
+    average.store(parameters := list(parameters))
+    average.copy_to(parameters)
+    try:
+        yield
+    finally:
+        average.restore(parameters)
 
 
-def picture(batch: Batch, samples: torch.Tensor) -> np.ndarray:
-    """(height, width, 3) uint8: a row for each item of a batch with samples (B, N, 3, H, W), a column for each view."""
-    mask = batch.known[:, :, None].float().expand_as(batch.favs)
-    columns = (batch.sources, batch.favs, mask, batch.condition, samples, batch.truth)
-    views = torch.cat([views[:, :1] for views in columns], 1).cpu().clamp(0, 1) * 255
-    rows = views.permute(0, 1, 3, 4, 2).numpy()  # [B, columns, h, w, 3]
-    width = len(COLUMNS) * max(120, rows.shape[3])  # smaller views are enlarged
-    titled = [(token, list(row), COLUMNS) for token, row in zip(batch.tokens, rows, strict=True)]
-    return contact_sheet(titled, width_px=width)
+def save_state(
+    folder: Path,
+    run: Mapping[str, Any],
+    step: int,
+    parameters: Mapping[str, nn.Parameter],
+    buffers: Mapping[str, torch.Tensor],
+    average: Any,
+    optimiser: torch.optim.Optimizer,
+) -> None:
+    """Write the state after ``step`` steps; OutputError if it fails, and the last state is unchanged.
+
+    ``run`` is plain data that must be the same in a resumed run. Accelerate's ``save_state`` pickles, and writes into
+    the folder in place.
+    """
+    tensors = {f"weights.{name}": parameter.detach() for name, parameter in parameters.items()}
+    tensors |= {f"buffers.{name}": value for name, value in buffers.items()}
+    tensors |= {f"average.{name}": value for name, value in zip(parameters, average.shadow_params, strict=True)}
+    for k, state in optimiser.state_dict()["state"].items():
+        tensors |= {f"optimiser.{k}.{key}": torch.as_tensor(value) for key, value in state.items()}
+    write_checkpoint(folder, {"step": step, "training": run}, tensors)
+
+
+def has_state(output: Path) -> bool:
+    """Whether a run's folder has a state to go on from; TrainingError for a generator without one.
+
+    A run writes its state first: a first save that was killed leaves a state, or neither, and can go on.
+    """
+    if (output / "state" / FILE).is_file():
+        return True
+    generator = output / "generator"
+    if generator.exists():
+        raise TrainingError(
+            f"{generator}: expected none, since {output / 'state'} holds no state to go on from, and a new run would "
+            f"replace the generator; give another --output, or remove {generator}"
+        )
+    return False
+
+
+def load_state(
+    folder: Path,
+    run: Mapping[str, Any],
+    parameters: Mapping[str, nn.Parameter],
+    buffers: Mapping[str, torch.Tensor],
+    average: Any,
+    optimiser: torch.optim.Optimizer,
+) -> int:
+    """Load a saved state into a run; returns its steps. TrainingError for another ``run``, or a broken state."""
+    with _broken(folder):
+        data, tensors = read_checkpoint(folder)
+        before, step = dict(data["training"]), data["step"]
+    now = json.loads(json.dumps(run))
+    changed = [name for name in now | before if name not in _MAY_DIFFER and before.get(name) != now.get(name)]
+    if changed:
+        fix = "resume with the same ones, or give another --output"
+        raise TrainingError(f"{folder}: a run with other {', '.join(changed)}; {fix}")
+    with _broken(folder):
+        if type(step) is not int or not 0 <= step <= now["steps"]:
+            raise ValueError(f"step: expected 0 to {now['steps']}, got {shown(step)}")
+        for (name, parameter), shadow in zip(parameters.items(), average.shadow_params, strict=True):
+            parameter.data.copy_(tensors[f"weights.{name}"])
+            shadow.copy_(tensors[f"average.{name}"])
+        for name, buffer in buffers.items():
+            buffer.copy_(tensors[f"buffers.{name}"])
+        average.optimization_step = step
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for name, value in tensors.items():
+            if name.startswith("optimiser."):
+                _, k, key = name.split(".")
+                state.setdefault(int(k), {})[key] = value
+        optimiser.load_state_dict({**optimiser.state_dict(), "state": state})
+    return step
+
+
+@contextmanager
+def _broken(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except (GeneratorError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        text = f"{one_line(error)}; delete it, or give another --output"
+        raise TrainingError(f"{folder}: expected the state of a training run: {text}") from None
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
@@ -316,8 +378,8 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
     settings, weights = config.generator, arguments.weights
     where = f"--config {settings.name}"
     if settings.frozen_unet and weights is None:
-        model = f"Stable Diffusion 1.5{' inpainting' if settings.inpainting else ''} in diffusers' layout"
-        raise TrainingError(f"{where}: expected --weights, a folder or hub id of {model}, for its frozen U-Net")
+        model = "Stable Diffusion 1.5 in diffusers' layout, for its frozen U-Net"
+        raise TrainingError(f"{where}: expected --weights, a folder or hub id of {model}")
     if not settings.frozen_unet and weights is not None:
         raise TrainingError(f"--weights: expected none for {where}, which is trained from scratch")
     if not settings.frozen_unet and settings.autoencoder.widths:
@@ -326,12 +388,6 @@ def run(arguments: argparse.Namespace, say: Callable[[str], None] = print) -> in
     options["perceptual"] = load_perceptual(arguments.vgg_weights) if config.loss.perceptual else None
     data = arguments.data or "synthetic"
     frames = open_frames(data, settings.image_size, scenes=config.scenes, seed=config.seed)
-    if data == "synthetic":
-        split = frames.split(config.seed)
-        used = [*split.training, *split.validation]
-        # Each process takes a second to start, a street half a second to render.
-        readers = min(8, os.cpu_count() or 1) if len(used) >= 16 else 0
-        frames.prepare(used, workers=readers, show=options["show"])
     torch.manual_seed(config.seed)
     made = Generator.from_config(settings) if weights is None else Generator.from_stable_diffusion(weights, settings)
     Trainer(config, frames, made.to(processes.device), output, **options).train()

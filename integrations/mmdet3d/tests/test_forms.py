@@ -13,10 +13,8 @@ import torch
 
 from arbiview_aug import (
     CalibrationError,
-    CropRig,
     Lidar,
     RandomRig,
-    ResizeRig,
     Rig,
     RigRetarget,
     SampleError,
@@ -25,6 +23,7 @@ from arbiview_aug import (
     load_rig,
 )
 from arbiview_aug.datasets.synthetic import SyntheticDrive
+from arbiview_aug.image_ops import resized
 from arbiview_aug.integrations.mmdet3d.matrices import MATRICES
 from arbiview_aug.integrations.mmdet3d.results import geometry
 from arbiview_aug.integrations.mmdet3d.transform import MEAN_STD, RigRetargetMultiView
@@ -171,7 +170,10 @@ def test_bevdet_takes_augmented_images_and_gives_untouched_ones(given: Recording
     assert torch.equal(post_rots, torch.eye(3).expand(6, 3, 3)) and not post_trans.any()
     assert torch.equal(ego2globals, results["img_inputs"][2][1].expand(6, 4, 4))
     size = tuple(results["img_inputs"][0].shape[-2:])
-    known = CropRig(12, 0, size)(ResizeRig((48, 132))(in_key_frame(given)))
+    key = in_key_frame(given)
+    images = torch.stack([resized(image, (48, 132))[:, 12 : 12 + size[0], : size[1]] for image in key["images"]])
+    rig = key["rig"].with_cameras([camera.resize((48, 132)).crop(12, 0, size) for camera in key["rig"]])
+    known = {**key, "images": images, "rig": rig}
     expected = RigRetarget(SOURCE, geometry="street")(known)
     assert np.mean(after["coverage"] == expected["coverage"].numpy()) > 0.999
     views = zip(pixels(after), expected["images"].permute(0, 2, 3, 1).numpy(), after["coverage"], strict=True)

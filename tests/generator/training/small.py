@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import Dataset
 
 from arbiview_aug.generator.training.config import LossConfig, TrainConfig
-from arbiview_aug.generator.training.data import Frames
+from arbiview_aug.generator.training.pseudo_views import Frames
 from tests.generator.small import ring, small_config
 
 SIZE = (16, 24)

@@ -10,9 +10,9 @@ import pytest
 
 from arbiview_aug.errors import GeneratorError, TrainingError
 from arbiview_aug.generator.config import from_plain
-from arbiview_aug.generator.training import data
+from arbiview_aug.generator.training import pseudo_views as data
 from arbiview_aug.generator.training.config import CONFIGS, TrainConfig, overridden
-from arbiview_aug.generator.training.data import Frames, open_frames
+from arbiview_aug.generator.training.pseudo_views import Frames, open_frames
 from tests.generator.training.small import SIZE, Pictures, frames
 
 

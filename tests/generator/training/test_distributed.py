@@ -29,7 +29,7 @@ rank, world = trainer.accelerator.process_index, trainer.accelerator.num_process
 seen = []
 plain = trainer.train_step
 trainer.train_step = lambda batch: (seen.extend(batch.tokens), plain(batch))[1]
-assert trainer.train()
+trainer.train()
 digest = sum(float(p.double().abs().sum()) for p in trainer.generator.denoiser.parameters())
 seen = sorted(int(token.split("/")[-1]) for token in seen)
 report = {"world": world, "digest": digest, "seen": seen}
@@ -52,4 +52,4 @@ def test_two_processes_train_one_model(tmp_path: Path) -> None:
     assert first["world"] == second["world"] == 2
     assert first["digest"] == second["digest"]
     assert first["seen"] == [0, 1, 4, 5, 8, 9] and second["seen"] == [2, 3, 6, 7, 10, 11]
-    assert len(list((tmp_path / "run" / "state").glob("weights-*.safetensors"))) == 1
+    assert len(list((tmp_path / "run" / "state").iterdir())) == 1

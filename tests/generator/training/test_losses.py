@@ -35,19 +35,6 @@ def diffusion(prediction: str = "v_prediction", zero_snr: bool = True) -> Forwar
     return ForwardProcess(small_config(prediction=prediction, zero_snr=zero_snr, residual=zero_snr))
 
 
-def test_min_snr_weights_have_a_floor() -> None:
-    t = torch.arange(1000)
-    for process in (diffusion(), diffusion("epsilon", zero_snr=False)):
-        weight = process.weight(t, 5.0, 0.1)
-        assert bool(torch.isfinite(weight).all()) and float(weight.min()) == pytest.approx(0.1)
-        assert float(weight.max()) <= 1.0001
-        assert torch.equal(process.weight(t, 0.0, 0.1), torch.ones(1000))
-    snr = diffusion().signal ** 2 / (diffusion().noise ** 2).clamp(min=1e-12)
-    v = diffusion().weight(t, 5.0, 0.0)
-    some = (snr < 5) & (snr > 1e-3)
-    assert torch.allclose(v[some], (snr / (snr + 1))[some], rtol=1e-3)
-
-
 def test_only_valid_pixels_count() -> None:
     predicted, target = torch.zeros(2, 1, 3, 4, 5), torch.zeros(2, 1, 3, 4, 5)
     predicted[0, :, :, :, :2], predicted[1] = 7.0, 2.0

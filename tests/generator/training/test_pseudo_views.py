@@ -14,8 +14,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator.training.config import CONFIGS, PseudoViewConfig
-from arbiview_aug.generator.training.data import Frames
-from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
+from arbiview_aug.generator.training.pseudo_views import Batch, Frames, PseudoViews, collate
 from arbiview_aug.inpaint.inpainter import seeded
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from tests.generator.training.small import SIZE, Pictures, config, frames
