@@ -1,9 +1,9 @@
 """Inpainters fill pixels of rendered views that no source shows: one protocol, ``Inpainter``, and its implementations.
 
 - ``continued``: the default, the background continued behind objects, and the mean colour;
-- ``telea``: Telea's fast marching; ``networks``, ``crops``: inpainting networks that others trained;
+- ``networks``: inpainting networks that others trained;
 - ``neighbours``: other frames of the drive, which fill before any of these;
-- ``inpainter``: the protocol, and filling after collating.
+- ``inpainter``: the protocol, filling after collating, and Telea's fast marching.
 
 The diffusion generator's inpainter is ``arbiview_aug.generator.Diffusion``.
 """
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from arbiview_aug.inpaint.inpainter import Black as Black
     from arbiview_aug.inpaint.inpainter import CompletedLoader as CompletedLoader
     from arbiview_aug.inpaint.inpainter import Inpainter as Inpainter
+    from arbiview_aug.inpaint.inpainter import Telea as Telea
     from arbiview_aug.inpaint.networks import NetworkInpainter as NetworkInpainter
     from arbiview_aug.inpaint.networks import PipelineInpainter as PipelineInpainter
     from arbiview_aug.inpaint.networks import TorchScriptInpainter as TorchScriptInpainter
-    from arbiview_aug.inpaint.telea import Telea as Telea
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -20,9 +20,8 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray
-from arbiview_aug.inpaint.inpainter import Inpainter, Tensors
-from arbiview_aug.inpaint.telea import GREY
-from arbiview_aug.render.plan import OBJECT, Paint
+from arbiview_aug.inpaint.inpainter import GREY, Inpainter, Tensors
+from arbiview_aug.render.plan import Paint
 from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.scene.boxes import PARTS
@@ -36,16 +35,9 @@ view's shorter side: nothing; upright things and road outside the sources' image
 SIDE_REACH = 1 / 4
 """The same of seen pixels of a body or cabin in the row and column of its unseen ones, against its colour."""
 
-PIXEL_REACH = 1 / 128
-"""The same of the nearest known pixels in a hole's row and column, against all of the above (docs/decisions.md)."""
-
 _LENS_NODES = 17  # directions of lines are interpolated between N nodes along each side; a pinhole's are linear
 _MOVE = 1e-4  # by which rays are moved along a line, as a share of their length
 _STEP_PX = 4  # distance of the nodes at which views without a plan know the road
-
-_WIDE = 2  # halvings of the columns alone: what is hidden looks like what is left and right of it
-_SWEEPS = 2
-"""Sweeps of smoothing at each size of the cells; more gain little (docs/decisions.md)."""
 
 Colour = npt.NDArray[np.float32]
 """(3,), or (n, 3) samples, in the images' unit."""
@@ -55,7 +47,7 @@ class Continue(Inpainter):
     """Continues the road along the heading, and upright things along the heading and vertically.
 
     Unseen parts of labelled objects: tops take the paint of their object's body and what a source sees of its tops
-    (``kernels.colour_objects``); sides continue their seen pixels. Covered pixels do not change.
+    (``paint_kernels.colour_objects``); sides continue their seen pixels. Covered pixels do not change.
     """
 
     outcome: ClassVar[str] = "filled in from its surroundings"
@@ -108,7 +100,8 @@ def fill_holes(
         only_mean: Set all to the mean colour of the frame's covered pixels. Else continue background from background,
             sides of objects from objects, and paint tops in their objects' colours.
     """
-    from arbiview_aug.inpaint import kernels
+    from arbiview_aug.inpaint.kernels import fill_background
+    from arbiview_aug.render.paint_kernels import paint as paint_parts
 
     seen = [of_view.cpu().numpy() for of_view in coverage]
     if all(of_view.all() for of_view in seen):
@@ -126,12 +119,14 @@ def fill_holes(
         if only_mean:
             view[:, ~known] = (mean + rounding)[:, None].astype(view.dtype)
             continue
-        of_view = np.zeros(known.shape, np.uint8) if layer is None else layer
-        _fill(view, known, of_view, on_road, camera, mean)
+        side, cell = min(known.shape), _cell_px(known.shape)
+        layer = np.zeros(known.shape, np.uint8) if layer is None else layer
+        on_road = _road_below_horizon(camera, known.shape) if on_road is None else on_road
+        lines = _line_directions(camera), REACH * np.float32(side / cell)
+        fill_background(view, known, layer, on_road, *lines, mean, cell, rounding)
         if objects is not None:
-            reach = SIDE_REACH * min(known.shape)
-            of_objects = objects.pixel, objects.part, objects.nearest
-            kernels.paint(*of_objects, colours, known, reach, rounding, view.reshape(3, -1))
+            parts = objects.pixel, objects.part, objects.nearest, colours
+            paint_parts(*parts, known, SIDE_REACH * side, rounding, view.reshape(3, -1))
     return [_like(*of_view) for of_view in zip(arrays, views, coverage, strict=True)]
 
 
@@ -148,66 +143,33 @@ def mean_colour(views: Sequence[npt.NDArray[Any]], coverage: Sequence[npt.NDArra
 
 def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | None]) -> Colour:
     """Colours (P, 3) of the parts of objects by their numbers in ``Paint``; -1 where unknown."""
-    from arbiview_aug.inpaint.kernels import colour_objects
+    from arbiview_aug.render.paint_kernels import colour_objects
 
-    painted = [(view.reshape(3, -1), p) for view, p in zip(views, paint, strict=True) if p is not None]
+    painted = [(view, p) for view, p in zip(views, paint, strict=True) if p is not None]
     if not any(len(p.pixel) for _, p in painted):
         return np.zeros((0, 3), np.float32)
-    samples = np.concatenate([view[:, p.sample] for view, p in painted], 1).T.astype(np.float32)
+    samples = np.concatenate([view.reshape(3, -1).take(p.sample, 1) for view, p in painted], 1).astype(np.float32)
     part = np.concatenate([p.sample_part for _, p in painted])
     colours = np.empty((PARTS * (part.max(initial=0) // PARTS + 1), 3), np.float32)
     colour_objects(samples, part, 255.0 if views[0].dtype == np.uint8 else 1.0, colours)
     return colours
 
 
-# --- one view ---------------------------------------------------------------------------------------------------------
-def _fill(
-    view: npt.NDArray[Any],
-    seen: BoolArray,
-    layers: npt.NDArray[np.uint8],
-    road: BoolArray | None,
-    camera: Camera | None,
-    mean: Colour,
-) -> None:
-    """Continue the background of a view."""
-    from arbiview_aug.inpaint.kernels import complete_cells, continue_lines, mark_cells, put_cells, sum_cells
-
-    cell = _cell_px(seen.shape)
-    sums = np.empty((4, *(-(-n // cell) for n in seen.shape)), np.float32)
-    for below in (OBJECT, OBJECT + 1):  # objects are all that is seen of some views
-        sum_cells(view, seen, layers, below, cell, sums)
-        if sums[3].any():
-            break
-    complete, around = (np.empty((4, *(-(-n // k) for n in sums.shape[1:])), np.float32) for k in (2, 4))
-    complete_cells(sums, mean, _WIDE, _SWEEPS, complete, around)
-    road = _road_below_horizon(camera, seen.shape) if road is None else road
-    kinds = np.empty(sums.shape[1:], np.uint8)
-    mark_cells(sums[3], seen, layers, road, cell, kinds)
-    reach = REACH * np.float32(min(seen.shape) / cell)
-    continue_lines(sums, around, complete, kinds, _line_directions(camera), reach)
-    rounding = 0.5 if view.dtype == np.uint8 else 0.0
-    put_cells(sums, cell, seen, layers, below, PIXEL_REACH * min(seen.shape), rounding, view)
-
-
+# --- one view -------------------------------------------------------------------------------------------------------
+@lru_cache(32)  # of a rig, frame by frame: a lens takes a millisecond
 def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
     """Directions (2, 2, n, n) in the image, x and y, of lines along the heading and vertical ones, as kernels read."""
     if camera is None:
         return np.array([(0, 0), (0, 1)], np.float32)[..., None, None].repeat(2, 2).repeat(2, 3)
-    if not camera.is_rectilinear:
-        return _bent_directions(camera)
-    ends = (camera.K @ camera.cam2ego[:3:2, :3].T).T[..., None, None]  # vanishing points, homogeneous
-    return np.asarray(ends[:, :2] - ends[:, 2:] * np.moveaxis(_places(camera.size, 2), -1, 0), np.float32)
-
-
-@lru_cache(32)  # of a rig, frame by frame: it takes a millisecond
-def _bent_directions(camera: Camera) -> npt.NDArray[np.float32]:
+    if camera.is_rectilinear:
+        ends = (camera.K @ camera.cam2ego[:3:2, :3].T).T[..., None, None]  # vanishing points, homogeneous
+        return np.asarray(ends[:, :2] - ends[:, 2:] * np.moveaxis(_places(camera.size, 2), -1, 0), np.float32)
     rays = camera.unproject_cam(_places(camera.size, _LENS_NODES)).directions
     start = camera.project_cam(rays).uv
     moved = [camera.project_cam(rays + _MOVE * axis).uv - start for axis in camera.cam2ego[:3:2, :3]]
     return np.nan_to_num(np.moveaxis(np.stack(moved), -1, 1) / _MOVE, posinf=0, neginf=0).astype(np.float32, "C")
 
 
-@lru_cache(32)
 def _places(size: tuple[int, int], n: int) -> npt.NDArray[np.float64]:
     """(n, n, 2) pixels from edge to edge of a view (h, w)."""
     h, w = size

@@ -169,7 +169,7 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
 
     ``find_overlaps(rig)`` takes longer than the rest: ``overlaps`` are given if they are known. Declined gains are 1.
     """
-    from arbiview_aug.render.photometry_kernels import tone
+    from arbiview_aug.render.photometry_kernels import overlap_errors
 
     overlaps = find_overlaps(rig) if overlaps is None else overlaps
     none = (1.0,) * len(rig)
@@ -188,14 +188,9 @@ def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overla
     log_gains = np.clip(_solve(len(rig), overlaps.pairs[:, enough], ratio, variance), -limit, limit)
     if np.abs(log_gains).max() < _MIN_LOG_GAIN:
         return PhotometricReport(none, False, "the cameras agree already")
-    gains = np.exp(log_gains)
-    before = _overlap_db(pixels, held_out)
-    runs = np.empty((2, 2 * count, 3), np.int64)
-    for k in range(2):
-        runs[..., k] = shared.ends[k : 2 * count + k] + np.array([[0], [pixels.shape[1]]])
-    runs[..., 2] = np.tile(overlaps.pairs, 2)
-    tone(pixels.reshape(-1), runs.reshape(-1, 3), tone_curves(gains).astype(np.float32), *SHARES)
-    after = _overlap_db(pixels, held_out)
+    gains, errors = np.exp(log_gains), np.empty((2, count))
+    overlap_errors(pixels, held_out, overlaps.pairs, tone_curves(gains).astype(np.float32), errors)
+    before, after = (-10 * np.log10(np.maximum(errors, 1e-10))).mean(1).tolist()
     reason = f"overlap {before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < MIN_RISE_DB:
         return PhotometricReport(none, False, f"gains would not help, {reason}")
@@ -244,13 +239,6 @@ def _solve(
     for name in set(group.tolist()):
         log_gains[group == name] -= median(log_gains[group == name].tolist())
     return log_gains
-
-
-def _overlap_db(pixels: _Pixels, ends: npt.NDArray[np.int64]) -> float:
-    """PSNR in dB between both readings of each of the last groups' pixels, mean over groups."""
-    errors = np.square(np.subtract(*pixels, dtype=np.float64)).mean(1)
-    errors = np.add.reduceat(errors, ends[:-1]) / np.diff(ends)
-    return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-10))))
 
 
 _MIN_SEAM_PIXELS, _SEAM_PRIOR, _MAX_SEAM_LOG_GAIN = 4, 0.1, 0.15

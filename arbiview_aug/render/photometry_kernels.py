@@ -6,24 +6,19 @@ from typing import Any
 
 import numpy as np
 
-from arbiview_aug.environment import compiled
+from arbiview_aug.environment import borrowing, compiled
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _MOST_SIDE_PX = 32767
 _AHEAD_COLUMNS, _MOST_AHEAD = 176, 32  # of a strip at a time; at most so many pixels are read for each of its own
+_BLOCK_PX = 128  # of a row that are compared at once
 
 
 @compiled
 def read_pixels(image: Any, camera: int, source: Any, at: Any, scale: Any, pixels: Any) -> None:
-    """Read one camera's pixels, times a scale; what is no number is 0.
+    """Read the pixels of a ``camera``'s image (3, h, w), times a float32 scale; what is no number is 0.
 
-    Args:
-        image: (3, h, w), the camera's.
-        camera: Its number.
-        source: (2, n) camera of each pixel.
-        at: (2, n, 2) row and column of each.
-        scale: Float32.
-        pixels: (2, n, 3) float32, written where ``source`` is this camera.
+    ``pixels`` (2, n, 3) are written where ``source`` (2, n) is this camera; ``at`` (2, n, 2) are rows and columns.
     """
     for side in range(2):
         for k in range(source.shape[1]):
@@ -34,15 +29,11 @@ def read_pixels(image: Any, camera: int, source: Any, at: Any, scale: Any, pixel
 
 @compiled
 def log_ratios(pixels: Any, ends: Any, dark: float, bright: float, measured: Any) -> None:
-    """Log-ratios between both readings of each group's pixels, where they count.
+    """Log-ratios between both readings ``pixels`` (2, n, 3) of each group, where they count.
 
-    Args:
-        pixels: (2, n, 3) float32 readings.
-        ends: (G + 1,) first pixel of each group, and the last one's end.
-        dark: Pixels count above this mean value,
-        bright: and below this value in every channel.
-        measured: (G, 3) float64, written: the number of pixels that count, and the median and spread of their
-            log-ratios; 0 without any.
+    Pixels count above the mean value ``dark``, and below ``bright`` in every channel. ``ends`` (G + 1,) are the groups'
+    first pixels and the last one's end; ``measured`` (G, 3) are written: the number of pixels that count, and the
+    median and spread of their log-ratios; 0 without any.
     """
     ratios = np.empty(pixels.shape[1])
     for g in range(len(ends) - 1):
@@ -63,26 +54,20 @@ def log_ratios(pixels: Any, ends: Any, dark: float, bright: float, measured: Any
 
 @compiled
 def sample_band(
-    weight: Any, y0: int, x0: int, step: int, xy: Any, band_xy: Any, slots: Any, rank: Any, parts: Any, groups: Any,
-    source: Any, at: Any, count: int,
+    weight: Any, y0: int, x0: int, step: int, xy: Any, band_xy: Any, slots: Any, rank: Any, parts: Any, rows: int,
+    keys: Any, source: Any, at: Any, count: int,
 ) -> int:  # fmt: skip
     """Sample the pixels of a blended band that two sources show; return the new number of samples.
 
-    Args:
-        weight: (h, w) share of the band's source, which counts where it is not 0.
-        y0: Row of the band in the view,
-        x0: and its column.
-        step: Distance of samples, pixels.
-        xy: (H, W, 2) positions of the view's pixels in the atlas.
-        band_xy: (h, w, 2) positions of the band's pixels in its source.
-        slots: (S, 6) x, y, width, height, source and halvings of the sources in the atlas.
-        rank: (N,) place of each source among those of the view, those that win more pixels first.
-        parts: (H,) part of the view's height of each row.
-        groups: (n, 4) rank and number of the worse source, number of the better one, and part of the height; written.
-        source: (2, n) the better and the worse source, written like ``at`` from ``count`` on.
-        at: (2, n, 2) row and column in each.
-        count: Samples written so far.
+    ``weight`` (h, w) of the band at (``y0``, ``x0``) counts where it is not 0. ``xy`` (H, W, 2) and ``band_xy`` (h, w,
+    2) are places in the atlas of the view and of the band, ``slots`` (S, 6) the sources' x, y, width, height, number
+    and halvings there, ``rank`` (N,) their places in the view, those that win more pixels first, and ``parts`` (H,)
+    the part of the height, of ``rows``, of each row, more by what tells views apart.
+
+    Written from ``count`` on: ``source`` (2, n), the better and the worse one; ``at`` (2, n, 2), row and column in
+    each; ``keys`` (n,), what sorts samples by view, rank and number of the worse source, the better one, and part.
     """
+    most = len(rank) + 1
     for y in range(0, weight.shape[0], step):
         for x in range(0, weight.shape[1], step):
             if weight[y, x] == _ZERO:
@@ -104,37 +89,91 @@ def sample_band(
                 for k in range(2):
                     at[0, count, k], at[1, count, k] = at[1, count, k], at[0, count, k]
             other = source[1, count]
-            groups[count, 0], groups[count, 1] = rank[other], other
-            groups[count, 2], groups[count, 3] = source[0, count], parts[y + y0]
+            keys[count] = ((rank[other] * most + other) * most + source[0, count]) * rows + parts[y + y0]
             count += 1
     return count
 
 
 @compiled
-def tone(values: Any, runs: Any, curves: Any, top: Any, rounding: Any) -> None:
-    """Put the pixels of a view through the tone curves of their sources.
+def overlap_errors(pixels: Any, ends: Any, pairs: Any, curves: Any, errors: Any) -> None:
+    """Mean squared differences of both readings of each group's pixels, as they are and after tone curves.
 
-    Args:
-        values: (3 n,) uint8 or float32, changed.
-        runs: (r, 3) first pixel, end and source of each run of pixels.
-        curves: (s, 2) float32 of each source, as ``harmonise.tone_curves`` makes them.
-        top: Largest value.
-        rounding: Added before the fraction is cut off.
+    ``pixels`` and ``ends`` as in ``log_ratios``; ``pairs`` (2, G) are both cameras, ``curves`` (N, 2) those of each,
+    and ``errors`` (2, G) are written.
+    """
+    both = np.empty((2, 3), np.float32)
+    for g in range(len(ends) - 1):
+        errors[:, g] = 0
+        for k in range(ends[g], ends[g + 1]):
+            for c in range(3):
+                errors[0, g] += (np.float64(pixels[0, k, c]) - np.float64(pixels[1, k, c])) ** 2
+            for side in range(2):
+                both[side] = pixels[side, k]
+                _tone(both[side], curves[pairs[side, g], 0], curves[pairs[side, g], 1], _ONE, _ZERO)
+            for c in range(3):
+                errors[1, g] += (np.float64(both[0, c]) - np.float64(both[1, c])) ** 2
+        errors[:, g] /= 3 * (ends[g + 1] - ends[g])
+
+
+@compiled
+def list_runs(values: Any, runs: Any) -> int:
+    """List the runs of equal values in the rows of an image (h, w): row, first column, end, value; return their number.
+
+    ``runs`` (h w, 4) are written.
+    """
+    (h, w), count = values.shape, 0
+    for y in range(h):
+        row, x = values[y], 0
+        while x < w:
+            end, value = x + 1, row[x]
+            while end < w:
+                block, others = row[end : end + _BLOCK_PX], 0
+                for k in range(len(block)):
+                    others += block[k] != value
+                if others:
+                    for k in range(len(block)):
+                        if block[k] != value:
+                            break
+                        end += 1
+                    break
+                end += len(block)
+            runs[count, 0], runs[count, 1], runs[count, 2], runs[count, 3] = y, x, end, value
+            count, x = count + 1, end
+    return count
+
+
+@compiled
+def tone(values: Any, runs: Any, curves: Any, top: Any, rounding: Any) -> None:
+    """Put the pixels of a view (h, 3 w) of interleaved colours, uint8 or float32, through their sources' tone curves.
+
+    ``runs`` (r, 4) are those of ``list_runs``, negative for no source; ``curves`` (N, h, 2) those of each source in
+    each row, as ``harmonise.tone_curves`` makes them. ``rounding`` is added before the fraction is cut off.
     """
     for r in range(len(runs)):
-        start, end, source = runs[r, 0], runs[r, 1], runs[r, 2]
-        gain, slope = curves[source, 0], curves[source, 1]
-        if gain == _ONE:
-            continue
-        part, offset = values[3 * start : 3 * end], top * (_ONE - slope)
-        if gain > _ONE:
-            for j in range(len(part)):
-                x = np.float32(part[j])
-                part[j] = min(x * gain, x * slope + offset) + rounding
-        else:
-            for j in range(len(part)):
-                x = np.float32(part[j])
-                part[j] = max(x * gain, x * slope + offset) + rounding
+        y, first, end, source = runs[r, 0], runs[r, 1], runs[r, 2], runs[r, 3]
+        if source >= 0:
+            _tone(values[y, 3 * first : 3 * end], curves[source, y, 0], curves[source, y, 1], top, rounding)
+
+
+@compiled
+def tone_band(values: Any, curves: Any, top: Any, rounding: Any) -> None:
+    """Put a band (h, 3 w) of one source through its curves (h, 2), as ``tone`` does."""
+    for y in range(len(values)):
+        _tone(values[y], curves[y, 0], curves[y, 1], top, rounding)
+
+
+@borrowing
+def _tone(part: Any, gain: Any, slope: Any, top: Any, rounding: Any) -> None:
+    """Put values (n,) through one curve."""
+    offset = top * (_ONE - slope)
+    if gain > _ONE:
+        for j in range(len(part)):
+            x = np.float32(part[j])
+            part[j] = min(x * gain, x * slope + offset) + rounding
+    elif gain != _ONE:
+        for j in range(len(part)):
+            x = np.float32(part[j])
+            part[j] = max(x * gain, x * slope + offset) + rounding
 
 
 @compiled
@@ -156,15 +195,23 @@ def blend(first: Any, second: Any, weight: Any, rounding: Any) -> None:
 def warm_up() -> None:
     """Compile these kernels, or load them from numba's cache."""
     source, at, ends = np.zeros((2, 1), np.int64), np.zeros((2, 1, 2), np.int64), np.array([0, 1])
-    pixels, curve, slots = np.ones((2, 1, 3), np.float32), np.ones((1, 2), np.float32), np.array([[0, 0, 1, 1, 0, 0]])
-    xy, weight = np.zeros((1, 1, 2), np.int16), np.ones((1, 1), np.float32)
+    pixels, curves, slots = (
+        np.ones((2, 1, 3), np.float32),
+        np.ones((1, 1, 2), np.float32),
+        np.array([[0, 0, 1, 1, 0, 0]]),
+    )
+    xy, weight, runs = np.zeros((1, 1, 2), np.int16), np.ones((1, 1), np.float32), np.zeros((1, 4), np.int32)
     log_ratios(pixels, ends, 0.0, 2.0, np.empty((1, 3)))
-    sample_band(weight, 0, 0, 1, xy, xy, slots, ends, ends, np.zeros((1, 4), np.int64), source, at, 0)
+    overlap_errors(pixels, ends, source, curves[0], np.empty((2, 1)))
+    sample_band(weight, 0, 0, 1, xy, xy, slots, ends, ends, 1, ends, source, at, 0)
+    list_runs(np.zeros((1, 1), np.int8), runs)
     for planes in (np.zeros((3, 1, 1), np.uint8), np.zeros((3, 1, 1), np.float32)):
         for image in (planes, planes.transpose(0, 2, 1)):  # channels first, and last
             read_pixels(image, 0, source, at, _ONE, pixels)
-        tone(planes.reshape(-1), np.zeros((1, 3), np.int64), curve, _ONE, _ZERO)
-        blend(planes.reshape(1, 3), planes.reshape(1, 3), weight, _ZERO)
+        view = planes.reshape(1, 3)
+        tone(view, runs, curves, _ONE, _ZERO)
+        tone_band(view, curves[0], _ONE, _ZERO)
+        blend(view, view, weight, _ZERO)
 
 
 @compiled

@@ -274,23 +274,12 @@ class ViewPlan:
         return "linear" if self.interpolation == "cubic" else self.interpolation
 
     @cached_property
-    def runs(self) -> npt.NDArray[np.int64]:
-        """(n, 3) runs of pixels of one source in a row of h: first one in the flattened view, end, source · h + row."""
-        winner, is_first = self.source_camera, np.ones(self.source_camera.shape, bool)
-        np.not_equal(winner[:, 1:], winner[:, :-1], out=is_first[:, 1:])
-        start = np.flatnonzero(is_first)
-        source, row = winner.ravel()[start].astype(np.int64), start // winner.shape[1]
-        runs = np.stack([start, np.append(start[1:], winner.size), source * len(winner) + row], 1)
-        return runs[runs[:, 2] >= 0]
+    def runs(self) -> npt.NDArray[np.int32]:
+        """(n, 4) runs of pixels of one source in a row: row, first column, end and source, -1 for none."""
+        from arbiview_aug.render.photometry_kernels import list_runs
 
-    @cached_property
-    def band_runs(self) -> list[npt.NDArray[np.int64]]:
-        """(rows, 3) runs of each band, as in ``runs`` but in the flattened band."""
-        h, runs = len(self.source_camera), []
-        for band in self.bands:
-            row, width = np.arange(len(band.weight)), band.weight.shape[1]
-            runs.append(np.stack([row * width, (row + 1) * width, band.source * h + band.y + row], 1))
-        return runs
+        runs = np.empty((self.source_camera.size, 4), np.int32)
+        return runs[: list_runs(self.source_camera, runs)].copy()
 
     @property
     def nbytes(self) -> int:
@@ -355,24 +344,25 @@ class RenderPlan:
 
         slots = np.array([[s.x, s.y, *s.size[::-1], s.source, s.level] for s in self.layout.slots], np.int64)
         count, most = 0, sum(band.weight.size for view in self.targets for band in view.bands)
-        keys, source, at = (np.empty(shape, np.int64) for shape in ((most, 5), (2, most), (2, most, 2)))
+        keys, source, at = (np.empty(shape, np.int64) for shape in (most, (2, most), (2, most, 2)))
+        shape = len(self.targets), *(len(self.source) + 1,) * 3, SEAM_ROWS  # view, rank, other and better source, part
         for number, view in enumerate(self.targets):
             step = max(1, view.source_camera.shape[1] // _SEAM_SAMPLES)
             rank, h = np.full(len(self.source), len(self.source)), len(view.source_camera)
             rank[[pair.source for pair in view.pairs]] = range(len(view.pairs))
-            parts, first = np.arange(h) * SEAM_ROWS // h, count
+            parts = np.arange(h) * SEAM_ROWS // h + number * int(np.prod(shape[1:]))
             for band in view.bands:
                 place = band.y, band.x, step, view.at.xy, band.at.xy
-                count = sample_band(band.weight, *place, slots, rank, parts, keys[:, 1:], source, at, count)
-            keys[first:count, 0] = number
-        order = np.lexsort(keys[:count, ::-1].T)
+                count = sample_band(band.weight, *place, slots, rank, parts, SEAM_ROWS, keys, source, at, count)
+        order = np.argsort(keys[:count], kind="stable")
         keys = keys[order]
-        starts = np.flatnonzero(np.diff(keys, axis=0, prepend=-1).any(1))
-        groups = keys[starts]
-        changes = np.flatnonzero(np.diff(groups[:, :3], axis=0, prepend=-1).any(1))
-        seams = np.column_stack([groups[changes][:, [0, 2]], changes, np.append(changes, len(groups))[1:]]).tolist()
+        starts = np.flatnonzero(np.diff(keys, prepend=-1))
+        views, _, other, better, part = np.unravel_index(keys[starts], shape)
+        changes = np.flatnonzero(np.diff(keys[starts] // (shape[3] * SEAM_ROWS), prepend=-1))
+        ends = np.append(changes, len(starts))[1:]
+        seams = np.column_stack([views[changes], other[changes], changes, ends]).tolist()
         shared = SharedPixels(source[:, order], at[:, order], np.append(starts, count))
-        return SeamSamples(shared, groups[:, 3], groups[:, 4], seams)
+        return SeamSamples(shared, better, part, seams)
 
     @property
     def coverage(self) -> list[BoolArray]:

@@ -51,7 +51,7 @@ def render_opencv(
     Returns:
         M views (3, h, w) of the images' type, black where no source sees; slices of one block where sizes agree.
     """
-    from arbiview_aug.render.photometry_kernels import blend, read_ahead, tone
+    from arbiview_aug.render.photometry_kernels import blend, read_ahead, tone, tone_band
 
     scratch = scratch or Scratch()
     dtype = images[0].dtype
@@ -65,7 +65,7 @@ def render_opencv(
         h, w = target.source_camera.shape
         if curves is not None:
             tones = curves[number].astype(np.float32)
-            tones = tones.reshape(-1, 2) if tones.ndim == 3 else tones.repeat(h, 0)
+            tones = tones if tones.ndim == 3 else tones[:, None].repeat(h, 1)
         change = np.zeros((h, w), np.float32) if seams is not None else None
         if seams is not None:
             seams.append(torch.from_numpy(change))
@@ -84,13 +84,13 @@ def render_opencv(
                 _put_edge(target.edge[first:end], at, atlas, buffer, rows)
         # Tone the views, not the sources: these have more pixels, and would have to be copied.
         if curves is not None:
-            tone(buffer.reshape(-1), target.runs, tones, *scale)
-        for k, band in enumerate(target.bands):
+            tone(buffer.reshape(h, -1), target.runs, tones, *scale)
+        for band in target.bands:
             bh, bw = band.weight.shape
             rows, columns = slice(band.y, band.y + bh), slice(band.x, band.x + bw)
             second = _remap(atlas, band.at.xy, band.at.frac, target.seam_interpolation)
             if curves is not None:
-                tone(second.reshape(-1), target.band_runs[k], tones, *scale)
+                tone_band(second.reshape(bh, -1), tones[band.source, rows], *scale)
             if change is not None:
                 difference = np.abs(buffer[rows, columns].astype(np.float32) - second).mean(-1)
                 change[rows, columns] += difference * band.weight

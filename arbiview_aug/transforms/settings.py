@@ -117,7 +117,7 @@ def inpainter_of(holes: Any) -> Inpainter:
 
 _INPAINTERS = {
     "continue": "inpaint.continued:Continue",
-    "telea": "inpaint.telea:Telea",
+    "telea": "inpaint.inpainter:Telea",
     "mean": "inpaint.continued:Mean",
     "black": "inpaint.inpainter:Black",
     "diffusion": "generator.completion:Diffusion",

@@ -20,8 +20,9 @@ from arbiview_aug.scene.scene import Scene
 
 GROUPS = {
     "objects": (
-        "transforms.warm_up:warm_up_boxes inpaint.kernels:warm_up render.photometry_kernels:warm_up",
-        "scene.kernels:draw_solids inpaint.kernels:paint render.photometry_kernels:blend",
+        "transforms.warm_up:warm_up_boxes inpaint.kernels:warm_up render.paint_kernels:warm_up "
+        "render.photometry_kernels:warm_up",
+        "scene.kernels:draw_solids inpaint.kernels:fill_background render.photometry_kernels:blend",
     ),
     "plans": ("render.view_planner:warm_up", "render.photometry_kernels:read_ahead"),
     "points": (

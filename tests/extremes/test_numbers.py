@@ -160,7 +160,12 @@ def test_curves_stay_in_range_and_rise(gain: float, worst: Worst) -> None:
     lines = x * curve[0], 1 - (1 - x) * curve[1]
     exact, triple = np.minimum(*lines) if gain > 1 else np.maximum(*lines), x.astype(np.float32).repeat(3)
     for values, scale in ((levels, LEVELS), (triple, SHARES)):
-        tone(values, np.array([[0, len(values) // 3, 0]]), curve[None].astype(np.float32), *scale)
+        tone(
+            values[None],
+            np.array([[0, 0, len(values) // 3, 0]], np.int32),
+            curve[None, None].astype(np.float32),
+            *scale,
+        )
     single = triple[::3]
     for y in (exact, single):
         assert y[0] == 0 and y[-1] == pytest.approx(1, abs=1e-6) and (np.diff(y) >= -1e-6).all()

@@ -15,8 +15,7 @@ from arbiview_aug import Camera, Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.inpaint import continued as holes_module
 from arbiview_aug.inpaint.continued import Continue, Mean, _line_directions, fill_holes, mean_colour, object_colours
-from arbiview_aug.inpaint.inpainter import Inpainter
-from arbiview_aug.inpaint.telea import Telea
+from arbiview_aug.inpaint.inpainter import Inpainter, Telea
 from arbiview_aug.render.paint_kernels import find_paint
 from arbiview_aug.render.plan import BACKGROUND, OBJECT, OCCLUDED, Paint
 from arbiview_aug.render.view_planner import build_plan

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from arbiview_aug.inpaint.crops import Window, drawn, packed, windows
+from arbiview_aug.inpaint.networks import Window, drawn, packed, windows
 
 
 def holes(seed: int, shape: tuple[int, int], kind: str) -> np.ndarray:

@@ -21,7 +21,7 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, Generator, load_inpainter
 from arbiview_aug.inpaint import Black, CompletedLoader, PipelineInpainter, TorchScriptInpainter
-from arbiview_aug.inpaint.telea import telea
+from arbiview_aug.inpaint.inpainter import telea
 from arbiview_aug.render.rendered import Views
 from arbiview_aug.sample.inputs import read_frames
 from integrations.benchmarks.study import peak_mib

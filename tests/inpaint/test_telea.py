@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from arbiview_aug.inpaint.telea import RADIUS_PX, telea
+from arbiview_aug.inpaint.inpainter import RADIUS_PX, telea
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.float64, torch.float16])

@@ -202,9 +202,9 @@ def test_tone_curves() -> None:
     for gain in (0.4, 0.7, 0.95, 1.0, 1.05, 1.3, 2.5):
         curve, values = tone_curves(gain), np.arange(768) // 3
         levels, shares = values.astype(np.uint8), (values / 255).astype(np.float32)
-        runs, lines = np.array([[0, 256, 0]]), curve[None].astype(np.float32)
-        tone(levels, runs, lines, *LEVELS)
-        tone(shares, runs, lines, *SHARES)
+        runs, lines = np.array([[0, 0, 256, 0]], np.int32), curve[None, None].astype(np.float32)
+        tone(levels[None], runs, lines, *LEVELS)
+        tone(shares[None], runs, lines, *SHARES)
         line = levels[::3].astype(int)
         assert line[0] == 0 and line[255] == 255 and (np.diff(line) >= 0).all(), "saturated stays saturated"
         knee = int(255 * KNEE / max(gain, 1))
@@ -221,15 +221,15 @@ def test_runs_hold_every_pixel_with_its_own_source() -> None:
     winner[np.add.outer(np.arange(70), 2 * np.arange(90)) > 120] = 3
     winner[20:30, 10:20] = 5
     winner[60:, 50:] = -1
-    for one in (winner, np.full((40, 8), -1, np.int8), np.zeros((40, 8), np.int8)):
-        seen = np.full(one.size, -1, np.int8)
-        for start, end, source in ViewPlan(
+    wide = (np.arange(3 * 700) // 129 % 3 - 1).astype(np.int8).reshape(3, 700)  # runs that cross blocks of a row
+    for one in (winner, wide, np.full((40, 8), -1, np.int8), np.zeros((40, 8), np.int8)):
+        seen = np.full(one.shape, -2, np.int8)
+        for row, first, end, source in ViewPlan(
             FixedMap(np.zeros((*one.shape, 2), np.int16), np.zeros(one.shape, np.uint16)), one, (), ()
         ).runs:
-            assert (seen[start:end] == -1).all(), "no pixel gets two curves"
-            seen[start:end] = source // len(one)
-            assert start // one.shape[1] == (end - 1) // one.shape[1] == source % len(one), "every row has its own"
-        assert np.array_equal(seen, one.ravel())
+            assert (seen[row, first:end] == -2).all(), "no pixel gets two curves"
+            seen[row, first:end] = source
+        assert np.array_equal(seen, one)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.45])

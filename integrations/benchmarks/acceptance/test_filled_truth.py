@@ -15,7 +15,7 @@ from arbiview_aug import Camera, Rig, RigRetarget, SampleKeys
 from arbiview_aug.datasets import FrameFolder, Neighbours
 from arbiview_aug.datasets.synthetic import RenderedViews, SceneClass, SyntheticDrive, demo_source_rig
 from arbiview_aug.evaluate.metrics import psnr_db
-from arbiview_aug.inpaint.telea import telea
+from arbiview_aug.inpaint.inpainter import telea
 from integrations.benchmarks.acceptance.protocol import frame_folder
 from integrations.benchmarks.speed import looking_down
 from tests.helpers import Standing
