@@ -41,6 +41,7 @@ class RenderConfig:
         seam_width: Width of the blended band along a seam, as a fraction of the target's width; 0 switches blending
             off. Wider bands show double images of near objects, narrower ones the exposure step.
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
+        sky: Let photographs tell, over LiDAR, what is sky where no scan line returned (``scene.sky``).
         certainty: Store the geometry's accuracy in plans, one byte a pixel, for ``SampleKeys(extra=("confidence",))``.
         layers: Store what holes show (``ViewPlan.layers``, ``paint``, ``road``); ``RigRetarget`` sets it by ``holes``.
     """
@@ -49,6 +50,7 @@ class RenderConfig:
     antialias: bool = True
     seam_width: float = 0.03
     overlap_depth: bool = False
+    sky: bool = False
     certainty: bool = False
     layers: bool = True
 
@@ -74,7 +76,7 @@ def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
 PRESETS = {
     "draft": RenderConfig(interpolation="nearest", seam_width=0.0),
     "fast": RenderConfig(),
-    "accurate": RenderConfig(overlap_depth=True),
+    "accurate": RenderConfig(overlap_depth=True, sky=True),
 }
 """Settings by ``quality``."""
 

@@ -27,6 +27,7 @@ class Scene:
     points: Points | None = None  # (P, 3) measured points, metres
     motion: Maps | None = None  # depth maps from motion
     sweeps: Points | None = None  # (P, 3) points of neighbouring frames beyond ``points``, metres
+    sky: Points | None = None  # (P, 3) points on what photographs show where no scan line returned, metres
     # depth maps and arrays of other sample keys that a row of ``GEOMETRIES`` reads
     further: Mapping[str, Geometry] = field(default_factory=dict)
     corrections: tuple[Correction, ...] = ()  # of the street's distances by depth from overlap
@@ -100,8 +101,8 @@ def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: 
     from arbiview_aug.scene.kernels import close_gaps
 
     boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
-    sweeps = None if points is None else scene.sweeps
-    parts = [np.zeros((0, 3), np.float32) if part is None else part[:, :3] for part in (points, sweeps)]
+    further = (None, None) if points is None else (scene.sweeps, scene.sky)
+    parts = [np.zeros((0, 3), np.float32) if part is None else part[:, :3] for part in (points, *further)]
     together = np.concatenate(parts, dtype=np.float32)
     together = together[: close_gaps(together, np.concatenate([own_car(part) for part in parts]))]
     known, pixels = [], np.zeros(0, np.int32)

@@ -38,6 +38,7 @@ from arbiview_aug.sample.inputs import (
 )
 from arbiview_aug.sample.neighbours import points_of_neighbours
 from arbiview_aug.scene.scene import GEOMETRIES, Scene
+from arbiview_aug.scene.sky import sky_points
 from arbiview_aug.transforms.settings import PlanCache, unseen_note
 
 _MIXED_P = 0.5
@@ -210,6 +211,8 @@ class PlannedRenderer:
             sweeps = points_of_neighbours(frame, self.warn) if self.settings.reach and scene.points is not None else []
             if sweeps:
                 scene = replace(scene, sweeps=np.concatenate([sweep[:, :3] for sweep in sweeps]))
+            if self.config.sky and scene.points is not None and len(scene.points):
+                scene = replace(scene, sky=sky_points(frame.rig, frame.images, scene.points, self._maps))
         if row.needs == "motion" and scene.motion is None:
             before = [part for part in [scene.geometry("points")] if part is not None]
             scene = replace(scene, motion=motion.maps(frame.rig, before) if motion else ())
