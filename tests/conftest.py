@@ -121,6 +121,15 @@ def referee(data_root: Path) -> ModuleType:
     return module
 
 
+@pytest.fixture(scope="session")
+def generator() -> Any:
+    """A small generator, not to be changed."""
+    pytest.importorskip("diffusers")
+    from tests.generator.small import small_generator
+
+    return small_generator()
+
+
 @pytest.fixture
 def own_ray(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Ray on this machine alone, which ends with the test."""

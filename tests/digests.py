@@ -23,14 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arbiview_aug import (
-    PlanCache,
-    RandomRig,
-    RigRetarget,
-    SampleKeys,
-    load_rig,
-    project_boxes_3d,
-)
+from arbiview_aug import PlanCache, RandomRig, RigRetarget, SampleKeys, load_rig, project_boxes_3d
 from arbiview_aug.__main__ import main
 from arbiview_aug.datasets import FrameFolder, Neighbours, NuScenesDataset
 from arbiview_aug.datasets.synthetic import SyntheticDrive

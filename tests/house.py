@@ -6,9 +6,16 @@ import inspect
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from types import FrameType
+from typing import Any
 
 import arbiview_aug
+from arbiview_aug import RigRetarget, load_rig
+from arbiview_aug.datasets import Neighbours
+from arbiview_aug.datasets.synthetic import SyntheticDrive
 from tests.test_docs import DOCS, ROOT, tables, text_of
 from tests.test_imports import PACKAGE
 
@@ -46,9 +53,50 @@ def measures() -> Iterator[tuple[str, int, int]]:
     yield "lines of its constructor", len(inspect.getsource(arbiview_aug.RigRetarget.__init__).splitlines()), 40
 
 
+def traced(retarget: RigRetarget, sample: Mapping[str, Any]) -> tuple[int, int]:
+    """Files that a call touches, and Python calls from a function in one of them to a function in another one."""
+    files, crossings = set[str](), 0
+
+    def profile(frame: FrameType, event: str, _: Any) -> None:
+        nonlocal crossings
+        to, caller = frame.f_code.co_filename, frame.f_back
+        if event == "call" and to.startswith(str(PACKAGE)):
+            files.add(to)
+            crossings += caller is not None and to != caller.f_code.co_filename in files
+
+    sys.setprofile(profile)
+    try:
+        retarget(sample)
+    finally:
+        sys.setprofile(None)
+    return len(files), crossings
+
+
+def calls() -> Iterator[tuple[str, int, int]]:
+    """``traced`` calls of each kind, with warm caches but for what every frame brings."""
+    rig = load_rig("nuscenes").undistorted().resized((90, 160))
+    drive = SyntheticDrive(rig, num_frames=3, neighbours=Neighbours(count=1, step_m=1.2))[1]
+    bare = {key: drive[key] for key in ("images", "rig")}
+    boxes = {**bare, "points": drive["points"], "boxes_3d": drive["boxes_3d"]}
+    target = replace(load_rig("argoverse2").undistorted().resized((64, 96)), lidars=())
+    for name, settings, sample, *most in (
+        ("street", {}, bare, 20, 60),
+        ("LiDAR and boxes", {}, boxes, 32, 550),
+        ("motion", {"geometry": "motion"}, bare | {"neighbours": drive["neighbours"]}, 32, 350),
+        ("paper", {"quality": "paper"}, bare, 23, 200),
+    ):
+        retarget = RigRetarget(target, **settings)
+        retarget(sample)
+        moved = {"points": sample["points"] + 0.01} if "points" in sample else {}  # which needs a new plan
+        for what, count, bound in zip(("files", "crossings"), traced(retarget, {**sample, **moved}), most, strict=True):
+            yield f"a call over {name}: {what}", count, bound
+
+
 def main() -> int:
     """Print all; 1 if one is beyond its bound."""
-    rows = list(measures())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        rows = [*measures(), *calls()]
     for what, count, most in rows:
         print(f"{what}: {count:d} of {most}{'  <--' if count > most else ''}")
     return int(any(count > most for _, count, most in rows))

@@ -21,19 +21,8 @@ generator's folder: it reads data sets and scores, which the generator does not 
 """
 
 HEAVY = (
-    "arbiview_aug.cameras.formats.calibration",
-    "numba",
-    "diffusers",
-    "safetensors",
-    "torchvision",
-    "sklearn",
-    "kornia",
-    "scipy",
-    "matplotlib",
-    "PIL",
-    "ray",
-    "accelerate",
-    "transformers",
+    *("arbiview_aug.cameras.formats.calibration", "numba", "diffusers", "safetensors", "torchvision", "sklearn"),
+    *("kornia", "scipy", "matplotlib", "PIL", "ray", "accelerate", "transformers"),
 )
 
 

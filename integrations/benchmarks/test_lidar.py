@@ -13,7 +13,7 @@ from arbiview_aug.cli.parsers import SIZE
 from integrations.benchmarks.acceptance.protocol import frame_folder
 from integrations.benchmarks.lidar import PAIRS, ddad, main, measured_near, rings_dropped
 from integrations.benchmarks.speed import measure
-from tests.evaluate.test_scans import LIDAR, at
+from tests.evaluate.test_metrics import LIDAR, at
 
 
 @pytest.mark.slow

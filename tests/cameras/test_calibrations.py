@@ -444,26 +444,6 @@ def test_poses_of_the_imu_alone(tmp_path: Path) -> None:
     np.testing.assert_allclose(rig[1].center_m, FORWARD[:3] @ [0.5, 0, 0, 1])  # 0.3 and 0.2 m to the right of the IMU
 
 
-@pytest.mark.parametrize(
-    ("row", "lens"),
-    [
-        ({"camera_distortion": BENT}, "radtan"),
-        ({"camera_distortion": []}, "pinhole"),
-        ({"camera_distortion": FOUR, "camera_model": "equidistant"}, "fisheye"),
-        ({"camera_distortion": FOUR}, "write distortion_model"),
-        ({"camera_distortion": BENT, "rectification_matrix": TURNED}, "expected the identity"),
-    ],
-)
-def test_lenses_of_tables_like_nuscenes(tmp_path: Path, row: dict[str, Any], lens: str) -> None:
-    path = nuscenes_tables(tmp_path) / "calibrated_sensor.json"
-    first, *others = json.loads(path.read_text())
-    path.write_text(json.dumps([{**first, **row}, *others]))
-    if " " in lens:
-        refused(path, lens)
-    else:
-        assert load_rig(path)[0].lens == lens
-
-
 # --- folders and files ------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("file", "text", "message"),

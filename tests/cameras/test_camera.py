@@ -227,14 +227,3 @@ def test_convention_resize_keeps_outer_edges(size: tuple[int, int]) -> None:
     # Wrong reading: K scaled by diag(s, s, 1) is off by (s - 1) / 2 pixels.
     scaled = np.diag([size[1] / 200, size[0] / 100, 1.0]) @ c.K
     assert abs(scaled[0, 2] - small.K[0, 2]) == pytest.approx(abs(size[1] / 200 - 1) / 2)
-
-
-def test_convention_resize_agrees_with_opencv() -> None:
-    # A smooth ramp in x resized by area averaging: its values are the positions of the new pixel centres.
-    ramp = np.tile(np.arange(200, dtype=np.float32), (100, 1))
-    half = cv2.resize(ramp, (100, 50), interpolation=cv2.INTER_AREA)
-    c = posed()
-    x = np.array([[10.0, 20.0], [40.0, 30.0]])
-    directions = c.resize((50, 100)).unproject(x).directions
-    uv = c.project(c.center_m + directions).uv
-    np.testing.assert_allclose(half[x[:, 1].astype(int), x[:, 0].astype(int)], uv[:, 0], atol=1e-4)

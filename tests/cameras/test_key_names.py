@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import pickle
 import warnings
-from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 import torch
 
 from arbiview_aug import Camera, Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.cameras.key_names import USUAL_NAMES, meant_by
-from arbiview_aug.datasets import FrameFolder
 
 BOXES = torch.tensor([[8.0, 1.0, 0.8, 4.0, 2.0, 1.6, 0.1]])
 RIG = Rig(
@@ -110,70 +104,8 @@ def test_the_table_is_of_other_names() -> None:
         assert all(meant_by(other, (name,)) == name for other in others) and name not in others
 
 
-# --- calib.json and rig files -----------------------------------------------------------------------------------------
-def write_frame(folder: Path, calib: dict[str, Any], camera: dict[str, Any]) -> Path:
-    folder.mkdir()
-    whole = RIG.to_dict()
-    entry = {**whole["cameras"][0], "file": "front.png", **camera}
-    text = {**whole, "cameras": [{k: v for k, v in entry.items() if v != "absent"}], **calib}
-    (folder / "calib.json").write_text(json.dumps({k: v for k, v in text.items() if v != "absent"}))
-    cv2.imwrite(str(folder / "front.png"), np.zeros((12, 16, 3), np.uint8))
-    return folder
-
-
-def read(folder: Path) -> list[str]:
-    """Warnings when a frame is read, twice."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        data = FrameFolder(folder)
-        assert data[0]["rig"].names == data[0]["rig"].names
-        pickle.loads(pickle.dumps(data))
-    return [str(w.message) for w in caught]
-
-
-@pytest.mark.parametrize(
-    ("calib", "camera", "words"),
-    [
-        ({"boxes_3D": BOXES.tolist()}, {}, "'boxes_3D' is not read; did you mean 'boxes_3d'?"),
-        ({"lidar_points": "points.npy"}, {}, "'lidar_points' is not read; did you mean 'lidar'?"),
-        ({}, {"masks": "front_mask.png"}, "'masks' is not read; did you mean 'mask'?"),
-    ],
-)
-def test_calibration_files_warn_once(calib: dict[str, Any], camera: dict[str, Any], words: str, tmp_path: Path) -> None:
-    (said,) = read(write_frame(tmp_path / "a", calib, camera))
-    assert "calib.json" in said and words in said
-
-
-@pytest.mark.parametrize(
-    ("calib", "camera", "words"),
-    [
-        ({}, {"K": "absent", "intrinsics": RIG.K[0].tolist()}, "missing K; found 'intrinsics': did you mean 'K'?"),
-        ({}, {"file": "absent", "filename": "front.png"}, "found 'filename': did you mean 'file'?"),
-        ({}, {"distortion": "absent", "distortions": [0.1, 0, 0, 0]}, "'distortions' is not read: did you mean"),
-        ({}, {"distortion": "absent", "dist_coeffs": {"model": "radtan"}}, "'dist_coeffs' is not read: did you mean"),
-        ({"ground_z_m": "absent", "ground_z": -0.3}, {}, "'ground_z' is not read: did you mean 'ground_z_m'?"),
-        ({"cameras": "absent", "cams": []}, {}, "found 'cams': did you mean 'cameras'?"),
-    ],
-)
-def test_lost_geometry_is_refused(calib: dict[str, Any], camera: dict[str, Any], words: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError) as caught:
-        read(write_frame(tmp_path / "a", calib, camera))
-    assert words in str(caught.value) and "calib.json" in str(caught.value)
-
-
-def test_notes_stay_notes(tmp_path: Path) -> None:
-    calib = {"license": "as you like", "timestamp": 1, "labels": [1], "boxes_2d": [], "lidar_points": 1200}
-    camera = {"timestamp": 1, "distortions": [0, 0, 0, 0], "lens": "6 mm", "cam2ego_static": RIG.cam2ego[0].tolist()}
-    assert not read(write_frame(tmp_path / "a", calib, {**camera, "distortion": "absent"}))
-    both = {"distortion": {"model": "pinhole", "coeffs": []}, "dist_coeffs": [0.1, 0, 0, 0]}
-    assert not read(write_frame(tmp_path / "b", {"ground_z": 3}, both))
-
-
 @pytest.mark.parametrize(("alias", "lens"), [("opencv_radtan", "radtan"), ("opencv_fisheye", "fisheye")])
-def test_opencvs_lenses_by_their_other_names(alias: Any, lens: str, tmp_path: Path) -> None:
-    bent: dict[str, Any] = {"model": alias, "coeffs": [0.1, -0.02, 0.003, 0.001]}
-    rig = FrameFolder(write_frame(tmp_path / "a", {}, {"distortion": bent}))[0]["rig"]
-    assert rig[0].lens == lens == rig.to_dict()["cameras"][0]["distortion"]["model"]
-    lensed = sample(distortion=torch.tensor([[*bent["coeffs"], 0, 0, 0, 0]]), ground_z_m=-0.2)
+def test_opencvs_lenses_by_their_other_names(alias: str, lens: str) -> None:
+    lensed = sample(distortion=torch.tensor([[0.1, -0.02, 0.003, 0.001, 0, 0, 0, 0]]), ground_z_m=-0.2)
     named, alike = (RigRetarget(RIG.turned(yaw_deg=3))({**lensed, "lens": [name]}) for name in (alias, lens))
     assert torch.equal(named["coverage"], alike["coverage"]) and named["coverage"].any()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -98,21 +97,6 @@ def test_one_draw_a_sequence() -> None:
     generators = [torch.Generator().manual_seed(seed) for seed in (5, 5, 6)]
     five, again, six = (random_rig.draw_for({"scene_token": "a"}, rng) for rng in generators)
     assert five == again != six
-
-
-def test_set_epoch_draws_anew_and_reaches_copies_in_other_processes() -> None:
-    torch.manual_seed(0)
-    random_rig = by_sequence()
-    draws = []
-    for epoch in (0, 1, 0):
-        random_rig.set_epoch(epoch)
-        draws.append(random_rig.draw_for({"scene_token": "a"}))
-    assert draws[0] == draws[2] != draws[1]
-    for other in (copy.deepcopy(random_rig), pickle.loads(pickle.dumps(random_rig))):
-        assert other._epoch.is_shared()
-        other.set_epoch(1)
-        assert other.draw_for({"scene_token": "a"}) == draws[1]
-    assert random_rig.draw_for({"scene_token": "a"}) == draws[0]
 
 
 def test_batches_of_sequences() -> None:

@@ -85,6 +85,7 @@ REFUSED: tuple[tuple[Callable[[], object], str], ...] = (
     (lambda: make(cam2ego=POSE.T), r"cam2ego: expected last row \(0, 0, 0, 1\).*pass cam2ego.T"),
     (lambda: make(K=edited(K, (0, 0), -500.0)), r"positive focal lengths, 1e-06 px at least, got fx -500"),
     (lambda: make(K=edited(K, (1, 1), 5e-324)), r"1e-06 px at least, got fx 500, fy 4.94"),
+    (lambda: make(K=edited(K, (0, 0), 1e308)), r"K: expected entries of at most 1e\+09 px"),
     (lambda: make(mask=np.ones((640, 480), bool)), r"mask: .*\(480, 640\), the size \(h, w\) .*, got .*\(640, 480\)"),
     (lambda: make(mask=np.ones((480, 640), np.uint8)), r"mask: expected bool.*pass mask > 0"),
     (lambda: make(mask=[[True], [True, False]]), r"mask: expected a bool array, got "),

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
-import inspect
 import json
 import os
 import re
@@ -14,16 +12,16 @@ import sys
 import warnings
 from collections.abc import Iterator
 from functools import partial
-from importlib import metadata
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
 
 from arbiview_aug import __main__, environment, load_rig
-from arbiview_aug.__main__ import COMMANDS, Command, main
+from arbiview_aug.__main__ import COMMANDS, main
 from arbiview_aug.choices import TRAINING_PRESETS, GeometryName, Quality
-from arbiview_aug.cli import parallel
+from arbiview_aug.cli import doctor, parallel
 from arbiview_aug.cli.parsers import parser_of
 from arbiview_aug.datasets.frame_folder import write_frame
 from arbiview_aug.errors import OutputError
@@ -33,27 +31,11 @@ from arbiview_aug.scene.scene import GEOMETRIES
 from tests.helpers import latin, street_sample
 
 
-@pytest.fixture(autouse=True)
-def nobody_was_warned() -> None:
-    environment.warn_about_cv2_wheels.cache_clear()
-
-
-def wheels(monkeypatch: pytest.MonkeyPatch, **installed: str) -> None:
-    def fake(name: str) -> str:
-        try:
-            return installed[name.replace("-", "_")]
-        except KeyError:
-            raise metadata.PackageNotFoundError(name) from None
-
-    monkeypatch.setattr(metadata, "version", fake)
-
-
 def test_two_cv2_wheels_warn_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    wheels(monkeypatch, opencv_python="4.10.0", opencv_contrib_python_headless="5.0.0")
-    message = (
-        r"opencv-python 4.10.0 and opencv-contrib-python-headless 5.0.0 are installed together: .*"
-        r"pip uninstall -y opencv-python opencv-contrib-python-headless && pip install opencv-contrib-python-headless"
-    )
+    environment.warn_about_cv2_wheels.cache_clear()
+    installed = {"opencv-python": "4.10.0", "opencv-contrib-python": "5.0.0"}
+    monkeypatch.setattr(environment, "installed_version", installed.get)
+    message = r"opencv-python 4.10.0 and .* 5.0.0 are installed together: .* pip install opencv-contrib-python"
     with pytest.warns(RuntimeWarning, match=message):
         environment.warn_about_cv2_wheels()
     with warnings.catch_warnings():
@@ -132,6 +114,10 @@ def mistakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             for option in ("frames 5", "downscale 2", "clean-masks")
         ),
         ("convert --data frame --target waymo --output o --fit pad", "argument --fit: expected --size with it"),
+        *(
+            (f"convert --data frame --target waymo --output o {option}", "expected")
+            for option in ("--holes diffusion --generator none", "--size 40000x8", "--depth none")
+        ),
         ("demo --seed 1000000000000000000000", r"expected a whole number from 0, at most 2\*\*60, got"),
     ],
 )
@@ -218,12 +204,6 @@ def test_usage(capsys: pytest.CaptureFixture[str]) -> None:
     assert "unknown command 'paint'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", COMMANDS.values())
-def test_every_command_runs_a_function(command: Command) -> None:
-    module = importlib.import_module(f"arbiview_aug.{command.module}")
-    assert next(iter(inspect.signature(module.run).parameters)) == "arguments"
-
-
 def test_help_imports_nothing_that_takes_time() -> None:
     """Neither torch nor OpenCV nor numba, and none of the package's modules of work, before arguments are parsed."""
     code = f"""
@@ -299,3 +279,36 @@ def test_help_is_complete(name: str, capsys: pytest.CaptureFixture[str]) -> None
     assert "(default: " in said
     if "[KIND:]PATH" in said:
         assert all(kind in said for kind in ("frames: frame folder", "nuscenes: nuScenes root"))
+
+
+# --- python -m arbiview_aug doctor ------------------------------------------------------------------------------------
+def test_a_sound_installation(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["doctor", "--size", "64x176"]) == 0
+    printed = capsys.readouterr().out
+    for part in ("numba ", "opencv ", "threads: ", "GPUs: ", "compiled kernels: ", "street "):
+        assert part in printed
+    assert "PROBLEM" not in printed and not list(tmp_path.iterdir())
+
+
+def test_two_wheels_are_a_problem(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    installed = {"opencv-python": "5.0", "opencv-contrib-python": "4.9"}
+    monkeypatch.setattr(environment, "installed_version", installed.get)
+    monkeypatch.setattr(doctor, "_frame", lambda _: (True, "a frame"))
+    assert main(["doctor"]) == 1
+    assert re.search("^PROBLEM: OpenCV: .*pip uninstall -y opencv-python ", capsys.readouterr().out, re.MULTILINE)
+
+
+def test_kernels_that_are_whole_damaged_and_missing(tmp_path: Path) -> None:
+    folder = tmp_path / "room" / "__pycache__"
+    folder.mkdir(parents=True)
+    assert doctor._kernels(None) == (False, "compiled kernels: not kept; set NUMBA_CACHE_DIR to a writable folder")
+    is_fine, text = doctor._kernels(str(folder))
+    assert is_fine and text.startswith(f"compiled kernels: 0 files in {tmp_path}; the first frames wait")
+    (folder / "kernels.sha256.nbi").write_bytes(b"index" + sha256(b"index").digest())
+    (folder / "kernels.sha256.1.nbc").write_bytes(b"code" + sha256(b"other").digest())
+    is_fine, text = doctor._kernels(str(folder))
+    assert not is_fine and "1 files" in text and "1 damaged files are deleted" in text
+    assert [path.name for path in folder.iterdir()] == ["kernels.sha256.nbi"] and doctor._kernels(str(folder))[0]

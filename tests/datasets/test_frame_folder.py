@@ -126,6 +126,14 @@ def edit(key: str, value: Any, camera: int | None = None) -> Change:
     return lambda calib: (calib if camera is None else calib["cameras"][camera]).update({key: value})
 
 
+def renamed(key: str, name: str, camera: int | None = None) -> Change:
+    def change(calib: dict[str, Any]) -> None:
+        entries = calib if camera is None else calib["cameras"][camera]
+        entries[name] = entries.pop(key)
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
@@ -152,6 +160,12 @@ def edit(key: str, value: Any, camera: int | None = None) -> Change:
         (edit("lens", "fisheye", 0), CalibrationError, "'lens' is not read: write distortion: {model: LENS"),
         (edit("mask", "small.png", 1), CalibrationError, r"'back': mask: expected shape \(48, 64\)"),
         # what would change the meaning
+        (renamed("K", "intrinsics", 0), CalibrationError, "missing K; found 'intrinsics': did you mean 'K'?"),
+        (renamed("file", "filename", 0), DataError, "found 'filename': did you mean 'file'?"),
+        (renamed("distortion", "distortions", 1), CalibrationError, "'distortions' is not read: did you mean"),
+        (renamed("distortion", "dist_coeffs", 1), CalibrationError, "'dist_coeffs' is not read: did you mean"),
+        (renamed("ground_z_m", "ground_z"), CalibrationError, "'ground_z' is not read: did you mean 'ground_z_m'?"),
+        (renamed("cameras", "cams"), DataError, "found 'cams': did you mean 'cameras'?"),
         (edit("xi", 0.9, 0), CalibrationError, "camera 'front': xi: 0.9 is not read; write distortion"),
         (edit("rectified", False, 0), CalibrationError, "rectified: False is not read"),
         (edit("distortion_model", "equidistant", 0), CalibrationError, "'equidistant' is not read"),
@@ -165,6 +179,21 @@ def test_bad_calibrations(tmp_path: Path, change: Change, error: type[Exception]
         dataset[0]
     assert "broken" in str(raised.value)  # the frame is named, whatever went wrong
     assert len(str(raised.value).replace(str(tmp_path), "")) < 1000
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (renamed("boxes_3d", "boxes_3D"), "'boxes_3D' is not read; did you mean 'boxes_3d'?"),
+        (edit("lidar_points", "points.npy"), "'lidar_points' is not read; did you mean 'lidar'?"),
+        (edit("masks", "front_mask.png", 0), "'masks' is not read; did you mean 'mask'?"),
+    ],
+)
+def test_keys_under_other_names_are_warned_of_once(tmp_path: Path, change: Change, words: str) -> None:
+    data = FrameFolder(frame(tmp_path, change))
+    with pytest.warns(UserWarning, match="calib.json") as said:
+        assert data[0]["rig"].names == data[0]["rig"].names
+    assert len(said) == 1 and words in str(said[0].message)
 
 
 def test_a_mask_that_was_drawn_anew_is_read_again(tmp_path: Path) -> None:
@@ -223,17 +252,23 @@ def test_folders_that_are_none(tmp_path: Path) -> None:
         dataset[0]
 
 
-def test_notes_of_neutral_lenses_and_byte_order_marks(tmp_path: Path) -> None:
+def test_notes_of_neutral_lenses_and_byte_order_marks(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
     notes = {"rectified": True, "camera_model": "FLIR BFS", "k1": 0, "distortion_model": "plumb_bob", "lens": "6 mm"}
-    frame(tmp_path / "000", lambda calib: calib["cameras"][0].update(notes))
+    notes |= {"distortions": [0, 0, 0, 0], "cam2ego_static": np.eye(4).tolist()}
+
+    def change(calib: dict[str, Any]) -> None:
+        calib |= {"license": "as you like", "timestamp": 1, "labels": [1], "boxes_2d": [], "lidar_points": 12}
+        calib["ground_z"] = 3
+        calib["cameras"][0].update(notes)
+        calib["cameras"][1]["distortion"]["model"] = "opencv_fisheye"
+        calib["cameras"][1]["dist_coeffs"] = [0.1, 0, 0, 0]  # the right key is there as well
+
+    frame(tmp_path / "000", change)
     (tmp_path / "sequence.json").write_text(json.dumps({"frames": ["000"]}))
     for path in (tmp_path / "sequence.json", tmp_path / "000" / "calib.json"):
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
-    assert FrameFolder(tmp_path)[0]["scene_token"] == tmp_path.name
-    for text in ('{"frames": {}}', '{"frames": [{"name": "000", "timestamp": 1}]}', "{}"):
-        (tmp_path / "sequence.json").write_text(text)
-        with pytest.raises(DataError, match=r"got (TypeError: frames|ValueError: timestamp, which|no 'frames')"):
-            FrameFolder(tmp_path)
+    sample = FrameFolder(tmp_path)[0]
+    assert sample["scene_token"] == tmp_path.name and sample["rig"]["back"].lens == "fisheye" and not list(recwarn)
 
 
 # --- masks that are cleaned -------------------------------------------------------------------------------------------

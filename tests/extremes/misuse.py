@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Container
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
@@ -91,6 +91,8 @@ OPTIONAL: dict[str, Callable[[], Any]] = {
     "ego_mask": lambda: torch.zeros(2, *SIZE, dtype=torch.bool),
     "ego2world": lambda: torch.eye(4, dtype=torch.float64),
     "token": lambda: "t",
+    **{f"{kind}_depth_m": lambda: torch.full((2, *SIZE), 12.0) for kind in ("motion", "learned")},
+    "neighbours": lambda: [{"images": torch.zeros(2, 3, *SIZE), "ego2ego": torch.eye(4), "time_s": -0.5}],
 }
 """Keys that a sample may have."""
 
@@ -121,11 +123,12 @@ def wrong_samples(draw: st.DrawFn) -> dict[str, Any]:
 
 
 @st.composite
-def settings(draw: st.DrawFn, keys: Container[str]) -> dict[str, Any]:
+def settings(draw: st.DrawFn, keys: Collection[str]) -> dict[str, Any]:
     """Right settings of a ``RigRetarget`` for a sample with these keys."""
 
     surfaces = ["auto", "auto", "infinity", "ground", "street"]
     surfaces += ["boxes"] * ("boxes_3d" in keys) + ["lidar"] * ("points" in keys or "depth_m" in keys)
+    surfaces += [kind for kind in ("motion", "learned", "fused") if {f"{kind}_depth_m", "neighbours"} & {*keys}]
     choices: dict[str, tuple[Any, ...]] = {
         "quality": ("fast", "fast", "fast", "fast", "draft", "accurate", "accurate", "paper"),
         "frame": ("source", "source", "target"),
@@ -159,7 +162,7 @@ SETTING_JUNK: tuple[Callable[[], Any], ...] = (
 )
 
 
-def wrong_settings(keys: Container[str]) -> st.SearchStrategy[dict[str, Any]]:
+def wrong_settings(keys: Collection[str]) -> st.SearchStrategy[dict[str, Any]]:
     """Settings of a ``RigRetarget`` with one of them wrong."""
     wrong = st.tuples(st.sampled_from(SETTING_NAMES), fresh((*JUNK, *SETTING_JUNK)))
     return st.tuples(settings(keys), wrong).map(lambda drawn: {**drawn[0], drawn[1][0]: drawn[1][1]})

@@ -150,19 +150,6 @@ def exact(name: str, cam2ego: list[list[float]], focal_px: float, **values: Any)
     return Camera(name=name, width_px=97, height_px=73, K=K, cam2ego=cam2ego, **values)
 
 
-@pytest.mark.parametrize("lens", LENSES)
-def test_points_on_the_image_plane(lens: str) -> None:
-    """z = 0 is seen by a fisheye alone; the centre, what is just behind, and what is straight behind by none."""
-    source = exact("s", FORWARD, 30.0, **LENSES[lens])
-    beside = [[0.0, y, z] for y in (-9.0, 1e-3, 1e9) for z in (0.0, 1.5, 1e6)]
-    got = source.project(beside)
-    assert np.isfinite(got.uv).all() and (got.valid == (lens in reference.WIDE)).all()
-    never = source.project([[0.0, 0.0, 1.5], [-5.0, 0.0, 1.5], [-1e-300, 0.0, 1.5], [-1e9, 0.0, 1.5]])
-    assert np.isfinite(never.uv).all() and not never.valid.any()
-    behind = source.project([[-1e-12 * y, y, 1.5] for y in (1.0, -3.0, 1e9)])
-    assert np.isfinite(behind.uv).all() and (behind.valid == (lens in reference.WIDE)).all()
-
-
 @pytest.mark.parametrize("surface", ["infinity", "ground", "street", "lidar"])
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_column_of_pixels_on_the_image_plane(lens: str, surface: str, worst: Worst) -> None:
@@ -204,31 +191,3 @@ def test_a_horizon_exactly_on_a_row(surface: str, worst: Worst) -> None:
     distance_m = np.inf if surface == "infinity" else 41.0  # the wall straight ahead: 40 m from 1 m before the origin
     assert rise_px[1] == pytest.approx(50.0 * 0.7 / distance_m, abs=MAP_TOLERANCE_PX)
     assert np.abs(np.diff(rise_px) + 1).max() <= 2 * MAP_TOLERANCE_PX + 1e-3, "the rows beside it continue it"
-
-
-MARGIN_M = 0.4  # two pixels of the source, 14 m away
-
-
-@pytest.mark.parametrize("side", [-1.0, 1.0])
-@pytest.mark.parametrize("rows", [48, 192])  # pixel by pixel, and on the coarse grid
-def test_boxes_hide_boxes_and_the_street(rows: int, side: float) -> None:
-    """The target looks from the side behind a box that hides another, no wider one from the source."""
-    size = {"height_px": rows, "width_px": rows * 4 // 3, "horizontal_fov_deg": 90.0}
-    source = Rig([camera("s", position_m=(0.0, 0.0, 1.5), **size)])
-    target = Rig([camera("t", position_m=(0.0, 6.0 * side, 1.8), azimuth_deg=-20.0 * side, **size)])
-    boxes = np.array([[x, 0.0, 1.0, 0.5, 4.0, 2.0, 0.0] for x in (8.0, 14.0)])
-    coverage = build_plan(source, target, geometry="boxes", scene=Scene(boxes=boxes)).targets[0].coverage
-    seen = reference.seen(source[0], target[0], "boxes", 0.0, boxes)
-    directions, _ = reference.rays(target[0])
-    near, far = (reference.box_distance(box, target[0].center_m, directions) for box in boxes)
-    inside = seen.valid & source[0].contains(seen.uv)
-    hidden = np.zeros_like(inside)
-    hidden[inside] = reference.hidden(source[0], seen.point_m[inside], boxes, MARGIN_M / 2)
-    on_far = inside & np.isfinite(far) & ~np.isfinite(near)
-    street = inside & ~np.isfinite(far) & ~np.isfinite(near)
-    for what, pixels in (("the box behind", on_far & hidden), ("the street", street & hidden)):
-        assert pixels.sum() > rows / 4, what
-        assert not coverage[pixels].any(), f"{what} is read through the box before it"
-    clear = street.copy()
-    clear[street] = ~reference.hidden(source[0], seen.point_m[street], boxes, -MARGIN_M)
-    assert coverage[clear].mean() > 0.98, "and nothing else is hidden"

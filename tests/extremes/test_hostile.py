@@ -120,7 +120,6 @@ class Boundaries:
             "record": (records, lambda _: self._go_on()),
             "generator": ([*self.generator.glob("*.safetensors")], self._read_generator),
         }
-        self.sound = tree(root)
 
     def holds(self, name: str, data: st.DataObject) -> bool:
         """Whether a drawn input of a boundary worked."""
@@ -192,23 +191,6 @@ def test_every_boundary_works_or_refuses(boundaries: Boundaries, worst: Worst, n
     return worked
 
 
-def test_files_that_mutations_found(boundaries: Boundaries) -> None:
-    """Each was another package's exception."""
-    frames = [{"name": "0000", "time_s": 10**400}, {"name": "0001", "time_s": 1.0}]
-    infinite = io.BytesIO()
-    with np.load(boundaries.depths.path("0000")) as file:
-        np.savez(infinite, **{**file, "format": np.array(np.inf)})
-    for file, content, read, message in (
-        ("drive/sequence.json", json.dumps({"frames": frames}).encode(), FrameFolder, "expected .* got OverflowError"),
-        ("depth/0000.npz", infinite.getvalue(), None, "expected depth of a frame, got OverflowError; delete it"),
-    ):
-        path = boundaries.root / file
-        path.write_bytes(content)
-        with pytest.raises(ArbiviewError, match=rf"{path.name}: {message}"):
-            read(path.parent) if read else boundaries.depths.read("0000", FRAMES)
-        path.write_bytes(boundaries.sound[file])
-
-
 def sample(**more: Any) -> dict[str, Any]:
     return {"images": torch.zeros(2, 3, *misuse.SIZE), "rig": misuse.rig(), **more}
 
@@ -241,6 +223,10 @@ REFUSED: tuple[tuple[Callable[[], object], str], ...] = (
     (lambda: RenderConfig(seam_width=10**400), r"RenderConfig\.seam_width"),
     (lambda: RenderConfig(antialias="no"), r"RenderConfig\.antialias: expected True or False"),  # type: ignore[arg-type]
     (lambda: PaperConfig(far_weight=None), r"PaperConfig\.far_weight: expected 0"),  # type: ignore[arg-type]
+    (lambda: PaperConfig(beta=1.5), r"PaperConfig\.beta: expected 0 to 1, got 1\.5"),
+    (lambda: PaperConfig(min_matches=3), r"PaperConfig\.min_matches: expected 4 to"),
+    (lambda: PaperConfig(consistent_px=30.0), r"consistent_px: expected less than inconsistent_px=24"),
+    (lambda: PaperConfig(far_weight=-1.0), r"PaperConfig\.far_weight: expected 0 to"),
     (lambda: PaperConfig(use_feature_matching="off"), "use_feature_matching: expected True or False, got 'off'"),  # type: ignore[arg-type]
     *((lambda p=params: RigRetarget(RandomRig(TARGET, yaw_deg=5.0))(sample(), p), "params")  # type: ignore[misc]
       for params in ({"yaw_deg": "x"}, {"skipped": None}, 3, ["yaw_deg"])),
@@ -308,3 +294,20 @@ def test_threads_do_not_disturb_each_other(settings: dict[str, Any]) -> None:
         assert torch.equal(images, fresh(moving(k % 35))["images"])
     assert retarget.renderer.plans.misses <= count
     assert retarget.renderer.plans.size <= retarget.cache.max_bytes or len(retarget.renderer.plans) == 1
+
+
+def test_files_that_mutations_found(boundaries: Boundaries) -> None:
+    """Each was another package's exception."""
+    frames = [{"name": "0000", "time_s": 10**400}, {"name": "0001", "time_s": 1.0}]
+    infinite = io.BytesIO()
+    with np.load(boundaries.depths.path("0000")) as file:
+        np.savez(infinite, **{**file, "format": np.array(np.inf)})
+    for file, content, read, message in (
+        ("drive/sequence.json", json.dumps({"frames": frames}).encode(), FrameFolder, "expected .* got OverflowError"),
+        ("depth/0000.npz", infinite.getvalue(), None, "expected depth of a frame, got OverflowError; delete it"),
+    ):
+        path = boundaries.root / file
+        path.write_bytes(content)
+        with pytest.raises(ArbiviewError, match=rf"{path.name}: {message}"):
+            read(path.parent) if read else boundaries.depths.read("0000", FRAMES)
+        path.write_bytes(boundaries.sound[file])

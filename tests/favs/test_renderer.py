@@ -230,6 +230,3 @@ def test_messages(pair_images) -> None:
         retarget({"images": images, "rig": PAIR})
     with pytest.raises(ValueError, match="there is no plan"):
         retarget.prepare(PAIR)
-
-
-# --- a real frame -----------------------------------------------------------------------------------------------------

@@ -14,13 +14,12 @@ from torch.utils.data import default_collate
 from arbiview_aug import Camera, Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.inpaint import continued as holes_module
-from arbiview_aug.inpaint.continued import Continue, Mean, _line_directions, fill_holes, mean_colour, object_colours
+from arbiview_aug.inpaint.continued import Continue, Mean, fill_holes, object_colours
 from arbiview_aug.inpaint.inpainter import Inpainter, Telea
 from arbiview_aug.render.paint_kernels import find_paint
-from arbiview_aug.render.plan import BACKGROUND, OBJECT, OCCLUDED, Paint
+from arbiview_aug.render.plan import OBJECT, OCCLUDED, Paint
 from arbiview_aug.render.view_planner import build_plan
-from arbiview_aug.scene.boxes import PARTS, RIM_PART, TOP_PART
-from arbiview_aug.scene.scene import Scene
+from arbiview_aug.scene.boxes import PARTS, TOP_PART
 from tests.helpers import camera, ring, street_sample
 
 SETTINGS = ("continue", "mean", "black")
@@ -131,63 +130,6 @@ def test_what_the_own_car_hides_is_continued() -> None:
         assert filled.min() > mean + 20  # the road around it, not the frame's mean colour
 
 
-# --- which of them lie in a source's image ----------------------------------------------------------------------------
-@pytest.mark.parametrize("size", [(64, 80), (128, 160), (256, 320)])
-@pytest.mark.parametrize("lens", ["pinhole", "radtan", "fisheye"])
-def test_occluded_pixels_are_those_that_an_image_contains(size: tuple[int, int], lens: str) -> None:
-    distortion = {"pinhole": (), "radtan": (-0.1, 0.01, 0.0, 0.0, 0.0), "fisheye": (-0.02, 0.003, 0.0, 0.0)}[lens]
-    mask = np.ones((128, 160), bool)
-    mask[100:] = False
-    source = Rig([replace(camera(size=(128, 160), lens=lens, distortion=distortion), mask=mask)])
-    target = Rig([camera(size=size, azimuth_deg=15)]).turned(pitch_deg=-10)
-    (view,) = build_plan(source, target, geometry="infinity").targets
-    v, u = np.indices(size, dtype=np.float64)
-    rays, _ = target[0].unproject_cam(np.stack([u, v], -1))
-    points = rays @ target[0].cam2ego[:3, :3].T @ source[0].cam2ego[:3, :3]
-    uv, _, valid = source[0].project_cam(points)
-    expected = valid & source[0].contains(uv) & ~view.coverage
-    assert view.layers is not None and expected.any() and (~view.coverage & (view.layers == BACKGROUND)).any()
-    assert np.count_nonzero((view.layers == OCCLUDED) != expected) < 0.002 * expected.size
-
-
-@pytest.mark.parametrize("surface", ["boxes", "lidar"])
-def test_plans_know_what_is_occluded_and_where_the_road_lies(street: dict[str, Any], surface: Any) -> None:
-    target = raised(street)
-    plan = RigRetarget(target, geometry=surface).explain(street).plan
-    occluded = [view.layers == OCCLUDED for view in plan.targets if view.layers is not None]
-    assert sum(map(np.count_nonzero, occluded)) > 300
-    assert not any(part[0].mean() > 0.5 for part in occluded)  # over the top edge nobody looks
-    for viewpoint, view in zip(target, plan.targets, strict=True):
-        assert view.layers is None or not ((view.layers == OCCLUDED) & view.coverage).any()
-        assert view.road is not None and view.road.shape == tuple(-(-n // 8) + 1 for n in viewpoint.size)
-        assert not view.road[0].any() and view.road[-1].mean() > 0.5  # above and below the horizon
-
-
-def test_holes_where_no_other_source_looks_show_road_and_objects() -> None:
-    """As if the cameras stood 5 cm ahead, where no source is exact: the target alone decides."""
-    size = (96, 160)
-    source = Rig([camera("front", size=size), camera("left", 60, size=size, position_m=(0.0, 0.5, 1.5))])
-    target = Rig([camera("turned", -40, size=size).turned(pitch_deg=-8)])
-    scene = Scene(boxes=np.array([(6.0, -3.0, 0.8, 4.2, 1.8, 1.6, 0.3)]))
-    (exact,), (ahead,) = (
-        build_plan(rig, target, geometry="boxes", scene=scene).targets for rig in (source, source.shifted(0.05))
-    )
-    assert exact.road is not None and 0.2 < exact.road.mean() < 0.8
-    np.testing.assert_array_equal(exact.road, ahead.road)
-    holes = ~exact.coverage & ~ahead.coverage
-    assert exact.layers is not None and exact.paint is not None and (exact.layers == OBJECT)[holes].sum() > 100
-    np.testing.assert_array_equal((exact.layers == OBJECT)[holes], (ahead.layers == OBJECT)[holes])
-    assert np.isin(np.flatnonzero((exact.layers == OBJECT) & ~exact.coverage), exact.paint.pixel).all()
-
-
-@pytest.mark.parametrize("surface", ["boxes", "ground", "infinity"])
-def test_holes_of_one_camera_that_turns_need_no_geometry(surface: str) -> None:
-    rig = Rig([camera(size=(64, 64))])
-    sample = {"images": gradient(64, 64), "rig": rig, "boxes_3d": torch.tensor([[7.0, -5.0, 0.9, 4.5, 2.0, 1.8, 0.0]])}
-    out = RigRetarget(rig.turned(yaw_deg=-45), geometry=surface)(sample)  # type: ignore[arg-type]
-    assert out["generated"].any() and torch.equal(out["generated"], ~out["coverage"])
-
-
 # --- the transform ----------------------------------------------------------------------------------------------------
 def test_a_whole_target_asks_for_no_filling(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(holes_module, "object_colours", None)
@@ -223,17 +165,6 @@ def test_gradients_of_seen_pixels_stay() -> None:
     assert gradients[0].any() and torch.equal(gradients[0], gradients[2]) and torch.equal(gradients[1], gradients[2])
 
 
-def test_views_of_several_sizes() -> None:
-    source = ring()
-    turned = source.turned(pitch_deg=-30)
-    target = turned.with_cameras([turned[0].resize((36, 48)), *turned.cameras[1:]])
-    sample = {"images": torch.randint(0, 255, (6, 3, 72, 96), dtype=torch.uint8), "rig": source}
-    out = RigRetarget(target)(sample)
-    assert [tuple(view.shape) for view in out["generated"]] == [(36, 48), *[(72, 96)] * 5]
-    for image, filled in zip(out["images"], out["generated"], strict=True):
-        assert filled.any() and image[:, filled].any()
-
-
 def test_made_up_pixels_are_never_sources(street: dict[str, Any]) -> None:
     first = RigRetarget(raised(street), geometry="street")(street)
     other = dict(first) | {"images": torch.where(first["generated"][:, None], 255, first["images"])}
@@ -242,13 +173,6 @@ def test_made_up_pixels_are_never_sources(street: dict[str, Any]) -> None:
 
 
 # --- the functions ----------------------------------------------------------------------------------------------------
-def test_the_mean_colour_is_that_of_what_is_seen_in_all_views() -> None:
-    views = [torch.zeros((3, 8, 8), dtype=torch.uint8), torch.full((3, 8, 8), 90, dtype=torch.uint8)]
-    seen = [torch.zeros((8, 8), dtype=torch.bool), torch.ones((8, 8), dtype=torch.bool)]
-    seen[0][:4] = True
-    np.testing.assert_allclose(mean_colour([view.numpy() for view in views], [part.numpy() for part in seen]), 60)
-    (first, second) = fill_holes([view.clone() for view in views], seen, [None] * 2, [None] * 2, only_mean=True)
-    assert (first[:, 4:] == 60).all() and not first[:, :4].any() and torch.equal(second, views[1])
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (5, 3), (70, 131), (257, 129)])
@@ -271,17 +195,6 @@ def test_the_nearer_side_is_never_smeared_into_what_it_hides() -> None:
     seen = torch.from_numpy(layers != OCCLUDED)
     (out,) = fill_holes([view * seen], [seen], [layers], [None])
     assert torch.equal(out[:, seen], view[:, seen]) and ((out[:, ~seen].int() - 120).abs() <= 1).all()
-
-
-def test_fills_change_evenly_away_from_what_is_known() -> None:
-    view = torch.full((3, 64, 64), 200, dtype=torch.uint8)
-    view[:, :30] = 100
-    layers = np.zeros((64, 64), np.uint8)
-    layers[30:40, 10:54], layers[40:, 10:54] = OCCLUDED, OBJECT
-    seen = torch.from_numpy(layers != OCCLUDED)
-    (out,) = fill_holes([view * seen], [seen], [layers], [None])
-    steps = np.diff(out[0, 29:40, 32].numpy().astype(int))  # from what is above to what is beside
-    assert (steps > 0).all() and steps.max() < 20
 
 
 # --- lines of the scene -----------------------------------------------------------------------------------------------
@@ -319,19 +232,6 @@ def test_posts_go_on_vertically_and_joints_of_the_road_along_the_heading() -> No
     )
     # The lines of the road start at the middle of the image: that through (45.5, 55.5) is at 49.8 in the row 62.5.
     assert wall[0, 62, 45] > wall[0, 62, 50] + 20 and road[0, 62, 50] > road[0, 62, 45] + 20
-
-
-def test_lines_lead_to_the_vanishing_points_of_the_heading_and_the_vertical() -> None:
-    ahead = camera(size=(64, 80), azimuth_deg=10)
-    along, up = _line_directions(ahead)
-    assert along.shape == up.shape == (2, 2, 2)
-    end = ahead.project(ahead.center_m + np.array([1e6, 0, 0])).uv
-    for j, y in enumerate((-0.5, 63.5)):
-        for i, x in enumerate((-0.5, 79.5)):
-            here, towards = along[:, j, i], end - (x, y)
-            np.testing.assert_allclose(here / np.hypot(*here), towards / np.hypot(*towards), atol=1e-3)
-    np.testing.assert_allclose(up[0], 0, atol=1e-6)  # a level camera's verticals are columns
-    assert (up[1] < 0).all()
 
 
 def test_batches_without_a_plan_are_filled(street: dict[str, Any]) -> None:
@@ -477,93 +377,12 @@ def test_colours_of_objects(painted: Any, hidden: Any, expected: dict[int, Any])
         np.testing.assert_allclose(colours[part], np.broadcast_to(colour, 3), atol=1e-2)
 
 
-def test_tops_take_their_bodies_paint_in_the_light_of_seen_tops() -> None:
-    view, _, paint = objects(*TWO, hidden=[np.s_[10:20, 54:60]])
-    colours = object_colours([view.numpy()], [paint])
-    assert 78 < colours[TOP_PART, 0] < 84 and 142 < colours[TOP_OF_OTHER, 0] < 152
-    view[2, 10:20, 36:54] = 90  # what sources show there is yellow, the body grey
-    assert np.ptp(object_colours([view.numpy()], [paint])[TOP_OF_OTHER]) < 1e-3
-    view, seen, paint = objects(*TWO, hidden=[OTHERS_TOP])  # the other's top is twice as bright as its body
-    alone = replace(paint, nearest=np.full_like(paint.nearest, -1))
-    for image in (view, view / 255):
-        white = 255 / float(image.max()) * 200 / 255
-        (top, *others) = object_colours([image.numpy()], [paint])[TOP_OF_OTHER] * white
-        assert 105 < top < 150 and others == [top, top]
-        out = filled(image, seen, alone)
-        assert (out[:, ~seen] * white - top).abs().max() < 0.51 and torch.equal(out[:, seen], image[:, seen])
-
-
-@pytest.mark.parametrize(("bonnet", "is_seen"), [(30, False), (90, True)], ids=["glass", "a shaded bonnet"])
-def test_glass_where_a_shape_has_a_bonnet_is_no_seen_top(bonnet: int, is_seen: bool) -> None:
-    """A van's windscreen is as dark as the frame's windows; a bonnet in the shade is nearer to its body."""
-    painted = (OTHERS_TOP, 11, bonnet), (OTHER, 6, 200), (WINDOWS, 10, 30)
-    view, _, paint = objects(
-        *painted, hidden=[np.s_[10:20, 54:60]], parts=np.where(np.arange(12) == 10, PARTS, FACE_PARTS)
-    )
-    top = object_colours([view.numpy()], [paint])[TOP_OF_OTHER]
-    assert (top < 150).all() if is_seen else (top > 195).all()
-
-
-def test_pale_tops_tell_of_reflected_sky() -> None:
-    """A top on which sky hides the paint's hue counts, one of another hue does not."""
-    red = (np.s_[20:50, 36:60], 6, (180, 60, 50))
-    for top, is_seen in (((230, 228, 227), True), ((60, 200, 60), False)):
-        view, _, paint = objects((OTHERS_TOP, 11, top), red, hidden=[np.s_[10:20, 54:60]])
-        colour = object_colours([view.numpy()], [paint])[TOP_OF_OTHER]
-        assert (np.abs(colour - top).max() < 40) == is_seen
-
-
-def test_rims_of_roofs_are_sampled_below_their_edge() -> None:
-    _, _, paint = objects((OTHERS_TOP, 11, 9), *ROOF, hidden=[OTHERS_TOP], parts=np.r_[FACE_PARTS[:10], PARTS, 12])
-    edge = paint.sample[paint.sample_part == PARTS + RIM_PART] // 64
-    assert sorted(set(edge.tolist())) == [20, 21, 22] and len(edge) == 3 * 24
-
-
-def test_tops_go_on_from_the_seen_pixels_of_their_body() -> None:
-    view, seen, paint = objects(*TWO, hidden=[OTHERS_TOP])
-    column, top = (
-        filled(view, seen, paint)[0, 10:20, 50].float(),
-        object_colours([view.numpy()], [paint])[TOP_OF_OTHER, 0],
-    )
-    assert (column.diff() <= 0).all() and column[-1] < 103 and abs(float(column[0]) - (top + 1.6 * 100) / 2.6) < 1
-
-
-def test_a_top_without_any_seen_part_is_left_to_the_background() -> None:
-    view, seen, paint = objects(*TWO, hidden=[OTHERS_TOP])
-    alone = replace(paint, sample=paint.sample[:0], sample_part=paint.sample_part[:0])
-    assert (object_colours([view.numpy()], [alone]) == -1).all() and (
-        filled(view, seen, alone, OCCLUDED)[:, ~seen] > 0
-    ).all()
-
-
-def test_cracks_in_objects_take_the_colour_beside_them() -> None:
-    rows = [(np.s_[y : y + 1, :], 0, 40 + 2 * y) for y in range(64)]
-    out = filled(*objects(*rows, hidden=[np.s_[:, 20]]))
-    assert (out[:, :, 20].int() - out[:, :, 10].int()).abs().max() <= 3  # a 33rd of it is the object's own colour
-
-
-def test_sides_take_the_seen_pixels_in_their_row_and_column() -> None:
-    windows, body = (np.s_[20:35, 10:54], 0, 40), (np.s_[35:50, 10:54], 0, 120)
-    view, seen, paint = objects(windows, body, hidden=[np.s_[20:50, 22:54]])  # up to the object's right end
-    out = filled(view, seen, paint)[0].int()
-    assert abs(int(out[27, 35]) - 40) <= abs(int(out[27, 50]) - 40) < 80
-    # One seen pixel, 14 to the left of (42, 35); the part's median is its windows' or its body's.
-    median, reach = int(object_colours([view.numpy()], [paint])[0, 0]), 64 / 4 / (35 - 21)
-    assert abs(int(out[42, 35]) - (median + 120 * reach) / (1 + reach)) <= 1
-
-
 def test_unseen_sides_take_no_colour_of_what_stands_before_them() -> None:
     """A dark object before the side of a bright one, which is hidden to the right of it, below a seen cabin."""
     side, dark, cabin = (np.s_[20:50, 10:54], 0, 180), (np.s_[10:50, 26:30], 6, 10), (np.s_[10:20, 30:54], 4, 90)
     view, seen, paint = objects(side, dark, cabin, hidden=[np.s_[20:50, 30:54]])
     assert len(paint.pixel) == 30 * 24 and (paint.nearest == -1).all()
     assert (filled(view, seen, paint)[:, ~seen] == 180).all()
-
-
-def test_all_that_is_seen_of_a_vehicle_is_sampled_where_little_is() -> None:
-    edge = (np.s_[20:50, 10:54], 0, 60)
-    for parts, count in ((FACE_PARTS, 44), (np.zeros(1, np.int32), 0)):  # of a barrier, an edge may be anything
-        assert len(objects(edge, hidden=[np.s_[21:50, 10:54]], parts=parts)[2].sample) == count
 
 
 def test_objects_that_nobody_sees_are_background() -> None:

@@ -1,5 +1,6 @@
 """Filling holes from neighbouring frames: with real pixels, without repainting, and not beside moved objects."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -156,13 +157,6 @@ def test_exposure_follows_the_seam() -> None:
     assert torch.equal(pixels[:, ~FREE], HOLE[:, ~FREE])
 
 
-def test_the_sharper_of_two_that_agree_is_taken() -> None:
-    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90, blur=3), candidate(91, blur=1)], 2)
-    assert (chosen[FREE] == 1).all()
-    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90, blur=1), candidate(91, blur=1)], 2)
-    assert (chosen[FREE] == 0).all()
-
-
 def passing(level: int, risk: ChangeRisk = ChangeRisk.UNLABELLED, later: bool = False) -> Candidate:
     """The road at the seam, something else farther in."""
     one = candidate(90, risk=risk, later=later)
@@ -170,42 +164,45 @@ def passing(level: int, risk: ChangeRisk = ChangeRisk.UNLABELLED, later: bool = 
     return one
 
 
-def test_two_that_contradict_each_other_leave_a_hole() -> None:
+def hidden(risk: ChangeRisk) -> Candidate:
+    """A neighbour that does not see the hole."""
+    return candidate(90, risk=risk, shows=np.zeros((H, W), bool))
+
+
+INSIDE, FARTHER = slice(8, None), slice(16, None)
+LORRY = [passing(200), passing(200), passing(200, later=True)]
+DECIDED: dict[str, tuple[Callable[[ChangeRisk], list[Candidate]], slice, Callable[[ChangeRisk], int]]] = {
+    "the sharper": (lambda _: [candidate(90, blur=3), candidate(91, blur=1)], INSIDE, lambda _: 1),
+    "the first of two alike": (lambda _: [candidate(90, blur=1), candidate(91, blur=1)], INSIDE, lambda _: 0),
+    "near the seam": (lambda r: [passing(200, r), candidate(90, risk=r)], slice(8, 10), lambda _: 0),
+    "a contradiction": (lambda r: [passing(200, r), candidate(90, risk=r)], FARTHER, lambda _: -1),
+    "a majority, with labels": (
+        lambda r: [passing(200, r), candidate(90, risk=r), candidate(92, risk=r)], FARTHER,
+        lambda r: 1 if r == ChangeRisk.NONE else -1,
+    ),
+    "one of three, unless something moved beside it": (
+        lambda r: [candidate(90, risk=r), hidden(r), hidden(r)], INSIDE,
+        lambda r: 0 if r <= ChangeRisk.SHADED else -1,
+    ),
+    "one of two": (lambda r: [candidate(90, risk=r), hidden(r)], INSIDE, lambda _: 0),
+    "two of one side": (lambda r: [passing(200), passing(200), hidden(ChangeRisk.UNLABELLED)], FARTHER, lambda _: -1),
+    "three of one side": (lambda _: [passing(200)] * 3, FARTHER, lambda _: 0),
+    "before and after, whatever farther frames show": (
+        lambda _: [candidate(90), candidate(90, later=True), *LORRY], FARTHER, lambda _: 0,
+    ),
+    "a lorry during most of them": (
+        lambda _: [candidate(90), *LORRY, candidate(90, later=True)], FARTHER, lambda _: -1,
+    ),
+}  # fmt: skip
+"""Candidates by the risk that something changed there, rows of the hole, and the candidate taken; -1 for none."""
+
+
+@pytest.mark.parametrize("case", DECIDED)
+def test_the_neighbour_that_fills(case: str) -> None:
+    make, rows, expected = DECIDED[case]
     for risk in ChangeRisk:
-        _, chosen = merged(HOLE, FREE, SEAM, [passing(200, risk), candidate(90, risk=risk)], 2)
-        assert (chosen[16:] == -1).all() and (chosen[8:10] == 0).all()
-
-
-def test_with_labels_the_majority_decides() -> None:
-    for risk in ChangeRisk:
-        several = [passing(200, risk), candidate(90, risk=risk), candidate(92, risk=risk)]
-        _, chosen = merged(HOLE, FREE, SEAM, several, 2)
-        assert (chosen[16:] == (1 if risk == ChangeRisk.NONE else -1)).all()
-
-
-def test_a_single_candidate_is_accepted_unless_something_moved_beside_it() -> None:
-    nothing = np.zeros((H, W), bool)
-    for risk in ChangeRisk:
-        several = [candidate(90, risk=risk), candidate(90, shows=nothing), candidate(90, shows=nothing)]
-        for of in (several, several[:2]):
-            _, chosen = merged(HOLE, FREE, SEAM, of, 2)
-            assert (chosen[FREE] == (0 if risk <= ChangeRisk.SHADED or len(of) == 2 else -1)).all()
-
-
-def test_without_labels_two_of_one_side_are_not_enough() -> None:
-    nothing = candidate(90, shows=np.zeros((H, W), bool))
-    for several in ([passing(200), passing(200), nothing], [passing(200), passing(200), passing(200)]):
-        _, chosen = merged(HOLE, FREE, SEAM, several, 2)
-        assert (chosen[16:] == (0 if several[2] is not nothing else -1)).all()
-
-
-def test_agreement_before_and_after_means_static() -> None:
-    """Farther frames do not matter: a lorry may pass during all of them."""
-    lorry = [passing(200), passing(200), passing(200, later=True)]
-    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90), candidate(90, later=True), *lorry], 2)
-    assert (chosen[16:] == 0).all()
-    _, chosen = merged(HOLE, FREE, SEAM, [candidate(90), *lorry[:2], lorry[2], candidate(90, later=True)], 2)
-    assert (chosen[16:] == -1).all()
+        _, chosen = merged(HOLE, FREE, SEAM, make(risk), 2)
+        assert (chosen[rows] == expected(risk)).all(), risk
 
 
 def test_an_arrived_object_continues_into_the_hole() -> None:

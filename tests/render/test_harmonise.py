@@ -24,11 +24,10 @@ from arbiview_aug.render.harmonise import (
     PhotometricReport,
     estimate_gains,
     find_overlaps,
-    match_seams,
     tone_curves,
 )
-from arbiview_aug.render.photometry_kernels import log_ratios, tone
-from arbiview_aug.render.plan import SEAM_ROWS, FixedMap, RenderPlan, ViewPlan
+from arbiview_aug.render.photometry_kernels import tone
+from arbiview_aug.render.plan import FixedMap, RenderPlan, ViewPlan
 from arbiview_aug.render.rendered import render_opencv
 from arbiview_aug.render.torch_backend import render_torch
 from arbiview_aug.render.view_planner import build_plan
@@ -148,18 +147,6 @@ def test_harmful_gains_are_declined(street, monkeypatch: pytest.MonkeyPatch) -> 
     assert not report.accepted and after < before
 
 
-@pytest.mark.parametrize(
-    ("fill", "reason"), [(0, "nor saturated"), (255, "nor saturated"), (128, "agree already"), (2, "nor saturated")]
-)
-def test_blank_images_and_stripes(street, fill: int, reason: str) -> None:
-    rig, images = street
-    blank = [torch.full_like(image, fill) for image in images]
-    assert reason in estimate_gains(rig, blank).reason
-    for image in blank:
-        image[..., ::8] = 200
-    assert all(0.9 < gain < 1.1 for gain in estimate_gains(rig, blank).gains)
-
-
 def test_order_of_cameras_and_repetition_change_nothing(street) -> None:
     rig, images = street
     spoiled = exposed(images, 2, 0.75)
@@ -182,24 +169,8 @@ def toned(x: np.ndarray, curve: np.ndarray) -> np.ndarray:
     return np.minimum(lower, upper) if curve[0] > 1 else np.maximum(lower, upper)
 
 
-def test_pairs_are_compared_by_their_usable_pixels() -> None:
-    rng, ends = np.random.default_rng(0), np.array([0, 80, 113, 115])
-    pixels = rng.uniform(0, 1, (2, 115, 3)).astype(np.float32)
-    pixels[:, 113:] = 0.001  # dark
-    ratios = np.empty((3, 3))
-    log_ratios(pixels, ends, 0.2, 0.9, ratios)
-    for (number, middle, spread), first, end in zip(ratios, ends, ends[1:], strict=False):
-        one, two = pixels[:, first:end].astype(np.float64)
-        use = np.all([(side.mean(1) > 0.2) & (side.max(1) < 0.9) for side in (one, two)], 0)
-        assert number == use.sum()
-        if number:
-            ratio = np.log(one.sum(1) / two.sum(1))[use]
-            assert middle == pytest.approx(np.median(ratio), abs=1e-6)
-            assert spread == pytest.approx(1.4826 * np.median(np.abs(ratio - np.median(ratio))), abs=1e-6)
-
-
 def test_tone_curves() -> None:
-    for gain in (0.4, 0.7, 0.95, 1.0, 1.05, 1.3, 2.5):
+    for gain in (1e-3, 0.4, 0.7, 0.95, 1.0, 1.05, 1.3, 2.5, 1e3):
         curve, values = tone_curves(gain), np.arange(768) // 3
         levels, shares = values.astype(np.uint8), (values / 255).astype(np.float32)
         runs, lines = np.array([[0, 0, 256, 0]], np.int32), curve[None, None].astype(np.float32)
@@ -213,23 +184,6 @@ def test_tone_curves() -> None:
         np.testing.assert_allclose(shares, toned(values / 255, curve), atol=1e-6)
         x = np.linspace(0, 1, 101)
         np.testing.assert_allclose(toned(toned(x, curve), tone_curves(1 / gain)), x, atol=1e-12)
-
-
-def test_runs_hold_every_pixel_with_its_own_source() -> None:
-    """A slanted seam, a source within another, and a hole."""
-    winner = np.zeros((70, 90), np.int8)
-    winner[np.add.outer(np.arange(70), 2 * np.arange(90)) > 120] = 3
-    winner[20:30, 10:20] = 5
-    winner[60:, 50:] = -1
-    wide = (np.arange(3 * 700) // 129 % 3 - 1).astype(np.int8).reshape(3, 700)  # runs that cross blocks of a row
-    for one in (winner, wide, np.full((40, 8), -1, np.int8), np.zeros((40, 8), np.int8)):
-        seen = np.full(one.shape, -2, np.int8)
-        for row, first, end, source in ViewPlan(
-            FixedMap(np.zeros((*one.shape, 2), np.int16), np.zeros(one.shape, np.uint16)), one, (), ()
-        ).runs:
-            assert (seen[row, first:end] == -2).all(), "no pixel gets two curves"
-            seen[row, first:end] = source
-        assert np.array_equal(seen, one)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.45])
@@ -345,7 +299,6 @@ def test_real_frames(frame: str, rise_db: float, request: pytest.FixtureRequest)
 
 
 # --- along seams ------------------------------------------------------------------------------------------------------
-NO_GAINS = np.zeros((6, 6))
 
 
 @pytest.fixture(scope="module")
@@ -376,26 +329,6 @@ def step(plan: RenderPlan, images: list[torch.Tensor], curves: Curves | None) ->
     return sum(float(seam.sum()) for seam in seams) / weights
 
 
-def test_samples_read_the_same_direction_in_both_sources(planned: tuple[Rig, RenderPlan]) -> None:
-    rig, plan = planned
-    samples, images = plan.seam_samples, pictures(rig)
-    (source, at, ends), measured = samples.shared, np.empty((len(samples.better), 3))
-    assert len(samples.better) > 50 and plan.seam_samples is samples
-    light = [
-        [images[k][:, y, x].numpy() / 255 for k, (y, x) in zip(*side, strict=True)]
-        for side in zip(source, at, strict=True)
-    ]
-    log_ratios(np.array(light, np.float32), ends, 0.0, 1.0, measured)
-    numbers, ratio, spread = measured.T
-    assert (numbers == np.diff(ends)).all() and np.abs(ratio).max() < 0.05 and np.median(spread) < 0.05
-    for view, other, first, end in samples.seams:
-        share = {pair.source: pair.share for pair in plan.targets[view].pairs}
-        assert all(share[k] >= share.get(other, 0) for k in samples.better[first:end])
-        for g in range(first, end):
-            better, worse = source[:, ends[g] : ends[g + 1]]
-            assert (better == samples.better[g]).all() and (worse == other).all()
-
-
 @pytest.mark.parametrize("gain", [1.0, 0.7])
 def test_falloff_to_the_top_and_bottom(planned: tuple[Rig, RenderPlan], gain: float) -> None:
     rig, plan = planned
@@ -413,25 +346,18 @@ def test_falloff_to_the_top_and_bottom(planned: tuple[Rig, RenderPlan], gain: fl
         assert np.abs(np.diff(np.log(curve[..., 0]), axis=1)).max() < 0.01, "no row differs visibly from the next"
 
 
-def test_where_nothing_differs_or_nothing_can_be_read_gains_stay(planned: tuple[Rig, RenderPlan]) -> None:
-    rig, plan = planned
-    gains = np.random.default_rng(0).normal(0, 0.2, (6, 6))
-    for level in (0, 2, 255):
-        blank = [torch.full_like(image, level) for image in pictures(rig)]
-        assert np.array_equal(match_seams(plan, blank, gains), np.repeat(gains[..., None], SEAM_ROWS, 2))
-    noise = np.random.default_rng(3)
-    unlike = [torch.from_numpy(noise.integers(30, 220, (3, *SIZE), np.uint8)) for _ in range(6)]
-    for images, most in ((pictures(rig), 0.02), (unlike, 0.1)):
-        assert np.abs(match_seams(plan, images, NO_GAINS)).max() < most
-    one = rig.with_cameras([rig[0]])
-    assert not build_plan(one, one).seam_samples.seams
-    assert (match_seams(build_plan(one, one), unlike[:1], np.zeros((1, 1))) == 0).all()
-
-
-def test_the_order_of_cameras_makes_no_difference(planned: tuple[Rig, RenderPlan]) -> None:
-    rig, plan = planned
-    images, order = pictures(rig, 0.25), [3, 0, 5, 1, 4, 2]
-    shuffled = build_plan(rig.with_cameras([rig[k] for k in order]), rig.turned(yaw_deg=22))
-    matched = match_seams(plan, images, NO_GAINS)
-    other = match_seams(shuffled, [images[k] for k in order], NO_GAINS)
-    np.testing.assert_allclose(other, matched[:, order], atol=1e-12)
+def test_runs_hold_every_pixel_with_its_own_source() -> None:
+    """A slanted seam, a source within another, and a hole."""
+    winner = np.zeros((70, 90), np.int8)
+    winner[np.add.outer(np.arange(70), 2 * np.arange(90)) > 120] = 3
+    winner[20:30, 10:20] = 5
+    winner[60:, 50:] = -1
+    wide = (np.arange(3 * 700) // 129 % 3 - 1).astype(np.int8).reshape(3, 700)  # runs that cross blocks of a row
+    for one in (winner, wide, np.full((40, 8), -1, np.int8), np.zeros((40, 8), np.int8)):
+        seen = np.full(one.shape, -2, np.int8)
+        for row, first, end, source in ViewPlan(
+            FixedMap(np.zeros((*one.shape, 2), np.int16), np.zeros(one.shape, np.uint16)), one, (), ()
+        ).runs:
+            assert (seen[row, first:end] == -2).all(), "no pixel gets two curves"
+            seen[row, first:end] = source
+        assert np.array_equal(seen, one)

@@ -12,26 +12,17 @@ import torch
 from arbiview_aug import PlanCache
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.rays import ego_rays, half_way_view, project_rays
+from arbiview_aug.cameras.rays import half_way_view
 from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
-from arbiview_aug.render.overlap_depth import (
-    LIMITS,
-    OverlapDepth,
-    estimate_overlap,
-    overlap_cache,
-    overlap_depth,
-    why_ambiguous,
-)
-from arbiview_aug.render.view_planner import build_plan
+from arbiview_aug.render.overlap_depth import LIMITS, OverlapDepth, estimate_overlap, overlap_cache, overlap_depth
 from arbiview_aug.sample.inputs import read_frames
-from arbiview_aug.scene.boxes import draw_boxes
 from arbiview_aug.scene.scene import Scene
-from arbiview_aug.scene.surface import CorrectedSurface, Correction, StaticSurface, Street
+from arbiview_aug.scene.surface import CorrectedSurface, StaticSurface, Street
 from arbiview_aug.transforms.rig_retarget import RigRetarget
 from arbiview_aug.transforms.settings import render_config
 from tests import helpers
-from tests.helpers import in_atlas, told_db
+from tests.helpers import told_db
 
 SIZE = (225, 400)
 
@@ -142,12 +133,6 @@ def test_declines_what_says_nothing(name: str) -> None:
     assert not report.accepted and report.reason
 
 
-def test_one_plain_colour_shows_nothing() -> None:
-    plain = np.empty((40, 60, 3), np.float32)
-    plain[:] = 200, 40, 10
-    assert why_ambiguous(plain, plain, np.ones((40, 60), bool)) == "one of the images shows nothing"
-
-
 def test_one_colour_of_light_more_or_less_is_no_depth(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
     """Exposure: the same distances within flow's noise."""
     images, depth = nearer
@@ -186,83 +171,12 @@ def test_the_order_of_cameras_does_not_matter(nearer: tuple[torch.Tensor, Overla
     assert overlap_depth(RIG, images).corrections[0].key == depth.corrections[0].key
 
 
-def test_floats_say_the_same(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
-    images, depth = nearer
-    floats = overlap_depth(RIG, images.float() / 255)
-    assert np.abs(floats.corrections[0].change - depth.corrections[0].change).max() < 0.05
-
-
-def test_labelled_objects_are_not_measured(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
-    """One that fills the overlap leaves nothing to measure."""
-    images, depth = nearer
-    view = half_way_view(RIG[0], RIG[1], SIZE)
-    box = np.array([[15.0, 0.0, 1.0, 4, 1.5, 2, 0]])
-    assert (draw_boxes(view, box)[1] >= 0).sum() > 200
-    (correction,) = overlap_depth(RIG, images, box).corrections
-    assert correction.key != depth.corrections[0].key
-    full = np.array([[12.0, 0.0, 0.0, 1, 40, 40, 0]])
-    (report,) = overlap_depth(RIG, images, full).reports
-    assert not report.accepted and "too little" in report.reason
-    none = overlap_depth(RIG, images, np.zeros((0, 7)))
-    assert none.corrections[0].key == depth.corrections[0].key
-
-
 def test_boxes_matter_where_they_are_solids(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
     images, _ = nearer
     sample = {"images": images, "boxes_3d": np.array([[12.0, 0.0, 0.0, 1, 40, 40, 0]])}
     for surface, accepted in (("boxes", False), ("auto", False), ("street", True)):
         depth = RigRetarget(TARGET, source=RIG, quality="accurate", geometry=surface).explain(sample).planned.overlap  # type: ignore[arg-type]
         assert depth is not None and depth.reports[0].accepted is accepted
-
-
-# --- the surface ------------------------------------------------------------------------------------------------------
-def test_a_correction_reaches_as_far_as_its_share() -> None:
-    view = camera("view", 0, 0)
-    half = np.zeros(SIZE, np.float32)
-    half[:, :200] = 1
-    refined = CorrectedSurface(Street(), (Correction(view, np.full(SIZE, 0.25, np.float32), half),))
-    rays = view.unproject(np.array([[100.0, 50], [300, 50], [100, 200]])).directions
-    behind = np.array([[-1.0, 0, 0]])
-    q, base = (s.inverse_distance(view.center_m, rays) for s in (refined, Street()))
-    np.testing.assert_allclose(q / base, [1.25, 1, 1.25], rtol=1e-6)
-    assert refined.inverse_distance(view.center_m, behind) == Street().inverse_distance(view.center_m, behind)
-
-
-def test_a_correction_belongs_to_the_scene_not_to_a_ray() -> None:
-    """From another centre, the change is read where the corrected point lies in the view."""
-    view = camera("view", 0, 0)
-    ramp = np.tile(np.linspace(0, 0.4, SIZE[1], dtype=np.float32), (SIZE[0], 1))
-    refined = CorrectedSurface(Street(), (Correction(view, ramp, np.ones(SIZE, np.float32)),))
-    origin = view.center_m + np.array([0.3, 0.8, 0.5])
-    rays = camera("other", 3, 0).unproject(np.array([[200.0, 90], [150, 120], [230, 60]])).directions
-    q, base = (s.inverse_distance(origin, rays) for s in (refined, Street()))
-    uv, _, valid = view.project(origin + rays / q[:, None])
-    assert valid.all()
-    np.testing.assert_allclose(q / base - 1, uv[:, 0] / (SIZE[1] - 1) * 0.4, atol=2e-3)
-
-
-def test_maps_over_corrections_are_exact(nearer: tuple[torch.Tensor, OverlapDepth]) -> None:
-    scene = Scene(corrections=nearer[1].corrections)
-    plan = build_plan(RIG, TARGET, geometry="street", scene=scene)
-    surface = scene.surface("street", RIG.ground_z_m)
-    for view, target in zip(plan.targets, plan.target, strict=True):
-        rays, _ = ego_rays(target, target.pixel_grid())
-        q = surface.inverse_distance(target.center_m, rays)
-        for pair in view.pairs:
-            won = view.source_camera == pair.source
-            uv, _ = project_rays(RIG[pair.source], rays[won], q[won], target.center_m - RIG[pair.source].center_m)
-            expected = in_atlas(plan.layout.slot(pair.source, pair.level), uv)
-            assert np.quantile(np.abs(view.at.to_float()[won] - expected), 0.99) <= 1 / 32
-
-
-def test_two_corrections_count_by_their_shares() -> None:
-    view, ray = camera("view", 0, 0), np.array([[1.0, 0, 0.1]]) / np.hypot(1, 0.1)
-    one, two = (
-        Correction(view, np.full(SIZE, c, np.float32), np.full(SIZE, s, np.float32)) for c, s in ((0.4, 1), (-0.2, 0.5))
-    )
-    q = CorrectedSurface(Street(), (one, two)).inverse_distance(view.center_m, ray)
-    base = Street().inverse_distance(view.center_m, ray)
-    np.testing.assert_allclose(q / base, 1 + (0.4 - 0.1) / 1.5, rtol=1e-6)
 
 
 # --- reuse ------------------------------------------------------------------------------------------------------------
@@ -297,15 +211,6 @@ def test_reports_of_shared_depth_name_the_cameras_of_the_sample(nearer: tuple[to
         (frame,) = read_frames({"images": images, "rig": rig}, None)
         depth = estimate_overlap(frame, None, True, cache)
         assert {depth.reports[0].first, depth.reports[0].second} == {one.name for one in rig}
-
-
-def test_a_cache_forgets_the_oldest(nearer: tuple[torch.Tensor, OverlapDepth], monkeypatch: pytest.MonkeyPatch) -> None:
-    _, depth = nearer
-    monkeypatch.setattr("arbiview_aug.render.overlap_depth._OVERLAP_BYTES", 2 * depth.nbytes)
-    cache = overlap_cache(True, render_config("accurate"))
-    for name in "abca":
-        cache.get((b"", name), lambda: depth)
-    assert cache.misses == 4
 
 
 def test_a_cache_needs_something_to_hold() -> None:

@@ -31,13 +31,6 @@ def zoomed(camera: Camera, factor: float, size: tuple[int, int] | None = None) -
     return changed if size is None else changed.resize(size)
 
 
-def built_without(source: Rig, target: Rig, config: RenderConfig, monkeypatch: pytest.MonkeyPatch) -> RenderPlan:
-    """The plan for which every source was looked at."""
-    with monkeypatch.context() as patch:
-        patch.setattr("arbiview_aug.render.requirements.covers_target_exactly", lambda *_: False)
-        return build_plan(source, target, config=config)
-
-
 def surfaces(plan: RenderPlan) -> list[str]:
     """The surface of each pair of which the plan shows a pixel."""
     return [pair.surface for view in plan.targets for pair in view.pairs]
@@ -60,7 +53,9 @@ def test_no_pixel_changes_where_one_source_serves_alone(
 ) -> None:
     rig = nuscenes()
     target = rig.with_cameras([view(camera) for camera in rig])
-    plan, whole = build_plan(rig, target, config=config), built_without(rig, target, config, monkeypatch)
+    plan = build_plan(rig, target, config=config)
+    monkeypatch.setattr("arbiview_aug.render.requirements.covers_target_exactly", lambda *_: False)
+    whole = build_plan(rig, target, config=config)  # for which every source is looked at
     assert surfaces(plan) == ["infinity"] * len(rig)
     assert same(plan, whole) and all(seen.all() for seen in plan.coverage)
 
@@ -83,9 +78,7 @@ def test_no_pixel_changes_where_sources_are_not_near(
 
 @settings(max_examples=60)
 @given(
-    yaw=st.floats(-12, 12),
-    pitch=st.floats(-8, 8),
-    roll=st.floats(-6, 6),
+    turn=st.tuples(st.floats(-12, 12), st.floats(-8, 8), st.floats(-6, 6)),
     zoom=st.floats(1.0, 2.5),
     size=st.sampled_from([(90, 160), (71, 131), (45, 80), (37, 64), (150, 260)]),
     source_size=st.sampled_from([(90, 160), (89, 159), (225, 401)]),
@@ -93,22 +86,14 @@ def test_no_pixel_changes_where_sources_are_not_near(
     exact=st.booleans(),
 )
 def test_a_source_that_serves_alone_covers_every_pixel(
-    yaw: float,
-    pitch: float,
-    roll: float,
-    zoom: float,
-    size: tuple[int, int],
-    source_size: tuple[int, int],
-    masked: bool,
-    exact: bool,
+    turn: tuple[float, ...], zoom: float, size: tuple[int, int], source_size: tuple[int, int], masked: bool, exact: bool
 ) -> None:
     source = nuscenes(source_size)[0]
     if masked:
         mask = np.ones(source.size, bool)
         mask[-source.height_px // 8 :, source.width_px // 3 : -source.width_px // 3] = False
         source = replace(source, mask=mask)
-    if exact:
-        yaw = pitch = roll = 0.0
+    yaw, pitch, roll = (0.0, 0.0, 0.0) if exact else turn
     target = zoomed(source, zoom, size).turned(yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
     assume(covers_target_exactly(source, target, FAST))
     event(f"masked {masked}, exact {exact}")
@@ -150,7 +135,7 @@ def test_geometry_is_needed_where_a_pixel_can_move() -> None:
     rig = nuscenes()
     cut = rig.with_cameras([zoomed(camera, 1.3) for camera in rig])
     front_and_back = rig.with_cameras([rig[0], rig[3]])
-    one_centre = rig.with_cameras([c.moved(moved_to_origin(c)) for c in rig])
+    one_centre = rig.with_cameras([c.shifted(*(-c.center_m + (0, 0, 1.5))) for c in rig])
     needed = {
         (rig, rig): False,
         (rig, cut): False,
@@ -168,12 +153,6 @@ def test_geometry_is_needed_where_a_pixel_can_move() -> None:
     assert needs_geometry(front_and_back, front_and_back.turned(yaw_deg=10), "lidar", FAST)
     nearly = rig.shifted(x_m=1e-5)
     assert needs_geometry(rig, nearly, "lidar", FAST)
-
-
-def moved_to_origin(camera: Camera) -> np.ndarray:
-    T = np.eye(4)
-    T[:3, 3] = -camera.center_m + (0, 0, 1.5)
-    return T
 
 
 def test_a_static_surface_harms_where_cameras_move_and_pixels_depend_on_the_street() -> None:

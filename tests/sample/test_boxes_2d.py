@@ -15,7 +15,6 @@ from tests.helpers import camera
 
 # 90 degrees over 801 px: focal length 400 px, principal point (400, 200), looking along the ego's x axis.
 FRONT = camera(size=(401, 801), position_m=(0, 0, 1.0), horizontal_fov_deg=90)
-RIG = Rig([FRONT, replace(FRONT.turned(yaw_deg=180), name="back")])
 
 
 def box(x: float, y: float = 0.0, z: float = 1.0, yaw: float = 0.0, size=(2.0, 2.0, 2.0)) -> list[float]:

@@ -14,7 +14,6 @@ from arbiview_aug.datasets.synthetic import SyntheticDrive, demo_source_rig, dem
 from arbiview_aug.sample.frame import Neighbour
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.sample.neighbours import ChangeRisk, change_risks
-from arbiview_aug.scene.boxes import moved_boxes
 from arbiview_aug.scene.point_cloud import seen_through
 
 RIG = demo_source_rig((64, 176))
@@ -178,17 +177,6 @@ def test_lenses_and_masks_of_the_rig_that_all_samples_share(sample: dict[str, An
         assert camera.lens == "radtan" and np.array_equal(camera.mask, mask)
 
 
-def test_frames_of_two_leading_dimensions(sample: dict[str, Any]) -> None:
-    retarget = RigRetarget(demo_target_rig((64, 176)), geometry="street", keys=SampleKeys(extra=("source_frame",)))
-    alone = retarget(sample)
-    batch = {key: sample[key].expand(2, 3, *sample[key].shape) for key in ("images", "ego2world")}
-    batch |= {"rig": RIG, "time_s": torch.full((2, 3), float(sample["time_s"]))}
-    batch |= {"boxes_3d": [sample["boxes_3d"]] * 6, "neighbours": [sample["neighbours"]] * 6}
-    both = retarget(batch)
-    for index in np.ndindex(2, 3):
-        assert all(torch.equal(both[key][index], alone[key]) for key in ("source_frame", "images"))
-
-
 # --- LiDAR points of other frames -------------------------------------------------------------------------------------
 def test_points_come_where_they_and_their_objects_are_now(sample: dict[str, Any]) -> None:
     """A post stays, a car drives on and turns, one without a counterpart and the own car are left out."""
@@ -253,18 +241,6 @@ def test_scan_lines_of_other_frames_fill_the_gaps(sample: dict[str, Any]) -> Non
 
 # --- labels that moved between two frames
 CAR = np.array([10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0])
-
-
-def placed(box: np.ndarray, x: float = 0.0, y: float = 0.0) -> np.ndarray:
-    return box + np.array([x, y, 0, 0, 0, 0, 0])
-
-
-def test_small_motions_are_noise_and_lost_objects_moved() -> None:
-    parked, lorry = placed(CAR, y=5), placed(CAR, x=20)
-    one, two = np.stack([parked, CAR]), np.stack([placed(CAR, x=1.0), placed(parked, x=0.2), lorry])
-    assert np.array_equal(moved_boxes(one, two), np.stack([CAR, placed(CAR, x=1.0), lorry]))
-    assert np.array_equal(moved_boxes(one, np.zeros((0, 7))), one)
-    assert not len(moved_boxes(one, one))
 
 
 def test_risk_falls_with_the_distance_relative_to_height() -> None:

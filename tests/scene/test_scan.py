@@ -108,16 +108,6 @@ def test_a_road_goes_on_under_the_lowest_line() -> None:
     assert not scanned(-8.0).any()
 
 
-def test_a_top_ends_at_its_face() -> None:
-    """Rays between a point on a box and one on its front meet what is farther: the front under the edge, or the top."""
-    top, face = [[5.2, 0.0, 1.0], [5.9, 0.0, 1.0], [6.6, 0.0, 1.0]], [[5.0, 0.0, 0.9], [5.0, 0.0, 0.8]]
-    points, edge_deg = np.array(face + top, np.float32), float(np.degrees(np.arctan2(-0.9, 5.0)))
-    for deg in (edge_deg - 0.3, edge_deg + 0.1):
-        ray = replace(scanner(1, at()), elevations_deg=(deg,), azimuth_step_deg=0.25)
-        expected_m = 5.0 if deg < edge_deg else -0.9 / np.tan(np.radians(deg))
-        np.testing.assert_allclose(scan([ray], points, 0.0).points[:, 0], expected_m, atol=0.02)
-
-
 @pytest.mark.parametrize(
     ("column", "z_m", "expected_m"),
     [
@@ -176,13 +166,6 @@ def test_other_frames_fill_what_the_own_scan_does_not_support() -> None:
     assert (filled > 0).sum() > 1.2 * (alone > 0).sum()
 
 
-def test_columns_are_those_of_the_surface() -> None:
-    """A ray that is nearer to a point on the road may pass it and meet the foot of an object."""
-    points = np.array([[20.0, 0.0, 0.0], [20.2, 0.0, 0.45], [20.2, 0.0, 0.75]], np.float32)
-    lidar = replace(scanner(1, at()), elevations_deg=(-5.2,), azimuth_step_deg=0.1)
-    assert set(scan([lidar], points, 0.0).nearest) == {1}
-
-
 def test_an_object_hides_the_wall() -> None:
     a = scanner(32, at())
     b = scanner(64, at(y=4.0))
@@ -198,16 +181,6 @@ def test_an_object_hides_the_wall() -> None:
     hits = b.center_m + (b.rays * true).transpose(1, 2, 0)
     unseen = (np.abs(hits[..., 0] - WALL_M) < 0.01) & (np.abs(hits[..., 1]) < 1.7) & (hits[..., 2] < 2.0)
     assert unseen.any() and (got[unseen] == 0).mean() > 0.95
-
-
-def test_returns_name_their_point_and_ring() -> None:
-    a = scanner(32, at())
-    points = measured(a)
-    result = scan([scanner(16, at()), scanner(8, at(), azimuth_deg=(0, 30))], points, 0.0)
-    apart = np.linalg.norm(points[result.nearest] - result.points, axis=1)
-    assert np.quantile(apart, 0.95) < 2 and result.nearest.dtype == result.rings.dtype == np.int32
-    assert set(result.rings[result.rings >= 16]) <= set(range(16, 24)) and (result.rings >= 16).any()
-    assert result.points.dtype == np.float32
 
 
 def test_beams_in_any_order_and_scanners_upside_down() -> None:

@@ -6,23 +6,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from arbiview_aug import Camera
-from arbiview_aug.datasets.synthetic import demo_source_rig
-from arbiview_aug.scene.depth_map import motion_camera
-from arbiview_aug.temporal import plane_sweep
-from arbiview_aug.temporal.kernels import (
-    INVALID,
-    JUMP,
-    NOISE_LEVELS,
-    PER_CORRELATION,
-    STEP,
-    aggregate,
-    find_least,
-)
+from arbiview_aug.temporal.kernels import INVALID, NOISE_LEVELS, PER_CORRELATION
 from arbiview_aug.temporal.motion_depth import _match
-from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, reduced_grey
+from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage
 from tests import helpers
 
 SIZE = (48, 80)
@@ -31,13 +19,8 @@ SIZE = (48, 80)
 camera = partial(helpers.camera, "a", 90, size=SIZE, horizontal_fov_deg=65.0)
 
 
-def textured(size: tuple[int, int], seed: int = 0) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    return rng.uniform(0, 255, size).astype(np.float32)
-
-
 def swept(seen_by: Camera, seed: int = 0, ground_z_m: float = 0.0) -> SweptImage:
-    return SweptImage(seen_by, textured(seen_by.size, seed), ground_z_m)
+    return SweptImage(seen_by, np.random.default_rng(seed).uniform(0, 255, seen_by.size).astype(np.float32), ground_z_m)
 
 
 def correlation(image: SweptImage, other: SweptImage, wall: float) -> Any:
@@ -85,59 +68,6 @@ def test_costs_are_correlations(lens: str) -> None:
         expected = np.minimum((1 - true[both]) * PER_CORRELATION, INVALID - 1)
         error = np.abs(costs[:, k][both] - expected) / PER_CORRELATION
         assert error.max() < 0.02 and error.mean() < 1e-3
-
-
-@pytest.mark.parametrize("yaw_deg", [-25.0, 25.0, 180.0])
-def test_all_that_a_turned_neighbour_sees_is_matched(yaw_deg: float) -> None:
-    """On the border of what it sees, and nowhere else, single precision may differ."""
-    image, other = swept(camera()), swept(camera(position_m=(1.5, 0.3, 1.5)).turned(yaw_deg=yaw_deg))
-    costs = image.costs(other, WALLS)
-    for k in range(0, len(WALLS), 5):
-        u, v = image.positions(other.camera, image.inverse_distance(WALLS[k]))
-        inside = (u >= 0.5) & (v >= 0.5) & (u < SIZE[1] - 1.5) & (v < SIZE[0] - 1.5)
-        assert ((costs[:, k] != INVALID) != inside).mean() < 2e-3
-
-
-def test_images_are_halved_to_about_400_px() -> None:
-    rig = demo_source_rig((451, 1601))
-    small = motion_camera(rig[0])
-    assert small.size == reduced_grey(rig[0], torch.zeros(3, 451, 1601, dtype=torch.uint8)).shape == (112, 400)
-    big, little = (view.project(rig[0].center_m + np.array([10.0, 1.0, -0.5])).uv for view in (rig[0], small))
-    np.testing.assert_allclose((big + 0.5) / 4 - 0.5, little, atol=1e-9)
-    assert [motion_camera(demo_source_rig(s)[0]).size for s in ((96, 256), (256, 704))] == [(96, 256), (128, 352)]
-
-
-def test_aggregation_is_semi_global_matching_along_four_paths() -> None:
-    """Against a naive loop over pixels and hypotheses."""
-    rng = np.random.default_rng(0)
-    costs = rng.integers(0, INVALID, (4, 6, 5)).astype(np.uint16)
-    h, w, K = costs.shape
-    total = np.zeros(costs.shape, int)
-    for dy, dx in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        path = np.zeros(costs.shape, int)
-        rows = range(h) if dy >= 0 else range(h - 1, -1, -1)
-        columns = range(w) if dx >= 0 else range(w - 1, -1, -1)
-        for y in rows:
-            for x in columns:
-                py, px = y - dy, x - dx
-                for k in range(K):
-                    if not (0 <= py < h and 0 <= px < w):
-                        path[y, x, k] = costs[y, x, k]
-                        continue
-                    before = path[py, px].astype(int)
-                    near = [before[j] + int(STEP) for j in (k - 1, k + 1) if 0 <= j < K]
-                    path[y, x, k] = costs[y, x, k] + min([before[k], before.min() + int(JUMP), *near]) - before.min()
-        total += path
-    np.testing.assert_array_equal(aggregate(costs), total)
-
-
-def test_a_least_is_clear_if_no_other_wall_is_nearly_as_good() -> None:
-    """Walls next to it do not count, nor those behind the road, which show the road too."""
-    total = np.array([[[30, 12, 10, 12, 30, 30], [30, 12, 10, 12, 30, 12], [14, 12, 10, 12, 30, 30]]] * 2, np.uint16)
-    total[1] = [10, 10, 10, 10, 20, 20]
-    road = np.array([[0, 0, 0], [3, 3, 0]], np.float32)
-    _, clear = find_least(total, np.float32(1), road)
-    assert clear.tolist() == [[True, False, True], [True, True, False]]
 
 
 # --- traffic that moves -----------------------------------------------------------------------------------------------
@@ -216,18 +146,3 @@ def test_what_is_too_slender_for_a_person_stays() -> None:
     for size_m, is_right in (((0.6, 1.7), True), ((0.6, 4.0), False)):
         found_m, _ = distances(True, (-1.2, 0.0), size_m=size_m)
         assert (abs(found_m - BOARD_M) < 0.15 * BOARD_M) == is_right
-
-
-@pytest.mark.parametrize("rows", [2, 3])
-def test_a_thing_in_the_uppermost_rows_stands_on_the_road_there(rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    camera = helpers.camera(size=(80, 120), elevation_deg=-35, horizontal_fov_deg=60, position_m=(0, 0, 1.6))
-    image = SweptImage(camera, np.zeros(camera.size, np.float32), 0.0)
-    thing = np.zeros(camera.size, bool)
-    thing[:rows, 40:80] = True
-    monkeypatch.setattr(plane_sweep, "_road_flow", lambda *_: None)
-    monkeypatch.setattr(plane_sweep, "_off_road", lambda *_: iter([thing]))
-    monkeypatch.setattr(plane_sweep, "_correlations", lambda *of: np.where(thing[of[-1]], 0.9, 0.1))
-    costs = np.where(thing, 0.8 * PER_CORRELATION, 0.1 * PER_CORRELATION).astype(np.float32)
-    q, valid = image.road.copy(), np.ones(camera.size, bool)
-    plane_sweep._stand_off_road(image, [image], costs, costs, q, valid)
-    assert q[0, 60] == pytest.approx(image.road[0, 60], rel=0.2)

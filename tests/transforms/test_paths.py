@@ -18,7 +18,7 @@ from arbiview_aug import Rig, RigRetarget, SampleError, SampleKeys
 from arbiview_aug.errors import GeneratorError
 from arbiview_aug.generator import Diffusion, Generator
 from arbiview_aug.inpaint import CompletedLoader, Inpainter, Telea
-from tests.generator.small import ring, small_config, stirred
+from tests.generator.small import ring
 from tests.helpers import assert_same_to_a_level
 
 
@@ -28,15 +28,6 @@ def no_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
-
-
-@pytest.fixture(scope="module")
-def generator() -> Generator:
-    pytest.importorskip("diffusers")
-    torch.manual_seed(0)
-    network = Generator.from_config(small_config())
-    stirred(network.denoiser)
-    return network.eval()
 
 
 SOURCE = ring(3, horizontal_fov_deg=70)
@@ -65,13 +56,6 @@ def test_pixels_of_low_confidence_are_filled_too(generator: Generator) -> None:
     assert torch.equal(out["coverage"], ~out["generated"])
     assert (out["confidence"][out["generated"]] == 0).all()
     assert (out["source_camera"][out["generated"]] == -1).all() and (out["source_frame"][out["generated"]] == -1).all()
-
-
-def test_generated_pixels_are_masked_when_retargeted_again() -> None:
-    once = RigRetarget(TARGET, holes="telea", keys=SampleKeys(extra=("sources", "confidence")))(a_sample())
-    again = RigRetarget(TARGET.undistorted(), holes="black")(once)
-    assert torch.equal(again["coverage"], once["coverage"])
-    assert "generated" not in again and "sources" not in again
 
 
 # --- after collating --------------------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -23,10 +22,7 @@ from arbiview_aug import RigRetarget
 from arbiview_aug.__main__ import main
 from arbiview_aug.cli.convert import command as command_module
 from arbiview_aug.cli.convert import job
-from arbiview_aug.cli.convert.command import Actor
-from arbiview_aug.cli.convert.job import Jobs
-from arbiview_aug.cli.convert.writer import Settings
-from arbiview_aug.datasets import FrameFolder, NuScenesDataset, RetargetedDataset
+from arbiview_aug.datasets import FrameFolder, RetargetedDataset
 from arbiview_aug.errors import DataError
 from tests.cli.convert.drives import TARGET, command, tree, write_frames, write_nuscenes
 
@@ -224,7 +220,7 @@ def test_links_that_stay_in_the_root(kind: str, request: pytest.FixtureRequest) 
     """Files and a folder that are links, in a root that is one."""
     home: Home = request.getfixturevalue(kind)
     (home.source / "sequence.json").unlink(missing_ok=True)  # its names are of frames
-    assert main(command(home.source, home.root / "plain")) == 0
+    assert main(command(home.source, home.root / "plain", "--points", "source")) == 0
     blobs = home.source / "blobs"
     (home.source / ("maps" if kind == "tables" else "0001")).rename(home.root / "folder")
     for k, path in enumerate(sorted(home.source.rglob("*.*"))):
@@ -235,7 +231,7 @@ def test_links_that_stay_in_the_root(kind: str, request: pytest.FixtureRequest) 
     (home.root / "folder").rename(blobs / "folder")
     (home.source / ("maps" if kind == "tables" else "0001")).symlink_to(Path("blobs", "folder"))
     (home.root / "root").symlink_to(Path("in", "source"))
-    assert main(command(home.root / "root", home.output)) == 0
+    assert main(command(home.root / "root", home.output, "--points", "source")) == 0
     plain, linked = tree(home.root / "plain"), tree(home.output)
     named = {"conversion/settings.json", "conversion/provenance.json"}  # the roots have other names
     assert {name for name in plain if linked.get(name) != plain[name]} <= named and plain.keys() == linked.keys()
@@ -254,12 +250,6 @@ def test_depth_is_not_written_elsewhere(frames: Home) -> None:
 
 
 # --- whatever a sample raises -----------------------------------------------------------------------------------------
-def test_a_camera_image_of_tables_with_such_a_name(tables: Home) -> None:
-    """A camera's file is not kept: so its sample alone is broken."""
-    tables.rename("sample_data", "../a\0b", "samples/CAM_FRONT/")
-    assert tables.convert("--on-error", "skip") == 0
-    assert tables.said.count("skipped: nuScenes") == 1
-    assert len(NuScenesDataset(tables.output)) == 3
 
 
 def raises(error: BaseException | None = None) -> Any:
@@ -289,17 +279,6 @@ def test_an_interrupt_is_no_samples_fault(frames: Home, monkeypatch: pytest.Monk
     monkeypatch.setattr(FrameFolder, "__getitem__", lambda *_: raises(KeyboardInterrupt()))
     assert frames.convert("--on-error", "skip") == 130
     assert "run it again to go on" in frames.said
-
-
-def test_errors_that_nobody_expects_in_ray_actors(frames: Home, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An actor's work: Ray itself is started by the slow test."""
-
-    asked = Settings(root=frames.source, target=TARGET, output=frames.output, size=(24, 40))
-    monkeypatch.setattr(FrameFolder, "__getitem__", lambda *_: raises(ZeroDivisionError("of \ud800")))
-    monkeypatch.setattr(command_module, "optional_package", lambda *_: SimpleNamespace(get_gpu_ids=list))
-    row = Actor(Jobs(asked, asked.open(), range(3), skip=True))({"id": 1})
-    done = pickle.loads(row["done"])
-    assert (done.token, done.state, done.messages) == ("0001", "skipped", ("ZeroDivisionError: of \ud800",))
 
 
 @pytest.mark.parametrize("name", ["conversion", "conversion/samples", "v1.0-mini"])

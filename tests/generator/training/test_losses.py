@@ -14,7 +14,7 @@ from arbiview_aug.errors import TrainingError
 from arbiview_aug.generator import Generator
 from arbiview_aug.generator.completion import shown_condition
 from arbiview_aug.generator.denoiser import REGRESSION, Rows, noise_schedule
-from arbiview_aug.generator.training.config import LossConfig, PseudoViewConfig, TrainConfig
+from arbiview_aug.generator.training.config import LossConfig, TrainConfig
 from arbiview_aug.generator.training.losses import (
     Draws,
     ForwardProcess,
@@ -27,8 +27,7 @@ from arbiview_aug.generator.training.losses import (
 )
 from arbiview_aug.generator.training.pseudo_views import Batch, PseudoViews, collate
 from arbiview_aug.generator.training.trainer import hole_psnr
-from tests.generator.small import small_config
-from tests.generator.training.small import config, frames
+from tests.generator.small import config, frames, small_config
 
 
 def diffusion(prediction: str = "v_prediction", zero_snr: bool = True) -> ForwardProcess:
@@ -145,15 +144,6 @@ def test_the_perceptual_term_compares_the_prediction_with_the_truth() -> None:
     term.backward()
     head = step.denoiser.unet.conv_out.weight.grad
     assert float(term.detach()) > 0.01 and head is not None and float(head.abs().max()) > 0
-
-
-def test_the_perceptual_term_is_a_mean_over_targets() -> None:
-    """As the other terms are."""
-    loss = LossConfig(perceptual=1.0, perceptual_below_t=1000, regression=0.0)
-    settings = config(loss=loss, pseudo_views=PseudoViewConfig(targets=2))
-    step, batch, draws = step_of(settings, [300, 600])
-    step._frozen = step._frozen[0], lambda predicted, _: torch.ones(len(predicted))  # type: ignore[assignment]
-    assert batch.truth.shape[:2] == (2, 2) and float(step(batch, draws, perceptual=True)["perceptual"]) == 1
 
 
 def test_only_holes_count_in_validation() -> None:

@@ -17,7 +17,7 @@ from arbiview_aug.generator.training.config import CONFIGS, PseudoViewConfig
 from arbiview_aug.generator.training.pseudo_views import Batch, Frames, PseudoViews, collate
 from arbiview_aug.inpaint.inpainter import seeded
 from arbiview_aug.transforms.rig_retarget import RigRetarget
-from tests.generator.training.small import SIZE, Pictures, config, frames
+from tests.generator.small import SIZE, Pictures, config, frames
 
 NO = (0.0, 0.0)
 PAPER = CONFIGS["paper"].pseudo_views
