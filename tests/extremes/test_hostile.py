@@ -307,7 +307,8 @@ def test_files_that_mutations_found(boundaries: Boundaries) -> None:
         ("depth/0000.npz", infinite.getvalue(), None, "expected depth of a frame, got OverflowError; delete it"),
     ):
         path = boundaries.root / file
+        sound = path.read_bytes()
         path.write_bytes(content)
         with pytest.raises(ArbiviewError, match=rf"{path.name}: {message}"):
             read(path.parent) if read else boundaries.depths.read("0000", FRAMES)
-        path.write_bytes(boundaries.sound[file])
+        path.write_bytes(sound)
