@@ -151,7 +151,7 @@ def working_s() -> float:
 @cache
 def say_compiling() -> None:
     """Say on stderr, once for each process, why the first frames take long."""
-    print("arbiview_aug: compiling kernels, once for each installation", file=sys.stderr)
+    print("arbiview_aug: compiling kernels that were not used before", file=sys.stderr)
 
 
 @cache
