@@ -36,6 +36,7 @@ _FARTHEST_M, _MOST_HEIGHT_M = 20.0, 8.0  # of a vehicle's cameras, from the ego 
 _COMPARE = "compare docs/rigs.md"  # the fix of an unknown mistake
 _AS_MOUNTED = "turn the image, or mend its pose; ignore this if it is mounted like that"
 _STEEP_DEG, _DOWN_DEG = 60.0, -75.0  # cameras of vehicles roll less and look up less; few look down more
+_TILTED, _LEVEL, _STRAIGHT = 0.5, 0.35, 0.95  # sines of 30, 20 and 72 degrees
 _SAME_COSINE = 0.94  # of 20 degrees: such a mistake hardly turns this camera
 
 _LEAST_NAMED, _ALIKE = 3, 0.8
@@ -262,12 +263,21 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[Finding]:
     upright = "cameras upright over the road: cam2ego with axes right, down, forward, in metres"
     general = [] if mistake is None else [Finding("cam2ego", upright, *mistake)]
     is_known, is_body = mistake is not None and mistake[1] != _COMPARE, mistake is not None and mistake[0] == BODY_AXES
+    sides = [_side(camera.name) for camera in cameras]
+    has_front = (1, 0) in sides
     if not is_known or is_body:
-        of_set = _set_mistake(cam2ego, [_side(camera.name) for camera in cameras], is_body)
+        of_set = _set_mistake(cam2ego, sides, is_body)
         if of_set is not None:
             return [Finding("cam2ego", "cameras that look where their names say", *of_set)]
     if is_known:
         return general
+    up = cam2ego[:, 2, 2]
+    if len(cameras) > 1 and (np.abs(up) > _TILTED).any() and up.min() > -_STRAIGHT:
+        for right, wrong, fix in _candidates(cam2ego):
+            is_level = (np.abs(right[:, 2, 2]) < _LEVEL) & (right[:, 2, 1] < -0.9)
+            looks_aside = any(_belies(pose, side, has_front) for pose, side in zip(right, sides, strict=True))
+            if is_level.all() and is_mounted(right, ground_z_m).all() and not looks_aside:
+                return [Finding("cam2ego", "level cameras that look where their names say", wrong, fix)]
     y_m, y_axes = cam2ego[:, 1, 3], cam2ego[:, 1, 2]
     aside = (np.abs(y_m) > 0.1) & (np.abs(y_axes) > 0.5)
     found = []
@@ -275,7 +285,6 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[Finding]:
         expected = "cameras that look to the left on the left"
         fix = "positions are left-handed (y to the right): negate cam2ego[1, 3]"
         found.append(Finding("cam2ego", expected, "y of all positions mirrored", fix))
-    has_front = any(_side(camera.name) == (1, 0) for camera in cameras)
     for camera in cameras:
         where, doubt = f"camera {shown(camera.name)}: cam2ego", pose_doubt(camera, has_front)
         likely = doubt and next(likely_poses(camera, ground_z_m, has_front), None)

@@ -23,6 +23,7 @@ from arbiview_aug.cameras.rotations import (
     rotation_from_quaternion,
     rotation_z,
 )
+from arbiview_aug.cameras.validation import doubts
 from arbiview_aug.datasets import FrameFolder, cleaned_rig, open_data
 from arbiview_aug.sample.label_mistakes import road_height_m
 from arbiview_aug.sample.mistakes import check_rig
@@ -471,3 +472,21 @@ def test_rendering_names_the_fix(mistake: str, street: Sample) -> None:
 def test_a_pose_that_is_none_tells_nothing(street: Sample) -> None:
     for pose in (torch.zeros(4, 4), torch.full((4, 4), float("nan")), torch.eye(3)):
         assert check({**street, "ego2world": pose}).findings == check({**street, "ego2world": None}).findings
+
+
+@pytest.mark.parametrize("order", [[1, 2, 3, 0], [3, 0, 1, 2]])
+@pytest.mark.parametrize("azimuth_deg", [35, 55, 75])
+def test_quaternions_of_a_pair_that_look_steeply_when_misread(azimuth_deg: float, order: list[int]) -> None:
+    cameras = [
+        Camera.looking(
+            name=name, azimuth_deg=azimuth, position_m=(1.5, azimuth / 100, 1.5), width_px=64, height_px=48,
+            horizontal_fov_deg=60,
+        )
+        for name, azimuth in (("front", 0), ("front_left", azimuth_deg))
+    ]  # fmt: skip
+    assert not doubts(cameras, 0.0)
+    poses = [camera.cam2ego.copy() for camera in cameras]
+    for pose in poses:
+        pose[:3, :3] = rotation_from_quaternion(quaternion_from_rotation(pose[:3, :3])[order])
+    wrong = [replace(camera, cam2ego=pose) for camera, pose in zip(cameras, poses, strict=True)]
+    assert any("quaternion" in finding.found for finding in doubts(wrong, 0.0))
