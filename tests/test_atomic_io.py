@@ -13,13 +13,13 @@ import pytest
 
 from arbiview_aug import atomic_io
 from arbiview_aug.atomic_io import inside, link_whole, remove_parts, whole_file, write_whole
-from arbiview_aug.errors import ArbiviewError, DataError, GeneratorError, OutputError
+from arbiview_aug.errors import ArbiviewError, DataError, OutputError
 from arbiview_aug.files import read_bytes, read_text
 from arbiview_aug.generator.completion import load_inpainter
 from arbiview_aug.generator.generator import FILE, load_part, read_checkpoint
 from arbiview_aug.generator.training.losses import load_perceptual
 from arbiview_aug.inpaint import PipelineInpainter
-from arbiview_aug.inpaint.networks import load_torchscript
+from arbiview_aug.inpaint.networks import TorchScriptInpainter
 from arbiview_aug.temporal.learned_depth import TransformersDepth
 
 
@@ -194,7 +194,7 @@ def with_pipe(folder: Path, name: str = "config.json") -> Path:
         lambda folder: load_inpainter(with_pipe(folder, "model_index.json")),
         lambda folder: PipelineInpainter.from_pretrained(with_pipe(folder)),
         lambda folder: read_checkpoint(with_pipe(folder, FILE)),
-        lambda folder: load_torchscript(with_pipe(folder) / "config.json", "network", GeneratorError),
+        lambda folder: TorchScriptInpainter(with_pipe(folder) / "config.json"),
         lambda folder: TransformersDepth(str(with_pipe(folder))),
         lambda folder: load_part("AutoencoderKL", with_pipe(folder), "vae", {}),
         lambda folder: load_perceptual(with_pipe(folder) / "config.json"),

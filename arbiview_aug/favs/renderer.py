@@ -1,4 +1,4 @@
-"""``quality="paper"``: FAVS stages 1 to 4 as published, over ``geometry="infinity"``, each frame by itself.
+"""``quality="paper"``: FAVS stages 1 to 4 as published, over ``geometry="infinity"``, frame by frame.
 
 The paper's section "Feature-Aware Adaptive View Synthesis (FAVS) Algorithm". For every target camera, one source is
 primary. Each source is warped by H_geom (stage 1), matched to the primary camera's warp (stage 2), shifted by its
@@ -46,6 +46,8 @@ class SourceReport:
 
 @dataclass(frozen=True)
 class PaperView:
+    """A target view rendered by the published stages."""
+
     image: torch.Tensor  # (3, h, w) in the type of the source images, black where no source sees
     source_camera: npt.NDArray[np.int8]  # (h, w) index of the source with the largest weight, -1 for none
     reports: tuple[SourceReport, ...]  # one for each source that the target shows
@@ -71,7 +73,7 @@ class PaperRendering:
         return [view.coverage for view in self.targets]
 
     def __str__(self) -> str:
-        """Coverage of each target camera, and what each stage made of its sources."""
+        """Coverage of each target camera, and the result of each stage for its sources."""
         names = f"{self.source.name or 'source'} -> {self.target.name or 'target'}"
         lines = [f"{names}: {len(self.source)} cameras to {len(self.target)}, stages 1 to 4 as published, far surface"]
         for camera, view in zip(self.target, self.targets, strict=True):
@@ -104,7 +106,15 @@ def render_paper(
             "quality='paper': expected CPU images without gradients: SIFT and RANSAC are OpenCV's and have no "
             "derivative; use quality='fast'"
         )
-    arrays = [_masked(camera, image) for camera, image in zip(source.cameras, images, strict=True)]
+    arrays = [
+        image.permute(1, 2, 0).to(torch.float32, copy=True, memory_format=torch.contiguous_format).numpy()
+        for image in images  # by torch, as numpy has no bfloat16
+    ]
+    for camera, array in zip(source.cameras, arrays, strict=True):
+        if images[0].dtype != torch.uint8:
+            array *= 255
+        if camera.mask is not None:
+            array[~camera.mask] = 0
     order = content_order(source.cameras)
     with repeatable_opencv():
         views = [
@@ -226,17 +236,6 @@ def paper_labels(rendering: PaperRendering, labels: Sequence[torch.Tensor], fill
             out[..., torch.from_numpy(won)] = label[..., y, x]
         rendered.append(out)
     return rendered
-
-
-def _masked(camera: Camera, image: torch.Tensor) -> Float32Image:
-    """(H, W, 3) in 0..255, black on the own car's body."""
-    copied = image.permute(1, 2, 0).to(torch.float32, copy=True, memory_format=torch.contiguous_format)
-    array = copied.numpy()  # by torch, as numpy has no bfloat16
-    if image.dtype != torch.uint8:
-        array *= 255
-    if camera.mask is not None:
-        array[~camera.mask] = 0
-    return array
 
 
 def _grey(image: Float32Image) -> npt.NDArray[np.uint8]:

@@ -31,7 +31,7 @@ Case = Literal["feature", "blended", "geometric"]
 
 REFERENCE_WIDTH_PX = 800  # target width at which ``PaperConfig`` states its lengths
 # Lengths named _PX are target pixels at that width.
-_MAX_FEATURES = 2000  # strongest SIFT keypoints of an overlap; the most seen in real frames is 1108
+_MAX_FEATURES = 2000  # strongest SIFT keypoints of an overlap; real frames have about half as many
 _OVERLAP_MARGIN_PX = 8.0  # around the overlap's bounding box: about the reach of a SIFT descriptor
 _MIN_OVERLAP_PX = 16.0  # descriptors reach across narrower overlaps
 _RANSAC_PX = 2.0  # largest reprojection error of an inlier of M
@@ -104,12 +104,12 @@ def consistency(H_geometric: FloatArray, H_feature: FloatArray, corners: FloatAr
 
 
 # --- matching ---------------------------------------------------------------------------------------------------------
-def overlap_region(one: BoolArray, two: BoolArray, margin_px: int) -> Region | None:
+def overlap_region(coverage: BoolArray, neighbour: BoolArray, margin_px: int) -> Region | None:
     """Bounding box of the overlap of two (h, w) coverages, grown by a margin inside the image; None without overlap."""
-    rows, columns = (np.flatnonzero((one & two).any(axis)) for axis in (1, 0))
+    rows, columns = (np.flatnonzero((coverage & neighbour).any(axis)) for axis in (1, 0))
     if not len(rows):
         return None
-    h, w = one.shape
+    h, w = coverage.shape
     return Region(
         max(int(columns[0]) - margin_px, 0),
         max(int(rows[0]) - margin_px, 0),
@@ -145,7 +145,7 @@ def match_features(warped: GreyImage, reference: GreyImage, usable: BoolArray, r
 def estimate_homography(matches: Matches, ransac_px: float) -> tuple[FloatArray, BoolArray] | None:
     """RANSAC(good_matches), as MAGSAC with its fixed seed: (3, 3) M from warp to reference and the (n,) inliers.
 
-    None for degenerate matches, such as collinear points.
+    None for degenerate matches, for example collinear points.
     """
     if len(matches.warped) < 4:
         return None
@@ -215,8 +215,8 @@ def accept(
 ) -> FeatureReport:
     """Apply the paper's three criteria for reliable matches and choose the case of H_base.
 
-    The arguments are those of ``optimise_transformation``, with the bounding box of the source's warp in target pixels
-    (``shown``) and the target's width over ``REFERENCE_WIDTH_PX`` (``scale``).
+    Arguments are as in ``optimise_transformation``; ``shown`` is the bounding box of the source's warp in target pixels
+    and ``scale`` the target's width over ``REFERENCE_WIDTH_PX``.
     """
     count = len(matches.warped)
     if count < config.min_matches:

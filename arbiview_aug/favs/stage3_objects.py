@@ -27,7 +27,7 @@ from arbiview_aug.favs.stage2_features import REFERENCE_WIDTH_PX, Matches
 CLUSTER_RADIUS_PX = 30.0  # DBSCAN's ε: a car's width, 1.8 m, at 40 m and 60 degrees of view
 MIN_SAMPLES = 4  # of DBSCAN
 _CLUSTER_SPREAD_PX = 2.0  # spread s_j of a cluster's offsets at which confidence_j is 1/2
-_GROUND_REACH_M = 40.0  # within which a cluster's top must meet the road for the type ``ground``
+_GROUND_REACH_M = 40.0  # distance within which the top of a ``ground`` cluster meets the road
 _MAX_SHIFT_PX = 12.0  # longest ΔT: longer ones come from mismatches or a single near object
 
 
@@ -101,11 +101,11 @@ def clusters(points: FloatArray, radius_px: float, min_samples: int) -> npt.NDAr
 
 
 def geometric_type(bbox: tuple[float, float, float, float], target: Camera, ground_z_m: float, reach_m: float) -> str:
-    """Classify a cluster by the road plane: the paper names types, but not what tells them.
+    """Classify a cluster by the road plane; the paper names the types, but no criterion.
 
     ``far``: its bottom edge lies above the horizon. ``ground``: its top edge meets the road within ``reach_m``.
-    ``upright``: all others, such as vehicles and pedestrians. ``bbox`` is (x0, y0, x1, y1) in target pixels; the road's
-    height is in the target's ego frame.
+    ``upright``: all others, for example vehicles and pedestrians. ``bbox`` is (x0, y0, x1, y1) in target pixels;
+    ``ground_z_m`` is in the target's ego frame.
     """
     x = (bbox[0] + bbox[2]) / 2
     top, bottom = target.unproject(np.array([(x, bbox[1]), (x, bbox[3])])).directions[:, 2]

@@ -66,7 +66,7 @@ def source_pixels(
     with np.errstate(divide="ignore", invalid="ignore"):
         uv = np.stack([u / third, v / third], -1)
     uv = np.where(front[..., None], uv, -1.0)
-    # Rotations of whole images land a rounding error beside the outermost pixel centres.
+    # Rotations of whole images miss the outermost pixel centres by a rounding error.
     nearest = np.round(uv)
     uv = np.where(np.abs(uv - nearest) < 1e-9, nearest, uv)
     inside = (uv >= 0) & (uv <= (source_size[1] - 1, source_size[0] - 1))

@@ -129,25 +129,25 @@ def correspondences(
         planes = plane_vectors(query, ground_z_m)
         rays = [camera.unproject_cam(camera.pixel_grid()) for camera in map(query.resize, sizes)]
         by_query.append([])  # views j that overlap the query, with ``correspond`` for each token grid
-        for j, of_sizes in enumerate(small):
-            same_centre = float(np.abs(query.center_m - of_sizes[0].center_m).max()) < SAME_CENTER_M
+        for j, cameras in enumerate(small):
+            same_centre = float(np.abs(query.center_m - cameras[0].center_m).max()) < SAME_CENTER_M
             used = planes[:1] if same_centre else planes
-            if j != self_index and (first := correspond(query, rays[0], of_sizes[0], used))[1].any():
-                rest = [correspond(query, ray, key, used) for ray, key in zip(rays[1:], of_sizes[1:], strict=True)]
+            if j != self_index and (first := correspond(query, rays[0], cameras[0], used))[1].any():
+                rest = [correspond(query, ray, key, used) for ray, key in zip(rays[1:], cameras[1:], strict=True)]
                 by_query[-1].append((j, [first, *rest]))
-    slots = max(1, *(len(of_query) for of_query in by_query))
-    levels = max((len(grids[0][0]) for of_query in by_query for _, grids in of_query), default=1)
+    slots = max(1, *(len(overlaps) for overlaps in by_query))
+    levels = max((len(grids[0][0]) for overlaps in by_query for _, grids in overlaps), default=1)
     shapes = [(1, len(queries), slots, levels, h, w) for h, w in sizes]
     neighbour = torch.zeros(shapes[0][:3], dtype=torch.int64)
     reads = [
         Correspondence(neighbour, torch.zeros((*shape, 2)), torch.zeros(shape, dtype=torch.bool)) for shape in shapes
     ]
-    for q, of_query in enumerate(by_query):
-        for slot, (j, grids) in enumerate(of_query):
+    for q, overlaps in enumerate(by_query):
+        for slot, (j, grids) in enumerate(overlaps):
             neighbour[0, q, slot] = j
-            for of_grid, (centre, valid) in zip(reads, grids, strict=True):
-                of_grid.centre[0, q, slot, : len(centre)] = torch.from_numpy(centre.astype(np.float32))
-                of_grid.valid[0, q, slot, : len(valid)] = torch.from_numpy(valid)
+            for read, (centre, valid) in zip(reads, grids, strict=True):
+                read.centre[0, q, slot, : len(centre)] = torch.from_numpy(centre.astype(np.float32))
+                read.valid[0, q, slot, : len(valid)] = torch.from_numpy(valid)
     return reads
 
 
@@ -306,25 +306,21 @@ class CrossViewAttention(nn.Module):
             Features (B, Q, T, width); with ``with_rows`` also M_ij^pred (E, 9) of L_geo: each Attention^(l) over its
             taps, mean over the heads.
         """
-        logits = self._logits(self.to_q(self.norm(tokens)), keys, at)
+        q = self.to_q(self.norm(tokens)).reshape(-1, self.heads, HEAD_WIDTH).index_select(0, at.token)
+        logits = (q[:, None] * self._gather(keys, at.tap)).sum(-1).transpose(1, 2)  # q·k, [E, heads, 9]
+        encoding = self.positions(tap_offsets(q.device)).to(q.dtype)
+        logits = logits + self.positions.rotate_queries(q, at.fraction) @ encoding.T  # q·PE(Δp)
+        logits = (logits / math.sqrt(HEAD_WIDTH)).masked_fill(~at.inside[:, None], MASKED)
         share = torch.softmax(logits.float(), -1) * self._weights(logits[..., TAPS // 2], at)[..., None]
         read = self._gather(values, at.tap)  # [E, 9, heads, 32]
         # Autocast sums in float32 on GPUs, in the values' type on CPUs; index_add takes one type.
-        of_place = (share.to(values.dtype).transpose(1, 2)[..., None] * read).sum(1).flatten(1).to(values.dtype)
+        weighted = (share.to(values.dtype).transpose(1, 2)[..., None] * read).sum(1).flatten(1).to(values.dtype)
         B, Q, T = at.read.shape
-        attended = values.new_zeros(B * Q * T, values.shape[-1]).index_add(0, at.token, of_place).view(B, Q, T, -1)
+        attended = values.new_zeros(B * Q * T, values.shape[-1]).index_add(0, at.token, weighted).view(B, Q, T, -1)
         gate = at.read[..., None].to(tokens.dtype)
         tokens = tokens + gate * self.to_out(attended)
         tokens = tokens + gate * self.feed(self.feed_norm(tokens))
         return tokens, torch.softmax(logits.float(), -1).mean(1) if with_rows else None
-
-    def _logits(self, queries: torch.Tensor, keys: torch.Tensor, at: TokenWindow) -> torch.Tensor:
-        """(E, heads, 9) q·(k + PE(Δp)) / √32, those outside view j at ``MASKED``."""
-        q = queries.reshape(-1, self.heads, HEAD_WIDTH).index_select(0, at.token)
-        logits = (q[:, None] * self._gather(keys, at.tap)).sum(-1).transpose(1, 2)  # q·k
-        encoding = self.positions(tap_offsets(q.device)).to(q.dtype)
-        logits = logits + self.positions.rotate_queries(q, at.fraction) @ encoding.T  # q·PE(Δp)
-        return (logits / math.sqrt(HEAD_WIDTH)).masked_fill(~at.inside[:, None], MASKED)
 
     def _weights(self, nearest: torch.Tensor, at: TokenWindow) -> torch.Tensor:
         """(E, heads) float32 weight of each pair and level, from the logits (E, heads) at the nearest taps."""

@@ -65,13 +65,13 @@ class Conditions(NamedTuple):
 
 def with_sampling(config: GeneratorConfig, steps: int | None, guidance: float | None) -> GeneratorConfig:
     """The config with steps and guidance where given; GeneratorError where its generator cannot sample so."""
-    own = config.guidance
-    steps, guidance = config.steps if steps is None else steps, own if guidance is None else guidance
+    default = config.guidance
+    steps, guidance = config.steps if steps is None else steps, default if guidance is None else guidance
     config = replace(config, steps=steps, guidance=guidance)
     if config.steps == 1 and not config.one_step:
         why = f"the one-step regression of generator {config.name!r} was not trained (loss.regression=0)"
         raise GeneratorError(f"steps: expected at least 2, got 1: {why}")
-    if config.steps == 1 and guidance not in (1, own):
+    if config.steps == 1 and guidance not in (1, default):
         raise GeneratorError(f"guidance: expected none with one step, which it cannot change, got {guidance}")
     return config
 
@@ -155,7 +155,7 @@ def sample(predict: Predict, prefilled: torch.Tensor, noise: torch.Tensor, confi
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
-ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: what is left is a seam
+ALMOST_COMPLETE = 0.995  # share of known pixels from which a view is inpainted: only a seam is left
 VIEWS_AT_ONCE = 24  # views that the denoiser sees in one call; a whole frame in any case
 
 _Inputs = tuple[Conditions, FrameGeometry, torch.Tensor]
@@ -229,16 +229,16 @@ class Diffusion(Inpainter, torch.nn.Module):
     def _completed(
         self, rendered: Sequence[Views], frames: Sequence[Frame]
     ) -> tuple[list[list[torch.Tensor]], list[list[torch.Tensor]]]:
-        """Images of each frame that are right in the holes, and the holes."""
+        """Images of each frame with completed holes, and the holes."""
         check_device(self.generator)
         names, images, holes = frame_names(frames), [list[torch.Tensor]() for _ in frames], []
         alike: dict[tuple[int, int], list[tuple[int, list[int], _Inputs]]] = {}
         for n, (frame, source) in enumerate(zip(rendered, frames, strict=True)):
-            known, of_frame = holes_of(frame, self.min_confidence)
-            holes.append(of_frame)
+            known, frame_holes = holes_of(frame, self.min_confidence)
+            holes.append(frame_holes)
             copied = [image.clone() for image in frame.images]
             images[n] = Continue().fill([replace(frame, images=copied, coverage=known)], [source])[0].images
-            left = [m for m, hole in enumerate(of_frame) if float(hole.float().mean()) > 1 - ALMOST_COMPLETE]
+            left = [m for m, hole in enumerate(frame_holes) if float(hole.float().mean()) > 1 - ALMOST_COMPLETE]
             if left:
                 inputs = self._inputs(frame, source, images[n], known, left, names[n])
                 alike.setdefault((len(left), inputs[0].sources.shape[1]), []).append((n, left, inputs))
@@ -293,7 +293,7 @@ def _changed(view: torch.Tensor, change: torch.Tensor) -> torch.Tensor:
 
 
 def load_inpainter(where: str | Path | None, *, steps: int | None = None) -> Diffusion | NetworkInpainter:
-    """Load what fills holes: a generator's folder, a TorchScript file, or an inpainting pipeline of diffusers.
+    """Load an inpainter: a generator's folder, a TorchScript file, or an inpainting pipeline of diffusers.
 
     Args:
         where: The folder, file or hub id.

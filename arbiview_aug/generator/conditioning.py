@@ -2,7 +2,7 @@
 
 The paper does not define its pose condition encoding f_pose. Here each view has
 
-- channels beside its noisy latent: the condition latent (FAVS at the view's pose, holes pre-filled), the coverage mask
+- channels next to its noisy latent: the condition latent (FAVS at the view's pose, holes pre-filled), the coverage mask
   of FAVS, its confidence, and the Plücker rays of its pixels;
 - one token, MLP(Fourier(R, t, K)), appended to the embedding of the empty prompt.
 
@@ -72,9 +72,8 @@ def nearest_sources(target: Camera, sources: Sequence[Camera]) -> list[int]:
 
 def relative_pose(camera: Camera, reference: Camera) -> tuple[FloatArray, FloatArray]:
     """R (3, 3) and t (3,) from the camera's frame to the reference's, t compressed to less than 1: t / (1 + |t|)."""
-    with np.errstate(over="ignore"):  # of poses beyond 1e154 m
-        R, t = between(camera, reference)
-        return R, t / (1 + np.linalg.norm(t))
+    R, t = between(camera, reference)
+    return R, t / (1 + np.linalg.norm(t))
 
 
 def plucker_rays(camera: Camera, reference: Camera, size: tuple[int, int]) -> torch.Tensor:
@@ -145,7 +144,7 @@ class FrameGeometry(NamedTuple):
         return ViewInputs(latent, known, trust, self.target_rays, self.target_pose)
 
     def source_views(self, latent: torch.Tensor, mask: torch.Tensor, confidence: torch.Tensor) -> ViewInputs:
-        """The sources' conditions; the latents are those of their images."""
+        """The sources' conditions, with the latents of their images."""
         return self.target_views(latent, mask, confidence)._replace(rays=self.source_rays, pose=self.source_pose)
 
     def target_windows(self, dropped: torch.Tensor | None = None) -> list[TokenWindow]:
@@ -165,7 +164,7 @@ def frame_geometry(
     size = config.latent_size
     viewed = (
         [(target, sources[nearest_sources(target, sources)[0]]) for target in targets],
-        [(one, one) for one in sources],
+        [(source, source) for source in sources],
     )
     rays = [torch.stack([plucker_rays(*pair, size) for pair in pairs])[None] for pairs in viewed]
     poses = [torch.stack([pose_vector(*pair) for pair in pairs])[None] for pairs in viewed]

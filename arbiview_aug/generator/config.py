@@ -168,7 +168,7 @@ class GeneratorConfig:
     steps: int = 4  # denoising steps; 1 is the one-step regression
     guidance: float = 1.0  # classifier-free guidance; 1 is none and takes half the time
     strength: float = 1.0  # share of the diffusion by which pre-filled latents are noised: 0.6 starts at t = 599
-    temperature: float = 0.5  # deviation of the initial noise; at 1 a sample is 3 dB below the posterior's mean
+    temperature: float = 0.5  # deviation of the initial noise; at 1 samples are less accurate than the posterior's mean
 
     def __post_init__(self) -> None:
         check_sizes(self, _MOST_PIXELS, "image_size", "prompt_tokens")

@@ -45,7 +45,7 @@ class Denoiser(nn.Module):
         unet: A diffusers ``UNet2DConditionModel`` as ``UNetConfig`` describes; ``conv_in`` is widened by zeros.
         config: Its ``prompt_tokens`` and ``unet.cross_view`` are read.
         signal: (T,) √ᾱ_t of the schedule: the network then predicts the residual between image and condition. None
-            leaves its output as it is, for Stable Diffusion's weights.
+            leaves its output unchanged, for Stable Diffusion's weights.
     """
 
     deviation: torch.Tensor  # (2,) of the residual inside holes and outside; measured before training
@@ -57,9 +57,9 @@ class Denoiser(nn.Module):
         self.unet = unet
         widths = tuple(unet.config.block_out_channels)
         used = config.unet.cross_view or (True,) * len(widths)
-        of_blocks = zip((*widths, widths[-1], *widths[::-1]), (*used, used[-1], *used[::-1]), strict=True)
+        blocks = zip((*widths, widths[-1], *widths[::-1]), (*used, used[-1], *used[::-1]), strict=True)
         self.cross_view = nn.ModuleDict(
-            {str(k): CrossViewAttention(width, len(LEVELS)) for k, (width, is_used) in enumerate(of_blocks) if is_used}
+            {str(k): CrossViewAttention(width, len(LEVELS)) for k, (width, is_used) in enumerate(blocks) if is_used}
         )
         self.context = PoseContext(int(unet.config.cross_attention_dim), config.prompt_tokens)
         self.regression = nn.Conv2d(widths[0], self.latent_channels, 3, padding=1)
@@ -234,11 +234,11 @@ def _read_views(
 ) -> tuple[torch.Tensor, KeysValues, torch.Tensor | None]:
     """Features (B Q, width, h, w) after reading [others, these views]; these views' keys and values; L_geo's rows."""
     tokens = _tokens(h, count)
-    keys, values = own_tokens = block.keys_values(tokens)
+    keys, values = view_tokens = block.keys_values(tokens)
     if others is not None:
-        keys, values = (torch.cat(both, 1) for both in zip(others, own_tokens, strict=True))
+        keys, values = (torch.cat(both, 1) for both in zip(others, view_tokens, strict=True))
     tokens, rows = block(tokens, keys, values, window, with_rows)
-    return tokens.flatten(0, 1).transpose(1, 2).reshape(h.shape), own_tokens, rows
+    return tokens.flatten(0, 1).transpose(1, 2).reshape(h.shape), view_tokens, rows
 
 
 def _tokens(h: torch.Tensor, count: Sequence[int]) -> torch.Tensor:

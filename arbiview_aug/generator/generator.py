@@ -188,7 +188,7 @@ def read_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, torch.Tenso
 def load_weights(module: nn.Module, tensors: Mapping[str, torch.Tensor], folder: Path) -> None:
     """Replace the tensors of a module by exactly its weights.
 
-    GeneratorError for names that are missing, extra or of another shape, and for values that are no finite numbers.
+    GeneratorError for names that are missing, extra or of another shape, and for values that are not finite.
     """
     for name, expected in module.state_dict().items():
         tensor = tensors.get(name, expected.new_zeros(0, device="cpu"))  # missing names are torch's to report
@@ -208,7 +208,7 @@ def load_part(kind: str, where: str | Path, subfolder: str, arguments: Mapping[s
     """Load a diffusers model (class ``kind``) that must be as its class makes it from the ``arguments``.
 
     ``where`` is a folder or hub id in diffusers' layout; from a hub id, safetensors are downloaded. GeneratorError if
-    anything does not fit: the arguments are all that a generator's own folder keeps.
+    anything does not fit: a generator's folder keeps these arguments only.
     """
     cls = getattr(optional_package("diffusers", "generator"), kind)
     label = f"{where}/{subfolder}"
@@ -221,14 +221,14 @@ def load_part(kind: str, where: str | Path, subfolder: str, arguments: Mapping[s
     for name, parameter in list(inspect.signature(cls.__init__).parameters.items())[1:]:  # without self
         expected, got = arguments.get(name, parameter.default), config.get(name, parameter.default)
         # diffusers takes a value for each level, or one for all
-        of_levels = [list(v) if isinstance(v, list | tuple) else [v] * levels for v in (got, expected)]
-        if name not in _FREE and of_levels[0] != of_levels[1]:
+        by_level = [list(v) if isinstance(v, list | tuple) else [v] * levels for v in (got, expected)]
+        if name not in _FREE and by_level[0] != by_level[1]:
             raise GeneratorError(f"{label}: expected {name} {expected}, got {shown(got)}")
     return _complete_model(cls, where, subfolder, low_cpu_mem_usage=False)
 
 
 def _complete_model(cls: Any, where: str | Path, subfolder: str, **options: Any) -> Any:
-    """Load a model and refuse what the libraries only warn of: missing or extra weights."""
+    """Load a model; refuse missing and extra weights, of which the libraries only warn."""
     label = f"{where}/{subfolder}: expected"
     try:
         model, report = cls.from_pretrained(

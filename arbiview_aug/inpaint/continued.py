@@ -1,9 +1,9 @@
 """Default filling of holes: the background continued along lines of the scene, by a pyramid of cells, and by pixels.
 
-A hole pixel knows whether its ray would meet the road next. The road continues along the ego's heading, in its plane;
-upright things continue along the heading, too, at equal height, and up and down. Each pixel mixes what its lines meet
-first with a blurred completion of its surroundings, and this with the nearest known pixels of its row and column:
-holes have the detail of their border near it. Unseen parts of objects are painted.
+Each hole pixel belongs to the road or to upright objects. The road continues along the ego's heading, in its plane.
+Upright objects continue along the heading at equal height, and vertically. Each pixel mixes the first known pixels
+along its lines with a blurred completion of its surroundings, and these with the nearest known pixels of its row and
+column, so that holes have the detail of their border near it. Unseen parts of objects are painted.
 """
 
 from __future__ import annotations
@@ -29,25 +29,26 @@ from arbiview_aug.scene.boxes import PARTS
 CELLS = 64  # cells along a view's shorter side; the pyramid starts with half as many
 
 REACH = np.array([(0, 0), (0, 1 / 8), (1 / 2, 0), (1 / 16, 1 / 16), (1 / 4, 0)], np.float32)
-"""Distance at which lines along the heading and vertical ones weigh as much as all that is around, as a share of the
-view's shorter side: nothing; upright things and road outside the sources' images; both where something hides them."""
+"""Distance at which lines along the heading and vertical lines weigh as much as all surroundings, as a share of the
+view's shorter side. Rows: nothing; upright objects and road outside the sources' images; both where occluded."""
 
 SIDE_REACH = 1 / 4
-"""The same of seen pixels of a body or cabin in the row and column of its unseen ones, against its colour."""
+"""Distance at which seen pixels of a body or cabin, in the row and column of an unseen one, weigh as much as the body's
+colour, as a share of the view's shorter side."""
 
 _LENS_NODES = 17  # directions of lines are interpolated between N nodes along each side; a pinhole's are linear
-_MOVE = 1e-4  # by which rays are moved along a line, as a share of their length
-_STEP_PX = 4  # distance of the nodes at which views without a plan know the road
+_MOVE = 1e-4  # step of rays along a line, as a share of their length
+_STEP_PX = 4  # spacing of road nodes in views without a plan
 
 Colour = npt.NDArray[np.float32]
 """(3,), or (n, 3) samples, in the images' unit."""
 
 
 class Continue(Inpainter):
-    """Continues the road along the heading, and upright things along the heading and vertically.
+    """Continues the road along the heading, and upright objects along the heading and vertically.
 
-    Unseen parts of labelled objects: tops take the paint of their object's body and what a source sees of its tops
-    (``paint_kernels.colour_objects``); sides continue their seen pixels. Covered pixels do not change.
+    Unseen tops of labelled objects take the colours of their object's body and seen tops
+    (``paint_kernels.colour_objects``); unseen sides continue their seen pixels. Covered pixels do not change.
     """
 
     outcome: ClassVar[str] = "filled in from its surroundings"
@@ -58,7 +59,7 @@ class Continue(Inpainter):
         return fill_holes([view.clone() for view in views], [~hole for hole in holes], only_mean=self.only_mean)
 
     def fill(self, rendered: Sequence[Views], frames: Sequence[Frame]) -> list[Views]:
-        """Fill rendered frames, in place where possible; the own car too."""
+        """Fill rendered frames, own car included, in place where possible."""
         filled = []
         for frame in rendered:
             plans = frame.layers, frame.paint, frame.road, frame.rig
@@ -90,36 +91,39 @@ def fill_holes(
     """Fill uncovered pixels; covered ones are unchanged and keep their gradients.
 
     Args:
-        views: M views (3, h, w), uint8 or float in [0, 1], black where uncovered. Those on the CPU without gradients
-            are modified.
+        views: M views (3, h, w), uint8 or float in [0, 1], black where uncovered. Views on the CPU without
+            gradients are modified.
         coverage: (h, w) bool of each.
         layers: (h, w) uint8 of each as in ``ViewPlan``, or None: all uncovered pixels lie outside the images.
         paint: Colours of each as in ``ViewPlan``, or None.
-        road: The road of each as in ``ViewPlan``, or None: the road reaches to the horizon.
-        cameras: That of each view; None if unknown: verticals are columns, and there is no road.
-        only_mean: Set all to the mean colour of the frame's covered pixels. Else continue background from background,
-            sides of objects from objects, and paint tops in their objects' colours.
+        road: Road nodes of each as in ``ViewPlan``, or None: the road reaches to the horizon.
+        cameras: Cameras of the views; None if unknown: verticals are columns, and there is no road.
+        only_mean: Set all to the mean colour of the frame's covered pixels. By default background continues background,
+            sides of objects continue objects, and tops are painted in their objects' colours.
     """
     from arbiview_aug.inpaint.kernels import fill_background
     from arbiview_aug.render.paint_kernels import paint as paint_parts
 
-    seen = [of_view.cpu().numpy() for of_view in coverage]
-    if all(of_view.all() for of_view in seen):
+    seen = [mask.cpu().numpy() for mask in coverage]
+    if all(mask.all() for mask in seen):
         return list(views)
     arrays = [_as_array(view) for view in views]
     needs_mean = only_mean or not all(of_view.any() for of_view in seen)
     mean = mean_colour(arrays, seen) if needs_mean else np.zeros(3, np.float32)
     none = [None] * len(arrays)
     colours = None if only_mean else object_colours(arrays, paint or none)
-    of_views = zip(arrays, seen, layers or none, paint or none, road or none, cameras or none, strict=True)
-    for view, known, layer, objects, on_road, camera in of_views:
+    inputs = zip(arrays, seen, layers or none, paint or none, road or none, cameras or none, strict=True)
+    for view, known, layer, objects, on_road, camera in inputs:
         if known.all():
             continue
         rounding = 0.5 if view.dtype == np.uint8 else 0.0
         if only_mean:
             view[:, ~known] = (mean + rounding)[:, None].astype(view.dtype)
             continue
-        side, cell = min(known.shape), _cell_px(known.shape)
+        side = min(known.shape)
+        most = max(1, side // CELLS)
+        divisors = (n for n in range(most // 2 + 1, most + 1) if not any(length % n for length in known.shape))
+        cell = max(divisors, default=most)  # preferably cells fill the view
         layer = np.zeros(known.shape, np.uint8) if layer is None else layer
         on_road = _road_below_horizon(camera, known.shape) if on_road is None else on_road
         lines = _line_directions(camera), REACH * np.float32(side / cell)
@@ -127,7 +131,12 @@ def fill_holes(
         if objects is not None:
             parts = objects.pixel, objects.part, objects.nearest, colours
             paint_parts(*parts, known, SIDE_REACH * side, rounding, view.reshape(3, -1))
-    return [_like(*of_view) for of_view in zip(arrays, views, coverage, strict=True)]
+    filled = []
+    for array, original, covered in zip(map(torch.from_numpy, arrays), views, coverage, strict=True):
+        is_in_place = array.data_ptr() == original.data_ptr()
+        pixels = array.to(original.device, original.dtype)
+        filled.append(original if is_in_place else torch.where(covered, original, pixels))
+    return filled
 
 
 def mean_colour(views: Sequence[npt.NDArray[Any]], coverage: Sequence[npt.NDArray[Any]]) -> Colour:
@@ -156,9 +165,9 @@ def object_colours(views: Sequence[npt.NDArray[Any]], paint: Sequence[Paint | No
 
 
 # --- one view -------------------------------------------------------------------------------------------------------
-@lru_cache(32)  # of a rig, frame by frame: a lens takes a millisecond
+@lru_cache(32)  # the cameras of a rig serve every frame
 def _line_directions(camera: Camera | None) -> npt.NDArray[np.float32]:
-    """Directions (2, 2, n, n) in the image, x and y, of lines along the heading and vertical ones, as kernels read."""
+    """Image directions (2, 2, n, n), x and y, of lines along the heading and of vertical lines, for kernels."""
     if camera is None:
         return np.array([(0, 0), (0, 1)], np.float32)[..., None, None].repeat(2, 2).repeat(2, 3)
     if camera.is_rectilinear:
@@ -184,23 +193,8 @@ def _road_below_horizon(camera: Camera | None, size: tuple[int, ...]) -> BoolArr
     return camera.unproject(np.stack(np.meshgrid(x, y), -1)).directions[..., 2] < 0
 
 
-def _cell_px(size: tuple[int, ...]) -> int:
-    """Side of a cell; preferably a divisor of both sides (h, w) of the view."""
-    most = max(1, min(size) // CELLS)
-    return max((n for n in range(most // 2 + 1, most + 1) if not any(side % n for side in size)), default=most)
-
-
-# --- arrays -----------------------------------------------------------------------------------------------------------
 def _as_array(view: torch.Tensor) -> npt.NDArray[Any]:
     """A view as an array, uint8 or float32; the view's own memory where it may be written."""
     array = view.detach().cpu().contiguous()
     array = array if array.dtype == torch.uint8 else array.float()
     return (array.clone() if view.requires_grad and array.data_ptr() == view.data_ptr() else array).numpy()
-
-
-def _like(array: npt.NDArray[Any], view: torch.Tensor, seen: torch.Tensor) -> torch.Tensor:
-    """A filled array as its view; covered pixels are the view's own."""
-    filled = torch.from_numpy(array)
-    if filled.data_ptr() == view.data_ptr():
-        return view
-    return torch.where(seen, view, filled.to(view.device, view.dtype))

@@ -1,4 +1,4 @@
-"""The protocol of all that fills pixels of rendered views that no source shows; black; and Telea's fast marching."""
+"""Protocol of inpainters, which fill pixels that no source shows; black, and Telea's fast marching."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class Inpainter(ABC):
     Attributes:
         min_confidence: Pixels that sources show with less confidence are filled too, 0 to 1.
         seed: Seed of random pixels, combined with the frame (its ``token``, else its images) and the camera.
-        outcome: The holes' fate, for warnings: "The rest is ...".
+        outcome: End of the warning "The rest is ...".
         is_random: Whether ``inpaint`` reads its seeds.
         needs_confidence: Whether frames must bring their confidence.
-        needs_layers: Whether they must bring what holes lie behind (``Views.layers``).
+        needs_layers: Whether frames must bring the layers of their holes (``Views.layers``).
         fills_own_car: Whether ``inpaint`` gets the own car, which is black, as a hole too, so that it does not bleed.
     """
 
@@ -93,9 +93,9 @@ class Inpainter(ABC):
     def complete_batch(self, batch: Mapping[str, Any]) -> dict[str, Any]:
         """Fill collated samples, on the device of a network: DataLoader workers cannot use a GPU.
 
-        The pixels are those of ``RigRetarget(holes=self)``, but for rounding: frames are computed together. Those of
-        ``Continue``, and of a generator, which corrects it, are not: batches do not say what holes lie behind. Nor do
-        they say which keys are label maps: with ``min_confidence``, ignore labels where ``generated`` is True.
+        The pixels equal those of ``RigRetarget(holes=self)`` up to rounding, since frames are computed together.
+        ``Continue``, and generators that correct its result, give other pixels: batches hold no layers of holes. Label
+        maps are not named either: with ``min_confidence``, ignore labels where ``generated`` is True.
 
         Args:
             batch: From ``RigRetarget(..., keys=SampleKeys(extra=("sources", "confidence")))``: a sample or a batch.
@@ -130,7 +130,12 @@ class Inpainter(ABC):
             else:
                 images = [image.clone() for image in view.images]  # some fill in place
             rendered.append(Views(images, view.rig, **{key: frames[b] for key, frames in maps.items()}))
-        done = [_without_own_car(frame) for frame in self.fill(rendered, sources)]
+        done = []
+        for frame in self.fill(rendered, sources):  # black and not marked where only the own car is
+            _, holes = holes_of(frame, 0)
+            shown = zip(frame.coverage, holes, frame.images, strict=True)
+            images = [torch.where(seen | hole, image, 0) for seen, hole, image in shown]
+            done.append(replace(frame, images=images, generated=stacked(holes)))
         out = {key: value for key, value in batch.items() if key != SOURCES_KEY}
         for key in (*maps, "generated"):
             out[key] = gathered([getattr(frame, key) for frame in done], lead)
@@ -140,9 +145,9 @@ class Inpainter(ABC):
 
 def _check_maps(key: str, maps: Sequence[Any], frames: Sequence[Frame]) -> None:
     """Raise SampleError unless the maps of each frame are tensors (M, h, w) of its images' sizes, of the key's type."""
-    for number, (of_frame, frame) in enumerate(zip(maps, frames, strict=True)):
-        of_frame = of_frame if isinstance(of_frame, torch.Tensor | list | tuple) else [of_frame]
-        got = [(getattr(m, "dtype", type(m)), tuple(getattr(m, "shape", ()))) for m in of_frame]
+    for number, (tensors, frame) in enumerate(zip(maps, frames, strict=True)):
+        tensors = tensors if isinstance(tensors, torch.Tensor | list | tuple) else [tensors]
+        got = [(getattr(m, "dtype", type(m)), tuple(getattr(m, "shape", ()))) for m in tensors]
         sizes = [tuple(image.shape[-2:]) for image in frame.images]
         is_mask = key in _MASK_KEYS
         is_typed = all(isinstance(kind, torch.dtype) and (kind == torch.bool) == is_mask for kind, _ in got)
@@ -154,14 +159,11 @@ def _check_maps(key: str, maps: Sequence[Any], frames: Sequence[Frame]) -> None:
 
 
 def _checked(name: str, images: Any, views: Tensors, holes: Tensors) -> list[torch.Tensor]:
-    """The images that an inpainter made of views, float ones cut to [0, 1].
-
-    GeneratorError for another number, type or shape, and where pixels of the holes are not finite.
-    """
+    """The images that an inpainter made of views, float ones cut to [0, 1]; GeneratorError if they do not fit."""
     images = list(images) if isinstance(images, Iterable) else [images]
     got, expected = (
-        [f"{getattr(x, 'dtype', type(x).__name__)} {tuple(getattr(x, 'shape', ()))}" for x in of]
-        for of in (images, views)
+        [f"{getattr(x, 'dtype', type(x).__name__)} {tuple(getattr(x, 'shape', ()))}" for x in tensors]
+        for tensors in (images, views)
     )
     if got != expected:
         raise GeneratorError(f"{name}.inpaint: expected images as its views, {', '.join(expected)}, got {got}")
@@ -185,7 +187,7 @@ class Black(Inpainter):
         return list(rendered)
 
     def complete_batch(self, batch: Mapping[str, Any]) -> dict[str, Any]:
-        """The batch without ``sources`` and ``generated``; what another inpainter filled is black again."""
+        """The batch without ``sources`` and ``generated``; pixels that another inpainter filled are black again."""
         return {key: value for key, value in super().complete_batch(batch).items() if key != "generated"}
 
 
@@ -225,7 +227,7 @@ def telea(image: torch.Tensor, hole: torch.Tensor) -> torch.Tensor:
 
 # --- holes ------------------------------------------------------------------------------------------------------------
 def holes_of(frame: Views, min_confidence: float) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    """Pixels (h, w) of each view that are seen with enough confidence, and the others that are not the own car."""
+    """Pixels (h, w) of each view seen with enough confidence, and the other pixels outside the own car."""
     trust = frame.coverage if frame.confidence is None else frame.confidence
     known = [seen & (c >= min_confidence) for seen, c in zip(frame.coverage, trust, strict=True)]
     views = zip(known, frame.rig, strict=True)
@@ -248,17 +250,9 @@ def put(rendered: Views, images: Sequence[torch.Tensor], holes: Sequence[torch.T
     return replace(rendered.with_maps(without_holes), images=views, generated=stacked(list(holes)), labels=labels)
 
 
-def _without_own_car(frame: Views) -> Views:
-    """The frame, black and not marked as generated where no source shows what its cameras' masks hide."""
-    _, holes = holes_of(frame, 0)
-    shown = [seen | hole for seen, hole in zip(frame.coverage, holes, strict=True)]
-    images = [torch.where(one, image, 0) for one, image in zip(shown, frame.images, strict=True)]
-    return replace(frame, images=images, generated=stacked(holes))
-
-
 # --- randomness -------------------------------------------------------------------------------------------------------
 def frame_names(frames: Sequence[Frame]) -> list[str]:
-    """Names of frames for seeds: their ``token``, else a digest of their images (33 ms for six of 1600 x 900)."""
+    """Names of frames for seeds: their ``token``, else a digest of their images."""
     return [f.further["token"] if "token" in f.further else digest_of(f.images) for f in frames]
 
 
@@ -302,7 +296,7 @@ def check_device(network: Any) -> None:
 
 
 class CompletedLoader:
-    """Loader that fills the batches of another one in this process, on the device of the inpainter's network.
+    """Loader that fills the batches of another loader in this process, on the device of the inpainter's network.
 
     ``loader`` yields batches from ``RigRetarget(..., keys=SampleKeys(extra=("sources", "confidence")))``.
     """

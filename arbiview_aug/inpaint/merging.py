@@ -2,9 +2,9 @@
 
 The sharpest static view is taken at each pixel, at the current view's exposure. A candidate is accepted by the votes of
 the others, as far as the labels require (``ChangeRisk``). ``NONE``: half of the others agree. ``SHADED``: all others
-agree. ``BESIDE``: the same, and one confirms it. ``UNLABELLED``: the nearest frames before and after the current one
-agree with it; where all frames lie on one side, at least three agree, or none of at most two contradicts; and the
-current frame shows no newly arrived object beside the hole.
+agree. ``BESIDE``: all others agree, and there is at least one. ``UNLABELLED``: the nearest frames before and after the
+current one agree with it; where all frames lie on one side, at least three agree, or none of at most two contradicts;
+and the current frame shows no newly arrived object next to the hole.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ _AGREEMENT_LEVELS = 16.0
 """Largest difference of two frames that agree, in grey levels over a window."""
 
 _CONTRADICTION_LEVELS = 24.0
-"""The same between a frame and the current one, on a seam (``docs/decisions.md``)."""
+"""Largest difference between a frame and the current one on a seam, in grey levels (``docs/decisions.md``)."""
 
 _WINDOW_PX = 5
-"""Side of the window in which two frames are compared, at least 3 samples."""
+"""Side of the window in which two frames are compared, pixels; at least 3 samples."""
 
 _CONTRADICTION_REACH = 1.25
 """A contradiction on the seam reaches to where agreement is nearer by this factor (``docs/decisions.md``)."""
@@ -41,7 +41,7 @@ _FEW_CANDIDATES = 2
 """With at most this many candidates, accept one without a confirming vote."""
 
 _MIN_SEAM_PX = 20
-"""Fewest common pixels for an exposure."""
+"""Minimum number of common pixels for an exposure."""
 
 _MAX_LOG_GAIN, _MAX_LOG_TINT = 1.3, 0.25
 """Largest logarithm of the gain between two cameras (real rigs: log 3.5), and of its spread over the channels."""
@@ -53,7 +53,7 @@ _DARK_LEVELS = 4.0
 """Offset added to colours before taking their ratio."""
 
 _MEAN_WEIGHT = 0.02
-"""Weight of the seam's mean offset beside the local one; far from the seam it stands alone."""
+"""Weight of the seam's mean offset relative to the local one; far from the seam only the mean is left."""
 
 
 Levels = npt.NDArray[np.float32]
@@ -91,10 +91,10 @@ def merged(
         (3, h, w) filled view, and (h, w) int16 index of the candidate taken, -1 for none.
     """
     pixels, chosen = view.clone(), np.full(free.shape, -1, np.int16)
-    shows = np.logical_or.reduce([one.shows for one in candidates])
+    shows = np.logical_or.reduce([candidate.shows for candidate in candidates])
     if (shows & free).any():
         box = bounding_box(shows, margin_px)
-        parts = view[(..., *box)], free[box], seam[box], [one.part(box) for one in candidates]
+        parts = view[(..., *box)], free[box], seam[box], [candidate.part(box) for candidate in candidates]
         pixels[(..., *box)], chosen[box] = _merged(*parts, margin_px)
     return pixels, chosen
 
@@ -102,45 +102,41 @@ def merged(
 def _merged(
     view: torch.Tensor, free: BoolArray, seam: BoolArray, candidates: Sequence[Candidate], margin_px: int
 ) -> tuple[torch.Tensor, npt.NDArray[np.int16]]:
-    """As ``merged``, where any candidate shows something; exposures and votes are those of a sample of pixels."""
-    # Without labels the borders of what moved must be found.
-    unlabelled = any((one.risk == ChangeRisk.UNLABELLED).any() for one in candidates)
+    """As ``merged``, within the box that candidates show; exposures and votes are computed on a sample of pixels."""
+    # Without labels the borders of moved objects must be found.
+    unlabelled = any((candidate.risk == ChangeRisk.UNLABELLED).any() for candidate in candidates)
     step, n = 1 if unlabelled else max(1, margin_px // _SAMPLES_PER_SEAM), len(candidates)
     every = slice(None, None, step), slice(None, None, step)
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
-    samples = [one.part(every) for one in candidates]
-    current, images = _levels(view[(..., *every)], levels), [_levels(one.image, levels) for one in samples]
+    samples = [candidate.part(every) for candidate in candidates]
+    current, images = _levels(view[(..., *every)], levels), [_levels(candidate.image, levels) for candidate in samples]
     recorded = [image.copy() if step > 1 else image for image in images]
     gains = _tone(current, images, free[every], seam[every], samples, max(1, margin_px // 2 // step))
-    shown = np.stack([one.shows & free[every] for one in samples])
+    shown = np.stack([candidate.shows & free[every] for candidate in samples])
     accepted = shown & _accepted(current, images, shown, seam[every], samples, max(3, _WINDOW_PX // step | 1))
     # The order breaks ties.
     rank, chosen = np.full(free.shape, 256 * n, np.uint16), np.full(free.shape, -1, np.int16)
-    for k, one in enumerate(candidates):
+    for k, candidate in enumerate(candidates):
         # Samples may miss a border.
-        accepts, rejects = (_beside(flags) for flags in (accepted[k], shown[k] & ~accepted[k]))
-        usable = of_cells(accepted[k] | (accepts & ~rejects & ~shown[k]), step, free.shape) & one.shows & free
-        key = one.blur * np.uint16(n) + np.uint16(k)
+        flags = (part.view(np.uint8) for part in (accepted[k], shown[k] & ~accepted[k]))
+        accepts, rejects = (cv2.dilate(part, np.ones((3, 3), np.uint8)) > 0 for part in flags)
+        usable = of_cells(accepted[k] | (accepts & ~rejects & ~shown[k]), step, free.shape) & candidate.shows & free
+        key = candidate.blur * np.uint16(n) + np.uint16(k)
         better = usable & (key < rank)
         np.copyto(rank, key, where=better)
         np.copyto(chosen, np.int16(k), where=better)
     pixels = view.clone(memory_format=torch.contiguous_format)
-    for k, one in enumerate(candidates):
+    for k, candidate in enumerate(candidates):
         taken = np.flatnonzero(chosen == k)
         y, x = np.divmod(taken, free.shape[1])
         at = y // step * current.shape[2] + x // step
         colours = images[k].reshape(3, -1).take(at, 1)
-        if step > 1:  # what a pixel has more than its sample
-            detail = _levels(one.image, levels).reshape(3, -1).take(taken, 1) - recorded[k].reshape(3, -1).take(at, 1)
-            colours += gains[k] * detail
+        if step > 1:  # difference of a pixel from its sample
+            detail = _levels(candidate.image, levels).reshape(3, -1).take(taken, 1)
+            colours += gains[k] * (detail - recorded[k].reshape(3, -1).take(at, 1))
         colours = np.clip(np.rint(colours) if levels == 1 else colours / np.float32(levels), 0, 255 / levels)
         pixels.view(3, -1).index_copy_(1, torch.from_numpy(taken).to(view.device), torch.from_numpy(colours).to(view))
     return pixels, chosen
-
-
-def _beside(flags: BoolArray) -> BoolArray:
-    """(h, w) True on True pixels and those next to them."""
-    return np.asarray(cv2.dilate(flags.view(np.uint8), np.ones((3, 3), np.uint8)) > 0)
 
 
 def _levels(image: torch.Tensor, levels: float) -> Levels:
@@ -157,10 +153,10 @@ def _accepted(
     candidates: Sequence[Candidate],
     window: int,
 ) -> BoolArray:
-    """(n, h, w) whether each candidate shows what stands there now."""
+    """Whether each candidate shows the present scene (n, h, w)."""
     votes, nearest = np.zeros(shown.shape, np.uint8), np.full((2, *seam.shape), -1, np.int16)
-    for k, one in enumerate(candidates):
-        side = nearest[int(one.later)]
+    for k, candidate in enumerate(candidates):
+        side = nearest[int(candidate.later)]
         np.copyto(side, np.int16(k), where=shown[k] & (side < 0))
     static = shown.copy()  # as far as the nearest frames before and after the current one agree
     for pair in combinations(range(len(candidates)), 2):
@@ -170,7 +166,7 @@ def _accepted(
             votes[i] += agree
             static[i] &= ~both | agree | (nearest[int(candidates[j].later)] != j)
     others = shown.sum(axis=0, dtype=np.uint8) - np.uint8(1)
-    risk, few = np.stack([one.risk for one in candidates]), len(candidates) <= _FEW_CANDIDATES
+    risk, few = np.stack([candidate.risk for candidate in candidates]), len(candidates) <= _FEW_CANDIDATES
     unanimous = votes == others
     accepted = unanimous | ((risk < ChangeRisk.SHADED) & (2 * votes >= others))
     accepted &= (risk < ChangeRisk.BESIDE) | (votes >= (0 if few else 1))
@@ -187,10 +183,10 @@ def _accepted(
 def _arrived(
     current: Levels, toned: Sequence[Levels], seam: BoolArray, candidates: Sequence[Candidate], window: int
 ) -> BoolArray:
-    """(h, w) where a hole continues what the current frame alone shows on the seam."""
+    """Pixels (h, w) of a hole that continue an object which only the current frame shows on the seam."""
     known, agree = np.zeros_like(seam), np.zeros_like(seam)
-    for image, one in zip(toned, candidates, strict=True):
-        both = seam & one.shows
+    for image, candidate in zip(toned, candidates, strict=True):
+        both = seam & candidate.shows
         known |= both
         agree |= _agreeing(image, current, both, _CONTRADICTION_LEVELS, window)
     contradicts = known & ~agree
@@ -202,9 +198,10 @@ def _arrived(
     return np.asarray(away / _CONTRADICTION_REACH < near)
 
 
-def _agreeing(one: Levels, two: Levels, where: BoolArray, limit: float, window: int) -> BoolArray:
-    """(h, w) where two images differ by less than a limit: means over the channels and a window's valid pixels."""
-    apart = np.asarray(cv2.absdiff(one.reshape(-1, one.shape[2]), two.reshape(-1, one.shape[2]))).reshape(one.shape)
+def _agreeing(first: Levels, second: Levels, where: BoolArray, limit: float, window: int) -> BoolArray:
+    """Pixels (h, w) where two images differ by less than a limit: means over channels and valid pixels of a window."""
+    rows = (image.reshape(-1, image.shape[2]) for image in (first, second))
+    apart = np.asarray(cv2.absdiff(*rows)).reshape(first.shape)
     valid = where.astype(np.float32)
     total, count = (
         np.asarray(cv2.boxFilter(part, -1, (window, window), normalize=False, borderType=cv2.BORDER_CONSTANT))
@@ -222,13 +219,10 @@ def _tone(
     candidates: Sequence[Candidate],
     cell: int,
 ) -> list[Levels]:
-    """Bring the candidates to the view's exposure, in place; return their gains (3, 1).
-
-    Candidates with too little of the seam are matched to those with enough. Their offsets are of cells of pixels.
-    """
+    """Bring the candidates to the view's exposure, in place; return their gains (3, 1)."""
     unmatched, gains = [], [np.ones((3, 1), np.float32)] * len(candidates)
-    for k, one in enumerate(candidates):
-        match = _expose(images[k], view, seam & one.shows, _SEAM_INLIERS)
+    for k, candidate in enumerate(candidates):
+        match = _expose(images[k], view, seam & candidate.shows, _SEAM_INLIERS)
         if match is None:
             unmatched.append(k)
         else:
@@ -236,6 +230,7 @@ def _tone(
             images[k] += _offset(*match[1:], seam.shape, cell)
     if not unmatched:
         return gains
+    # Candidates with too little of the seam are matched to those with enough.
     reference, known = view.copy(), seam.copy()
     for k in sorted(range(len(candidates)), key=unmatched.__contains__):
         shows = free & candidates[k].shows
@@ -252,11 +247,7 @@ def _tone(
 def _expose(
     image: Levels, reference: Levels, where: BoolArray, min_inliers: float
 ) -> tuple[Levels, npt.NDArray[np.int64], Levels] | None:
-    """Give an image the gain of a reference, in place; None if it is implausible.
-
-    Returns:
-        The gain (3, 1), pixels (n,) that then agree, and what they lack (3, n).
-    """
+    """Give an image a reference's gain, in place: the gain (3, 1), pixels (n,) that then agree, their errors (3, n)."""
     pixel = np.flatnonzero(where)
     if len(pixel) < _MIN_SEAM_PX:
         return None

@@ -1,4 +1,4 @@
-"""Fill holes of the target views from neighbouring frames, before anything is inpainted.
+"""Fill holes of the target views from neighbouring frames, before inpainting.
 
 Pixels that the current frame sees never change. By default only the near road is filled; its distances come from the
 current frame's surface. A neighbour's pixel is rejected where a labelled object hides the point from its camera, in
@@ -45,7 +45,7 @@ _SEAM_WIDTH = 0.02
 """Colour-matching margin around a hole, as a fraction of the view's width."""
 
 _CELL_PX = 8
-"""Side of the cells in which blur and risks are known."""
+"""Side of the cells in which blur and risks are evaluated, pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Hole:
 
     @cached_property
     def wanted(self) -> BoolArray:
-        """(h, w) pixels that neighbours are asked for."""
+        """Pixels (h, w) to plan in neighbours."""
         return self.free | self.seam
 
     @cached_property
@@ -82,7 +82,7 @@ class Hole:
     @property
     def points(self) -> FloatArray:
         """Points that these corners see, in the ego frame (n, 3)."""
-        directions, q = (of[self.near] for of in self.nodes)
+        directions, q = (part[self.near] for part in self.nodes)
         return np.asarray(self.camera.center_m + directions / q[:, None])
 
 
@@ -91,7 +91,7 @@ class Fill(NamedTuple):
 
     neighbour: Neighbour
     plan: RenderPlan  # render plan from its rig to the cameras of the holes
-    shown: list[Candidate]  # what it shows of each hole; no images yet
+    shown: list[Candidate]  # its part of each hole; no images yet
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +115,8 @@ class Fills:
         missing = [hole.free for hole in self.holes]
         lines = []
         for fill in self.fills:
-            new = [free & one.shows for free, one in zip(missing, fill.shown, strict=True)]
-            missing = [free & ~of_hole for free, of_hole in zip(missing, new, strict=True)]
+            new = [free & candidate.shows for free, candidate in zip(missing, fill.shown, strict=True)]
+            missing = [free & ~shown for free, shown in zip(missing, new, strict=True)]
             added = sum(map(np.count_nonzero, new))
             where = f"{fill.neighbour.travel_m:.1f} m of travel"
             lines.append(f"neighbour {fill.neighbour.name}, {where}: {added / pixels:.1%} of all pixels")
@@ -126,7 +126,7 @@ class Fills:
 # --- planning ---------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class _HoleSurface(DenseSurface):
-    """Known distances of the holes' pixels, hidden from a neighbour by labelled objects and by what was measured."""
+    """Known distances of the holes' pixels, hidden from a neighbour by labelled objects and measured points."""
 
     holes: Sequence[Hole]
     full: Surface  # the frame's surface
@@ -135,17 +135,17 @@ class _HoleSurface(DenseSurface):
 
     @property
     def is_dense(self) -> bool:  # type: ignore[override]
-        """Whether anything hides them."""
+        """Whether anything hides the holes' pixels."""
         return self.objects is not None or self.full.background.is_dense
 
     def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> npt.NDArray[np.float32]:
-        """Those of the hole with this camera's name, of which it may be a window."""
+        """Inverse distances (h, w) of the hole with this camera's name; the camera may be a window of it."""
         hole = next(hole for hole in self.holes if hole.camera.name == camera.name)
         left, top = np.rint(hole.camera.K[:2, 2] - camera.K[:2, 2]).astype(int)
         return hole.inverse_distance[top : top + camera.height_px, left : left + camera.width_px]
 
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """Labelled objects hide everything; what was measured hides what lies behind. Kept for the next hole."""
+        """Labelled objects hide everything, measured points hide points behind them; cached by camera."""
         key, full = camera.content_key, self.full.background
         if key not in self._shadows:
             before = np.zeros(camera.size, np.float32)
@@ -157,7 +157,7 @@ class _HoleSurface(DenseSurface):
         return self._shadows[key]
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
-        """The full surface's."""
+        """Uncertainty of the full surface."""
         return self.full.uncertainty(origin, directions, inverse_distance)
 
 
@@ -172,7 +172,7 @@ def plan_fills(
 ) -> Fills | None:
     """Find the holes of a frame's plan and the neighbours, nearest first, that show them; None if none does.
 
-    ``scene`` is the current frame's, in its ego frame, and ``surface`` the one that it is rendered over. ``reach`` is
+    ``scene`` is the current frame's, in its ego frame; ``surface`` names the surface it is rendered over. ``reach`` is
     the area that may be filled.
     """
     full = scene.surface(surface, plan.source.ground_z_m)
@@ -183,7 +183,7 @@ def plan_fills(
     config = replace(config, seam_width=0.0, layers=False)
     rig = Rig([hole.camera for hole in holes], ground_z_m=plan.source.ground_z_m)
     wanted, points = [hole.wanted for hole in holes], [hole.points for hole in holes]
-    ends, fills = np.cumsum([len(of_hole) for of_hole in points]), []
+    ends, fills = np.cumsum([len(hole_points) for hole_points in points]), []
     for neighbour in neighbours:
         boxes = neighbour.labelled + np.array([0, 0, 0, 2 * BOX_MARGIN_M, 2 * BOX_MARGIN_M, 0, 0])
         objects = BoxSurface(Street(), boxes, whole(boxes)) if len(boxes) else None
@@ -193,8 +193,8 @@ def plan_fills(
         risks: Sequence[Any] = [None] * len(holes)
         if neighbour.moved is not None:
             risks = np.split(change_risks(neighbour.moved, np.concatenate(points)), ends[:-1])
-        shown = [_shown(*one, neighbour) for one in zip(holes, views.targets, risks, strict=True)]
-        if any((hole.free & one.shows).any() for hole, one in zip(holes, shown, strict=True)):
+        shown = [_shown(*inputs, neighbour) for inputs in zip(holes, views.targets, risks, strict=True)]
+        if any((hole.free & candidate.shows).any() for hole, candidate in zip(holes, shown, strict=True)):
             fills.append(Fill(neighbour, views, shown))
     return Fills(holes, fills) if fills else None
 
@@ -215,9 +215,10 @@ def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: Ra
         return None
     inner = bounding_box(free, margin_px)
     up, allowed, free = up[inner], allowed[inner], free[inner]
-    rows, columns = box = _within(part[0], inner[0]), _within(part[1], inner[1])
-    camera = camera.crop(rows.start, columns.start, free.shape)
-    rays = maps.rays(camera, rays.crop(rows.start, columns.start, free.shape))
+    top, left = part[0].start + inner[0].start, part[1].start + inner[1].start
+    box = slice(top, top + len(free)), slice(left, left + free.shape[1])
+    camera = camera.crop(top, left, free.shape)
+    rays = maps.rays(camera, rays.crop(top, left, free.shape))
     q = surface.image(camera, rays) if q is None else q[box]
     if reach == "road":
         allowed &= (q > 0) & (np.abs(height_m + up / np.maximum(q, np.float32(1e-9))) < _ROAD_TOLERANCE_M)
@@ -226,11 +227,6 @@ def _hole(plan: RenderPlan, index: int, surface: Surface, reach: Reach, maps: Ra
         return None
     around = cv2.dilate(empty[box].view(np.uint8), np.ones((2 * margin_px + 1,) * 2, np.uint8)) > 0
     return Hole(index, box, camera, rays, free, around & allowed & covered[box], q, margin_px)
-
-
-def _within(outer: slice, inner: slice) -> slice:
-    """A slice of a slice."""
-    return slice(outer.start + inner.start, outer.start + inner.stop)
 
 
 def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neighbour: Neighbour) -> Candidate:
@@ -244,8 +240,8 @@ def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neig
         # Pixels per metre along the road, which is the coarser axis: proportional to sin(incidence) / distance.
         from_source = (hole.camera.center_m - source.center_m) * q[..., None] + directions
         relative = np.maximum((from_source**2).sum(axis=-1), 1e-9)
-        other, own_z = (np.maximum(np.abs(rays[..., 2]), 1e-9) for rays in (from_source, directions))
-        halves = np.clip(2 * np.log2(hole.camera.K[0, 0] * own_z * relative / (source.K[0, 0] * other)), 0, 255)
+        source_z, target_z = (np.maximum(np.abs(rays[..., 2]), 1e-9) for rays in (from_source, directions))
+        halves = np.clip(2 * np.log2(hole.camera.K[0, 0] * target_z * relative / (source.K[0, 0] * source_z)), 0, 255)
         upsample_where(halves.astype(np.float32), _CELL_PX, view.source_camera, pair.source, blur)
     if risks is not None:
         corners = np.zeros(q.shape, np.uint8)
@@ -259,7 +255,7 @@ def _shown(hole: Hole, view: ViewPlan, risks: npt.NDArray[np.uint8] | None, neig
 def fill_from_neighbours(
     rendered: Views, fills: Fills, images: Sequence[torch.Tensor], renderer: Renderer, warn: Warn
 ) -> Views:
-    """Fill the holes of a rendered frame from its neighbours; ``warn`` is called for those that cannot be read.
+    """Fill the holes of a rendered frame from its neighbours; ``warn`` is called for unreadable ones.
 
     The frame's maps, and its images where possible, are written into. Its tone curves serve the neighbours' cameras
     too: the holes overlap the current views too little to estimate others. ``images`` are its sources.
@@ -273,7 +269,8 @@ def fill_from_neighbours(
             neighbours.append((fill, renderer.views(fill.plan, sources, tones, images)))
     if not neighbours:
         return rendered
-    views, certain = list(rendered.images), [torch.as_tensor(one).clone() for one in rendered.certainty]  # a plan's
+    views = list(rendered.images)
+    certain = [torch.as_tensor(certainty).clone() for certainty in rendered.certainty]  # the plan keeps its own
     for k, hole in enumerate(fills.holes):
         view, place = views[hole.target], (slice(None), *hole.box)
         candidates = [fill.shown[k]._replace(image=of_holes[k]) for fill, of_holes in neighbours]
@@ -292,7 +289,7 @@ def fill_from_neighbours(
 
 
 def _write(maps: Maps | None, hole: Hole, where: BoolArray, value: Any) -> None:
-    """Write a value, or those of a map (h, w), into a hole of a view's map."""
+    """Write a value, or a map (h, w), into a hole of a view's map."""
     if maps is not None:
         place = maps[hole.target][hole.box]
         values = torch.from_numpy(np.broadcast_to(value, where.shape).copy()).to(place)

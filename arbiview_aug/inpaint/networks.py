@@ -1,8 +1,8 @@
-"""Inpainting networks that others trained, in the place of a generator: diffusers' pipelines and TorchScript files.
+"""Pretrained inpainting networks: diffusers' pipelines and TorchScript files.
 
-They see windows around the holes alone, at the view's resolution and aspect; seen pixels stay as they are. Small
-windows share a canvas; large and bent holes are cut into parts, and each part sees what the parts before it filled.
-Cracks are inpainted without networks.
+They see windows around the holes, at the view's resolution and aspect; seen pixels are unchanged. Small windows share a
+canvas. Large and bent holes are cut into parts, and each part sees the pixels filled before it. Cracks are inpainted by
+Telea's method.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ import torch
 
 from arbiview_aug.cameras.lens import BoolArray
 from arbiview_aug.environment import optional_package
-from arbiview_aug.errors import ArbiviewError, GeneratorError, one_line
+from arbiview_aug.errors import GeneratorError, one_line
 from arbiview_aug.files import check_regular, open_regular
 from arbiview_aug.inpaint.inpainter import Inpainter, Tensors, check_device, checked_settings, telea
 
-NARROW_PX = 5  # holes narrower than this are inpainted by Telea's method: half of the pixels around objects
+NARROW_PX = 5  # holes narrower than this are inpainted by Telea's method
 _SEED = 2**31
 _JOINED_PX = 8  # holes nearer than this to each other are one
 _CONTEXT_PX = (12, 64)
-"""Least and most context around a hole; in between, half of its shorter side."""
+"""Minimum and maximum context around a hole, pixels; in between, half of its shorter side."""
 
-_WORTH = 0.8  # a hole is cut where the windows of both parts have at most this share of the pixels
+_WORTH = 0.8  # maximum share of the pixels in the windows of both parts, for a hole to be cut
 
 
 class NetworkInpainter(Inpainter, torch.nn.Module):
@@ -103,26 +103,26 @@ class NetworkInpainter(Inpainter, torch.nn.Module):
         tops = [255.0 if view.dtype == torch.uint8 else 1.0 for view in views]
         # The network sees narrow holes inpainted, and they stay so.
         pixels = [telea(v, hole).float().cpu().numpy() / top for v, hole, top in zip(views, holes, tops, strict=True)]
-        # Squares of NARROW_PX fit into what is left; the rest are cracks and edges.
+        # The remaining holes hold squares of NARROW_PX; the others are cracks and edges.
         masks, square = [hole.cpu().numpy().astype(np.uint8) for hole in holes], np.ones((NARROW_PX,) * 2, np.uint8)
-        border: Any = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}  # by default all beyond a view is a hole
+        border: Any = {"borderType": cv2.BORDER_CONSTANT, "borderValue": 0}  # by default all outside a view is a hole
         left = [cv2.morphologyEx(mask, cv2.MORPH_OPEN, square, **border).astype(bool) for mask in masks]
         frame_of = np.repeat(np.arange(len(counts)), counts)
         for together in windows(left, self.size):
             # Frames share calls, but no canvas: a network sees all of it.
-            of_frames: dict[int, list[Window]] = defaultdict(list)
+            by_frame: dict[int, list[Window]] = defaultdict(list)
             for window in together:
-                of_frames[frame_of[window.view]].append(window)
+                by_frame[frame_of[window.view]].append(window)
             alike: dict[tuple[int, int], list[Canvas]] = defaultdict(list)
-            for parts in of_frames.values():
+            for parts in by_frame.values():
                 for canvas in packed(parts, self.size, self.multiple):
                     alike[canvas.size].append(canvas)
             for canvases in alike.values():
                 for start in range(0, len(canvases), self.batch):
                     self._fill(canvases[start : start + self.batch], pixels, left, seeds)
         filled = []
-        for view, hole, own_pixels, top in zip(views, holes, pixels, tops, strict=True):
-            values = torch.from_numpy(own_pixels * top).to(view.device)
+        for view, hole, view_pixels, top in zip(views, holes, pixels, tops, strict=True):
+            values = torch.from_numpy(view_pixels * top).to(view.device)
             values = values.round() if view.dtype == torch.uint8 else values
             filled.append(torch.where(hole, values.to(view.dtype), view))
         return filled
@@ -188,17 +188,17 @@ class PipelineInpainter(NetworkInpainter):
         seed: int = 0,
         **settings: Any,
     ) -> PipelineInpainter:
-        """Load what ``AutoPipelineForInpainting`` knows: Stable Diffusion, SDXL, Flux and others.
+        """Load a pipeline of ``AutoPipelineForInpainting``: Stable Diffusion, SDXL, Flux and others.
 
         Args:
             where: A folder or hub id in diffusers' layout.
             size: Longest side of an image that it sees; None: the pipeline's own.
             batch: Images that it sees at once.
-            prompt: Words for what fills the holes.
+            prompt: Text prompt for the holes.
             steps: Steps of the pipeline; None: its own.
             guidance: Guidance of the pipeline; None: its own.
             min_confidence: As for every ``Inpainter``, like ``seed``.
-            settings: Arguments of diffusers' ``from_pretrained``, such as ``torch_dtype`` or ``revision``.
+            settings: Arguments of diffusers' ``from_pretrained``, for example ``torch_dtype`` or ``revision``.
 
         Raises:
             ImportError: diffusers or transformers are missing.
@@ -214,8 +214,8 @@ class PipelineInpainter(NetworkInpainter):
         multiple = int(pipeline.vae_scale_factor)
         core = getattr(pipeline, "unet", None) or pipeline.transformer
         native_px = int(getattr(core.config, "sample_size", None) or 64) * multiple
-        of_all: dict[str, Any] = {"steps": steps, "guidance": guidance, "min_confidence": min_confidence, "seed": seed}
-        return cls(pipeline, native_px if size is None else size, multiple, batch, prompt, **of_all)
+        shared: dict[str, Any] = {"steps": steps, "guidance": guidance, "min_confidence": min_confidence, "seed": seed}
+        return cls(pipeline, native_px if size is None else size, multiple, batch, prompt, **shared)
 
     def run(self, images: torch.Tensor, holes: torch.Tensor, seeds: Sequence[int]) -> torch.Tensor:
         h, w = images.shape[-2:]
@@ -260,7 +260,12 @@ class TorchScriptInpainter(NetworkInpainter):
         batch: int = 4,
         min_confidence: float = 0.0,
     ) -> None:
-        network = load_torchscript(path, str(path), GeneratorError)
+        try:
+            with warnings.catch_warnings(), open_regular(path) as file:
+                warnings.simplefilter("ignore", FutureWarning)  # advice of torch 2.14 for authors of such files
+                network = torch.jit.load(file, map_location="cpu")
+        except (RuntimeError, ValueError, OSError) as error:
+            raise GeneratorError(f"{path}: expected a TorchScript file: {one_line(error)}") from None
         super().__init__(network, size, multiple, batch, min_confidence=min_confidence)
         self.path = path
 
@@ -278,16 +283,6 @@ class TorchScriptInpainter(NetworkInpainter):
             raise GeneratorError(
                 f"inpainting: the TorchScript file failed on images and masks: {one_line(error)}"
             ) from None
-
-
-def load_torchscript(path: str | Path, what: str, kind: type[ArbiviewError]) -> Any:
-    """Load a TorchScript file onto the CPU; an error of a ``kind`` says ``what`` it was to be."""
-    try:
-        with warnings.catch_warnings(), open_regular(path) as file:
-            warnings.simplefilter("ignore", FutureWarning)  # advice of torch 2.14 to those who write such files
-            return torch.jit.load(file, map_location="cpu")
-    except (RuntimeError, ValueError, OSError) as error:
-        raise kind(f"{what}: expected a TorchScript file: {one_line(error)}") from None
 
 
 # --- windows and canvases ---------------------------------------------------------------------------------------------
@@ -318,15 +313,15 @@ def windows(holes: Sequence[BoolArray], size: int) -> list[list[Window]]:
     Parts of one hole come in different rounds, so that a later one can see an earlier one's pixels. No pixel is filled
     twice.
     """
-    of_holes: list[list[Window]] = []
+    by_hole: list[list[Window]] = []
     for view, hole in enumerate(holes):
         joined = cv2.dilate(hole.astype(np.uint8), np.ones((_JOINED_PX + 1, _JOINED_PX + 1), np.uint8))
         count, labels, boxes, _ = cv2.connectedComponentsWithStats(joined)
         for label in range(1, count):
             x, y, w, h, _ = boxes[label].tolist()
             part = (labels[y : y + h, x : x + w] == label) & hole[y : y + h, x : x + w]
-            of_holes.append(list(_parts(Window(view, y, x, part), hole.shape, size)))
-    return [[window for window in together if window is not None] for together in zip_longest(*of_holes)]
+            by_hole.append(list(_parts(Window(view, y, x, part), hole.shape, size)))
+    return [[window for window in together if window is not None] for together in zip_longest(*by_hole)]
 
 
 def _parts(hole: Window, shape: tuple[int, ...], size: int) -> Iterator[Window]:
@@ -353,7 +348,7 @@ def _parts(hole: Window, shape: tuple[int, ...], size: int) -> Iterator[Window]:
 
 
 def _cut(part: BoolArray, context: int) -> tuple[int, int]:
-    """The axis, and the row or column there, at which cutting a hole saves most pixels; 0 where it saves too few."""
+    """Axis and position of the cut of a hole that saves most pixels; position 0 if it saves too few."""
     best, cut = _WORTH * (part.shape[0] + 2 * context) * (part.shape[1] + 2 * context), (0, 0)
     for axis, lines in enumerate((part, part.T)):
         both = _areas(lines, context)[:-1] + _areas(lines[::-1], context)[-2::-1]
@@ -363,7 +358,7 @@ def _cut(part: BoolArray, context: int) -> tuple[int, int]:
 
 
 def _areas(lines: BoolArray, context: int) -> npt.NDArray[np.int64]:
-    """Pixels of the windows of a hole's first row, its first two rows, and so on."""
+    """Numbers of pixels in the windows of a hole's first row, first two rows, and so on."""
     width, some = lines.shape[1], lines.any(1)
     first = np.minimum.accumulate(np.where(some, lines.argmax(1), width))
     last = np.maximum.accumulate(np.where(some, width - lines[:, ::-1].argmax(1), 0))
@@ -371,13 +366,13 @@ def _areas(lines: BoolArray, context: int) -> npt.NDArray[np.int64]:
 
 
 def packed(parts: Sequence[Window], size: int, multiple: int) -> list[Canvas]:
-    """Windows on canvases of at most ``size`` by ``size``: on the first shelf that has room, tallest windows first."""
+    """Pack windows on canvases of at most ``size`` by ``size``: first fit on shelves, tallest windows first."""
     shelves: list[list[int]] = []  # canvas, row, height, columns taken
     rows: list[int] = []  # taken of each canvas
     placed: list[list[tuple[Window, int, int]]] = []
-    for window in sorted(parts, key=lambda one: (-one.fills.shape[0], -one.fills.shape[1])):
+    for window in sorted(parts, key=lambda item: (-item.fills.shape[0], -item.fills.shape[1])):
         h, w = window.fills.shape
-        shelf = next((one for one in shelves if one[2] >= h and one[3] + w <= size), None)
+        shelf = next((item for item in shelves if item[2] >= h and item[3] + w <= size), None)
         if shelf is None:
             canvas = next((k for k, taken in enumerate(rows) if taken + h <= size), len(rows))
             if canvas == len(rows):
@@ -392,7 +387,7 @@ def packed(parts: Sequence[Window], size: int, multiple: int) -> list[Canvas]:
     for taken, on_canvas in zip(rows, placed, strict=True):
         wide = max(left + window.fills.shape[1] for window, _, left in on_canvas)
         size_px = -(-taken // multiple) * multiple, -(-wide // multiple) * multiple
-        canvases.append(Canvas(size_px, sorted(on_canvas, key=lambda one: one[1:])))
+        canvases.append(Canvas(size_px, sorted(on_canvas, key=lambda item: item[1:])))
     return canvases
 
 
@@ -401,7 +396,7 @@ def drawn(
 ) -> tuple[npt.NDArray[np.float32], BoolArray]:
     """A canvas's pixels (3, h, w), its holes black, and where they are (h, w).
 
-    Beside its windows it repeats their border, so that no edge of the canvas is a picture's.
+    The rest repeats the windows' borders, so that the canvas has no artificial edges.
     """
     pixels, marks = np.zeros((3, *canvas.size), np.float32), np.zeros(canvas.size, bool)
     for window, top, left in canvas.windows:

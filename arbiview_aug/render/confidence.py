@@ -24,7 +24,7 @@ DECORRELATION_RAD = 0.01
 """Displacement over which a view's details become unrelated; insensitive from 0.3 to 2 times."""
 
 RESOLUTION_POWER = 0.5
-"""A source with half or twice the target's resolution keeps 70 % of the detail; insensitive from 0.25 to 1."""
+"""Exponent of the share of detail that a coarser or finer source keeps; insensitive from 0.25 to 1."""
 
 _ERROR_PER_CONTRAST = 0.55
 """Mean absolute error of unrelated detail, as a share of the standard deviation around it."""
@@ -53,11 +53,11 @@ def confidence(
     """Confidence (..., h, w) float32 in [0, 1] of a rendered view: 0 where uncovered, 1 where the source is exact.
 
     The view (..., 3, h, w) is uint8, or float in [0, 1]; ``certain`` (h, w) is ``certainty`` in 255ths; ``seam``
-    (..., h, w), in the view's unit, says by how much blending a second source changed the winner's colour.
+    (..., h, w), in the view's unit, is the change of the winner's colour by blending a second source.
     """
     levels = 1.0 if view.dtype == torch.uint8 else 255.0
     with torch.no_grad():
-        # In place: three times as fast.
+        # In place, for speed.
         doubt = torch.as_tensor(certain).to(view.device).float().div_(-255).add_(1)
         error = _contrast(view.detach(), levels, covered).add_(_LEAST_CONTRAST).mul_(doubt).add_(seam, alpha=levels)
         return error.mul_(-_ERROR_PER_CONTRAST / EXPECTED_ERROR_LEVELS).exp_().mul_(covered)
@@ -79,17 +79,14 @@ def _contrast(view: torch.Tensor, levels: float, covered: torch.Tensor) -> torch
     cells = torch.nn.functional.avg_pool2d(padded, side, divisor_override=1)
     spread = torch.zeros_like(cells[:, :1])
     for window in _WINDOWS:
-        count, total, squares = _around(cells, window).split(1, 1)
+        # Sums over rows, then over columns: five times as fast as pooling.
+        rows, columns = cells.shape[-2:]
+        around = torch.nn.functional.pad(cells, [window // 2] * 4)
+        around = functools.reduce(torch.add, (around[..., k : k + columns] for k in range(window)))
+        around = functools.reduce(torch.add, (around[..., k : k + rows, :] for k in range(window)))
+        count, total, squares = around.split(1, 1)
         count = count.clamp(min=1e-6)
         spread += (squares / count - (total / count) ** 2).clamp(min=0).sqrt() / len(_WINDOWS)
     size = [n * cell for n in spread.shape[-2:]]
     smooth = torch.nn.functional.interpolate(spread, size=size, mode="bilinear", align_corners=False)
     return smooth[:, 0, :h, :w].reshape(*view.shape[:-3], h, w)
-
-
-def _around(cells: torch.Tensor, window: int) -> torch.Tensor:
-    """Sums (..., h, w) over windows of ``window`` cells a side; five times as fast as pooling."""
-    h, w = cells.shape[-2:]
-    padded = torch.nn.functional.pad(cells, [window // 2] * 4)
-    across = functools.reduce(torch.add, (padded[..., k : k + w] for k in range(window)))
-    return functools.reduce(torch.add, (across[..., k : k + h, :] for k in range(window)))

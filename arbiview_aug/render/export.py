@@ -1,6 +1,6 @@
 """Plans as plain arrays, for a runtime without this package.
 
-They hold the parts of a plan that stay the same for a fixed pair of rigs: positions, second sources and their weights.
+An export holds the constants of a fixed pair of rigs: positions, second sources and their weights.
 Exposure is not matched and holes stay black.
 """
 
@@ -20,16 +20,16 @@ LAYOUT_VERSION = 1
 def export_plan(plan: RenderPlan, path: str | Path) -> None:
     """Write a plan as a ``.npz`` of plain arrays, for ``cv2.remap``; ``docs/deploy.md`` lists them.
 
-    To one level, the views are those of ``RigRetarget`` with ``match_exposure=False`` and ``holes="black"`` on images
-    alone.
+    Views made from it equal those of ``RigRetarget`` with ``match_exposure=False`` and ``holes="black"`` on images
+    alone, up to one grey level.
 
     Args:
         plan: Plan of a fixed pair of rigs, from ``RigRetarget.prepare``; ``auto`` plans the street.
         path: The file; its folder is created.
 
     Raises:
-        ValueError: Another ending, no name, no plan, or one of ``quality="accurate"``.
-        OutputError: A file that cannot be written.
+        ValueError: Not a plan, a plan of ``quality="accurate"``, or a path that does not end in ``.npz``.
+        OutputError: The file cannot be written.
     """
     if not isinstance(plan, RenderPlan):
         raise ValueError(f"plan: expected what RigRetarget.prepare returns, got {type(plan).__name__}")
@@ -40,12 +40,6 @@ def export_plan(plan: RenderPlan, path: str | Path) -> None:
         )
     if not isinstance(path, str | Path) or Path(path).suffix != ".npz":
         raise ValueError(f"path: expected a file name that ends in .npz, got {path!r}")
-    with whole_file(Path(path)) as file:
-        np.savez_compressed(file, **plan_arrays(plan))
-
-
-def plan_arrays(plan: RenderPlan) -> dict[str, Any]:
-    """Arrays of an export by name; ``docs/deploy.md`` describes them."""
     slots = [(slot.source, slot.level, slot.y, slot.x, *slot.size) for slot in plan.layout.slots]
     arrays: dict[str, Any] = {
         "version": LAYOUT_VERSION,
@@ -57,7 +51,8 @@ def plan_arrays(plan: RenderPlan) -> dict[str, Any]:
     }
     for number, view in enumerate(plan.targets):
         arrays |= {f"{name}_{number}": values for name, values in _view_arrays(view).items()}
-    return arrays
+    with whole_file(Path(path)) as file:
+        np.savez_compressed(file, **arrays)
 
 
 def _view_arrays(view: ViewPlan) -> dict[str, Any]:

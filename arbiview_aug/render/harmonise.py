@@ -8,7 +8,7 @@ evaluation scores the odd ones. Half of each tile (a finer chessboard) is fitted
 gains are accepted.
 
 Vignetting and flare differ between the top and the bottom of an image. Both sources show the blended bands along a
-view's seams, so a sample of these says what the gain of each part of the view's height still lacks.
+view's seams, so a sample of these gives the missing gain of each part of the view's height.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ from arbiview_aug.scene.surface import Street
 
 _STEP_PX = 4  # every fourth pixel of each fourth row is read: medians need no more
 _Pixels = npt.NDArray[np.float32]
+_MAX_GIVEN_GAIN = 1e3  # ten stops
+_CACHED_RIGS = 8  # about 0.2 MB each; every frame of a drive may have its own calibration
 
 KNEE = 0.9
-"""Share of the scale from which a gain fades: higher is better by up to 0.5 dB against synthetic truth, but stretches
-the greys above it, which shows in clouds."""
-
+"""Share of the scale from which a gain fades. A higher knee is more accurate, but stretches the greys above it, which
+shows in clouds."""
 
 LEVELS = np.float32(255), np.float32(0.5)
 """The last two arguments of ``photometry_kernels.tone`` for uint8 images."""
 
 SHARES = np.float32(1), np.float32(0)
-"""Those for images in [0, 1]."""
-
+"""The last two arguments of ``photometry_kernels.tone`` for images in [0, 1]."""
 
 Curves = Sequence[npt.NDArray[np.float64]]
-"""Tone curves of each view for each of N sources: (N, h, 2), those of each row, or (N, 2) for all rows."""
+"""Tone curves of each view for each of N sources: (N, h, 2) by row, or (N, 2) for all rows."""
 
 
 def tone_curves(gains: npt.ArrayLike) -> npt.NDArray[np.float64]:
@@ -79,16 +79,16 @@ _PAIR_LOG_ERROR = 0.03
 """Error floor of a pair's log-ratio (lens shading, parallax); bounds the weight of a large overlap."""
 
 DARK, BRIGHT = 0.03, 0.92
-"""Shares of the scale: darker pixels are noise and black level, those with a brighter channel may be saturated."""
+"""Shares of the scale: darker pixels are noise and black level, brighter channels may be saturated."""
 
 MIN_PIXELS = 200
-"""Pixels that both the fit and the gate need in a pair, in a half-way view of 225 x 400."""
+"""Minimum number of pixels of a pair for the fit, and for the gate, in a half-way view of 225 x 400."""
 
 MIN_RISE_DB = 0.1
-"""Least rise of the held-out raw overlap PSNR, mean over pairs, for gains to be accepted."""
+"""Minimum rise of the raw overlap PSNR on held-out pixels, mean over pairs, for gains to be accepted."""
 
 _MIN_LOG_GAIN = 0.005
-"""If no log-gain exceeds this, the images stay as they are: half a grey level at mid-grey."""
+"""If no log-gain exceeds this, the images are unchanged: half a grey level at mid-grey."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class PhotometricReport:
 
 
 class Overlaps(NamedTuple):
-    """All overlaps of a rig: results must not depend on the order of its cameras, which are in content order here."""
+    """All overlaps of a rig. Its cameras are in content order, so that results do not depend on their given order."""
 
     order: list[int]  # index of each camera in the rig
     pairs: npt.NDArray[np.int64]  # (2, P) adjacent cameras that share enough pixels
@@ -119,7 +119,7 @@ class Overlaps(NamedTuple):
 
 
 def find_overlaps(rig: Rig) -> Overlaps:
-    """Find the pixels that adjacent cameras share over the street surface, without own-car masks."""
+    """Find the pixels outside own-car masks that adjacent cameras share over the street surface."""
     order = content_order(rig.cameras)
     rig = rig.with_cameras([rig[k] for k in order])
     lattice, held_out = _lattice()
@@ -167,7 +167,7 @@ def _lattice() -> tuple[FloatArray, BoolArray]:
 def estimate_gains(rig: Rig, images: Sequence[torch.Tensor], *, overlaps: Overlaps | None = None) -> PhotometricReport:
     """Estimate one gain per camera from one frame's N images (3, H, W): uint8, or float in [0, 1]; on any device.
 
-    ``find_overlaps(rig)`` takes longer than the rest: ``overlaps`` are given if they are known. Declined gains are 1.
+    ``overlaps`` are ``find_overlaps(rig)``, if known: finding them takes longer than the rest. Declined gains are 1.
     """
     from arbiview_aug.render.photometry_kernels import overlap_errors
 
@@ -214,7 +214,7 @@ def _read(images: Sequence[torch.Tensor], shared: SharedPixels) -> _Pixels:
 
 
 def _log_ratios(pixels: _Pixels, ends: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-    """Number (G, 3) of each group's pixels that count, and the median and spread of their log-ratios."""
+    """Number of usable pixels in each group, and median and spread of their log-ratios (G, 3)."""
     from arbiview_aug.render.photometry_kernels import log_ratios
 
     measured = np.empty((len(ends) - 1, 3))
@@ -242,8 +242,7 @@ def _solve(
 
 
 _MIN_SEAM_PIXELS, _SEAM_PRIOR, _MAX_SEAM_LOG_GAIN = 4, 0.1, 0.15
-"""Along seams: pixels that a group needs; the weight of no change, where a group without noise has 1; the bound of what
-is added to log-gains."""
+"""Along seams: minimum pixels of a group, weight of no change relative to a group without noise, bound of changes."""
 
 _SMOOTH = np.exp(-(np.subtract.outer(np.arange(SEAM_ROWS), np.arange(SEAM_ROWS)) ** 2))
 """Weights between the parts of a view's height."""
@@ -252,15 +251,15 @@ _SMOOTH = np.exp(-(np.subtract.outer(np.arange(SEAM_ROWS), np.arange(SEAM_ROWS))
 def match_seams(
     plan: RenderPlan, images: Sequence[torch.Tensor], log_gains: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Add to log-gains what each part of a view's height lacks at its seams: vignetting and flare vary down an image.
+    """Refine log-gains along the seams of each part of a view's height: vignetting and flare vary down an image.
 
     Args:
         plan: The plan for these images' rig.
         images: N images (3, H, W): uint8, or float in [0, 1]; on any device.
-        log_gains: (M, N) of each source in each view, which bring it to the main source on the whole.
+        log_gains: (M, N) of each source in each view, relative to the view's main source.
 
     Returns:
-        (M, N, ``SEAM_ROWS``); those of a view's main source are as given.
+        (M, N, ``SEAM_ROWS``) log-gains; a view's main source keeps its own.
     """
     samples = plan.seam_samples
     number, ratio, spread = _log_ratios(_read(images, samples.shared), samples.shared.ends).T
@@ -268,19 +267,12 @@ def match_seams(
     noise = 4 * spread**2 / np.maximum(number, 1) / _PAIR_LOG_ERROR**2
     weight = (number >= _MIN_SEAM_PIXELS) / (1 + noise)
     matched = np.repeat(log_gains[..., None], SEAM_ROWS, 2)
-    for view, other, first, end in samples.seams:
+    for view, source, first, end in samples.seams:
         part, near = samples.part[first:end], weight[first:end]
-        lack = ratio[first:end] + matched[view, samples.better[first:end], part] - log_gains[view, other]
+        lack = ratio[first:end] + matched[view, samples.better[first:end], part] - log_gains[view, source]
         change = _SMOOTH[:, part] @ (near * lack) / (_SMOOTH[:, part] @ near + _SEAM_PRIOR)
-        matched[view, other] += change.clip(-_MAX_SEAM_LOG_GAIN, _MAX_SEAM_LOG_GAIN)
+        matched[view, source] += change.clip(-_MAX_SEAM_LOG_GAIN, _MAX_SEAM_LOG_GAIN)
     return matched
-
-
-def _at_rows(parts: npt.NDArray[np.float64], h: int) -> npt.NDArray[np.float64]:
-    """Values (..., h) of rows from those of parts (..., ``SEAM_ROWS``), linear between their middles."""
-    place = ((np.arange(h) + 0.5) / h * SEAM_ROWS - 0.5).clip(0, SEAM_ROWS - 1)
-    above = place.astype(int).clip(max=SEAM_ROWS - 2)
-    return parts[..., above] + (place - above) * (parts[..., above + 1] - parts[..., above])
 
 
 Harmonise = bool | Sequence[float]
@@ -294,7 +286,7 @@ class Harmoniser:
         choice: As in ``Harmonise``; given gains are one for each source camera.
 
     Raises:
-        ValueError: Anything else, or gains that are no positive numbers up to a thousand.
+        ValueError: Another type, or gains outside 0.001 to 1000.
     """
 
     def __init__(self, choice: Harmonise = True) -> None:
@@ -324,7 +316,7 @@ class Harmoniser:
     def curves(self, rig: Rig, images: Sequence[torch.Tensor], plan: RenderPlan) -> Curves | None:
         """The tone curves (N, h, 2) of the cameras in each view; None if the N images (3, H, W) stay as they are.
 
-        Estimated gains leave the source that wins most pixels of a view as it is.
+        Estimated gains leave the source that wins most pixels of a view unchanged.
         """
         views = plan.targets
         if self.estimates and all(len(view.pairs) + len(view.bands) < 2 for view in views):
@@ -337,12 +329,13 @@ class Harmoniser:
             return [tone_curves(np.repeat(np.array(gains)[:, None], h, 1)) for h in heights]
         mains = [gains[view.pairs[0].source] if view.pairs else 1.0 for view in views]
         matched = np.exp(match_seams(plan, images, np.log(np.divide.outer(gains, mains)).T))
-        curves = {h: tone_curves(_at_rows(matched, h)) for h in set(heights)}
+        curves = {}
+        for h in set(heights):  # linear between the middles of the parts
+            place = ((np.arange(h) + 0.5) / h * SEAM_ROWS - 0.5).clip(0, SEAM_ROWS - 1)
+            above = place.astype(int).clip(max=SEAM_ROWS - 2)
+            step = matched[..., above + 1] - matched[..., above]
+            curves[h] = tone_curves(matched[..., above] + (place - above) * step)
         return [curves[h][view] for view, h in enumerate(heights)]
-
-
-_MAX_GIVEN_GAIN = 1e3  # ten stops
-_CACHED_RIGS = 8  # about 0.2 MB each; every frame of a drive may have its own calibration
 
 
 def _checked_gains(choice: object) -> tuple[float, ...]:

@@ -41,7 +41,7 @@ from arbiview_aug.lru_cache import LRUCache
 from arbiview_aug.render.harmonise import MIN_PIXELS
 from arbiview_aug.sample.frame import Frame
 from arbiview_aug.scene.boxes import draw_boxes
-from arbiview_aug.scene.surface import Correction, StaticSurface, Street
+from arbiview_aug.scene.surface import Correction, Layer, StaticSurface, Street
 
 ROUND_TRIP_PX = 0.75
 """Forward-backward error at which flow has a weight of one half."""
@@ -52,32 +52,30 @@ _REPEATS = 0.7
 """Autocorrelation along rows above which texture repeats: gratings have 0.9, real overlaps at most 0.35."""
 
 
-def why_ambiguous(one: npt.NDArray[np.float32], two: npt.NDArray[np.float32], both: BoolArray) -> str:
+def why_ambiguous(first: Layer, second: Layer, both: BoolArray) -> str:
     """Why views (h, w, 3) in [0, 255] cannot be matched where both see (h, w); "" if they can."""
-    if min(float(view[both].std(axis=0).max()) for view in (one, two)) < _BLANK_GREY:
+    if min(float(view[both].std(axis=0).max()) for view in (first, second)) < _BLANK_GREY:
         return "one of the images shows nothing"
-    if max(_repetition(view, both) for view in (one, two)) > _REPEATS:
+    if max(_repetition(view, both) for view in (first, second)) > _REPEATS:
         return "the texture repeats itself: matches would be ambiguous"
     return ""
 
 
-def dense_flow(
-    one: npt.NDArray[np.float32], two: npt.NDArray[np.float32], both: BoolArray
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Optical flow (h, w, 2) from one view to the other, and its weight (h, w) in [0, 1].
+def dense_flow(view: Layer, neighbour: Layer, both: BoolArray) -> tuple[Layer, Layer]:
+    """Optical flow (h, w, 2) from a view to its neighbour, and its weight (h, w) in [0, 1].
 
-    The views are brought to one brightness. Pixels that only one of them sees get the blurred mean of both, without any
+    The views are brought to one brightness. Pixels that only one of them sees get the blurred mean of both, without
     motion.
     """
-    grey = [cv2.cvtColor(view, cv2.COLOR_RGB2GRAY) for view in (one, two)]
-    log = [np.log(np.maximum(view[both], 4)) for view in grey]
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (view, neighbour)]
+    log = [np.log(np.maximum(image[both], 4)) for image in grey]
     half = np.exp(np.median(log[0] - log[1]) / 2)
     grey = [grey[0] / half, grey[1] * half]
     inside = both.astype(np.float32)
     around = cv2.GaussianBlur((grey[0] + grey[1]) / 2 * inside, (0, 0), 6) / np.maximum(
         cv2.GaussianBlur(inside, (0, 0), 6), 1e-3
     )
-    first, second = (np.clip(np.where(both, view, around), 0, 255).astype(np.uint8) for view in grey)
+    first, second = (np.clip(np.where(both, image, around), 0, 255).astype(np.uint8) for image in grey)
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     dis.setFinestScale(0)
     dis.setVariationalRefinementIterations(0)  # depth is smoothed later
@@ -92,7 +90,7 @@ def dense_flow(
     return there, np.where(both & (at_flow > 0), 1 / (1 + (miss / ROUND_TRIP_PX) ** 4), 0).astype(np.float32)
 
 
-def _repetition(image: npt.NDArray[np.float32], inside: BoolArray) -> float:
+def _repetition(image: Layer, inside: BoolArray) -> float:
     """Highest autocorrelation along the rows of a view (h, w, 3), beyond the shift where it first falls to 0.3."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     window = inside.astype(np.float32)
@@ -134,12 +132,12 @@ _NEAREST_BACKGROUND = 0.5  # larger changes belong to objects, not to the backgr
 
 @dataclass(frozen=True)
 class OverlapReport:
-    """The result for one pair of neighbours; ``str`` prints it."""
+    """Result for one pair of neighbours; ``str`` prints it."""
 
     first: str  # names of the two cameras
     second: str
     accepted: bool  # whether the surface changes
-    reason: str  # why, or why not; PSNR is that of the two in their half-way view, as ``fitted_psnr_db``
+    reason: str  # why, or why not; PSNR by ``fitted_psnr_db`` between the two in their half-way view
 
     def __str__(self) -> str:
         return f"{self.first} and {self.second}: {'' if self.accepted else 'distances as they were, '}{self.reason}"
@@ -172,7 +170,7 @@ class _Strip(NamedTuple):
     rays: FloatArray  # (h, w, 3)
     q: FloatArray  # (h, w) of the street
     fit: BoolArray  # (h, w) to fit on: seen by both cameras, without labelled objects
-    test: BoolArray  # (h, w) to decide on, likewise
+    test: BoolArray  # (h, w) to decide on: also seen by both, without labelled objects
     both: BoolArray  # (h, w) seen by both cameras
 
 
@@ -188,31 +186,17 @@ def overlap_depth(rig: Rig, images: Sequence[torch.Tensor], boxes: FloatArray | 
     surface = Street(ground_z_m=rig.ground_z_m)
     strips = [(a, b, _strip(rig, a, b, surface, boxes)) for a, b in adjacent_pairs(rig)]
     used = {k for a, b, strip in strips if strip is not None for k in (a, b)}
-    small = {k: _small(rig[k], images[k]) for k in used}
+    small = {k: reduced(images[k], source_level(rig[k], _SOURCE_WIDTH_PX)) * np.float32(255) for k in used}
     corrections, reports = [], []
     for a, b, strip in strips:
-        names = rig[a].name, rig[b].name
-        if strip is None:
-            reports.append(OverlapReport(*names, False, "they share too little"))
-            continue
-        correction, report = _refine(strip, (rig[a], rig[b]), (small[a], small[b]), surface)
-        reports.append(report)
+        correction, reason = None, "they share too little"
+        if strip is not None:
+            correction, reason = _refine(strip, (rig[a], rig[b]), (small[a], small[b]), surface)
+        reports.append(OverlapReport(rig[a].name, rig[b].name, correction is not None, reason))
         if correction is not None:
             corrections.append(correction)
     reports.sort(key=attrgetter("first", "second"))
     return OverlapDepth(tuple(corrections), tuple(reports))
-
-
-class _Small(NamedTuple):
-    """A halved source image."""
-
-    image: npt.NDArray[np.float32]  # (h, w, 3) in [0, 255]
-    level: int
-
-
-def _small(camera: Camera, image: torch.Tensor) -> _Small:
-    level = source_level(camera, _SOURCE_WIDTH_PX)
-    return _Small(reduced(image, level) * np.float32(255), level)
 
 
 def _strip(rig: Rig, a: int, b: int, surface: StaticSurface, boxes: FloatArray | None) -> _Strip | None:
@@ -250,45 +234,43 @@ def _seen_by_both(
 
 
 def _refine(
-    strip: _Strip, cameras: tuple[Camera, Camera], images: tuple[_Small, _Small], surface: StaticSurface
-) -> tuple[Correction | None, OverlapReport]:
-    """The pair's correction if it passes the gate, and why."""
-    names = cameras[0].name, cameras[1].name
-    one, two = (_read_over(strip.q, strip, c, image) for c, image in zip(cameras, images, strict=True))
+    strip: _Strip, cameras: tuple[Camera, Camera], images: Sequence[Layer], surface: StaticSurface
+) -> tuple[Correction | None, str]:
+    """The pair's correction if it passes the gate, and why, from halved images (h, w, 3) in [0, 255]."""
+    first, second = (_read_over(strip.q, strip, c, image) for c, image in zip(cameras, images, strict=True))
     fit, test = strip.fit, strip.test
-    ambiguous = why_ambiguous(one, two, strip.both)
+    ambiguous = why_ambiguous(first, second, strip.both)
     if ambiguous:
-        return None, OverlapReport(*names, False, ambiguous)
-    flow, trust = dense_flow(one, two, strip.both)
+        return None, ambiguous
+    flow, trust = dense_flow(first, second, strip.both)
     if not np.any(trust > 0.5):
-        return None, OverlapReport(*names, False, "nothing in one image is found in the other and back")
+        return None, "nothing in one image is found in the other and back"
     along, epipolar = _epipolar(strip, cameras, surface, flow)
-    trial = _smoothed(along, epipolar, trust * fit)
-    changed = strip.q * (1 + trial.change)
-    before = fitted_psnr_db(one, two, fit, test)
-    one, two = (_read_over(changed, strip, c, image) for c, image in zip(cameras, images, strict=True))
-    after = fitted_psnr_db(one, two, fit, test)
+    changed = strip.q * (1 + _smoothed(along, epipolar, trust * fit)[0])
+    before = fitted_psnr_db(first, second, fit, test)
+    first, second = (_read_over(changed, strip, c, image) for c, image in zip(cameras, images, strict=True))
+    after = fitted_psnr_db(first, second, fit, test)
     reason = f"{before:.1f} to {after:.1f} dB on held-out tiles"
     if after - before < MIN_RISE_DB:
-        return None, OverlapReport(*names, False, f"refining would not help, {reason}")
-    final = _smoothed(along, epipolar, trust * (fit | test))
-    if not final.valid.any():
-        return None, OverlapReport(*names, False, "too little is found in both images")
-    return _extended(strip, final), OverlapReport(*names, True, reason)
+        return None, f"refining would not help, {reason}"
+    change, valid = _smoothed(along, epipolar, trust * (fit | test))
+    if not valid.any():
+        return None, "too little is found in both images"
+    return _extended(strip, change, valid), reason
 
 
-def _read_over(q: FloatArray, strip: _Strip, camera: Camera, small: _Small) -> npt.NDArray[np.float32]:
+def _read_over(q: FloatArray, strip: _Strip, camera: Camera, image: Layer) -> Layer:
     """Warp a camera's image into the half-way view (h, w, 3), over inverse distances (h, w)."""
     uv, _ = project_rays(camera, strip.rays, q, strip.view.center_m - camera.center_m)
-    at = np.clip(at_level(uv, small.level), -1e4, 1e4).astype(np.float32)
+    at = np.clip(at_level(uv, source_level(camera, _SOURCE_WIDTH_PX)), -1e4, 1e4).astype(np.float32)
     return np.asarray(
-        cv2.remap(small.image, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),  # type: ignore[call-overload]
+        cv2.remap(image, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),  # type: ignore[call-overload]
         np.float32,
     )
 
 
 def _epipolar(
-    strip: _Strip, cameras: tuple[Camera, Camera], surface: StaticSurface, flow: npt.NDArray[np.float32]
+    strip: _Strip, cameras: tuple[Camera, Camera], surface: StaticSurface, flow: Layer
 ) -> tuple[FloatArray, FloatArray]:
     """Flow along the epipolar direction times its length, and the length squared: (h, w), px² per unit of change.
 
@@ -308,42 +290,35 @@ def _epipolar(
     return (flow * vector).sum(-1), (vector**2).sum(-1)
 
 
-class _Depth(NamedTuple):
-    """Relative changes (h, w) of inverse distance over a strip, and the pixels with measurements."""
-
-    change: npt.NDArray[np.float32]
-    valid: BoolArray
-
-
-def _smoothed(along: FloatArray, squared: FloatArray, weight: npt.NDArray[np.floating]) -> _Depth:
-    """Weighted least squares in a Gaussian window: change = Σ w f·e / (Σ w e·e + λ² Σ w)."""
+def _smoothed(along: FloatArray, squared: FloatArray, weight: npt.NDArray[np.floating]) -> tuple[Layer, BoolArray]:
+    """Weighted least squares in a Gaussian window: change = Σ w f·e / (Σ w e·e + λ² Σ w), and where it is measured."""
     top, bottom, total = (
         cv2.GaussianBlur(values.astype(np.float32), (0, 0), _SMOOTHING_PX)
         for values in (weight * along, weight * squared, weight)
     )
     change = top / np.maximum(bottom + _RIDGE_PX**2 * total, 1e-6)
-    return _Depth(np.clip(change, *LIMITS).astype(np.float32), total > _LEAST_SUPPORT)
+    return np.clip(change, *LIMITS).astype(np.float32), np.asarray(total > _LEAST_SUPPORT)
 
 
-def _extended(strip: _Strip, depth: _Depth) -> Correction:
-    """Extend a strip's depth over the whole view: the nearest change fades to the background's, then to none."""
+def _extended(strip: _Strip, measured: Layer, valid: BoolArray) -> Correction:
+    """Extend a strip's changes over the whole view: the nearest change fades to the background's, then to none."""
     change = np.zeros(HALF_VIEW_SIZE, np.float32)
-    change[strip.rows, strip.columns] = depth.change
+    change[strip.rows, strip.columns] = measured
     missing = np.ones(HALF_VIEW_SIZE, np.uint8)
-    missing[strip.rows, strip.columns] = ~(depth.valid & strip.both)
+    missing[strip.rows, strip.columns] = ~(valid & strip.both)
     distance, nearest = cv2.distanceTransformWithLabels(missing, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     by_label = np.zeros(int(nearest.max()) + 1, np.float32)
     by_label[nearest[missing == 0]] = change[missing == 0]
-    beside = np.where(missing == 0, change, cv2.GaussianBlur(by_label[nearest], (0, 0), _SMOOTHING_PX))
+    around = np.where(missing == 0, change, cv2.GaussianBlur(by_label[nearest], (0, 0), _SMOOTHING_PX))
     weight = _fade(distance / _FADE_PX)
-    change = beside * weight + _background(change, missing == 0)[:, None] * (1 - weight)
+    change = around * weight + _background(change, missing == 0)[:, None] * (1 - weight)
     (h, w), x, y = HALF_VIEW_SIZE, np.arange(HALF_VIEW_SIZE[1]), np.arange(HALF_VIEW_SIZE[0])[:, None]
     border_px = np.minimum(np.minimum(x, w - 1 - x), np.minimum(y, h - 1 - y))
     share = _fade(distance / _BACKGROUND_FADE_PX) * _fade(1 - border_px / _BORDER_PX)
     return Correction(strip.view, change.astype(np.float32), share.astype(np.float32))
 
 
-def _background(change: npt.NDArray[np.float32], valid: BoolArray) -> FloatArray:
+def _background(change: Layer, valid: BoolArray) -> FloatArray:
     """(h,) change of the background in each row: a low quantile, smoothed over rows."""
     count = valid.sum(axis=1)
     ordered = np.sort(np.where(valid, change, np.inf), axis=1)
@@ -357,27 +332,27 @@ def _background(change: npt.NDArray[np.float32], valid: BoolArray) -> FloatArray
 
 
 def _fade(t: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """From 1 at t <= 0 smoothly to 0 at t >= 1."""
+    """Smooth step from 1 at t <= 0 down to 0 at t >= 1."""
     t = np.clip(t, 0, 1)
     return 1 - t * t * (3 - 2 * t)
 
 
-def fitted_psnr_db(one: npt.NDArray[Any], two: npt.NDArray[Any], fit: BoolArray, test: BoolArray) -> float:
+def fitted_psnr_db(first: npt.NDArray[Any], second: npt.NDArray[Any], fit: BoolArray, test: BoolArray) -> float:
     """PSNR of (h, w, 3) views on ``test``, after a gain and an offset per channel fitted on ``fit``."""
     errors = []
     for channel in range(3):
-        x, y = (view[..., channel].astype(np.float64) for view in (one, two))
+        x, y = (view[..., channel].astype(np.float64) for view in (first, second))
         gain, offset = np.linalg.lstsq(np.stack([x[fit], np.ones(int(fit.sum()))], 1), y[fit], rcond=None)[0]
         errors.append(float(np.mean((x[test] * gain + offset - y[test]) ** 2)))
     return float(10 * np.log10(255**2 / max(float(np.mean(errors)), 1e-9)))
 
 
 def source_level(camera: Camera, width_px: int) -> int:
-    """How many times an image can be halved down to no less than ``width_px`` columns."""
+    """Number of halvings of an image that leave at least ``width_px`` columns."""
     return max(0, math.floor(math.log2(camera.width_px / width_px)))
 
 
-def reduced(image: torch.Tensor, level: int) -> npt.NDArray[np.float32]:
+def reduced(image: torch.Tensor, level: int) -> Layer:
     """Convert an image (3, H, W) to (h, w, 3) float32 in [0, 1], halved ``level`` times."""
     image = image.detach()
     top = np.float32(255 if image.dtype == torch.uint8 else 1)
@@ -395,11 +370,11 @@ def reduced(image: torch.Tensor, level: int) -> npt.NDArray[np.float32]:
 _OVERLAP_BYTES = 128 * 2**20  # about 4 MB each for six cameras
 
 OverlapCache = LRUCache[tuple[bytes, str | None], OverlapDepth]
-"""Depth from overlap by calibration with names, which its reports show, and name of what frames share."""
+"""Depth from overlap by calibration, with the names that reports show, and by the name that frames share."""
 
 
 def overlap_cache(share: bool | str, config: Any) -> OverlapCache | None:
-    """The cache of ``PlanCache.share_overlap``; ValueError unless the config asks for depth from overlap."""
+    """The cache of ``PlanCache.share_overlap``; ValueError unless the config enables depth from overlap."""
     if share is False:
         return None
     if not getattr(config, "overlap_depth", False):

@@ -1,4 +1,4 @@
-"""What holes show besides background: objects and what is near, unseen parts to paint, and samples of their colours."""
+"""Contents of holes other than background: objects and nearer pixels, unseen parts to paint, samples of colours."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from arbiview_aug.environment import borrowing, compiled
 
 _ZERO, _ONE = np.float32(0), np.float32(1)
 _MOST_SIDE_PX = 32767
-_AHEAD_COLUMNS, _MOST_AHEAD = 176, 32  # of a strip at a time; at most so many pixels are read for each of its own
+_AHEAD_COLUMNS, _MOST_AHEAD = 176, 32  # columns of a strip at a time, and maximum number of reads for each pixel
 _BLOCK_PX = 128  # of a row that are compared at once
 
 
@@ -96,9 +96,9 @@ def sample_band(
 
 @compiled
 def overlap_errors(pixels: Any, ends: Any, pairs: Any, curves: Any, errors: Any) -> None:
-    """Mean squared differences of both readings of each group's pixels, as they are and after tone curves.
+    """Mean squared differences of both readings of each group's pixels, before and after tone curves.
 
-    ``pixels`` and ``ends`` as in ``log_ratios``; ``pairs`` (2, G) are both cameras, ``curves`` (N, 2) those of each,
+    ``pixels`` and ``ends`` as in ``log_ratios``; ``pairs`` (2, G) are both cameras, ``curves`` (N, 2) are the cameras',
     and ``errors`` (2, G) are written.
     """
     both = np.empty((2, 3), np.float32)

@@ -1,15 +1,15 @@
-"""The render plan: all about a (source rig, target rig) pair that does not depend on image content; and its settings.
+"""The render plan: everything about a (source rig, target rig) pair but image content; and its settings.
 
 A plan is plain data: the place of each source image in an atlas, and for every target camera the position of every
 pixel in it, its winning source, and the bands along seams that are blended.
 
 Convention: a map holds, for every target pixel, the (x, y) of the atlas pixel to read; pixel centres are integers.
 Maps are OpenCV's fixed-point pairs: ``xy`` (h, w, 2) int16 whole pixels and ``frac`` (h, w) uint16 with 32nds of a
-pixel, (frac & 31) in x and (frac >> 5) in y. The torch path reads the very same positions, so both executions agree.
+pixel, (frac & 31) in x and (frac >> 5) in y. The torch path reads the same positions, so both executions agree.
 ``OUTSIDE`` marks pixels that read nothing and come out black.
 
-An atlas holds the source images that a plan reads, below and beside each other, some of them halved: one
-``cv2.remap`` then serves a target that sees several sources.
+An atlas holds the source images that a plan reads, in columns, some of them halved: one ``cv2.remap`` then serves a
+target that sees several sources.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from arbiview_aug.image_ops import level_size
 
 @dataclass(frozen=True, kw_only=True)
 class RenderConfig:
-    """Settings of planned rendering. ``docs/decisions.md`` says what each one is worth.
+    """Settings of planned rendering. ``docs/decisions.md`` measures each one.
 
     Attributes:
         interpolation: Sampling of the sources. ``cubic`` applies only where a target camera magnifies what it reads at
@@ -41,9 +41,9 @@ class RenderConfig:
         seam_width: Width of the blended band along a seam, as a fraction of the target's width; 0 switches blending
             off. Wider bands show double images of near objects, narrower ones the exposure step.
         overlap_depth: Correct the street's distances in every frame by stereo between overlapping cameras.
-        sky: Let photographs tell, over LiDAR, what is sky where no scan line returned (``scene.sky``).
+        sky: Find sky in photographs where no scan line of LiDAR returned (``scene.sky``).
         certainty: Store the geometry's accuracy in plans, one byte a pixel, for ``SampleKeys(extra=("confidence",))``.
-        layers: Store what holes show (``ViewPlan.layers``, ``paint``, ``road``); ``RigRetarget`` sets it by ``holes``.
+        layers: Store holes' contents (``ViewPlan.layers``, ``paint``, ``road``); ``RigRetarget`` sets it by ``holes``.
     """
 
     interpolation: Literal["nearest", "linear", "cubic"] = "cubic"
@@ -63,8 +63,8 @@ class RenderConfig:
 
 
 def check_ranges(config: Any, ranges: dict[str, tuple[float, float]]) -> None:
-    """Raise ValueError for fields of a config outside their (lowest, highest) value, and flags that are no bool."""
-    for flag in (one.name for one in fields(config) if isinstance(one.default, bool)):
+    """Raise ValueError for fields of a config outside their (lowest, highest) value, and flags that are not bool."""
+    for flag in (entry.name for entry in fields(config) if isinstance(entry.default, bool)):
         if not isinstance(value := getattr(config, flag), bool):
             raise ValueError(f"{type(config).__name__}.{flag}: expected True or False, got {shown(value)}")
     for name, (low, high) in ranges.items():
@@ -114,7 +114,7 @@ class FixedMap:
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
+        """Memory in bytes."""
         return self.xy.nbytes + self.frac.nbytes
 
 
@@ -150,7 +150,7 @@ class AtlasLayout:
     def for_sources(cls, sizes: Sequence[tuple[int, int]], used: Sequence[tuple[int, int]]) -> AtlasLayout:
         """Lay out the used (source, level) pairs: below each other, in further columns where rows run out.
 
-        Sources of one size take the rows that they have in a block of images: they may turn out to be all that is read.
+        Sources of one size take their rows in a block of images, which may then serve as the atlas.
 
         Raises:
             CalibrationError: There are no more columns: 29 images of 7680x4320 px, read at their full size.
@@ -200,20 +200,20 @@ class BlendRegion:
     y: int  # first row in the target
     x: int  # first column
     source: int  # index of the second source
-    at: FixedMap  # its positions in the atlas
-    weight: npt.NDArray[np.float32]  # (h, w) its share, at most 0.5
+    at: FixedMap  # positions of the second source in the atlas
+    weight: npt.NDArray[np.float32]  # (h, w) share of the second source, at most 0.5
 
 
 BACKGROUND, OCCLUDED, OBJECT = range(3)
 """Layers of a view's pixels: background that is seen, or outside all images; background that something hides; objects,
-and what is nearer than occluded background beside it."""
+and pixels nearer than occluded background next to them."""
 
 ROAD_M = 0.3
-"""Height up to which background belongs to the road: kerbs and sidewalks, and the noise of LiDAR."""
+"""Maximum height of background that belongs to the road: kerbs, sidewalks and noise of LiDAR, metres."""
 
 NEARER, NEARER_REACH = 1.5, 1 / 16
-"""Pixels so many times nearer than occluded background, within this share of the view's shorter side beside it, are not
-what continues it."""
+"""Factor by which pixels are nearer than occluded background to belong to something else, and distance from it within
+which they are compared, as a share of the view's shorter side."""
 
 
 def nearer_cells(size: tuple[int, int], step: int) -> int:
@@ -226,9 +226,9 @@ class Paint:
     """Parts of objects that no source sees, and where their colours are read in the view."""
 
     pixel: npt.NDArray[np.int32]  # (n,) int32 unseen pixels of objects, into the flattened view
-    part: npt.NDArray[np.int32]  # (n,) int32 what they show: ``scene.boxes.BoxSurface.face_parts``
+    part: npt.NDArray[np.int32]  # (n,) int32 their parts: ``scene.boxes.BoxSurface.face_parts``
     sample: npt.NDArray[np.int32]  # (m,) int32 seen pixels of objects, a sample
-    sample_part: npt.NDArray[np.int32]  # (m,) int32 what those show
+    sample_part: npt.NDArray[np.int32]  # (m,) int32 their parts
     nearest: npt.NDArray[np.int32]  # (4, n) int32 seen pixels next to the unseen ones, ``paint_kernels.nearest_seen``
 
     @property
@@ -272,7 +272,7 @@ class ViewPlan:
 
     @cached_property
     def seam_interpolation(self) -> str:
-        """Interpolation of its bands; never cubic: a mean of two sources is no sharper for it."""
+        """Interpolation of the bands; never cubic: a mean of two sources is no sharper for it."""
         return "linear" if self.interpolation == "cubic" else self.interpolation
 
     @cached_property
@@ -303,7 +303,7 @@ class SharedPixels(NamedTuple):
 
     source: npt.NDArray[np.int64]  # (2, n) both cameras
     at: npt.NDArray[np.int64]  # (2, n, 2) row and column in each
-    ends: npt.NDArray[np.int64]  # (G + 1,) first pixel of each group, and the last one's end
+    ends: npt.NDArray[np.int64]  # (G + 1,) first pixel of each group, and the end of the last group
 
 
 class SeamSamples(NamedTuple):

@@ -27,7 +27,7 @@ from arbiview_aug.sample.batching import barred, covered, framed, stacked
 from arbiview_aug.sample.frame import Frame
 
 _REMAP_COLUMNS = 32000  # cv2.remap needs sizes below 32767
-_STRIP_ROWS = 32  # are read together: they stay in the CPU's cache
+_STRIP_ROWS = 32  # rows that are read together: they stay in the CPU's cache
 _FLAGS = {"nearest": cv2.INTER_NEAREST, "linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC}
 
 
@@ -45,8 +45,8 @@ def render_opencv(
         images: N images (3, H, W) on the CPU: uint8, or float in [0, 1].
         scratch: Buffers to reuse between calls.
         curves: Tone curves of each view for the pixels of each image.
-        seams: A list to append to, for each view, (h, w) float32: by how much blending a second source changed the
-            winner's colour, mean over the channels, in the images' unit.
+        seams: A list to append to, for each view, (h, w) float32: the change of the winner's colour by blending a
+            second source, mean over the channels, in the images' unit.
 
     Returns:
         M views (3, h, w) of the images' type, black where no source sees; slices of one block where sizes agree.
@@ -58,7 +58,11 @@ def render_opencv(
     work = torch.uint8 if dtype == torch.uint8 else torch.float32
     atlas = _fill_atlas(plan.layout, [image.detach().to(work) for image in images], scratch)
     rows_of_bytes = atlas.view(np.uint8).reshape(len(atlas), -1)
-    views = _empty_views(plan, work)
+    sizes = [target.source_camera.shape for target in plan.targets]
+    if len(set(sizes)) == 1:
+        views = list(torch.empty((len(sizes), 3, *sizes[0]), dtype=work))
+    else:
+        views = [torch.empty((3, *size), dtype=work) for size in sizes]
     scale = LEVELS if work == torch.uint8 else SHARES
     pixels = scratch.get("view", (max(target.source_camera.size for target in plan.targets), 3), atlas.dtype)
     for number, (target, view) in enumerate(zip(plan.targets, views, strict=True)):
@@ -73,11 +77,10 @@ def render_opencv(
             view.zero_()
             continue
         buffer, at, winner = pixels[: h * w].reshape(h, w, 3), target.at, target.source_camera
-        packed = at.xy.view(np.int32)[..., 0]
         for y in range(0, h, _STRIP_ROWS):
             rows = slice(y, y + _STRIP_ROWS)
             strip = buffer[rows]
-            read_ahead(rows_of_bytes, 3 * atlas.itemsize, packed[rows], winner[rows])
+            read_ahead(rows_of_bytes, 3 * atlas.itemsize, at.packed[rows], winner[rows])
             _remap(atlas, at.xy[rows], at.frac[rows], target.interpolation, dst=strip)
             if target.edge is not None:
                 first, end = np.searchsorted(target.edge, (y * w, (y + _STRIP_ROWS) * w))
@@ -101,7 +104,7 @@ def render_opencv(
 
 
 def _put_edge(edge: np.ndarray, at: FixedMap, atlas: np.ndarray, view: np.ndarray, rows: slice) -> None:
-    """Read pixels of a view's rows bilinearly where cubics would reach too far, and clip what overshot in floats."""
+    """Read pixels of a view's rows bilinearly where cubics would reach too far, and clip overshoot of floats."""
     if view.dtype != np.uint8:
         np.clip(view[rows], 0, 1, out=view[rows])
     flat, xy, frac = view.reshape(-1, 3), at.xy.reshape(-1, 2), at.frac.reshape(-1)
@@ -110,15 +113,8 @@ def _put_edge(edge: np.ndarray, at: FixedMap, atlas: np.ndarray, view: np.ndarra
         flat[some] = _remap(atlas, xy[None, some], frac[None, some], "linear")[0]
 
 
-def _empty_views(plan: RenderPlan, dtype: torch.dtype) -> list[torch.Tensor]:
-    sizes = [target.source_camera.shape for target in plan.targets]
-    if len(set(sizes)) == 1:
-        return list(torch.empty((len(sizes), 3, *sizes[0]), dtype=dtype))
-    return [torch.empty((3, *size), dtype=dtype) for size in sizes]
-
-
 def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor], scratch: Scratch) -> np.ndarray:
-    """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 images; a channels-last block is used as it is."""
+    """The atlas (rows, columns, 3) of (3, H, W) uint8 or float32 images; a channels-last block is used uncopied."""
     block = _stacked_block(layout, images)
     if block is not None:
         return block
@@ -204,10 +200,10 @@ class Views:
         confidence: Float32 in [0, 1], 0 where uncovered.
         generated: Bool, True where a filler made up the pixel; None before filling.
         layers: (h, w) uint8 of each view as in ``ViewPlan``, or None.
-        paint: That of each view as in ``ViewPlan``, or None.
-        road: That of each view as in ``ViewPlan``, or None.
+        paint: ``ViewPlan.paint`` of each view, or None.
+        road: ``ViewPlan.road`` of each view, or None.
         certainty: (h, w) uint8 of each view as in ``ViewPlan``, for ``confidence_of``.
-        seams: (h, w) float32 of each view, by how much blending changed it, for ``confidence_of``.
+        seams: (h, w) float32 change of each view by blending, for ``confidence_of``.
         curves: Tone curves of each view for each source; None if exposures are as recorded.
         labels: Renders label maps; None if there are none.
     """
@@ -236,7 +232,7 @@ class Views:
         return replace(self, **changed)
 
     def between_bars(self, size: tuple[int, int]) -> Views:
-        """The frame with every view at ``size`` (h, w), black bars above and at both sides."""
+        """The frame with every view at ``size`` (h, w), with black bars above and at both sides."""
 
         def with_bars(views: Sequence[torch.Tensor], empty: float) -> torch.Tensor:
             return torch.stack([barred(view, size, empty) for view in views])
@@ -273,11 +269,11 @@ class Renderer:
         curves: Sequence[Curves | None],
         outputs: Collection[str] = (),
     ) -> list[Views]:
-        """Render frames by a plan each; torch renders those that share a plan in one batch.
+        """Render frames by a plan each; torch renders frames that share a plan in one batch.
 
-        ``curves`` are for each frame the tone curves of each view for each source, or None; ``outputs`` the
-        requested of ``source_camera``, ``source_frame`` and ``confidence``. SampleError for ``backend="opencv"`` and an
-        image on another device or with gradients.
+        ``curves`` are each frame's tone curves, or None; ``outputs`` are the requested keys among ``source_camera``,
+        ``source_frame`` and ``confidence``. SampleError for ``backend="opencv"`` and an image on another device or with
+        gradients.
         """
         with_seams = "confidence" in outputs
         rendered: dict[int, Views] = {}
@@ -292,11 +288,11 @@ class Renderer:
         for members in batches.values():
             plan = plans[members[0]]
             seams = [] if with_seams else None
-            sources = [torch.stack(images) for images in zip(*(frames[b].images for b in members), strict=True)]
+            sources = [torch.stack(batch) for batch in zip(*(frames[b].images for b in members), strict=True)]
             views = render_torch(plan, sources, [curves[b] for b in members], seams)
             for k, b in enumerate(members):
-                of_frame = [view[k] for view in views], [seam[k] for seam in seams or ()]
-                rendered[b] = _make_views(plan, *of_frame, curves[b], outputs)
+                images, changes = [view[k] for view in views], [seam[k] for seam in seams or ()]
+                rendered[b] = _make_views(plan, images, changes, curves[b], outputs)
         return [rendered[b] for b in range(len(frames))]
 
     def views(
@@ -357,8 +353,8 @@ def from_winners(
 
 def confidence_of(rendered: Views) -> Maps:
     """Compute the confidence of a frame's views from their certainty, seams and contrast."""
-    of_views = zip(rendered.images, rendered.certainty, rendered.coverage, rendered.seams, strict=True)
-    return stacked([confidence(*of_view) for of_view in of_views])
+    views = zip(rendered.images, rendered.certainty, rendered.coverage, rendered.seams, strict=True)
+    return stacked([confidence(*view) for view in views])
 
 
 # --- resized only -----------------------------------------------------------------------------------------------------

@@ -42,25 +42,25 @@ STATIC_HARM = (
     "Trained on such views alone, a detector that samples voxels finds fewer boxes than one trained on untouched "
     "images; one that lifts by depths finds more (docs/when.md)"
 )
-"""What a static surface does to detectors where cameras move: ``integrations/cross_rig/results/less.json``."""
+"""Effect of a static surface on detectors where cameras move: ``integrations/cross_rig/results/less.json``."""
 
 LEVEL_M, OFF_ROAD_M, FARTHEST_M = 40.0, 1.0, 250.0
-"""Boxes beyond the first stand on another height of the road; the bottoms of nearer ones are at most the second from
-it. Nothing is labelled beyond the third."""
+"""Distance up to which the road counts as level, maximum gap between it and the bottoms of boxes there, and maximum
+distance of labelled objects."""
 
-_COARSE_MASK_PX = 16  # margin that must be unmasked: weights know masks by blocks of 8 px
+_COARSE_MASK_PX = 16  # margin that must be unmasked: weights see masks in blocks of 8 px
 _ROUNDING_PX = 1e-6  # of float64 at the outermost pixel centres; plans allow for 1e-3
 _MAP_ERROR_PX = 1 / 32  # rounding of fixed-point maps, with as much again
 
 
 _FINER = 3.0  # readers decode at 1/4, while targets have their full size; 1/2 is a fair trade
-_UNREACHABLE = 0.5  # warn of target cameras of which less than this share is covered
-_SUSPICIOUS = 0.3  # a rig of which less is covered may have wrong poses
+_UNREACHABLE = 0.5  # minimum covered share of a target camera without a warning
+_SUSPICIOUS = 0.3  # covered share of a rig below which its poses may be wrong
 
 
 @dataclass(frozen=True, eq=False)
 class RigPair:
-    """A source rig of N cameras and a target rig of M, and what follows from their calibrations alone.
+    """A source rig of N cameras and a target rig of M, and the facts that follow from their calibrations alone.
 
     Geometry ``auto`` ignores pairs of cameras whose worst-case parallax is below ``FAR_PARALLAX_PX``, and those without
     common points beyond ``NEAREST_SCENE_M``.
@@ -123,11 +123,11 @@ class RigPair:
     @cached_property
     def poses(self) -> tuple[npt.NDArray[np.float32], ...]:
         """Rotations (M, N, 3, 3) from targets to sources, and targets minus sources in the frames of both (M, N, 3)."""
-        of_target, of_source = self.target.cam2ego[:, None, :3, :3], self.source.cam2ego[None, :, :3, :3]
+        target_R, source_R = self.target.cam2ego[:, None, :3, :3], self.source.cam2ego[None, :, :3, :3]
         offsets_m = self.target.cam2ego[:, None, :3, 3:] - self.source.cam2ego[None, :, :3, 3:]
-        to_source = of_source.transpose(0, 1, 3, 2)
-        in_source, in_target = to_source @ offsets_m, of_target.transpose(0, 1, 3, 2) @ offsets_m
-        return tuple(part.astype(np.float32) for part in (to_source @ of_target, in_source[..., 0], in_target[..., 0]))
+        to_source = source_R.transpose(0, 1, 3, 2)
+        in_source, in_target = to_source @ offsets_m, target_R.transpose(0, 1, 3, 2) @ offsets_m
+        return tuple(part.astype(np.float32) for part in (to_source @ target_R, in_source[..., 0], in_target[..., 0]))
 
     @cached_property
     def lenses(self) -> tuple[npt.NDArray[Any], ...]:
@@ -144,12 +144,12 @@ class RigPair:
         return static_harm(self.source, self.target, "street", self.config)
 
 
-_SLACK_PX, _ROUNDING = 1e-3, 5e-7  # a pixel on the very border must not drop out by a rounding of float32
+_SLACK_PX, _ROUNDING = 1e-3, 5e-7  # pixels on the border must not drop out by rounding in float32
 
 
 @lru_cache(32)
 def source_bounds(full: tuple[int, int], level: int) -> tuple[float, ...]:
-    """Least and largest columns and rows of what an image (h, w) halved ``level`` times shows; its last ones, or -1."""
+    """Visible columns and rows of an image (h, w) halved ``level`` times: least, largest, and the last pixels or -1."""
     (h, w), scale = level_size(full, level), 0.5**level
     slack_px = _SLACK_PX + _ROUNDING * max(full)
     first, *last = ((side + 0.5) * scale - 0.5 for side in (-slack_px, full[1] - 1 + slack_px, full[0] - 1 + slack_px))
@@ -182,14 +182,14 @@ def static_harm(source: Rig, target: Rig, geometry: str, config: RenderConfig) -
 
 
 def stand_in_view(source: Rig, boxes: FloatArray) -> bool:
-    """Whether most boxes (B, 7) stand on the road, by those nearby if there are any, and one of them is in a view."""
+    """Whether most boxes (B, 7), the nearby ones if any, are on the road, and at least one is in a camera's view."""
     away_m = np.hypot(boxes[:, 0], boxes[:, 1])
     near = away_m < LEVEL_M
-    stand = np.abs(boxes[:, 2] - boxes[:, 5] / 2 - source.ground_z_m) < np.where(near, OFF_ROAD_M, away_m / 10)
-    stand &= away_m < FARTHEST_M
-    if stand[near if near.any() else ...].mean() < 0.5:
+    on_road = np.abs(boxes[:, 2] - boxes[:, 5] / 2 - source.ground_z_m) < np.where(near, OFF_ROAD_M, away_m / 10)
+    on_road &= away_m < FARTHEST_M
+    if on_road[near if near.any() else ...].mean() < 0.5:
         return False
-    boxes = boxes[stand]
+    boxes = boxes[on_road]
     c, s, half = np.cos(boxes[:, 6]), np.sin(boxes[:, 6]), boxes[:, 3:6] / 2
     for camera in source:
         apart_m = np.linalg.norm(boxes[:, :3] - camera.center_m, axis=1)
@@ -202,7 +202,7 @@ def stand_in_view(source: Rig, boxes: FloatArray) -> bool:
 
 
 def boxes_harm(pair: RigPair, boxes: FloatArray | None) -> str | None:
-    """The harm of a pair that is rendered over boxes (B, 7) which fit nothing; None if there are none, or they fit."""
+    """Harm of rendering a pair over boxes (B, 7) that do not fit the data; None without boxes, or if they fit."""
     if boxes is None or not len(boxes) or stand_in_view(pair.source, boxes):
         return None
     lost = f"boxes_3d: most of {len(boxes)} are off the road or in no camera's view (python -m arbiview_aug check)"
@@ -238,7 +238,7 @@ def covers_target_exactly(source: Camera, target: Camera, config: RenderConfig) 
     side = math.sqrt((u1 - u0 + 1) * (v1 - v0 + 1) / (h * w))
     halved = 2 ** max(0, math.floor(math.log2(1.5 * side))) if config.antialias else 1
     lost_h, lost_w = (0 if n % halved == 0 else halved - 1 for n in source.size)
-    # Positions in a rotated view are interpolated; those in a cropped or scaled one are exact.
+    # Positions in a rotated view are interpolated; in a cropped or scaled view they are exact.
     scaled = float(np.abs(H[2, :2]) @ (w, h)) <= 1e-9 * float(H[2, 2])
     margin = -_ROUNDING_PX if scaled else _MAP_ERROR_PX * halved
     if min(u0, v0) < margin or u1 > source_w - 1 - lost_w - margin or v1 > source_h - 1 - lost_h - margin:
@@ -253,7 +253,7 @@ def covers_target_exactly(source: Camera, target: Camera, config: RenderConfig) 
 
 
 def check_reach(source: Rig, target: Rig, coverages: Sequence[BoolArray], unseen: str, warn: WarnOnce) -> None:
-    """Warn once of target cameras that the sources hardly cover; ``unseen`` says what becomes of uncovered pixels.
+    """Warn once of target cameras that the sources hardly cover; ``unseen`` names the fate of uncovered pixels.
 
     Raises:
         UnreachableError: The sources cover none of the target's pixels.

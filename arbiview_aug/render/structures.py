@@ -1,4 +1,4 @@
-"""What compiled planning reads and writes: named arrays with their shapes, types, frames and units."""
+"""Inputs and outputs of compiled planning: named arrays with their shapes, types, frames and units."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class Sources(NamedTuple):
 
     A: Any  # (K, 3, 3) float32 rotation from the target's frame
     o: Any  # (K, 3) float32 the target's centre in the source's frame; 0 where the scene counts as infinitely far
-    kind: Any  # (K,) int64 lens; -1 for one that kernels do not know
+    kind: Any  # (K,) int64 lens; -1 for lenses without a kernel
     P: Any  # (K, 14) float32 ``Camera.parameters``
     size: Any  # (K, 2) int64 height and width, not halved
     bounds: Any  # (K, 6) float32 least columns and rows of the image, largest ones; last pixel of a halved one, or -1
     offset_m: Any  # (K, 3) float32 the target's centre minus the source's, target's frame
     bonus: Any  # (K,) float32 factor of the weight
     slot: Any  # (K, 3) int32 number of the source; column and row of its image in the atlas
-    positions: Images  # (2 h, w) float32 columns, then rows, for lenses that kernels do not know
+    positions: Images  # (2 h, w) float32 columns, then rows, for lenses without a kernel
     to_mask: Images  # float32 distance of each cell of ``CELL_PX`` to the own car, pixels
     clean: Images  # uint8, 0 where the image shows the own car
 
@@ -53,17 +53,17 @@ class Surfaces(NamedTuple):
 
 
 class Occluders(NamedTuple):
-    """What hides points from K sources; ``surface.OcclusionMap`` for each."""
+    """Occluders of points for each of K sources; see ``surface.OcclusionMap``."""
 
     beyond: Images  # float32 inverse distances beyond which points are hidden, 1/m
     solid: Images  # int32 number of the solid that hides them, -1 for none
     scale: Any  # (K,) float32 size of these images over that of the image that is read
     before_m: Any  # (K, F) float32 metres that the source lies before the plane of each face; (K, 0) without objects
-    is_guess: bool  # the background was not measured: all that stands before it hides it
+    is_guess: bool  # the background was not measured: everything in front of it hides it
 
 
 class Nodes(NamedTuple):
-    """What weights depend on, for K sources on the nodes of a view; written by ``measure_nodes``."""
+    """Inputs of the weights of K sources on the nodes of a view; written by ``measure_nodes``."""
 
     score: Any  # (K, ny, nx) float32 weight, 0 where the source sees nothing
     border: Any  # (K, ny, nx) float32 distance to the border of what the source sees, target pixels; 0 if not ``near``

@@ -54,18 +54,14 @@ def maps_on(plan: RenderPlan, device: torch.device) -> Sequence[ViewMaps]:
     if device not in plan.on_devices:
         # Inference tensors could not take part in a later backward pass.
         with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
-            plan.on_devices[device] = tuple(_view_maps(plan, target, device) for target in plan.targets)
+            views, size = list[ViewMaps](), plan.layout.size
+            for target in plan.targets:
+                arrays = target.edge, target.certainty
+                edge, certainty = (None if part is None else torch.from_numpy(part).to(device) for part in arrays)
+                grid, blend = _grid(target.at.to_float(), size, device), _blend(target, size, device)
+                views.append(ViewMaps(grid, torch.from_numpy(target.source_camera).to(device), blend, edge, certainty))
+            plan.on_devices[device] = tuple(views)
     return plan.on_devices[device]
-
-
-def _view_maps(plan: RenderPlan, target: ViewPlan, device: torch.device) -> ViewMaps:
-    atlas_size = plan.layout.size
-    source = torch.from_numpy(target.source_camera).to(device)
-    edge, certainty = (
-        None if one is None else torch.from_numpy(one).to(device) for one in (target.edge, target.certainty)
-    )
-    grid, blend = _grid(target.at.to_float(), atlas_size, device), _blend(target, atlas_size, device)
-    return ViewMaps(grid, source, blend, edge, certainty)
 
 
 def _blend(target: ViewPlan, atlas_size: tuple[int, int], device: torch.device) -> Blend | None:
@@ -85,11 +81,7 @@ def _blend(target: ViewPlan, atlas_size: tuple[int, int], device: torch.device) 
 
 
 def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; differentiable.
-
-    Gaps between slots are 0: bilinear taps of weight 0 read them. Pieces are joined, since an exported graph would hold
-    the index of every pixel that is written.
-    """
+    """The atlas (B, 3, rows, columns) float32 of (B, 3, H, W) images in 0..255 or [0, 1]; 0 between slots."""
     rows, columns = layout.size
     if not layout.slots:
         return torch.zeros((len(images[0]), 3, rows, columns), device=images[0].device)
@@ -98,7 +90,12 @@ def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
     for left, right in pairwise(edges):
         y, pieces = 0, []
         for slot in sorted((slot for slot in layout.slots if slot.x == left), key=lambda slot: slot.y):
-            image = _halved(images[slot.source], slot.level)
+            image, is_uint8 = images[slot.source], images[slot.source].dtype == torch.uint8
+            if slot.level or not is_uint8:
+                image = image.float()  # autocast joins no float16
+            for _ in range(slot.level):
+                image = torch.nn.functional.avg_pool2d(image, 2)
+                image = torch.floor(image + 0.5) if is_uint8 else image  # as OpenCV rounds
             pieces.append(_padded(image, right - left - slot.size[1], slot.y - y, 0))
             y = slot.y + slot.size[0]
         parts.append(_padded(torch.cat(pieces, 2), 0, 0, rows - y))
@@ -107,19 +104,9 @@ def _fill_atlas(layout: AtlasLayout, images: Sequence[torch.Tensor]) -> torch.Te
 
 
 def _padded(image: torch.Tensor, right: int, above: int, below: int) -> torch.Tensor:
-    """An image with zeros beside it; itself, not a copy, without any."""
+    """An image padded with zeros; the same tensor if nothing is padded."""
     is_padded = right or above or below
     return torch.nn.functional.pad(image, (0, right, above, below)) if is_padded else image
-
-
-def _halved(image: torch.Tensor, level: int) -> torch.Tensor:
-    """An image halved so many times, float32; uint8 as it is for none. Autocast joins no float16."""
-    halved = image.float() if level or image.is_floating_point() else image
-    for _ in range(level):
-        halved = torch.nn.functional.avg_pool2d(halved, 2)
-        if image.dtype == torch.uint8:
-            halved = torch.floor(halved + 0.5)  # as OpenCV rounds halved uint8 images
-    return halved
 
 
 def _grid(uv: npt.NDArray[np.floating], atlas_size: tuple[int, int], device: torch.device) -> torch.Tensor:
@@ -145,21 +132,21 @@ def render_torch(
 ) -> list[torch.Tensor]:
     """Render the M target views (B, 3, h, w) of a batch of frames that share a plan, with ``grid_sample``.
 
-    The N images (B, 3, H, W) are uint8, or float in [0, 1], and sampled in float32. ``curves`` are for each frame None
-    or those of its views, and ``seams`` a list to append (B, h, w) float32 to for each view: see ``render_opencv``.
+    The N images (B, 3, H, W) are uint8, or float in [0, 1], and sampled in float32. ``curves`` are each frame's tone
+    curves, or None. ``seams`` is a list to append (B, h, w) float32 to for each view: see ``render_opencv``.
     """
     dtype, device = images[0].dtype, images[0].device
     top = 255 if dtype == torch.uint8 else 1
     atlas = _fill_atlas(plan.layout, images)
     tones: Callable[..., torch.Tensor] | None = None
-    curved = next((of_frame for of_frame in curves or () if of_frame is not None), None)
+    curved = next((frame for frame in curves or () if frame is not None), None)
     views = []
     for number, (target, maps) in enumerate(zip(plan.targets, maps_on(plan, device), strict=True)):
         if curves is not None and curved is not None:
             as_recorded = np.ones_like(curved[number])
-            of_view = np.stack([as_recorded if of_frame is None else of_frame[number] for of_frame in curves])
-            of_rows = of_view.reshape(len(curves), len(images), -1, 2)
-            tones = partial(_toned, curves=torch.from_numpy(of_rows).float().to(device), top=top)
+            view_curves = [as_recorded if frame is None else frame[number] for frame in curves]
+            row_curves = np.stack(view_curves).reshape(len(curves), len(images), -1, 2)
+            tones = partial(_toned, curves=torch.from_numpy(row_curves).float().to(device), top=top)
         view = _sample(atlas, maps.grid, target.interpolation)
         if maps.edge is not None:
             at_edge = _sample(atlas, maps.grid.view(-1, 2)[maps.edge][None], "linear")[:, :, 0]
@@ -183,7 +170,7 @@ def _blended(
     tones: Callable[..., torch.Tensor] | None,
     change: torch.Tensor,
 ) -> torch.Tensor:
-    """Blend the second sources into a view (B, 3, h, w), and write by how much they changed it to (B, h, w)."""
+    """Blend the second sources into a view (B, 3, h, w), and write the change to ``change`` (B, h, w)."""
     second = _sample(atlas, blend.grid, interpolation)[:, :, 0]  # [B, 3, n]
     if tones is not None:
         second = tones(second, blend.source, blend.pixel // view.shape[-1])

@@ -1,6 +1,6 @@
-"""How a rig is rendered: which sources see each target view, over which surface, and who wins each pixel.
+"""Planning of views: which sources see each target view, over which surface, and which one wins each pixel.
 
-The scene becomes images first: inverse distances of each view, and what hides it from each source. Compiled code
+The scene becomes images first: inverse distances of each view, and its occlusion in each source. Compiled code
 (``node_kernels``, ``kernels``) then evaluates nodes and pixels, fast enough for calibrations or geometry that change
 with every frame.
 """
@@ -44,7 +44,7 @@ from arbiview_aug.scene.surface import FAR_PARALLAX_PX, OcclusionMap, is_within_
 SMALL_SIDE_PX = 64  # weights of targets with a shorter side are evaluated at every pixel
 PRIMARY_BONUS = 1e6
 """w_primary of a source at the target's own centre (paper, FAVS Stage 4). It is exact and wins where it sees, down to
-the border of an image of 32767 px, where other weights make 1.5e-6 at least; those of other sources make 1 at most.
+the border of an image of 32767 px, where its other weights are at least 1.5e-6. Weights of other sources are at most 1.
 """
 
 MAGNIFIED = 0.8
@@ -56,7 +56,7 @@ _NO_IMAGE, _NO_FACES, _NO_PARTS = np.zeros((0, 0), np.float32), np.zeros((0, 0),
 
 
 class ViewPlanner:
-    """Plans one view in two steps: what each source sees, then who wins each pixel and where seams are blended.
+    """Plans one view in two steps: visibility in each source, then winners of pixels and blended seams.
 
     Positions, visibility and winners are evaluated at every pixel. Weights are smooth: they are known on nodes
     ``GRID_STEP_PX`` apart, which lie on pixel centres, and interpolated between.
@@ -94,7 +94,7 @@ class ViewPlanner:
         return self.scene.surface(name, self.pair.source.ground_z_m)
 
     def _seen(self, name: str) -> Surfaces:
-        """A surface as the view sees it: ``Surfaces``."""
+        """A surface as the view sees it, cached by name."""
         if name in self._surfaces:
             return self._surfaces[name]
         surface = self._surface(name)
@@ -117,9 +117,9 @@ class ViewPlanner:
         return self._surfaces[name]
 
     def _occluders(self) -> Occluders:
-        """What hides the scene from the sources: ``Occluders``."""
+        """Occluders of the scene for each source."""
         surface = self._surface(self.seen_name)
-        found, scales = [], []
+        occlusions, scales = [], []
         for k, level in self.used:
             hiding, coarser, source = OcclusionMap(_NO_IMAGE), level, self.pair.source.cameras[k]
             if _is_measured(surface) and not self.is_far[k]:
@@ -127,13 +127,15 @@ class ViewPlanner:
                 coarser = level if surface.is_layered else max(level, occlusion_level(source))
                 half = halved_camera(source, coarser) if coarser else source
                 hiding = surface.occlusion_map(half, self.maps.rays(half), self.maps.memory)
-            found.append(hiding)
+            occlusions.append(hiding)
             scales.append(0.5 ** (coarser - level))
-        before_m = np.zeros((len(found), max((len(one.before_m) for one in found), default=0)), np.float32)
-        for row, one in zip(before_m, found, strict=True):
-            row[: len(one.before_m)] = one.before_m
-        images = self._images([one.beyond for one in found]), self._images([one.solid for one in found])
-        return Occluders(*images, np.array(scales, np.float32), before_m, bool(surface.background.is_guess))
+        faces = max((len(hiding.before_m) for hiding in occlusions), default=0)
+        before_m = np.zeros((len(occlusions), faces), np.float32)
+        for row, hiding in zip(before_m, occlusions, strict=True):
+            row[: len(hiding.before_m)] = hiding.before_m
+        beyond = self._images([hiding.beyond for hiding in occlusions])
+        solid = self._images([hiding.solid for hiding in occlusions])
+        return Occluders(beyond, solid, np.array(scales, np.float32), before_m, bool(surface.background.is_guess))
 
     def _images(self, arrays: Sequence[npt.NDArray[Any]]) -> Images:
         """Arrays as ``Images``."""
@@ -249,7 +251,9 @@ class ViewPlanner:
         paint = road = None
         if name != "infinity":
             surfaces = self._seen(name)
-            road = self._road(surfaces.behind)
+            down = self._directions[..., 2] / np.maximum(surfaces.behind, np.float32(1e-9))
+            height_m = self.camera.center_m[2] - self.pair.source.ground_z_m + down
+            road = np.asarray((height_m < ROAD_M) & (surfaces.behind > 0))
             if surfaces.face.size or layers.any():
                 parts = self._surface(name).face_parts if surfaces.face.size else _NO_PARTS
                 paint = find_paint(surfaces.q, surfaces.face, parts, winner, view.step, layers)
@@ -300,14 +304,8 @@ class ViewPlanner:
             upsample_where(_filled(share[i], nodes.near[i]), self.view.step, winner, k, certain)
         return certain
 
-    def _road(self, behind: npt.NDArray[np.float32]) -> BoolArray:
-        """The nodes (ny + 1, nx + 1) behind which the road lies, by inverse distances of the background."""
-        down = self._directions[..., 2] / np.maximum(behind, np.float32(1e-9))
-        height_m = self.camera.center_m[2] - self.pair.source.ground_z_m + down
-        return np.asarray((height_m < ROAD_M) & (behind > 0))
-
     def _interpolation(self, won_px: npt.NDArray[np.int64]) -> str:
-        """Cubic where it is asked for and the view magnifies, by ``MAGNIFIED``, what lies at its own centre."""
+        """Cubic if requested and if the view magnifies, by ``MAGNIFIED``, sources at its own centre."""
         if self.config.interpolation != "cubic":
             return self.config.interpolation
         won, total = 0, 0.0
@@ -320,12 +318,12 @@ class ViewPlanner:
         return "cubic" if most and total <= MAGNIFIED * won else "linear"
 
     def _edge(self, fixed: FixedMap, winner: npt.NDArray[np.int8], layout: AtlasLayout) -> npt.NDArray[np.int64]:
-        """The pixels whose cubics, 4 x 4 pixels from one before ``fixed.xy``, leave the source or touch its mask."""
+        """Pixels whose 4 x 4 cubic taps, from one pixel before ``fixed.xy``, leave the source or touch its mask."""
         edge = np.zeros(winner.shape, np.uint8)
         for k, level in self.used:
             slot = layout.slot(k, level)
             h, w = slot.size
-            own_pixels: Any = cv2.inRange(winner, k, k)  # type: ignore[call-overload]
+            won: Any = cv2.inRange(winner, k, k)  # type: ignore[call-overload]
             low, high = (slot.x + 1, slot.y + 1), (slot.x + w - 3, slot.y + h - 3)
             inside: Any = cv2.inRange(fixed.xy, low, high)  # type: ignore[call-overload]
             clean = self.maps.clean_pixels(self.pair.source.cameras[k], level)
@@ -333,7 +331,7 @@ class ViewPlanner:
                 clean = np.asarray(cv2.erode(clean, np.ones((4, 4), np.uint8), anchor=(1, 1)), np.uint8)
                 at = fixed.xy - np.array([slot.x, slot.y], np.int16)
                 inside &= cv2.remap(clean, at, None, cv2.INTER_NEAREST)  # type: ignore[call-overload]
-            cv2.bitwise_or(edge, cv2.bitwise_and(own_pixels, cv2.bitwise_not(inside)), dst=edge)
+            cv2.bitwise_or(edge, cv2.bitwise_and(won, cv2.bitwise_not(inside)), dst=edge)
         return np.flatnonzero(edge)
 
     def _reports(self, winner: npt.NDArray[np.int8], won_px: npt.NDArray[np.int64]) -> Iterator[SourceUse]:
@@ -357,7 +355,7 @@ class ViewPlanner:
             )
 
     def _reason(self, baseline_m: float) -> str:
-        """Why a source so far away is read over its surface."""
+        """Why a source at this distance is read over its surface."""
         worst_px = worst_parallax_px(baseline_m, float(self.camera.K[0, 0]))
         if baseline_m < SAME_CENTER_M:
             return "centres coincide: exact"
@@ -379,7 +377,7 @@ def nodes_of(size: tuple[int, int], step: int) -> tuple[npt.NDArray[np.int64], n
     return y, x
 
 
-@lru_cache(32)  # all targets ask for the same ones
+@lru_cache(32)  # all targets need the same cameras
 def halved_camera(camera: Camera, level: int) -> Camera:
     """The camera of an image that was halved ``level`` times, at least once."""
     h, w = level_size(camera.size, level)
@@ -392,12 +390,12 @@ def _at(rows: Any, k: npt.NDArray[np.int64]) -> Any:
 
 
 def _is_measured(surface: Any) -> bool:
-    """Whether a surface knows what stands on the street."""
+    """Whether a surface includes the objects on the street."""
     return bool(surface.is_layered or surface.is_dense)
 
 
 def _filled(values: FloatArray, valid: BoolArray) -> npt.NDArray[np.float32]:
-    """Values on the nodes; those that are not valid take the mean of those around them."""
+    """Values on the nodes; invalid ones take the mean of their neighbours."""
     if valid.all():
         return values.astype(np.float32)
     known = np.where(valid, values, 0).astype(np.float32)
@@ -426,7 +424,7 @@ def build_plan(
         config: Settings; the ``fast`` preset by default.
         scene: Known geometry, in the source's ego frame.
         maps: Rays and masks of cameras, to be reused by later plans.
-        wanted: (h, w) pixels of each target that must be planned, in place of all.
+        wanted: (h, w) pixels of each target to plan; all by default.
 
     Returns:
         The plan. Targets that no source sees have zero coverage.
@@ -440,13 +438,13 @@ def plan_pair(
 ) -> RenderPlan:
     """As ``build_plan``, for a pair of rigs in one ego frame."""
     with compilation_announced():
-        # Cameras at one centre share panoramas: the order of targets must not tell which of them makes one.
+        # Cameras at one centre share panoramas: content order keeps results independent of the targets' order.
         order = content_order(pair.target.cameras)
         planners = {k: ViewPlanner(pair, k, scene, maps, None if wanted is None else wanted[k]) for k in order}
         used = {(k, source) for k, planner in planners.items() for source in planner.used}
         layout = AtlasLayout.for_sources(pair.source.sizes, [source for _, source in used])
         views = {k: planner.finish(layout) for k, planner in planners.items()}
-        # The same places for what is read: images that win no pixel are not copied.
+        # Images that win no pixel are not copied; the others keep their places.
         read = {source for k, source in used if source[0] in views[k].sources}
         layout = AtlasLayout(tuple(slot for slot in layout.slots if (slot.source, slot.level) in read))
         return RenderPlan(pair.source, pair.target, layout, tuple(views[k] for k in range(len(views))), pair.config)

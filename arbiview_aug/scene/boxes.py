@@ -1,7 +1,7 @@
 """Labelled 3D boxes on the street, which keep an object's height when cameras move, and the shapes inside them.
 
 A car, a person or a bicycle fills its box as up to two convex pieces: tapered slabs of six planes n · x <= d. Shares of
-bodies are those of production cars: the glasshouse is about a third of the height, the bonnet a quarter of the length,
+bodies follow production cars: the glasshouse is about a third of the height, the bonnet a quarter of the length,
 and a windscreen leans by 60 to 65 degrees.
 
 A ray meets the first face of a piece, or the street where it misses all. Pixels that an object occludes in a source are
@@ -26,19 +26,19 @@ from arbiview_aug.scene.point_cloud import PointCloudSurface
 from arbiview_aug.scene.surface import Layer, OcclusionMap, Points, Surface
 
 PIECES = 2
-"""Pieces of an object."""
+"""Number of convex pieces of an object."""
 
 LEAST_POINTS = 20
-"""Points that suffice to choose among profiles."""
+"""Minimum number of points to choose among profiles."""
 
 AIR_M = 0.2
-"""Distance outside an object within which points count as its own, m."""
+"""Distance outside an object within which points belong to it, metres."""
 
 SIDE_CELLS = 8, 16
 """Rows and columns of displacements on each side of an object: 0.2 by 0.3 m on a car, a few scan lines at 10 m."""
 
 SCANNER_M = 1.0, 0.0, 1.9
-"""A place of scanners on roofs, over the road, from which points were seen; nuScenes' is at 0.9, 0, 1.8."""
+"""Assumed position of the scanner, over the road, metres; nuScenes' is at 0.9, 0, 1.8."""
 
 
 class Piece(NamedTuple):
@@ -46,16 +46,16 @@ class Piece(NamedTuple):
 
     bottom: float
     top: float
-    rear: float = -0.5  # this, the front and the side are those of its bottom
+    rear: float = -0.5  # rear, front and side of its bottom
     front: float = 0.5
     side: float = 0.5  # half its width
-    rear_lean: float = 0.0  # how far the rear leans in, up to its top
+    rear_lean: float = 0.0  # inward lean of the rear, up to its top
     front_lean: float = 0.0
     side_lean: float = 0.0
 
 
 def _car(waist: float, rear: float, rear_lean: float, *, leans: bool = True) -> tuple[Piece, Piece]:
-    """A car with a body up to its waist, and a cabin from ``rear`` on, which leans or hardly does."""
+    """A car with a body up to its waist and a cabin from ``rear`` forward; upright cars hardly lean."""
     if leans:
         body = Piece(-0.5, waist, rear_lean=min(0.5 + rear, 0.03), front_lean=0.02, side_lean=0.03)
         return body, Piece(waist, 0.5, rear, 0.25, 0.47, rear_lean, 0.18, 0.09)
@@ -99,39 +99,40 @@ _KINDS: tuple[tuple[Any, tuple[float, ...], tuple[float, ...]], ...] = (
     ((_BOX,), (0.0, 0.0, 0.0), (np.inf, np.inf, np.inf)),  # all others
 )
 KIND_M = np.array([[least, most] for _, least, most in _KINDS]).transpose(1, 0, 2)
-"""Least and largest length, width and height (2, kinds, 3) of the kinds. An object is of the first one that it fits."""
+"""Minimum and maximum length, width and height (2, kinds, 3) of the kinds. An object has the first kind that fits."""
 
 _NOTHING = Piece(0.5, 0.5, 0.0, 0.0, 0.0)
-PROFILES = np.array([[*one, _NOTHING][:PIECES] for kind, *_ in _KINDS for one in kind], np.float64)
+PROFILES = np.array([[*profile, _NOTHING][:PIECES] for kind, *_ in _KINDS for profile in kind], np.float64)
 """All profiles (K, 2, 8), kind after kind."""
 
 _COUNTS = np.array([len(kind) for kind, *_ in _KINDS])
 OF_KIND = np.cumsum(_COUNTS)[:, None] - _COUNTS[:, None] + np.minimum(np.arange(_COUNTS.max()), _COUNTS[:, None] - 1)
-"""Numbers (kinds, most) of each kind's profiles, the last again where it has fewer."""
+"""Indices (kinds, most) of each kind's profiles, padded with the last one."""
 
 
 def kinds(boxes: FloatArray) -> npt.NDArray[np.int64]:
-    """Shapes that boxes (B, 7) may hold, by their sizes: rows (B,) of ``KIND_M``."""
+    """Kinds of boxes (B, 7) by their sizes: rows (B,) of ``KIND_M``."""
     sizes = boxes[:, None, 3:6]
     return np.asarray(((sizes >= KIND_M[0]) & (sizes <= KIND_M[1])).all(axis=-1).argmax(axis=-1))
 
 
 def solids(boxes: FloatArray) -> FloatArray:
-    """Planes (B, 2, 6, 4) of what boxes (B, 7) hold: points n · x <= d of the ego frame lie in a piece.
+    """Planes (B, 2, 6, 4) of the shapes in boxes (B, 7): points n · x <= d of the ego frame lie in a piece.
 
-    Planes are those of the rear, the front, the right, the left, the bottom and the top. The profile is the
-    first one that fits a box.
+    Planes come in the order rear, front, right, left, bottom, top. The profile is the first one that fits a box.
     """
     return _planes(boxes, PROFILES[OF_KIND[kinds(boxes), 0]])
 
 
 def solids_among(boxes: FloatArray, points: Points, ground_z_m: float = 0.0) -> tuple[FloatArray, BoolArray, Layer]:
-    """Shapes in boxes (B, 7), as ``solids`` gives it, by the points (P, 3) in them; which points (P,) are theirs; how
-    far their sides (B, 5, rows, columns) lie off the shapes, metres.
+    """Fit shapes in boxes (B, 7) to the points (P, 3) in them.
 
-    Of the profiles that fit a box it is the one whose faces lie nearest to its points; then cabin and faces fit these.
-    Points within ``AIR_M`` of it are its own: mirrors, and the noise of points and labels. This far over the box's
-    floor they may be the road's.
+    The profile whose faces lie nearest to a box's points is chosen; then cabin and faces are fitted to them. Points
+    within ``AIR_M`` of a shape belong to it: mirrors, and the noise of points and labels. This close to the box's floor
+    they may belong to the road.
+
+    Returns:
+        Planes as from ``solids``; the points (P,) of objects; displacements (B, 5, rows, columns) of sides, metres.
     """
     from arbiview_aug.scene.shape_kernels import fit_profiles
 
@@ -147,7 +148,7 @@ def solids_among(boxes: FloatArray, points: Points, ground_z_m: float = 0.0) -> 
 def points_by_box(
     boxes: FloatArray, points: Points, air_m: float
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Indices (n,) of the points (P, 3) in boxes (B, 7) widened by ``air_m``, box by box; where each box ends (B,)."""
+    """Indices (n,) of the points (P, 3) in boxes (B, 7) widened by ``air_m``, box by box; end of each box (B,)."""
     from arbiview_aug.scene.kernels import points_in
 
     box, point = points_in(np.ascontiguousarray(boxes), np.ascontiguousarray(points, np.float32), air_m)
@@ -156,7 +157,7 @@ def points_by_box(
 
 
 def whole(boxes: FloatArray) -> FloatArray:
-    """Planes (B, 1, 6, 4) of the boxes' own faces."""
+    """Planes (B, 1, 6, 4) of the boxes' faces."""
     return _planes(boxes, np.tile(np.array([_BOX], np.float64), (len(boxes), 1, 1)))
 
 
@@ -176,30 +177,29 @@ BOX_ERROR = 0.08
 """Mean relative error of a box face's inverse distance. Fitted on synthetic streets, seeds 100 to 105."""
 
 TOP = 0.9
-"""Upward part of a face's normal, above which it is a top: windscreens have up to 0.87."""
+"""Upward component of a normal above which a face is a top: windscreens have up to 0.87."""
 
 ROOF_M2 = 2.0
-"""Least footprint of objects whose tops have a colour of their own: heads, cones and barriers go on as their sides."""
+"""Minimum footprint of objects whose tops are coloured separately: heads, cones and barriers continue their sides."""
 
 PARTS, TOP_PART, RIM_PART = 7, 5, 6
-"""Parts of an object; those that are its tops, and what lies just below their edges: samples of paint alone."""
+"""Number of parts of an object; the part of its tops, and of the rim just below their edges, for samples of paint."""
 
 _WIDER = np.array([1, 1, 1, 1, 0, 1])  # all planes of a piece but its floor
 
 
 @dataclass(frozen=True, eq=False)
 class BoxSurface(Surface):
-    """Labelled objects on the street or among points: what their boxes hold.
+    """Shapes of labelled objects on the street or among points.
 
-    Pixels that show an object are mapped one by one, the others by the background. ``occlusion_map`` hides both. Among
-    points a shape decides within its silhouette, and what was measured before it wins. An object's points choose its
-    shape, move its faces and displace them where they were measured. They are left out of the panoramas, where they
-    would blur over its outline.
+    Pixels that show an object are mapped one by one, the others by the background. ``occlusion_map`` covers both. Among
+    points a shape decides within its silhouette, but nearer measured points win. An object's points choose its shape,
+    move its faces and displace them. They are left out of the panoramas, where they would blur over its outline.
     """
 
-    street: Surface  # behind the objects: static, or of the points that are of no object
+    street: Surface  # behind the objects: static, or made of the points of no object
     boxes: FloatArray  # (B, 7) centre x, y, z, length, width, height (metres), yaw (radians), in the ego frame
-    solids: FloatArray  # (B, pieces, 6, 4) planes of what they hold
+    solids: FloatArray  # (B, pieces, 6, 4) planes of their shapes
     displaced: Layer | None = None  # (B, 5, rows, columns) of their sides, as ``solids_among`` gives it
     _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, init=False, repr=False)
     is_layered: ClassVar[bool] = True
@@ -217,7 +217,7 @@ class BoxSurface(Surface):
         return q
 
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """Find what objects hide from a source; kept for the next target."""
+        """Occlusion by objects in a source; cached for the next target."""
         key = camera.content_key
         if key not in self._shadows:
             pixel_rad = float(1 / camera.K[0, 0])
@@ -232,7 +232,7 @@ class BoxSurface(Surface):
     def drawn(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> tuple[Layer, npt.NDArray[np.int32]]:
         """Inverse distances (h, w) of the objects' faces along a camera's rays where nothing hides them; faces, or -1.
 
-        A face's number is 6 x its piece + that of its plane; ``face_parts`` tells what it shows.
+        A face's number is 6 x its piece + its plane; ``face_parts`` gives its part.
         """
         onto = self._hidden(camera, rays, memory, coarse=False)
         widened = self._widened(camera.center_m, float(1 / camera.K[0, 0]))
@@ -251,15 +251,15 @@ class BoxSurface(Surface):
         return memory.full(camera.size, 0, np.float32)
 
     def before_faces(self, origin: FloatArray) -> FloatArray:
-        """By how many metres a point lies before the planes of all faces (n,)."""
+        """Distances (n,) of a point in front of the planes of all faces, metres."""
         return np.asarray((self.solids[..., :3] @ origin - self.solids[..., 3]).reshape(-1))
 
     @cached_property
     def face_parts(self) -> npt.NDArray[np.int32]:
         """Part that each face (n,) shows: ``PARTS`` times its object, and ``TOP_PART`` more for roofs and bonnets.
 
-        The sides of the lowest piece, the body under the windows, have 1 to 4 in the order of their planes. All else
-        has 0, also small objects.
+        The sides of the lowest piece, the body under the windows, have 1 to 4 in the order of their planes. All other
+        faces have 0, and all faces of small objects.
         """
         count, pieces = self.solids.shape[:2]
         is_large = (self.boxes[:, 3] * self.boxes[:, 4] > ROOF_M2)[:, None, None]
@@ -307,11 +307,11 @@ def draw_solids(
     faces: bool = True,
     onto: Layer | None = None,
 ) -> tuple[Layer, npt.NDArray[np.int32]]:
-    """Rasterise the pieces (B, pieces, 6, 4), as ``solids`` gives them, of what boxes (B, 7) hold.
+    """Rasterise the pieces (B, pieces, 6, 4) of ``solids`` in boxes (B, 7).
 
-    ``rays`` are the camera's, if they are known; ``scale`` is a factor of inverse distances. With ``faces`` these are
-    numbered, 6 x piece + plane, else the pieces. ``onto`` (h, w) inverse distances, 0 by default, is drawn over by what
-    is nearer.
+    ``rays`` are the camera's, if known; ``scale`` is a factor of inverse distances. With ``faces`` the faces are
+    numbered, 6 x piece + plane, else the pieces. Nearer pieces overwrite ``onto`` (h, w), inverse distances, 0 by
+    default.
 
     Returns:
         (h, w) inverse distances of the nearest faces, or of ``onto``; (h, w) the pieces or faces, or -1.
@@ -331,7 +331,7 @@ def draw_boxes(camera: Camera, boxes: FloatArray) -> tuple[Layer, npt.NDArray[np
 
 
 def silhouette_sums(camera: Camera, boxes: FloatArray, weight: FloatArray) -> FloatArray:
-    """Sums (B,) of weights (h, w) over the pixels whose rays meet each box, whatever stands before it."""
+    """Sums (B,) of weights (h, w) over the pixels whose rays meet each box, occluded or not."""
     from arbiview_aug.scene.kernels import sum_silhouettes
 
     rays, sums = pixel_rays(camera), np.zeros(len(boxes))
@@ -345,8 +345,8 @@ def meets(box: FloatArray, origin: FloatArray, directions: FloatArray) -> BoolAr
     rays = _in_box_frame(box, directions)
     rays = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
     start, half = _in_box_frame(box, origin - box[:3]), box[3:6] / 2
-    one, two = (-half - start) / rays, (half - start) / rays
-    enter, leave = np.minimum(one, two).max(axis=-1), np.maximum(one, two).min(axis=-1)
+    near, far = (-half - start) / rays, (half - start) / rays
+    enter, leave = np.minimum(near, far).max(axis=-1), np.maximum(near, far).min(axis=-1)
     return np.asarray((leave >= enter) & (enter > 0))
 
 
@@ -368,7 +368,7 @@ def _in_box_frame(box: FloatArray, vectors: FloatArray) -> FloatArray:
 
 
 def checked_boxes(boxes: Any) -> FloatArray:
-    """(B, 7) float64 boxes of a sample; refuse other shapes, numbers that are not finite, and sizes up to 0."""
+    """Check a sample's boxes and return them as (B, 7) float64; sizes must be positive, and all numbers finite."""
     try:
         array = np.asarray(boxes.detach().cpu() if hasattr(boxes, "detach") else boxes, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -405,35 +405,35 @@ SAME_SIZE_M = 0.2
 """Largest difference of one object's labelled sizes from frame to frame."""
 
 MOST_MOVED_M = 40.0
-"""Largest way of one object from frame to frame: that of a car in a second."""
+"""Maximum motion of an object between frames: about that of a car in a second."""
 
 
-def carried(points: Points, one: FloatArray, two: FloatArray) -> FloatArray:
-    """The points (P, >= 3), those in boxes ``one`` (B, 7) moved to where the same objects are in ``two`` (C, 7).
+def carried(points: Points, boxes: FloatArray, boxes_now: FloatArray) -> FloatArray:
+    """Move points (P, >= 3) in ``boxes`` (B, 7) along with their objects to ``boxes_now`` (C, 7).
 
-    The same are boxes of one size within ``MOST_MOVED_M`` that are each other's nearest. Points that are in other boxes
-    alone are left out.
+    Boxes match if they have one size, are within ``MOST_MOVED_M``, and are each other's nearest. Points that lie only
+    in boxes without a match are left out.
     """
     moved, kept = points.astype(np.float64), np.ones(len(points), bool)
-    apart = np.linalg.norm(one[:, None, :3] - two[None, :, :3], axis=-1)
-    differs = np.abs(one[:, None, 3:6] - two[None, :, 3:6]).max(axis=-1) > SAME_SIZE_M
+    apart = np.linalg.norm(boxes[:, None, :3] - boxes_now[None, :, :3], axis=-1)
+    differs = np.abs(boxes[:, None, 3:6] - boxes_now[None, :, 3:6]).max(axis=-1) > SAME_SIZE_M
     apart[differs | (apart > MOST_MOVED_M)] = np.inf
-    within = points_in(one, points, AIR_M)
+    within = points_in(boxes, points, AIR_M)
     for rows in within:
         kept[rows] = False
-    for k, rows in enumerate(within if len(two) else ()):
+    for k, rows in enumerate(within if len(boxes_now) else ()):
         match = int(apart[k].argmin())
         if apart[k, match] < np.inf and apart[:, match].argmin() == k:
             kept[rows] = True
-            c, s = np.cos(two[match, 6]), np.sin(two[match, 6])
+            c, s = np.cos(boxes_now[match, 6]), np.sin(boxes_now[match, 6])
             to_ego = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-            moved[rows, :3] = _in_box_frame(one[k], points[rows, :3] - one[k, :3]) @ to_ego + two[match, :3]
+            moved[rows, :3] = _in_box_frame(boxes[k], points[rows, :3] - boxes[k, :3]) @ to_ego + boxes_now[match, :3]
     return moved[kept]
 
 
-def moved_boxes(one: FloatArray, two: FloatArray) -> FloatArray:
+def moved_boxes(boxes: FloatArray, neighbour_boxes: FloatArray) -> FloatArray:
     """The boxes (M, 7) of two frames that have no counterpart at the same place in the other."""
-    if not len(one) or not len(two):
-        return np.concatenate([one, two])
-    apart_m = np.linalg.norm(one[:, None, :3] - two[None, :, :3], axis=-1)
-    return np.concatenate([one[apart_m.min(axis=1) > STAYED_M], two[apart_m.min(axis=0) > STAYED_M]])
+    if not len(boxes) or not len(neighbour_boxes):
+        return np.concatenate([boxes, neighbour_boxes])
+    apart_m = np.linalg.norm(boxes[:, None, :3] - neighbour_boxes[None, :, :3], axis=-1)
+    return np.concatenate([boxes[apart_m.min(axis=1) > STAYED_M], neighbour_boxes[apart_m.min(axis=0) > STAYED_M]])

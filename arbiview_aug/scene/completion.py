@@ -1,4 +1,4 @@
-"""Compiled completion of the points around a centre: which of them are seen, made dense, and what they hide."""
+"""Compiled completion of the points around a centre: visibility, dense layers, and occlusion."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from arbiview_aug.scene.kernels import upsampled_row
 from arbiview_aug.scene.panorama_kernels import cells_row
 
 _STEP = np.float32(0.1)
-"""Relative change of inverse distance within ``SMOOTH_RAD`` that makes an outline."""
+"""Relative change of inverse distance within ``SMOOTH_RAD`` above which a step is an outline."""
 
 _STEP_PER_M = np.float32(0.003)
-"""... and the least absolute one, 1/m: two pixels of parallax for 1 m of baseline."""
+"""Absolute change above which a step is an outline, 1/m: two pixels of parallax for 1 m of baseline."""
 
 NEAREST_M = 0.5
-"""Points nearer than this to a centre are the vehicle's, or the camera itself."""
+"""Minimum distance of points from a centre, metres: nearer ones belong to the vehicle or the camera."""
 
 _THIN_CELLS = 1, 5
-"""Most cells above and below, and to each side, that a thin thing's point takes: 5 bridge gaps of 1 degree. A tape that
-one scan line met would else take its surroundings, in ovals as high as the spacing of the lines."""
+"""Maximum cells above and below, and to each side, taken by a point on a thin object: 5 bridge gaps of 1 degree. A tape
+met by one scan line would otherwise spread into ovals as high as the spacing of the lines."""
 
 _ZERO, _HALF, _ONE, _TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 _NEAREST = np.float32(1 / NEAREST_M)
 _BLOCK = 1024
-"""Points worked on at once."""
+"""Points processed at once."""
 
 # A cell's nearest seed in one int32, so that the nearer of two is their minimum: distance in 1/1024 cell (from bit 14),
 # row (from bit 7) and column of the seed as seen from the cell, plus 64. Distances are those of Borgefors' 5 x 5 mask.
@@ -122,7 +122,7 @@ def _nearest_points(points: Any, origin: Any, window: Any, q: Any, number: Any) 
 
 @borrowing
 def _window_max(a: Any, rows: int, columns: int, sign: Any, line: Any, out: Any) -> None:
-    """Largest of ``sign`` times each cell of ``a`` (h, w) and those up to so many rows and columns on.
+    """Maximum of ``sign`` times ``a`` (h, w) over each cell and the next ``rows`` and ``columns`` cells.
 
     ``line`` (w + columns,) is scratch.
     """
@@ -151,7 +151,7 @@ def _window_max(a: Any, rows: int, columns: int, sign: Any, line: Any, out: Any)
 
 @borrowing
 def _drop_hidden(scratch: Any, away: int, side: int, points: int, mapped: int, between: Any) -> int:
-    """Drop points that shine through gaps of what is nearer on both sides of them, and find thin things.
+    """Drop points seen through gaps of nearer objects on both sides of them, and find thin objects.
 
     ``scratch.most`` is ``_window_max`` of ``q`` over ``2 * side`` cells; ``away`` and ``side`` are ``SEE_THROUGH_RAD``
     and ``SIDE_RAD`` in cells. The last ``mapped`` of all ``points`` are of depth maps, which show gaps as they are:
@@ -208,7 +208,7 @@ def complete(n: int, static: Any, window: Any, scratch: Any, layers: Any) -> Non
     written over; ``layers`` (5, h, w) float32, those of ``Panorama``, are written.
     """
     (_, h, w), cells, thin, code = layers.shape, scratch.cells[:n], scratch.thin[:n], scratch.code
-    # What is known by now gives its place to residuals and inverse distances of all cells, and their maxima.
+    # Residuals and inverse distances of all cells, and their maxima, reuse the memory of the points.
     planes, low, smooth = scratch.rays[: 3 * h * w].reshape(3, h, w), scratch.most, window.cells.smooth
     r, near_q, high, q = planes[0], planes[1], planes[2], scratch.q.reshape(h * w)
     residuals, work = np.empty(n, np.float32), np.empty((10 + 6 * smooth, w), np.float32)

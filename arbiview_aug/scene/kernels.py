@@ -165,7 +165,7 @@ def draw_solids(
 def sum_silhouettes(
     planes: Any, P: Any, rows: Any, numbers: Any, cones: Any, step: int, weight: Any, sums: Any
 ) -> None:
-    """Add weights (h, w) of the pixels whose rays meet a piece to its sum, whatever stands before it.
+    """Add weights (h, w) of the pixels whose rays meet a piece to its sum, occluded or not.
 
     ``sums`` (all pieces,) float64 is updated; the other arguments are as in ``draw_solids``.
     """

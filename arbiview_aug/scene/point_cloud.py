@@ -1,11 +1,11 @@
 """Measured points as a surface: LiDAR or depth maps, made dense as one centre sees them, with the street behind them.
 
-No sensor's place is assumed: points are z-buffered and made dense for each centre, a target's to find what it sees and
-a source's to find what is hidden from it. A panorama has one cell per 0.2 degrees of azimuth and elevation, or per 0.4
-for a coarse view. Its cells hold *residuals* against a static surface, so that a road stays a plane between the scan
-lines, and what no point tells fades back to the static surface. A cell at a step from near to far holds both, and the
-share of near ones around it; the outline runs where the share is one half. Interpolating the two layers and the share
-apart keeps outlines sharp between the cells too.
+No sensor position is assumed: points are z-buffered and made dense for each centre, a target's for visibility and a
+source's for occlusion. A panorama has one cell per 0.2 degrees of azimuth and elevation, or per 0.4 for a coarse view.
+Its cells hold *residuals* against a static surface, so that a road stays a plane between the scan lines, and directions
+without points fade back to the static surface. A cell at a step from near to far holds both, and the share of near ones
+around it; the outline runs where the share is one half. The two layers and the share are interpolated separately, which
+keeps outlines sharp between the cells.
 """
 
 from __future__ import annotations
@@ -30,38 +30,38 @@ from arbiview_aug.scene.depth_map import CELL_RAD, OWN_CAR_M, SHRINK_RAD, SUPPOR
 from arbiview_aug.scene.surface import DenseSurface, Layer, OcclusionMap, Points, StaticSurface
 
 SEE_THROUGH_RAD = math.radians(2.0)
-"""A point is occluded where nearer ones lie on both sides of it within this angle: 1.5 spacings of 32 scan lines."""
+"""Angle within which nearer points on both sides of a point occlude it: 1.5 spacings of 32 scan lines."""
 
 SIDE_RAD = math.radians(0.75)
-"""... and off that line by no more than this: half the spacing of 32 scan lines."""
+"""Maximum angle of these points off the line through it: half the spacing of 32 scan lines."""
 
 SMOOTH_RAD = math.radians(1.3)
 """Window in which residuals are averaged and outlines straightened: the spacing of 32 scan lines, over which an average
 of nearest values is linear interpolation."""
 
 REACH_RAD = math.radians(12.0)
-"""Beyond this angle from any point the static surface is all that is known. From half of it the points fade out: above
+"""Angle from all points beyond which only the static surface is known. From half of it the points fade out: above
 the highest scan line houses and trees continue, and a fade over a few degrees bends them."""
 
 BASE_STEP = 4  # cells between nodes of the static surface, which is smooth
 HALO_RAD = math.radians(4.0)
-"""Room around a window that its filters need."""
+"""Margin around a window for its filters."""
 
 ROOM_CELLS = 5
-"""Cells by which a window is wider than the rays that it must hold: nodes of plans lie on its border."""
+"""Margin of a window around its rays, cells: nodes of plans lie on its border."""
 
 _BLOCK = 1 << 16  # cells by which scratch grows
 
 NODES_RAD = 4 * CELL_RAD
 """Distance of nodes between which positions in a panorama are interpolated, to 1/50 of a cell."""
 
-_MOST_FEATURES = 16  # of a point: 3 or 4 rows that are longer are points turned on their side
+_MOST_FEATURES = 16  # of a point: 3 or 4 longer rows are a transposed array of points
 
 MEASURED_SPREAD = 0.05
 """Spread of a measured inverse distance, as a share of it: half of STEP, below which densification follows a slope."""
 
 KNOWN_SHARE = 0.9
-"""Share of a camera's pixels with a depth, from which on its map alone tells what is hidden from it."""
+"""Share of a camera's pixels with a depth above which its map alone decides occlusion."""
 
 
 class Cells(NamedTuple):
@@ -85,11 +85,6 @@ class Cells(NamedTuple):
         reach, support = np.float32(REACH_RAD / rad), np.float32(SUPPORT_RAD / rad)
         return cls(rad, turn, halo, see_through, side, smooth, round(SHRINK_RAD / rad), reach, support)
 
-    @property
-    def beyond(self) -> float:
-        """Angle below and above all points beyond which a window's halo shows the static surface too, radians."""
-        return (math.ceil(self.reach) + 4 * self.smooth + 1 - self.halo) * self.rad
-
 
 class Window(NamedTuple):
     """A part of the sphere, in cells: row 0 begins at the horizon, column 0 straight ahead."""
@@ -106,8 +101,8 @@ class Window(NamedTuple):
     ) -> tuple[Window, bool]:
         """The smallest window, and some room, that holds rays (3, ny, nx), and whether positions may be interpolated.
 
-        ``R`` (3, 3) turns the rays to the ego frame; those of elevations below ``low`` and above ``high``, radians, do
-        not count if there are others. Azimuths bend near the zenith, and jump in a window all around.
+        ``R`` (3, 3) turns the rays to the ego frame; rays of elevations outside ``low`` to ``high``, radians,
+        count only if there are no others. Azimuths bend near the zenith, and jump in a window all around.
         """
         from arbiview_aug.scene.panorama_kernels import span_of
 
@@ -132,12 +127,12 @@ class Scratch(NamedTuple):
     most: Layer  # (h, w) maximum of ``q`` over a window
     rays: Layer  # (3 h w,) or more: rays (3, n) to the n points that are seen, ego frame
     cells: npt.NDArray[np.int32]  # (h w,) or more: flat indices of their cells
-    thin: npt.NDArray[np.int32]  # (h w,) or more: 1 for those on thin things, else 0
+    thin: npt.NDArray[np.int32]  # (h w,) or more: 1 for points on thin objects, else 0
     code: npt.NDArray[np.int32]  # (h + 4, w + 4) the nearest point around each cell
 
     @classmethod
     def of(cls, window: Window, memory: Memory = FRESH) -> Scratch:
-        """Scratch for a window; blocks of few sizes are found again, as windows differ by some rows."""
+        """Scratch for a window, in blocks of few sizes, so that memory is reused by windows of similar sizes."""
         (h, w), around = window.shape, (window.shape[0] + 4, window.shape[1] + 4)
         size, room = h * w, math.prod(around)
         planes = memory.empty((9, _BLOCK * math.ceil(room / _BLOCK)), np.float32)
@@ -149,9 +144,9 @@ class Scratch(NamedTuple):
 class Panorama:
     """Depth by points within a window of the view from one centre, made dense over a static surface.
 
-    Nearest point first in each cell, none next to the centre; points that shine through gaps of what is nearer are
-    dropped; each cell takes the residual of its nearest point; residuals are averaged, on both sides of a step apart.
-    What one scan line alone met is drawn last.
+    Each cell keeps its nearest point, but none next to the centre. Points seen through gaps of nearer objects are
+    dropped. Each cell takes the residual of its nearest point, and residuals are averaged separately on both sides of a
+    step. Thin objects, met by a single scan line, are drawn last.
 
     Attributes:
         window: The window.
@@ -164,7 +159,7 @@ class Panorama:
         self, window: Window, origin: FloatArray, points: Layer, mapped: int, street: StaticSurface,
         memory: Memory = FRESH,
     ) -> None:  # fmt: skip
-        """Complete the points (3, P), of which the last ``mapped`` are of depth maps, around ``origin`` (3,)."""
+        """Complete the points (3, P), of which the last ``mapped`` come from depth maps, around ``origin`` (3,)."""
         from arbiview_aug.scene.completion import complete, find_visible
 
         self.window, self._origin, self._street = window, origin, street
@@ -176,7 +171,7 @@ class Panorama:
 
     @cached_property
     def hidden_below(self) -> Layer:
-        """Points of a smaller inverse distance are hidden by what was certainly measured; 0 where it is silent."""
+        """Inverse distances below which measured surfaces hide points; 0 where nothing was measured."""
         from arbiview_aug.scene.completion import hidden_depths
 
         (rad, _, halo, *_), shape = self.window.cells, self.layers.shape[1:]
@@ -194,12 +189,12 @@ FINE, COARSE = Cells.of(CELL_RAD), Cells.of(2 * CELL_RAD)
 MAPPED = FINE._replace(smooth=1)
 """Cells where there are depth maps: their outlines are seen, not guessed between scan lines, and are not rounded."""
 MAPPED_COARSE = Cells.of(1.5 * CELL_RAD)._replace(smooth=1)
-"""... for coarse views: cells twice as wide as fine ones lose detail."""
+"""Cells of coarse views where there are depth maps: cells twice as wide as fine ones lose detail."""
 SWEPT = MAPPED._replace(see_through=round(math.radians(1.4) / CELL_RAD), side=round(SIDE_RAD / CELL_RAD / 2))
 """Cells where neighbouring frames add their scan lines: with gaps half as wide, outlines need less rounding."""
 
 AROUND_CELLS = 5, 2
-"""Half the height and width of the window in which a scan's own points contradict those of another frame: 1 by 0.4
+"""Half the height and width, in cells, of the window in which a scan's points contradict another frame's: 1 by 0.4
 degrees."""
 
 
@@ -208,10 +203,10 @@ class PointCloudSurface(DenseSurface):
     """Points made dense over the street."""
 
     street: StaticSurface  # where nothing was measured
-    points: Points  # (P, 3) in the ego frame, finite, metres; none of the own car's
-    mapped: int = 0  # number of the last points that are of depth maps
+    points: Points  # (P, 3) in the ego frame, finite, metres; none on the own car
+    mapped: int = 0  # number of trailing points from depth maps
     swept: bool = False  # whether points of neighbouring frames are among them
-    maps: Sequence[DepthMap] = ()  # these depth maps, which tell what is hidden from their own cameras
+    maps: Sequence[DepthMap] = ()  # these depth maps, for occlusion in their cameras
     _elevations: dict[bytes, tuple[float, float]] = field(default_factory=dict, repr=False)
     _panoramas: dict[bytes, dict[Window, Panorama]] = field(default_factory=dict, repr=False)
     _shadows: dict[bytes, OcclusionMap] = field(default_factory=dict, repr=False)
@@ -222,12 +217,12 @@ class PointCloudSurface(DenseSurface):
 
     @cached_property
     def _measured(self) -> PointCloudSurface:
-        """The surface of the points alone, without those of maps."""
+        """The surface without points from maps."""
         return PointCloudSurface(self.street, self.points[: len(self.points) - self.mapped], swept=self.swept)
 
     @cached_property
     def _rows(self) -> Layer:
-        """The points (3, P), as kernels read them."""
+        """The points (3, P), for kernels."""
         return np.ascontiguousarray(self.points.T)
 
     def _cells(self, camera: Camera | None = None) -> Cells:
@@ -238,7 +233,7 @@ class PointCloudSurface(DenseSurface):
         return (MAPPED if is_fine else MAPPED_COARSE) if self.mapped else FINE if is_fine else COARSE
 
     def image(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> Layer:
-        """The points' dense surface at all pixels, 1/m (h, w)."""
+        """Inverse distances (h, w) of the dense surface at all pixels, 1/m."""
         from arbiview_aug.scene.panorama_kernels import add_residuals
 
         q = self.street.image(camera, rays, memory)
@@ -247,10 +242,10 @@ class PointCloudSurface(DenseSurface):
         return q
 
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """Find what is hidden from a source; kept for the next target.
+        """Occlusion in a source; cached for the next target.
 
-        Points farther by a tenth of their distance and 0.3 m than what was measured, as in the evaluation's visibility,
-        and only within measured outlines: nothing hides where the LiDAR is silent.
+        Points are hidden if they are farther than the measured surface by a tenth of their distance and 0.3 m, as in
+        evaluation. Nothing hides where nothing was measured.
         """
         key = camera.content_key
         if key not in self._shadows:
@@ -260,7 +255,7 @@ class PointCloudSurface(DenseSurface):
     def hidden(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH, *, coarse: bool = True) -> Layer:
         """Inverse distances (h, w) beyond which points are hidden, interpolated between rays a cell apart.
 
-        With ``coarse`` a camera's own depth map tells, if it has one, and measured points where that knows too little.
+        With ``coarse`` a camera's depth map decides, if it has one, and measured points where it has too few pixels.
         """
         from arbiview_aug.scene.panorama_kernels import interpolate_layer
 
@@ -279,7 +274,7 @@ class PointCloudSurface(DenseSurface):
         return hidden
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
-        """Small where a point is near, the street's elsewhere: 1/m (...,)."""
+        """Expected error (...,) in 1/m: small near points, the street's elsewhere."""
         from arbiview_aug.scene.panorama_kernels import read_layer
 
         key, rays = origin.tobytes(), directions.reshape(-1, 3).T.astype(np.float32, order="C")
@@ -296,13 +291,14 @@ class PointCloudSurface(DenseSurface):
     def panorama(
         self, origin: FloatArray, rays: Layer, R: FloatArray, cells: Cells, memory: Memory = FRESH
     ) -> tuple[Panorama, bool]:
-        """The panorama around a centre that shows rays (3, ny, nx) turned by ``R``, kept; see ``Window.around``."""
+        """The cached panorama around a centre that shows rays (3, ny, nx) turned by ``R``; see ``Window.around``."""
         from arbiview_aug.scene.completion import elevations
 
         key, origin = origin.tobytes(), origin.copy()  # a copy has one layout: kernels are compiled for each
         if key not in self._elevations:
             self._elevations[key] = (-math.pi, math.pi) if self.mapped else elevations(self._rows, origin)
-        (low, high), beyond = self._elevations[key], cells.beyond
+        (low, high), filters = self._elevations[key], math.ceil(cells.reach) + 4 * cells.smooth + 1
+        beyond = (filters - cells.halo) * cells.rad  # from all points: there even the halo is static
         window, is_smooth = Window.around(rays, R, cells, low - beyond, high + beyond)
         known = self._panoramas.setdefault(key, {})
         if window not in known:
@@ -312,10 +308,7 @@ class PointCloudSurface(DenseSurface):
     def _locate_nodes(
         self, camera: Camera, rays: PixelRays, cells: Cells, memory: Memory
     ) -> tuple[Panorama, Layer, Layer, int]:
-        """The panorama around a camera; rows and columns in it (ny + 1, nx + 1) of nodes, and how far these are apart.
-
-        Kept for the next question.
-        """
+        """The panorama around a camera, rows and columns (ny + 1, nx + 1) in it of nodes, and their spacing; cached."""
         from arbiview_aug.scene.panorama_kernels import cells_of
 
         key = camera.content_key, cells
@@ -338,9 +331,9 @@ def occlusion_level(camera: Camera) -> int:
 
 
 def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArray:
-    """(Q,) points of other frames, in the current ego frame, that a frame's own points (P, 3) contradict.
+    """Points (Q,) of other frames, in the current ego frame, that a frame's points (P, 3) contradict.
 
-    They lie clearly before all points around them, as seen from ``origin`` near the sensor: something moved away.
+    They lie clearly in front of all points around them, seen from ``origin`` near the sensor: an object moved away.
     """
     from arbiview_aug.scene.completion import NEAREST_M, elevations, find_visible
     from arbiview_aug.scene.panorama_kernels import cells_of
@@ -362,14 +355,14 @@ def seen_through(points: Points, others: Points, origin: FloatArray) -> BoolArra
 
 
 def own_car(points: Points) -> BoolArray:
-    """(P,) points within ``OWN_CAR_M``."""
+    """Mask (P,) of points within ``OWN_CAR_M``."""
     (x0, x1), (y0, y1) = OWN_CAR_M
     x, y = points[:, 0], points[:, 1]
     return np.asarray((x > x0) & (x < x1) & (y > y0) & (y < y1))
 
 
 def shape_mistake(shape: tuple[int, ...]) -> str | None:
-    """Say what is wrong with the shape of points that should be (P, >= 3); None if nothing is."""
+    """Describe the error in the shape of points that should be (P, >= 3); None if it is right."""
     is_table = len(shape) == 2
     turned = is_table and shape[0] in (3, 4) and not 3 <= shape[1] <= _MOST_FEATURES
     if is_table and shape[1] >= 3 and not turned:
@@ -379,7 +372,7 @@ def shape_mistake(shape: tuple[int, ...]) -> str | None:
 
 
 def finite_rows(points: Points) -> BoolArray:
-    """(P,) points (P, >= 3) whose places are numbers within ``MOST_M``."""
+    """Mask (P,) of points (P, >= 3) with finite coordinates within ``MOST_M``."""
     x, y, z = (np.abs(points[:, k]) <= MOST_M for k in range(3))  # NaN is not
     return np.asarray(x & y & z)
 

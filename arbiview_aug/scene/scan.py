@@ -41,13 +41,13 @@ _JOINED_STEP_M, _JOINED_SLOPE = np.float32(0.3), np.float32(0.05)
 """Maximum height between two level surfaces that are one, metres, and as a share of their distance: kerbs, and roads
 that rise."""
 _TOP_M = np.float32(2.0)
-"""Maximum gap between two points joined by a horizontal surface: a top, or a floor under what hangs over it, metres."""
+"""Maximum gap between two points joined by a horizontal surface: a top, or a floor under an overhang, metres."""
 _JOINED_M, _JOINED_STEEP = np.float32(0.1), np.float32(2.0)
-"""... and by an upright surface: maximum difference of their distances, metres, and as a multiple of their distance
+"""Maximum difference in distance of two points joined by an upright surface, metres, and as a multiple of their gap
 across the ray."""
 _MISSING_LINE = np.float32(1.5)
 """Spacings of scan lines, of at least two cells, between two points above which a line is missing: glass and dark paint
-return nothing. Of lines that are closer together, some share a cell."""
+return nothing. Some lines that are closer together share a cell."""
 _ASIDE, _ASIDE_CELLS = np.float32(0.6), np.float32(0.55)
 """Half the spacing of points along a scan line, and half a cell, each with a tenth for jitter."""
 
@@ -59,12 +59,12 @@ class Scan(NamedTuple):
 
     points: Layer  # (n, 3) float32, ego frame, metres
     nearest: Numbers  # (n,) numbers of the measured points on whose surfaces they lie
-    rings: Numbers  # (n,) beams; those of a scanner follow the ones of the scanner before it
-    unsupported: float  # share of all rays that meet nothing measured; the sky's are among them
+    rings: Numbers  # (n,) beams, numbered across scanners
+    unsupported: float  # share of all rays that meet nothing measured, the sky included
 
 
 def scan(lidars: Sequence[Lidar], points: Points, ground_z_m: float, swept: int = 0) -> Scan:
-    """Scan what one frame measured by scanners at other places.
+    """Scan one frame's measured scene by scanners at other places.
 
     Args:
         lidars: The scanners, in the frame's ego frame.
@@ -239,10 +239,10 @@ def continue_road(
     rows: Any, columns: Any, rays: Any, index: Any, seeds: Any, numbers: Any, ground: float, side: float,
     q: Any, nearest: Any,
 ) -> None:  # fmt: skip
-    """Let the road go on under the lowest points: rays below all that was measured there meet it, if that is road.
+    """Continue the road below the lowest points: rays below all points of a column meet it if the lowest is road.
 
-    Whatever stands on it and reaches up to the lowest scan line would have been measured. Only roads within
-    ``_LOWEST_LINE_M`` go on: farther ones are not of the lowest line. Arguments are those of ``meet_points``.
+    Objects on it that reach the lowest scan line would have been measured. Only roads within ``_LOWEST_LINE_M`` are
+    continued: farther ones do not belong to the lowest line. Arguments are as in ``meet_points``.
     """
     w, aside = index.shape[1], int(side)
     lowest = _next_points(index)[0][0]
@@ -261,9 +261,9 @@ def continue_road(
 
 @inlined
 def _next_points(index: Any) -> tuple[Any, Any]:
-    """The point in each cell of (h, w), or else the next one above it in its column; likewise below; -1 without.
+    """The point in each cell of (h, w), or the next one above in its column, and the same below; -1 without.
 
-    Both have a row more, of -1: index h, and -1.
+    Both have one more row of -1, at index h and -1.
     """
     h, w = index.shape
     above, below = np.full((h + 1, w), -1, np.int32), np.full((h + 1, w), -1, np.int32)
@@ -293,8 +293,8 @@ def _describe(
     """Write the cells to the next points above and below (2, n), for how many cells up and down and aside (n,) points
     speak, and which lie on level surfaces (2, n).
 
-    A point speaks for half the spacing of points there, at most ``reach``. Rows say how its surface goes on below and
-    above it: as it lies on its other side where it stands upright on this one, so that a top ends in a level edge.
+    A point speaks for half the spacing of points there, at most ``reach``. Rows are the surfaces below and above it:
+    where it is upright on one side, the other side's surface is taken, so that a top ends in a level edge.
     """
     h, w = index.shape
     for row in range(h):

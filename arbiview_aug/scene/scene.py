@@ -27,7 +27,7 @@ class Scene:
     points: Points | None = None  # (P, 3) measured points, metres
     motion: Maps | None = None  # depth maps from motion
     sweeps: Points | None = None  # (P, 3) points of neighbouring frames beyond ``points``, metres
-    sky: Points | None = None  # (P, 3) points on what photographs show where no scan line returned, metres
+    sky: Points | None = None  # (P, 3) points by photographs where no scan line returned, metres
     # depth maps and arrays of other sample keys that a row of ``GEOMETRIES`` reads
     further: Mapping[str, Geometry] = field(default_factory=dict)
     corrections: tuple[Correction, ...] = ()  # of the street's distances by depth from overlap
@@ -36,9 +36,9 @@ class Scene:
 
     def geometry(self, name: str) -> Geometry | None:
         """The arrays or depth maps of a name in ``GeometryRow.reads``; None if there is none."""
-        other = {"points": "depth_m", "motion": "learned_depth_m"}.get(name)  # what may stand in its place
-        if other is not None and getattr(self, name) is None:
-            return self.further.get(other)
+        substitute = {"points": "depth_m", "motion": "learned_depth_m"}.get(name)
+        if substitute is not None and getattr(self, name) is None:
+            return self.further.get(substitute)
         return getattr(self, name) if name in ("boxes", "points", "motion") else self.further.get(name)
 
     @property
@@ -49,7 +49,7 @@ class Scene:
 
     @cached_property
     def best(self) -> GeometryName:
-        """What ``auto`` is in this scene, the one rule that all ask: the surface made of the most accurate geometry."""
+        """The geometry of ``auto`` in this scene: the surface made of the most accurate data."""
         motion = self.motion is not None and len(self.motion) > 0
         if any(array is not None and len(array) for array in (self.points, self.further.get("depth_m"))):
             return "fused" if motion else "lidar"
@@ -97,7 +97,7 @@ def _boxes(scene: Scene, ground_z_m: float) -> Surface:
 
 
 def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: Geometry | None) -> Surface:
-    """Points with those of neighbouring frames, and depth maps, with the scene's boxes."""
+    """Points of this frame and its neighbours, and depth maps, with the scene's boxes."""
     from arbiview_aug.scene.kernels import close_gaps
 
     boxes = scene.boxes if scene.boxes is not None and len(scene.boxes) else None
@@ -106,8 +106,8 @@ def _point_cloud(scene: Scene, ground_z_m: float, points: Points | None, *maps: 
     together = np.concatenate(parts, dtype=np.float32)
     together = together[: close_gaps(together, np.concatenate([own_car(part) for part in parts]))]
     known, pixels = [], np.zeros(0, np.int32)
-    if of_kinds := [part for part in maps if isinstance(part, tuple) and part]:
-        known = joined(chain.from_iterable(of_kinds))
+    if depth_maps := [part for part in maps if isinstance(part, tuple) and part]:
+        known = joined(chain.from_iterable(depth_maps))
         together, pixels = points_of(known, together)
     street = _street(scene, ground_z_m)
     if len(together) == 0:

@@ -1,4 +1,4 @@
-"""Sky in photographs: where no scan line returned, they tell what is far from what continues above the lines."""
+"""Sky in photographs: where no scan line returned, colours separate sky from objects that continue above the lines."""
 
 from __future__ import annotations
 
@@ -20,27 +20,28 @@ FAR_M = 250.0
 """Distance of sky, beyond returns: half a pixel of parallax at most."""
 
 SIDE_RAD = math.radians(0.8)
-"""Side of the cells of photographs that are sky or not: finer ones cost more than they tell."""
+"""Side of the cells of photographs that are classified: finer cells cost more than they gain."""
 
 SPARSE_RAD = math.radians(8.0)
-"""Elevation above which scan lines are too sparse to tell that a silent direction is far."""
+"""Elevation above which scan lines are too sparse for a direction without return to be far."""
 
-_LEAST_CELLS, _LEAST_SHARE = 12, 0.03  # of certain sky in a view, and its share of a patch of sky
+_LEAST_CELLS, _LEAST_SHARE = 12, 0.03  # minimum cells of certain sky in a view, and their share of a patch of sky
 _FLAT = 20  # grey levels between neighbouring cells of certain sky
 _CLEARER, _UNLIKELY = 2.0, 12.0  # log density of sky above that of returns, and below its largest
 
 
 def sky_points(rig: Rig, images: Sequence[torch.Tensor], points: Points, cache: RayCache) -> Points:
-    """Points (Q, 3) on the sky of N images (3, H, W), and on what continues from the highest scan lines up to it."""
+    """Points (Q, 3) on the sky of N images (3, H, W), and on objects between the highest scan lines and the sky."""
     lowest, found = min(camera.center_m[2] for camera in rig), [np.zeros((0, 3), np.float32)]
     cloud = points[points[:, 2] > lowest, :3].astype(np.float32)
     for camera, image in zip(rig, images, strict=True):
-        if abs(camera.cam2ego[2, 0]) < 0.5:  # what is upright continues along columns
+        if abs(camera.cam2ego[2, 0]) < 0.5:  # upright objects continue along columns
             found += _points_of(camera, image, cloud, cache)
     return np.concatenate(found)
 
 
 def _points_of(camera: Camera, image: torch.Tensor, cloud: Layer, cache: RayCache) -> list[Layer]:
+    """Points on the sky and below it by one image."""
     step = max(1, round(SIDE_RAD * float(camera.K[0, 0])))
     (h, w), R, origin = (n // step for n in camera.size), camera.cam2ego[:3, :3].astype(np.float32), camera.center_m
     local = cache.rays(camera).at(*(np.arange(n) * step + step // 2 for n in (h, w)))
@@ -74,7 +75,7 @@ def _points_of(camera: Camera, image: torch.Tensor, cloud: Layer, cache: RayCach
 
 
 def _find_sky(colours: np.ndarray, away: Layer, up: Layer, shows: BoolArray) -> BoolArray:
-    """Cells (h, w) that look more like silent cells above all returns than like cells with returns.
+    """Cells (h, w) that look more like cells above all returns than like cells with returns.
 
     ``colours`` (h, w, 3) uint8; ``away`` is infinite without a return; ``up`` are sines of elevations.
     """
@@ -91,13 +92,13 @@ def _find_sky(colours: np.ndarray, away: Layer, up: Layer, shows: BoolArray) -> 
     certain = (around == 0) & (below_hit == 0) & shows & (up > 0.02) & (up < highest + 0.017) & (contrast < _FLAT)
     bright = features[:3].sum(0)
     certain = certain.reshape(-1) & (bright > bright[returned].mean())
-    others, _ = _log_density(features[:, returned], features)
+    solid, _ = _log_density(features[:, returned], features)
     for _ in range(2):
         if np.count_nonzero(certain) < _LEAST_CELLS:
             return sky
         density, below = _log_density(features[:, certain], features)
-        certain &= density > others
-    maybe = ((density > others + _CLEARER) & (below < _UNLIKELY)).reshape(hit.shape) & shows & ~hit & (up > 0.01)
+        certain &= density > solid
+    maybe = ((density > solid + _CLEARER) & (below < _UNLIKELY)).reshape(hit.shape) & shows & ~hit & (up > 0.01)
     count, labels = cv2.connectedComponents(maybe.view(np.uint8), connectivity=4)
     sizes, sure = (np.bincount(part, minlength=count) for part in (labels.reshape(-1), labels.reshape(-1)[certain]))
     sizes[0] = 0
@@ -105,7 +106,7 @@ def _find_sky(colours: np.ndarray, away: Layer, up: Layer, shows: BoolArray) -> 
 
 
 def _log_density(sample: Layer, features: Layer) -> tuple[Layer, Layer]:
-    """Log normal density (n,) of features (4, n) by a sample (4, m), less a constant, and how far below its peak."""
+    """Log normal density (n,) of features (4, n) by a sample (4, m), up to a constant, and its gap to the peak."""
     mean = sample.mean(1, keepdims=True)
     covariance = (sample - mean) @ (sample - mean).T / sample.shape[1] + 4 * np.eye(4)  # widened by two grey levels
     whitening = np.linalg.inv(np.linalg.cholesky(covariance)).astype(np.float32)

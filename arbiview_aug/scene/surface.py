@@ -29,7 +29,7 @@ Layer = npt.NDArray[np.float32]
 """float32 values of pixels, cells or rays."""
 
 _TYPICAL_OBJECT_M = 20.0
-_ROWS = 64  # of pixels, evaluated at once: they stay in the cache
+_ROWS = 64  # rows of pixels evaluated at once: they stay in the cache
 
 
 class Surface(ABC):
@@ -38,7 +38,7 @@ class Surface(ABC):
     Attributes:
         is_layered: Objects are rasterised in front of ``background``, see ``scene.boxes.BoxSurface``.
         is_dense: Points or depth maps, see ``DenseSurface``.
-        is_guess: Not measured; occluders also hide its points in front of them.
+        is_guess: Not measured; occluders also hide its points that lie in front of them.
     """
 
     is_layered: ClassVar[bool] = False
@@ -77,7 +77,7 @@ class DenseSurface(Surface):
 
     @abstractmethod
     def occlusion_map(self, camera: Camera, rays: PixelRays, memory: Memory = FRESH) -> OcclusionMap:
-        """The surface as an occluder in a source image."""
+        """Occlusion by the surface in a source image."""
 
 
 class StaticSurface(Surface):
@@ -127,16 +127,15 @@ FREE_SHARE, OBJECT_DENSITY = 0.1, 1.33
 
 
 SHARPNESS = 4
-"""Exponent of the norm that joins road and wall; infinity would be the nearer of both, with a crease."""
+"""Exponent of the norm that joins road and wall; infinity would give the nearer of both, with a crease."""
 
 
 @dataclass(frozen=True)
 class Street(StaticSurface):
     """The road joined smoothly to an elliptical far wall, which is nearer at the sides than ahead.
 
-    The norm of two inverse distances, (q_road^4 + q_wall^4)^(1/4), is a smooth minimum of the distances. It shortens
-    them by 16 % where road and wall cross, 1.5 % where the road is at half the wall's distance. docs/surfaces.md says
-    how the defaults were measured.
+    The norm of two inverse distances, (q_road^4 + q_wall^4)^(1/4), is a smooth minimum of the distances.
+    See docs/surfaces.md for the defaults.
 
     Attributes:
         ground_z_m: Height of the road in the ego frame.
@@ -150,7 +149,7 @@ class Street(StaticSurface):
     is_smooth: ClassVar[bool] = True
 
     def inverse_distance(self, origin: FloatArray, directions: FloatArray) -> FloatArray:
-        """The join of plane and wall, 1/m (...,)."""
+        """Inverse distances (...,) of plane and wall joined, 1/m."""
         road = plane_inverse_distance(origin, directions, self.ground_z_m)
         wall = wall_inverse_distance(origin, directions, self.half_length_m, self.half_width_m)
         nearer, farther = np.maximum(road, wall), np.minimum(road, wall)
@@ -179,7 +178,7 @@ class Street(StaticSurface):
         return q
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
-        """Mean error (...,) in 1/m caused by unknown objects, within a quarter on most of six synthetic streets.
+        """Mean error (...,) in 1/m caused by unknown objects.
 
         A ray meets objects between ``FREE_SHARE`` of the way to the wall and the surface, at ``OBJECT_DENSITY`` per
         such way: the integral of (1/t - 1/t_surface) over t. The road nearby is certain, the wall is not.
@@ -233,7 +232,7 @@ NEAREST_SCENE_M = 2.0
 """Distance of the nearest scene point assumed for worst-case parallax."""
 
 FAR_PARALLAX_PX = 0.5
-"""Worst-case parallax below which ``auto`` takes a pair of cameras as far."""
+"""Worst-case parallax below which ``auto`` treats the scene as infinitely far for a pair of cameras."""
 
 
 def worst_parallax_px(baseline_m: Any, focal_px: Any) -> Any:
@@ -241,7 +240,7 @@ def worst_parallax_px(baseline_m: Any, focal_px: Any) -> Any:
     return focal_px * baseline_m / NEAREST_SCENE_M
 
 
-_STEPS = 2  # fixed-point iterations; a third one changes two real frames by at most 0.02 dB
+_STEPS = 2  # fixed-point iterations; a third one changes hardly anything
 _ROW = 4096  # remap's sizes must stay below 32767
 
 
@@ -265,7 +264,7 @@ class Correction:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the arrays."""
+        """Memory in bytes."""
         return 2 * (self.change.nbytes + self.share.nbytes)
 
 
@@ -299,7 +298,7 @@ class CorrectedSurface(StaticSurface):
         return q
 
     def uncertainty(self, origin: FloatArray, directions: FloatArray, inverse_distance: FloatArray) -> FloatArray:
-        """The base's."""
+        """Uncertainty of the base surface."""
         return self.base.uncertainty(origin, directions, inverse_distance)
 
 

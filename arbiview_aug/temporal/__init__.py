@@ -1,4 +1,4 @@
-"""Depth from other frames of a drive; imported where a geometry asks for it."""
+"""Depth from other frames of a drive; imported where a geometry needs it."""
 
 from typing import TYPE_CHECKING
 

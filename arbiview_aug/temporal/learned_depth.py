@@ -1,6 +1,6 @@
-"""Depth of a network of transformers, brought to metres by what is known of the frame.
+"""Depth of a network of transformers, fitted to metres by known points of the frame.
 
-A network knows depth up to a scale and a shift, or assumes a focal length. Both are fitted for each camera, robustly
+A network predicts depth up to a scale and a shift, or assumes a focal length. Both are fitted for each camera, robustly
 and in inverse depth, to LiDAR points, else to depth from motion, else to the road below the camera. A camera whose fit
 fails stays without learned depth.
 """
@@ -31,18 +31,18 @@ from arbiview_aug.scene.surface import Layer, plane_inverse_distance
 from arbiview_aug.temporal.motion_depth import FARTHEST_M, MotionDepth
 
 LEAST_POINTS = 50
-"""Least number of pixels to fit a camera to."""
+"""Minimum number of pixels to fit a camera to."""
 
 MAX_RESIDUAL = 0.15
-"""Largest median error of a fit, relative to inverse depth."""
+"""Maximum median error of a fit, relative to inverse depth."""
 
 MAX_OF_CONSTANT = 0.5
-"""Largest residual as a share of that of one depth for all pixels: beyond it, the network tells nothing."""
+"""Maximum residual, relative to fitting one depth for all pixels; above it the network is uninformative."""
 
 _ROAD_M = 15.0  # the road is fitted up to this distance: farther on, slopes and traffic hide the plane
 _RELATIVE_M = 50.0  # errors are relative to inverse depth, but not to less than that of this depth
 _NEAREST_M = 0.5
-_CELL_PX = 4  # of several LiDAR points in a cell, the nearest counts: the camera may not see those behind it
+_CELL_PX = 4  # of several LiDAR points in a cell, the nearest counts: the others may be occluded
 _OUTLIER, _HUBER = 0.2, 0.02  # relative errors: beyond the first a point has no weight, below the second all of it
 _PAIRS, _MOST_POINTS = 256, 4000
 
@@ -56,11 +56,11 @@ class LearnedDepth(MotionDepth):
 
 
 Output = Literal["depth", "inverse"] | None
-"""What a network gives: depth, inverse depth, or None if only the fit tells which."""
+"""Output of a network: depth, inverse depth, or None if the fit decides."""
 
 
 class DepthInputs(NamedTuple):
-    """A frame, and what is known of its depth: (P, 3) LiDAR points, depth from motion, (B, 7) labelled objects."""
+    """A frame and the references of its depth: (P, 3) LiDAR points, depth from motion, (B, 7) labelled objects."""
 
     rig: Rig
     images: Sequence[torch.Tensor]
@@ -70,7 +70,7 @@ class DepthInputs(NamedTuple):
 
 
 class CameraFit(NamedTuple):
-    """How a camera's prediction became metres, or why it was declined."""
+    """Fit of a camera's prediction to metres, or the reason why it was declined."""
 
     camera: str
     reference: Reference | None = None
@@ -93,7 +93,7 @@ def learned_depth(
 ) -> Iterator[tuple[LearnedDepth, list[CameraFit]]]:
     """Predict the depth of frames, ``batch`` images at a time, and fit it to their geometry.
 
-    A camera is fitted to the first reference of ``wanted`` that it has enough points of.
+    Each camera is fitted to the first reference of ``wanted`` with enough points.
     """
     views = {(n, k): View.of(frame, k) for n, frame in enumerate(frames) for k in range(len(frame.rig))}
     predictions: dict[tuple[int, int], Layer] = {}
@@ -104,11 +104,11 @@ def learned_depth(
     for n, frame in enumerate(frames):
         predicted = [(views[n, k], predictions[n, k]) for k in range(len(frame.rig))]
         depth_m, fits = _fitted(frame, predicted, model.output, wanted)
-        words = [f"{model.name}, revision {model.revision}, licence {model.licence}", *map(str, fits)]
-        yield LearnedDepth(tuple(depth_m), "\n  ".join(words)), fits
+        lines = [f"{model.name}, revision {model.revision}, licence {model.licence}", *map(str, fits)]
+        yield LearnedDepth(tuple(depth_m), "\n  ".join(lines)), fits
 
 
-# --- images that networks know ----------------------------------------------------------------------------------------
+# --- images for the network -------------------------------------------------------------------------------------------
 class View(NamedTuple):
     """A camera's image as a pinhole camera would have taken it."""
 
@@ -153,7 +153,7 @@ def measured_pixels(camera: Camera, points: FloatArray) -> tuple[Any, FloatArray
     return (row[nearest], column[nearest]), z[seen][nearest]
 
 
-# --- what is known of the depth ---------------------------------------------------------------------------------------
+# --- references of depth ----------------------------------------------------------------------------------------------
 def _references(frame: DepthInputs, k: int, view: View, seen: BoolArray) -> Iterator[tuple[Reference, Any, FloatArray]]:
     """Measurements that a camera may be fitted to: its name, pixels (rows, columns) and z-depths."""
     camera = view.camera
@@ -206,7 +206,8 @@ def _fitted(
     too_few = f"fewer than {LEAST_POINTS} points of {', '.join(wanted)}"
     for k, (view, prediction) in enumerate(predicted):
         values, seen = view.sampled(prediction)
-        known = (of for of in _references(frame, k, view, seen) if of[0] in wanted and len(of[2]) >= LEAST_POINTS)
+        references = _references(frame, k, view, seen)
+        known = (entry for entry in references if entry[0] in wanted and len(entry[2]) >= LEAST_POINTS)
         reference, pixels, depth_m = next(known, (None, (), np.zeros(0)))
         metres = np.zeros(values.shape)
         if reference is None:
@@ -245,11 +246,11 @@ def fit_depth(values: FloatArray, depth_m: FloatArray, output: Output) -> tuple[
 
 
 def _robust_line(x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[float, float]:
-    """Scale and shift by RANSAC with a truncated cost, refined by Huber weights on what is no outlier."""
-    one, two = np.random.default_rng(0).integers(len(x), size=(2, _PAIRS))
+    """Scale and shift by RANSAC with a truncated cost, refined by Huber weights on the inliers."""
+    first, second = np.random.default_rng(0).integers(len(x), size=(2, _PAIRS))
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = (y[two] - y[one]) / (x[two] - x[one])
-        shift = y[one] - scale * x[one]
+        scale = (y[second] - y[first]) / (x[second] - x[first])
+        shift = y[first] - scale * x[first]
         cost = np.minimum(np.abs(scale[:, None] * x + shift[:, None] - y) * weight, _OUTLIER).mean(1)
     if not np.isfinite(cost).any():  # the output is constant
         return 0.0, float(np.median(y))
@@ -291,8 +292,8 @@ class TransformersDepth:
                 f"{option}: expected a model that estimates depth, such as "
                 f"depth-anything/Depth-Anything-V2-Metric-Outdoor-Small-hf, got {type(config).__name__}"
             )
-        beside = "preprocessor_config.json beside the model"
-        self._processor = load_pretrained(transformers.AutoImageProcessor, option, name, beside)
+        expected = "preprocessor_config.json beside the model"
+        self._processor = load_pretrained(transformers.AutoImageProcessor, option, name, expected)
         model = load_pretrained(transformers.AutoModelForDepthEstimation, option, name, "weights of the model")
         self.model, self.device = model.float().eval().to(device), device
         commit = str(getattr(config, "_commit_hash", None) or "unknown")[:12]

@@ -3,7 +3,7 @@
 Each neighbour is matched by a plane sweep. The costs of both are merged and aggregated. A pixel is kept where one
 distance fits clearly better than all others, away from outlines, and where enough of its neighbours are kept too.
 Labelled objects that moved between the frames are masked in both. Unlabelled traffic is put upright where its foot is
-on the road (``plane_sweep.stand_on_road``). ``docs/decisions.md`` says how the constants were chosen.
+on the road (``plane_sweep.stand_on_road``). See ``docs/decisions.md`` for the constants.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
 from typing import Any, NamedTuple
 
 import cv2
@@ -34,26 +33,26 @@ from arbiview_aug.scene.surface import Layer
 from arbiview_aug.temporal.plane_sweep import WALLS, SweptImage, read_at, reduced_grey, stand_on_road
 
 BEST_TRAVEL_M, TRAVEL_M = 1.2, (0.4, 3.0)
-"""Best travel to a neighbour, and the range allowed: shorter baselines measure nothing, longer ones hide too much."""
+"""Best travel to a neighbour, and its allowed range: shorter baselines measure nothing, longer ones hide too much."""
 
 STEP, _STEP_PER_M = 0.075, 1.5e-3
-"""Largest change of inverse distance within 3 x 3 pixels, as a share of it, and in 1/m on top."""
+"""Maximum change of inverse distance within 3 x 3 pixels: a share of it, plus a constant in 1/m."""
 
 FARTHEST_M = 300.0
-"""Distance of all that is farther."""
+"""Maximum distance; farther points are set to it."""
 
 LEAST_SHIFT_PX = 0.06
-"""Least motion of a pixel that tells of a pose, when its inverse distance grows by a tenth."""
+"""Minimum motion of a pixel that constrains a pose, when its inverse distance grows by a tenth."""
 
 _NEARER, _MORE = 1e-3, 10
 """Share of confirmed pixels at half the size that may be nearer than the nearest wall, and walls added to that one."""
 
 LABEL_ERROR = 0.1
-"""Largest relative error of a distance on a labelled object: that of an object which moves along with the vehicle, or
-against it, by this share of the vehicle's way, and the difference from a label's face."""
+"""Maximum relative error of a distance on a labelled object. It bounds the object's motion as a share of the vehicle's
+travel, and the difference from the label's face."""
 
 _SPECKLE_PX, _SPECKLE_STEP = 100, 0.15
-"""Smallest patch, and the largest relative change of inverse distance from pixel to pixel within it."""
+"""Size of the smallest patch, and maximum relative change of inverse distance between its adjacent pixels."""
 
 _AROUND = np.ones((3, 3), np.uint8)
 
@@ -92,7 +91,7 @@ Estimate = tuple[Layer, BoolArray]
 """Inverse distances (h, w) of one camera, 1/m, and their validity."""
 
 Load = Callable[[Neighbour], Sequence[torch.Tensor] | None]
-"""Reads the images of a neighbour; None if they cannot be read, and another one is taken."""
+"""Reads the images of a neighbour; None if they cannot be read, so that another neighbour is tried."""
 
 
 @compilation_announced()
@@ -103,32 +102,40 @@ def motion_depth(
 
     Images (3, H, W) are uint8, or float in [0, 1]; ``load`` reads a neighbour's. They are matched at half the size
     first. Poses are checked on the result (``pose_error``); small errors are corrected and the images matched again.
-    Neighbours and labelled objects (B, 7) are in the current ego frame. Objects that moved are left out, and depth that
-    contradicts the label of an object which may have moved.
+    Neighbours and labelled objects (B, 7) are in the current ego frame. Objects that moved are left out, and depth
+    that contradicts the label of an object that may have moved.
     """
     labels = np.zeros((0, 7)) if boxes is None else boxes[:, :7]
 
     def declined(reason: str) -> MotionDepth:
         return MotionDepth(tuple(np.zeros(motion_camera(camera).size, np.float32) for camera in rig), reason)
 
-    usable = [one for one in neighbours if TRAVEL_M[0] <= one.travel_m <= TRAVEL_M[1]]
-    usable.sort(key=lambda one: abs(one.travel_m - BEST_TRAVEL_M))
+    usable = [neighbour for neighbour in neighbours if TRAVEL_M[0] <= neighbour.travel_m <= TRAVEL_M[1]]
+    usable.sort(key=lambda neighbour: abs(neighbour.travel_m - BEST_TRAVEL_M))
     sides = []
     for is_ahead in (False, True):
-        loaded = ((one, seen) for one in usable if (one.ahead_m > 0) == is_ahead and (seen := load(one)) is not None)
-        for one, seen in islice(loaded, 1):
-            then = np.zeros((0, 7)) if one.boxes is None else one.boxes
-            sides.append(_Side(one, _swept(one.rig, seen, then[_moved_m(then, labels) > STAYED_M], rig.ground_z_m)))
+        for neighbour in usable:
+            if (neighbour.ahead_m > 0) == is_ahead and (seen := load(neighbour)) is not None:
+                objects = np.zeros((0, 7)) if neighbour.boxes is None else neighbour.boxes
+                objects = objects[_moved_m(objects, labels) > STAYED_M]
+                sides.append(_Side(neighbour, _swept(neighbour.rig, seen, objects, rig.ground_z_m)))
+                break
     if not sides:
         return declined(f"no frame {TRAVEL_M[0]:g} to {TRAVEL_M[1]:g} m before or after it can be used")
-    moved, unsure = _motion_of_labels(labels, [side.neighbour for side in sides])
+    # Labels may have moved by less than labels jitter, and by any way if no neighbour is labelled.
+    labelled = [(_moved_m(labels, n.boxes), n.travel_m) for n, _ in sides if n.boxes is not None]
+    moved, unsure = np.zeros(len(labels), bool), np.full(len(labels), not labelled)
+    for moved_m, travel_m in labelled:
+        moved |= moved_m > STAYED_M
+        unsure |= moved_m > LABEL_ERROR * travel_m
+    unsure &= ~moved
     swept = _swept(rig, images, labels[moved], rig.ground_z_m)
-    if any(min(one.camera.size) < 2 for part in (swept, *(side.images for side in sides)) for one in part):
+    if any(min(image.camera.size) < 2 for part in (swept, *(side.images for side in sides)) for image in part):
         return declined("images one pixel wide or high have nothing to interpolate")
     words = f"from {' and '.join(side.neighbour.name for side in sides)}"
     for correction in range(MAX_CORRECTIONS + 1):
-        others = [[side.images[k] for side in sides] for k in range(len(swept))]
-        coarse = [_coarse(one, of_sides) for one, of_sides in zip(swept, others, strict=True)]
+        counterparts = [[side.images[k] for side in sides] for k in range(len(swept))]
+        coarse = [_coarse(image, sides_images) for image, sides_images in zip(swept, counterparts, strict=True)]
         errors = [pose_error(swept, side.images, coarse) for side in sides]
         measured = [error for error in errors if error is not None]
         if len(measured) < len(sides):
@@ -140,12 +147,12 @@ def motion_depth(
         if correction < MAX_CORRECTIONS:
             words += f"{'; poses corrected by' if correction == 0 else ', then'} {' and '.join(map(str, measured))}"
             sides = [
-                side._replace(images=[one.moved(error.correction) for one in side.images])
+                side._replace(images=[image.moved(_pose(error.change)) for image in side.images])
                 for side, error in zip(sides, measured, strict=True)
             ]
         elif worst.error_px > MAX_ERROR_PX:
             return declined(f"the pose of frame {sides[measured.index(worst)].neighbour.name} errs by {worst}")
-    fine = map(partial(_match, stands=True), swept, others, map(_walls, swept, coarse))
+    fine = map(partial(_match, stands=True), swept, counterparts, map(_walls, swept, coarse))
     return MotionDepth(tuple(map(partial(_depth_m, unsure=labels[unsure]), swept, fine)), words)
 
 
@@ -160,19 +167,10 @@ def _swept(rig: Rig, images: Sequence[torch.Tensor], moved: FloatArray, ground_z
 
 
 def _moved_m(boxes: FloatArray, others: FloatArray) -> FloatArray:
-    """How far (B,) labels (B, 7) are from the nearest of their size in another frame (C, 7); infinite without one."""
+    """Distances (B,) of labels (B, 7) to the nearest label of their size in another frame (C, 7), or infinity."""
     apart_m = np.linalg.norm(boxes[:, None, :3] - others[None, :, :3], axis=-1)
     differ = np.abs(boxes[:, None, 3:6] - others[None, :, 3:6]).max(axis=-1) > SAME_SIZE_M
     return np.asarray(np.where(differ, np.inf, apart_m).min(axis=1, initial=np.inf))
-
-
-def _motion_of_labels(labels: FloatArray, neighbours: Sequence[Neighbour]) -> tuple[BoolArray, BoolArray]:
-    """Which labels (B, 7) moved; which may have moved: by less than labels jitter, or without labels of neighbours."""
-    labelled = [(_moved_m(labels, one.boxes), one.travel_m) for one in neighbours if one.boxes is not None]
-    if not labelled:
-        return np.zeros(len(labels), bool), np.ones(len(labels), bool)
-    moved = np.any([moved_m > STAYED_M for moved_m, _ in labelled], axis=0)
-    return moved, np.any([moved_m > LABEL_ERROR * travel_m for moved_m, travel_m in labelled], axis=0) & ~moved
 
 
 def without_objects(camera: Camera, boxes: FloatArray, margin_m: float = BOX_MARGIN_M, margin_px: int = 0) -> Camera:
@@ -187,20 +185,17 @@ def without_objects(camera: Camera, boxes: FloatArray, margin_m: float = BOX_MAR
 
 
 def _match(image: SweptImage, others: Sequence[SweptImage], walls: Layer, stands: bool = False) -> Estimate:
-    """Estimate the distances of one camera's pixels from the costs of all sides together.
-
-    Valid are clear matches away from the outlines of objects, which windows blur. With ``stands``, things that hang
-    above the road are put upon it.
-    """
+    """Estimate distances from the costs of all sides; ``stands`` moves objects that float above the road onto it."""
     from arbiview_aug.temporal.kernels import aggregate, find_least, merge_costs
 
-    of_sides = [image.costs(other, walls) for other in others]
+    side_costs = [image.costs(other, walls) for other in others]
     costs = np.empty((*image.camera.size, len(walls)), np.uint16)
-    merge_costs(of_sides[0], of_sides[-1], costs)
+    merge_costs(side_costs[0], side_costs[-1], costs)
     wall, clear = find_least(aggregate(costs), walls[1], image.road / np.maximum(image.horizontal, np.float32(1e-6)))
     q = image.inverse_distance(wall)
     step = cv2.dilate(q, _AROUND) - cv2.erode(q, _AROUND)
-    visible = [read_at(o.unmasked, image.positions(o.camera, q), cv2.INTER_NEAREST) for o in others]
+    visible = [read_at(other.unmasked, image.positions(other.camera, q), cv2.INTER_NEAREST) for other in others]
+    # Clear matches away from the outlines of objects, which windows blur.
     valid = clear & (step <= STEP * q + _STEP_PER_M) & (np.max(visible, 0) > 0)
     if stands:
         q, valid = stand_on_road(image, others, costs, float(walls[1]), q, valid)
@@ -223,7 +218,7 @@ def _coarse(image: SweptImage, others: Sequence[SweptImage]) -> Estimate:
 
 
 def _walls(image: SweptImage, coarse: Estimate) -> Layer:
-    """The walls up to the nearest that was confirmed, and some more; noise does not confirm any."""
+    """The walls up to the nearest confirmed one, and a few more; noise confirms none."""
     q, valid = coarse
     upright = (q / np.maximum(image.horizontal, 1e-6))[valid & (q > 1.02 * image.road)]
     nearest = np.quantile(upright, 1 - _NEARER) if len(upright) else WALLS[-1]
@@ -272,10 +267,10 @@ def estimate_motion(frame: Frame, boxes: FloatArray | None, warn: WarnOnce) -> M
 
 # --- errors of poses --------------------------------------------------------------------------------------------------
 CORRECTED_PX = 0.15
-"""Mean displacement in matched images above which a pose is corrected; exact poses measure 0.02 to 0.1."""
+"""Mean displacement in matched images above which a pose is corrected; exact poses stay below 0.1."""
 
 MAX_ERROR_PX = 0.4
-"""Largest displacement left after the corrections, a tenth of a degree at 400 px; above it depth is declined."""
+"""Maximum displacement after the corrections, a tenth of a degree at 400 px; above it depth is declined."""
 
 MAX_CORRECTIONS = 2
 """One correction reduces a third of a degree to a quarter; half a degree needs two."""
@@ -285,7 +280,7 @@ _ACROSS = 0.3
 
 _CONTRAST_LEVELS = 2.0  # per pixel; fainter gradients are noise
 
-_MIN_PIXELS, _MANY_PIXELS = 500, 4000  # for the five parameters; of more of a camera, every so many are taken
+_MIN_PIXELS, _MANY_PIXELS = 500, 4000  # for the five parameters; cameras with more pixels are subsampled
 
 _TURN_DEG, _SHIFT_M = 0.1, 0.02  # steps of the derivatives
 
@@ -300,11 +295,6 @@ class PoseError:
     # (5,) correcting turns about the current ego frame's axes, degrees, and shifts along its y and z, metres; a shift
     # along x cannot be told from scale
     change: FloatArray
-
-    @property
-    def correction(self) -> FloatArray:
-        """(4, 4) motion of the neighbour's cameras to their estimated poses, in the current ego frame."""
-        return _pose(self.change)
 
     def __str__(self) -> str:
         degrees, metres = np.linalg.norm(self.change[:3]), np.linalg.norm(self.change[3:])
@@ -332,18 +322,14 @@ def pose_error(
 def _equations(
     image: SweptImage, other: SweptImage, estimate: Estimate
 ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Linear equations A x = b, (n, 5) and (n,), and the motion J of pixels (n, 2, 5); None without usable pixels.
-
-    x holds turns about the ego's axes in degrees and shifts along its y and z in metres. Images are compared at their
-    local mean and contrast, as in the sweep's correlation.
-    """
+    """Linear equations A x = b of ``PoseError.change``, (n, 5) and (n,), and the motion J of pixels (n, 2, 5)."""
     q, valid = estimate
     at, nearer = (image.positions(other.camera, np.float32(factor) * q) for factor in (1, 1.1))
     warped = read_at(other.grey, at)
-    one, two = _normalised(image.grey), _normalised(warped)
+    current, neighbour = _normalised(image.grey), _normalised(warped)
     mean = (image.grey + warped) / 2
-    # Gradients of the warped image stand for those of the neighbour's: the warp is close to the identity.
-    gx, gy = (cv2.Sobel((one + two) / 2, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))
+    # Gradients of the warped image approximate the neighbour's: the warp is close to the identity.
+    gx, gy = (cv2.Sobel((current + neighbour) / 2, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1)))
     contrast = cv2.magnitude(*(cv2.Sobel(mean, cv2.CV_32F, *d, ksize=3, scale=1 / 8) for d in ((1, 0), (0, 1))))
     ex, ey = nearer - at
     length = cv2.magnitude(ex, ey)
@@ -352,7 +338,7 @@ def _equations(
     if not len(use):
         return None
     use = use[:: max(1, len(use) // _MANY_PIXELS)]
-    ex, ey, length, gx, gy, difference = (np.ravel(part)[use] for part in (ex, ey, length, gx, gy, one - two))
+    ex, ey, length, gx, gy, difference = (np.ravel(part)[use] for part in (ex, ey, length, gx, gy, current - neighbour))
     # (n, 2, 5) motion of the corresponding pixels per unit of turn and shift of the neighbour
     rays, q, at = image.rays.reshape(3, 1, -1)[..., use], q.reshape(1, -1)[:, use], at.reshape(2, -1)[:, use]
     columns = []
@@ -364,18 +350,19 @@ def _equations(
     normal = np.stack([-ey, ex], -1) / length[:, None]
     off_line = np.einsum("nk,nkp->np", normal, motion)  # [n, 5] px per unit
     gradient = gx * normal[:, 0] + gy * normal[:, 1]
-    # Pixels read by the erroneous pose are displaced by its error: two(x) = one(x - off_line).
+    # Pixels read by the erroneous pose are displaced by its error: neighbour(x) = current(x - off_line).
     return gradient[:, None] * off_line, difference, motion
 
 
 def _normalised(image: Layer) -> Layer:
+    """An image at its local mean and contrast, as in the sweep's correlation."""
     mean = cv2.blur(image, (15, 15))
     spread = np.sqrt(np.maximum(cv2.blur(image * image, (15, 15)) - mean * mean, 0) + 4)
     return np.asarray((image - mean) / spread)
 
 
 def _pose(x: FloatArray) -> FloatArray:
-    """(4, 4) of turns about x, y, z in degrees and shifts along y and z in metres."""
+    """Pose (4, 4) of turns about x, y, z in degrees and shifts along y and z in metres."""
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.radians(x[:3]))[0]
     pose[1:3, 3] = x[3:]

@@ -4,12 +4,12 @@ Each surface is the road with an upright wall around the camera. The wall shrink
 Gallup et al., "Real-time plane-sweeping stereo with multiple sweeping directions", CVPR 2007). The score is the
 zero-mean normalised cross-correlation of small windows.
 
-Traffic that moves without labels is put upright on the road where its foot is. Two images show a thing that moves along
+Unlabelled moving traffic is put upright on the road where its foot is. Two images show an object that moves along
 with the vehicle, or against it, as a copy that is scaled about the camera: it stays on its epipolar lines, and both
 neighbours agree. A copy that is too near hangs above the road. Below it the images match the road beyond, so the row
-where matching changes is the thing's foot, which gives the scale. A copy that is too far lies below the road, where
+where matching changes is the object's foot, which gives the scale. A copy that is too far lies below the road, where
 nothing is: it moves less than the road that it hides. Crossing traffic leaves its epipolar lines.
-``docs/decisions.md`` says how the constants were chosen.
+See ``docs/decisions.md`` for the constants.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class SweptImage:
 
     @cached_property
     def halved(self) -> SweptImage:
-        """At half the size."""
+        """The image at half the size."""
         h, w = (max(2, side // 2) for side in self.camera.size)
         grey = np.asarray(cv2.resize(self.grey, (w, h), interpolation=cv2.INTER_AREA), np.float32)
         return SweptImage(self.camera.resize((h, w)), grey, self.ground_z_m)
@@ -71,7 +71,7 @@ class SweptImage:
 
     @cached_property
     def rays(self) -> Layer:
-        """(3, h, w) the same in the camera's frame."""
+        """(3, h, w) unit rays in the camera's frame."""
         local = self.directions @ self.camera.cam2ego[:3, :3]
         return np.ascontiguousarray(np.moveaxis(local, -1, 0), dtype=np.float32)
 
@@ -115,9 +115,9 @@ class SweptImage:
         """
         from arbiview_aug.temporal.kernels import LEVELS
 
-        one = np.rint(LEVELS * self.grey).astype(np.int64) | self.unmasked.astype(np.int64) << 15
-        two = one | np.roll(one, -1, 1) << 16
-        return two | np.roll(two, -1, 0) << 32
+        pixels = np.rint(LEVELS * self.grey).astype(np.int64) | self.unmasked.astype(np.int64) << 15
+        rows = pixels | np.roll(pixels, -1, 1) << 16
+        return rows | np.roll(rows, -1, 0) << 32
 
     @cached_property
     def windows(self) -> tuple[npt.NDArray[np.int32], Any, Any]:
@@ -150,7 +150,7 @@ class SweptImage:
         rays = (A @ self.rays.reshape(3, -1)).reshape(3, h, w)
         surfaces = rays, self.road, self.horizontal
         y, x = (np.minimum(np.arange(0, n + NODE_PX - 1, NODE_PX), n - 1) for n in (h, w))
-        nodes = tuple(np.ascontiguousarray(one[..., y[:, None], x]) for one in surfaces)
+        nodes = tuple(np.ascontiguousarray(part[..., y[:, None], x]) for part in surfaces)
         costs = np.empty((h, len(walls), w), np.uint16)
         walls = np.ascontiguousarray(walls)  # another layout would be compiled, too
         match_walls(*surfaces, nodes, self.windows, walls, offset, lens, other.quads, costs)
@@ -158,7 +158,7 @@ class SweptImage:
 
 
 def read_at(image: Any, at: Sequence[Any] | Layer, interpolation: int = cv2.INTER_LINEAR) -> Any:
-    """Read an image at pixels, u and v (h, w); the border's beyond it."""
+    """Read an image at pixels u and v (h, w), and its border beyond them."""
     return cv2.remap(image, at[0], at[1], interpolation, borderMode=cv2.BORDER_REPLICATE)
 
 
@@ -167,34 +167,34 @@ def reduced_grey(camera: Camera, image: torch.Tensor) -> Layer:
     return np.asarray(255 * cv2.cvtColor(reduced(image, halvings(camera)), cv2.COLOR_RGB2GRAY), np.float32)
 
 
-# --- traffic that moves -----------------------------------------------------------------------------------------------
+# --- moving traffic ---------------------------------------------------------------------------------------------------
 SLOPE_DEG = 1.0
-"""Pitch of the vehicle against its road, and of the road against a plane: feet that are so far off may be right."""
+"""Maximum pitch of the vehicle against the road and of the road against a plane, by which feet may be off."""
 
 UPRIGHT = 1.05
-"""Least inverse distance of what is not road, over the road's."""
+"""Minimum inverse distance of pixels that are not road, relative to the road's."""
 
 LOWEST_M, TALLEST_M = 1.4, 4.5
-"""Heights of the lowest vehicles and of the tallest."""
+"""Heights of the lowest and the tallest vehicles."""
 
 LEAST_SCALE = 0.1
-"""Scale of a thing that comes at nine times the vehicle's speed: a slow vehicle meets fast traffic."""
+"""Scale of an object that approaches at nine times the vehicle's speed: a slow vehicle meets fast traffic."""
 
 EVIDENCE = 5.0
-"""Least gain in correlation, summed over pixels, on both sides of a foot: a tenth over the 49 pixels of a window."""
+"""Minimum gain in correlation on both sides of a foot, summed over pixels: a tenth for each pixel of a window."""
 
 STANDING = 0.1
-"""Largest share of the evidence below a foot that columns give which show the thing to reach down to the road."""
+"""Maximum share of the evidence below a foot from columns in which the object reaches down to the road."""
 
 FLOW_PX, _FLOW_SHARE = 0.5, 0.5
 """Optical flow that noise and pose errors leave (half of it below the lowest road), and the share of the flow by which
 two neighbours may differ on top."""
 
-_PATCH_PX = 4  # half of a patch of DIS flow, within which it moves the road beside a thing, too
+_PATCH_PX = 4  # half of a patch of DIS flow, within which the road next to an object moves with it
 
 _LEAST_DIS_PX = 16  # two patches; OpenCV fails on smaller images
 
-_LEAST_CORRELATION, _AS_GOOD = 0.5, 0.1  # of a match, and the difference of two that tell nothing
+_LEAST_CORRELATION, _AS_GOOD = 0.5, 0.1  # of a match; difference up to which two correlations are equal
 
 _MOST_SLENDER, _SLENDEREST = 1.5, 3.0  # height over width: a truck from behind, and a person
 
@@ -207,11 +207,11 @@ def stand_on_road(
     q: Layer,
     valid: BoolArray,
 ) -> tuple[Layer, BoolArray]:
-    """Move what hangs above the road, lies below it or crosses it to the distance at which its foot is on it.
+    """Move objects that float above the road, lie below it or cross it to the distance at which their foot is on it.
 
-    ``others`` are the neighbours' images. ``costs`` (h, w, K) are those of walls at multiples of ``spacing``, 1/radius
-    in 1/m; the first is the road alone. Returns inverse distances ``q`` (h, w), 1/m, and whether they are valid, with
-    the moved things filled.
+    ``others`` are the neighbours' images. ``costs`` (h, w, K) belong to walls at multiples of ``spacing``, 1/radius in
+    1/m; the first is the road alone. Returns inverse distances ``q`` (h, w), 1/m, and whether they are valid, with
+    the moved objects filled.
     """
     from arbiview_aug.temporal.kernels import RADIUS_PX, find_feet
 
@@ -238,19 +238,19 @@ class _RoadFlow(NamedTuple):
 
 
 def _road_flow(image: SweptImage, other: SweptImage, road: Layer) -> _RoadFlow:
-    """The flow in the rows that show some road; above them, nothing is seen."""
+    """Flow in the rows that show some road; the rows above count as unseen."""
     first = max(0, int((road > 0).any(1).argmax()) - 2 * _PATCH_PX)
     at = image.positions(other.camera, road)
     seen = read_at(other.unmasked, at, cv2.INTER_NEAREST) > 0
     seen[:first] = False
     warped = np.where(seen, read_at(other.grey, at), image.grey)
-    grey, warped = (np.rint(one[first:]).astype(np.uint8) for one in (image.grey, warped))
+    grey, warped = (np.rint(part[first:]).astype(np.uint8) for part in (image.grey, warped))
     moved = np.zeros((*road.shape, 2), np.float32)
     cv: Any = cv2  # whose stubs lack DIS flow
     dis = cv.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     moved[first:] = dis.calc(grey, warped, None) if min(grey.shape) >= _LEAST_DIS_PX else 0
     towards = cv2.split(image.camera.pixel_grid().astype(np.float32) + moved)
-    matching = np.stack([read_at(one, towards) for one in at])
+    matching = np.stack([read_at(part, towards) for part in at])
     (x, y), (ex, ey) = matching - at, image.positions(other.camera, np.float32(1.1) * road + np.float32(1e-4)) - at
     length = np.maximum(cv2.magnitude(ex, ey), np.float32(1e-9))
     flow = np.stack([(x * ex + y * ey) / length, (y * ex - x * ey) / length])
@@ -260,9 +260,9 @@ def _road_flow(image: SweptImage, other: SweptImage, road: Layer) -> _RoadFlow:
 def _stand_off_road(
     image: SweptImage, others: Sequence[SweptImage], costs: Any, road_costs: Any, q: Layer, valid: BoolArray
 ) -> None:
-    """Put things upright, in place, that move less than the road or off its epipolar lines, alike in all neighbours.
+    """Put objects upright, in place, that move less than the road or off its epipolar lines in all neighbours.
 
-    ``costs`` (h, w) are those of what was found: a thing must match better as one that moves.
+    ``costs`` (h, w) belong to the distances found so far: an object must match better as a moving one.
     """
     from arbiview_aug.temporal.kernels import PER_CORRELATION, RADIUS_PX
 
@@ -275,7 +275,7 @@ def _stand_off_road(
         first = max(0, min(top, int(rows.max() - _MOST_SLENDER * (right - left))))
         part = np.s_[first : min(rows.max() + 1 + 2 * _PATCH_PX, len(q)), left:right]
         moving = _correlations(image, flows, rows, columns, part)
-        still, of_road = (1 - one[part] / np.float32(PER_CORRELATION) for one in (costs, road_costs))
+        still, of_road = (1 - cost[part] / np.float32(PER_CORRELATION) for cost in (costs, road_costs))
         seed = thing[part]
         if moving[seed].mean() < max(_LEAST_CORRELATION, still[seed].mean()):
             continue
@@ -302,9 +302,9 @@ def _off_road(flows: Sequence[_RoadFlow], free: BoolArray) -> Iterator[BoolArray
     """Masks (h, w) of patches in which the flow is off the road, in the same way in all neighbours that see it."""
     from arbiview_aug.temporal.kernels import RADIUS_PX
 
-    ways = [(-2 * one.flow[0], one.flow[1], -one.flow[1]) for one in flows]
-    sizes = [np.where(one.seen, cv2.magnitude(*one.flow), np.inf) for one in flows]
-    unseen = [~one.seen for one in flows]
+    ways = [(-2 * side.flow[0], side.flow[1], -side.flow[1]) for side in flows]
+    sizes = [np.where(side.seen, cv2.magnitude(*side.flow), np.inf) for side in flows]
+    unseen = [~side.seen for side in flows]
     alike = [((ways[0][k] > FLOW_PX) | unseen[0]) & ((ways[-1][k] > FLOW_PX) | unseen[-1]) for k in range(3)]
     size = np.minimum(sizes[0], sizes[-1])
     difference = flows[0].flow - flows[-1].flow
@@ -325,13 +325,13 @@ def _correlations(image: SweptImage, flows: Sequence[_RoadFlow], rows: Any, colu
     side = (2 * RADIUS_PX + 1,) * 2
     y, x = np.mgrid[part]
     grid, pixels = np.stack([x, y, np.ones_like(x)], -1), np.stack([columns, rows, np.ones_like(rows)], -1)
-    one, correlations = image.grey[part], []
+    window, correlations = image.grey[part], []
     for flow in flows:
         if not flow.seen[rows, columns].any():
             continue
         affine = np.linalg.lstsq(pixels.astype(np.float64), flow.at[:, rows, columns].T, rcond=None)[0]
-        two = read_at(flow.other.grey, cv2.split((grid @ affine).astype(np.float32)))
-        products = one, two, one * one, two * two, one * two
+        warped = read_at(flow.other.grey, cv2.split((grid @ affine).astype(np.float32)))
+        products = window, warped, window * window, warped * warped, window * warped
         means = [cv2.blur(product, side, borderType=cv2.BORDER_REPLICATE) for product in products]
         variances = [np.maximum(means[k + 2] - means[k] ** 2, 0) + NOISE_LEVELS**2 for k in range(2)]
         correlations.append((means[4] - means[0] * means[1]) / np.sqrt(variances[0] * variances[1]))

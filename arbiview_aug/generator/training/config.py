@@ -104,7 +104,7 @@ class TrainConfig:
 
 # --- overrides --------------------------------------------------------------------------------------------------------
 def overridden(config: TrainConfig, settings: Sequence[str]) -> TrainConfig:
-    """The config with settings such as ``steps=100`` or ``loss.geo=0`` applied together; values as in JSON.
+    """The config with settings like ``steps=100`` or ``loss.geo=0`` applied together; values as in JSON.
 
     TrainingError for an unknown key, or a value of another type; GeneratorError for settings that do not fit together.
     """
@@ -146,7 +146,7 @@ _PAPER = TrainConfig(
 """Algorithm 1 as published, on Stable Diffusion's frozen weights and the published stages' pseudo views.
 
 See Sec. Training Parameters. Deviations: x0 is the real view's latent (``training.losses``). Pseudo poses are turned
-but not moved: the published stages know rotations alone. L_geo is normalised, since as printed it outgrows L_main
+but not moved: the published stages model rotations only. L_geo is normalised, since as printed it outgrows L_main
 (``loss.geo_mode="frobenius_sum"``). L_perceptual compares crops at early times, in every 4th step. The learning rate is
 warmed up for 100 steps.
 """

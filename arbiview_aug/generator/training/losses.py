@@ -1,7 +1,7 @@
 """The loss terms of a training step of CVC-SSL: L_total = L_main + α L_geo + β L_perceptual (Algorithm 1).
 
 x0 is the latent of the real view. The paper's sentence under L_main says FAVS's image, but its overview and Algorithm 1
-reconstruct the real one; FAVS's image has the very holes that the model is to fill.
+reconstruct the real one; FAVS's image has the holes that the model is to fill.
 """
 
 from __future__ import annotations

@@ -131,12 +131,7 @@ def open_frames(data: str, size: tuple[int, int], *, scenes: int, seed: int = 0)
 
 
 # --- items ------------------------------------------------------------------------------------------------------------
-_CONFIG = RenderConfig(certainty=True, layers=True)  # layers say what holes show, to the default fill
-
-
-def one_of(rng: torch.Generator, count: int) -> int:
-    """Draw an index below ``count``."""
-    return int(torch.randint(count, (), generator=rng))
+_CONFIG = RenderConfig(certainty=True, layers=True)  # layers are for the default fill
 
 
 class Batch(NamedTuple):
@@ -182,8 +177,8 @@ def collate(items: Sequence[Batch]) -> Batch:
 def rendered(frame: Frame, targets: Sequence[Camera], quality: PseudoQuality = "fast") -> Views:
     """Render a frame at M target cameras of one size in its ego frame, over the geometry that it has (``auto``).
 
-    The published stages (``paper``) know ``infinity`` alone, run on the CPU and have no confidence: it is 1 where they
-    see.
+    The published stages (``paper``) are limited to ``infinity``, run on the CPU and give no confidence: it is 1 where
+    they see.
     """
     target = Rig([replace(camera, name=str(k)) for k, camera in enumerate(targets)], ground_z_m=frame.rig.ground_z_m)
     device = frame.images[0].device
@@ -194,7 +189,7 @@ def rendered(frame: Frame, targets: Sequence[Camera], quality: PseudoQuality = "
         plan = build_plan(frame.rig, target, geometry="auto", config=_CONFIG, scene=read_scene(frame, "auto"))
         (views,) = Renderer().render([plan], [frame], [None], ("confidence",))
     images = [unit(image).clamp(0, 1).to(device) for image in views.images]
-    return replace(views.with_maps(lambda maps, _: [of_view.to(device) for of_view in maps]), images=images)
+    return replace(views.with_maps(lambda maps, _: [view.to(device) for view in maps]), images=images)
 
 
 @dataclass(eq=False)
@@ -213,9 +208,9 @@ class PseudoViews(Dataset[Batch]):
 
     def __getitem__(self, k: int) -> Batch:
         config, rng = self.config, seeded(self.seed, "view", k)
-        frame = self.frames[self.indices[one_of(rng, len(self.indices))]]
+        frame = self.frames[self.indices[int(torch.randint(len(self.indices), (), generator=rng))]]
         frame = replace(frame, images=tuple(image.to(self.device) for image in frame.images))
-        rig, first = frame.rig, one_of(rng, len(frame.rig))
+        rig, first = frame.rig, int(torch.randint(len(frame.rig), (), generator=rng))
         axes = np.stack([camera.cam2ego[:3, 2] for camera in rig])
         places = sorted(range(len(rig)), key=lambda i: (i != first, -float(axes[i] @ axes[first])))[: config.targets]
         targets = [replace(rig[i], mask=None) for i in places]
@@ -226,7 +221,7 @@ class PseudoViews(Dataset[Batch]):
         there = replace(frame, images=tuple(pseudo.images), rig=pseudo_rig.with_cameras(masked))
         back = rendered(there, targets, config.quality)
         maps = back.coverage, back.confidence or (), pseudo.coverage
-        known, confidence, seen = (torch.stack([*of_views]) for of_views in maps)
+        known, confidence, seen = (torch.stack([*part]) for part in maps)
         favs = torch.stack(back.images) * known[:, None]
         (filled,) = Continue().fill([replace(back, images=list(favs.clone()))], [there])
         likeness = [max(float(camera.cam2ego[:3, 2] @ axes[i]) for i in places) for camera in masked]

@@ -307,9 +307,9 @@ def save_state(
 
 
 def has_state(output: Path) -> bool:
-    """Whether a run's folder has a state to go on from; TrainingError for a generator without one.
+    """Whether a run's folder has a state to resume from; TrainingError for a generator without one.
 
-    A run writes its state first: a first save that was killed leaves a state, or neither, and can go on.
+    A run writes its state first: a killed first save leaves a state or neither, and can be resumed.
     """
     if (output / "state" / FILE).is_file():
         return True
