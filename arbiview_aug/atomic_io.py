@@ -113,10 +113,7 @@ def whole_file(path: Path, owner: str = "") -> Iterator[BinaryIO]:
 
 
 def write_whole(files: Mapping[Path, bytes], owner: str = "") -> None:
-    """Write files atomically, given their contents by path; ``owner`` is that of ``whole_file``.
-
-    OutputError if one cannot be written; others may have been.
-    """
+    """Write files atomically, by path; ``owner`` as in ``whole_file``; OutputError if one cannot be written."""
     parts = {}
     try:
         for path, content in files.items():
@@ -162,7 +159,7 @@ def write_new(path: Path, content: bytes) -> None:
 
 
 def link_whole(source: Path, path: Path, owner: str = "") -> None:
-    """Link a file, or copy it where its disk allows no hard links; a source that is a link is followed.
+    """Link a file, or copy it on a disk without hard links; a source that is a link is followed.
 
     An existing file of the same content stays. FileNotFoundError without a source, DataError for one that cannot be
     read, OutputError for the link.
@@ -204,10 +201,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def remove_parts(root: Path, owned: Callable[[str], bool]) -> None:
-    """Remove files that ended processes left half-written below a folder.
-
-    ``owned`` tells whether this process alone writes an owner's files, also those from other machines.
-    """
+    """Remove half-written files of ended processes below a folder; ``owned`` tells which owners are this process's."""
     for folder, _, names in os.walk(root):
         for name in names:
             path = Path(folder, name)
@@ -224,7 +218,7 @@ def remove(path: Path) -> None:
 
 
 def is_part(path: Path) -> bool:
-    """Whether a file is a half-written one."""
+    """Whether a file is half-written."""
     return _IS_PART.fullmatch(path.name) is not None
 
 

@@ -144,7 +144,7 @@ def is_kept(kernel: Any) -> bool:
 
 
 def working_s() -> float:
-    """Read a clock, in seconds, that stands still while kernels are compiled."""
+    """Read a clock, in seconds, that stops while kernels are compiled."""
     return time.perf_counter() - _compilation().seconds
 
 
@@ -191,10 +191,7 @@ def _kernel_cache() -> type:
     from numba.core.caching import FunctionCache, IndexDataCacheFile
 
     class Files(IndexDataCacheFile):  # type: ignore[misc]
-        """The files of a kernel; each ends in its SHA-256, as numba runs what it reads.
-
-        Code is named after its signature, not numbered: processes that save at the same time never mix it up.
-        """
+        """Files of a kernel that end in their SHA-256; code is named after its signature, for concurrent processes."""
 
         def save(self, key: Any, data: Any) -> None:
             name = f"{self._index_name[:-4]}.{sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
@@ -210,7 +207,7 @@ def _kernel_cache() -> type:
         def _load_data(self, name: str) -> Any:
             path = self._data_path(name)
             if not is_intact(Path(path)):
-                raise FileNotFoundError(path)  # it is compiled anew
+                raise FileNotFoundError(path)  # it is compiled again
             return super()._load_data(name)
 
         @contextmanager
@@ -227,7 +224,7 @@ def _kernel_cache() -> type:
             while waiting:  # kernels of the modules that its module imports kernels from, and so on
                 known = waiting.pop().__globals__
                 constants |= {f"{name} {value}" for name, value in known.items() if isinstance(value, Number)}
-                kernels = [one.py_func for one in known.values() if hasattr(one, "py_func")]
+                kernels = [value.py_func for value in known.values() if hasattr(value, "py_func")]
                 new = {kernel.__code__.co_filename: kernel for kernel in kernels}
                 waiting += [new[file] for file in new.keys() - called]
                 called |= new.keys()

@@ -37,8 +37,8 @@ def described(error: BaseException) -> str:
 def exit_status(program: str, command: Callable[[], int | None], *, resumable: bool = False) -> int:
     """Run a command; what the user can fix, Ctrl-C, SIGTERM or SIGHUP becomes one line on stderr after ``program``.
 
-    Returns the command's exit status (None is 0), 2 after an error, 130 after Ctrl-C and the other signals, where a
-    ``resumable`` command may be run again to go on.
+    Returns the command's exit status (None is 0), 2 after an error, 130 after Ctrl-C and the other signals; a
+    ``resumable`` command may then be run again to continue.
     """
     numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     in_main = threading.current_thread() is threading.main_thread()
@@ -100,7 +100,7 @@ class OutputError(ArbiviewError, RuntimeError):
 
 
 class TrainingError(ArbiviewError, RuntimeError):
-    """A training run with impossible settings or data, or one that cannot go on."""
+    """A training run with impossible settings or data, or one that cannot continue."""
 
 
 class GeometryWarning(UserWarning):

@@ -10,10 +10,7 @@ from typing import BinaryIO
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """Open a regular file to read its bytes.
-
-    OSError, whose ``strerror`` says which, for no such file, a folder, pipe or device, or an impossible name.
-    """
+    """Open a regular file to read its bytes; OSError with a ``strerror`` for anything else and impossible names."""
     try:
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     except ValueError:  # NUL or a lone surrogate

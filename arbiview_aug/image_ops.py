@@ -118,10 +118,7 @@ class Scratch:
         self._local = threading.local()
 
     def get(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> np.ndarray:
-        """Return a buffer of this shape and type, in the memory of the largest one of this name so far.
-
-        Its content is arbitrary but finite: taps of weight 0 read it.
-        """
+        """Return a buffer of a shape and type in reused memory; its content is arbitrary but finite."""
         buffers, size = self._local.__dict__, math.prod(shape)
         buffer = buffers.get(name)
         if buffer is None or buffer.size < size or buffer.dtype != dtype:
@@ -133,10 +130,7 @@ class Scratch:
 
 
 class Memory:
-    """Memory for arrays, used again when nothing refers to them any more: page faults cost more than filling it.
-
-    ``limit`` bytes are kept for the next array of the same size; 0 keeps none.
-    """
+    """Memory for arrays, reused once nothing refers to them: page faults are slow. It keeps ``limit`` bytes."""
 
     def __init__(self, limit: int = 512 * 2**20) -> None:
         self.limit, self._kept, self._lock = limit, 0, threading.Lock()

@@ -73,7 +73,7 @@ class Camera:
             (xi alpha) and ``eucm`` (alpha beta), as Kalibr has them. The formulas are in docs/formats.md.
             ``opencv_radtan``, ``opencv_fisheye`` and ``ds`` are other names.
         distortion: Coefficients of the lens.
-        mask: (H, W) bool, True where the scene is seen, False on the own car's body.
+        mask: (H, W) bool, True where the scene is seen, False on the ego car's body.
 
     Raises:
         CalibrationError: An impossible value; the message names the camera and the fix.
@@ -92,7 +92,7 @@ class Camera:
         self.__dict__.update(checked_calibration(**self.__dict__))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Copies and unpickled cameras are read-only, too, and their centres views: kernels are compiled for those.
+        # Copies are read-only too, and their centres are views: kernels are compiled for such arrays.
         self.__dict__.update({key: value for key, value in state.items() if key != "center_m"})
         for array in (self.K, self.cam2ego, *([] if self.mask is None else [self.mask])):
             array.setflags(write=False)
@@ -122,7 +122,7 @@ class Camera:
 
         ``cam2ego[:3, :3] = R_z(azimuth) B R_x(elevation) R_z(roll)``, where B puts the resting camera's axes
         (right, down, forward) on the ego axes (-y, -z, +x). R_z(azimuth) turns about the ego's z axis (up):
-        positive looks to the left. R_x(elevation) turns about the camera's own x axis (right): positive looks up.
+        positive looks to the left. R_x(elevation) turns about the camera's x axis (right): positive looks up.
         Roll turns about the optical axis: positive turns the camera clockwise as seen from behind it.
         Further arguments are those of ``Camera``.
 
@@ -136,7 +136,7 @@ class Camera:
                 distortion makes both halves of the angle equal. Either this or ``K``.
 
         Raises:
-            CalibrationError: On impossible values, or when both or none of K and horizontal_fov_deg are given.
+            CalibrationError: Impossible values; both or neither of K and horizontal_fov_deg.
         """
         if (K is None) == (horizontal_fov_deg is None):
             raise CalibrationError(f"camera {name!r}: expected either K or horizontal_fov_deg, got both or none")
@@ -281,7 +281,7 @@ class Camera:
         xd = (uv[..., 0] - self.K[0, 2] - self.K[0, 1] * yd) / self.K[0, 0]
         directions = self.lens_model.undistort(xd, yd)
         if self.is_rectilinear:
-            x, y, z = np.moveaxis(directions, -1, 0)  # ten times faster than a reduction over the short axis
+            x, y, z = np.moveaxis(directions, -1, 0)  # faster than a reduction over the short axis
             return Rays(directions, np.isfinite(x) & np.isfinite(y) & np.isfinite(z))
         again = self.project_cam(directions)
         with np.errstate(invalid="ignore"):
@@ -304,11 +304,11 @@ class Camera:
 
         Args:
             size: (h, w) in pixels.
-            fit: ``stretch`` scales each side by itself, ``crop`` covers the size and cuts at the top and both sides,
+            fit: ``stretch`` scales each side separately, ``crop`` covers the size and cuts at the top and both sides,
                 ``pad`` fits inside and adds bars there, where a mask is False.
 
         Raises:
-            CalibrationError: An impossible size, or one that ``crop`` would have to be cut from too large an image.
+            CalibrationError: An impossible size, or one that ``crop`` would cut from too large an image.
         """
         if fit != "stretch":
             frame = framing(self.name, self.size, size, fit)
@@ -347,9 +347,9 @@ class Camera:
         return replace(self, cam2ego=cam2ego)
 
     def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Camera:
-        """Turned about its own centre: yaw about the ego's z (left), pitch about its own x (up), roll about its z.
+        """Turn about the centre: yaw about the ego's z (left), pitch about the camera's x (up), roll about its z.
 
-        The mask stays on the own car: it is re-sampled, and pixels that the old image did not show are not masked.
+        The mask stays on the ego car: it is re-sampled, and pixels that the old image did not show are not masked.
         """
         yaw, pitch, roll = checked_numbers(self._where, "yaw, pitch, roll", (yaw_deg, pitch_deg, roll_deg), 3, _ANGLES)
         cam2ego = self.cam2ego.copy()
@@ -371,7 +371,7 @@ class Camera:
 
 
 def with_mask_of(seen: Camera, camera: Camera, *, outside: bool) -> Camera:
-    """``camera`` with the mask of one at the same centre, and ``outside`` in pixels that the other's image lacks."""
+    """``camera`` with the mask of ``seen``, at the same centre, and ``outside`` in pixels that its image lacks."""
     if seen.mask is None:
         return camera
     views = ((c.lens, c.distortion, c.K.tobytes(), c.cam2ego[:3, :3].tobytes()) for c in (seen, camera))
@@ -382,7 +382,7 @@ def with_mask_of(seen: Camera, camera: Camera, *, outside: bool) -> Camera:
     border: Any = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": int(outside)}
     (h, w), H = camera.size, seen.K @ to_seen @ np.linalg.inv(camera.K)
     is_in_front = (H[2] @ [[0, w, 0, w], [0, 0, h, h], [1, 1, 1, 1]] > 0).all()
-    if seen.is_rectilinear and camera.is_rectilinear and is_in_front:  # a homography, 30 times as fast
+    if seen.is_rectilinear and camera.is_rectilinear and is_in_front:  # a homography is much faster
         mask = cv2.warpPerspective(mask, H, (w, h), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP, **border)
     else:
         directions, has_ray = camera.unproject_cam(camera.pixel_grid())
@@ -392,7 +392,7 @@ def with_mask_of(seen: Camera, camera: Camera, *, outside: bool) -> Camera:
     return replace(camera, mask=mask.astype(bool))
 
 
-@lru_cache(256)  # from frame to frame cameras move, and their lenses stay
+@lru_cache(256)  # from frame to frame poses change, but lenses stay
 def _half_angle_rad(h: int, w: int, lens: LensName, distortion: tuple[float, ...], K: bytes) -> float:
     K_px: Any = np.frombuffer(K).reshape(3, 3)
     camera = Camera(name="lens", width_px=w, height_px=h, K=K_px, cam2ego=np.eye(4), lens=lens, distortion=distortion)

@@ -8,7 +8,7 @@ from arbiview_aug.cameras.validation import MAX_SIZE_PX, checked_size
 from arbiview_aug.errors import CalibrationError, shown
 
 Fit = Literal["crop", "pad", "stretch"]
-"""``stretch`` scales each side by itself; the others keep the aspect ratio. ``crop`` scales to cover the size and cuts
+"""``stretch`` scales each side separately; others keep the aspect ratio. ``crop`` scales to cover the size and cuts
 at the top and both sides. ``pad`` scales to fit inside and adds bars above and at both sides."""
 
 

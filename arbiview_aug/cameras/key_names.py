@@ -45,18 +45,18 @@ _LENSES = {spelling: lens for lens, spellings in _CALLED.items() for spelling in
 """This package's lens by the names that tools give it; ``unified`` is MEI and omni."""
 
 _LIKENESS = 0.88
-"""Least difflib ratio of a misspelling: ``masks`` for ``mask`` has 0.89, ``boxes_2d`` for ``boxes_3d`` 0.875."""
+"""Least difflib ratio of a misspelling: ``masks`` for ``mask`` is one, ``boxes_2d`` for ``boxes_3d`` is not."""
 
 
 def misnamed(entries: Mapping[Any, Any], read: Sequence[str]) -> dict[str, str]:
-    """The keys of ``entries`` that are likely meant as one of the keys that are ``read`` and absent or null."""
+    """Keys of ``entries`` that probably mean one of the ``read`` keys that are absent or null."""
     names = tuple(read)
     meanings = ((key, meant_by(key, names)) for key in entries if isinstance(key, str))
     return {k: meant for k, meant in meanings if meant and entries.get(meant) is None and _could_be(meant, entries[k])}
 
 
 def hint(entries: Iterable[Any], wanted: Sequence[str]) -> str:
-    """Suggestions for an error about missing keys; empty where there are none."""
+    """Suggestions for an error about missing keys; empty without any."""
     names = tuple(wanted)
     pairs = [(key, meant) for key in entries if isinstance(key, str) and (meant := meant_by(key, names))]
     return "".join(f"; found {key!r}: did you mean {meant!r}?" for key, meant in pairs)
@@ -73,7 +73,7 @@ def lens_called(value: Any) -> str | None:
 
 
 def unknown_key(entries: Iterable[Any], known: Sequence[str]) -> str:
-    """The first key of a file of this package's that is not known, for an error; keys that begin with _ are notes."""
+    """Error text for the first unknown key of this package's files; keys that begin with _ are notes."""
     for key in entries:
         if key not in known and not str(key).startswith(("_", ".", "x-")):
             meant = meant_by(key, tuple(known)) if isinstance(key, str) else None
@@ -94,7 +94,7 @@ def meant_by(key: str, names: tuple[str, ...]) -> str | None:
 
 
 def _could_be(meant: str, value: Any) -> bool:
-    """Whether a value can be the key's: paths, counts and 2D boxes have such names too."""
+    """Whether a value fits the key: paths, counts and 2D boxes have similar names."""
     if meant in ("points", "boxes_3d", "depth_m", "neighbours") and isinstance(value, str | Number | Mapping):
         return False
     if meant == "lidar" and isinstance(value, Number):

@@ -256,7 +256,7 @@ class FTheta(_PolynomialLens):
 class FThetaBackward(FTheta):
     """NVIDIA's f-theta with the backward polynomial: θ = r + k2 r² + k3 r³ + k4 r⁴ + k5 r⁵.
 
-    In pixels it is b1 p + ... + b5 p⁵ of the distance p: here kn = bn / b1ⁿ, and 1 / b1 stands for ``FTheta``'s j1.
+    In pixels it is b1 p + ... + b5 p⁵ of the distance p: here kn = bn / b1ⁿ, and 1 / b1 replaces ``FTheta``'s j1.
     Source: as ``FTheta``, polynomial type pixel-distance-to-angle.
     """
 
@@ -268,10 +268,7 @@ class FThetaBackward(FTheta):
 
     @cached_property
     def _largest_radius(self) -> float:
-        """The radius at which the polynomial gives 180 degrees, or rises a tenth as fast as on the axis.
-
-        Where it stops rising, a radian is infinitely many pixels: no image reaches that far. ``_inverse`` reaches 10.
-        """
+        """Radius of 180 degrees, or of a tenth of the slope on the axis: no image reaches further; at most 10."""
         flat, behind = self._slope_polynomial, -np.array([*self.distortion[::-1], 1.0, -math.pi]) / math.pi
         flat[-1] -= 0.1
         return min(_smallest_positive_root(flat / flat[-1]), _smallest_positive_root(behind), 10.0)
@@ -331,7 +328,7 @@ class _SphereLens(Lens):
 class DoubleSphere(_SphereLens):
     """The double sphere model: ξ α, as Kalibr and basalt write them.
 
-    With d1 = |(x, y, z)|, d2 = sqrt(x² + y² + (ξ d1 + z)²): (x, y) / (α d2 + (1 - α) (ξ d1 + z)). K is the tools' own:
+    With d1 = |(x, y, z)|, d2 = sqrt(x² + y² + (ξ d1 + z)²): (x, y) / (α d2 + (1 - α) (ξ d1 + z)). K is as in the tools:
     on the optical axis a radian is K[0, 0] / (1 + ξ) pixels. Source: Usenko, Demmel and Cremers, "The Double Sphere
     Camera Model", 3DV 2018.
     """
@@ -395,7 +392,7 @@ def _smallest_positive_root(polynomial: FloatArray) -> float:
 def intrinsics_for_fov(name: str, fov_deg: float, size: tuple[int, int], lens: Lens) -> FloatArray:
     """Square-pixel K whose outer image edges span ``fov_deg``, half to each side of the principal point.
 
-    It is in the middle of the image, but for a tangential distortion, which makes the sides unequal.
+    That is the middle of the image, except with tangential distortion, which makes the sides unequal.
     """
     largest = 360.0 if lens.sees_behind else 180.0
     if not isinstance(fov_deg, Real) or not 0 < fov_deg < largest:

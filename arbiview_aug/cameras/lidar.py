@@ -16,7 +16,7 @@ from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.validation import checked_numbers, checked_pose, refusal
 from arbiview_aug.errors import CalibrationError, calibration_of, shown
 
-MOST_BEAMS, MOST_RAYS = 1024, 1 << 21  # largest scanner; sensors on sale have 128 beams and 500,000 rays
+MOST_BEAMS, MOST_RAYS = 1024, 1 << 21  # largest scanner, well beyond products (128 beams and 500,000 rays)
 _KEYS = ("name", "lidar2ego", "elevations_deg", "azimuth_step_deg", "range_m")
 
 
@@ -30,7 +30,7 @@ class Lidar:
         elevations_deg: Angle of each beam over the scanner's x-y plane, -90 to 90; a beam's place here is its ring.
         azimuth_step_deg: Angle from column to column.
         range_m: Least and largest distance of returns.
-        azimuth_deg: First azimuth and the end, which has no column of its own; 0 along x, 90 along y.
+        azimuth_deg: First azimuth, and the end of the last column; 0 along x, 90 along y.
 
     Raises:
         CalibrationError: An impossible value; the message names the scanner.

@@ -1,4 +1,4 @@
-"""YAML and JSON files of strangers: plain data of bounded size, where a number is a number."""
+"""Safe loading of untrusted YAML and JSON: plain data of bounded size, with YAML 1.2's numbers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from arbiview_aug.errors import CalibrationError, described, one_line
 from arbiview_aug.files import read_text
 
 MOST_BYTES = 1 << 20
-"""Largest calibration file: 8 KiB a camera. It is counted before it is read: YAML takes seconds a megabyte."""
+"""Largest calibration file: 8 KiB per camera. Checked before parsing, as YAML takes seconds per megabyte."""
 
 _MOST_VALUES = 200_000
 
@@ -27,11 +27,11 @@ _FLOAT = (
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2's numbers and booleans: ``yes`` and ``1:30`` are text."""
+    """Loader of YAML 1.2's numbers and booleans: ``yes`` and ``1:30`` are text."""
 
 
 class _Dumper(yaml.SafeDumper):
-    """Text that the loader would take for a number is quoted, such as ``08`` and ``12e3``."""
+    """Dumper that quotes text which the loader would read as a number, for example ``08`` and ``12e3``."""
 
 
 _Loader.yaml_implicit_resolvers = {"<": yaml.SafeLoader.yaml_implicit_resolvers["<"]}
@@ -51,7 +51,7 @@ def read_plain(path: Path, where: str, most_bytes: int = MOST_BYTES) -> Any:
 
 
 def read_documents(path: Path, where: str, most_bytes: int = MOST_BYTES) -> list[Any]:
-    """Plain data of each document of a file; OpenCV's and Kalibr's first line and tags are taken off."""
+    """Plain data of each document of a file; OpenCV's first line and tags are removed."""
     text = read_calibration_text(path, where, most_bytes)
     try:
         if path.suffix == ".json":
@@ -64,7 +64,7 @@ def read_documents(path: Path, where: str, most_bytes: int = MOST_BYTES) -> list
 
 
 def read_calibration_text(path: Path, where: str, most_bytes: int = MOST_BYTES) -> str:
-    """Text of a calibration file, or CalibrationError that says why there is none."""
+    """Text of a calibration file; CalibrationError if it cannot be read."""
     try:
         return read_text(path, most_bytes)
     except UnicodeError as error:
@@ -75,12 +75,12 @@ def read_calibration_text(path: Path, where: str, most_bytes: int = MOST_BYTES) 
 
 
 def dump_yaml(data: Any) -> str:
-    """Plain data as YAML, in its own order."""
+    """Plain data as YAML; keys keep their order."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=120)
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Data of a JSON document; ValueError for a key that stands twice, of which ``json`` alone takes the last."""
+    """Data of a JSON document; ValueError for a repeated key, of which ``json`` would take the last."""
     return json.loads(text, object_pairs_hook=_without_repeats)
 
 
@@ -93,10 +93,7 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def parse_yaml(text: str) -> Any:
-    """Plain data of a YAML document; YAMLError for anything else.
-
-    ValueError for a key that stands twice, aliases that lead back or multiply to too many values, or a wrong tag.
-    """
+    """Plain data of a YAML document; YAMLError or ValueError for others, repeated keys, or aliases without bound."""
     loader = _Loader(text)
     try:
         node = loader.get_single_node()
@@ -105,14 +102,14 @@ def parse_yaml(text: str) -> Any:
         if _size(node, {}) > _MOST_VALUES:
             raise ValueError(f"more than {_MOST_VALUES} values once its aliases are written out")
         return loader.construct_document(node)
-    except (AttributeError, LookupError) as error:  # of PyYAML's own constructors
+    except (AttributeError, LookupError) as error:  # of PyYAML's constructors
         raise ValueError(f"a value that is not what its tag says ({described(error)})") from None
     finally:
         loader.dispose()  # type: ignore[no-untyped-call]
 
 
 def _size(node: yaml.Node, known: dict[int, int]) -> int:
-    """Number of nodes below one, aliases written out."""
+    """Number of nodes in a tree with its aliases expanded."""
     if not isinstance(node, yaml.CollectionNode):
         return 1
     if id(node) in known:

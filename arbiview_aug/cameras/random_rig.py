@@ -24,9 +24,9 @@ Range = float | tuple[float, float]
 
 
 def sequence_rng(name: object, epoch: int = 0, rng: torch.Generator | None = None) -> torch.Generator:
-    """A generator that is the same for all frames of a named sequence, in all workers of a DataLoader's epoch.
+    """Make a generator that is the same for all frames of a sequence, in all workers of a DataLoader's epoch.
 
-    ``epoch`` changes the draws. Outside workers the initial seed of ``rng``, else of torch's global generator, counts.
+    ``epoch`` changes the draws. Outside workers the initial seed of ``rng`` or torch's global generator is used.
     """
     worker = torch.utils.data.get_worker_info()
     if worker is not None:
@@ -38,7 +38,7 @@ def sequence_rng(name: object, epoch: int = 0, rng: torch.Generator | None = Non
 
 
 class Epochs:
-    """The epoch that draws by sequence depend on: all copies of one object share it, in running workers too."""
+    """Epoch of draws by sequence, shared by all copies of an object, in running workers too."""
 
     def __init__(self) -> None:
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
@@ -49,7 +49,7 @@ class Epochs:
             self._epoch.share_memory_()
 
     def set_epoch(self, epoch: int) -> None:
-        """Change the draws by sequence, also in running workers; ValueError for what is no whole number of 63 bits."""
+        """Change the draws by sequence, also in running workers; ValueError unless a whole number of 63 bits."""
         if not is_whole(epoch, -(2**63), 2**63 - 1):
             raise ValueError(f"set_epoch: expected a whole number below 2**63, got {shown(epoch)}")
         self._epoch.fill_(int(epoch))
@@ -61,12 +61,12 @@ class Epochs:
 
 
 class RandomRig(Epochs):
-    """Target rigs around ``base``: the whole rig turned, moved and zoomed by random amounts; masks follow the own car.
+    """Target rigs around ``base``: the whole rig turned, moved and zoomed by random amounts; masks follow the ego car.
 
     Args:
         base: A rig, the name of a shipped one, or a rig file.
-        yaw_deg: Every camera turned about the vertical through its own centre; positive to the left.
-        pitch_deg: Every camera turned about its own x axis; positive up.
+        yaw_deg: Every camera turned about the vertical through its centre; positive to the left.
+        pitch_deg: Every camera turned about its x axis; positive up.
         roll_deg: Every camera turned about its optical axis.
         height_m: The rig moved up.
         forward_m: The rig moved forward.
@@ -163,10 +163,9 @@ def _range(name: str, value: Any) -> tuple[float, float]:
 
 
 def names_in(key: str, value: Any) -> list[str | None]:
-    """Names of sequences or frames in nested lists, tensors and arrays, as in a collated batch, and None where it is.
+    """Names of sequences or frames, or None, in nested lists, tensors and arrays, as in a collated batch.
 
-    A container that holds itself is read once. SampleTypeError for values without a text that is theirs in all
-    processes.
+    A container within itself is read once. SampleTypeError for values whose text differs between processes.
     """
     names: list[str | None] = []
     seen: dict[int, Any] = {}

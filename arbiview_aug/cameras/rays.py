@@ -1,6 +1,6 @@
-"""Rays of pixels and where other cameras see their points; what plans read of single cameras again and again.
+"""Rays of pixels and their projections into other cameras; caches of single cameras' data for plans.
 
-Directions lie plane by plane in memory, (3, ny, nx): three times faster.
+Directions lie plane by plane in memory, (3, ny, nx), which is faster.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ def project_rays(
 
 def cone_gaps(targets: Rig, sources: Rig) -> FloatArray:
     """Angles (M, N) between the viewing cones of cameras; negative where directions are shared."""
-    axes, others = targets.cam2ego[:, :3, 2], sources.cam2ego[:, :3, 2]
-    spread, further = (np.array([camera.half_angle_rad for camera in rig]) for rig in (targets, sources))
-    return np.asarray(np.arccos(np.clip(axes @ others.T, -1, 1)) - spread[:, None] - further - 0.01)
+    cosine = targets.cam2ego[:, :3, 2] @ sources.cam2ego[:, :3, 2].T
+    target_rad, source_rad = (np.array([camera.half_angle_rad for camera in rig]) for rig in (targets, sources))
+    return np.asarray(np.arccos(np.clip(cosine, -1, 1)) - target_rad[:, None] - source_rad - 0.01)
 
 
 def look_apart(gaps: FloatArray, baselines_m: FloatArray, nearest: float) -> BoolArray:
@@ -111,7 +111,7 @@ class PixelRays:
 
     size: tuple[int, int]  # (h, w)
     parameters: Planes  # ``Camera.parameters``
-    planes: Planes  # (3, h, w) float32 unit rays, 0 where there is none; (3, 0, 0) for a pinhole
+    planes: Planes  # (3, h, w) float32 unit rays, 0 in pixels without one; (3, 0, 0) for a pinhole
     _nodes: dict[int, Planes] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
@@ -150,7 +150,7 @@ class PixelRays:
         return PixelRays(size, parameters, planes)
 
     def nodes(self, apart: int) -> Planes:
-        """Rays (3, ny + 1, nx + 1) of each ``apart``-th pixel and of the last; read-only, as they are kept."""
+        """Rays (3, ny + 1, nx + 1) of each ``apart``-th pixel and of the last; cached, so read-only."""
         nodes = self._nodes.get(apart)
         if nodes is None:
             nodes = self.at(*(np.minimum(np.arange(0, n + apart, apart), n - 1) for n in self.size))
@@ -172,10 +172,7 @@ class PixelRays:
 
 
 class RayCache:
-    """Rays and masks of cameras by their content: what is costly and does not change from frame to frame.
-
-    ``memory`` is that of what does change.
-    """
+    """Rays and masks of cameras by their content, which stay from frame to frame; ``memory`` serves other arrays."""
 
     def __init__(self) -> None:
         self._cache: LRUCache[Any, Any] = LRUCache(_MAX_BYTES, lambda item: item.nbytes)
@@ -185,15 +182,15 @@ class RayCache:
         return RayCache, ()
 
     def rays(self, camera: Camera, known: PixelRays | None = None) -> PixelRays:
-        """The rays of a camera; ``known`` are taken for it from now on."""
+        """The rays of a camera; ``known`` ones are cached for it."""
         return self._cache.get(_lens_key(camera), lambda: known or pixel_rays(camera))
 
     def of_lens(self, camera: Camera, key: Any, make: Callable[[], Planes]) -> Planes:
-        """Result of ``make`` for the rays of a camera; held."""
+        """Result of ``make`` for the rays of a camera; cached."""
         return self._cache.get((_lens_key(camera), key), make)
 
     def clean_pixels(self, camera: Camera, level: int) -> npt.NDArray[np.uint8]:
-        """255 (h, w) where a source halved ``level`` times shows no part of the own car; (0, 0) without a mask."""
+        """255 (h, w) where a source halved ``level`` times shows no part of the ego car; (0, 0) without a mask."""
 
         def clean(mask: BoolArray) -> Any:
             pixels: Any = mask.view(np.uint8) * np.uint8(255)
@@ -205,15 +202,15 @@ class RayCache:
         """Distance (px) of each cell of ``CELL_PX`` to a source's mask; (0, 0) without one."""
         return self._of_mask(camera, "distance", distance_to_mask, _NO_DISTANCE)
 
-    def _of_mask(self, camera: Camera, name: Any, make: Callable[[Any], Any], none: Any) -> Any:
+    def _of_mask(self, camera: Camera, name: Any, make: Callable[[Any], Any], default: Any) -> Any:
         if camera.mask is None:
-            return none
+            return default
         mask = camera.mask
-        return self._cache.get((camera.mask_key, name), lambda: none if mask.all() else make(mask))
+        return self._cache.get((camera.mask_key, name), lambda: default if mask.all() else make(mask))
 
 
 def _lens_key(camera: Camera) -> Any:
-    """Key of all that the rays of a camera's pixels depend on."""
+    """Cache key of the rays of a camera's pixels."""
     return camera.size, camera.lens, camera.distortion, camera.K.tobytes()
 
 
@@ -238,7 +235,7 @@ def relative_pose(target: Camera, source: Camera) -> tuple[Planes, Planes]:
 
 
 def source_pixels(target: Camera, rays: Planes, inverse_distance: Planes, source: Camera) -> tuple[Planes, Planes]:
-    """As ``pixels_of``, for rays in the frame of a target; both cameras are in one ego frame."""
+    """Pixels of a source for scene points on a target's rays, as ``pixels_of``; both cameras are in one ego frame."""
     return pixels_of(rays, inverse_distance, *relative_pose(target, source), source)
 
 
@@ -262,10 +259,7 @@ def pixels_of(rays: Planes, inverse_distance: Planes, A: Any, o: Any, source: Ca
 
 
 def edge_distance(camera: Camera, uv: FloatArray) -> FloatArray:
-    """Distance (px) of pixels (..., 2) to the border of what a source sees.
-
-    The outermost pixel centres are 0.5 inside it; outside the image it is negative.
-    """
+    """Distance (px) of pixels (..., 2) to the border of what a source sees: 0.5 at the outermost, negative outside."""
     from arbiview_aug.cameras.kernels import edge_distance_row
 
     u, v = (np.ascontiguousarray(uv[..., k], np.float32).ravel() for k in range(2))
@@ -283,5 +277,5 @@ def distance_to_mask(mask: Any) -> Any:
     coarse = cv2.resize(clean, (-(-w // CELL_PX), -(-h // CELL_PX)), interpolation=cv2.INTER_AREA)
     free = np.pad((coarse >= 1).astype(np.uint8), 1, constant_values=1)
     distance = cv2.distanceTransform(free, cv2.DIST_L2, 3)[1:-1, 1:-1]
-    # It is the largest float where nothing is masked.
+    # Without a mask the distance is the largest float.
     return np.minimum(distance, np.float32(1e6)) * np.float32(CELL_PX)

@@ -2,7 +2,7 @@
 
 A rig file (YAML or JSON) holds ``name``, ``ground_z_m`` and ``cameras``, each with ``name``, ``width``, ``height``,
 ``K`` (3x3), ``cam2ego`` (4x4), ``distortion`` (null or ``{model: LENS, coeffs: [...]}``) and optionally
-``mask`` (a PNG beside the file, white = scene); optionally ``lidars``, each with the arguments of ``Lidar``.
+``mask`` (a PNG next to the file, white = scene); optionally ``lidars``, each with the arguments of ``Lidar``.
 ``source``, ``notes``, ``ego_frame``, ``ground_source``, ``dataset``, ``kind`` and ``license`` document it.
 """
 
@@ -52,7 +52,7 @@ class Rig:
         cameras: One or more cameras with different names; all ``cam2ego`` are in this rig's ego frame.
         ground_z_m: Height of the road in that frame (-0.33 where the origin is a rear axle 0.33 m above it).
         name: A label for tables and messages.
-        lidars: Scanners with different names, in the same frame; none by default.
+        lidars: Scanners with different names, in the same frame.
 
     Raises:
         CalibrationError: No cameras or more than 128, duplicate names, or a ground height that is not finite.
@@ -72,8 +72,8 @@ class Rig:
         lidars = tuple(self.lidars) if isinstance(self.lidars, Sequence) else (self.lidars,)
         sensors: tuple[Any, ...]
         for kind, sensors in ((Camera, cameras), (Lidar, lidars)):
-            if others := [type(sensor).__name__ for sensor in sensors if not isinstance(sensor, kind)]:
-                raise CalibrationError(f"{where}: expected {kind.__name__} objects, got {others[0]}")
+            if wrong := [type(sensor).__name__ for sensor in sensors if not isinstance(sensor, kind)]:
+                raise CalibrationError(f"{where}: expected {kind.__name__} objects, got {wrong[0]}")
             twice = sorted(name for name, count in Counter(sensor.name for sensor in sensors).items() if count > 1)
             if twice:
                 kinds, got = kind.__name__.lower(), ", ".join(name[:100] for name in twice[:5])
@@ -159,7 +159,7 @@ class Rig:
 
     @cached_property
     def named_key(self) -> bytes:
-        """``content_key`` and names, for what is kept and shown."""
+        """``content_key`` and names, for cached values that show names."""
         names = self.name, *(camera.name for camera in self.cameras), *(lidar.name for lidar in self.lidars)
         return self.content_key + repr(names).encode()
 
@@ -178,7 +178,7 @@ class Rig:
         return self.with_cameras([c.resize(to, fit) for c, to in zip(self, sizes, strict=True)])
 
     def turned(self, *, yaw_deg: float = 0.0, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Rig:
-        """Each camera turned about its own centre, see ``Camera.turned``; scanners stay."""
+        """Turn each camera about its centre, see ``Camera.turned``; scanners stay."""
         return self.with_cameras([c.turned(yaw_deg=yaw_deg, pitch_deg=pitch_deg, roll_deg=roll_deg) for c in self])
 
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Rig:
@@ -236,7 +236,7 @@ class Rig:
             return cls(cameras, ground_z_m=data.get("ground_z_m", 0.0), name=name, lidars=lidars)
 
     def save(self, path: str | Path) -> Path:
-        """Write the rig to a .yaml, .yml or .json file; masks become PNGs beside it. Returns the path.
+        """Write the rig to a .yaml, .yml or .json file, and masks to PNGs next to it. Returns the path.
 
         The folder is created. CalibrationError for another suffix, OutputError for a file that cannot be written.
         """
@@ -258,10 +258,9 @@ class Rig:
 def load_rig(name_or_path: Rig | str | Path) -> Rig:
     """A shipped rig by name (see ``shipped_rigs``), a rig file (YAML or JSON), or another tool's calibration.
 
-    Recognised are files and folders of ROS and Foxglove (CameraInfo, with tf), OpenCV, Python scripts, Kalibr, COLMAP,
-    nuScenes, Argoverse 2, Waymo and WoodScape, with a file ``mounting.yaml`` beside them that holds what they lack
-    (docs/rigs.md). Cameras that are likely wrong give one warning. Files are read by safe parsers. A ``Rig`` is
-    returned unchanged.
+    Other tools are ROS and Foxglove (CameraInfo, with tf), OpenCV, Python scripts, Kalibr, COLMAP, nuScenes,
+    Argoverse 2, Waymo and WoodScape; a file ``mounting.yaml`` next to theirs completes them (docs/rigs.md). Cameras
+    that are likely wrong give one warning. Files are read by safe parsers. A ``Rig`` is returned unchanged.
 
     Raises:
         CalibrationError: An unknown name, a missing or unreadable file, or an impossible or ambiguous calibration.
@@ -279,7 +278,7 @@ def load_rig(name_or_path: Rig | str | Path) -> Rig:
 
 
 def read_rig(path: Path) -> tuple[Rig, str]:
-    """As ``load_rig``, of a file or folder, and how that was read; one warning names likely mistakes."""
+    """Load a rig from a file or folder as ``load_rig``, with a note on how it was read."""
     where = f"rig file {path}"
     if not os.path.exists(path):  # unlike Path.exists, False for a name that is too long
         expected = f"a file or one of the shipped rigs ({', '.join(shipped_rigs())})"
@@ -335,7 +334,7 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
 
 
 def _refuse_misnamed(entries: Mapping[str, Any], keys: Sequence[str], label: str) -> None:
-    """Refuse other names of keys that are absent or null, which would not be read; of numbers, text may be a note."""
+    """Refuse misspelt names of absent keys, which would not be read; text may be a note."""
     for wrong, key in misnamed(entries, keys).items():
         value = entries[wrong]
         is_zero = not any(value) if isinstance(value, list) else not value
@@ -359,5 +358,5 @@ def read_mask(file: Any, folder: Path | None, label: str) -> np.ndarray:
 
 
 def content_order(cameras: Sequence[Camera]) -> list[int]:
-    """Indices of cameras in an order that depends on their calibration alone, not on their place in the list."""
+    """Indices of cameras in an order that depends on their calibrations alone, not on their order in the list."""
     return sorted(range(len(cameras)), key=lambda k: (cameras[k].content_key, k))

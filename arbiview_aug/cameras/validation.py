@@ -1,7 +1,7 @@
 """Checks of a camera's calibration, and likely mistakes of a rig's.
 
-``checked_...`` first take whose value it is ("camera 'front'"). They return read-only values and raise
-``CalibrationError`` with the fix.
+The first argument of ``checked_...`` names the owner of the value ("camera 'front'"). They return read-only values and
+raise ``CalibrationError`` with the fix.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from arbiview_aug.errors import CalibrationError, one_line, shown
 ROTATION_TOLERANCE = 1e-4
 """Largest entry of |R Rᵀ - I| accepted as a rotation: published calibrations carry 5 to 7 digits."""
 
-_MAX_COEFFICIENT = 1e6  # real lenses stay below 1e3, and near 1e300 their polynomials overflow
+_MAX_COEFFICIENT = 1e6  # far above those of real lenses; polynomials of huge ones overflow
 _SHORTEST_PX = 1e-6  # focal length; the inverse of 5e-324 is infinite
 _MOST_PX = 1e9  # of K's entries: float32 squares stay finite
-MOST_M = 1e9  # of positions, as far
+MOST_M = 1e9  # of positions, for the same reason
 
 _FARTHEST_M, _MOST_HEIGHT_M = 20.0, 8.0  # of a vehicle's cameras, from the ego origin and over the road
 
@@ -37,14 +37,14 @@ _COMPARE = "compare docs/rigs.md"  # the fix of an unknown mistake
 _AS_MOUNTED = "turn the image, or mend its pose; ignore this if it is mounted like that"
 _STEEP_DEG, _DOWN_DEG = 60.0, -75.0  # cameras of vehicles roll less and look up less; few look down more
 _TILTED, _LEVEL, _STRAIGHT = 0.5, 0.35, 0.95  # sines of 30, 20 and 72 degrees
-_SAME_COSINE = 0.94  # of 20 degrees: such a mistake hardly turns this camera
+_SAME_COSINE = 0.94  # cosine of 20 degrees: smaller turns are no mistake that shows
 
 _LEAST_NAMED, _ALIKE = 3, 0.8
-"""Cameras with sides in their names, and the length of the mean of their turns' unit vectors, to tell of the set."""
+"""Least number of cameras with sides in their names, and least length of their turns' mean unit vector, for a set."""
 
 _OFF_CENTER, _OFF_CENTER_ALONE, _ALIKE_OFF = 0.04, 0.08, 0.06
-"""Principal points off centre by such a share of the width, in all cameras or in one alone, and by about the same of
-the height, are another resolution's. Real ones are off by up to 0.02 of the width, in both directions."""
+"""Principal points off centre by this share of the width, in all cameras or in one alone, and by about the same share
+of the height, belong to another resolution."""
 
 BODY_AXES = "a body's axes (ROS: x forward, z up)"  # words of messages
 
@@ -79,7 +79,15 @@ def checked_calibration(
         raise CalibrationError(f"camera name: expected a non-empty string of Unicode, got {shown(name)}")
     where = f"camera {shown(name)}"
     w, h = checked_pixels(where, "width_px", width_px), checked_pixels(where, "height_px", height_px)
-    K, cam2ego = _checked_intrinsics(where, K), checked_pose(where, cam2ego)
+    K, cam2ego = checked_array(where, "K", K, (3, 3)), checked_pose(where, cam2ego)
+    if K[0, 0] < _SHORTEST_PX or K[1, 1] < _SHORTEST_PX:
+        expected = f"positive focal lengths, {_SHORTEST_PX:g} px at least"
+        raise refusal(where, "K", expected, f"fx {K[0, 0]:g}, fy {K[1, 1]:g}")
+    if np.abs(K).max() > _MOST_PX:
+        raise refusal(where, "K", f"entries of at most {_MOST_PX:g} px", f"{K.tolist()}")
+    if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or abs(K[2, 2] - 1) > 1e-9:
+        fix = "pass K.T" if np.any(K[2, :2]) and not np.any(K[:2, 2]) else "divide K by K[2, 2]"
+        raise refusal(where, "K", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]", f"{K.tolist()}", fix)
     known = canonical_name(lens) if isinstance(lens, str) else ""
     if known not in LENSES:
         raise refusal(where, "lens", f"one of {', '.join(LENSES)}", shown(lens))
@@ -157,20 +165,6 @@ def _holds_booleans(value: Sequence[Any]) -> bool:
     return any(isinstance(entry, bool) for row in (value, *rows) for entry in row)
 
 
-def _checked_intrinsics(where: str, value: Any) -> FloatArray:
-    """(3, 3) K: upper triangular, normalised, with positive focal lengths."""
-    K = checked_array(where, "K", value, (3, 3))
-    if K[0, 0] < _SHORTEST_PX or K[1, 1] < _SHORTEST_PX:
-        expected = f"positive focal lengths, {_SHORTEST_PX:g} px at least"
-        raise refusal(where, "K", expected, f"fx {K[0, 0]:g}, fy {K[1, 1]:g}")
-    if np.abs(K).max() > _MOST_PX:
-        raise refusal(where, "K", f"entries of at most {_MOST_PX:g} px", f"{K.tolist()}")
-    if K[1, 0] != 0 or K[2, 0] != 0 or K[2, 1] != 0 or abs(K[2, 2] - 1) > 1e-9:
-        fix = "pass K.T" if np.any(K[2, :2]) and not np.any(K[:2, 2]) else "divide K by K[2, 2]"
-        raise refusal(where, "K", "[[fx, s, cx], [0, fy, cy], [0, 0, 1]]", f"{K.tolist()}", fix)
-    return K
-
-
 def is_rigid(pose: FloatArray) -> bool:
     """Whether an array is a finite pose (4, 4): a rotation, within 1e-3, and a position over 0 0 0 1."""
     if pose.shape != (4, 4) or not np.isfinite(pose).all() or not np.allclose(pose[3], (0, 0, 0, 1)):
@@ -222,8 +216,8 @@ def checked_distortion(where: str, lens: str, value: Any) -> tuple[float, ...]:
     counts = LENSES[lens].coefficient_counts
     if len(coefficients) not in counts:
         expected = " or ".join(map(str, counts)) + f" coefficients for a {lens} lens"
-        others = " or ".join(f"lens={other!r}" for other in LENSES if LENSES[other].coefficient_counts != (0,))
-        fix = f"name the lens: {others}" if counts == (0,) else "docs/formats.md, Lenses, has them"
+        names = " or ".join(f"lens={name!r}" for name in LENSES if LENSES[name].coefficient_counts != (0,))
+        fix = f"name the lens: {names}" if counts == (0,) else "docs/formats.md, Lenses, has them"
         raise refusal(where, "distortion", expected, str(len(coefficients)), fix)
     if not all(abs(k) <= _MAX_COEFFICIENT for k in coefficients):  # also catches NaN
         raise refusal(where, "distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", shown(coefficients))
@@ -235,7 +229,7 @@ def checked_distortion(where: str, lens: str, value: Any) -> tuple[float, ...]:
 
 
 def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | None:
-    """Guess what poses (N, 4, 4) are instead, and name the fix; None if most cameras stand upright over the road."""
+    """Guess the mistake in poses (N, 4, 4), and the fix; None if most cameras are upright over the road."""
     looks_down = cam2ego[:, 2, 2] < -0.8  # such cameras have no lower edge
     if ((_stands(cam2ego) | looks_down) & is_mounted(cam2ego, ground_z_m)).mean() >= 0.5:
         return None
@@ -254,10 +248,7 @@ def pose_mistake(cam2ego: FloatArray, ground_z_m: float) -> tuple[str, str] | No
 
 
 def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[Finding]:
-    """Likely mistakes in the cameras of a rig: poses, directions unlike their names, K of another size.
-
-    Some may be meant so: cameras that are mounted on their side, or crosswise.
-    """
+    """Likely mistakes in the cameras of a rig: poses, directions unlike their names, K of another size."""
     cam2ego = np.stack([camera.cam2ego for camera in cameras])
     mistake = pose_mistake(cam2ego, ground_z_m)
     upright = "cameras upright over the road: cam2ego with axes right, down, forward, in metres"
@@ -266,9 +257,9 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[Finding]:
     sides = [_side(camera.name) for camera in cameras]
     has_front = (1, 0) in sides
     if not is_known or is_body:
-        of_set = _set_mistake(cam2ego, sides, is_body)
-        if of_set is not None:
-            return [Finding("cam2ego", "cameras that look where their names say", *of_set)]
+        set_mistake = _set_mistake(cam2ego, sides, is_body)
+        if set_mistake is not None:
+            return [Finding("cam2ego", "cameras that look where their names say", *set_mistake)]
     if is_known:
         return general
     up = cam2ego[:, 2, 2]
@@ -300,7 +291,7 @@ def doubts(cameras: Sequence[Any], ground_z_m: float) -> list[Finding]:
 
 
 def pose_doubt(camera: Any, has_front: bool) -> tuple[str, str] | None:
-    """What is expected and found of a camera that lies, looks up, or looks elsewhere than its name says; or None."""
+    """Expected and found pose of a camera that lies, looks up, or looks elsewhere than its name says; or None."""
     pose, up_deg, side = camera.cam2ego, camera.elevation_deg, _side(camera.name)
     if up_deg > _STEEP_DEG or (up_deg < _DOWN_DEG and side[1]):
         return "a level camera", f"it looks {'up' if up_deg > 0 else 'down'} by {abs(up_deg):.0f} degrees"
@@ -313,9 +304,9 @@ def pose_doubt(camera: Any, has_front: bool) -> tuple[str, str] | None:
 
 
 def likely_poses(camera: Any, ground_z_m: float, has_front: bool) -> Iterator[tuple[FloatArray, str, str]]:
-    """Poses (4, 4) that a camera's may stand for, what it is instead, and the fix, the likeliest first.
+    """Poses (4, 4) that were probably meant, the mistake in the given one, and the fix; the likeliest first.
 
-    The camera is upright, nearly level and on the vehicle in each, and looks where its name says.
+    With each, the camera is upright, nearly level and on the vehicle, and looks where its name says.
     """
     side = _side(camera.name)
     staying_first = sorted(
@@ -358,13 +349,13 @@ def _size_doubts(cameras: Sequence[Any]) -> list[Finding]:
         is_turned = max(abs(x), abs(y)) > 0.1 and np.abs(middle / (h, w) - 0.5).max() < 0.05
         if is_scaled or is_turned or max(abs(x), abs(y)) > 0.5:
             where, expected = f"camera {shown(camera.name)}: K", f"a principal point near the middle of {w}x{h} pixels"
-            is_of = "the middle of about {:.0f}x{:.0f} pixels".format(*2 * middle)
-            found.append(Finding(where, expected, is_of, "is K of another resolution? Camera.resize scales it"))
+            seen = "the middle of about {:.0f}x{:.0f} pixels".format(*2 * middle)
+            found.append(Finding(where, expected, seen, "is K of another resolution? Camera.resize scales it"))
     return found
 
 
 def _side(name: str) -> tuple[int, int]:
-    """Forward 1 or backward -1, left 1 or right -1, by the words of a name; 0 without or with both."""
+    """Side in a camera's name: forward 1 or backward -1, left 1 or right -1; 0 for neither or both."""
     words = {*re.findall("front|forward|back|rear|left|right|mirror|stereo", name.lower())}
     if words & {"mirror", "stereo"}:  # rear-view mirrors are at the front, a stereo pair's left and right look ahead
         return 0, 0
@@ -372,7 +363,7 @@ def _side(name: str) -> tuple[int, int]:
 
 
 def _belies(pose: FloatArray, side: tuple[int, int], has_front: bool) -> bool:
-    """Whether a camera looks elsewhere than its name says; left and right without a front may be a stereo pair."""
+    """Whether a camera does not look where its name says; left and right without a front may be a stereo pair."""
     flat = math.hypot(*pose[:2, 2])
     most_deg = 100 if all(side) else 80 if has_front or side[0] else 110
     cosine = np.dot(pose[:2, 2], side) / max(flat * math.hypot(*side), 1e-9)
@@ -380,7 +371,7 @@ def _belies(pose: FloatArray, side: tuple[int, int], has_front: bool) -> bool:
 
 
 def _candidates(cam2ego: FloatArray) -> Iterator[tuple[FloatArray, str, str]]:
-    """Poses (N, 4, 4) that wrong ones may stand for, what these are instead, and the fix."""
+    """Poses (N, 4, 4) that were perhaps meant, the mistake in the given ones, and the fix."""
     body, metres, turned = np.eye(4), cam2ego.copy(), cam2ego.copy()
     body[:3, :3] = CAMERA_AXES_IN_EGO
     metres[:, :3, 3] /= 1000
@@ -414,6 +405,6 @@ def is_mounted(cam2ego: FloatArray, ground_z_m: float) -> BoolArray:
 
 
 def refusal(where: str, field: str, expected: str, got: Any, fix: str = "") -> CalibrationError:
-    """The error of a value: whose it is, its name, what was expected, what was given."""
+    """Error for a value: its owner, its name, the expected and the given value."""
     prefix = "".join(f"{part}: " for part in (where, field) if part)
     return CalibrationError(f"{prefix}expected {expected}, got {got}{f'; {fix}' if fix else ''}")

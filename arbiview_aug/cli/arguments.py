@@ -40,7 +40,7 @@ class _HelpFormatter(argparse.HelpFormatter):
 def command_parser(
     command: str, description: str, example: str, program: str = "python -m arbiview_aug"
 ) -> argparse.ArgumentParser:
-    """Create the parser of a command, without its options; ``example`` shows arguments at work."""
+    """Create the parser of a command, without its options; ``example`` shows typical arguments."""
     prog = f"{program} {command}".strip()
     return argparse.ArgumentParser(
         prog=prog, description=description, epilog=f"example: {prog} {example}", formatter_class=_HelpFormatter
@@ -65,13 +65,13 @@ def data(text: str) -> str:
     path(text if kind is None else text.partition(":")[2])
     kinds = kinds_of(root) if kind is None else [kind]
     if len(kinds) > 1:
-        others = " or ".join(f"{other}:{text}" for other in kinds[1:])
-        print(f"{text}: taken as a {READERS[kinds[0]].description}; otherwise: {others}", file=sys.stderr)
+        alternatives = " or ".join(f"{kind}:{text}" for kind in kinds[1:])
+        print(f"{text}: taken as a {READERS[kinds[0]].description}; otherwise: {alternatives}", file=sys.stderr)
     return text
 
 
 def is_rig(text: str) -> bool:
-    """Whether an argument names no data but a rig: what is no folder, or another tool's calibration."""
+    """Whether an argument names a rig and no data: anything but a folder, or another tool's calibration."""
     kind, root = split_kind(text)
     if kind is not None or not os.path.isdir(root):
         return kind is None
@@ -193,7 +193,7 @@ def options() -> dict[str, dict[str, Any]]:
 
 
 def add_options(parser: argparse.ArgumentParser, *flags: str, without: str = "", **changes: Any) -> None:
-    """Add options; ``changes`` replace what ``options`` says of them, ``without`` tells their default."""
+    """Add options; ``changes`` replace entries of ``options``, ``without`` describes the default."""
     for flag in flags:
         option = {**options().get(flag, {}), **changes}
         option["help"] += f" (default: {without})" if without else ""
@@ -238,7 +238,7 @@ def output_file(asked: str, endings: Sequence[str] = ()) -> Path:
 
 @contextmanager
 def gathered_warnings(lines: list[str]) -> Iterator[None]:
-    """Collect warnings but for deprecations in ``lines``, as ``told_once`` tells them."""
+    """Collect warnings other than deprecations in ``lines``, shortened by ``told_once``."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -247,16 +247,16 @@ def gathered_warnings(lines: list[str]) -> Iterator[None]:
 
 
 def told_once(texts: Iterable[str]) -> list[str]:
-    """Messages of a run: the first of those that differ in numbers and quoted names alone, with the others counted."""
+    """Messages of a run; of those that differ only in numbers and quoted names the first, with a count of the rest."""
     alike: dict[str, list[str]] = {}
     for text in dict.fromkeys(texts):
         alike.setdefault(re.sub(r"'[^']*'|\d+", "#", text), []).append(text)
-    return [f"{first} ({len(others)} more like it)" if others else first for first, *others in alike.values()]
+    return [f"{first} ({len(rest)} more like it)" if rest else first for first, *rest in alike.values()]
 
 
 @contextmanager
 def named_steps(notes: list[str], frames: int = 1) -> Iterator[Callable[[str, int], None]]:
-    """Collect warnings in ``notes``; yields a function to call before each step with its name and steps a frame."""
+    """Collect warnings in ``notes``; yield a function to call before each step with its name and steps per frame."""
     with gathered_warnings(notes), tqdm(unit="step", leave=False) as bar:
 
         def tick(name: str, steps: int) -> None:

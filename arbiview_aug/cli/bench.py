@@ -48,7 +48,7 @@ Row = Mapping[str, Any]
 
 REFERENCE: Reduce = 2  # decoding factor of the images whose colours score
 _ROUNDS, _LEAST_ROUNDS = 9, 3  # a median of fewer is a single time
-_ENOUGH_MS = 1000.0  # keeps a sweep of 30 settings at two minutes
+_ENOUGH_MS = 1000.0  # time measured for a setting after which it is not called again
 
 
 class Setting(NamedTuple):
@@ -103,7 +103,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
                 raise DataError(f"data {arguments.data}: expected LiDAR points or several cameras, to score by")
             return [held_out(sample, place, reference) for place in range(len(sample["rig"]))]
         frame, points = (
-            make_frame(given, exposures=("even",), hand_over_points=True).lidar["even"] for given in (sample, reference)
+            make_frame(each, exposures=("even",), hand_over_points=True).lidar["even"] for each in (sample, reference)
         )
         return [ScoredFrame(frame.sample, {"even": LidarReference(frame.sample, points.points)}, True)]
 
@@ -119,7 +119,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         if "paper" in arguments.quality:
             print(f"note: left out, {left_out}", file=sys.stderr)
         arguments.quality = [quality for quality in arguments.quality if quality != "paper"]
-    if "paper" in arguments.quality:  # homographies know no lens; all settings share the target
+    if "paper" in arguments.quality:  # homographies have no lens; all settings share the target
         target = target.undistorted()
 
     num_frames = min(arguments.frames, len(opened[reduces[0]]))
@@ -152,18 +152,17 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         calls[f"decode 1/{reduce}"] = partial(data.__getitem__, 0)
     # CPU time leaves out waiting on a busy machine. Each round runs every call in turn, once to warm its caches and
     # once measured, so that other load slows all alike.
-    taken: dict[str, list[float]] = {name: [] for name in calls}
+    times_ms: dict[str, list[float]] = {name: [] for name in calls}
     for number in tqdm(range(_ROUNDS), desc="times", unit="round", leave=False):
         for name, call in calls.items():
-            if number < _LEAST_ROUNDS or sum(taken[name]) < _ENOUGH_MS:
+            if number < _LEAST_ROUNDS or sum(times_ms[name]) < _ENOUGH_MS:
                 call()
-                taken[name].append(1e3 * timeit(call, timer=process_time, number=1))
+                times_ms[name].append(1e3 * timeit(call, timer=process_time, number=1))
     for row in rows:
-        row["q1_ms"], row["median_ms"], row["q3_ms"] = np.quantile(taken[row["name"]], (0.25, 0.5, 0.75)).tolist()
-        decode_ms = float(np.median(taken[f"decode 1/{row['reduce']}"]))
+        row["q1_ms"], row["median_ms"], row["q3_ms"] = np.quantile(times_ms[row["name"]], (0.25, 0.5, 0.75)).tolist()
+        decode_ms = float(np.median(times_ms[f"decode 1/{row['reduce']}"]))
         row |= {"decode_ms": decode_ms, "decode_ratio": row["median_ms"] / decode_ms}
-    front = {row["name"] for row in pareto_front(rows)}
-    against = "photographs of cameras rendered from the others"
+    front, against = {row["name"] for row in pareto_front(rows)}, "photographs of cameras rendered from the others"
     return {
         "clock": "CPU time of the process, milliseconds, one thread",
         "versions": versions(),
@@ -177,7 +176,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def pareto_front(rows: Sequence[Row]) -> list[Row]:
-    """Rows that no other beats in both ``median_ms`` and ``psnr_db``, fastest first."""
+    """Rows that no other row beats in both ``median_ms`` and ``psnr_db``, fastest first."""
     front: list[Row] = []
     for row in sorted(rows, key=lambda row: (row["median_ms"], -row["psnr_db"])):
         if not front or row["psnr_db"] > front[-1]["psnr_db"]:
@@ -201,10 +200,7 @@ NOTES = (
 
 
 def table(report: Mapping[str, Any]) -> str:
-    """Markdown table, fastest setting first, and why static surfaces should not be chosen.
-
-    Shows the front, and other settings at the decoded size of the fastest one.
-    """
+    """Markdown table of the front and of settings at the fastest one's decoded size, and a note on static surfaces."""
     h, w = report["size"]
     rows = sorted(report["settings"], key=lambda row: row["median_ms"])
     shown = [{**row, "mark": "front" if row["front"] else ""} for row in rows]

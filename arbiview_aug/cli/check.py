@@ -19,7 +19,7 @@ from arbiview_aug.sample.frame import Frame
 from arbiview_aug.sample.inputs import read_frames
 from arbiview_aug.sample.mistakes import CheckReport, check, check_own_car, check_rig
 
-_MOST_HELD = 8  # frames in memory at once, in which the own car is looked for
+_MOST_FRAMES = 8  # in memory at once, to look for the own car in
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -38,15 +38,15 @@ def run(arguments: argparse.Namespace) -> int:
         errors: dict[tuple[str, str], list[FloatArray]] = {}
         for index in chosen:
             sample = samples[index]
-            if index in chosen[:: -(-len(chosen) // _MOST_HELD)]:
+            if index in chosen[:: -(-len(chosen) // _MOST_FRAMES)]:
                 frames += read_frames(sample, None)
             for finding in check(sample).findings:
                 lines.setdefault((finding.where, finding.fix), []).append(str(finding))
-            for pair, found in neighbour_errors(sample["rig"], sample["images"]).items():
-                errors.setdefault(pair, []).append(found)
+            for pair, pair_errors in neighbour_errors(sample["rig"], sample["images"]).items():
+                errors.setdefault(pair, []).append(pair_errors)
             if index == chosen[0]:
-                given = sample.get("points"), sample.get("boxes_3d")
-                points, boxes = (None if value is None else value.numpy() for value in given)
+                labels = sample.get("points"), sample.get("boxes_3d")
+                points, boxes = (None if value is None else value.numpy() for value in labels)
                 for camera, image in zip(sample["rig"], as_arrays(sample["images"]), strict=True):
                     picture = draw_labels(camera, image, points, boxes)
                     save_picture(folder / f"check-{file_name(camera.name)}.png", picture)
@@ -54,12 +54,12 @@ def run(arguments: argparse.Namespace) -> int:
             lines[finding.where, finding.fix] = [str(finding)] * len(chosen)
     for note in notes:
         print(note)
-    for same in lines.values():
-        print(same[0] if len(chosen) == 1 else f"{same[0]} ({len(same)} of {len(chosen)} frames)")
+    for findings in lines.values():
+        print(findings[0] if len(chosen) == 1 else f"{findings[0]} ({len(findings)} of {len(chosen)} frames)")
     if errors:
-        angles = [f"{one}, {two} {np.median(np.concatenate(found)):.2f}" for (one, two), found in errors.items()]
+        angles = [f"{', '.join(pair)} {np.median(np.concatenate(parts)):.2f}" for pair, parts in errors.items()]
         print(f"degrees between matches of neighbouring cameras, median: {'; '.join(angles)}")
     count = len(notes) + len(lines)
-    told = f"{count or 'no'} finding{'s' * (count != 1)} in {len(chosen)} of {len(samples)} frames"
-    print(f"{told}; pictures: {folder}/check-*.png")
+    summary = f"{count or 'no'} finding{'s' * (count != 1)} in {len(chosen)} of {len(samples)} frames"
+    print(f"{summary}; pictures: {folder}/check-*.png")
     return int(count > 0)

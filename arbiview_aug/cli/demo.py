@@ -29,7 +29,7 @@ from arbiview_aug.transforms.warm_up import compiling
 PICTURE_FILE = "demo.png"
 _COMPARED: tuple[GeometryName, ...] = ("street", "ground", "infinity")
 _TIMED_CALLS = 3
-_OTHER_M = 1e-4  # shift of cameras and boxes that makes them others, and nothing else
+_SHIFT_M = 1e-4  # of cameras and boxes, so that no plan fits them
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -49,8 +49,8 @@ def run(arguments: argparse.Namespace) -> None:
     quality, geometry, holes = arguments.quality, arguments.geometry, arguments.holes
     is_paper = quality == "paper"
     chosen = "paper" if is_paper else geometry
-    others = [retargeting("fast" if is_paper else quality, name, name) for name in _COMPARED if name != chosen]
-    methods = [retargeting(quality, geometry, chosen), *others]
+    baselines = [retargeting("fast" if is_paper else quality, name, name) for name in _COMPARED if name != chosen]
+    methods = [retargeting(quality, geometry, chosen), *baselines]
     notes: list[str] = []
     done = measured(arguments, data, methods, notes)
     target = done.target
@@ -78,10 +78,10 @@ def timed(retarget: Callable[[Mapping[str, Any]], Any], sample: Mapping[str, Any
     """Median milliseconds of a call on the same sample again, and of one with another calibration and boxes."""
     boxes, ms = sample.get("boxes_3d"), list[tuple[float, float]]()
     for k in range(1 + _TIMED_CALLS):
-        moved_m = k * _OTHER_M
+        moved_m = k * _SHIFT_M
         moved = {"rig": sample["rig"].shifted(x_m=moved_m), "boxes_3d": None if boxes is None else boxes + moved_m}
         call = partial(retarget, {**sample, **moved})
-        planned, held = (1e3 * timeit(call, timer=working_s, number=1) for _ in range(2))
-        ms.append((held, planned))
-    held_ms, planned_ms = (statistics.median(times) for times in zip(*ms[1:], strict=True))  # the first has other work
-    return held_ms, planned_ms
+        first, again = (1e3 * timeit(call, timer=working_s, number=1) for _ in range(2))
+        ms.append((again, first))
+    again_ms, first_ms = (statistics.median(times) for times in zip(*ms[1:], strict=True))  # the first has other work
+    return again_ms, first_ms

@@ -1,4 +1,4 @@
-"""``python -m arbiview_aug depth --data FOLDER``: depth of every frame, into files beside the data set.
+"""``python -m arbiview_aug depth --data FOLDER``: depth of every frame, in files next to the data set.
 
 From the motion of the vehicle, or with ``--model`` by a network.
 """
@@ -39,14 +39,14 @@ class Done(NamedTuple):
     """Result of a frame."""
 
     token: str
-    state: Literal["made", "kept", "failed", "stopped"]  # kept: made by an earlier run; stopped: so will the others be
+    state: Literal["made", "kept", "failed", "stopped"]  # kept: made by an earlier run; stopped: no more can be made
     message: str = ""  # how depth was found, or why not
     density: float = 0.0  # share of pixels with known distance; 0 if depth was declined
     fits: Sequence[CameraFit] = ()  # of a network's depth
 
 
 class _Loaded(NamedTuple):
-    """A frame for a network, and what its file will say of its origin."""
+    """A frame for a network, and the origin to record in its file."""
 
     token: str
     inputs: DepthInputs
@@ -54,7 +54,7 @@ class _Loaded(NamedTuple):
 
 
 class _Frames(Dataset[Any]):
-    """Frames, with each of which ``work`` is done on access, in a DataLoader's workers."""
+    """Dataset that runs ``work`` on each frame on access, in a DataLoader's workers."""
 
     def __init__(self, data: Any, work: Callable[[str, dict[str, Any]], Done | _Loaded]) -> None:
         self.data, self.work = data, work
@@ -101,10 +101,7 @@ def _for_network(
     token: str,
     sample: dict[str, Any],
 ) -> _Loaded | Done:
-    """Load what a network needs of a frame, unless its depth is there.
-
-    ``model`` is what a file says of the network; ``motion`` is the folder of depth from motion.
-    """
+    """Load a network's inputs of a frame, unless its depth is there; ``model`` is its record, ``motion`` a folder."""
     (frame,) = read_frames(sample, None, "auto")
     scene = read_scene(frame, "auto")
     measured = [] if scene.points is None else [scene.points[:, :3]]

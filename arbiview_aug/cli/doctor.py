@@ -24,11 +24,11 @@ from arbiview_aug.transforms.warm_up import compiling
 
 _CALLS = 5
 
-Line = tuple[bool, str]  # whether all is well, and what was found
+Line = tuple[bool, str]  # whether it is fine, and the finding
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what was found, a line each; 1 if something is wrong."""
+    """Print one line for each finding; return 1 if something is wrong."""
     is_sound = True
     for is_fine, text in _lines(arguments.size):
         is_sound &= is_fine
@@ -49,7 +49,7 @@ def _lines(size: tuple[int, int]) -> Iterator[Line]:
 
 
 def _kernels(path: str | None) -> Line:
-    """The compiled kernels in the folder of one room and in those of the others; None if numba found none to write."""
+    """Check the compiled kernels, given the folder of one subpackage; None if numba can write to no folder."""
     if path is None:
         return False, "compiled kernels: not kept; set NUMBA_CACHE_DIR to a writable folder"
     root = Path(path).parents[1 if Path(path).name == "__pycache__" else 0]

@@ -61,9 +61,9 @@ def run(arguments: argparse.Namespace) -> None:
     if done.declined.keys() >= {*names}:
         raise DataError("; ".join(done.declined.values()))
     notes.extend(f"{name}: {why}" for name, why in done.declined.items())
-    whole = [name for name in names if name not in done.declined]  # others were judged on fewer frames
-    verdicts, rows = panel.rows(whole), done.views if common is None else common.rows
-    tables = [evaluation_table(done, names)] if common is None else common.tables(whole)
+    complete = [name for name in names if name not in done.declined]  # judged on all frames
+    verdicts, rows = panel.rows(complete), done.views if common is None else common.rows
+    tables = [evaluation_table(done, names)] if common is None else common.tables(complete)
     tables += verdict_tables(verdicts)
     if too_few(verdicts.values()):
         notes.append(TOO_FEW)
@@ -104,7 +104,7 @@ def measured(
 def _held_out(
     arguments: argparse.Namespace, notes: list[str], common: CommonPixels, segmenter: Segmenter | None
 ) -> tuple[list[Method], Evaluation]:
-    """Evaluate the surfaces on held-out photographs, or what fills held-out holes; none is read from neighbours."""
+    """Evaluate the surfaces on held-out photographs, or fillers on held-out holes; no neighbour fills."""
     asked, place_of = arguments.held_out, load_rig(arguments.target or REAL_TARGET) if common.in_holes else None
     everything: GeometryName = "fused" if arguments.geometry == ["auto"] else "motion"
     data = open_frames(arguments, [*arguments.geometry, *([everything] if place_of is None else [])])
@@ -127,10 +127,10 @@ def _held_out(
 
 
 def _methods(arguments: argparse.Namespace, **settings: Any) -> list[Method]:
-    """All chosen settings."""
+    """Methods of all chosen settings."""
     methods = []
     for quality, geometry, holes in product(arguments.quality, arguments.geometry, arguments.holes):
-        # Neighbours are opened for motion: where some row asks for it, the others must not read them.
+        # Neighbours are opened for depth from motion; methods without it must not read them.
         reads = settings if GEOMETRIES[geometry].needs == "motion" else {"neighbours": None}
         fills = load_inpainter(arguments.generator) if holes == "diffusion" else holes
         methods.append(retargeting(quality, geometry, holes=fills, **reads))
@@ -152,8 +152,8 @@ def open_frames(arguments: argparse.Namespace, surfaces: Sequence[GeometryName],
 
 
 def target_rig(arguments: argparse.Namespace, chosen: Rig | None, source: Rig) -> Rig:
-    """Rig to render; ``chosen`` is that of ``--target``."""
+    """Rig to render; ``chosen`` is the rig of ``--target``."""
     rig = chosen or (load_rig(REAL_TARGET) if arguments.data else demo_target_rig(source.sizes[0]))
-    if "paper" in arguments.quality:  # homographies know no lens; all methods share the target
+    if "paper" in arguments.quality:  # homographies have no lens; all methods share the target
         rig = rig.undistorted()
     return rig if arguments.size is None else rig.resized(arguments.size, "crop")

@@ -60,7 +60,7 @@ def unchanged(value: Any) -> Any:
 
 
 def _begin(_: int) -> None:
-    """Set up a worker, which ends with its parent, so that a killed run leaves no process behind."""
+    """Set up a worker that ends with its parent, so that a killed run leaves no process behind."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # handled by the parent
     threads = one_thread()
     threads.__enter__()

@@ -19,17 +19,17 @@ from arbiview_aug.evaluate.common_rig import common_rig, seen_shares
 from arbiview_aug.evaluate.report.pictures import draw_rigs, save_picture
 from arbiview_aug.evaluate.report.tables import markdown_table
 
-NOISE_DEG, NOISE_M = 0.2, 0.02  # errors of a calibration that is kept up: rigs that differ by less are one
+NOISE_DEG, NOISE_M = 0.2, 0.02  # errors of a maintained calibration: rigs that differ by less are the same
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Print the rigs and the differences of the others from the first; write the picture, or the common rig."""
+    """Print the rigs and their differences from the first; write the picture, or the common rig."""
     default, endings = ("common.yaml", RIG_SUFFIXES) if arguments.common else ("inspect.png", PICTURES)
     path = output_file(arguments.output or default, endings)
     rigs, notes = zip(*(_load(name) for name in arguments.rigs), strict=True)
     print("\n\n".join(f"{rig!r}{note}" for rig, note in zip(rigs, notes, strict=True)))
-    for other in rigs[1:]:
-        print(f"\n{differences(rigs[0], other)}")
+    for rig in rigs[1:]:
+        print(f"\n{differences(rigs[0], rig)}")
     if arguments.common:
         common = common_rig(rigs)
         shares = [[f"{share:.0%}" for share in seen_shares(rig, common)] for rig in rigs]
@@ -41,10 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def differences(source: Rig, target: Rig) -> str:
-    """Table of each target camera against the source camera that looks most nearly the same way.
-
-    Heights are over each rig's own road (see ``Rig.in_frame_of``).
-    """
+    """Table of each target camera against the source camera nearest in direction; heights are over each rig's road."""
     axes = source.cam2ego[:, :3, 2]
     rows, is_noise = [], len(source) == len(target)
     for camera in target.in_frame_of(source):
@@ -55,8 +52,8 @@ def differences(source: Rig, target: Rig) -> str:
         off = np.nan_to_num(_corners(camera)) - np.nan_to_num(_corners(nearest))  # outside a lens both may be NaN
         is_noise &= bool(np.linalg.norm(off, axis=1).max() < np.radians(NOISE_DEG) and np.linalg.norm(away_m) < NOISE_M)
         density = []
-        for seen in (nearest, camera):  # columns a degree on the optical axis
-            aside, ahead = seen.project_cam(np.array([[np.radians(1e-3), 0, 1], [0, 0, 1]])).uv[:, 0]
+        for view in (nearest, camera):  # columns per degree on the optical axis
+            aside, ahead = view.project_cam(np.array([[np.radians(1e-3), 0, 1], [0, 0, 1]])).uv[:, 0]
             density.append(float(1e3 * (aside - ahead)))
         rows.append(
             [
@@ -73,13 +70,13 @@ def differences(source: Rig, target: Rig) -> str:
 
 
 def _corners(camera: Camera) -> FloatArray:
-    """(4, 3) directions of the image's corners in the ego frame: other lenses, K and rotations have others."""
+    """(4, 3) directions of the image's corners in the ego frame: they depend on lens, K and rotation."""
     w, h = camera.width_px - 0.5, camera.height_px - 0.5
     return camera.unproject([[-0.5, -0.5], [w, -0.5], [-0.5, h], [w, h]]).directions
 
 
 def _load(name: str) -> tuple[Rig, str]:
-    """A rig, and a line on what another tool's calibration was read as."""
+    """A rig, and a line on how another tool's calibration was read."""
     if not name or name in shipped_rigs():  # an empty name would be the current folder
         return load_rig(name), ""
     if is_rig(name):

@@ -51,8 +51,8 @@ def run(arguments: argparse.Namespace) -> None:
         first = data[0]
         target = target_rig(arguments, chosen, first["rig"])
         keys = SampleKeys(extra=() if arguments.quality == "paper" else ("confidence",))
-        given = {name: getattr(arguments, name) for name in ("quality", "geometry", "holes")}
-        retarget = RigRetarget(target, keys=keys, **given)
+        options = {name: getattr(arguments, name) for name in ("quality", "geometry", "holes")}
+        retarget = RigRetarget(target, keys=keys, **options)
         recording = SampleRecording(Path(file.name), first["rig"], target)
         count = min(arguments.frames, len(data))
         for number in range(count):
@@ -67,10 +67,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 class SampleRecording:
-    """A recording of samples and their views by a target rig, written to an .rrd file frame by frame.
-
-    A frame's points, boxes and cameras are below ``ego``, which drives through the first one's ego frame.
-    """
+    """Recording of samples and their views by a target rig, written to an .rrd file frame by frame."""
 
     def __init__(self, path: Path, source: Rig, target: Rig) -> None:
         self._rr = optional_package("rerun", "viewer")
@@ -96,20 +93,20 @@ class SampleRecording:
             images = [views.Spatial2DView(contents=contents, **place) for place in places]
             return views.Grid(*images, grid_columns=min(3, len(ordered)), name=name)
 
-        of_target = grid("target", "image coverage", "target"), grid("target", "confidence", "confidence")
-        images = views.Vertical(grid("source", "image coverage", "source"), views.Tabs(*of_target))
+        tabs = grid("target", "image coverage", "target"), grid("target", "confidence", "confidence")
+        images = views.Vertical(grid("source", "image coverage", "source"), views.Tabs(*tabs))
         layout = views.Horizontal(scene, images, column_shares=[2, 3])
         self._stream.send_blueprint(views.Blueprint(layout, collapse_panels=True))
 
     def close(self) -> None:
-        """Write what is not on the disk yet."""
+        """Write the rest to the disk."""
         self._stream.disconnect()
 
     def _path(self, side: str, camera: Camera) -> str:
         return f"/ego/{side}/{self._rr.escape_entity_path_part(camera.name)}"
 
     def add(self, sample: Mapping[str, Any], out: Mapping[str, Any]) -> None:
-        """Add a reader's sample, and what ``RigRetarget`` made of it."""
+        """Add a reader's sample and the output of ``RigRetarget``."""
         self._stream.set_time("frame", sequence=self._frames)
         if sample.get("time_s") is not None:
             self._first.setdefault("time_s", float(sample["time_s"]))
@@ -148,7 +145,7 @@ class SampleRecording:
         self._log(path, self._rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
 
     def _add_camera(self, path: str, camera: Camera, image: Image, boxes: FloatArray, colour: str) -> None:
-        """Add a camera's pose, image and boxes; Rerun's cameras know no lenses: images with one are not in 3D."""
+        """Add a camera's pose, image and boxes; Rerun's cameras have no lenses: images with one are not in 3D."""
         self._add_pose(path, camera.cam2ego)
         K = camera.K.copy()
         K[:2, 2] += _PIXEL_CENTER

@@ -48,7 +48,7 @@ class DepthFolder:
         return inside(self.root, f"{file_name(token)}.npz", f"depth of frame {token!r}")
 
     def needed_by(self) -> str | None:
-        """The key of ``FOLDERS`` that its depth is for, by its first file; None if that does not tell."""
+        """The key of ``FOLDERS`` that the folder's first file belongs to; None if it does not say."""
         for path in filter(Path.is_file, self.root.glob("*.npz")):
             with suppress(*BROKEN_ARRAY, KeyError):
                 file = np.load(BytesIO(read_bytes(path, _MOST_BYTES)), allow_pickle=False)
@@ -71,12 +71,12 @@ class DepthFolder:
     def find(self, token: str, rig: Rig, origin: Sequence[str], kind: str = "motion") -> MotionDepth | None:
         """A frame's depth, if it fits the rig and has this origin, else None; DataError for depth of the other kind."""
         try:
-            depth, origin_there = self._read(token, rig)
+            depth, recorded = self._read(token, rig)
         except DataError:
             return None
         if type(depth) is not _KINDS[kind]:
             raise DataError(f"{self.path(token)}: expected {kind} depth, got another kind; name another --output")
-        return depth if origin_there == list(origin) else None
+        return depth if recorded == list(origin) else None
 
     def _read(self, token: str, rig: Rig) -> tuple[MotionDepth, list[str]]:
         path = self.path(token)
@@ -101,8 +101,8 @@ class WithDepth(Dataset[dict[str, Any]]):
     """A map-style dataset that adds the ``depth`` command's results to its samples.
 
     Depth from motion becomes ``motion_depth_m``, for ``RigRetarget(geometry="motion")``; learned depth becomes
-    ``learned_depth_m``, for ``geometry="learned"``. ``motion_depth_words`` and ``learned_depth_words`` tell how they
-    were found, or why not. Samples need a ``token`` and a ``rig`` (or ``source``).
+    ``learned_depth_m``, for ``geometry="learned"``. ``motion_depth_words`` and ``learned_depth_words`` say how they
+    were estimated, or why not. Samples need a ``token`` and a ``rig`` (or ``source``).
 
     Args:
         dataset: Map-style dataset of samples.
@@ -119,7 +119,7 @@ class WithDepth(Dataset[dict[str, Any]]):
     def __init__(self, dataset: Any, folder: str | Path, *, source: Rig | None = None) -> None:
         self.dataset, self.source = checked_map_style(dataset, "WithDepth", "pass the dataset first"), source
         below = [inside(Path(folder), name, "depth") for name in FOLDERS.values()]
-        self.folders = [DepthFolder(one) for one in below if one.is_dir()] or [DepthFolder(folder)]
+        self.folders = [DepthFolder(path) for path in below if path.is_dir()] or [DepthFolder(folder)]
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -146,10 +146,10 @@ def _calibration(rig: Rig) -> dict[str, Any]:
 
 
 def _misfit(arrays: Mapping[str, Any], token: str, rig: Rig, depth: tuple[Layer, ...]) -> str | None:
-    """The expected frame, format, rig, image size or calibration, and what a file has instead; None if it fits."""
-    of, number = str(arrays.get("token", token)), int(arrays["format"])  # older files name no token
-    if of != token:
-        return f"frame {token!r}, got that of frame {of!r}; "
+    """Expected and actual frame, format, rig, image size or calibration of a file; None if it fits."""
+    recorded, number = str(arrays.get("token", token)), int(arrays["format"])  # older files name no token
+    if recorded != token:
+        return f"frame {token!r}, got that of frame {recorded!r}; "
     if number != _FORMAT:
         return f"format {_FORMAT}, got format {number}; "
     if len(depth) != len(rig):

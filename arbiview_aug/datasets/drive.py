@@ -51,7 +51,7 @@ def warn_of_unfinished(root: Path, found: int) -> None:
 
 
 def checked_index(index: Any, count: int) -> int:
-    """The place from 0 of one of ``count`` samples; TypeError for a slice, IndexError for a number beyond them."""
+    """Index from 0 of one of ``count`` samples; TypeError for a slice, IndexError for a number beyond them."""
     try:
         return range(count)[operator.index(index)]
     except TypeError:
@@ -126,8 +126,8 @@ def check_neighbours(value: Any) -> None:
 class Drive:
     """Distance travelled by a vehicle, from its positions (F, 3) in the world, in recording order.
 
-    ``parts`` (F,) are non-decreasing numbers of uninterrupted parts; neighbours share their part. Jitter of the poses
-    of a standing vehicle is no travel.
+    ``parts`` (F,) are non-decreasing numbers of uninterrupted parts; neighbours share their part. Pose jitter of a
+    standing vehicle does not count as travel.
     """
 
     def __init__(self, positions_m: FloatArray, parts: npt.NDArray[np.int64]) -> None:
@@ -154,16 +154,16 @@ class Drive:
 
 
 def parts_of_clock(names: Sequence[str], times_s: Mapping[str, float] | None, where: str) -> npt.NDArray[np.int64]:
-    """(F,) parts of a drive with frames ``names``; where the clock goes back, a new one begins, with a warning."""
-    goes_back = [times_s is not None and times_s[two] <= times_s[one] for one, two in pairwise(names)]
+    """(F,) parts of a drive with frames ``names``; a new one begins, with a warning, where the clock goes back."""
+    goes_back = [times_s is not None and times_s[after] <= times_s[before] for before, after in pairwise(names)]
     for k in np.flatnonzero(goes_back).tolist():
         warn(clock_message(where, names[k], names[k + 1]))
     return np.cumsum([0, *goes_back], dtype=np.int64)[: len(names)]
 
 
-def clock_message(where: str, one: str, two: str) -> str:
+def clock_message(where: str, before: str, after: str) -> str:
     """Warning for a clock that goes back from one frame to the next."""
-    return f"{where}: the clock goes back from frame {one!r} to {two!r}: they are no neighbours"
+    return f"{where}: the clock goes back from frame {before!r} to {after!r}: they are no neighbours"
 
 
 def camera_fields(rig: Rig, images: Any, token: str) -> dict[str, Any]:
@@ -185,7 +185,7 @@ class WritableRecording(Recording, ABC):
         """All files that a sample is read from."""
 
     def _neighbours(self, drive: Drive, place: int) -> list[LazyFrame]:
-        """The frames beside the one at a place of a drive; broken ones raise on access."""
+        """Neighbours of the frame at a place of a drive; broken ones raise on access."""
         frames: list[LazyFrame] = []
         for k in drive.neighbours(place, self.neighbours) if self.neighbours else ():
             try:
@@ -196,7 +196,7 @@ class WritableRecording(Recording, ABC):
 
     def _neighbour(self, place: int) -> LazyFrame:
         """The frame at a place of the drive; its images and points are read on access."""
-        raise NotImplementedError  # not abstract: readers without neighbours need none
+        raise NotImplementedError  # not abstract: readers without neighbours do not need it
 
     def _token(self, place: int) -> str:
         """Token of the frame at a place of the drive."""
@@ -204,8 +204,10 @@ class WritableRecording(Recording, ABC):
 
 
 class LazyFrame(Mapping[str, Any]):
-    """A neighbour with ``fields`` (pose, calibration, time, token), whose images ``load`` decodes on first access, and
-    whose LiDAR points ``points`` reads, if given. With an ``error`` every access but to the token raises it."""
+    """Neighbour with ``fields``, whose images and points ``load`` and ``points`` read on first access.
+
+    An ``error`` is raised by every access but to the token.
+    """
 
     def __init__(
         self,

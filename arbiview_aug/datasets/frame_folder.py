@@ -88,8 +88,7 @@ class _Frame:
         return cameras
 
     def read(self) -> _Frame:
-        """The frame with its calibration, a mapping with a list of cameras; other entries are checked where they are
-        read."""
+        """Read the calibration, a mapping with a list of cameras; other entries are checked when they are used."""
         path = self.file(CALIBRATION_FILE)
         try:
             text = read_text(path, MOST_BYTES)
@@ -121,7 +120,7 @@ class _Frame:
         return inside(self.root, name, f"{self.where}: {what}" if what else self.where)
 
     def named(self, entry: Mapping[str, Any], key: str) -> Path | None:
-        """The file that a camera names under a key, None without; its image must be named."""
+        """The file that a camera names under a key; None without one, but each camera must name its image."""
         what, name = f"camera {shown(entry.get('name'))}: {key}", entry.get(key)
         if name is None and key != "file":
             return None
@@ -138,13 +137,13 @@ class _Frame:
         return self.file(name, what)
 
     def of_cameras(self, key: str) -> list[Any]:
-        """What ``named`` finds for each camera."""
+        """The file that each camera names under a key."""
         return [self.named(entry, key) for entry in self.cameras]
 
     def view_mask_files(self, keys: Sequence[str] = VIEW_MASKS) -> dict[str, list[Path | None]]:
-        """The masks of converted views that are named and exist, for each camera."""
-        found = {key: self.of_cameras(key) for key in keys}
-        return {key: [path and (path if os.path.lexists(path) else None) for path in found[key]] for key in keys}
+        """Masks of converted views that are named and exist, for each camera."""
+        paths = {key: self.of_cameras(key) for key in keys}
+        return {key: [path and (path if os.path.lexists(path) else None) for path in paths[key]] for key in keys}
 
     def view_masks(self, reduce: Reduce, keys: Sequence[str] = VIEW_MASKS) -> dict[str, Any]:
         return decode_view_masks(self.view_mask_files(keys), **self._labels(), reduce=reduce)
@@ -213,7 +212,7 @@ class FrameFolder(WritableRecording):
     """A folder that is a frame (it has ``calib.json``), or a folder of such folders, in the order of their names.
 
     ``docs/formats.md`` describes ``calib.json``, the points (a float .npy of shape (P, >=3), x y z first, in the ego
-    frame, metres) and ``sequence.json``, which may stand in a folder of frames and lists those of one drive in the
+    frame, metres) and ``sequence.json``, an optional list of the frames of one drive in the
     order of their recording. All files lie below ``root``, which may be a link: names and links that leave it are
     refused.
 
@@ -229,8 +228,8 @@ class FrameFolder(WritableRecording):
         root: The folder.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
         load_points: Whether to read the points.
-        neighbours: Which other frames of the drive come with a frame; None for none.
-        clean_masks: Turn over specks in masks, and mask the dark rim of fisheye images that have no mask. The rim is
+        neighbours: Selection of other frames of the drive to add; None for none.
+        clean_masks: Invert specks in masks, and mask the dark rim of fisheye images that have no mask. The rim is
             found in the first, the middle and the last frame together (``cleaned_rig``).
 
     Raises:
@@ -252,10 +251,10 @@ class FrameFolder(WritableRecording):
         self.clean_masks = clean_masks
         if not os.path.isdir(self.root):  # unlike Path.is_dir, False for a name that is too long
             raise DataError(f"frame folder {root}: expected a folder, found none")
-        is_one, one = (self.root / CALIBRATION_FILE).is_file(), self.root.resolve()  # resolved, so that "." has a name
-        folders = () if is_one else sorted(self.root.iterdir())
+        is_frame, root = (self.root / CALIBRATION_FILE).is_file(), self.root.resolve()  # so that "." has a name
+        folders = () if is_frame else sorted(self.root.iterdir())
         frames = [_Frame(self.root, folder) for folder in folders if (folder / CALIBRATION_FILE).is_file()]
-        self._frames = [_Frame(one, one)] if is_one else frames
+        self._frames = [_Frame(root, root)] if is_frame else frames
         if not self._frames:
             expected = f"expected {CALIBRATION_FILE}, or folders that have one, found neither"
             raise DataError(f"frame folder {root}: {expected}; docs/formats.md has the format")
@@ -295,7 +294,7 @@ class FrameFolder(WritableRecording):
         return sample
 
     def truth(self, index: int) -> dict[str, Any] | None:
-        """``rig`` and ``images`` of a frame's ``truth`` camera, by default of its first camera's size; None without."""
+        """``rig`` and ``images`` of a frame's ``truth`` camera, by default of its first camera's size; or None."""
         frame = self._frames[checked_index(index, len(self))].read()
         entry = frame.calib.get("truth")
         if entry is None:
@@ -372,14 +371,14 @@ class FrameFolder(WritableRecording):
         return last[1]
 
     def _without_rim(self, camera: Camera) -> Camera:
-        """The camera, if it has no mask, with one of the rim that is dark in several frames of the data."""
+        """The camera with a mask of the rim that is dark in several frames, if it has no mask."""
         if camera.mask is not None or camera.is_rectilinear:
             return camera
         key = camera.name, camera.size, camera.lens, camera.distortion, camera.K.tobytes()  # poses may differ by frame
         if key not in self._rims:
             images = []
             for k in sorted({0, len(self) // 2, len(self) - 1}):
-                with suppress(ArbiviewError):  # told when that frame is read
+                with suppress(ArbiviewError):  # raised when that frame is read
                     frame = self._frames[k].read()
                     for entry in (entry for entry in frame.cameras if entry.get("name") == camera.name):
                         file: Any = frame.named(entry, "file")
@@ -404,10 +403,10 @@ def _read_sequence(root: Path, index: Mapping[str, int]) -> tuple[dict[str, floa
         if not isinstance(listed, list):
             raise TypeError(f"frames of type {type(listed).__name__}")
         names = [*map(entry_name, listed)]
-        if unread := sorted({k for one in listed if isinstance(one, Mapping) for k in one if _CLOCK.search(str(k))}):
+        mappings = [entry for entry in listed if isinstance(entry, Mapping)]
+        if unread := sorted({key for entry in mappings for key in entry if _CLOCK.search(str(key))}):
             raise ValueError(f"{', '.join(unread)}, which is not read: time_s is in seconds")
-        timed = [entry for entry in listed if isinstance(entry, Mapping) and "time_s" in entry]
-        times_s = {entry_name(entry): float(entry["time_s"]) for entry in timed}
+        times_s = {entry_name(entry): float(entry["time_s"]) for entry in mappings if "time_s" in entry}
     except (OSError, ValueError, KeyError, TypeError, RecursionError, OverflowError) as error:
         expected = "{'frames': [names, or {'name': ..., 'time_s': ...}]}"
         got = f"no {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"

@@ -68,9 +68,9 @@ def decode_images(
     """
     check_reduce(reduce)
     files = [Path(path) for path in paths]
-    for argument, given in (("names", names), ("sizes", sizes)):
-        if given is not None and len(given) != len(files):
-            raise ValueError(f"{argument}: expected one for each of {len(files)} images, got {len(given)}")
+    for argument, values in (("names", names), ("sizes", sizes)):
+        if values is not None and len(values) != len(files):
+            raise ValueError(f"{argument}: expected one for each of {len(files)} images, got {len(values)}")
     labels = [f"camera {(names[k] if names else file.stem)!r}: image {file}" for k, file in enumerate(files)]
     contents = [_content(file, label) for file, label in zip(files, labels, strict=True)]
     headers = [_header(content, label) for content, label in zip(contents, labels, strict=True)]
@@ -134,7 +134,7 @@ def reduced_rig(rig: Rig, reduce: Reduce) -> Rig:
 
 
 VIEW_MASKS = ("coverage", "generated")
-"""Masks that ``convert`` writes beside its views, and that its sets have in a sample."""
+"""Masks that ``convert`` writes next to its views; readers add them to samples."""
 
 
 def decode_view_masks(
@@ -151,11 +151,11 @@ def decode_view_masks(
     of its pixels are, and generated if any is. Masks without any file are left out.
     """
     masks = {}
-    for key, of_key in files.items():
-        if any(of_key):
+    for key, paths in files.items():
+        if any(paths):
             is_filled = key == "coverage"  # a reduced pixel is as its filled ones are only if all of its pixels are
             views = []
-            for name, size, path in zip(names, sizes, of_key, strict=True):
+            for name, size, path in zip(names, sizes, paths, strict=True):
                 mask, label = np.full(size, is_filled), f"camera {name!r}: {key} {path}"
                 if path is not None:
                     mask = _decoded(_content(path, label), label, "file", cv2.IMREAD_GRAYSCALE) > 0
@@ -233,16 +233,13 @@ def area_reduced(image: npt.NDArray[Any], reduce: int) -> npt.NDArray[Any]:
     return cv2.resize(image, reduced_size((h, w), reduce)[::-1], interpolation=cv2.INTER_AREA)
 
 
-JPEG_QUALITY = 96  # quality at 4:4:4 chroma; costs at most 0.08 dB (acceptance/test_converted.py)
+JPEG_QUALITY = 96  # quality at 4:4:4 chroma, hardly below lossless (acceptance/test_converted.py)
 
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111)
 
 
 def encoded_image(image: torch.Tensor, suffix: str = ".jpg") -> bytes:
-    """Encode an RGB image (3, h, w) uint8 as ``.jpg``, at ``JPEG_QUALITY``, or lossless ``.png``.
-
-    SampleTypeError for images of another type.
-    """
+    """Encode an RGB image (3, h, w) as ``.jpg`` or lossless ``.png``; SampleTypeError for images that are not uint8."""
     if image.dtype != torch.uint8:
         fix = "convert [0, 1] by (images * 255).round().byte()"
         raise SampleTypeError(f"images: expected uint8 to write, got {image.dtype}; {fix}")

@@ -25,10 +25,10 @@ NUSCENES_COLUMNS = ("x", "y", "z", "intensity", "ring")
 _WIDTHS = range(3, 11)
 _LEAST_TESTED, _MOST_TESTED = 100, 12 * 2520  # numbers: chance decides below; a multiple of all ``_WIDTHS``
 _LEAST_SCORE, _EXPLAINED = 0.1, 0.7
-"""Least score of a width, below which all columns are alike, and least share of the best score: the true width has the
-best one but for noise, and half of it had 0.58 of it on real frames."""
+"""Least score of a width, below which all columns are alike, and least share of the best score: the true width has
+about the best one, and half of it clearly less."""
 _NEAREST, _FARTHEST, _SANE = 1e-3, 1e5, 0.9
-"""Magnitudes of numbers other than 0, and least share of those within: bytes of another type are anything."""
+"""Magnitudes of coordinates other than 0, and least share within: bytes of another type have any magnitude."""
 
 _OTHERS = re.compile(rb"ply|LASF|PK|\x1f\x8b|ARROW1|\x89HDF")  # first bytes of PLY, LAS, NPZ, gzip, Arrow, HDF5
 _PCD_DATA = re.compile(rb"^DATA[ \t]+(\w+)[^\n]*\n", re.MULTILINE)
@@ -37,8 +37,8 @@ _PCD_DATA = re.compile(rb"^DATA[ \t]+(\w+)[^\n]*\n", re.MULTILINE)
 def read_cloud(path: Path, columns: Any, how: str, assumed: Sequence[str] | None = None) -> Array:
     """Points (P, >=3) of a .npy or .pcd file or of rows of numbers: x y z, intensity if any, then the other columns.
 
-    ``columns`` are as ``row_type`` takes them, None if nobody stated them; ``how`` tells users how to. Rows that nobody
-    stated must look like those ``assumed``. DataError for no such file, one of another format, or of other columns.
+    ``columns`` are as ``row_type`` takes them, or None; ``how`` tells users how to state them. Without them, rows must
+    look like those ``assumed``. DataError for a missing file, or one of another format or other columns.
     """
     where = f"points {path}"
     stated = None if columns is None else row_type(columns, f"{where}: columns")
@@ -132,7 +132,7 @@ def _pcd(data: bytes, where: str) -> dict[str, Array]:
         counts = [*map(int, header.get("COUNT", ["1"] * len(names)))]
         if kind == b"binary":
             types = [f"<{type.lower()}{size}" for type, size in zip(header["TYPE"], header["SIZE"], strict=True)]
-            row = np.dtype([(str(k), *one) for k, one in enumerate(zip(types, counts, strict=True))])
+            row = np.dtype([(str(k), *column) for k, column in enumerate(zip(types, counts, strict=True))])
             rows = np.frombuffer(body, row, count=int(header["POINTS"][0]))
             columns = {name: rows[str(k)].reshape(len(rows), -1)[:, 0] for k, name in enumerate(names)}
         elif kind == b"ascii":
@@ -148,7 +148,7 @@ def _pcd(data: bytes, where: str) -> dict[str, Array]:
 
 
 def _likely(numbers: Array, width: int) -> str | None:
-    """Describe the rows that numbers look like, if those are not of ``width`` columns (0: unknown); else None."""
+    """Describe the rows that numbers look like, if not of ``width`` columns (0: unknown); else None."""
     if len(numbers) < _LEAST_TESTED:
         return None
     pairs = np.frombuffer(numbers[: min(len(numbers), _MOST_TESTED) // 2 * 2].tobytes(), "<f8")
@@ -159,8 +159,8 @@ def _likely(numbers: Array, width: int) -> str | None:
     best, score = _best_width(wide)
     if score > _LEAST_SCORE and (not width or _score(wide, width) < _EXPLAINED * score):
         return f"{best} columns"
-    is_same = not width or _sane_share(wide[: len(wide) // width * width].reshape(-1, width)[:, :3]) > _SANE
-    return None if is_same else "other numbers than coordinates in metres"
+    is_fine = not width or _sane_share(wide[: len(wide) // width * width].reshape(-1, width)[:, :3]) > _SANE
+    return None if is_fine else "other numbers than coordinates in metres"
 
 
 def _best_width(numbers: Array) -> tuple[int, float]:

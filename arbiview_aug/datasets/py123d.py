@@ -45,7 +45,7 @@ _FTHETA_CONSTANT_PX = 0.01
 
 @dataclass(frozen=True)
 class _Log:
-    """A log: py123d's scene over all of it, and its cameras, by py123d's identity, posed in the ego frame."""
+    """A log: py123d's scene of the whole log, and its cameras by py123d's identity, posed in the ego frame."""
 
     folder: Path
     scene: Any
@@ -95,14 +95,14 @@ class Py123dDataset(WritableRecording):
         root: py123d's data root (with ``logs``), the folder of logs, a split, or a log.
         reduce: Reduce the images to 1, 1/2 or 1/4 of their size.
         load_points: Whether to read the LiDARs' points.
-        neighbours: Which other frames of the drive come with a sample; None for none.
+        neighbours: Selection of other frames of the drive to add; None for none.
         cameras: Names of the cameras to read, or one name; None for all.
 
     Raises:
         ImportError: py123d is not installed.
         TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
         DataError: No log, or one that py123d cannot read.
-        CalibrationError: A camera of a lens that no lens here comes near.
+        CalibrationError: A camera whose lens no lens here approximates.
     """
 
     def __init__(
@@ -189,7 +189,7 @@ class Py123dDataset(WritableRecording):
         detections = log.scene.get_box_detections_se3_at_iteration(iteration)
         if detections is not None:
             fields["boxes_3d"] = torch.from_numpy(_boxes(detections, world2ego))
-            fields["box_names"] = [one.attributes.label.serialize() for one in detections]
+            fields["box_names"] = [detection.attributes.label.serialize() for detection in detections]
         return fields
 
     def _find_drive(self) -> Drive:
@@ -232,7 +232,7 @@ def _images(log: _Log, iteration: int, names: Sequence[str], reduce: Reduce) -> 
 def _points(log: _Log, iteration: int, token: str) -> torch.Tensor | None:
     with _reading(log.folder):
         scans = [log.scene.get_lidar_at_iteration(iteration, lidar) for lidar in log.lidars]
-        clouds = [np.asarray(one.point_cloud_3d, np.float32) for one in scans if one is not None]
+        clouds = [np.asarray(scan.point_cloud_3d, np.float32) for scan in scans if scan is not None]
     return checked_points(np.concatenate(clouds), f"of {token}") if clouds else None
 
 
@@ -291,10 +291,10 @@ def _ftheta(intrinsics: Any, where: str) -> tuple[FloatArray, FloatArray]:
 
 def _boxes(detections: Any, world2ego: FloatArray) -> Any:
     """(B, 9) float32 in the ego frame."""
-    rows = np.array([one.bounding_box_se3.array for one in detections], np.float64).reshape(-1, 10)
+    rows = np.array([box.bounding_box_se3.array for box in detections], np.float64).reshape(-1, 10)
     moved = world2ego[:3, :3] @ rotation_from_quaternion(rows[:, 3:7])
     yaw = np.arctan2(moved[:, 1, 0], moved[:, 0, 0])
-    velocities = [one.velocity_3d for one in detections]
+    velocities = [box.velocity_3d for box in detections]
     velocity = np.array([[np.nan] * 3 if v is None else [v.x, v.y, v.z] for v in velocities]).reshape(-1, 3)
     centre = rows[:, :3] @ world2ego[:3, :3].T + world2ego[:3, 3]
     return np.column_stack([centre, rows[:, 7:10], yaw, (velocity @ world2ego[:3, :3].T)[:, :2]]).astype(np.float32)

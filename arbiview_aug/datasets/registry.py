@@ -79,7 +79,7 @@ def data_name(data: str | Path) -> str:
 
 
 def kinds_of(root: Path) -> list[str]:
-    """All kinds whose readers recognise a folder; none for what is no folder."""
+    """All kinds whose readers recognise a folder; empty for anything else."""
     return [kind for kind, reader in READERS.items() if os.path.isdir(root) and reader.recognises(root)]
 
 
@@ -120,14 +120,14 @@ def open_data(
     """Open a data set with the reader that fits it.
 
     Args:
-        data: ``PATH`` or ``KIND:PATH``, such as ``nuscenes:/data/nuscenes``: a frame folder, a folder of such folders,
-            a nuScenes root, or a folder of py123d's logs. A bare path is opened by the first of ``READERS`` that
-            recognises it.
+        data: ``PATH`` or ``KIND:PATH``, for example ``nuscenes:/data/nuscenes``: a frame folder, a folder of frame
+            folders, a nuScenes root, or a folder of py123d's logs. A bare path is opened by the first of ``READERS``
+            that recognises it.
         kind: A key of ``READERS``, instead of ``KIND:``.
         version: nuScenes' folder of tables; by default v1.0-mini or v1.0-trainval, else the first one.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size.
         load_points: Whether to read the LiDAR's points.
-        neighbours: Which other frames of the drive come with a sample; None for none.
+        neighbours: Selection of other frames of the drive to add; None for none.
         clean_masks: As for ``FrameFolder``; nuScenes has no masks, and py123d's logs refuse it.
         lidar_channel: As for ``NuScenesDataset``, alone.
         lidar_columns: As for ``NuScenesDataset``, alone; frame folders state them in ``calib.json``.

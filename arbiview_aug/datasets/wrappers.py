@@ -104,7 +104,7 @@ class RetargetedIterable(IterableDataset[Any]):
     ``torch.utils.data.get_worker_info`` gives every sample once per worker, with or without this wrapper.
 
     Args:
-        dataset: Iterable dataset, not an iterator: each epoch iterates it anew.
+        dataset: Iterable dataset, not an iterator: each epoch iterates it again.
         retarget: ``RigRetarget``, or any callable from sample to sample.
 
     Raises:

@@ -1,4 +1,4 @@
-"""One rig for several vehicles: of each camera, the part of the view that all of them see."""
+"""One rig for several vehicles: the part of each camera's view that all of them see."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _FAR_M = 50.0  # rays that do not meet the road before end here: cameras are met
 
 
 def common_rig(rigs: Sequence[Rig]) -> Rig:
-    """The pinhole rig that loses least of its views when samples of all ``rigs`` are retargeted to it.
+    """Propose the pinhole rig that loses least of its views when samples of all ``rigs`` are retargeted to it.
 
     Each rig proposes its cameras, at the mean height of all rigs and cut to one size, of several aspects. A camera's
     field of view is narrowed until every rig sees ``LEAST_SEEN`` of it; cameras that some rig does not see are left
-    out. The proposal that shows most objects around the vehicle wins. It stands on the road z = 0 m.
+    out. The proposal that shows most objects around the vehicle wins. Its road is at z = 0 m.
 
     Raises:
         CalibrationError: Fewer than two rigs, or no camera whose view all of them see.

@@ -1,4 +1,4 @@
-"""Evaluation of methods on frames: what renders, the sample that it gets, and the references that score its views.
+"""Evaluation of methods on frames: renderers, the samples that they get, and the references that score their views.
 
 References are true images (of synthetic streets, or photographs), or LiDAR points in the source cameras' colours, as
 recorded and with even exposures. If a method may read points, all methods get those of alternate azimuth sectors
@@ -62,7 +62,7 @@ def retargeting(
     holes: Holes | Inpainter = "black",
     **settings: Any,
 ) -> Method:
-    """Wrap ``RigRetarget`` as a method, with its arguments; exposures stay as recorded: metrics compare with them."""
+    """Wrap ``RigRetarget`` as a method, with its arguments; exposures stay as recorded, for the metrics."""
     inpainter = inpainter_of(holes)  # once, not for each target
     settings = dict[str, Any](cache=PlanCache(max_bytes=0)) | settings
     images_alone = replace(settings.get("keys", SampleKeys()), points="source")
@@ -90,7 +90,7 @@ def views_of(out: Sample) -> list[RenderedView]:
     return [RenderedView(*parts) for parts in zip(images, coverage, confidence, generated, strict=True)]
 
 
-# --- frames and what scores them --------------------------------------------------------------------------------------
+# --- frames and their references --------------------------------------------------------------------------------------
 class LidarReference(NamedTuple):
     sample: Mapping[str, Any]  # at one exposure
     points: ColouredPoints  # the scoring ones, in its colours
@@ -118,7 +118,7 @@ class ScoredFrame:
 def photographed(
     sample: Mapping[str, Any], rig: Rig, images: Sequence[Image], regions: Sequence[Mapping[str, BoolArray]] = ()
 ) -> ScoredFrame:
-    """Frame whose truth is what the cameras of ``rig``, in its ego frame, photographed outside of their masks."""
+    """Frame whose truth are photographs of the cameras of ``rig``, in its ego frame, outside of their masks."""
     truth = Truth(images, scene_masks(rig), regions)
     return ScoredFrame(sample, truth=lambda _: truth, target=without_masks(rig))
 
@@ -194,13 +194,13 @@ def scores(
         truth = frame.truth(target)
         classes = truth.regions or [{}] * len(views)
         for row, view, true, valid, parts in zip(rows, views, truth.images, truth.valid, classes, strict=True):
-            found = truth_metrics(view.image, true, coverage=view.coverage, classes=parts, valid=valid)
-            row |= {f"true_{name}": value for name, value in found.items()}
+            metrics = truth_metrics(view.image, true, coverage=view.coverage, classes=parts, valid=valid)
+            row |= {f"true_{name}": value for name, value in metrics.items()}
     for k, (exposure, reference) in enumerate(references):
         rendered = views if k == 0 else render(reference.sample, target)
         for row, camera, view in zip(rows, mounted, rendered, strict=True):
-            found = sparse_metrics(view.image, camera, reference.points, coverage=view.coverage) or {}
-            row |= {f"{exposure}_{name}": value for name, value in found.items()}
+            metrics = sparse_metrics(view.image, camera, reference.points, coverage=view.coverage) or {}
+            row |= {f"{exposure}_{name}": value for name, value in metrics.items()}
     return views, rows
 
 
@@ -217,7 +217,7 @@ class Evaluation:
     declined: dict[str, str] = field(default_factory=dict)  # why a method could not render
 
     def means(self, method: str) -> dict[str, float]:
-        """Mean the per-image values over cameras and frames."""
+        """Means of the per-image values over cameras and frames."""
         return mean_of(row for row in self.views if row["method"] == method)
 
 

@@ -34,7 +34,7 @@ _BY_CAMERA = ("images", "K", "cam2ego", "distortion", "lens", "coverage", "gener
 _WINDOW_PX = 9  # side of the square around a point that belongs to its class
 
 MOST_APART_S = 2.0
-"""Longest time to the photograph that is the truth: a vehicle that stands waits longer, and traffic has gone on."""
+"""Longest time to the photograph that is the truth: after a longer stop, traffic has moved."""
 
 NO_PHOTOGRAPH = (
     "--held-out next: expected a 'truth' camera in calib.json, or a later frame of the drive (sequence.json and "
@@ -76,8 +76,8 @@ class WithoutCamera(Mapping[str, Any]):
             return [WithoutCamera(frame, place) for frame in value]
         if key not in _BY_CAMERA:
             return value
-        others = [entry for k, entry in enumerate(value) if k != place]
-        return torch.stack(others) if isinstance(value, torch.Tensor) else others
+        kept = [entry for k, entry in enumerate(value) if k != place]
+        return torch.stack(kept) if isinstance(value, torch.Tensor) else kept
 
     def __contains__(self, key: object) -> bool:
         return key in self._sample  # the images need not be decoded
@@ -108,13 +108,13 @@ def held_out_frames(
     for index in indices:
         sample = data[index]
         rig, frame = rig_of(sample), str(sample.get("token", index))
-        held: list[tuple[Camera, torch.Tensor, Mapping[str, Any]]] = []  # camera, photograph, and what methods get
+        views: list[tuple[Camera, torch.Tensor, Mapping[str, Any]]] = []  # camera, photograph, and the methods' sample
         if place_of is not None:
             sample, holes = _with_holes(sample, rig, place_of)
             for camera, image, hole in zip(rig, sample["images"], holes, strict=True):
-                held += [(replace(camera, mask=hole), image, sample)] if hole.any() else []
+                views += [(replace(camera, mask=hole), image, sample)] if hole.any() else []
         elif cameras == ["next"]:
-            held = _displaced(sample, recorded.truth(index) if isinstance(recorded, FrameFolder) else None, problems)
+            views = _displaced(sample, recorded.truth(index) if isinstance(recorded, FrameFolder) else None, problems)
         elif unknown := {*cameras} - {*rig.names, "all"}:
             expected = f"all, next, or cameras of frame {frame}, {', '.join(rig.names)}"
             raise DataError(f"--held-out: expected {expected}, got {', '.join(sorted(unknown))}")
@@ -122,18 +122,18 @@ def held_out_frames(
             raise DataError(f"--held-out: expected frames of several cameras, frame {frame} has one")
         else:
             for place, (camera, image) in enumerate(zip(rig, sample["images"], strict=True)):
-                held += [(camera, image, WithoutCamera(sample, place))] if {camera.name, "all"} & {*cameras} else []
+                views += [(camera, image, WithoutCamera(sample, place))] if {camera.name, "all"} & {*cameras} else []
         points, classes = sample.get("points"), None
         if points is not None and isinstance(recorded, FrameFolder) and cameras != ["next"]:
             classes = recorded.point_classes(index, len(points))
-        for camera, image, given in held:
+        for camera, image, inputs in views:
             (photograph,) = as_arrays([image])
             masks = () if segmenter is None else segmenter(to_bytes(photograph))
             regions = {f"mask {k}": mask for k, mask in enumerate(masks, 1)}
             regions |= {} if points is None or classes is None else _windows(camera, points, classes)
             target = Rig([camera], name=camera.name, ground_z_m=rig.ground_z_m)
-            yield f"{frame}: {camera.name}", photographed(given, target, [photograph], [regions])
-        count += len(held)
+            yield f"{frame}: {camera.name}", photographed(inputs, target, [photograph], [regions])
+        count += len(views)
     if cameras == ["next"] and not count:
         raise DataError(problems[0] if problems else NO_PHOTOGRAPH)
 
@@ -141,7 +141,7 @@ def held_out_frames(
 def _displaced(
     sample: Mapping[str, Any], truth: Mapping[str, Any] | None, problems: list[str]
 ) -> list[tuple[Camera, torch.Tensor, Mapping[str, Any]]]:
-    """Cameras and photographs of ``truth``, or of the next frame, where what moved is masked; the other entries."""
+    """Cameras and photographs of ``truth``, or of the next frame with moved objects masked; and the methods' sample."""
     if truth is not None:
         return [(camera, image, sample) for camera, image in zip(truth["rig"], truth["images"], strict=True)]
     if (found := later_neighbour(sample, problems)) is None:
@@ -154,10 +154,7 @@ def _displaced(
 
 
 def later_neighbour(sample: Mapping[str, Any], problems: list[str]) -> tuple[Frame, Neighbour, list[Any]] | None:
-    """A sample's frame, the nearest neighbour recorded at most ``MOST_APART_S`` later, and the neighbours elsewhere.
-
-    None if there is no such frame; what was wrong goes to ``problems``.
-    """
+    """A sample's frame, its nearest neighbour up to ``MOST_APART_S`` later, and the neighbours elsewhere; or None."""
     (frame,) = read_frames(sample, None, further=("neighbours",), warn=lambda _, message: problems.append(message))
     neighbours = frame.neighbours or ()
     later = next((neighbour for neighbour in neighbours if neighbour.is_later), None)
@@ -170,7 +167,7 @@ def later_neighbour(sample: Mapping[str, Any], problems: list[str]) -> tuple[Fra
         )
         warn(problems[-1])
         return None
-    apart_m = {one.number: np.linalg.norm((one.ego2ego - later.ego2ego)[:3, 3]) for one in neighbours}
+    apart_m = {frame.number: np.linalg.norm((frame.ego2ego - later.ego2ego)[:3, 3]) for frame in neighbours}
     others = [entry for k, entry in enumerate(sample["neighbours"]) if apart_m.get(k, np.inf) > STILL_M]
     return frame, later, others
 
@@ -202,13 +199,13 @@ def _with_holes(sample: Mapping[str, Any], rig: Rig, target: Rig) -> tuple[dict[
     moved = [camera.shifted(*min(centres - camera.center_m, key=np.linalg.norm)) for camera in rig]
     there = RigRetarget(without_masks(rig.with_cameras(moved)), holes="black", match_exposure=False, neighbours=None)
     seen = [covered.numpy() for covered in there(sample)["coverage"]]
-    own = scene_masks(rig)
-    coverage = [torch.from_numpy(covered & mask) for covered, mask in zip(seen, own, strict=True)]
-    return {**sample, "coverage": coverage}, [mask & ~covered for covered, mask in zip(seen, own, strict=True)]
+    pairs = list(zip(seen, scene_masks(rig), strict=True))
+    coverage = [torch.from_numpy(covered & mask) for covered, mask in pairs]
+    return {**sample, "coverage": coverage}, [mask & ~covered for covered, mask in pairs]
 
 
 def _gradients(image: npt.NDArray[Any], pixels: BoolArray) -> float:
-    """Sum of the differences of those pixels (h, w) and their right and lower neighbours, if they are of these, too."""
+    """Sum of the differences of the pixels (h, w) to their right and lower neighbours among them."""
     steps = [np.abs(np.diff(image.astype(np.float64), axis=axis)).sum(-1) for axis in (0, 1)]
     return float(steps[0][pixels[1:] & pixels[:-1]].sum() + steps[1][pixels[:, 1:] & pixels[:, :-1]].sum())
 
@@ -233,12 +230,12 @@ class CommonPixels:
     in_holes: bool = False  # score the pixels that no method covers, at their own exposure
     rows: list[dict[str, Any]] = field(default_factory=list)  # metrics by frame, camera and method
     _name: str = ""  # of the held-out camera in its frame
-    _place: tuple[str, str] = "", ""  # its frame, and its own name
+    _place: tuple[str, str] = "", ""  # its frame, and its name alone
     _truth: Truth | None = None
     _views: dict[str, RenderedView] = field(default_factory=dict)  # of that camera, by method
 
     def look(self, name: str, frame: ScoredFrame, method: str, rig: Rig, views: Sequence[RenderedView]) -> None:
-        """Collect a method's view of a held-out camera, and score the views of the one before."""
+        """Collect a method's view of a held-out camera, and score the views of the camera before it."""
         if name != self._name:
             self.finish()
             self._name, self._truth = name, None if frame.truth is None else frame.truth(rig)
@@ -266,8 +263,8 @@ class CommonPixels:
                 row["ssim"] = float(ssim_map(view.image, true).mean(-1)[common].mean())
                 row["gradients"] = _gradients(view.image, common) / max(_gradients(true, common), 1.0)
                 for region, mask in regions.items():
-                    found = errors(gain * view.image[common & mask], true[common & mask])
-                    row |= {region: found["psnr_db"]} if found else {}
+                    metrics = errors(gain * view.image[common & mask], true[common & mask])
+                    row |= {region: metrics["psnr_db"]} if metrics else {}
             self.rows.append(row)
         self._views = {}
 
@@ -276,10 +273,10 @@ class CommonPixels:
         frames = list(dict.fromkeys(row["frame"] for row in self.rows))
         means, by_frame = {}, {}
         for method in methods:
-            own = [row for row in self.rows if row["method"] == method]
-            means[method] = mean_of(own)
-            of_frames = [mean_of(row for row in own if row["frame"] == frame) for frame in frames]
-            by_frame[method] = np.array([row.get("gain_psnr_db", np.nan) for row in of_frames])
+            rows = [row for row in self.rows if row["method"] == method]
+            means[method] = mean_of(rows)
+            frame_means = [mean_of(row for row in rows if row["frame"] == frame) for frame in frames]
+            by_frame[method] = np.array([row.get("gain_psnr_db", np.nan) for row in frame_means])
         drawn = draws_of(len(frames))
         for method in methods[1:]:
             difference = by_frame[method] - by_frame[methods[0]]
@@ -290,8 +287,8 @@ class CommonPixels:
         tables: list[Table] = [("Against the photographs of held-out cameras", means, _COLUMNS, notes)]
         if self.in_holes:
             tables = [("Against the photographs in held-out holes", means, _HOLE_COLUMNS, HOLE_NOTES)]
-        found = {key for row in self.rows for key in row if key.startswith(("class ", "mask "))}
-        if names := sorted(found, key=lambda name: (name.split()[0], int(name.split()[1]))):
+        regions = {key for row in self.rows for key in row if key.startswith(("class ", "mask "))}
+        if names := sorted(regions, key=lambda name: (name.split()[0], int(name.split()[1]))):
             columns = [(name, f"{{{name}:.2f}}") for name in names]
             notes = "PSNR of these pixels (cameras: after one gain), by class of points around or segmenter's mask."
             tables.append(("The same by class", means, columns, notes))

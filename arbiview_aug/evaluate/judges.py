@@ -1,7 +1,7 @@
 """Networks that judge views, and their verdicts: hits, AP, recall and IoU with bootstrap intervals.
 
 Networks were trained on photographs and are named as ``FILE.py:function``. Detectors take an RGB image (H, W, 3) uint8
-and return boxes, scores, and what else they like, which is not read; segmenters return masks (n, H, W).
+and return boxes, scores, and further values that are not read; segmenters return masks (n, H, W).
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ Detector = Callable[[Picture], Detections]
 Segmenter = Callable[[Picture], BoolArray]
 
 LEAST_SCORE = 0.05
-"""Detections below it are left out: torchvision's default of Faster R-CNN, whatever the detector's."""
+"""Least score of a detection, torchvision's default for Faster R-CNN; it applies to all detectors."""
 
 
 def load_detector(name: str) -> Detector:
     """Load the detector that ``--detector`` names.
 
-    It returns the detections from ``LEAST_SCORE`` on, cut at the image's border.
+    It returns detections with a score of ``LEAST_SCORE`` or more, clipped to the image.
 
     Raises:
         DataError: No such function. Calls raise it for outputs that are not boxes (n, 4) and scores (n,), or boxes that
@@ -108,7 +108,7 @@ def _host(part: Any) -> Any:
 
 @contextmanager
 def _foreign(text: str) -> Iterator[None]:
-    """Turn what another's code raises into DataError with a text; SystemExit, too, which would end the command."""
+    """Turn errors of foreign code into DataError with a text; SystemExit, too, which would end the command."""
     try:
         yield
     except KeyboardInterrupt:
@@ -151,7 +151,7 @@ OVERLAP = 0.5  # least IoU of a hit, as in PASCAL VOC
 IntArray = npt.NDArray[np.int64]
 
 FEWEST = {"objects": 100, "images": 10}
-"""95 % intervals of a share of 100 objects are 0.2 wide at most. Of fewer than 10 images a bootstrap says little."""
+"""Least numbers: a share of fewer objects has a wide interval, and a bootstrap over fewer images says little."""
 
 TOO_FEW = "rows of fewer than 100 objects or 10 images are too few to tell methods apart; add frames"
 
@@ -173,25 +173,25 @@ class Matches(NamedTuple):
     num_true: int
 
 
-def ious(one: FloatArray, two: FloatArray) -> FloatArray:
+def ious(a: FloatArray, b: FloatArray) -> FloatArray:
     """(n, m) IoU of boxes (n, 4) and (m, 4); that of two empty ones is 0."""
     # Not torchvision's: importing it takes seconds.
-    low, high = np.maximum(one[:, None, :2], two[:, :2]), np.minimum(one[:, None, 2:], two[:, 2:])
+    low, high = np.maximum(a[:, None, :2], b[:, :2]), np.minimum(a[:, None, 2:], b[:, 2:])
     both = (high - low).clip(0).prod(axis=-1)
-    one_px, two_px = ((boxes[:, 2:] - boxes[:, :2]).prod(axis=1) for boxes in (one, two))
-    return np.asarray(both / np.maximum(one_px[:, None] + two_px - both, 1e-9))
+    a_px, b_px = ((boxes[:, 2:] - boxes[:, :2]).prod(axis=1) for boxes in (a, b))
+    return np.asarray(both / np.maximum(a_px[:, None] + b_px - both, 1e-9))
 
 
 def match(detections: Detections, objects: Objects) -> Matches:
     """Match detections, the surest first, each with the free object that it overlaps most."""
-    true, others = objects.boxes[objects.counts], objects.boxes[~objects.counts]
+    true, uncounted = objects.boxes[objects.counts], objects.boxes[~objects.counts]
     hits, free = np.zeros(len(detections.boxes), bool), np.ones(len(true), bool)
     overlaps = ious(detections.boxes, true)
     for k in np.argsort(-detections.scores, kind="stable") if len(true) else ():
         best = np.where(free, overlaps[k], 0).argmax()
         hits[k] = free[best] and overlaps[k, best] >= OVERLAP
         free[best] &= not hits[k]
-    chosen = hits | (ious(detections.boxes, others).max(axis=1, initial=0) < OVERLAP)
+    chosen = hits | (ious(detections.boxes, uncounted).max(axis=1, initial=0) < OVERLAP)
     return Matches(detections.scores[chosen], hits[chosen], len(true))
 
 
@@ -223,7 +223,7 @@ class Reference(NamedTuple):
 
 @dataclass
 class Panel:
-    """Networks, and their verdicts on all views that they were shown: true images say what is there.
+    """Networks, and their verdicts on all views so far, against their output for the true images.
 
     Sure detections in the true images are the objects. Frames without a truth are not judged.
     """
@@ -231,7 +231,7 @@ class Panel:
     detector: Detector | None = None
     segmenter: Segmenter | None = None
     matches: dict[str, list[Matches]] = field(default_factory=dict)  # by method
-    pixels: dict[str, list[IntArray]] = field(default_factory=dict)  # (masks, 2) intersection and union, likewise
+    pixels: dict[str, list[IntArray]] = field(default_factory=dict)  # (masks, 2) intersection and union, by method
     _frame: str = ""
     _references: list[Reference] = field(default_factory=list)  # of that frame, by camera
 
@@ -275,10 +275,7 @@ def valid_detections(detections: Detections, valid: BoolArray) -> Detections:
 
 
 def figures(matches: Sequence[Matches], pixels: Sequence[IntArray] = ()) -> dict[str, float]:
-    """Figures of a row: ``ap``, ``recall`` and number of ``objects``; ``iou_1``, ... and number of ``images``.
-
-    Each has a 95 % interval, ``_low`` and ``_high``, by the bootstrap over images, from one seed.
-    """
+    """``ap``, ``recall``, ``objects``; ``iou_1``, ..., ``images``; intervals ``_low``, ``_high`` by bootstrap."""
     row: dict[str, float] = {}
     if matches:
         row["objects"] = sum(found.num_true for found in matches)
@@ -300,7 +297,7 @@ def interval(name: str, draws: FloatArray) -> dict[str, float]:
 
 
 def draws_of(count: int) -> FloatArray:
-    """(1 + draws, count) how often each of ``count`` things counts: once, and as drawn with replacement."""
+    """(1 + draws, count) weights of ``count`` things: 1 each, and numbers of draws with replacement."""
     drawn = np.random.default_rng(0).multinomial(count, np.full(count, 1 / count), size=_DRAWS)
     return np.concatenate([np.ones((1, count)), drawn])
 

@@ -23,7 +23,7 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.evaluate.metrics import Image, errors, ssim_map
 from arbiview_aug.scene.point_cloud import own_car
 
-NEAREST_M = 1.0  # closer points lie on the own car
+NEAREST_M = 1.0  # closer points lie on the ego car
 _CELL_PX = 8  # of the z-buffer
 _OCCLUSION_FACTOR, _OCCLUSION_TOLERANCE_M = 1.1, 0.3
 _GROUND_BAND_M = 0.3

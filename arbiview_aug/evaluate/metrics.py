@@ -44,14 +44,14 @@ def as_tensors(images: Sequence[Image]) -> list[torch.Tensor]:
 
 
 def to_bytes(image: Image) -> npt.NDArray[np.uint8]:
-    """Round to uint8; uint8 is returned as it is."""
+    """Round to uint8; uint8 is returned unchanged."""
     if image.dtype == np.uint8:
         return np.asarray(image, dtype=np.uint8)
     return np.clip(np.round(image), 0, 255).astype(np.uint8)
 
 
 def errors(got: npt.NDArray[Any], want: npt.NDArray[Any], prefix: str = "") -> dict[str, float]:
-    """PSNR (138.1 dB for equal colours), MAE and RMSE of colours (n, 3) on the scale 0-255; empty for none."""
+    """PSNR (finite for equal colours), MAE and RMSE of colours (n, 3) on the scale 0-255; empty without colours."""
     if len(got) == 0:
         return {}
     difference = got.astype(np.float64) - want
@@ -65,18 +65,18 @@ def psnr_db(mse: float) -> float:
     return float(10 * np.log10(_PEAK**2 / max(mse, _SMALLEST_MSE)))
 
 
-def ssim_map(one: npt.NDArray[Any], two: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+def ssim_map(image: npt.NDArray[Any], truth: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     """Structural similarity (Wang et al. 2004) per pixel and channel (h, w, c) of images on the scale 0-255.
 
     Gaussian window 11x11 with σ = 1.5, K1 = 0.01, K2 = 0.03; borders are reflected.
     """
-    from kornia.metrics import ssim  # half a second, which those who need errors alone do not pay
+    from kornia.metrics import ssim  # imported late: it takes half a second
 
     around = ((5, 5), (5, 5), (0, 0))
-    padded = (np.pad(image.astype(np.float64), around, "reflect") for image in (one, two))
-    a, b = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in padded)
+    padded = (np.pad(array.astype(np.float64), around, "reflect") for array in (image, truth))
+    a, b = (torch.from_numpy(array).permute(2, 0, 1)[None] for array in padded)
     strips = []
-    for top in range(0, len(one), _STRIP_PX):  # a whole large image takes ten times as long, most of it for memory
+    for top in range(0, len(image), _STRIP_PX):  # a large image at once is slower: its scratch leaves the cache
         part = slice(top, top + _STRIP_PX + 10)
         strips.append(ssim(a[:, :, part], b[:, :, part], window_size=11, max_val=_PEAK, padding="valid")[0])
     return np.asarray(torch.cat(strips, 1).permute(1, 2, 0).numpy())

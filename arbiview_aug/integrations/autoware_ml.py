@@ -13,19 +13,20 @@ from arbiview_aug.integrations.mmdet3d.matrices import entry
 from arbiview_aug.integrations.mmdet3d.transform import RigRetargetMultiView
 
 IMAGE_KEYS = ("camera_intrinsics", "lidar2cam", "lidar2img")
-"""Matrices (N, 4, 4) of ``LoadMultiViewImagesFromFiles``, beside ``img`` (N, 3, H, W) and ``camera_names``."""
+"""Matrices (N, 4, 4) of ``LoadMultiViewImagesFromFiles``, next to ``img`` (N, 3, H, W) and ``camera_names``."""
 
 
 class RigRetargetMultiViewImages:
-    """Re-renders ``img`` as another vehicle's cameras, and rewrites the matrices beside it.
+    """Re-renders ``img`` as another vehicle's cameras, and rewrites its matrices.
 
-    It stands right after ``LoadMultiViewImagesFromFiles`` (and what loads points and boxes, where they are loaded:
+    Place it right after ``LoadMultiViewImagesFromFiles`` and the steps that load points and boxes, if any (they are the
     geometry), before images are resized and points and boxes are turned.
 
     Args:
         target: A rig's name, file, ``Rig`` or ``RandomRig``; of pinhole cameras (``Rig.undistorted()``).
         lidar2ego: (4, 4) the LiDAR's pose; the frame of points and boxes.
-        settings: Further ones of ``RigRetargetMultiView``: ``size``, ``geometry``, ``keys``, ``p``, ``sequence_key``.
+        settings: Further options of ``RigRetargetMultiView``: ``size``, ``geometry``, ``keys``, ``p``,
+            ``sequence_key``.
 
     Raises:
         CalibrationError: A target with lenses, or that cannot be loaded.
@@ -38,8 +39,8 @@ class RigRetargetMultiViewImages:
         """The entries that change: the pipeline merges them into the dict.
 
         Raises:
-            SampleError: Entries are missing, or images are not stacked (N, 3, H, W) in RGB of [0, 1] or [0, 255];
-                entries that speak of the source's pixels, which a transform cannot take out.
+            SampleError: Missing entries; images that are not stacked (N, 3, H, W) in RGB of [0, 1] or [0, 255];
+                entries that describe the source's pixels, which a transform cannot remove.
         """
         missing = [key for key in ("img", *IMAGE_KEYS) if input_dict.get(key) is None]
         if missing:
@@ -58,8 +59,8 @@ class RigRetargetMultiViewImages:
         out = self.step(results)
         if dropped := ", ".join(key for key in results if key not in out):
             raise SampleError(f"{dropped}: of the source's pixels; retarget before what makes them, or leave them out")
-        own = {key for key in ("gt_bboxes_3d", "points") if key not in input_dict}
-        changed = {key: value for key, value in out.items() if key not in own and value is not results.get(key)}
+        absent = {key for key in ("gt_bboxes_3d", "points") if key not in input_dict}
+        changed = {key: value for key, value in out.items() if key not in absent and value is not results.get(key)}
         changed["img"] = (out["img"].numpy() / scale).astype(images.dtype)
         if "camera_names" in input_dict:
             skipped = out.get("retarget_params", {}).get("skipped")

@@ -22,8 +22,8 @@ _FAR_SHARE = 0.01  # largest share of values far outside [0, 1]: more are normal
 class OnImages(torch.nn.Module):
     """Runs a photometric module on a sample's images alone, all cameras (of all frames) as one batch.
 
-    kornia's modules want float images (B, 3, H, W) in [0, 1]; uint8 images come back as uint8. Pixels that no source
-    saw and nothing filled stay black: changed with the rest, holes would look like something that was seen.
+    kornia's modules expect float images (B, 3, H, W) in [0, 1]; uint8 images come back as uint8. Pixels that no source
+    saw and nothing filled stay black: augmented, holes would look like scene.
 
     Args:
         module: An ``ImageSequential``, or anything from a batch of images to a batch of images in [0, 1]: normalise
@@ -77,7 +77,7 @@ def check_photometric(module: Callable[[torch.Tensor], torch.Tensor]) -> None:
     """Refuse modules of kornia and torchvision that move pixels, by name."""
     bases = [(type(part).__name__, base) for part in _parts(module) for base in type(part).__mro__]
     for name, base in bases:
-        if base.__module__ == "torchvision.transforms.transforms":  # of both sorts: their namesakes in v2 are apart
+        if base.__module__ == "torchvision.transforms.transforms":  # judged by their namesakes in v2
             from torchvision.transforms import v2
 
             base = getattr(v2, base.__name__, base)
@@ -89,8 +89,8 @@ def check_photometric(module: Callable[[torch.Tensor], torch.Tensor]) -> None:
 
 
 def _parts(module: Any) -> Iterator[Any]:
-    """A module or function and all in it; ``Compose`` of both versions keeps its own in a plain list."""
+    """A module or function and its children; ``Compose`` of both versions keeps them in a plain list."""
     for part in module.modules() if isinstance(module, torch.nn.Module) else [module]:
         yield part
-        for held in getattr(part, "transforms", ()):
-            yield from _parts(held)
+        for child in getattr(part, "transforms", ()):
+            yield from _parts(child)

@@ -27,9 +27,9 @@ from arbiview_aug.transforms.settings import checked_probability
 DataDict = dict[str, Any]
 
 MATRICES = ("camera_intrinsics", "camera2ego", "camera2lidar", "lidar2camera", "lidar2image")
-"""Lists of (4, 4) that ``NuScenesDataset.load_camera_info`` writes beside ``camera_imgs``."""
+"""Lists of (4, 4) that ``NuScenesDataset.load_camera_info`` writes next to ``camera_imgs``."""
 
-_LEAST_UP = 0.9  # z of the upward axis of a frame that boxes stand upright in
+_LEAST_UP = 0.9  # z of the upward axis of a frame in which boxes are upright
 
 
 class _Step(RigRetargetMultiView):
@@ -39,19 +39,18 @@ class _Step(RigRetargetMultiView):
 class RigRetargetDataDict:
     """Retargets a ``data_dict``: points, and images with their calibration where it holds them.
 
-    It stands before everything that turns, flips or scales the scene or the images: first in ``DATA_AUGMENTOR``, or
+    Place it before everything that turns, flips or scales the scene or the images: first in ``DATA_AUGMENTOR``, or
     after ``gt_sampling``, whose pasted objects are then scanned too; or in ``__getitem__`` before ``prepare_data``.
 
     Args:
         target: A rig's name, file, ``Rig`` or ``RandomRig``. With ``lidars``: points are those of its scanners. With
             images: of pinhole cameras (``Rig.undistorted()``).
         lidar2ego: (4, 4) pose of the frame of points and boxes in the source's ego frame.
-        target_lidar2ego: (4, 4) pose of the frame of those that come out, as B's own data set has it; by default they
-            stay in the frame that they came in.
+        target_lidar2ego: (4, 4) pose of the output's frame, as in B's data set; by default that of the input.
         min_points_in_gt: Boxes with fewer points after retargeting are left out: OpenPCDet's
             ``FILTER_MIN_POINTS_IN_GT``, which counts those before.
-        p: Probability of retargeting; a skipped dict stays as it is.
-        settings: Further ones of ``RigRetargetMultiView``: ``size``, ``ground_z_m``, ``geometry``, ``keys``,
+        p: Probability of retargeting; a skipped dict is unchanged.
+        settings: Further options of ``RigRetargetMultiView``: ``size``, ``ground_z_m``, ``geometry``, ``keys``,
             ``sequence_key`` (frames of a drive share the draw of ``p`` too; ``self.step.set_epoch`` changes it).
 
     Raises:
@@ -81,7 +80,7 @@ class RigRetargetDataDict:
     def __call__(self, data_dict: Mapping[str, Any]) -> DataDict:
         """A new ``data_dict``; ``calib`` is the given object, which becomes that of the new frame.
 
-        ``DatasetTemplate.prepare_data`` puts the object that it was given back after all augmentors.
+        ``DatasetTemplate.prepare_data`` restores the object that it was given after all augmentors.
 
         Raises:
             SampleError: A scene that is turned already, images without matrices or of KITTI, nothing to retarget.
@@ -166,10 +165,7 @@ class RigRetargetDataDict:
 
 
 def register(augmentor: Any) -> None:
-    """Make the step known to OpenPCDet's ``DataAugmentor`` class as ``rig_retarget``; twice is allowed.
-
-    Keys of the entry in ``AUG_CONFIG_LIST`` are the arguments in capitals.
-    """
+    """Register ``rig_retarget`` with OpenPCDet's ``DataAugmentor``; keys of its entry are arguments in capitals."""
 
     def rig_retarget(_: Any, config: Mapping[str, Any]) -> RigRetargetDataDict:
         return RigRetargetDataDict(**{key.lower(): value for key, value in config.items() if key != "NAME"})

@@ -48,8 +48,8 @@ def project_boxes_3d(boxes_3d: Any, cameras: Rig | Mapping[str, Any]) -> list[Im
 
     Args:
         boxes_3d: (B, >= 7) centre x y z, length, width, height in metres, yaw in radians, in the cameras' ego frame.
-        cameras: A rig, or an unbatched sample, such as ``RigRetarget`` returns, whose ``coverage`` and ``ego_mask``
-            mask pixels.
+        cameras: A rig, or an unbatched sample as ``RigRetarget`` returns it; its ``coverage`` and ``ego_mask`` mask
+            pixels.
 
     Returns:
         An entry for each camera.
@@ -72,10 +72,7 @@ def rig_of(cameras: Rig | Mapping[str, Any]) -> Rig:
 
 
 def _outline(camera: Camera, box: FloatArray) -> FloatArray | None:
-    """Rectangles (2, 4) x0 y0 x1 y1 around the projection of a box (7,): uncut, and inside the image.
-
-    None if it is outside or holds the camera.
-    """
+    """Rectangles (2, 4) x0 y0 x1 y1 around a box (7,), uncut and in the image; None if outside or around the camera."""
     if is_over(box, camera.center_m) and abs(camera.center_m[2] - box[2]) <= box[5] / 2:
         return None
     points = edge_points(camera, box)

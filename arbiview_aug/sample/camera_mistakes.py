@@ -22,12 +22,12 @@ Gray = npt.NDArray[np.float32]
 
 # --- points on images -------------------------------------------------------------------------------------------------
 EDGE_WIDTH_PX, _NEARER, _LEAST_EDGES = 160, 0.2, 50
-"""Points are compared with images of this width: pixels whose depth's logarithm is so much less than two pixels aside
-are edges of objects. Levinson and Thrun (2013) calibrate online by the same evidence."""
+"""Width of the images that points are compared with; least step of the logarithm of depth, over two pixels, at edges of
+objects; least number of such pixels. Levinson and Thrun (2013) calibrate online by the same evidence."""
 
 CLEAR_FIT, FIT_GAIN = 0.1, 0.05
-"""Fits of right points are 0.11 to 0.36 on 16 real frames and streets, of mirrored or turned ones up to 0.12, and at
-least 0.06 below those of the right ones."""
+"""Fit of points that are right, and the least gain of a better reading: between those of right points and of mirrored
+or turned ones on real frames and synthetic streets."""
 
 
 class EdgeFit(NamedTuple):
@@ -38,7 +38,7 @@ class EdgeFit(NamedTuple):
 
     def beats(self, other: EdgeFit) -> bool:
         """Whether it is clearly better: by ``FIT_GAIN`` and four standard errors of uniform ranks."""
-        gain, edges = other if other.edges >= _LEAST_EDGES else (0.0, self.edges)  # it sees nothing to speak of
+        gain, edges = other if other.edges >= _LEAST_EDGES else (0.0, self.edges)  # it sees too few
         error = 0.29 * np.sqrt(1 / max(self.edges, 1) + 1 / max(edges, 1))
         least = _LEAST_EDGES if other.edges >= _LEAST_EDGES else 2 * _LEAST_EDGES
         return self.edges >= least and self.gain > max(CLEAR_FIT, gain + max(FIT_GAIN, 4 * error))
@@ -84,14 +84,11 @@ def total(fits: Sequence[EdgeFit]) -> EdgeFit:
 
 
 def fit_findings(rig: Rig, views: Sequence[tuple[Camera, Gray]], points: Points) -> Iterator[Finding]:
-    """Cameras that points do not fit although they fit others, where another pose or image is clearly better.
-
-    Those whose pose alone is impossible are left to ``validation.doubts``.
-    """
+    """Cameras that points misfit although they fit others, if another pose or image is clearly better."""
     fits = [edge_fit(camera, ranks, points) for camera, ranks in views]
     for k, (camera, ranks) in enumerate(views):
-        others = total(fits[:k] + fits[k + 1 :])
-        if pose_doubt(camera, True) is not None or fits[k].gain > CLEAR_FIT or others.gain < CLEAR_FIT:
+        rest = total(fits[:k] + fits[k + 1 :])
+        if pose_doubt(camera, True) is not None or fits[k].gain > CLEAR_FIT or rest.gain < CLEAR_FIT:
             continue
         where, expected = f"camera {camera.name!r}", "points on the edges of its image"
         order = "are the images in another order?"
@@ -105,7 +102,7 @@ def fit_findings(rig: Rig, views: Sequence[tuple[Camera, Gray]], points: Points)
 
 # --- neighbouring cameras ---------------------------------------------------------------------------------------------
 DISAGREE_DEG, _LEAST_MATCHES = 1.0, 15
-"""Neighbours of real rigs disagree by 0.05 to 0.6 degrees, the most where cameras fire apart while the car moves."""
+"""Angle of a mistake, above that of cameras that fire apart while the car moves; least number of matches."""
 
 _VIEW_PX, _RATIO, _NEAREST_M, _FALSE_DEG = 800, 0.8, 2.0, 10.0
 """Size of the common view; Lowe's ratio; the nearest scene; matches farther apart are false."""
@@ -191,17 +188,18 @@ def neighbour_findings(errors: dict[tuple[str, str], FloatArray]) -> Iterator[Fi
 
 # --- the own car ------------------------------------------------------------------------------------------------------
 _ROAD_AHEAD_M, _FLOW_PX, _GRADIENT, _STEADY = 12.0, 3.0, 3.0, 0.85
-"""An edge of the own car is in all frames, where the road nearer than the first would have moved across it by the
-second; its gradient is so many grey levels a pixel, and so much of the mean of the frames' gradients."""
+"""Edges of the own car are in all frames. The road there is nearer than the first and would have moved across the edge
+by the second. The edge's mean gradient is at least the third, in grey levels a pixel, and at least the fourth of the
+mean of the frames' gradients."""
 
 _LEAST_WIDTH = 0.2
-"""Length of such an edge as a share of the width: 0.28 to 0.63 on a roof, up to 0.13 on 16 views of moving traffic."""
+"""Least length of such an edge as a share of the width, above that of edges in moving traffic."""
 
 
 def own_car_share(
     camera: Camera, images: Sequence[torch.Tensor], ego2world: Sequence[FloatArray], ground_z_m: float
 ) -> float:
-    """Share of the images below edges of the own car; 0 where there are none."""
+    """Share of the images below edges of the own car; 0 without edges."""
     small = [gray(camera, image, EDGE_WIDTH_PX) for image in images]
     camera = small[0][0]
     gradients = np.stack([np.stack([cv2.Sobel(p, cv2.CV_32F, *d) / 8 for d in ((1, 0), (0, 1))], -1) for _, p in small])

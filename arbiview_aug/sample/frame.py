@@ -27,7 +27,7 @@ class Frame:
         images: N images (3, H, W), uint8 or float in [0, 1].
         rig: Their cameras.
         points: Measured points (P, >= 3) in the ego frame, as the sample holds them; None without any, as for boxes.
-        boxes: Labelled objects (B, >= 7), likewise.
+        boxes: Labelled objects (B, >= 7), not checked either.
         depth: Depth maps of each camera, by sample key.
         neighbours: Other frames of the drive, nearest first; None if the sample has no such key.
         further: Other entries that were asked for, by sample key.
@@ -76,10 +76,7 @@ class Neighbour:
         return moved_boxes(self.boxes_now, self.boxes)
 
     def points(self) -> FloatArray | None:
-        """(P, C) its points in the current ego frame, those of labelled objects where these are now; None without.
-
-        Columns beyond x, y, z stay.
-        """
+        """(P, C) its points in the current ego frame, those of labelled objects moved with them; None without any."""
         value = self.given.get("points")
         if value is None:
             return None

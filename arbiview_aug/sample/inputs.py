@@ -32,7 +32,7 @@ MOTION_KEY, LEARNED_KEY = "motion_depth_m", "learned_depth_m"
 
 MOTION_WORDS_KEY, LEARNED_WORDS_KEY = "motion_depth_words", "learned_depth_words"
 DEPTH_WORDS = {"motion": MOTION_WORDS_KEY, LEARNED_KEY: LEARNED_WORDS_KEY}
-"""How they were made, or why they were declined, for ``explain`` and warnings; by names of ``GeometryRow.reads``."""
+"""Sample keys of texts on how depth was made or why it was declined, by names of ``GeometryRow.reads``."""
 
 CALIBRATION_KEYS = (
     *("images", "rig", "K", "cam2ego", "distortion", "lens", "ground_z_m", "coverage", "ego_mask", "neighbours"),
@@ -67,10 +67,10 @@ def read_frames(
 
     Args:
         sample: The sample dict.
-        source: The rig of samples that carry none; one that carries another calibration is refused.
+        source: Rig of samples without a calibration; a sample with another one is refused.
         geometry: A name in ``GEOMETRIES``; what it uses is read.
-        further: Sample keys of other entries to read: arrays, or lists of one for each frame.
-        names: Sample keys of names to read: one, or in a batch a list or tensor of names.
+        further: Sample keys of other entries to read: arrays, or lists with one for each frame.
+        names: Sample keys of names to read: a name, or in a batch a list or tensor of names.
         warn: Called with a topic and a message for neighbours that are left out.
 
     Raises:
@@ -89,8 +89,8 @@ def read_frames(
     if 0 in lead:
         raise SampleError(f"images: expected at least one frame, got the leading dimensions {lead}")
     frames, places = [], list(np.ndindex(*lead))
-    for index, of_frame in zip(places, split("images", images, lead), strict=True):
-        checked = checked_images(of_frame)
+    for index, views in zip(places, split("images", images, lead), strict=True):
+        checked = checked_images(views)
         frames.append(Frame(checked, read_rig(checked, sample, source, lead, index)))
     if source is not None and sample.get("rig") is None and not CHECKED_KEYS.isdisjoint(sample):
         for key in differing_keys(source, sample, lead):
@@ -108,21 +108,18 @@ def read_frames(
     entries = {key: _entries(key, sample[key], lead) for key in wanted if sample.get(key) is not None}
     entries |= {key: _names(key, sample[key], lead) for key in names if sample.get(key) is not None}
     for k, (frame, index) in enumerate(zip(frames, places, strict=True)):
-        found = {key: of_frames[k] for key, of_frames in entries.items()}
-        depth = {key: found.pop(key) for key in DEPTH_KEYS if key in found}
-        others, points, boxes = (found.pop(key, None) for key in ("neighbours", "points", "boxes_3d"))
-        frame = replace(frame, points=points, boxes=boxes, depth=depth, further=found)
-        if others is not None:
-            frame = replace(frame, neighbours=read_neighbours(frame, others, sample, index, warn or WarnOnce()))
+        values = {key: frame_values[k] for key, frame_values in entries.items()}
+        depth = {key: values.pop(key) for key in DEPTH_KEYS if key in values}
+        neighbours, points, boxes = (values.pop(key, None) for key in ("neighbours", "points", "boxes_3d"))
+        frame = replace(frame, points=points, boxes=boxes, depth=depth, further=values)
+        if neighbours is not None:
+            frame = replace(frame, neighbours=read_neighbours(frame, neighbours, sample, index, warn or WarnOnce()))
         frames[k] = frame
     return frames
 
 
 def _entries(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
-    """The entry of each frame: an array, a tensor with the leading dimensions, or a list with an array for each.
-
-    Depth maps are a tensor (*lead, N, H, W) or a list of a tensor (*lead, H, W) for each camera.
-    """
+    """Entry of each frame of a (*lead, ...) tensor, or of a list over frames (of depth maps, over cameras)."""
     if key in DEPTH_KEYS:
         try:
             return [entry(value, lead, index) for index in np.ndindex(*lead)]
@@ -140,7 +137,7 @@ def _entries(key: str, value: Any, lead: tuple[int, ...]) -> list[Any]:
 
 
 def _names(key: str, value: Any, lead: tuple[int, ...]) -> list[str]:
-    """The name of each frame."""
+    """Name of each frame."""
     count = math.prod(lead)
     is_whole = isinstance(value, torch.Tensor) and value.numel() and value.numel() % count == 0
     names = [value] if not lead else list(value.reshape(count, -1)) if is_whole else value
@@ -151,27 +148,24 @@ def _names(key: str, value: Any, lead: tuple[int, ...]) -> list[str]:
 
 # --- scenes -----------------------------------------------------------------------------------------------------------
 def read_scene(frame: Frame, geometry: str) -> Scene:
-    """The scene that a geometry of ``GEOMETRIES`` uses, in the source's ego frame.
-
-    SampleError for values that are impossible.
-    """
-    reads, found = GEOMETRIES[geometry].reads, dict[str, Geometry]()
+    """Read the scene that a geometry uses, in the source's ego frame; SampleError for impossible values."""
+    reads, parts = GEOMETRIES[geometry].reads, dict[str, Geometry]()
     for name in reads:
         key = _SAMPLE_KEYS.get(name, name)
         if key in frame.depth:
             maps = _depth_maps(key, frame)
             if name == "motion" and LEARNED_KEY in reads and LEARNED_KEY in frame.depth:
                 maps = list(map(believed, maps, _depth_maps(LEARNED_KEY, frame)))
-            before = [found[other] for other in ("points", "depth_m", "motion") if other in found and key != "depth_m"]
-            found[name] = anchored_maps(maps, before)
+            anchors = ("points", "depth_m", "motion") if key != "depth_m" else ()
+            parts[name] = anchored_maps(maps, [parts[anchor] for anchor in anchors if anchor in parts])
         elif name == "boxes" and frame.boxes is not None:
-            found[name] = checked_boxes(as_array(key, frame.boxes))
+            parts[name] = checked_boxes(as_array(key, frame.boxes))
         elif name == "points" and frame.points is not None:
-            found[name] = checked_points(as_array(key, frame.points))
+            parts[name] = checked_points(as_array(key, frame.points))
         elif key in frame.further:
-            found[name] = as_array(key, frame.further[key])
-    fields: dict[str, Any] = {name: found.pop(name) for name in _SAMPLE_KEYS if name in found}
-    return Scene(**fields, further=found)
+            parts[name] = as_array(key, frame.further[key])
+    fields: dict[str, Any] = {name: parts.pop(name) for name in _SAMPLE_KEYS if name in parts}
+    return Scene(**fields, further=parts)
 
 
 def _depth_maps(key: str, frame: Frame) -> list[DepthMap]:
@@ -196,7 +190,7 @@ PIXEL_BOUND_KEYS = (
     *("lidar2img", "lidar2image", "ego2img", "global2img", "world2img"),
     *("projection", "projection_mat", "projection_matrix", "proj_mat", "P", "P2"),
 )
-"""Keys bound to the source's pixels; they are dropped, as they would be stale in the target's views."""
+"""Keys bound to the source's pixels; dropped, because they would be stale in the target's views."""
 
 CAMERA_KEYS = (
     *USUAL_NAMES["cam2ego"],
@@ -204,7 +198,7 @@ CAMERA_KEYS = (
     *("cam2global", "global2cam", "cam2world", "world2cam"),
     *("distortions", "dist_coeffs", "distortion_coeffs", "distortion_coefficients", "img_filename"),
 )
-"""Keys that speak of the source's cameras; they would be stale, too."""
+"""Keys that describe the source's cameras; dropped for the same reason."""
 
 EGO_KEYS = ("points", "boxes_3d", "ego2world")  # they pass, or move with ``SampleKeys(frame="target")``
 _MAX_ENTRIES = 64  # checked per list: longer lists are tokens or numbers
@@ -225,7 +219,7 @@ def refuse_camera_values(labels: Sequence[Any]) -> None:
 def check_other_keys(
     sample: Mapping[str, Any], sizes: Sequence[tuple[int, ...]], label_keys: Sequence[str], pass_keys: Sequence[str]
 ) -> list[str]:
-    """The keys that hold label maps; refuse others that may be bound to the source's pixels.
+    """Find the keys that hold label maps; refuse others that may be bound to the source's pixels.
 
     ``sizes`` are (h, w) of the images; ``label_keys`` and ``pass_keys`` are the user's. SampleError for a tensor of the
     images' height and width, or a torchvision tv_tensor, under another key.
@@ -254,7 +248,7 @@ def check_other_keys(
 
 
 def _stale_map(key: Any, value: Any, leaf: Any, images: Any) -> str:
-    """Say what a leaf of an entry is, which has the images' height and width, and what to do with it."""
+    """Describe a leaf of an entry that has the images' height and width, and the fix."""
     shape = tuple(leaf.shape)
     image = images[0] if isinstance(images, list | tuple) else images
     is_nested = leaf is not value and not (isinstance(value, list | tuple) and any(leaf is part for part in value))
@@ -277,7 +271,7 @@ def _tv_tensor(value: Any) -> str:
 
 
 def _leaves(value: Any) -> Iterator[Any]:
-    """Yield the leaves of nested mappings and sequences, in order; a container that stands in itself is read once."""
+    """Yield the leaves of nested mappings and sequences, in order; a container within itself is read once."""
     seen: dict[int, Any] = {}
     waiting = [value]
     while waiting:
@@ -290,10 +284,10 @@ def _leaves(value: Any) -> Iterator[Any]:
 
 
 def misnamed_keys(sample: Mapping[str, Any], calibrated: bool, static: bool = False) -> dict[str, str]:
-    """Keys that are probably misnamed and would not be read, and what is meant.
+    """Keys that are probably misnamed and would not be read, and the names that are meant.
 
-    Where ``calibrated``, a rig stands for ``lens``, ``distortion`` and ``ground_z_m``; where ``static``, no ego-frame
-    key is used.
+    If ``calibrated``, a rig replaces ``lens``, ``distortion`` and ``ground_z_m``; if ``static``, no ego-frame key is
+    used.
     """
     lenses = () if calibrated else ("distortion", "lens", "ground_z_m")
     keys = misnamed(sample, ("neighbours", *lenses, *(() if static else (*EGO_KEYS, "depth_m"))))
@@ -312,7 +306,7 @@ def warn_of_misnamed(
 
 
 def focal_mistake(camera: Camera) -> tuple[str, str] | None:
-    """Say that a focal length is too short for pixels, as (found, fix); None if it is not."""
+    """Mistake of a focal length that is too short for pixels, as (found, fix); None if it is plausible."""
     f, size = camera.K[0, 0], min(camera.size)
     if size < _MOST_FOCALS * f:
         return None

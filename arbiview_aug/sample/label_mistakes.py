@@ -27,15 +27,15 @@ from arbiview_aug.scene.point_cloud import own_car
 from arbiview_aug.scene.surface import Points
 
 ROAD_M = 0.2
-"""Largest distance of the points' road from ``ground_z_m``; on three real frames and six streets it is up to 0.01."""
+"""Largest distance of the points' road from ``ground_z_m``, well above that of right frames."""
 
 _ROAD_RADIUS_M, _SECTORS, _LEAST_SECTORS, _LEAST_IN_SECTOR = 10.0, 36, 12, 20
-_ROAD_PERCENTILE = 10  # of a sector's points: those above stand on the road
+_ROAD_PERCENTILE = 10  # of a sector's points: higher ones belong to things on the road
 _OVER_ROAD_M = 0.3  # points above this are objects'
 
 _LIDAR_HEIGHT_M = 1.2  # points this far below the road come from the height of a LiDAR on a roof
 
-_LEAST_POINTS = 5  # in a box, for it to speak
+_LEAST_POINTS = 5  # in a box that counts
 _MOST_POINTS = 50  # near boxes count as much as others
 _BETTER = 1.3  # times as many points: a box of another reading holds clearly more
 _LEAST_WINS, _WIN_RATIO = 3, 4
@@ -52,8 +52,8 @@ _HALVES, _ALONE, _TWICE = 0.35, 1.2, 0.6
 """Shares of the points in boxes twice as large that other readings hold; points a third farther out, where objects
 stand alone; shares in boxes' inner halves, where right ones are hollow."""
 
-_MOST_LONG_M = 30.0  # the median of the boxes' longest sides: no street has so many trains
-_NEAR_M = 40.0  # boxes farther away stand on another height of the road
+_MOST_LONG_M = 30.0  # largest median of the boxes' longest sides: beyond it, most objects would be trains
+_NEAR_M = 40.0  # at boxes farther away, the road may have another height
 ELSEWHERE_M = 200.0  # nothing nearer than this: another frame, or another unit
 _MANY_DEG = 2 * math.pi + 1e-3
 
@@ -90,8 +90,8 @@ def label_findings(
     if boxes is not None and (np.abs(boxes[:, 6]) > _MANY_DEG).any():
         largest = float(np.abs(boxes[:, 6]).max())
         return [Finding("boxes_3d", "yaw in radians", f"yaw up to {largest:.1f}", "pass degrees through torch.deg2rad")]
-    of_points, points, is_sure = _points_finding(rig, images, points, ego2world)
-    findings += of_points
+    point_findings, points, is_sure = _points_finding(rig, images, points, ego2world)
+    findings += point_findings
     road_m = None if points is None else road_height_m(points)
     if boxes is not None and len(boxes):
         objects = None
@@ -99,7 +99,7 @@ def label_findings(
             level_m = rig.ground_z_m if road_m is None else road_m
             objects = points[(points[:, 2] > level_m + _OVER_ROAD_M) & ~own_car(points)]
             if abs(level_m - rig.ground_z_m) > _LIDAR_HEIGHT_M:
-                objects = None  # these points are elsewhere, and tell nothing of the boxes
+                objects = None  # these points are elsewhere, and say nothing about the boxes
         single = _order_finding(boxes, objects) or (objects is not None and _size_finding(boxes, objects))
         single = single or _elsewhere(rig, boxes, objects, ego2world, is_sure)
         findings += [single] if single else _box_findings(rig, boxes, objects)
@@ -122,7 +122,7 @@ _FLIPS: tuple[tuple[str, FloatArray, str, str], ...] = (
     ("in centimetres", np.eye(3) / 100, "divide by 100", "divide positions and sizes by 100"),
     ("in feet", np.eye(3) * 0.3048, "multiply by 0.3048", "multiply positions and sizes by 0.3048"),
 )
-"""What is found, the way to the ego frame, and the fix of points and of boxes."""
+"""Finding, matrix to the ego frame, and the fixes for points and for boxes."""
 
 _OF_LIDAR = "are they in the LiDAR's frame? Apply lidar2ego to them"
 
@@ -172,9 +172,9 @@ def _points_finding(
         level_m = road_height_m(there)
         if level_m is not None and abs(level_m - rig.ground_z_m) > 2 * ROAD_M:
             continue  # another frame must put the road in its place
-        other = total([edge_fit(*view, there) for view in views])
-        if other.beats(fit) and other.gain > best.gain:
-            best, chosen, moved = other, reading, there
+        candidate = total([edge_fit(*view, there) for view in views])
+        if candidate.beats(fit) and candidate.gain > best.gain:
+            best, chosen, moved = candidate, reading, there
     if chosen is None:
         return list(fit_findings(rig, views, xyz)), points, fit.gain > CLEAR_FIT
     seen = f"points {chosen.found}, by the edges of the images"
@@ -188,8 +188,8 @@ def _elsewhere(
     bottoms = _bottoms_m(rig, boxes)
     height_m, spread_m = (0.0, 0.0) if bottoms is None else _spread(bottoms[0])
     readings = _readings(rig, ego2world, -height_m if abs(height_m) > _LIDAR_HEIGHT_M and spread_m < _ALIKE_M else 0.0)
-    moved = [(reading, other) for reading in readings for other in _moved(boxes, reading)]
-    leads = [0 if objects is None else _lead(other, boxes, objects) for _, other in moved]
+    moved = [(reading, candidate) for reading in readings for candidate in _moved(boxes, reading)]
+    leads = [0 if objects is None else _lead(candidate, boxes, objects) for _, candidate in moved]
     if max(leads):
         chosen = moved[int(np.argmax(leads))][0]
         found, fix = f"boxes {chosen.found}: they hold more points elsewhere", chosen.fix_of_boxes
@@ -201,8 +201,8 @@ def _elsewhere(
         return None
     low, high = np.percentile(bottoms[0], [10, 90])
     hang, fix = f"bottoms {low:+.1f} to {high:+.1f} m over it", "are they in another sensor's frame, or other units?"
-    kept = [(reading, other) for reading, other in moved if abs(np.linalg.det(reading.pose)) > 0.99]
-    stand = [(reading, there[0]) for reading, other in kept if (there := _bottoms_m(rig, other)) is not None]
+    rigid = [(reading, candidate) for reading, candidate in moved if abs(np.linalg.det(reading.pose)) > 0.99]
+    stand = [(reading, there[0]) for reading, candidate in rigid if (there := _bottoms_m(rig, candidate)) is not None]
     off_m = [sum(np.abs(_spread(heights_m))) for _, heights_m in stand]
     if min(off_m, default=np.inf) < _ALIKE_M:
         chosen = stand[int(np.argmin(off_m))][0]
@@ -212,7 +212,7 @@ def _elsewhere(
 
 
 def _moved(boxes: FloatArray, reading: Reading) -> Iterator[FloatArray]:
-    """Boxes as they are in the ego frame if they were given in a frame; labels of cameras differ in yaw and centre."""
+    """Boxes in the ego frame, if they were given in a reading's; labels of cameras differ in yaw and centre."""
     pose, c, s = reading.pose[:3, :3], np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
     sizes = boxes[:, 3:6] * np.linalg.norm(pose[0])
     nothing = np.zeros_like(c)
@@ -231,17 +231,17 @@ def _spread(values: FloatArray) -> tuple[float, float]:
 
 
 def road_height_m(points: Points) -> float | None:
-    """Height of the road around the vehicle: the median over directions of each one's low points; None if unknown."""
+    """Height of the road around the vehicle: the median of low points over directions; None if unknown."""
     points = points[~own_car(points)]
     x, y, z = points[np.hypot(points[:, 0], points[:, 1]) < _ROAD_RADIUS_M, :3].T
     sector = ((np.arctan2(y, x) / (2 * np.pi) + 0.5) * _SECTORS).astype(int) % _SECTORS
-    of_sectors = [z[sector == k] for k in range(_SECTORS)]
-    low = [np.percentile(heights, _ROAD_PERCENTILE) for heights in of_sectors if len(heights) >= _LEAST_IN_SECTOR]
+    sectors = [z[sector == k] for k in range(_SECTORS)]
+    low = [np.percentile(heights, _ROAD_PERCENTILE) for heights in sectors if len(heights) >= _LEAST_IN_SECTOR]
     return float(np.median(low)) if len(low) >= _LEAST_SECTORS else None
 
 
 def _bottoms_m(rig: Rig, boxes: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-    """Heights (n,) of the near boxes' bottoms over the road, and the boxes' own; None where there are too few."""
+    """Heights (n,) of the near boxes' bottoms over the road, and of the boxes; None if there are too few."""
     near = boxes[np.hypot(boxes[:, 0], boxes[:, 1]) < _NEAR_M]
     return (near[:, 2] - near[:, 5] / 2 - rig.ground_z_m, near[:, 5]) if len(near) >= _LEAST_WINS else None
 
@@ -249,7 +249,9 @@ def _bottoms_m(rig: Rig, boxes: FloatArray) -> tuple[FloatArray, FloatArray] | N
 def _box_findings(rig: Rig, boxes: FloatArray, objects: Points | None) -> Iterator[Finding]:
     """Another yaw, another height of the centre."""
     if objects is not None:
-        leads = {n: _lead(other, boxes, objects, _informative(boxes, other)) for n, other in _yaws(boxes).items()}
+        leads = {
+            name: _lead(turned, boxes, objects, _informative(boxes, turned)) for name, turned in _yaws(boxes).items()
+        }
         best = max(leads, key=lambda name: leads[name])
         if leads[best]:
             expected, seen = "yaw counter-clockwise from the x axis", f"more points in the boxes of {best}"
@@ -270,19 +272,19 @@ def _box_findings(rig: Rig, boxes: FloatArray, objects: Points | None) -> Iterat
 
 
 def _size_finding(boxes: FloatArray, objects: Points) -> Finding | None:
-    """Sizes that are halves, as simulators give extents, or twice what they should be."""
+    """Sizes that are halves, as simulators give extents, or twice the true ones."""
 
     def share(of: FloatArray, whole: FloatArray) -> float:
-        """The median share of the points in larger boxes that others hold; NaN where too few boxes speak."""
-        speak = whole >= 4 * _LEAST_POINTS
-        return float(np.median(of[speak] / whole[speak])) if speak.sum() >= _LEAST_WINS else np.nan
+        """The median share of the points in larger boxes that others hold; NaN if too few boxes have enough."""
+        enough = whole >= 4 * _LEAST_POINTS
+        return float(np.median(of[enough] / whole[enough])) if enough.sum() >= _LEAST_WINS else np.nan
 
     inner, inside, double, beyond = (_counts(boxes * ([1] * 3 + [k] * 3 + [1]), objects) for k in (0.55, 1.0, 2.0, 2.6))
     expected, seen = "whole lengths, widths and heights", "the size of what the points show"
     if share(beyond, double) < _ALONE:
         lift = np.array([0, 0, 0.5, 0, 0, 0, 0]) * boxes[:, 5:6]
-        others = boxes, boxes + lift, boxes - lift, *_yaws(boxes).values()
-        if max(share(_counts(other, objects), double) for other in others) < _HALVES:
+        candidates = boxes, boxes + lift, boxes - lift, *_yaws(boxes).values()
+        if max(share(_counts(candidate, objects), double) for candidate in candidates) < _HALVES:
             fix = "are they extents from the centre? Double them"
             return Finding("boxes_3d", expected, f"half {seen}", fix)
     if share(inner, inside) > _TWICE:
@@ -294,7 +296,7 @@ def _yaws(boxes: FloatArray) -> dict[str, FloatArray]:
     """The boxes with another yaw, by its formula."""
     yaw, quarter = boxes[:, 6], math.pi / 2
     yaws = {"-yaw": -yaw, "yaw + pi / 2": yaw + quarter, "pi / 2 - yaw": quarter - yaw}
-    return {formula: np.column_stack([boxes[:, :6], other]) for formula, other in yaws.items()}
+    return {formula: np.column_stack([boxes[:, :6], turned]) for formula, turned in yaws.items()}
 
 
 def _order_finding(boxes: FloatArray, objects: Points | None) -> Finding | None:
@@ -309,8 +311,8 @@ def _order_finding(boxes: FloatArray, objects: Points | None) -> Finding | None:
         return Finding("boxes_3d", expected, seen, "is it height, width, length? Reorder the columns")
     if share[1] < _MOST_LONG:
         return None
-    other = boxes[:, [0, 1, 2, 4, 3, 5, 6]]
-    if objects is not None and _lead(boxes, other, objects, _informative(boxes, other)):
+    swapped = boxes[:, [0, 1, 2, 4, 3, 5, 6]]
+    if objects is not None and _lead(boxes, swapped, objects, _informative(boxes, swapped)):
         return None  # the yaw is counted from the other side, and the boxes are right
     seen = f"{share[1]:.0%} of {len(long)} vehicles wider than long"
     return Finding("boxes_3d", expected, seen, "is it width, length, height? Swap columns 3 and 4")
@@ -325,13 +327,13 @@ def _informative(boxes: FloatArray, others: FloatArray) -> Any:
 
 
 def _lead(boxes: FloatArray, rivals: FloatArray, objects: Points, which: Any = slice(None)) -> int:
-    """By how many points one reading of the boxes holds more than another, if it clearly does; else 0."""
-    counts, others = _counts(boxes[which], objects), _counts(rivals[which], objects)
-    pairs = (counts, others), (others, counts)
+    """Number of points that one reading of the boxes holds more than another, if it clearly does; else 0."""
+    counts, rival_counts = _counts(boxes[which], objects), _counts(rivals[which], objects)
+    pairs = (counts, rival_counts), (rival_counts, counts)
     wins, losses = (((more >= _LEAST_POINTS) & (more > _BETTER * fewer)).sum() for more, fewer in pairs)
     if wins < _LEAST_WINS or wins < _WIN_RATIO * losses:
         return 0
-    return max(0, int((counts.clip(max=_MOST_POINTS) - others.clip(max=_MOST_POINTS)).sum()))
+    return max(0, int((counts.clip(max=_MOST_POINTS) - rival_counts.clip(max=_MOST_POINTS)).sum()))
 
 
 def _counts(boxes: FloatArray, points: Points) -> FloatArray:

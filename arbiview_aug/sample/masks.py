@@ -16,20 +16,20 @@ from arbiview_aug.cameras.rig import Rig
 from arbiview_aug.errors import SampleError
 
 SPECK_SHARE = 2e-4
-"""Largest speck as a share of the image. In DDAD's masks specks have up to 0.5e-4, parts of the car from 250e-4."""
+"""Largest speck as a share of the image; parts of the car in DDAD's masks are a hundred times larger."""
 
 CLEANING = "clean_masks=True in the reader, --clean-masks, or arbiview_aug.datasets.cleaned_rig"
 """How to mask what is no scene, for messages."""
 
-_DARK = 32  # of 255: rims have 0 to 30 beyond the vignette
+_DARK = 32  # of 255: brightest level of a rim beyond the vignette
 _SIDE_PX = 512  # images are searched at this size
 _LEAST_RIM, _LEAST_HIDDEN = 0.02, 0.005  # shares of the image: dark, and hidden where pixels have rays
 _OFF_CIRCLE = 0.01  # of the image's width: farther boundary pixels do not lie on the circle
 _LEAST_ON_CIRCLE = 0.6
-"""Share of a dark region's boundary on one circle: 0.92 to 1.00 on four real cameras, up to 0.22 on dark images."""
+"""Least share of a dark region's boundary on one circle, between those of real rims and of dark images."""
 
 _DIMMED = 0.8
-"""Brightness near the rim as a share of that farther inside; less is a vignette. On four real cameras 0.4 to 0.65."""
+"""Brightness near the rim as a share of that farther inside; less is a vignette."""
 
 _VIGNETTE = 0.93  # radius within the vignette as a share of the rim's
 _TRIALS = 200
@@ -61,8 +61,8 @@ def without_specks(mask: BoolArray) -> BoolArray:
 def image_circle(camera: Camera, image: torch.Tensor) -> Circle | None:
     """Find the circle around which a fisheye's image (3, h, w), uint8 or float in [0, 1], is dark.
 
-    The dark regions at the corners must end in one circle, so that a dark scene is not taken for a rim. The circle is
-    that within the vignette; None without a rim, and for lenses that keep straight lines straight.
+    The dark regions at the corners must end in one circle, so that a dark scene is not taken for a rim. The circle
+    leaves out the vignette. None without a rim, and for lenses that keep straight lines straight.
     """
     if camera.is_rectilinear:
         return None
@@ -85,8 +85,8 @@ def image_circle(camera: Camera, image: torch.Tensor) -> Circle | None:
     if circle is None:
         return None
     radius = np.linalg.norm((pixels - circle.center_px) / circle.radii_px, axis=-1)
-    within, beside = (small[(radius > low) & (radius < high)] for low, high in ((0.8, 0.9), (0.96, 1.0)))
-    if within.size and beside.size and np.median(beside) < _DIMMED * np.median(within):
+    inside, margin = (small[(radius > low) & (radius < high)] for low, high in ((0.8, 0.9), (0.96, 1.0)))
+    if inside.size and margin.size and np.median(margin) < _DIMMED * np.median(inside):
         circle = circle._replace(radii_px=_VIGNETTE * circle.radii_px)
         radius = radius / _VIGNETTE
     # Pixels without a ray are never read.

@@ -43,13 +43,13 @@ class CheckReport:
 def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
     """Look for mistakes that rendering cannot notice.
 
-    Points in boxes tell the reading of the boxes, edges in the images the frame of the points and each camera's pose;
-    the road in the points tells ``ground_z_m``; poses are compared with cameras that stand upright over the road, with
-    their names, and by matches with their neighbours. Frames of one drive in a batch show the own car.
+    Points in boxes tell the reading of the boxes; edges in the images tell the frame of the points and each camera's
+    pose; the road in the points tells ``ground_z_m``. Poses are compared with cameras upright over the road, with their
+    names, and by matches with their neighbours. Frames of one drive in a batch show the own car.
 
     Args:
         sample: A sample or batch as ``RigRetarget`` takes it.
-        source: The rig of samples that carry none.
+        source: Rig of samples without a calibration.
 
     Raises:
         ArbiviewError: ``RigRetarget`` would refuse the sample too.
@@ -69,8 +69,8 @@ def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
     # Holes of an earlier retargeting are masks too, of any shape.
     is_recorded = sample.get("coverage") is None
     for frame in frames:
-        of_rig = check_rig(frame.rig, masks=is_recorded and sample.get("ego_mask") is None)
-        findings += of_rig
+        rig_findings = check_rig(frame.rig, masks=is_recorded and sample.get("ego_mask") is None)
+        findings += rig_findings
         for camera, circle in dark_rims(frame.rig, frame.images):
             expected = "a mask that hides the dark rim around the image circle"
             found = f"no mask, and {1 - circle.holds(camera).mean():.0%} of the image that would be read as scene"
@@ -78,7 +78,7 @@ def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
         boxes = None if frame.boxes is None else checked_boxes(as_array("boxes_3d", frame.boxes))
         points = None if frame.points is None else checked_points(as_array("points", frame.points))
         # Images tell nothing through poses that are all wrong.
-        wrong = [finding.where for finding in of_rig if finding.where.endswith("cam2ego")]
+        wrong = [finding.where for finding in rig_findings if finding.where.endswith("cam2ego")]
         is_clear = is_recorded and "cam2ego" not in wrong and 2 * len(wrong) <= len(frame.rig)
         findings += label_findings(frame.rig, frame.images if is_clear else (), boxes, points, _pose(frame))
         if is_clear:
@@ -89,7 +89,7 @@ def check(sample: Mapping[str, Any], source: Rig | None = None) -> CheckReport:
 
 
 def check_own_car(frames: Sequence[Frame]) -> list[Finding]:
-    """Cameras of one moving vehicle that see it, in frames that know their poses."""
+    """Cameras without a mask that see their moving vehicle, in frames with poses."""
     first, rigs = frames[0].rig, [frame.rig for frame in frames]
     poses = [pose for frame in frames if (pose := _pose(frame)) is not None]
     same = all(rig.names == first.names and rig.sizes == first.sizes for rig in rigs)
@@ -105,14 +105,14 @@ def check_own_car(frames: Sequence[Frame]) -> list[Finding]:
 
 
 def _pose(frame: Frame) -> FloatArray | None:
-    """The frame's ``ego2world`` (4, 4); None without one, or if it is no pose, which only neighbours need refuse."""
+    """The frame's ``ego2world`` (4, 4); None without one, or if it is no pose: only neighbours need one."""
     pose = frame.further.get("ego2world")
     pose = None if pose is None else np.asarray(as_array("ego2world", pose), np.float64)
     return pose if pose is not None and is_rigid(pose) else None
 
 
 def check_rig(rig: Rig, *, masks: bool = True) -> list[Finding]:
-    """Mistakes in poses, intrinsics and, where ``masks``, masks alone."""
+    """Mistakes in poses, intrinsics and, if ``masks``, masks of a rig alone."""
     findings = doubts(rig.cameras, rig.ground_z_m)
     for camera in rig:
         if found := focal_mistake(camera):

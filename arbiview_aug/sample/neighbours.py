@@ -23,10 +23,8 @@ from arbiview_aug.scene.surface import Points
 
 MAX_NEIGHBOURS = 120  # frame numbers are int8
 STILL_M, STILL_DEG = 0.1, 0.5  # a frame with less motion than this sees what the current one sees
-MAX_SWEEPS = 2
-"""Nearest neighbours that lend their LiDAR points: four win 0.1 dB on synthetic streets, in twice the time."""
-
-MAX_TRAVEL_M = 60.0  # largest distance to a neighbour: farther on, none of the ground nearby is in view
+MAX_SWEEPS = 2  # nearest neighbours whose LiDAR points are used: more take time and hardly help
+MAX_TRAVEL_M = 60.0  # largest distance to a neighbour: from farther away it does not see the ground nearby
 MAX_SPEED_MPS = 80.0
 MAX_TILT_DEG = 6.0  # largest angle between two roads that share one plane: ramps have 5 degrees
 _MAX_MOUNTING_M, _MAX_MOUNTING_DEG = 1.5, 10.0
@@ -43,8 +41,8 @@ def read_neighbours(
     ``entries`` is a list of mappings, each another frame of the same rig: ``images``; ``ego2ego`` (4, 4), its ego frame
     to the current one, or ``ego2world`` as in the sample; optionally ``points`` and ``boxes_3d`` in its own ego frame,
     ``time_s``, ``token``, and its calibration where it differs. K and cam2ego alone keep the current lenses and masks.
-    Without own boxes, the sample's are moved by their velocities (columns 7 and 8, m/s in the ego frame) if both frames
-    have a time and all velocities are finite.
+    Without ``boxes_3d``, the sample's are moved by their velocities (columns 7 and 8, m/s in the ego frame) if both
+    frames have a time and all velocities are finite.
 
     Frames at the same place are left out silently, unusable ones with a warning.
     """
@@ -66,10 +64,7 @@ def read_neighbours(
 
 
 def points_of_neighbours(frame: Frame, warn: Warn) -> list[FloatArray]:
-    """Points (P, C) of a frame's neighbours in its ego frame, metres: an array for each that has some.
-
-    Points that the frame's points contradict are left out, and points that cannot be read, with a warning.
-    """
+    """Points (P, C) of each neighbour in the frame's ego frame; contradicted and unreadable ones are left out."""
     sweeps = list[FloatArray]()
     for neighbour in (frame.neighbours or ())[:MAX_SWEEPS]:
         try:
@@ -117,28 +112,25 @@ def _neighbour(
 
 
 def _checked_rig(frame: Frame, entry: Mapping[str, Any]) -> Rig:
-    """The neighbour's cameras in its ego frame, refused if they are another vehicle's.
-
-    The current images stand for the neighbour's, which are read lazily.
-    """
-    given, is_whole = entry, entry.get("rig") is not None or (entry.get("K") is None and entry.get("cam2ego") is None)
+    """The neighbour's cameras, of the current images' sizes, in its ego frame; SampleError for another rig's."""
+    source, is_whole = entry, entry.get("rig") is not None or (entry.get("K") is None and entry.get("cam2ego") is None)
     if entry.get("K") is None and not is_whole:
-        given = {**entry, "K": frame.rig.K}
+        source = {**entry, "K": frame.rig.K}
     cameras = []
-    for other, camera in zip(read_rig(frame.images, given, frame.rig if is_whole else None), frame.rig, strict=True):
+    for moved, camera in zip(read_rig(frame.images, source, frame.rig if is_whole else None), frame.rig, strict=True):
         if not is_whole:
-            lens, mask = other if entry.get("lens") is not None else camera, other.mask
+            lens, mask = moved if entry.get("lens") is not None else camera, moved.mask
             mask = camera.mask if mask is None else mask
-            other = replace(other, name=camera.name, lens=lens.lens, distortion=lens.distortion, mask=mask)
-        scale = float(np.abs(other.K - camera.K).max()) / camera.width_px
-        if other.lens != camera.lens or scale > 0.02:
+            moved = replace(moved, name=camera.name, lens=lens.lens, distortion=lens.distortion, mask=mask)
+        scale = float(np.abs(moved.K - camera.K).max()) / camera.width_px
+        if moved.lens != camera.lens or scale > 0.02:
             raise SampleError(f"camera {camera.name!r}: expected the current frame's lens and K, got another rig's")
-        shift_m = float(np.linalg.norm(other.center_m - camera.center_m))
-        turned_deg = _angle_deg(other.cam2ego[:3, :3] @ camera.cam2ego[:3, :3].T)
+        shift_m = float(np.linalg.norm(moved.center_m - camera.center_m))
+        turned_deg = _angle_deg(moved.cam2ego[:3, :3] @ camera.cam2ego[:3, :3].T)
         if shift_m > _MAX_MOUNTING_M or turned_deg > _MAX_MOUNTING_DEG:
             got = f"a pose {shift_m:.2f} m and {turned_deg:.1f} degrees away"
             raise SampleError(f"camera {camera.name!r}: expected the current frame's mounting, got {got}; another rig?")
-        cameras.append(other)
+        cameras.append(moved)
     return frame.rig.with_cameras(cameras)
 
 
@@ -204,12 +196,12 @@ class ChangeRisk(IntEnum):
 
     NONE = 0  # labels say that nothing moved there
     SHADED = 1  # the shadow of a moved object may lie there in either frame
-    BESIDE = 2  # a moved object stands or stood right beside it
+    BESIDE = 2  # a moved object is or was right next to it
     UNLABELLED = 3  # a frame has no labels
 
 
 def change_risks(moved: FloatArray, points: FloatArray) -> npt.NDArray[np.uint8]:
-    """Compute the ``ChangeRisk`` (n,) of points (n, 3) on the road beside boxes (B, 7) that moved."""
+    """Compute the ``ChangeRisk`` (n,) of points (n, 3) on the road near boxes (B, 7) that moved."""
     risks = np.zeros(len(points), np.uint8)
     if not len(points) or not len(moved):
         return risks

@@ -18,25 +18,25 @@ from arbiview_aug.sample.inputs import DEPTH_KEYS
 from arbiview_aug.scene.point_cloud import checked_points
 
 STACKED = ("images", "K", "cam2ego", "coverage", "ego_mask", "distortion", "ego2world", "ego2ego", *DEPTH_KEYS)
-"""Keys of one shape in all frames of a rig; so have maps over the images. All else is a list: of points and boxes
-each frame has its own number."""
+"""Keys that ``collate`` stacks, as it does maps over the images. All else becomes a list: the number of points and
+boxes differs from frame to frame."""
 
 _ABSENT = {"coverage": True, "generated": False, "ego_mask": False}
-"""Masks that samples without them stand for: all is seen, nothing made up, no car of one's own in the image."""
+"""Values of masks that a sample lacks: everything seen, nothing generated, no ego car in the image."""
 
 _CALIBRATION = ("rig", "K", "cam2ego", "lens", "distortion", "ground_z_m", "ego2ego")
-"""Keys without which the others mean something else."""
+"""Keys that all samples must have or none, as the others depend on them."""
 
 
 def depth_maps(points: Any, cameras: Rig | Mapping[str, Any]) -> torch.Tensor | list[torch.Tensor]:
     """Depth maps as BEVDepth and BEVDet supervise depth with: the nearest point in each pixel.
 
     Retargeted points are those of the target's scanners, so that depth maps and images are of one vehicle. Points are
-    sparse: those behind a surface show through its gaps, as in the frameworks' own maps.
+    sparse: those behind a surface show through its gaps, as in the frameworks' maps.
 
     Args:
         points: (P, >=3) in the cameras' ego frame.
-        cameras: A rig, or an unbatched sample, such as ``RigRetarget`` returns.
+        cameras: A rig, or an unbatched sample as ``RigRetarget`` returns it.
 
     Returns:
         (N, h, w) float32 z-depth in the camera's frame, metres; 0 without a point. A list where sizes differ.
@@ -59,13 +59,12 @@ def depth_maps(points: Any, cameras: Rig | Mapping[str, Any]) -> torch.Tensor | 
 
 # --- batches
 def collate(samples: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """A batch of samples, before or after ``RigRetarget``: a ``collate_fn`` for frames with points and boxes.
+    """Batch samples, before or after ``RigRetarget``: a ``collate_fn`` for frames with points and boxes.
 
-    Cameras and maps over their images are stacked; of points, boxes and all else there is a list, an entry a frame.
-    ``lens`` stays a name for each camera, or has a list over the frames where they differ; torch's ``default_collate``
-    makes tuples of each camera's names, which ``RigRetarget`` reads as well.
-    Frames of one rig keep it. If each has its own (nuScenes: cameras and LiDAR expose at different times), ``K`` and
-    ``cam2ego`` say so.
+    Cameras and maps over their images are stacked; points, boxes and all else become lists with an entry for each
+    frame. ``lens`` stays a name for each camera, or a list over the frames where they differ; torch's
+    ``default_collate`` makes tuples of each camera's names, which ``RigRetarget`` reads as well. Frames of one rig keep
+    it. If rigs differ (nuScenes: cameras and LiDAR expose at different times), ``K`` and ``cam2ego`` replace it.
 
     Keys that some samples lack are left out, with a warning; but samples without ``coverage``, ``generated`` or
     ``ego_mask`` are covered, not generated, and show no car.
@@ -133,12 +132,12 @@ def _are_maps(values: Sequence[Any], images: Any) -> bool:
 
 
 def _stacked(key: str, values: Sequence[Any]) -> Any:
-    """One tensor, or where cameras have tensors of their own a list of one for each camera; tv_tensors stay such."""
+    """One tensor, or a list of a tensor for each camera; tv_tensors keep their class."""
     try:
         values = [torch.from_numpy(value.copy()) if isinstance(value, np.ndarray) else value for value in values]
         if all(isinstance(value, torch.Tensor) for value in values):
             return rewrapped(torch.stack(list(values)), values[0])
-        cameras = [torch.stack(list(of_camera)) for of_camera in zip(*values, strict=True)]
+        cameras = [torch.stack(list(frames)) for frames in zip(*values, strict=True)]
         return rewrapped(cameras, values[0])
     except (TypeError, ValueError, RuntimeError) as error:
         raise SampleError(f"collate: {key}: expected equal shapes in all samples: {error}") from None

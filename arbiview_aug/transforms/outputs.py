@@ -56,11 +56,22 @@ class SampleWriter:
     ) -> dict[str, Any]:
         """Write the output sample of a ``sample`` and its frames; the input is not changed.
 
-        ``labels`` are the sample's keys that hold label maps; ``target`` is in its own ego frame; ``points`` are those
-        of its scanners.
+        ``labels`` are the sample's keys of label maps; ``target`` is in its own ego frame; ``points`` are what its
+        scanners measured.
         """
         lead = leading_shape(sample["images"])
-        out = self._passed_on(sample, labels) | (transforms.entries_of(points, lead) if points else {})
+        # Entries that do not depend on the images pass as the same objects.
+        named = (*labels, *self.keys.keep)
+        stale = [key for key in sample if key in (*PIXEL_BOUND_KEYS, *CAMERA_KEYS) and key not in named]
+        # The coverage of an earlier retargeting already masks what it generated.
+        dropped = [key for key in stale if key not in (*self.keys.extra, "generated", "depth_m")]
+        if dropped:
+            meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
+            message = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels or cameras{meant}"
+            self.warn(f"dropped {dropped}", message)
+        kept = ("images", "K", "cam2ego", *named)  # the first three are replaced in their places in the dict
+        out = {k: v for k, v in sample.items() if k in kept or k not in (*CALIBRATION_KEYS, *stale)}
+        out |= transforms.entries_of(points, lead) if points else {}
         out["images"] = rewrapped(gathered([stacked(frame.images) for frame in rendered], lead), sample["images"])
         rigs, device = [frame.rig for frame in rendered], rendered[0].images[0].device
         entries = calibration_entries(rigs, device, lead, lenses=self.lenses, masks=self.masks)
@@ -84,36 +95,20 @@ class SampleWriter:
             out["ground_z_m"] = torch.full_like(out["ground_z_m"], target.ground_z_m) if lead else target.ground_z_m
         return out
 
-    def _passed_on(self, sample: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
-        """The entries that do not depend on the images, as the same objects."""
-        named = (*labels, *self.keys.keep)
-        stale = [key for key in sample if key in (*PIXEL_BOUND_KEYS, *CAMERA_KEYS) and key not in named]
-        # The coverage of an earlier retargeting already masks what it generated.
-        dropped = [key for key in stale if key not in (*self.keys.extra, "generated", "depth_m")]
-        if dropped:
-            meant = "" if "depth_m" in sample else hint(dropped, ("depth_m",))
-            message = f"RigRetarget drops {', '.join(dropped)}: they speak of the source's pixels or cameras{meant}"
-            self.warn(f"dropped {dropped}", message)
-        kept = ("images", "K", "cam2ego", *named)  # the first three are replaced in their places in the dict
-        return {k: v for k, v in sample.items() if k in kept or k not in (*CALIBRATION_KEYS, *stale)}
-
 
 # --- calibration ------------------------------------------------------------------------------------------------------
 def calibration_entries(
     rigs: Sequence[Rig], device: torch.device, lead: tuple[int, ...], *, lenses: bool = True, masks: bool = True
 ) -> dict[str, Any]:
-    """``K``, ``cam2ego`` and ``ground_z_m`` of frames' rigs, their ``distortion`` and ``lens``, and ``ego_mask``.
-
-    Masks alone lie on the device.
-    """
+    """``K``, ``cam2ego``, ``ground_z_m``, ``distortion``, ``lens`` of frames' rigs; ``ego_mask`` on the device."""
     parts: dict[str, list[Any]] = {key: [torch.from_numpy(getattr(rig, key)) for rig in rigs] for key in _MATRICES}
     if lenses:
         padded = [[(*c.distortion, *(0.0,) * (8 - len(c.distortion))) for c in rig] for rig in rigs]
-        parts["distortion"] = [torch.tensor(of_rig, dtype=torch.float64) for of_rig in padded]
+        parts["distortion"] = [torch.tensor(coefficients, dtype=torch.float64) for coefficients in padded]
     if masks:
         ignored = [[np.zeros(c.size, bool) if c.mask is None else ~c.mask for c in rig] for rig in rigs]
-        parts["ego_mask"] = [stacked([torch.from_numpy(mask).to(device) for mask in of_rig]) for of_rig in ignored]
-    entries = {key: gathered(of_rigs, lead) for key, of_rigs in parts.items()}
+        parts["ego_mask"] = [stacked([torch.from_numpy(mask).to(device) for mask in row]) for row in ignored]
+    entries = {key: gathered(values, lead) for key, values in parts.items()}
     if lenses:
         entries["lens"] = lens_names([[c.lens for c in rig] for rig in rigs], lead)
     grounds = torch.tensor([rig.ground_z_m for rig in rigs], dtype=torch.float64)
@@ -124,10 +119,7 @@ def calibration_entries(
 def target_labels(
     key: str, value: Any, frames: Sequence[Frame], lead: tuple[int, ...], rendered: Sequence[Views], fill: float
 ) -> Any:
-    """Render label maps, (..., N, H, W) or a list of (..., Hi, Wi), in the target's views.
-
-    SampleError for maps that do not fit the images, or a fill value that their type cannot hold.
-    """
+    """Render label maps in the target's views; SampleError for maps or a fill value that do not fit."""
 
     def checked_fill(dtype: torch.dtype) -> float:
         if dtype == torch.bool:
@@ -143,27 +135,24 @@ def target_labels(
             raise SampleError(f"{key}: SampleKeys.ignore_index: expected a value of {dtype}, got {shown(fill)}; {fix}")
         return fill
 
-    views = []
-    for of_frame, maps in zip(rendered, label_maps(key, value, frames, lead), strict=True):
-        assert of_frame.labels is not None
+    outputs = []
+    for views, maps in zip(rendered, label_maps(key, value, frames, lead), strict=True):
+        assert views.labels is not None
         if (dtype := maps[0].dtype) in (torch.uint16, torch.uint32, torch.uint64):  # torch cannot index them by masks
             raise SampleTypeError(f"{key}: expected uint8 or signed label maps, got {dtype}; use .to(torch.int32)")
-        views.append(stacked(of_frame.labels([label.as_subclass(torch.Tensor) for label in maps], checked_fill)))
-    return rewrapped(gathered(views, lead), value)
+        outputs.append(stacked(views.labels([label.as_subclass(torch.Tensor) for label in maps], checked_fill)))
+    return rewrapped(gathered(outputs, lead), value)
 
 
 def label_maps(key: str, value: Any, frames: Sequence[Frame], lead: tuple[int, ...]) -> list[Any]:
-    """The maps of each frame, from (*lead, N, ..., H, W) or a list of (*lead, ..., Hi, Wi).
-
-    SampleError for maps that do not fit the images.
-    """
+    """Label maps of each frame, from (*lead, N, ..., H, W) or a list by camera; SampleError if images do not fit."""
     if not all(map(is_readable, value if isinstance(value, list | tuple) else [value])):
         got = type(value).__name__
         raise SampleTypeError(f"{key}: expected label maps as tensors, got {got}; use torch.as_tensor")
     if isinstance(value, torch.Tensor) and value.ndim < len(lead) + 3:
         raise SampleError(f"{key}: expected label maps of shape (..., N, H, W), got {tuple(value.shape)}")
-    of_frames = split(key, value, lead)
-    for frame, maps in zip(frames, of_frames, strict=True):
+    frame_maps = split(key, value, lead)
+    for frame, maps in zip(frames, frame_maps, strict=True):
         if len(maps) != len(frame.images):
             raise SampleError(f"{key}: expected {len(frame.images)} label maps, one an image, got {len(maps)}")
         for camera, label in zip(frame.rig, maps, strict=True):
@@ -174,15 +163,12 @@ def label_maps(key: str, value: Any, frames: Sequence[Frame], lead: tuple[int, .
                 first, this = ((str(m.dtype), *m.shape[:-2], "H", "W") for m in (maps[0], label))
                 fix = "merge masks of instances into one map of their numbers"
                 raise SampleError(f"{where}: expected {first} as of the first, got {this}; {fix}")
-    return of_frames
+    return frame_maps
 
 
 # --- labels in the ego frame ------------------------------------------------------------------------------------------
 def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, ...]) -> None:
-    """Move an output sample's poses, points and boxes by the translation of ``ego2ego`` (*lead, 4, 4).
-
-    Entries are replaced, never written to.
-    """
+    """Move an output sample's poses, points and boxes by the translation of ``ego2ego`` (*lead, 4, 4); copies them."""
     # Sums instead of matrix products, which autocast and TF32 would round.
     out["ego2ego"], offset_m = ego2ego.to(out["cam2ego"].device), ego2ego[..., :3, 3]
     out["cam2ego"] = out["cam2ego"].clone()
@@ -200,11 +186,11 @@ def move_to_target(out: dict[str, Any], ego2ego: torch.Tensor, lead: tuple[int, 
             raise SampleTypeError(f"{where}: expected a float tensor, got {kind}")
         moved = torch.from_numpy(pose.astype(np.float64)) if is_array else pose
         try:
-            whole = torch.broadcast_shapes(moved.shape[:-2], offset_m.shape[:-1])
+            batch_shape = torch.broadcast_shapes(moved.shape[:-2], offset_m.shape[:-1])
         except RuntimeError:
             expected = (*offset_m.shape[:-1], 4, 4)
             raise SampleError(f"ego2world: expected shape {expected}, got {tuple(pose.shape)}") from None
-        moved = moved.expand(*whole, 4, 4).clone()
+        moved = moved.expand(*batch_shape, 4, 4).clone()
         moved[..., :3, 3] -= (moved[..., :3, :3] * offset_m[..., None, :].to(moved)).sum(-1)
         out["ego2world"] = moved.numpy() if is_array else moved
 

@@ -1,6 +1,6 @@
-"""Renderers of ``RigRetarget``, of one protocol: over a scene by a plan, and by the paper's stages.
+"""Renderers of ``RigRetarget`` behind one protocol: planned over a scene, and by the paper's stages.
 
-``plan`` says how a frame is rendered, ``render`` makes the views of frames by their plans. The third renderer is
+``plan`` decides how a frame is rendered; ``render`` renders frames by their plans. The third renderer is
 ``render.rendered.Resizer``.
 """
 
@@ -59,7 +59,7 @@ class RendererSettings:
     backend: Backend
     cache: PlanCache
     outputs: Collection[str]  # requested maps, as in ``Renderer.render``
-    inpainter: Inpainter  # fills the holes that stay
+    inpainter: Inpainter  # fills the remaining holes
     p: float  # share of samples that are retargeted
     warn: WarnOnce  # once per topic
 
@@ -71,13 +71,13 @@ class FrameRenderer(Protocol):
         """Plan how a frame is rendered."""
 
     def render(self, plans: Sequence[Any]) -> list[Views]:
-        """Render frames by their plans; holes stay."""
+        """Render frames by their plans; holes remain."""
 
 
 # --- over a scene -----------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, eq=False)
 class FramePlan:
-    """How one frame is rendered, and from what it was planned."""
+    """Plan of one frame, and the data that it was made from."""
 
     frame: Frame
     pair: RigPair  # its rig and the target
@@ -97,12 +97,12 @@ class FramePlan:
 
 @dataclass(frozen=True, repr=False)
 class Explanation:
-    """Why a frame is rendered as it is; ``str`` prints it."""
+    """Explanation of how and why a frame is rendered; print it."""
 
     planned: FramePlan
     outcome: str  # of pixels that no camera saw
     harmonisation: PhotometricReport | None = None  # the sources' gains and why, if they are harmonised
-    fills: Fills | None = None  # how other frames of the drive fill holes, if there are any
+    fills: Fills | None = None  # holes that other frames of the drive fill, if there are any
     points: str | None = None  # what the target's scanners measure, if it has any
 
     @property
@@ -163,8 +163,8 @@ class PlannedRenderer:
         self.settings, self.geometry, self.warn = settings, settings.geometry, settings.warn
         self.outputs = (*settings.outputs, "confidence") if certainty else tuple(settings.outputs)
         self.harmoniser, self.backend = Harmoniser(settings.match_exposure), Renderer(settings.backend)
-        self.overlaps = overlap_cache(cache.share_overlap, config)  # that frames share, or None
-        self.plans: LRUCache[Any, RenderPlan] = LRUCache(cache.max_bytes, attrgetter("nbytes"))  # that come back
+        self.overlaps = overlap_cache(cache.share_overlap, config)  # shared by frames, or None
+        self.plans: LRUCache[Any, RenderPlan] = LRUCache(cache.max_bytes, attrgetter("nbytes"))  # of recurring rigs
         self._maps, self._unseen = RayCache(), unseen_note(inpainter)
         self._pairs: LRUCache[Any, RigPair] = LRUCache(_MAX_RIG_PAIRS)
 
@@ -187,10 +187,10 @@ class PlannedRenderer:
     def choose_scene(
         self, frame: Frame, pair: RigPair
     ) -> tuple[Scene, GeometryName, OverlapDepth | None, temporal.MotionDepth | None]:
-        """Read a frame's scene, ask it what ``auto`` is, and estimate the depth that the geometry asks for.
+        """Read a frame's scene, decide ``auto``, and estimate the depth that the geometry needs.
 
-        Returns the scene, the geometry's name, and depth from overlap and from motion as far as they were estimated,
-        which they are only where a pixel depends on distances.
+        Returns the scene, the geometry's name, and depth from overlap and from motion where they were estimated:
+        only where a pixel depends on distances.
         """
         row, overlap, motion = GEOMETRIES[self.geometry], None, None
         is_read = pair.needs_geometry or self.geometry != "auto" or bool(frame.neighbours)  # objects limit their fills
@@ -203,11 +203,11 @@ class PlannedRenderer:
             if row.needs == "motion" and not temporal.brings_motion(frame, self.geometry):
                 motion = temporal.estimate_motion(frame, scene.boxes, self.warn)
             elif row.needs in ("motion", LEARNED_KEY) and scene.geometry(row.needs) == ():
-                key, words = (
+                key, reason_key = (
                     (LEARNED_KEY, LEARNED_WORDS_KEY) if scene.motion is None else (MOTION_KEY, MOTION_WORDS_KEY)
                 )
                 declined = f"{key}: 0 everywhere; what else the sample offers stands"
-                self.warn("motion", frame.further.get(words, declined))
+                self.warn("motion", frame.further.get(reason_key, declined))
             sweeps = points_of_neighbours(frame, self.warn) if self.settings.reach and scene.points is not None else []
             if sweeps:
                 scene = replace(scene, sweeps=np.concatenate([sweep[:, :3] for sweep in sweeps]))
@@ -223,10 +223,7 @@ class PlannedRenderer:
         return self._plan_views(self._pair(source, target), scene)
 
     def _plan_views(self, pair: RigPair, scene: Scene) -> RenderPlan:
-        """The plan of a pair in a scene; cached without a frame's own geometry, which never comes back.
-
-        A scene that no pixel depends on is ignored.
-        """
+        """The plan of a pair in a scene; cached unless pixels depend on one frame's geometry, which never recurs."""
         if scene.is_empty or not pair.needs_geometry:
             return self.plans.get((pair.key, ()), lambda: self._build(pair, Scene()))
         if self.overlaps is not None and scene.best == "street":
@@ -237,7 +234,7 @@ class PlannedRenderer:
     def _build(self, pair: RigPair, scene: Scene) -> RenderPlan:
         plan = plan_pair(pair, scene, self._maps)
         coverage = plan.coverage
-        # Objects may hide all of a frame's target, if its cameras are where they should be.
+        # Objects may hide the whole target in one frame; with plausible poses that is no mistake.
         if not scene.is_empty and not any(map(np.any, coverage)) and not pose_mistakes(pair.source, pair.target):
             coverage = plan_pair(replace(pair, geometry="street"), Scene(), self._maps).coverage
         check_reach(pair.source, pair.target, coverage, self._unseen, self.warn)
@@ -274,10 +271,7 @@ class PlannedRenderer:
 
 # --- by the paper -----------------------------------------------------------------------------------------------------
 class PaperRenderer:
-    """Renders frames by the paper's stages 1 to 4, which depend on every image: no plan comes back.
-
-    The plan of a frame is the frame, and the target in its ego frame.
-    """
+    """Renders frames by the paper's stages 1 to 4; a plan is the frame and the target in its ego frame."""
 
     geometry: ClassVar[GeometryName] = "infinity"
 
@@ -312,5 +306,5 @@ class PaperRenderer:
         return [favs.as_rendered(self._render(*planned), self.settings.outputs) for planned in plans]
 
     def explain(self, frame: Frame, target: Rig, *_: str) -> favs.PaperRendering:
-        """Say what the stages made of a frame."""
+        """Report each stage's result for a frame."""
         return self._render(*self.plan(frame, target))

@@ -66,7 +66,7 @@ def _eager_on_cpu(method: Any) -> Any:
     def run_on_cpu(*args: Any, **options: Any) -> Any:
         if get_worker_info() is not None:
             _one_thread_of_opencv(os.getpid())
-        # Under another default device, numbers of plans would be made there, or nowhere (meta).
+        # Plans would be made on another default device, or without numbers on ``meta``.
         is_cpu = torch.empty(0).device.type == "cpu"  # get_default_device of torch 2.6 misses contexts
         with nullcontext() if is_cpu else torch.device("cpu"), compilation_announced():
             return method(*args, **options)
@@ -81,7 +81,7 @@ def _eager_on_cpu(method: Any) -> Any:
 
 @cache
 def _one_thread_of_opencv(process: int) -> None:
-    """Leave OpenCV one thread in a DataLoader's worker: more would fight for the cores."""
+    """Limit OpenCV to one thread in a DataLoader's worker: more would compete for the cores."""
     cv2.setNumThreads(0)
 
 
@@ -97,7 +97,7 @@ class RigRetarget(torch.nn.Module):
 
     Args:
         target: A ``Rig``, the name of a shipped one, a rig file, or a ``RandomRig``.
-        source: The rig of samples that carry none.
+        source: Rig of samples without a calibration.
         geometry: Source of distances where cameras move. ``auto`` takes the best that the sample offers.
             ``infinity``: nothing, right where centres coincide. ``ground``, ``street``: a flat road, with walls.
             ``boxes``: ``boxes_3d`` on the street. ``lidar``: ``points`` or ``depth_m``, with boxes. ``motion``: depth
@@ -115,15 +115,15 @@ class RigRetarget(torch.nn.Module):
         fit: How target cameras come to ``size``: ``crop`` cuts at the top and the sides, ``pad`` adds bars there,
             ``stretch`` changes the aspect.
         p: Probability of retargeting. A skipped sample keeps its own cameras at ``size``, with full coverage, so
-            ``p < 1`` needs ``size`` and equal camera counts (else see ``MixedDataset``). Each call draws anew; calls of
-            one sequence share the draw with a ``RandomRig(per="sequence")``.
+            ``p < 1`` needs ``size`` and equal camera counts (else see ``MixedDataset``). Each call draws again; calls
+            of one sequence share the draw with a ``RandomRig(per="sequence")``.
         keys: Label maps, further outputs and frames: ``SampleKeys``.
         cache: Limits of the plans kept from call to call.
         backend: ``opencv`` (CPU), ``torch`` (any device, differentiable); ``auto`` takes OpenCV for CPU images that
             need no gradient.
 
     Draws come from torch's global generator; with a ``RandomRig(per="sequence")`` from the sequence's. A batch shares
-    one draw, which ``retarget_params`` tells.
+    one draw, recorded in ``retarget_params``.
 
     Raises:
         ValueError: Impossible settings.
@@ -330,7 +330,7 @@ class RigRetarget(torch.nn.Module):
             source: The rig of the samples; the transform's ``source`` by default.
 
         Raises:
-            ValueError: No source rig, a random target, ``quality="paper"``, or a surface that every frame has anew.
+            ValueError: No source rig, a random target, ``quality="paper"``, or a surface that differs in every frame.
         """
         source = self.source if source is None else load_rig(source)
         if source is None or isinstance(self.target, RandomRig):
@@ -344,10 +344,10 @@ class RigRetarget(torch.nn.Module):
 
     # --- reports ----------------------------------------------------------------------------------------------------
     def explain(self, sample: Mapping[str, Any]) -> Explanation | favs.PaperRendering:
-        """How a sample would be rendered: sources, surfaces and why, coverage, expected parallax; print it.
+        """Explain how a sample would be rendered: sources, surfaces and why, coverage, expected parallax; print it.
 
-        With ``quality="paper"``: what each stage made of each source. A random target is explained for one draw. Like a
-        call, it fills the caches, issues warnings once, and advances the RNG.
+        With ``quality="paper"``: each stage's result for each source. A random target is explained for one draw. Like
+        a call, it fills the caches, issues warnings once, and advances the RNG.
         """
         frame = self._read_frames(sample)[0]
         target, _, _ = self._make_params(sample, [frame], None)

@@ -55,13 +55,13 @@ def retarget_points(
         target: A rig with ``lidars``, as ``RigRetarget`` takes it.
         boxes_3d: (B, >= 7) labelled objects, to count the points in each; they change no point.
         ground_z_m: Height of the road in the frame's ego frame.
-        skip: Leave the points as they are, and count those in boxes.
+        skip: Leave the points unchanged, and count those in boxes.
         sweeps: Arrays or tensors of points (Q, C) of other frames in this frame's ego frame, with the same columns.
-            They fill rays that the frame's own do not support.
+            They fill rays that the frame's points do not support.
 
     Raises:
         SampleError: Points or boxes of another shape.
-        SampleTypeError: Points that are no floats.
+        SampleTypeError: Points that are not floats.
         CalibrationError: A rig without scanners, or with one that is not over the road.
     """
     from arbiview_aug.scene.scan import scan  # compiled
@@ -90,16 +90,16 @@ def retarget_points(
             if array.ndim != 2 or sweep.ndim != 2 or sweep.shape[1] != array.shape[1]:
                 expected = f"expected the columns of points {array.shape}"
                 raise SampleError(f"sweeps[{k}]: {expected}, got {sweep.shape}")
-        own = len(measured)
+        count = len(measured)
         if len(arrays) > 1:
             array = as_array("points", np.concatenate(arrays).astype(array.dtype))
         measured = checked_points(array)
-        hits, nearest, rings_of, unsupported = scan(lidars, measured, ground_z_m, len(measured) - own)
-        found = array[np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest]
-        if found.ndim == 2:  # an empty list is points too
-            found[:, :3] = hits
-        points = found.astype(points.dtype) if isinstance(points, np.ndarray) else torch.from_numpy(found).to(points)
-        measured, rings = hits, torch.from_numpy(rings_of)
+        hits, nearest, beams, unsupported = scan(lidars, measured, ground_z_m, len(measured) - count)
+        rows = array[np.flatnonzero(finite_rows(array))[nearest] if len(measured) else nearest]
+        if rows.ndim == 2:  # an empty list is points too
+            rows[:, :3] = hits
+        points = rows.astype(points.dtype) if isinstance(points, np.ndarray) else torch.from_numpy(rows).to(points)
+        measured, rings = hits, torch.from_numpy(beams)
     counts = None
     if boxes is not None:
         _, ends = points_by_box(boxes, measured, 0.0)
@@ -110,27 +110,24 @@ def retarget_points(
 def retarget_frames(
     frames: Sequence[Frame], target: Rig, skip: bool, warn: Warn, *, neighbours: bool
 ) -> list[RetargetedPoints]:
-    """``retarget_points`` of a sample's frames; empty if the sample has no points.
-
-    With ``neighbours``, other frames of the drive fill what one does not see; ``warn`` tells why one cannot.
-    """
+    """``retarget_points`` of a sample's frames, filled by their neighbours; empty if the sample has no points."""
     if frames[0].points is None:
         return []
     parts = []
     for frame in frames:
         sweeps = points_of_neighbours(frame, warn) if neighbours and not skip else []
-        count, counts = as_array("points", frame.points).shape[-1], [sweep.shape[1] for sweep in sweeps]
-        if counts != [count] * len(counts):
-            warn("columns of points", f"points of neighbours: expected {count} columns, got {counts}")
+        columns, found = as_array("points", frame.points).shape[-1], [sweep.shape[1] for sweep in sweeps]
+        if found != [columns] * len(found):
+            warn("columns of points", f"points of neighbours: expected {columns} columns, got {found}")
         boxes_3d = None if frame.boxes is None else as_array("boxes_3d", frame.boxes)
         settings: dict[str, Any] = {"boxes_3d": boxes_3d, "ground_z_m": frame.rig.ground_z_m, "skip": skip}
-        fitting = [sweep for sweep in sweeps if sweep.shape[1] == count]
+        fitting = [sweep for sweep in sweeps if sweep.shape[1] == columns]
         parts.append(retarget_points(frame.points, target, sweeps=fitting, **settings))
     return parts
 
 
 def entries_of(parts: Sequence[RetargetedPoints], lead: tuple[int, ...]) -> dict[str, Any]:
-    """Entries of the output sample of one frame or more: with leading dimensions, a list over the frames."""
+    """Entries of the output sample; with leading dimensions, lists over the frames."""
     keys = {"points": [p.points for p in parts], RINGS_KEY: [p.rings for p in parts]}
     if parts[0].counts is not None:
         keys[COUNTS_KEY] = [p.counts for p in parts]

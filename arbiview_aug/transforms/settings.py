@@ -33,14 +33,14 @@ class SampleKeys:
         labels: Keys of label maps (..., N, H, W), or lists of them, to render besides ``tv_tensors.Mask``.
             ``RigRetarget`` refuses names of depth, disparity, flow and normals, which depend on the camera.
         ignore_index: Value of label pixels that no source sees (False for bool maps).
-        keep: Keys to keep although they look bound to the source's pixels; those that the output has anew are replaced.
+        keep: Keys to keep although they look bound to the source's pixels; those that the output writes are replaced.
         extra: Further maps (..., M, h, w) of the output: ``source_camera`` int8, -1 where uncovered; ``source_frame``
             int8, 0 for the current frame, n + 1 for number n of the neighbours; ``confidence`` float32 in [0, 1],
             exp(-e / 10) for an expected error of e grey levels of 255 (``arbiview_aug.render.confidence``). Also
             ``sources``: the source images and calibration, for ``Inpainter.complete_batch``.
         frame: Ego frame of output poses, points and boxes. ``target`` moves them, and ``ego2world``, into the target's
             and adds ``ego2ego`` (..., 4, 4).
-        points: ``target``: as its scanners would have measured them, if it has any. ``source``: as they are.
+        points: ``target``: as its scanners would have measured them, if it has any. ``source``: unchanged.
 
     Raises:
         ValueError: Impossible values.
@@ -59,10 +59,10 @@ class SampleKeys:
             if not isinstance(value, list | tuple) or not all(isinstance(key, str) for key in value):
                 raise ValueError(f"SampleKeys.{name}: expected names in a list or tuple, got {shown(value)}")
             object.__setattr__(self, name, tuple(value))
-        if own := {*self.labels} & {*CALIBRATION_KEYS}:
-            raise ValueError(f"SampleKeys.labels: expected keys of label maps, got {', '.join(sorted(own))}")
-        if own := {*self.keep} & {"rig", "lens", "distortion"}:
-            raise ValueError(f"SampleKeys.keep: expected no calibration of the source's, got {', '.join(sorted(own))}")
+        if keys := {*self.labels} & {*CALIBRATION_KEYS}:
+            raise ValueError(f"SampleKeys.labels: expected keys of label maps, got {', '.join(sorted(keys))}")
+        if keys := {*self.keep} & {"rig", "lens", "distortion"}:
+            raise ValueError(f"SampleKeys.keep: expected no calibration of the source's, got {', '.join(sorted(keys))}")
         for key in self.extra:
             choice("SampleKeys.extra", key, EXTRA_KEYS)
         if not is_number(self.ignore_index):
@@ -76,10 +76,10 @@ class PlanCache:
     """Plans that a transform keeps between calls. Pickles and copies are empty: each DataLoader worker fills its own.
 
     Attributes:
-        max_bytes: Memory for plans of calibrations that come back; the least recently used go first.
-        share_overlap: Frames that share the depth from overlap of ``quality="accurate"``, which depends on the images:
-            False, none; a key of the sample, such as a scene token, those with the same value and calibration; True,
-            all of a calibration, which is right for a vehicle at rest alone.
+        max_bytes: Memory for plans of recurring calibrations; the least recently used go first.
+        share_overlap: Frames that share the depth from overlap of ``quality="accurate"``, which depends on the images.
+            False: none. A key of the sample, for example of a scene token: those with the same value and calibration.
+            True: all with one calibration, which is right only for a vehicle at rest.
 
     Raises:
         ValueError: Impossible values.
@@ -125,13 +125,13 @@ _INPAINTERS = {
 
 
 def unseen_note(inpainter: Inpainter) -> str:
-    """Say what becomes of pixels that no source sees, and what to do about them in training."""
+    """Note on pixels that no source sees, and on their use in training."""
     marked = " and marked in 'generated': leave it out of losses that compare pixels"
     return f"The rest is {inpainter.outcome}{'' if isinstance(inpainter, Black) else marked}."
 
 
 def checked_instance(name: str, value: Any, kind: type[T]) -> T:
-    """``value``, of a class; ValueError for anything else."""
+    """Return ``value`` if it is an instance of ``kind``; ValueError for anything else."""
     if not isinstance(value, kind):
         raise ValueError(f"{name}: expected a {kind.__name__}, got {type(value).__name__}")
     return value
@@ -166,8 +166,7 @@ def checked_pixels(value: Any) -> tuple[int, int]:
 
 
 _LEAST_KEPT, _LEAST_ROWS = 0.5, 0.4
-"""Shares of a view below which a size is hardly meant. Detectors cut the sky: 256x704 leaves 0.43 to 0.66 of shipped
-rigs' vertical fields of view."""
+"""Shares of a view below which a size is probably a mistake. Rows may be fewer: detectors cut the sky."""
 
 
 def size_mistake(rig: Rig, size: tuple[int, int], fit: Fit) -> str | None:
@@ -182,7 +181,7 @@ def size_mistake(rig: Rig, size: tuple[int, int], fit: Fit) -> str | None:
 
 
 def _lost(camera: Camera, size: tuple[int, int], fit: Fit) -> str:
-    """What becomes of a camera whose view keeps less than ``_LEAST_KEPT``; empty otherwise."""
+    """Loss of a camera whose view keeps less than ``_LEAST_KEPT``; empty otherwise."""
     ratio = size[0] * camera.width_px / (size[1] * camera.height_px)
     share = min(ratio, 1 / ratio)
     if share >= _LEAST_KEPT:

@@ -52,24 +52,24 @@ def compiling(*names: str) -> Iterator[None]:
     missing = [name for name in names if not all(map(is_kept, _named(GROUPS[name][1])))]
     shares = [missing[k::cores] for k in range(min(cores, len(missing)))]
     spawn = multiprocessing.get_context("spawn")
-    others = [spawn.Process(target=_compile_share, args=(share,), daemon=True) for share in shares[1:]]
-    if others:
+    processes = [spawn.Process(target=_compile_share, args=(share,), daemon=True) for share in shares[1:]]
+    if processes:
         say_compiling()
     try:
-        for other in others:
-            other.start()
+        for process in processes:
+            process.start()
         yield
-        if others:
+        if processes:
             _warm_up(shares[0])
-        for other in others:
-            other.join()
+        for process in processes:
+            process.join()
     finally:
-        for other in others:
-            other.kill()
+        for process in processes:
+            process.kill()
 
 
 def _compile_share(names: Sequence[str]) -> None:
-    """Compile groups in a process that says nothing: what fails here fails again where it is called."""
+    """Compile groups in a silent process: errors occur again where kernels are called."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # handled by the parent
     silence = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):

@@ -31,7 +31,7 @@ from arbiview_aug.files import read_bytes
 TF = "tf_static.yaml"
 SUFFIXES = (".yaml", ".yml", ".xml", ".json")
 _EGO_FRAMES = ("base_link", "base_footprint")  # REP 105; REP 120: base_footprint is on the floor
-_BODY_UP_DEG = 60.0  # a camera that looks up more steeply is none of a car's: its frame is the body's
+_BODY_UP_DEG = 60.0  # no car's camera looks up more steeply: its frame is the body's
 _OPTICAL = ("_optical_frame", "_optical", "")  # suffixes of a camera's frame; REP 103
 _ROS_KEYS = {"distortionmodel", "p", "projectionmatrix", "binningx"}
 _WOODSCAPE_KEYS = set("aspect_ratio cx_offset cy_offset height width k1 k2 k3 k4 model poly_order".split())
@@ -56,7 +56,7 @@ _UNREAD = {
 
 _INSTEAD = "which is not read: write a rig file (docs/formats.md)"
 
-# Words of which a file with a camera has one; YAML takes seconds a megabyte.
+# A file with a camera has one of these words; others are not parsed, as YAML takes seconds per megabyte.
 _WORDS = re.compile(r"(?i)matrix|mat\b|\bmtx\b|intrinsic|\bcam_k\b|\bk\b|\bfx\b|\bmu\b|\bgamma1\b|radial_poly")
 
 
@@ -76,7 +76,7 @@ def has_cameras(path: Path) -> bool:
 
 
 def unread_tool(text: str) -> str:
-    """The tool of a file, if it is one that is not read, and what to do; else nothing."""
+    """The tool of a file that is not read, and the fix; empty for others."""
     tools = (f"{tool}, {_INSTEAD}; {fix}" for tool, (words, fix) in _UNREAD.items() if re.search(words, text))
     return next(tools, "")
 
@@ -152,10 +152,7 @@ def _is_woodscape(data: Any) -> bool:
 
 
 def _woodscape(name: str, data: Mapping[Any, Any], mounting: Mounting) -> dict[str, Any]:
-    """A camera of WoodScape: r = k1 θ + ... + k4 θ⁴ in pixels, quaternion x y z w, camera to vehicle.
-
-    Source: scripts/calibration/projection.py of valeoai/WoodScape.
-    """
+    """A camera of WoodScape, as its scripts/calibration/projection.py reads it: r = k1 θ + ... + k4 θ⁴ in pixels."""
     lens, extrinsic = data["intrinsic"], data["extrinsic"]
     if (unread := lens.keys() - _WOODSCAPE_KEYS) or lens.get("poly_order", 4) != 4:
         got = ", ".join(unread) or "another poly_order"
@@ -198,16 +195,13 @@ def _pose(
 
 
 def ros_road_z_m(path: Path) -> float | None:
-    """Height of the road in the ego frame: that of base_footprint, which stands on it; None if tf has no such frame."""
+    """Height of the road in the ego frame: that of base_footprint; None if tf has no such frame."""
     foot = _frames(path).get(_EGO_FRAMES[1])
     return None if foot is None else round(float(foot[2, 3]), 6) + 0.0  # not -0.0
 
 
 def _frames(path: Path) -> dict[str, FloatArray]:
-    """Poses (4, 4) of the frames of the tf in a file's folder; none without one.
-
-    They are in the ego frame: base_link, or base_footprint where there is none.
-    """
+    """Poses (4, 4) of the tf frames of a file's folder in the ego frame: base_link, or base_footprint without it."""
     tf = (path if path.is_dir() else path.parent) / TF
     if not tf.is_file():
         return {}
@@ -348,7 +342,7 @@ def read_calibration(path: Path, where: str) -> Any:
         mounting = Mounting.read(folder)
         with np.errstate(all="ignore"):  # ``Camera`` refuses numbers that are not finite
             cameras = form.read(path, mounting)
-            if is_folder:  # of a file alone it may name the others beside it
+            if is_folder:  # next to a single file, it may name other files' cameras
                 mounting.check([camera["name"] for camera in cameras])
             cameras = mounting.named(cameras)
             heights = (mounting.ground_z_m, MOUNTING), (form.road_z_m(path), "the files"), (form.ground_z_m, "")
@@ -396,13 +390,13 @@ def _unread(folder: Path, name: str | None) -> list[Path]:
     read = {MOUNTING, TF, *(path.name for pattern in patterns for path in folder.glob(pattern))}
     if name and not patterns:
         read |= {path.name for path in camera_files(folder)}
-    stems = {Path(file).stem for file in read}  # ost.txt beside ost.yaml is the same camera
+    stems = {Path(file).stem for file in read}  # ost.txt next to ost.yaml is the same camera
     files = (path for path in sorted(folder.glob("*.*")) if path.suffix in _LIKE_CAMERAS and path.stem not in stems)
     return [path for path in files if not path.is_dir()]
 
 
 def _seems(path: Path) -> str:
-    """What a file that is not read seems to be, and what to do; empty for a rig file and if it has no camera."""
+    """Guess the kind of a file that is not read, and the fix; empty for a rig file or without a camera."""
     try:
         text = read_bytes(path, MOST_BYTES).decode("utf-8-sig", "replace")
     except OSError as error:

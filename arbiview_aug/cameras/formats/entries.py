@@ -1,4 +1,4 @@
-"""Cameras as in a rig file, made by readers; ``mounting.yaml``: what other tools lack."""
+"""Cameras as in a rig file, made by readers; ``mounting.yaml``, which completes other tools' files."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ WAY_OUT = (
 
 
 def refusal(name: str, expected: str, got: str, fix: str = "", *, key: str = "") -> CalibrationError:
-    """The error of a camera whose file says something else than ``expected``."""
+    """Error for a camera whose file differs from ``expected``."""
     return validation.refusal(f"camera {name!r}", key, expected, got, fix)
 
 
 def fitted(name: str, lens: str, coefficients: Any) -> tuple[str, list[float]]:
-    """A lens and as many coefficients as it has, without zeros behind them; a polynomial of zeros is a pinhole."""
+    """A lens and its coefficients without padding zeros; a polynomial of zeros is a pinhole."""
     numbers = [float(k) for k in np.ravel(coefficients)]
     if lens == "radtan" and not any(numbers):
         return "pinhole", []
@@ -71,7 +71,7 @@ class Mounting:
         metres_per_unit: Scale of a calibration without one (COLMAP).
         images: Image of each camera (COLMAP).
         sizes: ``{width, height}`` of all cameras, or by camera.
-        names: Names of the cameras by those in the files, in the rig's order; all others come after them.
+        names: Names of cameras by those in the files, in the rig's order; all other cameras follow.
     """
 
     poses: Mapping[str, FloatArray] = field(default_factory=dict)

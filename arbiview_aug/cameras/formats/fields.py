@@ -133,7 +133,7 @@ def read_fields(name: str, data: Mapping[Any, Any]) -> tuple[str, FloatArray, An
 
 
 def unread_lens(data: Mapping[Any, Any], read: Collection[str]) -> str:
-    """``KEY: VALUE`` of a lens in an entry from which none is read, under a key that is not ``read``; or nothing."""
+    """``KEY: VALUE`` of a lens in an entry under a key that is not ``read``; empty without one."""
     for key, value in data.items():
         meaning = _MEANINGS.get(plain(key))
         if meaning in ("model", "distortion model"):  # others, for example a camera's make, are notes

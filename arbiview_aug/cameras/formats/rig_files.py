@@ -151,7 +151,7 @@ CAMCHAINS = ("*camchain*.yaml", "*cam_chain*.yaml")
 
 
 def chain_entries(data: Any) -> dict[str, Mapping[str, Any]]:
-    """The cameras of a camchain by name; none of anything else."""
+    """The cameras of a camchain by name; empty for anything else."""
     pairs = data.items() if isinstance(data, Mapping) else ()
     return {name: entry for name, entry in pairs if isinstance(entry, Mapping) and "camera_model" in entry}
 
@@ -162,9 +162,9 @@ def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     Source: the wiki pages "yaml formats" and "supported models" of ethz-asl/kalibr.
     """
     if path.is_dir():
-        path, *others = sorted({file for pattern in CAMCHAINS for file in path.glob(pattern)})
-        if others:
-            names = ", ".join(file.name for file in (path, *others))
+        path, *further = sorted({file for pattern in CAMCHAINS for file in path.glob(pattern)})
+        if further:
+            names = ", ".join(file.name for file in (path, *further))
             raise CalibrationError(f"which of {names}? Name the file")
     chain = chain_entries(read_plain(path, path.name))
     if all(re.fullmatch(r"cam\d{1,9}", str(name)) for name in chain):  # other tools sort cam10 before cam2
@@ -179,16 +179,16 @@ def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
 
 def _relative(chain: Mapping[str, Mapping[str, Any]]) -> dict[str, FloatArray]:
     """Poses in the first camera's frame, or in the IMU's where the cameras have T_cam_imu or T_imu_cam alone."""
-    first, *others = chain
+    first, *rest = chain
     for key, power in (("T_cam_imu", -1), ("T_imu_cam", 1)):
-        if others and all(entry.get(key) and not entry.get("T_cn_cnm1") for entry in chain.values()):
+        if rest and all(entry.get(key) and not entry.get("T_cn_cnm1") for entry in chain.values()):
             poses = {name: checked_pose(f"camera {name!r}", entry[key], key) for name, entry in chain.items()}
             return {name: np.asarray(np.linalg.matrix_power(pose, power), np.float64) for name, pose in poses.items()}
     pose: FloatArray = np.eye(4)
     relative = {first: pose}
     if chain[first].get("T_cn_cnm1") is not None:
         raise CalibrationError(f"camera {first!r}: expected no T_cn_cnm1, as it is the first; sort the file")
-    for name in others:
+    for name in rest:
         if (before := chain[name].get("T_cn_cnm1")) is None:
             raise refusal(name, "T_cn_cnm1, or T_cam_imu of all cameras", "neither")
         pose = pose @ np.asarray(np.linalg.inv(checked_pose(f"camera {name!r}", before, "T_cn_cnm1")), np.float64)
@@ -259,7 +259,7 @@ def read_argoverse2(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
 
 
 def waymo_entries(data: Any) -> list[Mapping[str, Any]]:
-    """Camera calibrations in JSON that protobuf made of a Frame, a Context or its list; none in anything else."""
+    """Camera calibrations in protobuf's JSON of a Frame, a Context or its list; empty for anything else."""
     data = data.get("context", data) if isinstance(data, Mapping) else data
     if isinstance(data, Mapping):
         data = data.get("cameraCalibrations", data.get("camera_calibrations"))

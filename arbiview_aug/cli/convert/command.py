@@ -119,10 +119,7 @@ def _settings(arguments: argparse.Namespace) -> Settings:
 
 
 def _depth_folder(arguments: argparse.Namespace, root: Path) -> Path | None:
-    """The folder of ``--depth``, by default the depth command's in the data; DataError if the geometry needs another.
-
-    None where the geometry reads none, or estimates depth from neighbours.
-    """
+    """The folder of ``--depth`` or of the depth command; None if the geometry reads none or estimates depth."""
     folder, geometry = arguments.motion_depth, GEOMETRIES[arguments.geometry]
     if folder is not None:
         if not os.path.isdir(folder):  # unlike Path.is_dir, False for a name that is too long
@@ -198,12 +195,12 @@ def write_report(settings: Settings, data: Recording, tokens: Sequence[str], cou
     def read_views(sample: Mapping[str, Any], rig: Rig) -> list[RenderedView]:
         stored = written.by_token(sample["token"])
         views = map(RenderedView, as_arrays(stored["images"]), map(np.asarray, stored["coverage"]))
-        by_name = dict(zip(stored["rig"].names, views, strict=True))  # the reader's own order
+        by_name = dict(zip(stored["rig"].names, views, strict=True))  # in the reader's order
         return [by_name[name] for name in rig.names]
 
     # The views were rendered at the recorded exposures.
     frames = ((token, make_frame(data.by_token(token), exposures=("raw",))) for token in picked)
-    with gathered_warnings([]):  # each sample's were told when it was converted
+    with gathered_warnings([]):  # printed already during conversion
         done = evaluate(frames, lambda _: settings.sized_target, [Method("converted", read_views)])
     title = f"{data.root.resolve().name} as {settings.target.name or 'the target'} would have seen it"
     notes = [f"{len(picked)} of {len(tokens)} frames. LiDAR points also score views that were made with them."]

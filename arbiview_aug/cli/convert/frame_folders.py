@@ -78,15 +78,14 @@ class FrameFolders(Writer):
 
     def finish(self, records: Iterable[Record], left_out: set[str]) -> tuple[list[str], list[str]]:
         """Write the frames' sequence, without those that were left out."""
-        path = self.data.root / SEQUENCE_FILE
-        if not path.is_file():
-            return self._finish(left_out, None)
-        sequence = json.loads(read_text(path, MOST_BYTES))
-        frames = [frame for frame in sequence["frames"] if entry_name(frame) not in left_out]
-        return self._finish(left_out, {**sequence, "frames": frames})
+        path, sequence = self.data.root / SEQUENCE_FILE, None
+        if path.is_file():
+            sequence = json.loads(read_text(path, MOST_BYTES))
+            sequence["frames"] = [frame for frame in sequence["frames"] if entry_name(frame) not in left_out]
+        return self._finish(left_out, sequence)
 
     def _finish(self, left_out: set[str], sequence: Mapping[str, Any] | None) -> tuple[list[str], list[str]]:
-        """Write a sequence; remove the calibrations that make frames of folders: a killed run may have left them."""
+        """Write a sequence; remove calibrations of left-out frames, which a killed run may have left."""
         for token in left_out:
             remove(self.kept_path(f"{token}/{CALIBRATION_FILE}"))
         if sequence is not None:
@@ -95,7 +94,7 @@ class FrameFolders(Writer):
 
 
 class LogFrames(FrameFolders):
-    """A folder for each iteration of py123d's logs, with points, boxes and pose of its own."""
+    """A folder for each iteration of py123d's logs, with its points, boxes and pose."""
 
     def facts(self) -> dict[str, Any]:
         root = self.data.root.resolve().name

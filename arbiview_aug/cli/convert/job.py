@@ -41,10 +41,7 @@ scene, 0 for the target's own car, as in frame folders."""
 
 
 def rig_of(target: Rig, out: Mapping[str, Any], source: Rig) -> Rig:
-    """Cameras of a retargeted sample, and the scanners that measured its points, in the ego frame of ``source``.
-
-    ``target`` has the views' size and lenses.
-    """
+    """Cameras and scanners of a retargeted sample in the ego frame of ``source``; ``target`` has the views' size."""
     poses, K = out["cam2ego"].numpy(), out["K"].numpy()
     cameras = [replace(camera, K=K[k], cam2ego=poses[k]) for k, camera in enumerate(target)]
     lidars = target.in_frame_of(source).lidars if RINGS_KEY in out else source.lidars
@@ -150,7 +147,7 @@ class Jobs(Dataset[Done]):
             view: dict[str, bytes] = {suffix: encoded_image(out["images"][k], suffix)}
             for key in (key for key in MASKS if key in out):
                 mask = ~out[key][k] if key == "ego_mask" else out[key][k]
-                # convertScaleAbs rounds; both are ten times as fast as torch for a full-size mask.
+                # convertScaleAbs rounds; both are faster than torch for a full-size mask.
                 is_flags = mask.dtype == torch.bool
                 grey = mask.numpy().view(np.uint8) * 255 if is_flags else cv2.convertScaleAbs(mask.numpy(), alpha=255)
                 view[f".{MASKS[key]}.png"] = encoded(grey, ".png")
@@ -186,22 +183,15 @@ class Jobs(Dataset[Done]):
         return float(np.mean(coverage))
 
     def source_files(self, index: int) -> dict[str, Path]:
-        """Files that a sample is read from, by relative path from the root, as records have them.
-
-        Files of a frame that is its own root, or that it shares with others, are not below the root.
-        """
+        """Files that a sample is read from, by relative path from the root, which may lead out of it."""
         files, root = self.data.files(index), self.data.root
         if isinstance(self.samples, WithDepth):
             files += [folder.path(self.data.tokens[index]) for folder in self.samples.folders]
-        real = os.path.realpath(root)
-        return {
-            (
-                path.relative_to(root).as_posix()
-                if path.is_relative_to(root)
-                else Path(os.path.relpath(os.path.realpath(path), real)).as_posix()
-            ): path
-            for path in files
-        }
+        sources = {}
+        for path in files:
+            outside = Path(os.path.relpath(os.path.realpath(path), os.path.realpath(root)))
+            sources[(path.relative_to(root) if path.is_relative_to(root) else outside).as_posix()] = path
+        return sources
 
 
 def _sizes(files: Mapping[str, Path]) -> dict[str, int]:
@@ -239,9 +229,8 @@ class Manifest:
         if record.pop("checksum", None) != _checksum_of(record):
             got = "a file that was changed"
             raise DataError(f"{path}: expected what the conversion wrote, got {got}; remove this file")
-        if record["token"] != token:
-            got = repr(record["token"])
-            raise DataError(f"{path}: expected the record of sample {token!r}, got that of {got}; remove this file")
+        if (got := record["token"]) != token:
+            raise DataError(f"{path}: expected the record of sample {token!r}, got that of {got!r}; remove this file")
         return record
 
     def records(self, tokens: Sequence[str]) -> Iterator[Record]:
@@ -267,8 +256,8 @@ class Manifest:
             else:
                 sources[record["token"]] = record["sources"]
         files = {name: checksum(self.output / name) for name in finished}
-        said = {**facts, "sources": sources, "skipped": skipped, "files": files}
-        write_whole({self.folder / FINISHED_FILE: _signed(said)})
+        provenance = {**facts, "sources": sources, "skipped": skipped, "files": files}
+        write_whole({self.folder / FINISHED_FILE: _signed(provenance)})
 
 
 def _text(data: Mapping[str, Any]) -> bytes:
@@ -276,7 +265,7 @@ def _text(data: Mapping[str, Any]) -> bytes:
 
 
 def _signed(data: Mapping[str, Any]) -> bytes:
-    """Plain data with the checksum of its own text, which tells whether a file is as it was written."""
+    """Plain data with the checksum of its text, which shows later changes of the file."""
     return _text({**data, "checksum": _checksum_of(data)})
 
 
@@ -301,5 +290,5 @@ def differences(recorded: Any, asked: Any, where: str = "") -> Iterator[str]:
         for key in dict.fromkeys([*recorded, *asked]):
             yield from differences(recorded.get(key), asked.get(key), f"{where}.{key}" if where else key)
     elif recorded != asked:
-        one, two = shown(asked), shown(recorded)
-        yield f"another {where}" if max(len(one), len(two)) > 40 else f"{where} {one} instead of {two}"
+        new, old = shown(asked), shown(recorded)
+        yield f"another {where}" if max(len(new), len(old)) > 40 else f"{where} {new} instead of {old}"

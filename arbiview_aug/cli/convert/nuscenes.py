@@ -154,13 +154,13 @@ class NuScenes(Writer):
             for k in on_circle(after)[:1] if key in ("prev", "next") else ():
                 got = f"a circle through row {tables.row(table, int(k))['token']!r}"
                 raise tables.error(table, f"{key} that lead to an end", got, f"empty one row's {key}")
-        own_folders = (FOLDER, self.data.version, *(view_stem("", c.name).rpartition("/")[0] for c in self.target))
+        new_folders = (FOLDER, self.data.version, *(view_stem("", c.name).rpartition("/")[0] for c in self.target))
         for folder, where in folders.items():
             for root, what in ((self.data.root, where), (self.output, f"--output {self.output}: {where}")):
                 inside(root, folder or ".", what)
             parts = PurePosixPath(folder).parts
-            if parts and (parts[0] in own_folders or "/".join(parts[:2]) in own_folders):
-                raise DataError(f"{where}: expected a file outside of {', '.join(own_folders)}, got one in {folder}")
+            if parts and (parts[0] in new_folders or "/".join(parts[:2]) in new_folders):
+                raise DataError(f"{where}: expected a file outside of {', '.join(new_folders)}, got one in {folder}")
 
     def stem(self, index: int, name: str) -> str:
         return view_stem(PurePosixPath(self.data.moment_file(index)).name, name)
@@ -260,9 +260,9 @@ def kept_sensors(tables: Tables) -> tuple[set[str], set[str]]:
 class ConvertedTables:
     """Rows of a converted root: a method for each table that changes, named after it.
 
-    The source's rows stay, but for those of its cameras and of the samples ``left_out``; chains between rows are closed
+    The source's rows stay, except those of its cameras and of the samples ``left_out``; chains between rows are closed
     again. A LiDAR keyframe of a sample that was left out becomes a sweep of the next sample of its scene. With
-    ``scanned`` the scans of the sensor ``moment``, whose keyframes time the samples, go as cameras do. Rows of the
+    ``scanned``, scans of the sensor ``moment``, whose keyframes time the samples, are replaced like images. Rows of the
     target's cameras and scanners come from the ``records`` of the converted samples; ``suffix`` is that of images.
 
     Attributes:
@@ -307,7 +307,7 @@ class ConvertedTables:
         self._visible: dict[str, float] = {}  # visible share of each annotation's box
         self._num_lidar_pts: dict[str, int] = {}  # points in it, where scans are the target's
         self._views: dict[str, dict[str, Row]] = {}  # columns of ``sample_data`` by sample and camera
-        self._scans: dict[str, Row] = {}  # likewise of scans
+        self._scans: dict[str, Row] = {}  # columns of ``sample_data`` of scans, by sample
         for record in records:
             self._visible |= record["visible"]
             views = self._views[record["token"]] = {}

@@ -133,10 +133,7 @@ class Converted:
 
 
 class Writer(ABC):
-    """Writes a converted data set in its source's format; a row of ``READERS`` names it.
-
-    ArbiviewError if the format cannot hold the target's cameras.
-    """
+    """Writes a data set in its source's format; ArbiviewError if the format cannot hold the target's cameras."""
 
     def __init__(self, settings: Settings, data: Any) -> None:
         self.output, self.data = settings.output, data
@@ -147,7 +144,7 @@ class Writer(ABC):
 
     @abstractmethod
     def check(self) -> None:
-        """Look for everything that could not be written, before hours of work end with it, and raise DataError."""
+        """Raise DataError for everything that could not be written, before hours of work."""
 
     def notes(self) -> list[str]:
         """Notes for the user before the conversion starts."""
@@ -159,14 +156,11 @@ class Writer(ABC):
 
     @abstractmethod
     def rest(self, converted: Converted) -> tuple[dict[str, bytes], dict[str, Path], dict[str, Any]]:
-        """Files of a sample besides its views, its files that are kept, and further entries of its record."""
+        """Files of a sample other than its views, its kept files, and further entries of its record."""
 
     @abstractmethod
     def finish(self, records: Iterable[Record], left_out: set[str]) -> tuple[list[str], list[str]]:
-        """Write what belongs to all samples: ``records`` of the converted ones, tokens of those ``left_out``.
-
-        Returns the names of the files that it wrote, and notes.
-        """
+        """Write files of all samples, by ``records``, without those ``left_out``; return their names, and notes."""
 
     def kept_path(self, name: str, where: str = "") -> Path:
         """Path of a kept file in the output: it may be a link that leaves the output, its folder may not."""

@@ -49,8 +49,8 @@ class NuScenesDataset(WritableRecording):
     velocity x y in m/s over the ground (NaN where unknown), with ``box_names`` (categories) and ``box_tokens``. The
     numbers of points and boxes vary: batch with ``collate_fn=arbiview_aug.collate``. If no sample is annotated, they
     have no boxes, with a warning; boxes without a size are left out, with a warning. Cameras have the lens of
-    ``camera_distortion``, if it is there.
-    A root that ``convert`` wrote also has ``coverage`` and ``generated``, as ``FrameFolder`` gives them.
+    ``camera_distortion``, if it is there. A root that ``convert`` wrote also has ``coverage`` and ``generated``, as
+    ``FrameFolder`` gives them.
 
     With ``neighbours`` a sample also has other frames of its scene, keyframes and sweeps, by the distance that the
     vehicle travelled between the images of the first of ``channels``. A sweep has its own time and ego pose, the image
@@ -59,25 +59,25 @@ class NuScenesDataset(WritableRecording):
 
     All files lie below the root, which may be a link: names and links that leave it are refused when they are read.
 
-    The ego's origin is on the road (``ground_z_m`` = 0). Boxes stand upright: roll and pitch of the ego are left out.
+    The ego's origin is on the road (``ground_z_m`` = 0). Boxes are upright: roll and pitch of the ego are left out.
 
     Args:
         root: The folder with ``samples`` and the folder of tables.
         version: The folder of tables.
         split_scenes: Names or tokens of the scenes to keep; None keeps all.
         channels: Camera channels in the order wanted; None takes all in the order of ``CAMERA_RING``.
-        compensate_ego_motion: Pose each camera as at its exposure, in the ego frame at the LiDAR's time. Without, its
-            pose is the mounting alone, which at 9 m/s is 0.4 m away from the pixels.
+        compensate_ego_motion: Pose each camera as at its exposure, in the ego frame at the LiDAR's time. Otherwise its
+            pose is the mounting alone, which is tens of centimetres off while the vehicle drives.
         load_points: Whether to read the LiDAR's points.
         load_boxes: Whether to read the boxes.
         reduce: Decode the images at 1, 1/2 or 1/4 of their size; the rig follows (see ``decode_images``).
-        neighbours: Which other frames of the drive come with a sample; None for none. Sweeps make opening half as long
+        neighbours: Selection of other frames of the drive to add; None for none. Sweeps make opening take half as long
             again. If no sweep's file exists, only keyframes are neighbours, with a warning; if none of the LiDAR's
             does, only they have points.
         lidar_channel: The LiDAR to read; None for ``LIDAR_TOP``, or the only one. Without any, samples have no points,
             and the time and ego pose of their first camera.
-        lidar_columns: Columns of LiDAR files without a header, such as ``["x", "y", "z", "intensity"]``, float32 unless
-            they say otherwise (``"ring:uint16"``); None for x y z intensity ring, of which files must look like rows.
+        lidar_columns: Columns of LiDAR files without a header, for example ``["x", "y", "z", "intensity"]``, float32
+            unless a type follows (``"ring:uint16"``); None for x y z intensity ring, which files must look like.
 
     Raises:
         TypeError: ``neighbours`` is neither ``Neighbours`` nor None.
@@ -180,7 +180,7 @@ class NuScenesDataset(WritableRecording):
         return reduced_rig(Rig(rig, ground_z_m=0.0, name="nuscenes"), self.reduce)
 
     def _size(self, row: int) -> tuple[int, int]:
-        """(h, w) of an image: of its row, or where that has none of the first such image of its sensor."""
+        """(h, w) of an image: from its row, or of the first image of its sensor that was decoded."""
         size, sensor = self._recordings.size(row), int(self._recordings.rows["sensor"][row])
         if not all(size) and sensor not in self._sizes:
             self._sizes[sensor] = tuple(decode_images([inside(*self._file(row))])[0].shape[-2:])  # type: ignore[assignment]
@@ -198,7 +198,7 @@ class NuScenesDataset(WritableRecording):
         return partial(_decode_images, files, names=self.channels, sizes=sizes, reduce=self.reduce)
 
     def _mask_files(self, cameras: Iterable[int], key: str) -> list[Path | None]:
-        """The masks beside the views of cameras that are there."""
+        """Mask files next to the cameras' images; None where there is none."""
         files = ((PurePosixPath(name).with_suffix(f".{key}.png"), where) for _, name, where in map(self._file, cameras))
         paths = (inside(self.root, str(name), where) for name, where in files)
         return [path if path.is_file() else None for path in paths]
@@ -214,10 +214,7 @@ class NuScenesDataset(WritableRecording):
         return partial(_read_points, self._file(lidar), points2ego, self.lidar_columns)
 
     def _find_drive_rows(self) -> IntArray:
-        """Rows of the first camera that can be neighbours: all, or keyframes only if sweeps were not copied.
-
-        Find out too whether the LiDAR's were copied.
-        """
+        """Rows of the first camera that can be neighbours; finds out which sweeps were copied."""
         recordings = self._recordings
         rows, is_key = np.arange(len(recordings.tokens)), recordings.rows["key"]
         sweeps = np.flatnonzero(~is_key)
@@ -303,7 +300,7 @@ def _chosen_channels(tables: Tables, channels: Sequence[str] | None) -> list[str
 
 
 def _chosen_lidar(tables: Tables, wanted: str | None, load_points: bool) -> str | None:
-    """The LiDAR's channel: the wanted one, ``LIDAR``, or the only one; without points any, if there is one."""
+    """The LiDAR's channel: the wanted one, ``LIDAR``, or the only one; any if points are not read."""
     lidars = sorted({row["channel"] for row in tables.rows("sensor") if str(row["modality"]).lower() == "lidar"})
     if wanted is not None and wanted not in lidars:
         got = f"{', '.join(lidars) or 'none'} in table sensor"

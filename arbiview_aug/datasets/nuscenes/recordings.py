@@ -121,8 +121,8 @@ def read_recordings(
     for batch in tables.batches(table):
         is_key = tables.column(table, batch, "is_key_frame", kinds.FLAGS)
         kept = batch if sweeps else [*compress(batch, is_key)]
-        of_samples = tables.column(table, kept, "sample_token", TOKENS)
-        kept = [row for row, token in zip(kept, of_samples, strict=True) if token in samples]  # of the chosen scenes
+        sample_tokens = tables.column(table, kept, "sample_token", TOKENS)
+        kept = [row for row, token in zip(kept, sample_tokens, strict=True) if token in samples]  # of the chosen scenes
         sensors = tables.follow(table, kept, "calibrated_sensor_token", "calibrated_sensor", calibrated)
         pairs = zip(kept, sensors, strict=True)
         is_wanted = [k >= 0 and (row["is_key_frame"] or wanted[channel_of[k]] in sweeps) for row, k in pairs]
@@ -130,35 +130,35 @@ def read_recordings(
         _refuse_calibrations(tables, kept)
         part = np.zeros(len(kept), _ROW)
         part["sensor"], part["channel"] = sensors, [channel_of[sensor] for sensor in sensors]
-        part["sample"] = of_samples = [samples[row["sample_token"]] for row in kept]
-        part["scene"], part["key"] = [scenes[k] for k in of_samples], [row["is_key_frame"] for row in kept]
+        part["sample"] = numbers = [samples[row["sample_token"]] for row in kept]
+        part["scene"], part["key"] = [scenes[k] for k in numbers], [row["is_key_frame"] for row in kept]
         times = tables.column(table, kept, "timestamp", kinds.MICROSECONDS)
         part["time_us"] = times_us = [time // 1000 if time >= kinds.NANOSECONDS else time for time in times]
         for key in ("height", "width"):
             part[key] = tables.column(table, kept, key, kinds.COUNTS, default=0)  # none for the LiDAR
-        of_poses = tables.column(table, kept, "ego_pose_token", TOKENS)
-        part["pose"] = [poses.setdefault(token, len(poses)) for token in of_poses]
+        pose_tokens = tables.column(table, kept, "ego_pose_token", TOKENS)
+        part["pose"] = [poses.setdefault(token, len(poses)) for token in pose_tokens]
         names = tables.column(table, kept, "filename", kinds.FILES)
         names_cut = (name.partition(str(time_us)) for name, time_us in zip(names, times_us, strict=True))
         part["file"] = [files.setdefault((a, b if time else None), len(files)) for a, time, b in names_cut]
-        of_tokens = unique.add(kept)
+        row_tokens = unique.add(kept)
         if sweeps:
             is_first = part["channel"] == 0
             part["token"][is_first] = len(tokens) + np.arange(is_first.sum())
-            tokens += compress(of_tokens, is_first)
+            tokens += compress(row_tokens, is_first)
             previous += tables.column(table, [*compress(kept, is_first)], "prev", kinds.LINKS)
         parts.append(part)
     unique.check()
     rows = np.concatenate(parts)
     rows = rows[np.lexsort((rows["time_us"], rows["scene"], rows["channel"]))]
     keyframes = np.full((len(samples), len(wanted)), -1)
-    of_keys = rows[rows["key"]]
+    key_rows = rows[rows["key"]]
     counts = np.zeros(keyframes.shape, np.int64)
-    np.add.at(counts, (of_keys["sample"], of_keys["channel"]), 1)
+    np.add.at(counts, (key_rows["sample"], key_rows["channel"]), 1)
     for k, channel in np.argwhere(counts > 1)[:1]:
         expected = f"one keyframe of {wanted[channel]} for sample {list(samples)[k]}"
         raise tables.error(table, expected, str(counts[k, channel]), "remove the others")
-    keyframes[of_keys["sample"], of_keys["channel"]] = np.flatnonzero(rows["key"])
+    keyframes[key_rows["sample"], key_rows["channel"]] = np.flatnonzero(rows["key"])
     if lidar is None:
         keyframes[:, -1] = keyframes[:, 0]
     for k in np.flatnonzero((keyframes < 0).any(axis=1))[:1]:
@@ -193,7 +193,7 @@ def read_recordings(
 def _calibrations(
     tables: Tables, wanted: Sequence[str]
 ) -> tuple[dict[str, int], list[int], FloatArray, FloatArray, list[tuple[str, list[float]]]]:
-    """Number of each calibrated sensor, -1 for others such as radars; channels, sensor2ego, K and lenses by number."""
+    """Number of each calibrated sensor, -1 if it is not read; channels, sensor2ego, K and lenses by number."""
     by_token = tables.by_token("calibrated_sensor")
     rows, by_sensor = [*by_token.values()], tables.by_token("sensor")
     sensors = tables.follow("calibrated_sensor", rows, "sensor_token", "sensor", by_sensor)
@@ -215,12 +215,12 @@ def _calibrations(
 
 
 def _refuse_calibrations(tables: Tables, rows: Sequence[Row]) -> None:
-    """Raise DataError for rows of ``sample_data`` with a calibration or lens of their own."""
-    if others := {key for keys in {*map(tuple, rows)} for key in keys} - {*_COLUMNS}:
+    """Raise DataError for rows of ``sample_data`` that hold a calibration or lens."""
+    if further := {key for keys in {*map(tuple, rows)} for key in keys} - {*_COLUMNS}:
         for row in rows:
-            entry = {key: row[key] for key in others if row.get(key) is not None}
-            other = next((f"{key}: {shown(entry[key])}" for key in _OF_IMAGES if entry.get(key)), "")
-            if odd := other or unread_lens(entry, ()):
+            entry = {key: row[key] for key in further if row.get(key) is not None}
+            calibration = next((f"{key}: {shown(entry[key])}" for key in _OF_IMAGES if entry.get(key)), "")
+            if odd := calibration or unread_lens(entry, ()):
                 expected = "each image's calibration in calibrated_sensor alone"
                 raise tables.error("sample_data", expected, f"{odd} in row {row.get('token')!r}")
 
@@ -242,8 +242,7 @@ def _ego_poses(tables: Tables, wanted: Mapping[str, int]) -> FloatArray:
 
 
 def _parts(scene: npt.NDArray[Any], tokens: Sequence[str], previous: Sequence[str], where: str) -> IntArray:
-    """(F,) numbers of the drives in one camera's recordings, sorted by scene and time: one ends with its scene, at a
-    missing ``prev``, and where the clock goes back (with a warning)."""
+    """(F,) drive of each recording of a camera; it ends with its scene, without ``prev``, or if the clock goes back."""
     number_of = {token: k for k, token in enumerate(tokens)}
     before = np.array([number_of.get(token, -1) for token in previous], np.int64)
     number = np.arange(len(before))
@@ -273,8 +272,8 @@ class Annotations:
     headings: SingleArray  # (B, 3) unit vectors along the lengths, world frame
     velocities_mps: SingleArray  # (B, 3) world frame, NaN where unknown
     sample: _Int32  # (B,) index of the sample
-    later: _Int32  # (B,) the same object's next annotation, -1 for none
-    earlier: _Int32  # (B,) its previous annotation, -1 for none
+    later: _Int32  # (B,) the same object's next annotation, or -1
+    earlier: _Int32  # (B,) its previous annotation, or -1
     times_s: FloatArray  # (S,) times of the samples
     scenes: npt.NDArray[np.int64]  # (S,) numbers of their scenes
     order: npt.NDArray[np.int64]  # (S,) samples sorted by scene and time
@@ -290,10 +289,10 @@ class Annotations:
         return self._in_ego_frame(rows, self.centers_m[rows], self.headings[rows], global2ego)
 
     def at_time(self, scene: int, time_s: float, global2ego: FloatArray) -> SingleArray:
-        """(n, 9) boxes of a scene at any time, as ``at_sample``.
+        """(n, 9) boxes of a scene at any time, in the form of ``at_sample``.
 
         Objects in the keyframes before and after are interpolated linearly. Objects in one of them move with their
-        velocity, or stand still if it is unknown.
+        velocity, or stay if it is unknown.
         """
         samples = self.order[slice(*np.searchsorted(self.scenes[self.order], [scene, scene + 1]))]
         at = int(np.searchsorted(self.times_s[samples], time_s))
@@ -325,23 +324,20 @@ class Annotations:
 def read_annotations(
     tables: Tables, samples: Mapping[str, int], times_s: FloatArray, scenes: npt.NDArray[np.int64]
 ) -> Annotations:
-    """Read the annotations of the samples (number by token), which have times (S,) and numbers of scenes (S,).
-
-    DataError for a malformed row, or a dangling token.
-    """
+    """Read annotations of samples (number by token) with times and scenes (S,); DataError for malformed rows."""
     categories = tables.by_token("category")
     names = sorted({*tables.column("category", [*categories.values()], "name", TEXTS)})
     instances = tables.by_token("instance")
     kinds = tables.follow("instance", [*instances.values()], "category_token", "category", categories)
     objects = {token: (k, names.index(kinds[k]["name"])) for k, token in enumerate(instances)}
-    table, none = "sample_annotation", np.empty((0, 3), np.float32)
+    table, no_sizes = "sample_annotation", np.empty((0, 3), np.float32)
     unique = Tokens(tables, table)
     empty = np.empty(0, np.int32), np.empty((0, 2), np.int32), np.empty(0, np.bytes_)
-    annotations: list[tuple[Any, ...]] = [(*empty, none.astype(np.float64), none, none)]
+    annotations: list[tuple[Any, ...]] = [(*empty, no_sizes.astype(np.float64), no_sizes, no_sizes)]
     left_out: list[Any] = []
     for batch in tables.batches(table):
-        of_samples = tables.column(table, batch, "sample_token", TOKENS)
-        rows = [row for row, token in zip(batch, of_samples, strict=True) if token in samples]
+        sample_tokens = tables.column(table, batch, "sample_token", TOKENS)
+        rows = [row for row, token in zip(batch, sample_tokens, strict=True) if token in samples]
         is_whole = _are_whole(rows)
         left_out += (row.get("token") for row in compress(rows, ~is_whole))
         rows = [*compress(rows, is_whole)]
@@ -360,14 +356,14 @@ def read_annotations(
     columns = [np.concatenate([batch[k] for batch in annotations]) for k in range(len(annotations[0]))]
     order = np.argsort(columns[0], kind="stable")
     sample, instance_and_category, tokens, centers_m, sizes, headings = (column[order] for column in columns)
-    # Each object's previous and next annotation, and its velocity between them where they are close enough in time.
+    # Each object's previous and next annotation, and its velocity between them if they are close enough in time.
     instance, time_s, itself = instance_and_category[:, 0], times_s[sample], np.arange(len(sample))
     earlier, later = (np.full(len(sample), -1, np.int32) for _ in range(2))
     in_time = np.lexsort((time_s, scenes[sample], instance))
-    one, two = in_time[:-1], in_time[1:]
-    same = (instance[one] == instance[two]) & (scenes[sample[one]] == scenes[sample[two]])
-    earlier[two[same]], later[one[same]] = one[same], two[same]
-    start, end = (np.where(others < 0, itself, others) for others in (earlier, later))
+    before, after = in_time[:-1], in_time[1:]
+    same = (instance[before] == instance[after]) & (scenes[sample[before]] == scenes[sample[after]])
+    earlier[after[same]], later[before[same]] = before[same], after[same]
+    start, end = (np.where(annotation < 0, itself, annotation) for annotation in (earlier, later))
     seconds = time_s[end] - time_s[start]
     longest_s = np.where((earlier >= 0) & (later >= 0), 2 * MAX_STEP_S, MAX_STEP_S)
     known = (seconds > 0) & (seconds <= longest_s)

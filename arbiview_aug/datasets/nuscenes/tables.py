@@ -194,10 +194,7 @@ def is_camera(sensor: Row) -> bool:
 
 
 class Tokens:
-    """A column of tokens as 64-bit hashes, in a twelfth of the texts' memory.
-
-    Tokens of a table of millions collide with a probability of one in a million.
-    """
+    """A column of tokens as 64-bit hashes, in a twelfth of the texts' memory; collisions are one in a million."""
 
     def __init__(self, tables: Tables, table: str, key: str = "token") -> None:
         self.tables, self.table, self.key = tables, table, key
@@ -218,10 +215,7 @@ class Tokens:
             raise self.tables.error(self.table, "each token once", f"{token!r} twice", "remove one of the rows")
 
     def places_in(self, other: Tokens, or_empty: bool) -> npt.NDArray[np.int64]:
-        """(rows,) row of another table that each token names, -1 for an empty token, which ``or_empty`` allows.
-
-        DataError for a dangling token.
-        """
+        """(rows,) row of another table that each token names, -1 for an empty one; DataError for a dangling token."""
         wanted, there = self._all(), other._all()
         if not len(there):
             there = np.array([hash("")])
@@ -238,7 +232,7 @@ class Tokens:
 
 
 def on_circle(after: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Find a row on a circle for each endless chain; ``after`` (n,) has the next row of each row, -1 for none."""
+    """Find a row on a circle for each endless chain; ``after`` (n,) has the next row of each row, or -1."""
     ahead = np.append(after, -1)  # -1 leads to -1
     for _ in range(len(after).bit_length()):  # by 1, 2, 4, ... rows, until past the longest chain
         ahead = ahead[ahead]

@@ -43,7 +43,7 @@ class RenderedViews(NamedTuple):
         depth_m: (h, w) float32 z in the camera frame along the ray through each pixel's centre; infinite for the sky
             and where the lens sees nothing; negative past 90 degrees off a fisheye's axis.
         classes: (h, w) uint8 ``SceneClass`` of that ray.
-        instances: (h, w) int16 row of ``boxes_3d`` of that ray, -1 for none.
+        instances: (h, w) int16 row of ``boxes_3d`` of that ray, or -1.
     """
 
     images: Tensor | list[Tensor]
@@ -74,7 +74,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         seed: Seed of the world, not negative.
         supersampling: Rays across a pixel at outlines; 1 for no antialiasing.
         lidar: Whether samples carry ``points``.
-        neighbours: Which other frames of the drive come with a sample; None for none.
+        neighbours: Selection of other frames of the drive to add; None for none.
 
     Raises:
         TypeError: A ``rig`` or ``neighbours`` of another type.
@@ -161,7 +161,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
         return self._points(self.scene(index), (self.seed, index, 1), None if rig is None else _checked_rig(rig))
 
     def _points(self, scene: Scene, noise: tuple[int, ...], rig: Rig | None = None) -> Tensor:
-        """The points of a scene, whose noise has a seed of its own."""
+        """Points (P, 4) of a scene, with the noise of a seed."""
         rig = self.rig if rig is None else rig
         road = np.array([0.0, 0.0, rig.ground_z_m])
         scanners = [(lidar.center_m - road, lidar.rays.T, lidar.range_m) for lidar in rig.lidars]
@@ -180,10 +180,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
     def _scan(
         self, scene: Scene, position: FloatArray, rays: Rays, range_m: tuple[float, float], seed: tuple[int, ...]
     ) -> FloatArray:
-        """(P, 4) x y z and intensity, 0 to 255, of rays (columns, beams, 3) in the ego frame, unit vectors.
-
-        They leave ``position`` (3,), whose z is over the road, and return from distances between both of ``range_m``.
-        """
+        """(P, 4) x y z and intensity of unit rays (columns, beams, 3) from ``position``, whose z is over the road."""
         R = scene.ego2street[:3, :3]
         origin = R @ position + scene.ego2street[:3, 3]
         ego = rays.astype(np.float64)[:, :, None]
@@ -197,7 +194,7 @@ class SyntheticDrive(Dataset[dict[str, Any]]):
 
 
 def cast_rays(scene: Scene, origin: FloatArray, street: Rays) -> tuple[FloatArray, IntArray]:
-    """Distances and rows (n,) of what rays (columns, m, 3) of the street frame meet; columns are neighbours."""
+    """Distances and rows (n,) of the hits of rays (columns, m, 3) of the street frame; columns are neighbours."""
     columns, m, _ = street.shape
     packets = np.pad(street, ((0, -columns % 8), (0, 0), (0, 0)), mode="edge").reshape(-1, 8 * m, 3)
     with small_steps():

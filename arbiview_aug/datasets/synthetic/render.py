@@ -58,7 +58,7 @@ def camera_rays(camera: Camera) -> CameraRays:
     right, down = _differences(rays, valid, 1), _differences(rays, valid, 0)
     pitch = np.sqrt(np.linalg.norm(right, axis=-1) * np.linalg.norm(down, axis=-1)).clip(1e-6, 0.3)
     for top, left in product(*(range(0, side, TILE_PX) for side in camera.size)) if not valid.all() else ():
-        # Invalid pixels get a valid ray of their own tile, so that they do not widen its pyramid.
+        # Invalid pixels get a valid ray of the same tile, so that they do not widen its pyramid.
         tile = np.s_[top : top + TILE_PX, left : left + TILE_PX]
         if valid[tile].any() and not valid[tile].all():
             rays[tile][~valid[tile]] = rays[tile][valid[tile]][0]
@@ -117,9 +117,7 @@ class Renderer:
 
     def __init__(self, *, supersampling: int = 2) -> None:
         self.supersampling = supersampling
-        self._rays: LRUCache[bytes, CameraRays] = LRUCache(
-            _CACHED_BYTES, lambda rays: sum(part.nbytes for part in rays)
-        )
+        self._rays: LRUCache[bytes, CameraRays] = LRUCache(_CACHED_BYTES, lambda rays: sum(a.nbytes for a in rays))
 
     def __reduce__(self) -> tuple[Any, tuple[()]]:
         return partial(type(self), supersampling=self.supersampling), ()  # without the caches
@@ -153,9 +151,9 @@ class Renderer:
 
     def _cast(self, scene: Scene, cameras: list[Camera], ground_z_m: float) -> _Cast:
         """First pass: one ray through every pixel's centre. All cameras are cast together, in longer operations."""
-        of_cameras = [self._rays.get(camera.content_key, partial(camera_rays, camera)) for camera in cameras]
-        tiles = [len(rays.directions) for rays in of_cameras]
-        rays = CameraRays(*map(torch.cat, zip(*of_cameras, strict=True)))
+        parts = [self._rays.get(camera.content_key, partial(camera_rays, camera)) for camera in cameras]
+        tiles = [len(rays.directions) for rays in parts]
+        rays = CameraRays(*map(torch.cat, zip(*parts, strict=True)))
         directions, pose = _to_street(rays.directions, scene), scene.ego2street
         origins = [pose[:3, :3] @ (camera.center_m - (0, 0, ground_z_m)) + pose[:3, 3] for camera in cameras]
         start = torch.as_tensor(np.repeat(origins, tiles, axis=0).astype(np.float32))
@@ -177,13 +175,12 @@ class Renderer:
     def _cast_outlines(self, first: _Cast, key: Tensor, scene: Scene) -> tuple[Tensor, Hits]:
         """Second pass: rows (m,) of the supersampled pixels, and their (m * s * s) hits."""
         rays, candidates, s = first.rays, first.candidates, self.supersampling
-        of_cameras = zip(first.cameras, key.view_as(first.hit).split(first.tiles), strict=True)
         outlines = []
-        for camera, keys in of_cameras:  # pixels with a direct neighbour of another key
+        for camera, keys in zip(first.cameras, key.view_as(first.hit).split(first.tiles), strict=True):
             pixels = _from_tiles(keys, camera.size)
-            differs = torch.zeros_like(pixels, dtype=torch.bool)
-            for one, across in ((pixels, differs), (pixels.T, differs.T)):
-                step = one[1:] != one[:-1]
+            differs = torch.zeros_like(pixels, dtype=torch.bool)  # whether a direct neighbour has another key
+            for rows, across in ((pixels, differs), (pixels.T, differs.T)):
+                step = rows[1:] != rows[:-1]
                 across[1:] |= step
                 across[:-1] |= step
             outlines.append(_to_tiles(differs)[:, 0])
@@ -198,9 +195,8 @@ class Renderer:
         d, r, b = (a[tile, :, slot] for a in (rays.directions, rays.right, rays.down))  # [m, 3]
         sub = torch.stack([d + u * r + v * b for v in offsets for u in offsets], 1)  # [m, s*s, 3]
         sub = sub / (sub[..., 0] ** 2 + sub[..., 1] ** 2 + sub[..., 2] ** 2).sqrt()[..., None]
-        found = torch.bincount(
-            candidates.packet, minlength=len(outline)
-        )  # a pixel is a packet with its tile's candidates
+        # A pixel is a packet with its tile's candidates.
+        found = torch.bincount(candidates.packet, minlength=len(outline))
         packet = torch.repeat_interleave(torch.arange(len(tile)), found[tile])
         counts = found[tile]
         rank = torch.arange(len(packet)) - (counts.cumsum(0) - counts)[packet]  # of a candidate in its packet
@@ -219,9 +215,8 @@ class Renderer:
         depth = torch.where(torch.isfinite(first.t), depth, torch.inf)
         row = hit.clamp_min(0)
         classes = torch.tensor(scene.cls)[row]
-        others = (GROUND_ID, SceneClass.GROUND), (SKY_ID, SceneClass.SKY)
-        of_others = *((hit == k, cls) for k, cls in others), (~rays.valid, SceneClass.VOID)
-        for there, cls in of_others:
+        surroundings = (hit == GROUND_ID, SceneClass.GROUND), (hit == SKY_ID, SceneClass.SKY)
+        for there, cls in (*surroundings, (~rays.valid, SceneClass.VOID)):
             classes = torch.where(there, int(cls), classes)
         instances = torch.where(hit >= 0, torch.tensor(scene.instance)[row], -1)
         image = (color.view(*hit.shape, 3) * 255 + 0.5).to(torch.uint8) * rays.valid[..., None]

@@ -61,9 +61,9 @@ class Street:
     half_width_m: Range  # road edge to the right (y < 0) and to the left (y > 0), both positive
     parking: tuple[bool, bool]
     sidewalk_m: Range
-    verge_m: Range  # width of the grass between kerb and paving; 0 for none
+    verge_m: Range  # width of the grass between kerb and paving; 0 without grass
     kerb_m: float
-    crossing_x_m: float  # centre of the crossing street, infinite where there is none
+    crossing_x_m: float  # centre of the crossing street; infinite without one
     crossing_half_m: float
     zebra: bool
     solid_centre: bool
@@ -152,7 +152,7 @@ class SceneBuilder:
         self.box_classes: list[int] = []
 
     def place(self, origin: Vector, yaw: float, cls: SceneClass, instance: int = -1) -> Placed:
-        """A frame (origin on the surface it stands on, x forward) to add parts in."""
+        """A frame to add parts in: origin on the surface below, x forward."""
         return Placed(self, np.array(origin, dtype=np.float64), yaw_matrix(yaw), cls, instance)
 
     def add_box(self, center: FloatArray, size: Vector, yaw: float, cls: BoxClass) -> int:
@@ -179,7 +179,7 @@ class Look(NamedTuple):
 
 @dataclass
 class Placed:
-    """Adds parts of one object in the object's own frame."""
+    """Adds parts of one object in the object's frame."""
 
     builder: SceneBuilder
     origin: FloatArray

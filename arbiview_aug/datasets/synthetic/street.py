@@ -32,7 +32,7 @@ _MOVING_SHARES = (0.62, 0.18, 0.14, 0.06)
 _PARKED_SHARES = (0.76, 0.19, 0.05, 0.0)
 _SPEED_MPS = (6.0, 14.0)
 _SIGNS = ((0.78, 0.12, 0.12), (0.10, 0.25, 0.62), (0.85, 0.72, 0.10), (0.90, 0.90, 0.90))
-_WAITING = 0.2  # share of the people and of the traffic in other directions that stands still
+_WAITING = 0.2  # share of the people and of the traffic in other directions that does not move
 
 
 def make_scene(seed: int, index: int) -> Scene:

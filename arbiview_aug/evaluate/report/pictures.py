@@ -95,10 +95,7 @@ def outline_coverage(image: Image, coverage: BoolArray) -> Picture:
 
 
 def draw_labels(camera: Camera, image: Image, points: FloatArray | None, boxes: FloatArray | None) -> Picture:
-    """Draw points (P, >=3) by depth, red to blue, and boxes (B, 7) with headings into an image (h, w, 3), 0-255.
-
-    What the camera's mask hides is hatched.
-    """
+    """Draw points (P, >=3) by depth and boxes (B, 7) into an image (h, w, 3), 0-255; masked pixels are hatched."""
     picture = to_bytes(image).copy() if camera.mask is None else outline_coverage(image, camera.mask)
     h, w = camera.size
     width_px = max(1, h // 400)
@@ -111,8 +108,8 @@ def draw_labels(camera: Camera, image: Image, points: FloatArray | None, boxes: 
             picture[np.minimum(row + dy, h - 1), np.minimum(column + dx, w - 1)] = colours
     for box in np.zeros((0, 7)) if boxes is None else boxes:
         for segments, colour in box_lines(camera, box):
-            for one, two in np.round(segments).astype(int).tolist():
-                cv2.line(picture, one, two, colour, width_px, cv2.LINE_AA)
+            for start, end in np.round(segments).astype(int).tolist():
+                cv2.line(picture, start, end, colour, width_px, cv2.LINE_AA)
     return picture
 
 
@@ -204,13 +201,13 @@ def left_to_right(rig: Rig) -> list[int]:
 
 
 _COLUMNS = 3
-_DIMMED = 0.35  # brightness of what is no evidence
+_DIMMED = 0.35  # brightness of pixels that no camera saw
 
 
 def show(sample: Mapping[str, Any]) -> Any:
     """Draw a sample's images in rows, with its boxes and their headings; a notebook shows the result.
 
-    What ``coverage`` or a mask leaves out is dimmed: no source camera saw it, or it is the own car.
+    Pixels outside of ``coverage`` or a mask are dimmed: no source camera saw them, or they show the ego car.
 
     Args:
         sample: A sample that ``RigRetarget`` takes or returns; of a batch, each frame.
@@ -248,10 +245,7 @@ def draw_rigs(rigs: Sequence[Rig]) -> Picture:
 
 
 def rig_figure(rigs: Sequence[Rig]) -> Any:
-    """Draw one column per rig, from above and from the side, on one scale with the other rigs' outlines behind.
-
-    Wedges are fields of view, longer for telephoto cameras; dots are scanners. Heights are over each rig's own road.
-    """
+    """Draw a column per rig, from above and the side: fields of view, scanners as dots, heights over the road."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8 * len(rigs), 10.5), dpi=100, layout="constrained")
@@ -270,18 +264,18 @@ def rig_figure(rigs: Sequence[Rig]) -> Any:
                 centre = camera.center_m - (0, 0, rig.ground_z_m)
                 x, _, z = np.concatenate([centre[None], centre + 1.1 * rays]).T
                 side.fill(x, z, **style)
-        own = rigs[column]
-        for camera in own:  # its name and field of view at the end of its wedge
+        shown = rigs[column]
+        for camera in shown:  # its name and field of view at the end of its wedge
             forward, left = np.cos(np.radians(camera.azimuth_deg)), np.sin(np.radians(camera.azimuth_deg))
             y, x = camera.center_m[1::-1] + (_radius_m(camera) + 0.2) * np.array([left, forward])
             text = f"{camera.name}\n{camera.fov_deg[0]:.0f}° x {camera.fov_deg[1]:.0f}°"
             aligned = {"ha": "right" if left > 0.3 else "left" if left < -0.3 else "center"}
             above.text(y, x, text, fontsize=8, va="bottom" if forward > 0 else "top", **aligned)
-        for lidar in own.lidars:
-            x, y, z = lidar.center_m - (0, 0, own.ground_z_m)
+        for lidar in shown.lidars:
+            x, y, z = lidar.center_m - (0, 0, shown.ground_z_m)
             above.plot(y, x, **_DOT)
             side.plot(x, z, **_DOT)
-        above.set_title(f"{own.name or 'rig'}: {len(own)} cameras", color=RIG_COLOURS[column % len(RIG_COLOURS)])
+        above.set_title(f"{shown.name or 'rig'}: {len(shown)} cameras", color=RIG_COLOURS[column % len(RIG_COLOURS)])
         above.set(xlabel="left (m)", ylabel="forward (m)", aspect="equal")
         side.set(xlabel="forward (m)", ylabel="height over the road (m)", aspect="equal")
         side.axhline(0, color="grey", linewidth=3)

@@ -141,7 +141,7 @@ def html_report(
         seen = "; ".join(f"{method} {views[k].coverage.mean():.1%}" for method, views in shown.items())
         pictures = {name: _data_url(picture) for name, picture in by_camera[k].items()}
         cameras.append({"name": rig[k].name, "size": rig[k].size, "seen": seen, "pictures": pictures})
-    # Every camera offers the same layers: a view without holes stands for its holes.
+    # Every camera offers the same layers: a view without holes is also its picture of holes.
     names = [*dict.fromkeys(name for pictures in by_camera for name in pictures)]
     sides = {"before": _TRUTH if _TRUTH in names else _SOURCE, "after": next(iter(shown), "")}
     template = jinja2.Environment(autoescape=True, trim_blocks=True).from_string(

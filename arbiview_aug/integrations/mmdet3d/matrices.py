@@ -69,8 +69,8 @@ class ResultCameras:
 def read_views(matrices: Mapping[str, Any], count: int, names: Sequence[str], lidar2ego: FloatArray) -> ResultCameras:
     """The cameras that a dict's matrices (values of the keys of ``MATRICES``, each of ``count`` cameras) describe.
 
-    ``cam2ego`` is not read: mmdet3d's is the mounting alone, 0.4 m off what the image shows at 9 m/s; ``lidar2cam`` has
-    the motion between LiDAR and camera in it. Missing and contradictory matrices are a ``SampleError``.
+    ``cam2ego`` is not read: mmdet3d's is the mounting alone; ``lidar2cam`` includes the vehicle's motion between LiDAR
+    and camera. Missing and contradictory matrices are a ``SampleError``.
     """
     of: dict[str, FloatArray] = {}
     for key, kind in MATRICES.items():
@@ -122,10 +122,7 @@ def decomposed(lidar2img: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def upper_triangular(M: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """K, upper triangular with a positive diagonal, and a rotation R (n, 3, 3) with M = K R (RQ decomposition).
-
-    M must not mirror: its determinant is positive.
-    """
+    """K, upper triangular with a positive diagonal, and R (n, 3, 3) with M = K R (RQ decomposition), for det M > 0."""
     flip = np.eye(3)[::-1]
     Q, R = np.linalg.qr((flip @ M).transpose(0, 2, 1))
     K, rotation = flip @ R.transpose(0, 2, 1) @ flip, flip @ Q.transpose(0, 2, 1)

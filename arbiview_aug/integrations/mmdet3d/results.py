@@ -33,7 +33,7 @@ STALE_KEYS = (
     *("centers_2d", "centers2d", "depths", "depth_map", "depth_maps", "gt_depth", "canvas"),
     *("gt_masks", "gt_semantic_seg", "gt_seg_map", "seg_label"),
 )
-"""Keys, also in ``ann_info``, that speak of the source's pixels: dropped (``project_boxes_3d`` makes new 2D boxes)."""
+"""Keys, also in ``ann_info``, bound to the source's pixels: dropped (``project_boxes_3d`` makes new 2D boxes)."""
 
 FILE_KEYS = ("filename", "img_path", "img_filename", "image_paths")
 """Lists of image files: no file holds the new images, so they become the cameras' names."""
@@ -51,7 +51,7 @@ _AS_RECORDED: dict[str, Any] = {
 augmented: loading steps write that too."""
 
 TARGET_OUTPUTS = ("coverage", "ego_mask", "confidence", "generated", "source_camera", "source_frame", "retarget_params")
-"""Entries of a retargeted sample that the results get besides, as arrays."""
+"""Entries of a retargeted sample that are added to the results, as arrays."""
 
 
 def retarget_results(
@@ -64,10 +64,10 @@ def retarget_results(
 ) -> dict[str, Any]:
     """Re-render the images of a ``results`` dict, as the loading transforms leave it, and rewrite what describes them.
 
-    Whatever keys of ``MATRICES`` the dict has are rewritten in their container, type and shape, at the top and in
-    ``images``: the form is never guessed. All target cameras stand where they are at the LiDAR's time. ``points``
-    (LiDAR frame) and ``gt_bboxes_3d`` are read as geometry, where there are any. Boxes stay. Points become what the
-    target's scanners would have measured, if it has any, in the frame of the LiDAR that recorded.
+    All keys of ``MATRICES`` in the dict are rewritten in their container, type and shape, at the top and in ``images``:
+    the form is never guessed. Poses of target cameras are those at the LiDAR's time. ``points`` (LiDAR frame) and
+    ``gt_bboxes_3d`` are read as geometry. Boxes stay. Points become what the target's scanners would have measured, if
+    it has any, in the frame of the LiDAR that recorded.
 
     Raises:
         SampleTypeError: Images of another form.
@@ -195,7 +195,7 @@ def source_rig(views: ResultCameras, images: Sequence[torch.Tensor], ground_z_m:
 def geometry(results: Mapping[str, Any], lidar2ego: FloatArray) -> dict[str, torch.Tensor]:
     """The sample's ``points`` and ``boxes_3d`` in the ego frame, of what the results hold in the LiDAR's.
 
-    Boxes are taken by their corners: what their numbers mean differs between mmdet3d's versions. Those of plain numbers
+    Boxes are read by their corners, as the meaning of their numbers differs between mmdet3d's versions. Plain numbers
     (Sparse4D) are gravity centre, length, width, height and yaw. Other shapes are a ``SampleError``.
     """
     values = {}
@@ -342,14 +342,14 @@ def images_like(original: Sequence[Any], images: torch.Tensor) -> Any:
 
 
 def _as_written(original: Any, matrices: FloatArray) -> Any:
-    """The matrices as the given ones are; transposed where they are."""
+    """Matrices in the form of the given ones; transposed where those are."""
     if np.shape(original[0]) == (4, 4) and is_transposed(np.stack([np.asarray(m, np.float64) for m in original])):
         matrices = matrices.transpose(0, 2, 1)
     return like_given(original, matrices)
 
 
 def _infos(infos: Mapping[str, Any], views: ResultCameras, images: torch.Tensor) -> dict[str, Any]:
-    """``images``: an entry for each target camera with the keys of the source's that can be told of it."""
+    """``images``: an entry for each target camera with those keys of the source's that are known for it."""
     first: Mapping[str, Any] = next((info for info in infos.values() if isinstance(info, Mapping)), {})
     columns = {
         key: _as_written([first[key]], views.matrices(kind))
@@ -367,7 +367,7 @@ def _infos(infos: Mapping[str, Any], views: ResultCameras, images: torch.Tensor)
 
 
 def without_stale(results: Mapping[str, Any], *, silently: str = "") -> dict[str, Any]:
-    """Drop ``STALE_KEYS``, also in ``ann_info``, with a warning but for the one that goes ``silently``."""
+    """Drop ``STALE_KEYS``, also in ``ann_info``, with a warning except for the ``silently`` dropped key."""
     kept = {key: value for key, value in results.items() if key not in STALE_KEYS}
     dropped = {*results} - {*kept, silently}
     if isinstance(annotated := kept.get("ann_info"), Mapping):

@@ -43,10 +43,10 @@ class RigRetargetMultiView:
 
     Points become those of the target's scanners, if it has any; ``keys=dict(points="source")`` keeps them.
 
-    It stands right after what loads images (and points and annotations, where they are loaded: geometry), before
-    resizing, cropping, flipping and whatever turns points and boxes. Several frames in one dict (BEVDet4D) share one
-    draw of ``p`` and of a ``RandomRig``. If each frame of a drive passes the pipeline by itself (BEVFormer,
-    StreamPETR, Sparse4D), ``sequence_key`` does that.
+    Place it right after the steps that load images, and points and annotations, if any (they are the geometry), before
+    resizing, cropping, flipping, and steps that turn points and boxes. Several frames in one dict (BEVDet4D) share one
+    draw of ``p`` and of a ``RandomRig``. If each frame of a drive passes the pipeline separately (BEVFormer,
+    StreamPETR, Sparse4D), set ``sequence_key`` for that.
 
     Args:
         target: A rig's name, file, ``Rig`` or ``RandomRig``; of pinhole cameras (``Rig.undistorted()``).
@@ -55,14 +55,14 @@ class RigRetargetMultiView:
         img_norm: Means and standard deviations (three each) of BEVDet's normalisation.
         sequence_key: Names the drive in the results (``scene_token``; Sparse4D: ``aug_config``): frames where it is
             equal share one draw, in all workers of a DataLoader's epoch. By default that of a
-            ``RandomRig(per="sequence")``; else each dict has its own draw. The training loop calls ``set_epoch``
+            ``RandomRig(per="sequence")``; else each dict is drawn separately. The training loop calls ``set_epoch``
             before each epoch without workers or with persistent ones: else every epoch repeats the draws.
         settings: Any of ``RigRetarget``'s: ``size``, ``geometry``, ``quality``, ``p``, ``match_exposure``,
             ``holes``, ``keys`` (a dict of ``SampleKeys``' values in a config file).
 
     Raises:
         CalibrationError: A target with lenses, or that cannot be loaded; a pose of another shape.
-        ValueError: Numbers or keys that are none.
+        ValueError: Values that are not numbers, or unknown keys.
     """
 
     _refuses_lenses = True  # at once, not with the first images
@@ -86,17 +86,17 @@ class RigRetargetMultiView:
         if lidar2ego is not None and np.shape(lidar2ego) != (4, 4):
             raise CalibrationError(f"lidar2ego: expected a pose (4, 4), got shape {np.shape(lidar2ego)}")
         self.retarget = RigRetarget(target, **settings)
-        held = self.retarget.target
-        rig = held.base if isinstance(held, RandomRig) else held
+        chosen = self.retarget.target
+        rig = chosen.base if isinstance(chosen, RandomRig) else chosen
         if self._refuses_lenses:
             check_no_lenses([camera.lens for camera in rig])
         self.names = rig.names
         self.lidar2ego = lidar2ego
         self.ground_z_m = float(ground_z_m)
         self.img_norm = checked_norm(img_norm)
-        by_target = held.sequence_key if isinstance(held, RandomRig) and held.per == "sequence" else None
+        by_target = chosen.sequence_key if isinstance(chosen, RandomRig) and chosen.per == "sequence" else None
         self.sequence_key = sequence_key or by_target
-        self._epochs = held if isinstance(held, RandomRig) else Epochs()
+        self._epochs = chosen if isinstance(chosen, RandomRig) else Epochs()
 
     def set_epoch(self, epoch: int) -> None:
         """Change the draws by ``sequence_key``, also in running workers; as ``RandomRig.set_epoch``."""
@@ -130,10 +130,7 @@ class RigRetargetMultiView:
 
 
 def register(registry: Any) -> None:
-    """Make the step known to a registry: mmengine's ``TRANSFORMS``, or ``PIPELINES`` of mmdet 2.
-
-    Registering twice, as when a config is loaded again, is allowed.
-    """
+    """Register the step with mmengine's ``TRANSFORMS`` or mmdet 2's ``PIPELINES``; registering twice is allowed."""
     registry.register_module(name="RigRetargetMultiView", force=True, module=RigRetargetMultiView)
 
 
@@ -157,13 +154,13 @@ def retarget_img_inputs(
     """Re-render ``img_inputs`` of one frame (BEVDet) or several (BEVDet4D, BEVStereo4D), and what belongs to it.
 
     ``results`` are as ``PrepareImageInputs`` leaves them, the current frame first: images by camera, then by frame; all
-    else by frame, then by camera. The source cameras are those of the images as they are: their resizing, cropping,
-    flipping and turning is a part of their K and pose. The target's images are not augmented: ``post_rots`` are ones,
+    else by frame, then by camera. The source cameras are those of the augmented images: resizing, cropping, flipping
+    and turning are part of their K and pose. The target's images are not augmented: ``post_rots`` are ones,
     ``post_trans`` zeros. ``ann_infos`` are read as geometry and stay; ``points`` become those of the target's scanners.
 
-    All target cameras stand where they are at ``CAM_FRONT``'s time (the first camera's, without one of that name):
-    that is the ego frame of BEVDet's boxes, and what it then takes, ``ego2globals[0]``, for its key ego frame. With the
-    LiDAR's pose there the boxes would be 0.33 m off at 9 m/s.
+    Poses of target cameras are those at ``CAM_FRONT``'s time (the first camera's, without one of that name): that is
+    the ego frame of BEVDet's boxes, and ``ego2globals[0]`` becomes its key ego frame. With the LiDAR's pose, boxes of a
+    moving vehicle would be off by its motion in between.
     """
     inputs = results["img_inputs"]
     tensors = _checked(inputs)
@@ -202,7 +199,7 @@ def retarget_img_inputs(
         if isinstance(info, Mapping) and "cams" in info:
             infos[t] = {**info, "cams": _infos(target, key2global)}
     images = torch.stack([entries[0] for entries in outputs], dim=1).flatten(0, 1)
-    rest = [torch.cat(of_frames) for of_frames in zip(*(entries[1:] for entries in outputs), strict=True)]
+    rest = [torch.cat(frames) for frames in zip(*(entries[1:] for entries in outputs), strict=True)]
     changed["img_inputs"] = type(inputs)([images, *rest, *inputs[6:]])
     if "cam_names" in results:
         changed["cam_names"] = list(target.names)
@@ -243,7 +240,7 @@ def _checked(inputs: Any) -> list[torch.Tensor]:
 def _as_recorded(
     frame: Sequence[torch.Tensor], names: Sequence[str], key2global: FloatArray, width_px: int
 ) -> tuple[list[bool], ResultCameras]:
-    """Which images are mirrored; the cameras of the others as they are, and of those when mirrored back."""
+    """Flags of mirrored images, and the cameras of all images with these mirrored back."""
     sensor2ego, ego2global, intrinsics, post_rots, post_trans = (entry.double().numpy() for entry in frame)
     moved = np.tile(np.eye(3), (len(names), 1, 1))
     moved[:, :2, :2], moved[:, :2, 2] = post_rots[:, :2, :2], post_trans[:, :2]
@@ -280,15 +277,15 @@ def _lidar2key(info: Any, key2global: FloatArray) -> FloatArray | None:
 
 
 def _infos(target: ResultCameras, key2global: FloatArray) -> dict[str, dict[str, Any]]:
-    """``curr["cams"]``: what ``PointToMultiViewDepth`` reads."""
+    """Entries of ``curr["cams"]`` that ``PointToMultiViewDepth`` reads."""
 
     def pose(prefix: str, matrix: FloatArray) -> dict[str, Any]:
         quaternion = quaternion_from_rotation(matrix[:3, :3])
         return {f"{prefix}_rotation": quaternion.tolist(), f"{prefix}_translation": matrix[:3, 3].tolist()}
 
-    of_key = pose("ego2global", key2global)
+    ego_pose = pose("ego2global", key2global)
     return {
-        name: {"data_path": name, "cam_intrinsic": K, **pose("sensor2ego", cam2ego), **of_key}
+        name: {"data_path": name, "cam_intrinsic": K, **pose("sensor2ego", cam2ego), **ego_pose}
         for name, K, cam2ego in zip(target.names, target.K, target.cam2ego, strict=True)
     }
 
