@@ -134,7 +134,10 @@ COMMANDS = {
             (f"--generator --seed --size {_READING} --output", {}),
             ("--detector --segmenter", {}),
             ("--held-out", {"nargs": "+"}),
-            ("--displaced", {"dest": "held_out", "action": "store_const", "const": ["next"], "help": "as next"}),
+            (
+                "--displaced",
+                {"dest": "held_out", "action": "store_const", "const": ["next"], "help": "--held-out next"},
+            ),
         ],
     ),
     "inspect": Command(

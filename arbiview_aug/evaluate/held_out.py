@@ -43,9 +43,9 @@ NO_PHOTOGRAPH = (
 NOTES = (
     "Each camera is rendered from the others (next: from the frame before) and compared with its photograph. seen: "
     "share of its pixels that the method covers. PSNR and SSIM: of the pixels that all methods cover ({common:.0%}), "
-    "means over cameras and frames; one gain: each view times the number that fits it best. difference: to the first "
-    "row, with a 95 % interval, bootstrap over frames. Frames of one drive are alike: the interval says little about "
-    "other drives. Tone curves and calibration of the cameras limit all PSNR here: read the differences."
+    "means over cameras and frames; one gain: each view times the number that fits it best. difference: of one gain, "
+    "to the first row, with a 95 % interval, bootstrap over frames. Frames of one drive are alike: the interval says "
+    "little about other drives. Tone curves and calibration of the cameras limit all PSNR here: read the differences."
 )
 HOLE_NOTES = (
     "Fills of the holes that the target's place would leave in the photographs, which are the truth. Means over "
@@ -283,10 +283,18 @@ class CommonPixels:
             known = np.isfinite(difference)
             draws = drawn[:, known] @ difference[known] / np.maximum(drawn[:, known].sum(1), 1)
             means[method] |= interval("difference_db", draws)
-        notes = NOTES.format(common=mean_of(self.rows).get("common", 0.0))
-        tables: list[Table] = [("Against the photographs of held-out cameras", means, _COLUMNS, notes)]
+        title, notes = (
+            "Against the photographs of held-out cameras",
+            NOTES.format(common=mean_of(self.rows).get("common", 0.0)),
+        )
         if self.in_holes:
-            tables = [("Against the photographs in held-out holes", means, _HOLE_COLUMNS, HOLE_NOTES)]
+            title, notes, columns = "Against the photographs of held-out cameras", NOTES, list(_COLUMNS)
+        if self.in_holes:
+            title, notes, columns = "Against the photographs in held-out holes", HOLE_NOTES, list(_HOLE_COLUMNS)
+        if len(frames) == 1:  # one frame has no interval
+            columns = [(name, text.split(" [")[0]) for name, text in columns]
+        notes = notes.format(common=mean_of(self.rows).get("common", 0.0))
+        tables: list[Table] = [(title, means, columns, notes)]
         regions = {key for row in self.rows for key in row if key.startswith(("class ", "mask "))}
         if names := sorted(regions, key=lambda name: (name.split()[0], int(name.split()[1]))):
             columns = [(name, f"{{{name}:.2f}}") for name in names]
