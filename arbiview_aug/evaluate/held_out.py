@@ -283,14 +283,9 @@ class CommonPixels:
             known = np.isfinite(difference)
             draws = drawn[:, known] @ difference[known] / np.maximum(drawn[:, known].sum(1), 1)
             means[method] |= interval("difference_db", draws)
-        title, notes = (
-            "Against the photographs of held-out cameras",
-            NOTES.format(common=mean_of(self.rows).get("common", 0.0)),
-        )
+        title, notes, columns = "Against the photographs of held-out cameras", NOTES, [*_COLUMNS]
         if self.in_holes:
-            title, notes, columns = "Against the photographs of held-out cameras", NOTES, list(_COLUMNS)
-        if self.in_holes:
-            title, notes, columns = "Against the photographs in held-out holes", HOLE_NOTES, list(_HOLE_COLUMNS)
+            title, notes, columns = "Against the photographs in held-out holes", HOLE_NOTES, [*_HOLE_COLUMNS]
         if len(frames) == 1:  # one frame has no interval
             columns = [(name, text.split(" [")[0]) for name, text in columns]
         notes = notes.format(common=mean_of(self.rows).get("common", 0.0))
