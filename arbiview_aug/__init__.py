@@ -38,4 +38,4 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__, __all__ = lazy_names(__name__)
 
-__version__ = "0.4.0.dev0"
+__version__ = "0.4.0"
