@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from arbiview_aug import RigRetarget
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.rays import RayCache
 from arbiview_aug.cameras.rig import Rig
+from arbiview_aug.choices import Quality
+from arbiview_aug.datasets.synthetic import demo_source_rig
 from arbiview_aug.scene.sky import FAR_M, sky_points
+from arbiview_aug.scene.surface import Points
+from arbiview_aug.transforms import renderers
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
@@ -39,3 +44,18 @@ def test_a_view_without_sky_adds_nothing() -> None:
     wall = np.stack([np.full(y.size, 10.0), y.ravel(), z.ravel()], -1)
     image = torch.from_numpy(np.random.default_rng(0).integers(0, 255, (3, 240, 320), np.uint8))
     assert len(sky_points(Rig([camera], name="one", ground_z_m=0.0), [image], wall, RayCache())) == 0
+
+
+@pytest.mark.parametrize(("quality", "calls"), [("fast", 0), ("accurate", 1)])
+def test_accurate_alone_looks_for_sky(quality: Quality, calls: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = list[Rig]()
+
+    def no_sky(rig: Rig, *_: object) -> Points:
+        asked.append(rig)
+        return np.zeros((0, 3), np.float32)
+
+    monkeypatch.setattr(renderers, "sky_points", no_sky)
+    source = demo_source_rig((64, 96))
+    sample = {"images": torch.zeros(6, 3, 64, 96), "rig": source, "points": torch.tensor([[12.0, 1.0, 1.0]])}
+    RigRetarget(source.shifted(z_m=0.5), quality=quality, holes="black")(sample)
+    assert len(asked) == calls
