@@ -68,14 +68,19 @@ def settings(
     qualities: Sequence[Quality] = get_args(Quality),
     reduces: Sequence[Reduce] = get_args(Reduce),
 ) -> list[Setting]:
-    """List combinations that differ: ``paper`` has ``infinity`` alone; ``accurate`` needs depth from overlap."""
+    """List combinations that differ: ``paper`` has ``infinity`` alone; ``accurate`` refines the street, and LiDAR."""
     rows = []
     for quality, reduce in itertools.product(qualities, reduces):
         for surface in surfaces if quality != "paper" else ("infinity",):
-            if quality != "accurate" or GEOMETRIES[surface].overlap_depth:
-                caches = (False, True) if quality == "accurate" else (False,)
+            if quality != "accurate" or _is_refined(surface):
+                caches = (False, True) if quality == "accurate" and GEOMETRIES[surface].overlap_depth else (False,)
                 rows += [Setting(quality, surface, reduce, cached) for cached in caches]
     return rows
+
+
+def _is_refined(surface: GeometryName) -> bool:
+    """Whether ``accurate`` differs from ``fast`` over a surface."""
+    return GEOMETRIES[surface].overlap_depth or "points" in GEOMETRIES[surface].reads
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -127,7 +132,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     surfaces = [name for name in offered if not arguments.geometry or name in arguments.geometry]
     chosen = settings(surfaces, arguments.quality, reduces)
     if not chosen or not {*offered}.issuperset(arguments.geometry or ()):
-        refined = [name for name in offered if GEOMETRIES[name].overlap_depth]
+        refined = [name for name in offered if _is_refined(name)]
         expected = f"{', '.join(offered)}, which the samples offer (accurate: {', '.join(refined)})"
         raise DataError(f"--geometry {' '.join(arguments.geometry or ['none'])}: expected geometry of {expected}")
     prefix, rows, calls = "even" if by_points else "true", [], dict[str, Callable[[], Any]]()
