@@ -239,7 +239,7 @@ def test_the_trade_is_the_commands() -> None:
 DETECTORS = (
     ("random", "fov50", "auto_fill"),
     ("less", "up70", "auto_fill"),
-    ("rule", "up70", "auto_fill_mixed"),
+    ("less", "up70", "auto_fill_mixed"),
     ("rule", "up70-long", "auto_fill"),
     ("rule", "up70-long", "auto_fill_mixed"),
     ("less", "up70", "objects_fill"),
