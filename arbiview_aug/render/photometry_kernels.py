@@ -15,6 +15,39 @@ _BLOCK_PX = 128  # of a row that are compared at once
 
 
 @compiled
+def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
+    """Read what a strip of a view is about to read from an atlas, so that it lies in the cache; the result is no use.
+
+    The view itself reads along slanted lines with gaps, which no cache foresees: it would take up to twice as long.
+
+    Args:
+        atlas: (rows, bytes) uint8.
+        pixel: Bytes of one of its pixels.
+        packed: (h, w) ``FixedMap.packed``.
+        winner: (h, w) int8 source, -1 where none is read.
+    """
+    (h, w), total = winner.shape, 0
+    ends = np.empty((4, 128), np.int32)  # first and last row and column of each source
+    for x0 in range(0, w, _AHEAD_COLUMNS):
+        ends[0::2] = _MOST_SIDE_PX
+        ends[1::2] = -1
+        for j in range(0, h + 3, 4):
+            for i in range(x0, min(x0 + _AHEAD_COLUMNS, w) + 7, 8):
+                y, x = min(j, h - 1), min(i, w - 1)
+                k, row, column = winner[y, x], packed[y, x] >> 16, packed[y, x] & 0xFFFF
+                if k >= 0:
+                    ends[0, k], ends[1, k] = min(ends[0, k], row), max(ends[1, k], row)
+                    ends[2, k], ends[3, k] = min(ends[2, k], column), max(ends[3, k], column)
+        for k in range(128):
+            top, bottom, left, right = ends[0, k], ends[1, k], ends[2, k], ends[3, k]
+            if (bottom - top) * (right - left) <= _MOST_AHEAD * h * _AHEAD_COLUMNS:
+                for row in range(top, min(bottom + 2, atlas.shape[0])):
+                    for at in range(left * pixel, min((right + 2) * pixel, atlas.shape[1]), 64):
+                        total ^= atlas[row, at]
+    return total  # else nothing would be read
+
+
+@compiled
 def read_pixels(image: Any, camera: int, source: Any, at: Any, scale: Any, pixels: Any) -> None:
     """Read the pixels of a ``camera``'s image (3, h, w), times a float32 scale; what is no number is 0.
 
@@ -212,36 +245,3 @@ def warm_up() -> None:
         tone(view, runs, curves, _ONE, _ZERO)
         tone_band(view, curves[0], _ONE, _ZERO)
         blend(view, view, weight, _ZERO)
-
-
-@compiled
-def read_ahead(atlas: Any, pixel: int, packed: Any, winner: Any) -> int:
-    """Read what a strip of a view is about to read from an atlas, so that it lies in the cache; the result is no use.
-
-    The view itself reads along slanted lines with gaps, which no cache foresees: it would take up to twice as long.
-
-    Args:
-        atlas: (rows, bytes) uint8.
-        pixel: Bytes of one of its pixels.
-        packed: (h, w) ``FixedMap.packed``.
-        winner: (h, w) int8 source, -1 where none is read.
-    """
-    (h, w), total = winner.shape, 0
-    ends = np.empty((4, 128), np.int32)  # first and last row and column of each source
-    for x0 in range(0, w, _AHEAD_COLUMNS):
-        ends[0::2] = _MOST_SIDE_PX
-        ends[1::2] = -1
-        for j in range(0, h + 3, 4):
-            for i in range(x0, min(x0 + _AHEAD_COLUMNS, w) + 7, 8):
-                y, x = min(j, h - 1), min(i, w - 1)
-                k, row, column = winner[y, x], packed[y, x] >> 16, packed[y, x] & 0xFFFF
-                if k >= 0:
-                    ends[0, k], ends[1, k] = min(ends[0, k], row), max(ends[1, k], row)
-                    ends[2, k], ends[3, k] = min(ends[2, k], column), max(ends[3, k], column)
-        for k in range(128):
-            top, bottom, left, right = ends[0, k], ends[1, k], ends[2, k], ends[3, k]
-            if (bottom - top) * (right - left) <= _MOST_AHEAD * h * _AHEAD_COLUMNS:
-                for row in range(top, min(bottom + 2, atlas.shape[0])):
-                    for at in range(left * pixel, min((right + 2) * pixel, atlas.shape[1]), 64):
-                        total ^= atlas[row, at]
-    return total  # else nothing would be read
