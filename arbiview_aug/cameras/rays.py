@@ -227,16 +227,15 @@ def pixel_rays(camera: Camera) -> PixelRays:
     return PixelRays(camera.size, camera.parameters, planes)
 
 
-def relative_pose(target: Camera, source: Camera) -> tuple[Planes, Planes]:
-    """Rotation (3, 3) from a target's frame to a source's, and the target's centre (3,) there; float32."""
-    to_source = source.cam2ego[:3, :3].T
-    A, o = to_source @ target.cam2ego[:3, :3], to_source @ (target.center_m - source.center_m)
-    return A.astype(np.float32), o.astype(np.float32)
+def between(query: Camera, key: Camera) -> tuple[FloatArray, FloatArray]:
+    """R (3, 3) and t (3,), metres, from the frame of ``query`` to that of ``key``: X_key = R X_query + t."""
+    to_key = key.cam2ego[:3, :3].T
+    return to_key @ query.cam2ego[:3, :3], to_key @ (query.center_m - key.center_m)
 
 
 def source_pixels(target: Camera, rays: Planes, inverse_distance: Planes, source: Camera) -> tuple[Planes, Planes]:
     """Pixels of a source for scene points on a target's rays, as ``pixels_of``; both cameras are in one ego frame."""
-    return pixels_of(rays, inverse_distance, *relative_pose(target, source), source)
+    return pixels_of(rays, inverse_distance, *between(target, source), source)
 
 
 def pixels_of(rays: Planes, inverse_distance: Planes, A: Any, o: Any, source: Camera) -> tuple[Planes, Planes]:

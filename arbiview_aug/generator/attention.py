@@ -41,6 +41,7 @@ from torch.nn import functional
 
 from arbiview_aug.cameras.camera import Camera, Rays
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
+from arbiview_aug.cameras.rays import between
 from arbiview_aug.render.requirements import SAME_CENTER_M
 
 FACING_M = 10.0  # of the plane that faces the camera: at a baseline of 1 m a 3-token window spans 7 to 17 m
@@ -73,12 +74,6 @@ def plane_vectors(camera: Camera, ground_z_m: float) -> FloatArray:
     down = camera.cam2ego[:3, :3].T @ np.array([0.0, 0.0, -1.0])
     road = down / height_m if height_m > 0 else np.zeros(3)
     return np.stack([np.zeros(3), road, np.array([0.0, 0.0, 1 / FACING_M])])
-
-
-def between(query: Camera, key: Camera) -> tuple[FloatArray, FloatArray]:
-    """R (3, 3) and t (3,), metres, from the frame of ``query`` to that of ``key``: X_j = R X_i + t."""
-    to_key = key.cam2ego[:3, :3].T
-    return to_key @ query.cam2ego[:3, :3], to_key @ (query.center_m - key.center_m)
 
 
 def correspond(query: Camera, rays: Rays, key: Camera, planes: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -23,10 +23,10 @@ from torch.nn import functional
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import FloatArray
+from arbiview_aug.cameras.rays import between
 from arbiview_aug.generator.attention import (
     Correspondence,
     TokenWindow,
-    between,
     correspondences,
     stacked,
     token_sizes,

@@ -26,7 +26,7 @@ import torch
 
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import BoolArray, FloatArray
-from arbiview_aug.cameras.rays import ego_rays, relative_pose, source_pixels
+from arbiview_aug.cameras.rays import between, ego_rays, source_pixels
 from arbiview_aug.render.overlap_depth import reduced
 from arbiview_aug.scene.depth_map import halvings
 from arbiview_aug.scene.surface import Layer, plane_inverse_distance
@@ -143,7 +143,8 @@ class SweptImage:
         kind, positions = LENS_CODES.get(other.camera.lens, -1), np.zeros((0, 2, h, w), np.float32)
         if kind < 0:
             positions = np.stack([self.positions(other.camera, self.inverse_distance(wall)) for wall in walls])
-        (A, offset), lens = relative_pose(self.camera, other.camera), (kind, other.camera.parameters, positions)
+        A, offset = (part.astype(np.float32) for part in between(self.camera, other.camera))
+        lens = kind, other.camera.parameters, positions
         if kind == 0:
             K = other.camera.K.astype(np.float32)
             A, offset = K @ A, K @ offset
