@@ -87,9 +87,9 @@ def name_of(page: Path) -> str:
 
 
 def commands() -> set[str]:
-    """Commands after ``python -m arbiview_aug`` in the README and the pages, without comments."""
+    """Commands of the package in the README and the pages, without comments."""
     pages = "\n".join(text_of(page) for page in (ROOT / "README.md", *DOCS)).replace("\\\n", " ")
-    return {" ".join(command.split()) for command in re.findall(r"python -m arbiview_aug ([^`\n#]+)", pages)}
+    return {" ".join(command.split()) for command in re.findall(r"(?:python -m |bin/)arbiview_aug ([^`\n#]+)", pages)}
 
 
 def fences(page: Path) -> Iterator[tuple[str, str | None, str]]:
@@ -257,8 +257,8 @@ def test_the_detectors_numbers_are_the_reports() -> None:
 
     def cell(report: str, change: str, variant: str) -> str:
         path = ROOT / "integrations" / "cross_rig" / "results" / f"{report}.json"
-        of_change = json.loads(path.read_text())["changes"].get(change)
-        return Interval(**of_change["variants"][variant]["share"]).percent() if of_change else "no gap"
+        share = json.loads(path.read_text())["changes"][change]["variants"][variant]["share"]
+        return Interval(**share).percent() if share else "no gap"
 
     _, _, *rows, unmeasured = tables(text_of(ROOT / "docs" / "when.md"))[0]
     for row, (report, change, variant) in zip(rows, DETECTORS, strict=True):
