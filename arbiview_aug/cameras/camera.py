@@ -27,7 +27,6 @@ from arbiview_aug.cameras.validation import (
     MAX_SIZE_PX,
     checked_array,
     checked_calibration,
-    checked_numbers,
     checked_pixels,
     checked_size,
 )
@@ -141,9 +140,9 @@ class Camera:
         if (K is None) == (horizontal_fov_deg is None):
             raise CalibrationError(f"camera {name!r}: expected either K or horizontal_fov_deg, got both or none")
         where, angles = f"camera {shown(name)}", (azimuth_deg, elevation_deg, roll_deg)
-        azimuth, elevation, roll = checked_numbers(where, "azimuth, elevation, roll", angles, 3, _ANGLES)
+        azimuth, elevation, roll = checked_array(where, "azimuth, elevation, roll", angles, (3,), _ANGLES)
         cam2ego = np.eye(4)
-        cam2ego[:3, 3] = checked_numbers(where, "position_m", position_m, 3, _METRES)
+        cam2ego[:3, 3] = checked_array(where, "position_m", position_m, (3,), _METRES)
         cam2ego[:3, :3] = rotation_z(azimuth) @ CAMERA_AXES_IN_EGO @ rotation_x(elevation) @ rotation_z(roll)
         fields: dict[str, Any] = {"lens": lens, "distortion": distortion, "mask": mask, "cam2ego": cam2ego}
         camera = cls(name=name, width_px=width_px, height_px=height_px, K=np.eye(3) if K is None else K, **fields)
@@ -351,7 +350,7 @@ class Camera:
 
         The mask stays on the ego car: it is re-sampled, and pixels that the old image did not show are not masked.
         """
-        yaw, pitch, roll = checked_numbers(self._where, "yaw, pitch, roll", (yaw_deg, pitch_deg, roll_deg), 3, _ANGLES)
+        yaw, pitch, roll = checked_array(self._where, "yaw, pitch, roll", (yaw_deg, pitch_deg, roll_deg), (3,), _ANGLES)
         cam2ego = self.cam2ego.copy()
         cam2ego[:3, :3] = rotation_z(yaw) @ cam2ego[:3, :3] @ rotation_x(pitch) @ rotation_z(roll)
         return with_mask_of(self, replace(self, cam2ego=cam2ego, mask=None), outside=True)
@@ -359,7 +358,7 @@ class Camera:
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Camera:
         """Moved along the ego's axes."""
         cam2ego = self.cam2ego.copy()
-        cam2ego[:3, 3] += checked_numbers(self._where, "shift", (x_m, y_m, z_m), 3, _METRES)
+        cam2ego[:3, 3] += checked_array(self._where, "shift", (x_m, y_m, z_m), (3,), _METRES)
         return replace(self, cam2ego=cam2ego)
 
     def undistorted(self) -> Camera:

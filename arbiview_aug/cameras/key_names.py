@@ -9,6 +9,8 @@ from functools import lru_cache
 from numbers import Number
 from typing import Any
 
+from arbiview_aug.errors import CalibrationError
+
 USUAL_NAMES = {
     "images": ("image", "imgs", "img"),
     "K": ("intrinsics", "intrinsic", "camera_intrinsics", "camera_intrinsic", "cam_intrinsic", "cam2img", "Ks"),
@@ -72,14 +74,23 @@ def lens_called(value: Any) -> str | None:
     return _LENSES.get(plain(value))
 
 
-def unknown_key(entries: Iterable[Any], known: Sequence[str]) -> str:
-    """Error text for the first unknown key of this package's files; keys that begin with _ are notes."""
+def refuse_unknown(entries: Iterable[Any], known: Sequence[str], where: str) -> None:
+    """CalibrationError for unknown keys of this package's files; keys that begin with _ are notes."""
     for key in entries:
         if key not in known and not str(key).startswith(("_", ".", "x-")):
             meant = meant_by(key, tuple(known)) if isinstance(key, str) else None
             guess = f"did you mean {meant!r}?" if meant else f"expected keys are {', '.join(sorted(known))}"
-            return f"{str(key)[:100]!r} is not read: {guess}; if it is a note, begin it with _"
-    return ""
+            got = f"{str(key)[:100]!r} is not read: {guess}; if it is a note, begin it with _"
+            raise CalibrationError(f"{where}: {got}")
+
+
+def check_keys(entry: Any, needed: Sequence[str], known: Sequence[str], where: str) -> None:
+    """CalibrationError unless an entry of a file is a mapping that has the needed keys."""
+    if not isinstance(entry, Mapping):
+        raise CalibrationError(f"{where}: expected a mapping, got {type(entry).__name__}")
+    if missing := [key for key in needed if entry.get(key) is None]:
+        expected = f"expected keys {', '.join(known)}, missing {', '.join(missing)}"
+        raise CalibrationError(f"{where}: {expected}{hint(entry, missing)}")
 
 
 @lru_cache(maxsize=4096)

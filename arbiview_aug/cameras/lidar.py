@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import islice
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from arbiview_aug.cameras.key_names import hint, unknown_key
+from arbiview_aug.cameras.key_names import check_keys, refuse_unknown
 from arbiview_aug.cameras.lens import FloatArray
-from arbiview_aug.cameras.validation import checked_numbers, checked_pose, refusal
+from arbiview_aug.cameras.validation import checked_array, checked_pose
 from arbiview_aug.errors import CalibrationError, calibration_of, shown
 
 MOST_BEAMS, MOST_RAYS = 1024, 1 << 21  # largest scanner, well beyond products (128 beams and 500,000 rays)
@@ -46,33 +46,28 @@ class Lidar:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise CalibrationError(f"lidar name: expected a non-empty string, got {shown(self.name)}")
-        where, elevations = self._where, self.elevations_deg
-        beams = f"1 to {MOST_BEAMS} elevations from -90 to 90 degrees"
         try:
-            count = len(elevations)
-        except TypeError:  # a generator, which may have no end, or a number
-            count = 0
-        is_short = 0 < count <= MOST_BEAMS
-        table = checked_numbers(where, "elevations_deg", elevations, count, beams) if is_short else ()
-        if not table or max(map(abs, table)) > 90:
-            raise refusal(where, "elevations_deg", beams, shown(elevations))
-        span = "two azimuths in degrees, the first below the second by at most 360"
-        first, end = checked_numbers(where, "azimuth_deg", self.azimuth_deg, 2, span)
-        ranges = "two distances in metres, 0 <= the least < the largest"
-        least, most = checked_numbers(where, "range_m", self.range_m, 2, ranges)
-        (step,) = checked_numbers(where, "azimuth_step_deg", [self.azimuth_step_deg], 1, "a number of degrees")
-        pose = checked_pose(where, self.lidar2ego, "lidar2ego")
-        fewest = (end - first) * count / MOST_RAYS
-        for field, is_valid, expected, got in (
-            ("azimuth_deg", 0 < end - first <= 360, span, (first, end)),
-            ("range_m", 0 <= least < most, ranges, (least, most)),
-            ("azimuth_step_deg", fewest <= step <= 360 and step > 0, f"more than {fewest:.2g} and at most 360", step),
-        ):
-            if not is_valid:
-                raise refusal(where, field, expected, got)
+            elevations = tuple(islice(self.elevations_deg, MOST_BEAMS + 1))  # a generator may have no end
+        except TypeError:
+            elevations = ()
+        check, beams = partial(checked_array, self._where), len(elevations)
+        expected = f"1 to {MOST_BEAMS} elevations from -90 to 90 degrees"
+        is_table = lambda table: 0 < beams <= MOST_BEAMS and abs(table).max() <= 90  # noqa: E731
+        table = check("elevations_deg", elevations, (-1,), expected, is_table)
+        expected = "two azimuths in degrees, the first below the second by at most 360"
+        ends = check("azimuth_deg", self.azimuth_deg, (2,), expected, lambda ends: 0 < ends[1] - ends[0] <= 360)
+        expected = "two distances in metres, 0 <= the least < the largest"
+        range_m = check("range_m", self.range_m, (2,), expected, lambda ends: 0 <= ends[0] < ends[1])
+        fewest = (ends[1] - ends[0]) * beams / MOST_RAYS
+        expected = f"more than {fewest:.2g} and at most 360 degrees"
+        step = check("azimuth_step_deg", self.azimuth_step_deg, (), expected, lambda step: fewest <= step <= 360)
         self.__dict__.update(
-            **{"name": str(self.name), "lidar2ego": pose, "elevations_deg": table},  # numpy's text is no plain YAML
-            **{"azimuth_step_deg": step, "range_m": (least, most), "azimuth_deg": (first, end)},
+            name=str(self.name),  # numpy's text is no plain YAML
+            lidar2ego=checked_pose(self._where, self.lidar2ego, "lidar2ego"),
+            elevations_deg=tuple(table.tolist()),
+            azimuth_step_deg=float(step),
+            range_m=tuple(range_m.tolist()),
+            azimuth_deg=tuple(ends.tolist()),
         )
 
     @property
@@ -136,7 +131,7 @@ class Lidar:
     def shifted(self, x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0) -> Lidar:
         """Moved along the ego's axes."""
         T = np.eye(4)
-        T[:3, 3] = checked_numbers(self._where, "shift", (x_m, y_m, z_m), 3, "three finite numbers of metres")
+        T[:3, 3] = checked_array(self._where, "shift", (x_m, y_m, z_m), (3,), "three finite numbers of metres")
         return self.moved(T)
 
     def to_dict(self) -> dict[str, Any]:
@@ -147,12 +142,7 @@ class Lidar:
     @classmethod
     def from_dict(cls, entry: Any, where: str) -> Lidar:
         """A scanner from an entry of a rig file; ``where`` is named in errors."""
-        if not isinstance(entry, Mapping):
-            raise CalibrationError(f"{where}: expected a mapping, got {type(entry).__name__}")
-        if missing := [key for key in _KEYS if entry.get(key) is None]:
-            expected, guesses = ", ".join((*_KEYS, "azimuth_deg")), hint(entry, missing)
-            raise CalibrationError(f"{where}: expected keys {expected}, missing {', '.join(missing)}{guesses}")
-        if unknown := unknown_key(entry, (*_KEYS, "azimuth_deg", "source", "notes")):
-            raise CalibrationError(f"{where}: {unknown}")
+        check_keys(entry, _KEYS, (*_KEYS, "azimuth_deg"), where)
+        refuse_unknown(entry, (*_KEYS, "azimuth_deg", "source", "notes"), where)
         with calibration_of(where):
             return cls(**{key: entry[key] for key in (*_KEYS, "azimuth_deg") if key in entry})

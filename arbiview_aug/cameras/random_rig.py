@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from numbers import Number
@@ -16,6 +15,7 @@ import torch
 
 from arbiview_aug.cameras.camera import with_mask_of
 from arbiview_aug.cameras.rig import Rig, load_rig
+from arbiview_aug.cameras.validation import checked_array, refusal
 from arbiview_aug.choices import is_whole
 from arbiview_aug.errors import CalibrationError, SampleError, SampleTypeError, shown
 
@@ -108,10 +108,6 @@ class RandomRig(Epochs):
         u = torch.rand(len(self.ranges), generator=rng, dtype=torch.float64).tolist()
         return {name: low + (high - low) * x for (name, (low, high)), x in zip(self.ranges.items(), u, strict=True)}
 
-    def draw_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> dict[str, float]:
-        """Parameters for a sample, following ``per``; raises as ``rng_for``."""
-        return self.draw(self.rng_for(sample, rng))
-
     def rng_for(self, sample: Mapping[str, Any], rng: torch.Generator | None = None) -> torch.Generator | None:
         """Generator of a sample's draws: ``rng``, or that of its sequence; SampleError unless it names just one."""
         if self.per == "sample":
@@ -150,38 +146,30 @@ class RandomRig(Epochs):
 
 def _range(name: str, value: Any) -> tuple[float, float]:
     is_scale = name == "focal_scale"
-    try:
-        ends = value if isinstance(value, tuple | list) else (is_scale - value, is_scale + value)
-        is_number = not any(isinstance(entry, bool | str) for entry in (value, *ends))
-        low, high = (float(end) if is_number else math.nan for end in ends)
-    except (TypeError, ValueError, OverflowError):
-        low, high = math.nan, math.nan
-    if not (math.isfinite(low) and math.isfinite(high) and low <= high) or (is_scale and low <= 0):
-        kind = "half-width below 1 or a positive" if is_scale else "half-width or a"
-        raise CalibrationError(f"RandomRig: {name}: expected a {kind} (low, high), got {shown(value)}")
+    kind = "half-width below 1 or a positive" if is_scale else "half-width or a"
+    pair = isinstance(value, tuple | list)
+    ends = checked_array("RandomRig", name, value, (2,) if pair else (), f"a {kind} (low, high)")
+    low, high = ends.tolist() if pair else (is_scale - float(ends), is_scale + float(ends))
+    if low > high or (is_scale and low <= 0):
+        raise refusal("RandomRig", name, f"a {kind} (low, high)", shown(value))
     return low, high
 
 
 def names_in(key: str, value: Any) -> list[str | None]:
     """Names of sequences or frames, or None, in nested lists, tensors and arrays, as in a collated batch.
 
-    A container within itself is read once. SampleTypeError for values whose text differs between processes.
+    SampleTypeError for values whose text differs between processes, and for containers without end.
     """
-    names: list[str | None] = []
-    seen: dict[int, Any] = {}
-    waiting = [value]
-    while waiting:
-        entry = waiting.pop()
-        try:
-            entry = entry.tolist() if isinstance(entry, torch.Tensor | np.ndarray) else entry
-            if isinstance(entry, list | tuple):
-                waiting += () if id(entry) in seen else reversed(entry)
-                seen[id(entry)] = entry
-            elif entry is None or isinstance(entry, str | bytes | Number | np.generic):
-                names.append(None if entry is None else str(entry))
-            else:
-                names.append(json.dumps(entry, sort_keys=True, default=lambda part: part.tolist()))
-        except (AttributeError, TypeError, ValueError, RuntimeError):  # no plain data, a circle, or on meta
-            expected = "names: text or numbers, the same in all processes"
-            raise SampleTypeError(f"{key}: expected {expected}, got {type(entry).__name__}; pass its text") from None
-    return names
+    try:
+        if isinstance(value, torch.Tensor | np.ndarray):
+            value = value.tolist()
+        if isinstance(value, list | tuple):
+            return [name for entry in value for name in names_in(key, entry)]
+        if value is None or isinstance(value, str | bytes | Number | np.generic):
+            return [None if value is None else str(value)]
+        return [json.dumps(value, sort_keys=True, default=lambda part: part.tolist())]
+    except SampleTypeError:
+        raise
+    except (AttributeError, TypeError, ValueError, RuntimeError):  # no plain data, a circle, or on meta
+        expected = "names: text or numbers, the same in all processes"
+        raise SampleTypeError(f"{key}: expected {expected}, got {type(value).__name__}; pass its text") from None

@@ -64,8 +64,7 @@ def look_apart(gaps: FloatArray, baselines_m: FloatArray, nearest: float) -> Boo
     return np.asarray((sine < 1) & (gaps > np.arcsin(np.minimum(sine, 1))))
 
 
-VIEW_SIZE, TILE_PX = (450, 800), 32  # (h, w) of the half-way view, and side of the chessboard's tiles in it
-HALF_VIEW_SIZE, HALF_TILE_PX = (225, 400), 16  # the same at half resolution, which exposure and depth from overlap read
+HALF_VIEW_SIZE, HALF_TILE_PX = (225, 400), 16  # (h, w) of the half-way view; side of the chessboard's tiles in it
 
 
 def adjacent_pairs(rig: Rig) -> list[tuple[int, int]]:
@@ -79,7 +78,7 @@ def adjacent_pairs(rig: Rig) -> list[tuple[int, int]]:
     return sorted(set(pairs))
 
 
-def half_way_view(a: Camera, b: Camera, size: tuple[int, int] = VIEW_SIZE) -> Camera:
+def half_way_view(a: Camera, b: Camera, size: tuple[int, int]) -> Camera:
     """The pinhole camera between two: mean centre, half-way rotation, the narrower camera's K scaled to ``size``."""
     between = a.cam2ego[:3, :3].T @ b.cam2ego[:3, :3]
     cam2ego = np.eye(4)
@@ -90,7 +89,7 @@ def half_way_view(a: Camera, b: Camera, size: tuple[int, int] = VIEW_SIZE) -> Ca
     return Camera(name=f"{a.name}+{b.name}", width_px=size[1], height_px=size[0], K=scale @ narrower.K, cam2ego=cam2ego)
 
 
-def odd_tiles(size: tuple[int, int], tile_px: int = TILE_PX) -> BoolArray:
+def odd_tiles(size: tuple[int, int], tile_px: int) -> BoolArray:
     """(h, w) bool chessboard: True on the tiles used for scores, False on those used for fitting."""
     row, column = np.indices(size)
     return np.asarray((column // tile_px + row // tile_px) % 2 == 1)

@@ -27,7 +27,7 @@ import numpy as np
 from arbiview_aug.atomic_io import write_whole
 from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.framing import Fit
-from arbiview_aug.cameras.key_names import USUAL_NAMES, hint, lens_called, misnamed, unknown_key
+from arbiview_aug.cameras.key_names import USUAL_NAMES, check_keys, lens_called, misnamed, refuse_unknown
 from arbiview_aug.cameras.lens import FloatArray, canonical_name
 from arbiview_aug.cameras.lidar import Lidar
 from arbiview_aug.cameras.plain_yaml import dump_yaml, parse_yaml
@@ -216,7 +216,7 @@ class Rig:
 
     @classmethod
     def from_dict(cls, data: Any, *, folder: Path | None = None, where: str = "rig") -> Rig:
-        """A rig from plain data in the rig file's format, with masks from ``folder``; ``where`` is named in errors.
+        """A rig from data in the rig file's format, with masks from ``folder``; ``where`` is named in errors.
 
         CalibrationError for missing keys or impossible values, by camera.
         """
@@ -289,12 +289,10 @@ def read_rig(path: Path) -> tuple[Rig, str]:
     if any(isinstance(entry, Mapping) and "file" in entry for entry in data["cameras"]):  # a frame's, with other keys
         data = {key: value for key, value in data.items() if key != "lidar"}
     else:
-        if unknown := unknown_key(data, ("name", "ground_z_m", "cameras", "lidars", *_NOTES)):
-            raise CalibrationError(f"{where}: {unknown}")
-        for entry in data["cameras"]:
-            known = (*_CAMERA_KEYS, *_NOTES, "lens", *USUAL_NAMES["lens"])
-            if isinstance(entry, Mapping) and (unknown := unknown_key(entry, known)):
-                raise CalibrationError(f"{where}: camera {shown(entry.get('name'))}: {unknown}")
+        refuse_unknown(data, ("name", "ground_z_m", "cameras", "lidars", *_NOTES), where)
+        known = (*_CAMERA_KEYS, *_NOTES, "lens", *USUAL_NAMES["lens"])
+        for entry in (entry for entry in data["cameras"] if isinstance(entry, Mapping)):
+            refuse_unknown(entry, known, f"{where}: camera {shown(entry.get('name'))}")
     rig = Rig.from_dict(data, folder=path.parent, where=where)
     if found := doubts(rig.cameras, rig.ground_z_m):
         more = f"; and {len(found) - 4} more" if len(found) > 4 else ""
@@ -303,12 +301,10 @@ def read_rig(path: Path) -> tuple[Rig, str]:
 
 
 def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -> Camera:
-    if not isinstance(entry, Mapping):
-        raise CalibrationError(f"{where}: camera {index}: expected a mapping, got {type(entry).__name__}")
-    label = f"{where}: camera {shown(entry.get('name', index))}"
-    if missing := [key for key in ("name", "width", "height", "K", "cam2ego") if entry.get(key) is None]:
-        expected = ", ".join(sorted(_CAMERA_KEYS))
-        raise CalibrationError(f"{label}: expected keys {expected}, missing {', '.join(missing)}{hint(entry, missing)}")
+    if isinstance(entry, Camera):
+        return entry
+    label = f"{where}: camera {shown(entry.get('name', index) if isinstance(entry, Mapping) else index)}"
+    check_keys(entry, ("name", "width", "height", "K", "cam2ego"), sorted(_CAMERA_KEYS), label)
     _refuse_misnamed(entry, ("distortion", "mask"), label)
     calibration = {key: entry[key] for key in ("name", "K", "cam2ego")}
     distortion = entry.get("distortion")
@@ -316,13 +312,13 @@ def _camera_from_dict(entry: Any, index: int, folder: Path | None, where: str) -
         if not isinstance(distortion, Mapping) or not {"model", "coeffs"} <= distortion.keys():
             raise CalibrationError(f"{label}: distortion: expected null or {{model, coeffs}}, got {shown(distortion)}")
         calibration |= {"lens": distortion["model"], "distortion": distortion["coeffs"]}
-        unknown, order = unknown_key(distortion, ("model", "coeffs", "order")), distortion.get("order")
+        refuse_unknown(distortion, ("model", "coeffs", "order"), f"{label}: distortion")
+        order = distortion.get("order")
         usual = _ORDERS.get(canonical_name(str(distortion["model"])), "").split()
         named = re.findall(r"[a-z]+\d", str(order).partition("(")[0])  # k1..k4 (cv2.fisheye)
         is_usual = order is None or named == usual[: len(named)] or (named == ["k1", "k4"] and len(usual) > 3)
-        if unknown or not is_usual:
-            unknown = unknown or f"order: expected {' '.join(usual)}, got {shown(order)}"
-            raise CalibrationError(f"{label}: distortion: {unknown}")
+        if not is_usual:
+            raise CalibrationError(f"{label}: distortion: order: expected {' '.join(usual)}, got {shown(order)}")
     for key in ("lens", *USUAL_NAMES["lens"]):
         lens = lens_called(entry.get(key) or "pinhole")
         if lens != "pinhole" and (distortion is None or lens != canonical_name(str(distortion["model"]))):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,43 +126,32 @@ def checked_size(where: str, value: Any) -> tuple[int, int]:
     return checked_pixels(where, "height_px", h), checked_pixels(where, "width_px", w)
 
 
-def checked_numbers(where: str, field: str, values: Any, count: int, expected: str) -> tuple[float, ...]:
-    """``count`` finite numbers; ``expected`` describes them in the error."""
+def checked_array(
+    where: str,
+    field: str,
+    value: Any,
+    shape: tuple[int, ...],
+    expected: str = "",
+    is_valid: Callable[[FloatArray], Any] = lambda array: True,
+) -> FloatArray:
+    """A finite float64 copy of the given shape (-1: any) that ``is_valid``; ``expected`` describes it in the error."""
     try:
-        numbers = tuple(float(v) for v in values)
-        valid = len(numbers) == count and all(map(math.isfinite, numbers))
-        valid = valid and not any(isinstance(v, str | bytes | bool) for v in values)  # float() takes these
-    except (TypeError, ValueError, OverflowError):
-        valid = False
-    if not valid:
-        raise refusal(where, field, expected, shown(values))
-    return numbers
-
-
-def checked_array(where: str, field: str, value: Any, shape: tuple[int, ...]) -> FloatArray:
-    """A finite float64 copy of the given shape."""
-    try:
-        if np.iscomplexobj(value):
-            raise TypeError("complex numbers")
-        if isinstance(value, list | tuple) and _holds_booleans(value):
-            raise TypeError("true or false")
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+            for entry in np.array(value, dtype=object).flat:
+                if isinstance(entry, bool | str | bytes | complex):
+                    raise TypeError(f"{shown(entry)} is no real number")
         array = np.array(value, dtype=np.float64)
+        got = "" if array.shape == shape or (shape == (-1,) and array.ndim == 1) else f"shape {array.shape}"
+        if not np.isfinite(array).all():
+            got = got or f"NaN or infinity in {array.tolist()}"
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # RuntimeError: tensors that need gradients
-        got = f"{type(value).__name__} ({str(error)[:200]})"
-        raise refusal(where, field, f"numbers of shape {shape}", got) from None
-    if array.shape != shape:
-        raise refusal(where, field, f"shape {shape}", f"shape {array.shape}")
-    if not np.isfinite(array).all():
-        raise refusal(where, field, "finite numbers", f"NaN or infinity in {array.tolist()}")
+        got = f"{type(value).__name__} ({one_line(error, 200)})"
+    if got or not is_valid(array):
+        expected, got = (expected, shown(value)) if expected else (f"finite numbers of shape {shape}", got)
+        raise refusal(where, field, expected, got)
     array += 0.0  # -0.0 becomes 0.0: equal calibrations have equal bytes (content_key)
     array.setflags(write=False)
     return array
-
-
-def _holds_booleans(value: Sequence[Any]) -> bool:
-    """Whether a list or one of its lists holds true or false, which numpy would read as 1 and 0."""
-    rows = [row for row in value if isinstance(row, list | tuple)]
-    return any(isinstance(entry, bool) for row in (value, *rows) for entry in row)
 
 
 def is_rigid(pose: FloatArray) -> bool:
@@ -179,13 +168,8 @@ def checked_pose(where: str, value: Any, field: str = "cam2ego") -> FloatArray:
     if np.abs(pose[3] - (0, 0, 0, 1)).max() > 1e-9:
         fix = f"pass {field}.T" if np.any(pose[3, :3]) and not np.any(pose[:3, 3]) else ""
         raise refusal(where, field, "last row (0, 0, 0, 1)", f"{pose[3].tolist()}", fix)
-    R = pose[:3, :3]
-    largest = float(np.abs(R).max())
-    if largest > 2:  # the products below could overflow
-        fix = f"the nearest rotation is {nearest_rotation(R / largest).round(9).tolist()}"
-        raise refusal(where, field, "a rotation, with entries from -1 to 1", f"{R.tolist()}", fix)
-    deviation = float(np.abs(R @ R.T - np.eye(3)).max())
-    determinant = float(np.linalg.det(R))
+    R = pose[:3, :3] / max(1.0, float(np.abs(pose[:3, :3]).max()) / 2)  # products of huge entries would overflow
+    deviation, determinant = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
     if deviation <= 0.1 and determinant < 0:
         fix = f"np.diag([1, -1, 1, 1]) @ {field}, if y is to the right (CARLA, Unreal)"
         if R[2, 1] > 0.5:  # the image's y axis is up, where the ego's z is
@@ -207,20 +191,15 @@ def checked_pose(where: str, value: Any, field: str = "cam2ego") -> FloatArray:
 
 def checked_distortion(where: str, lens: str, value: Any) -> tuple[float, ...]:
     """As many coefficients as the lens takes, up to ``_MAX_COEFFICIENT``."""
-    try:
-        coefficients = tuple(float(k) + 0.0 for k in value)
-        if isinstance(value, str) or (isinstance(value, list | tuple) and _holds_booleans(value)):
-            raise TypeError
-    except (TypeError, ValueError, OverflowError):
-        raise refusal(where, "distortion", "a sequence of numbers", shown(value)) from None
+    expected = f"finite numbers up to {_MAX_COEFFICIENT:g}"
+    array = checked_array(where, "distortion", value, (-1,), expected, lambda k: (abs(k) <= _MAX_COEFFICIENT).all())
+    coefficients = tuple(array.tolist())
     counts = LENSES[lens].coefficient_counts
     if len(coefficients) not in counts:
         expected = " or ".join(map(str, counts)) + f" coefficients for a {lens} lens"
         names = " or ".join(f"lens={name!r}" for name in LENSES if LENSES[name].coefficient_counts != (0,))
         fix = f"name the lens: {names}" if counts == (0,) else "docs/formats.md, Lenses, has them"
         raise refusal(where, "distortion", expected, str(len(coefficients)), fix)
-    if not all(abs(k) <= _MAX_COEFFICIENT for k in coefficients):  # also catches NaN
-        raise refusal(where, "distortion", f"finite numbers up to {_MAX_COEFFICIENT:g}", shown(coefficients))
     ranges = LENSES[lens].coefficient_ranges
     if any(not low <= k <= high for k, (_, low, high) in zip(coefficients, ranges, strict=False)):
         expected = " and ".join(f"{label} from {low:g} to {high:g}" for label, low, high in ranges)

@@ -110,6 +110,14 @@ def test_ros_frames_with_a_bodys_axes_are_refused(tmp_path: Path) -> None:
         assert load_rig(tmp_path)[0].elevation_deg == pytest.approx(elevation_deg, abs=1e-5)
 
 
+def test_poses_as_lists_are_in_tfs_order(tmp_path: Path) -> None:
+    poses = "poses: {left: {translation: [1.2, 0.9, 1.5], rotation: [-0.5, 0, 0, 0.5]}}"
+    rig = load_rig(written(tmp_path, left__yaml=FISHEYE_INFO, mounting__yaml=poses))
+    np.testing.assert_allclose(rig[0].cam2ego, LEFT, atol=1e-12)
+    with pytest.warns(UserWarning, match="a quaternion w x y z read as x y z w"):
+        load_rig(written(tmp_path, mounting__yaml=poses.replace("[-0.5, 0, 0, 0.5]", "[0.5, -0.5, 0, 0]")))
+
+
 # --- OpenCV, Kalibr, COLMAP -------------------------------------------------------------------------------------------
 def test_opencv_file_storage(tmp_path: Path) -> None:
     mounting = f"poses: {{wide: {ROWS}, back: {LEFT.tolist()}}}"
@@ -122,7 +130,7 @@ def test_opencv_file_storage(tmp_path: Path) -> None:
     storage.write("cameraMatrix", back.K)
     storage.write("distCoeffs", np.array([*back.distortion, *[0.0] * 9]))  # thin prism and tilt of zero
     storage.release()
-    refused(tmp_path, r"OpenCV: camera 'back': how large are its images\? .* sizes: ")
+    refused(tmp_path, r"OpenCV or ROS: camera 'back': how large are its images\? .* sizes: ")
     written(tmp_path, mounting__yaml=f"{mounting}\nsizes: {{back: {{width: 1920, height: 1080}}}}")
     again = load_rig(tmp_path)["back"]
     assert again.distortion == (*back.distortion, 0.0, 0.0, 0.0) and np.array_equal(again.K, back.K)
@@ -196,7 +204,11 @@ REFUSED_FILES: list[tuple[dict[str, str], str, str, str, str]] = [
     *((ROS | {"mounting__yaml": text}, "mounting__yaml", "", "", message) for text, message in (
         ("poses: [1]", "mounting.yaml: poses: expected values by camera"),
         ("pose: {}", "mounting.yaml: expected the keys poses, ground_z_m"),
-        ("poses: {front: {translation: {x: 1}}}", r"camera 'front': pose: expected a 4x4 matrix, or \{translation"),
+        *((f"poses: {{front: {{translation: {xyz}, rotation: {xyzw}}}}}", f"camera 'front': pose: expected {words}")
+          for xyz, xyzw, words in (
+              ("{x: 1}", "{}", "a 4x4 matrix"), ("[1, 2, 3]", "[0, 0, 1]", "a 4x4"), ("3", "[0, 0, 0, 1]", "a 4x4"),
+              ("[1, 2]", "[0, 0, 0, 1]", "three finite numbers"), ("[1, 2, 3]", "[0, 0, 0, 0]", "three finite numbers"),
+              ("[1, 2, true]", "[0, 0, 0, 1]", "three finite numbers"), ("[1, 2, 3]", "[0, 0, 0, .inf]", "three"))),
         (f"poses: {{front: {(2 * FORWARD).tolist()}}}", "camera 'front': pose: expected last row"),
         ("metres_per_unit: abc", "ROS: mounting.yaml: metres_per_unit: expected a positive number, got 'abc'"),
         (f"ground_z_m: low\n{POSED}", "ground_z_m: expected a finite height"),
@@ -301,7 +313,7 @@ def test_inspect_says_what_was_assumed(tmp_path: Path, capsys: pytest.CaptureFix
     assert main(["inspect", str(tmp_path), str(tmp_path / "camchain.yaml"), *output]) == 0
     said = capsys.readouterr().out
     assert said.count("read as Kalibr: T_cn_cnm1 takes points from the camera before") == 2
-    assert "road at z = 0.0 m, assumed" in said and "double_sphere" in said
+    assert "road at z = 0.0 m, by default" in said and "double_sphere" in said
     (tmp_path / "mounting.yaml").unlink()
     assert main(["inspect", str(tmp_path), *output]) == 2
     assert "where is it on the vehicle?" in capsys.readouterr().err

@@ -83,54 +83,60 @@ def by_sequence(**settings: Any) -> RandomRig:
     return RandomRig("waymo", yaw_deg=10, per="sequence", **settings)
 
 
+def draw_for(random_rig: RandomRig, sample: dict[str, Any], rng: torch.Generator | None = None) -> dict[str, float]:
+    return random_rig.draw(random_rig.rng_for(sample, rng))
+
+
 def test_one_draw_a_sequence() -> None:
     torch.manual_seed(0)
     random_rig = by_sequence()
     state = torch.get_rng_state()
-    first = random_rig.draw_for({"scene_token": "a"})
-    assert random_rig.draw_for({"scene_token": "a"}) == first != random_rig.draw_for({"scene_token": "b"})
+    first = draw_for(random_rig, {"scene_token": "a"})
+    assert draw_for(random_rig, {"scene_token": "a"}) == first != draw_for(random_rig, {"scene_token": "b"})
     assert torch.equal(torch.get_rng_state(), state)  # nothing else that is random changes
-    assert by_sequence().draw_for({"scene_token": "a"}) == first  # the same in every worker of a seed
+    assert draw_for(by_sequence(), {"scene_token": "a"}) == first  # the same in every worker of a seed
     torch.manual_seed(1)
-    assert random_rig.draw_for({"scene_token": "a"}) != first
-    assert by_sequence(sequence_key="drive").draw_for({"drive": 7})
+    assert draw_for(random_rig, {"scene_token": "a"}) != first
+    assert draw_for(by_sequence(sequence_key="drive"), {"drive": 7})
     generators = [torch.Generator().manual_seed(seed) for seed in (5, 5, 6)]
-    five, again, six = (random_rig.draw_for({"scene_token": "a"}, rng) for rng in generators)
+    five, again, six = (draw_for(random_rig, {"scene_token": "a"}, rng) for rng in generators)
     assert five == again != six
 
 
 def test_batches_of_sequences() -> None:
     random_rig = by_sequence()
-    assert random_rig.draw_for({"scene_token": ["a", "a"]}) == random_rig.draw_for({"scene_token": "a"})
-    assert random_rig.draw_for({"scene_token": [{"a": 1}] * 2})  # names need no hash
-    expected, tensor = random_rig.draw_for({"scene_token": 3}), torch.tensor
+    assert draw_for(random_rig, {"scene_token": ["a", "a"]}) == draw_for(random_rig, {"scene_token": "a"})
+    assert draw_for(random_rig, {"scene_token": [{"a": 1}] * 2})  # names need no hash
+    expected, tensor = draw_for(random_rig, {"scene_token": 3}), torch.tensor
     for same in (tensor(3), tensor([3]), tensor([3, 3, 3]), np.array([3, 3]), [tensor(3), tensor(3)], [[3, 3], [3, 3]]):
-        assert random_rig.draw_for({"scene_token": same}) == expected, "however a name is collated"
+        assert draw_for(random_rig, {"scene_token": same}) == expected, "however a name is collated"
     for other in (["a", "b"], tensor([3, 4]), [("a", "b"), ("a", "b")], np.array([3, 4])):
         with pytest.raises(SampleError, match="scene_token: expected one sequence a batch, got 2"):
-            random_rig.draw_for({"scene_token": other})
+            draw_for(random_rig, {"scene_token": other})
     for more in ({}, {"scene_token": None}, {"scene_token": ["a", None]}):
         with pytest.raises(SampleError, match=r"expected 'scene_token' in the sample, .*, got images, token"):
-            random_rig.draw_for({"images": 0, "token": 0} | more)
+            draw_for(random_rig, {"images": 0, "token": 0} | more)
 
 
 CIRCLE: list[Any] = ["a"]
 CIRCLE.append(CIRCLE)
 
 
-@pytest.mark.parametrize("name", [CIRCLE, nested(100_000, "a"), b"a", np.str_("a"), np.array("a"), {"b": np.int64(1)}])
+@pytest.mark.parametrize("name", [nested(100, "a"), b"a", np.str_("a"), np.array("a"), {"b": np.int64(1)}])
 def test_names_however_nested(name: Any) -> None:
     random_rig = by_sequence()
-    assert random_rig.draw_for({"scene_token": name}) == random_rig.draw_for({"scene_token": copy.copy(name)})
+    assert draw_for(random_rig, {"scene_token": name}) == draw_for(random_rig, {"scene_token": copy.copy(name)})
 
 
-NAMELESS = object(), {"a": object()}, {"a", "b"}, {"a": CIRCLE}, {"a": nested(100_000)}, torch.zeros(2).to("meta")
+NAMELESS = object(), {"a": object()}, {"a", "b"}, CIRCLE, {"a": CIRCLE}, nested(100_000), torch.zeros(2).to("meta")
 
 
-@pytest.mark.parametrize("name", NAMELESS, ids=["object", "in a dict", "set", "circle", "deep", "meta"])
+@pytest.mark.parametrize(
+    "name", NAMELESS, ids=["object", "in a dict", "set", "circle", "circle in a dict", "deep", "meta"]
+)
 def test_what_has_another_text_in_each_process_names_nothing(name: Any) -> None:
     with pytest.raises(SampleTypeError, match="scene_token: expected"):
-        by_sequence().draw_for({"scene_token": name})
+        draw_for(by_sequence(), {"scene_token": name})
     with pytest.raises(SampleTypeError, match="token: expected"):
         read_frames(sample_of(load_rig("waymo").resized((8, 12))) | {"token": name}, None, names=("token",))
 

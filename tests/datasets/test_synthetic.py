@@ -313,7 +313,7 @@ def test_a_folder_without_a_drive_says_so(recorded: Path, tmp_path: Path) -> Non
     sequence = FrameFolder(recorded)
     assert sequence[0]["scene_token"] == recorded.name
     random = RandomRig(sequence[0]["rig"], yaw_deg=3, per="sequence")
-    assert random.draw_for(sequence[0]) == random.draw_for(sequence[2])
+    assert random.draw(random.rng_for(sequence[0])) == random.draw(random.rng_for(sequence[2]))
 
 
 @pytest.mark.parametrize("broken", ["image", "corrupt", "calibration"])

@@ -81,7 +81,7 @@ CALIBRATION: dict[str, tuple[dict[str, Any], str]] = {
     "none": (sample(K=None, cam2ego=None), "expected calibration, 'rig' or 'K' and 'cam2ego', missing K, cam2ego"),
     "no poses": (sample(cam2ego=None), "missing cam2ego; or give RigRetarget the rig as source="),
     "no rotation": (edited("cam2ego", (1, 0, 0), 2.0), "'camera 1': cam2ego: expected a rotation .* the nearest"),
-    "NaN K": (edited("K", (0, 0, 0), torch.nan), "camera 'camera 0': K: expected finite numbers, got NaN"),
+    "NaN K": (edited("K", (0, 0, 0), torch.nan), "camera 'camera 0': K: expected finite numbers of shape .*, got NaN"),
     "negative focal length": (edited("K", (0, 1, 1), -5.0), "camera 'camera 0': K: expected positive focal lengths"),
     "K of a larger image": (sample(K=HALF * torch.tensor([[5.0], [5.0], [1.0]])), r"K\[0\]: .* inside the image of"),
     "K of a smaller image": (sample(K=HALF), r"K\[0\]: .* near the middle of the image of \(h, w\) = \(36, 64\)"),

@@ -1,4 +1,4 @@
-"""Calibrations of other tools: recognised by their files, and read as the plain data of a rig file."""
+"""Calibrations of other tools: recognised by their files, and read as rigs."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from xml.etree import ElementTree
 import numpy as np
 import yaml
 
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.formats import rig_files
-from arbiview_aug.cameras.formats.entries import MOUNTING, Mounting, camera_entry, matrix, pose_of, refusal
+from arbiview_aug.cameras.formats.entries import MOUNTING, Mounting, camera_of, matrix, pose_of, refusal
 from arbiview_aug.cameras.formats.fields import has_camera, read_fields
-from arbiview_aug.cameras.key_names import hint, plain
+from arbiview_aug.cameras.key_names import hint
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import MOST_BYTES, read_calibration_text, read_documents
 from arbiview_aug.cameras.rotations import poses_from
@@ -33,7 +34,6 @@ SUFFIXES = (".yaml", ".yml", ".xml", ".json")
 _EGO_FRAMES = ("base_link", "base_footprint")  # REP 105; REP 120: base_footprint is on the floor
 _BODY_UP_DEG = 60.0  # no car's camera looks up more steeply: its frame is the body's
 _OPTICAL = ("_optical_frame", "_optical", "")  # suffixes of a camera's frame; REP 103
-_ROS_KEYS = {"distortionmodel", "p", "projectionmatrix", "binningx"}
 _WOODSCAPE_KEYS = set("aspect_ratio cx_offset cy_offset height width k1 k2 k3 k4 model poly_order".split())
 _DEFAULT_NAME = "narrow_stereo"  # of camera_calibration, for every camera
 
@@ -60,25 +60,19 @@ _INSTEAD = "which is not read: write a rig file (docs/formats.md)"
 _WORDS = re.compile(r"(?i)matrix|mat\b|\bmtx\b|intrinsic|\bcam_k\b|\bk\b|\bfx\b|\bmu\b|\bgamma1\b|radial_poly")
 
 
-def camera_files(folder: Path) -> list[Path]:
-    """A folder's files with a camera."""
-    files = (path for path in sorted(folder.glob("*.*")) if path.suffix in SUFFIXES and path.name not in (MOUNTING, TF))
-    return [path for path in files if not path.is_dir() and has_cameras(path)]
-
-
-def has_cameras(path: Path) -> bool:
-    """Whether a file has a camera that is read here; False if it cannot be read."""
-    try:
-        text = read_calibration_text(path, path.name)
-        return bool(_WORDS.search(text) and not unread_tool(text) and _cameras(path))
-    except CalibrationError:
-        return False
-
-
 def unread_tool(text: str) -> str:
     """The tool of a file that is not read, and the fix; empty for others."""
     tools = (f"{tool}, {_INSTEAD}; {fix}" for tool, (words, fix) in _UNREAD.items() if re.search(words, text))
     return next(tools, "")
+
+
+def camera_files(path: Path) -> dict[Path, dict[str, Mapping[Any, Any]]]:
+    """Cameras of a file by their keys, or of the files in a folder; without files that have none or cannot be read."""
+    files = [path]
+    if os.path.isdir(path):
+        files = [file for file in sorted(path.glob("*.*")) if file.suffix in SUFFIXES and not file.is_dir()]
+    found = {file: _cameras(file) for file in files if file.name not in (MOUNTING, TF)}
+    return {file: cameras for file, cameras in found.items() if cameras}
 
 
 def documents(path: Path) -> list[Any]:
@@ -94,16 +88,15 @@ def documents(path: Path) -> list[Any]:
         raise CalibrationError(f"{path.name}: expected XML, got {error}") from None
 
 
-def tool_of(path: Path) -> str:
-    """Format of a file with cameras: ``ros``, ``woodscape``, or ``opencv`` for FileStorage's and Python's."""
-    data = next(iter(_cameras(path).values()))
-    return "woodscape" if _is_woodscape(data) else "ros" if _ROS_KEYS & set(map(plain, data)) else "opencv"
-
-
 def _cameras(path: Path) -> dict[str, Mapping[Any, Any]]:
     """The cameras of a file, by the file's name; by their keys, names or frames where it has several."""
+    try:
+        text = read_calibration_text(path, path.name)
+        contents = documents(path) if _WORDS.search(text) and not unread_tool(text) else []
+    except CalibrationError:
+        return {}
     keyed, listed = dict[str, Mapping[Any, Any]](), dict[str, Mapping[Any, Any]]()
-    for data in documents(path):
+    for data in contents:
         if isinstance(data, Mapping) and not _is_camera(data) and not isinstance(data.get("cameras"), list):
             keyed |= {str(key): part for key, part in data.items() if _is_camera(part)}
         for part in filter(_is_camera, data if isinstance(data, list) else [data]):
@@ -123,27 +116,27 @@ def _frame_id(data: Mapping[Any, Any]) -> str:
     return str((header if isinstance(header, Mapping) else data).get("frame_id") or "").strip("/")
 
 
-def read_camera_files(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+def read_camera_files(path: Path, mounting: Mounting) -> list[Camera]:
     """Cameras of one file, or of all of a folder.
 
     Sources: camera_calibration_parsers of ROS; CameraCalibration of Foxglove's schemas; the sample
     calib3d/camera_calibration of OpenCV.
     """
-    frames, files = _frames(path), camera_files(path) if path.is_dir() else [path]
-    cameras = [(file, key, data) for file in files for key, data in _cameras(file).items()]
-    names = Counter(_declared(data) for _, _, data in cameras)
-    found = []
-    for file, key, data in cameras:
+    frames = _frames(path)
+    entries = [(file, key, data) for file, found in camera_files(path).items() for key, data in found.items()]
+    names = Counter(_declared(data) for _, _, data in entries)
+    cameras = []
+    for file, key, data in entries:
         name = _declared(data)
         is_default = name.startswith(_DEFAULT_NAME) and name not in mounting.poses
         name = key if not name or names[name] > 1 or is_default else name
         if _is_woodscape(data):
-            found.append(_woodscape(name, data, mounting))
+            cameras.append(_woodscape(name, data, mounting))
             continue
         lens, K, coefficients, size, is_shifted = read_fields(name, data)
         pose = _pose(file, name, _frame_id(data), is_shifted, mounting, frames)
-        found.append(camera_entry(name, size or mounting.size(name), K, pose, lens, coefficients))
-    return found
+        cameras.append(camera_of(name, size or mounting.size(name), K, pose, lens, coefficients))
+    return cameras
 
 
 def _is_woodscape(data: Any) -> bool:
@@ -151,7 +144,7 @@ def _is_woodscape(data: Any) -> bool:
     return isinstance(intrinsic, Mapping) and intrinsic.get("model") == "radial_poly"
 
 
-def _woodscape(name: str, data: Mapping[Any, Any], mounting: Mounting) -> dict[str, Any]:
+def _woodscape(name: str, data: Mapping[Any, Any], mounting: Mounting) -> Camera:
     """A camera of WoodScape, as its scripts/calibration/projection.py reads it: r = k1 θ + ... + k4 θ⁴ in pixels."""
     lens, extrinsic = data["intrinsic"], data["extrinsic"]
     if (unread := lens.keys() - _WOODSCAPE_KEYS) or lens.get("poly_order", 4) != 4:
@@ -162,7 +155,7 @@ def _woodscape(name: str, data: Mapping[Any, Any], mounting: Mounting) -> dict[s
     x, y, z, w = extrinsic["quaternion"]
     pose = mounting.poses.get(name, poses_from([*extrinsic["translation"], w, x, y, z]))
     coefficients = [*(lens[key] / k1 for key in ("k2", "k3", "k4")), 0.0]
-    return camera_entry(name, (width, height), K, pose, "ftheta", coefficients)
+    return camera_of(name, (width, height), K, pose, "ftheta", coefficients)
 
 
 def _declared(data: Mapping[Any, Any]) -> str:
@@ -176,9 +169,7 @@ def _pose(
     optical = [frame_id] if frame_id else [name.strip("/") + end for end in _OPTICAL]
     frame = next((frame for frame in optical if frame in frames), None)
     if frame is None or name in mounting.poses:
-        is_ros = tool_of(file) == "ros"
-        there = f", or a frame {optical[0]} to {TF} as `ros2 topic echo /tf_static` prints it" if is_ros else ""
-        return mounting.pose(name, there)
+        return mounting.pose(name, f", or a frame {optical[0]} to {TF} as `ros2 topic echo /tf_static` prints it")
     pose = frames[frame]
     up_deg = math.degrees(math.atan2(pose[2, 2], math.hypot(*pose[:2, 2])))
     if up_deg > _BODY_UP_DEG and "optical" not in frame.lower():
@@ -194,10 +185,10 @@ def _pose(
     return pose
 
 
-def ros_road_z_m(path: Path) -> float | None:
-    """Height of the road in the ego frame: that of base_footprint; None if tf has no such frame."""
-    foot = _frames(path).get(_EGO_FRAMES[1])
-    return None if foot is None else round(float(foot[2, 3]), 6) + 0.0  # not -0.0
+def ros_road_z_m(folder: Path) -> float:
+    """Height of the road in the ego frame: that of base_footprint; 0 if tf has no such frame."""
+    foot = _frames(folder).get(_EGO_FRAMES[1], np.zeros((4, 4)))
+    return round(float(foot[2, 3]), 6) + 0.0  # not -0.0
 
 
 def _frames(path: Path) -> dict[str, FloatArray]:
@@ -250,9 +241,8 @@ class Format(NamedTuple):
     files: tuple[str, ...]  # patterns, one of which a folder has
     keys: str  # by which a file is recognised, for errors
     convention: str  # assumed on reading, for ``inspect``
-    read: Callable[[Path, Mounting], list[dict[str, Any]]]  # cameras as in a rig file
-    ground_z_m: float = 0.0  # road in the ego frame, where mounting.yaml does not say otherwise
-    road_z_m: Callable[[Path], float | None] = lambda path: None  # the same, where the files say it
+    read: Callable[[Path, Mounting], list[Camera]]
+    road_z_m: Callable[[Path], float] = lambda folder: 0.0  # in the ego frame, where mounting.yaml says no other height
 
 
 FORMATS = {
@@ -265,7 +255,7 @@ FORMATS = {
     "argoverse2": Format(
         "Argoverse 2", ("intrinsics.feather", "calibration/intrinsics.feather"), "intrinsics.feather",
         "images are published undistorted, k1 to k3 are not used; ego origin at the rear axle, 0.33 m over the road",
-        rig_files.read_argoverse2, -0.33,
+        rig_files.read_argoverse2, lambda folder: -0.33,
     ),
     "nuscenes": Format(
         "nuScenes", (rig_files.CALIBRATED_SENSOR,), "calibrated_sensor.json with sensor.json",
@@ -278,16 +268,12 @@ FORMATS = {
         f"pose of one camera from {MOUNTING}",
         rig_files.read_kalibr,
     ),
-    "opencv": Format(
-        "OpenCV", (), "camera_matrix and distortion_coefficients, also mtx and dist, or K and D",
-        f"coefficients k1 k2 p1 p2 ..., or k1 to k4 of a fisheye where the file says so; poses from {MOUNTING}",
-        read_camera_files,
-    ),
     "ros": Format(
-        "ROS", (), "camera_matrix and distortion_model, or K, D and P; Foxglove's too",
-        "K and D of the raw image, not P; optical frames (x right, y down, z forward) below base_link in "
-        f"{TF}, the road at base_footprint if it is there, or poses from {MOUNTING}",
-        read_camera_files, road_z_m=ros_road_z_m,
+        "OpenCV or ROS", (), "camera_matrix and distortion_coefficients, also K and D, or mtx and dist; Foxglove's too",
+        "K and D of the raw image, not P; coefficients k1 k2 p1 p2 ..., or k1 to k4 of a fisheye where the file says "
+        f"so; optical frames (x right, y down, z forward) below base_link in {TF}, the road at base_footprint if it is "
+        f"there, or poses from {MOUNTING}",
+        read_camera_files, ros_road_z_m,
     ),
     "woodscape": Format(
         "WoodScape", (), "intrinsic with model radial_poly",
@@ -303,6 +289,8 @@ FORMATS = {
 }  # fmt: skip
 """Formats by name, in the order in which folders are tried."""
 
+_BY_NAME = {".bin": "colmap", ".feather": "argoverse2", rig_files.CALIBRATED_SENSOR: "nuscenes"}
+
 _FIX = "convert them, write a rig file, or move them elsewhere"
 _CAMERA = re.compile(r"(?i)camera_?mat|intrinsic|distort|camera_?model|\bmtx\b|focal|\bf[lx]_?x?\b")
 _LIKE_CAMERAS = (*SUFFIXES, ".npz", ".npy", ".mat", ".pkl", ".toml")
@@ -314,7 +302,7 @@ _BROKEN = (
 
 
 def read_calibration(path: Path, where: str) -> Any:
-    """Plain data in the rig file's format of a rig file, or of a tool's file or folder, then with ``notes``.
+    """Data of a rig file, or that of a tool's file or folder, whose cameras are ``Camera`` and which has ``notes``.
 
     CalibrationError for a file that is not as its tool writes it or lacks what ``mounting.yaml`` could say, and for a
     folder with a camera that is not read; ImportError for Argoverse 2's files without pyarrow.
@@ -343,9 +331,11 @@ def read_calibration(path: Path, where: str) -> Any:
         with np.errstate(all="ignore"):  # ``Camera`` refuses numbers that are not finite
             cameras = form.read(path, mounting)
             if is_folder:  # next to a single file, it may name other files' cameras
-                mounting.check([camera["name"] for camera in cameras])
-            cameras = mounting.named(cameras)
-            heights = (mounting.ground_z_m, MOUNTING), (form.road_z_m(path), "the files"), (form.ground_z_m, "")
+                mounting.check([camera.name for camera in cameras])
+        ground, source = mounting.ground_z_m, f"from {MOUNTING}"
+        if ground is None:
+            ground, source = form.road_z_m(folder), "by default"
+        cameras = mounting.named(cameras)
     except ArbiviewError as error:
         raise type(error)(f"{where}: {form.tool}: {error}") from None
     except _BROKEN as error:  # readers take files apart as their tools write them
@@ -355,31 +345,29 @@ def read_calibration(path: Path, where: str) -> Any:
         raise CalibrationError(f"{where}: {form.tool}: expected cameras of one tool, got also {seems}: {_FIX}")
     if is_folder and unread:
         warn(f"{where}: {form.tool}: not read: {', '.join(file.name for file in unread)}")
-    ground, source = next((height, source) for height, source in heights if height is not None)
-    road = f"road at z = {ground} m, {f'from {source}' if source else 'assumed'}"
-    notes, stem = f"read as {form.tool}: {form.convention}; {road}", folder.name if is_folder else path.stem
-    return {"name": stem.encode(errors="replace").decode(), "ground_z_m": ground, "notes": notes, "cameras": cameras}
+    stem = (folder.name if is_folder else path.stem).encode(errors="replace").decode()
+    notes = f"read as {form.tool}: {form.convention}; road at z = {ground} m, {source}"
+    return {"name": stem, "ground_z_m": ground, "notes": notes, "cameras": cameras}
 
 
 def recognised(path: Path) -> str | None:
     """Name in ``FORMATS`` of a folder by its files, or of a file by its name and content."""
     if os.path.isdir(path):
-        for name, form in FORMATS.items():
+        for tool, form in FORMATS.items():
             if any(any(path.glob(pattern)) for pattern in form.files):
-                return name
-        files = camera_files(path)
-        return tool_of(files[0]) if files else None
-    if path.suffix == ".txt":
+                return tool
+    elif path.suffix == ".txt":
         return None if unread_tool(read_calibration_text(path, path.name, 1 << 28)) else "colmap"
-    by_name = {".bin": "colmap", ".feather": "argoverse2", rig_files.CALIBRATED_SENSOR: "nuscenes"}
-    if path.name in by_name or path.suffix in by_name:
-        return by_name.get(path.name) or by_name[path.suffix]
-    data = next(iter(documents(path)), None)
-    if rig_files.waymo_entries(data):
-        return "waymo"
-    if rig_files.chain_entries(data):
-        return "kalibr"
-    return tool_of(path) if has_cameras(path) else None
+    elif name := _BY_NAME.get(path.name) or _BY_NAME.get(path.suffix):
+        return name
+    else:
+        data = next(iter(documents(path)), None)
+        if rig_files.waymo_entries(data):
+            return "waymo"
+        if rig_files.chain_entries(data):
+            return "kalibr"
+    first = next((data for cameras in camera_files(path).values() for data in cameras.values()), None)
+    return None if first is None else "woodscape" if _is_woodscape(first) else "ros"
 
 
 def _unread(folder: Path, name: str | None) -> list[Path]:

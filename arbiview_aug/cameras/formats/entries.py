@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from arbiview_aug.cameras import validation
+from arbiview_aug.cameras.camera import Camera
 from arbiview_aug.cameras.lens import LENSES, FloatArray
 from arbiview_aug.cameras.plain_yaml import read_plain
 from arbiview_aug.cameras.rotations import poses_from
-from arbiview_aug.cameras.validation import checked_numbers, checked_pose
+from arbiview_aug.cameras.validation import checked_array, checked_pose
 from arbiview_aug.errors import CalibrationError, shown
 
 WAY_OUT = (
@@ -41,16 +42,13 @@ def fitted(name: str, lens: str, coefficients: Any) -> tuple[str, list[float]]:
     raise refusal(name, f"{' or '.join(map(str, counts))} coefficients of {lens}", got, WAY_OUT)
 
 
-def camera_entry(
+def camera_of(
     name: str, size: tuple[Any, Any], K: Any, cam2ego: FloatArray, lens: str = "pinhole", coefficients: Any = ()
-) -> dict[str, Any]:
-    """A camera as in a rig file, of (width, height)."""
+) -> Camera:
+    """A camera of (width, height), whose coefficients may be padded with zeros."""
     lens, coefficients = fitted(name, lens, coefficients)
-    return {
-        **{"name": name, "width": size[0], "height": size[1]},
-        **{"K": np.asarray(K, float).tolist(), "cam2ego": cam2ego.tolist()},
-        "distortion": {"model": lens, "coeffs": coefficients} if lens != "pinhole" else None,
-    }
+    calibration: dict[str, Any] = {"K": K, "cam2ego": cam2ego, "lens": lens, "distortion": coefficients}
+    return Camera(name=name, width_px=size[0], height_px=size[1], **calibration)
 
 
 def matrix(fx: float, fy: float, cx: float, cy: float) -> list[list[float]]:
@@ -66,7 +64,7 @@ class Mounting:
     """The file's content.
 
     Attributes:
-        poses: cam2ego (4, 4) by camera; in the file, rows or tf's ``{translation: {x, ...}, rotation: {x, ..., w}}``.
+        poses: cam2ego (4, 4) by camera; in the file as ``pose_of`` reads them.
         ground_z_m: Height of the road in the ego frame.
         metres_per_unit: Scale of a calibration without one (COLMAP).
         images: Image of each camera (COLMAP).
@@ -124,11 +122,11 @@ class Mounting:
             raise CalibrationError(f"camera {name!r}: how large are its images? {fix}; without the name it is for all")
         return size["width"], size["height"]
 
-    def named(self, cameras: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-        """A rig file's cameras by their ``names``, and in that order."""
+    def named(self, cameras: Sequence[Camera]) -> list[Camera]:
+        """Cameras by their ``names``, and in that order."""
         places = {name: place for place, name in enumerate(self.names)}
-        ordered = sorted(cameras, key=lambda camera: places.get(camera["name"], len(places)))
-        return [camera | {"name": self.names.get(camera["name"], camera["name"])} for camera in ordered]
+        ordered = sorted(cameras, key=lambda camera: places.get(camera.name, len(places)))
+        return [replace(camera, name=self.names.get(camera.name, camera.name)) for camera in ordered]
 
     def mounted(self, relative: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """cam2ego of cameras whose poses (4, 4) in a common frame are known, by the pose of one of them."""
@@ -147,16 +145,18 @@ class Mounting:
 
 
 def pose_of(name: str, value: Any) -> FloatArray:
-    """(4, 4) pose of a matrix, or of a translation and a quaternion as tf writes them."""
+    """(4, 4) pose of a matrix, or of tf's translation x y z and quaternion x y z w, which are mappings or lists."""
     where = f"camera {name!r}"
     if isinstance(value, Mapping):
+        expected = "a 4x4 matrix, or {translation: {x, y, z}, rotation: {x, y, z, w}} or their lists [x, y, z, w]"
         try:
-            numbers = [value["translation"][axis] for axis in "xyz"] + [value["rotation"][axis] for axis in "wxyz"]
-        except (LookupError, TypeError):
-            expected = "a 4x4 matrix, or {translation: {x, y, z}, rotation: {x, y, z, w}}"
+            (*position,), (x, y, z, w) = (
+                [part[axis] for axis in axes] if isinstance(part, Mapping) else part
+                for part, axes in ((value["translation"], "xyz"), (value["rotation"], "xyzw"))
+            )
+        except (LookupError, TypeError, ValueError):
             raise refusal(name, expected, shown(value), key="pose") from None
-        checked_numbers(where, "pose", numbers, 7, "seven finite numbers")
-        if not any(numbers[3:]):
-            raise refusal(name, "a quaternion", "zeros", key="pose")
-        value = poses_from(numbers)
+        numbers = [*position, w, x, y, z]
+        expected = "three finite numbers, and four of a quaternion that are not all 0"
+        value = poses_from(checked_array(where, "pose", numbers, (7,), expected, lambda numbers: numbers[3:].any()))
     return checked_pose(where, value, "pose")

@@ -7,12 +7,14 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from arbiview_aug.cameras.formats.entries import MOUNTING, WAY_OUT, Mounting, camera_entry, matrix, refusal
+from arbiview_aug.cameras.camera import Camera
+from arbiview_aug.cameras.formats.entries import MOUNTING, WAY_OUT, Mounting, camera_of, matrix, refusal
 from arbiview_aug.cameras.formats.fields import read_fields
 from arbiview_aug.cameras.lens import FloatArray
 from arbiview_aug.cameras.plain_yaml import read_calibration_text, read_plain
@@ -52,7 +54,7 @@ class _Image(NamedTuple):
     pose: FloatArray  # (4, 4) camera to world, in the reconstruction's units
 
 
-def read_colmap(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+def read_colmap(path: Path, mounting: Mounting) -> list[Camera]:
     """Images of one moment as cameras: all, if each camera has one, or those that ``mounting.yaml`` names.
 
     Source: "Output Format" of COLMAP's documentation.
@@ -60,36 +62,36 @@ def read_colmap(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     folder = path if path.is_dir() else path.parent
     end = path.suffix if path.is_file() else ".bin" if (folder / "images.bin").is_file() else ".txt"
     models, images = (_binary_model if end == ".bin" else _text_model)(folder)
-    if not mounting.images and len({image.camera for image in images}) < len(images):
-        camera, times = Counter(image.camera for image in images).most_common(1)[0]
-        fix = f"Write one for each camera to {MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
-        raise CalibrationError(f"camera {camera} has {times} images: which were taken at one moment? {fix}")
-    by_file = {image.name: image for image in images}
+    by_file, chosen = {image.name: image for image in images}, mounting.images
     if len(by_file) < len(images):
         (file, times), *_ = Counter(image.name for image in images).most_common(1)
         raise CalibrationError(f"images{end}: expected images with different names, got {shown(file)} {times} times")
-    for file in mounting.images.values():
-        if file not in by_file:
-            expected = f"files that images{end} has, such as {images[0].name}"
-            raise CalibrationError(f"{MOUNTING}: images: expected {expected}, got {shown(file)}")
-    names = [os.path.dirname(file) or Path(file).stem for file in by_file]
-    if len({*names}) < len(by_file):  # several cameras in a folder
-        names = [Path(file).stem for file in by_file]
-    if not mounting.images and len({*names}) < len(by_file):
-        fix = f"write one for each to {MOUNTING} beside the files: images: {{front: {images[0].name}, ...}}"
-        raise CalibrationError(f"expected images with different names, got {', '.join(names[:8])}: {fix}")
-    chosen = {name: by_file[file] for name, file in (mounting.images or dict(zip(names, by_file, strict=True))).items()}
+    example = next(iter(by_file), "")
+    if not chosen:
+        fix = f"write one for each camera to {MOUNTING} beside the files: images: {{front: {example}, ...}}"
+        for camera, times in Counter(image.camera for image in images).items():
+            if times > 1:
+                raise CalibrationError(f"camera {camera} has {times} images: which were taken at one moment? {fix}")
+        names = [os.path.dirname(file) or Path(file).stem for file in by_file]
+        if len({*names}) < len(names):  # several cameras in a folder
+            names = [Path(file).stem for file in by_file]
+        if len({*names}) < len(names):
+            raise CalibrationError(f"expected images with different names, got {', '.join(names[:8])}: {fix}")
+        chosen = dict(zip(names, by_file, strict=True))
+    if unknown := [file for file in chosen.values() if file not in by_file]:
+        expected = f"files that images{end} has, such as {example}"
+        raise CalibrationError(f"{MOUNTING}: images: expected {expected}, got {shown(unknown[0])}")
     if mounting.metres_per_unit is None:
         example = f"poses: {{{next(iter(chosen), 'front')}: [[r, r, r, x], ...]}}"
         fix = f"Write it and the pose of one camera to {MOUNTING} beside the files: metres_per_unit: 1.0, {example}"
         raise CalibrationError(f"how many metres is a unit of the reconstruction? {fix}")
     scale = np.ones((4, 4))
     scale[:3, 3] = mounting.metres_per_unit
-    poses = mounting.mounted({name: image.pose * scale for name, image in chosen.items()})
-    return [_camera(name, models[chosen[name].camera], cam2ego) for name, cam2ego in poses.items()]
+    poses = mounting.mounted({name: by_file[file].pose * scale for name, file in chosen.items()})
+    return [_camera(name, models[by_file[chosen[name]].camera], cam2ego) for name, cam2ego in poses.items()]
 
 
-def _camera(name: str, camera: tuple[Any, ...], cam2ego: FloatArray) -> dict[str, Any]:
+def _camera(name: str, camera: tuple[Any, ...], cam2ego: FloatArray) -> Camera:
     key, width, height, numbers = camera
     _, model, focals, bends, lens = _model(key)
     if len(numbers) != (expected := focals + 2 + bends):
@@ -98,7 +100,7 @@ def _camera(name: str, camera: tuple[Any, ...], cam2ego: FloatArray) -> dict[str
     if lens != "pinhole":
         coefficients += [0.0] * (4 - len(coefficients)) if lens != "eucm" else []
     K = matrix(numbers[0], numbers[focals - 1], cx - 0.5, cy - 0.5)
-    return camera_entry(name, (width, height), K, cam2ego, lens, coefficients)
+    return camera_of(name, (width, height), K, cam2ego, lens, coefficients)
 
 
 def _model(key: int | str) -> tuple[int, str, int, int, str]:
@@ -156,7 +158,7 @@ def chain_entries(data: Any) -> dict[str, Mapping[str, Any]]:
     return {name: entry for name, entry in pairs if isinstance(entry, Mapping) and "camera_model" in entry}
 
 
-def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+def read_kalibr(path: Path, mounting: Mounting) -> list[Camera]:
     """Cameras of a camchain, in the order of the chain, also as OpenVINS ships it.
 
     Source: the wiki pages "yaml formats" and "supported models" of ethz-asl/kalibr.
@@ -172,9 +174,9 @@ def read_kalibr(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     cameras = {}
     for name, entry in chain.items():  # lenses are refused before poses are asked
         lens, K, coefficients, size, _ = read_fields(name, entry)
-        cameras[name] = camera_entry(name, size or mounting.size(name), K, np.eye(4), lens, coefficients)
+        cameras[name] = camera_of(name, size or mounting.size(name), K, np.eye(4), lens, coefficients)
     poses = mounting.mounted(_relative(chain))
-    return [cameras[name] | {"cam2ego": pose.tolist()} for name, pose in poses.items()]
+    return [replace(cameras[name], cam2ego=pose) for name, pose in poses.items()]
 
 
 def _relative(chain: Mapping[str, Mapping[str, Any]]) -> dict[str, FloatArray]:
@@ -204,7 +206,7 @@ _AV2_POSE = "tx_m", "ty_m", "tz_m", "qw", "qx", "qy", "qz"
 _WAYMO_NAMES = dict(enumerate(("UNKNOWN", "FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT")))
 
 
-def read_nuscenes(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+def read_nuscenes(path: Path, mounting: Mounting) -> list[Camera]:
     """Cameras of nuScenes' ``calibrated_sensor.json``; names from ``sensor.json``, sizes from ``sample_data.json``.
 
     Schema: docs/schema_nuscenes.md of nutonomy/nuscenes-devkit.
@@ -226,7 +228,7 @@ def read_nuscenes(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
         lens, K, coefficients, _, _ = read_fields(name, row)  # T4's rows have camera_distortion, k1 k2 p1 p2 k3
         pose = poses_from([*row["translation"], *row["rotation"]])
         size = sizes.get(row["token"]) or mounting.size(name)
-        cameras.append(camera_entry(name, size, K, pose, lens, coefficients))
+        cameras.append(camera_of(name, size, K, pose, lens, coefficients))
     return cameras
 
 
@@ -234,7 +236,7 @@ def _table(folder: Path, name: str) -> Any:
     return read_plain(folder / f"{name}.json", f"{name}.json", _MOST_TABLE_BYTES)
 
 
-def read_argoverse2(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+def read_argoverse2(path: Path, mounting: Mounting) -> list[Camera]:
     """Cameras of Argoverse 2's ``calibration`` folder, or of the log that it is in.
 
     Source: ``PinholeCamera.from_feather`` of argoverse/av2-api.
@@ -254,7 +256,7 @@ def read_argoverse2(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
     for row in rows("intrinsics.feather"):
         K = matrix(row["fx_px"], row["fy_px"], row["cx_px"], row["cy_px"])
         size, name = (row["width_px"], row["height_px"]), row["sensor_name"]
-        cameras.append(camera_entry(name, size, K, poses[name]))
+        cameras.append(camera_of(name, size, K, poses[name]))
     return cameras
 
 
@@ -267,7 +269,7 @@ def waymo_entries(data: Any) -> list[Mapping[str, Any]]:
     return data if is_waymo else []
 
 
-def read_waymo(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
+def read_waymo(path: Path, mounting: Mounting) -> list[Camera]:
     """Cameras of Waymo's ``CameraCalibration`` messages (dataset.proto of waymo-research/waymo-open-dataset).
 
     ``intrinsic`` is the list of version 1, or the mapping of version 2's component.
@@ -281,5 +283,5 @@ def read_waymo(path: Path, mounting: Mounting) -> list[dict[str, Any]]:
         cam2ego = np.reshape(np.asarray(entry["extrinsic"]["transform"], float), (4, 4)) @ axes
         name = _WAYMO_NAMES[name] if isinstance(name, int) else name  # CameraName.Name
         size = entry["width"], entry["height"]
-        cameras.append(camera_entry(name, size, matrix(*intrinsic[:4]), cam2ego, "radtan", intrinsic[4:]))
+        cameras.append(camera_of(name, size, matrix(*intrinsic[:4]), cam2ego, "radtan", intrinsic[4:]))
     return cameras
